@@ -125,6 +125,7 @@ def seen_by(
         gauge_deviation=2e-3,
         size=e.size,
         delays=Delays(*np.broadcast_to([[0.01], [0.06], [0.06], [5e5], [5e5]], (5, n))),
+        tip_delay=0.01,
         swing=None,
     )
 
@@ -177,7 +178,7 @@ def test_usual_arms_fit(seed: int) -> None:
         ({"sensor": turned("y", 12.0)}, "the sensor is turned on the tip by 1"),
         ({"registration": turned("z", 10.0)}, "the tracker's frame is turned by"),
         ({"registration": turned("x", 5.0)}, "the tracker's frame is turned by"),
-        ({"modulus": (1.9, 1.9)}, "times as far (modulus or gain)"),
+        ({"modulus": (1.9, 1.9)}, "a gain of all its channels that does the same"),
     ],
 )
 def test_faults_of_the_set_up_are_found(fault: dict[str, Any], text: str) -> None:
@@ -262,6 +263,7 @@ def test_gauges_noise_lag_and_swings_are_judged() -> None:
     noisy = only_wrong(with_changes(noise=1.5e-4))
     assert noisy.keys == ("control.tracker_noise",)
     assert "400 ms old" in only_wrong(with_changes(latency=0.4)).text
+    assert "poses are older than it says" in only_wrong(with_changes(tip_delay=0.12)).text
     slow = Delays(*np.broadcast_to([[0.05], [0.4], [0.4], [5e5], [5e5]], (5, 6)))
     assert "follows after 0.45 s" in only_wrong(with_changes(delays=slow)).text
     swing = Swing(1.7, 0.05, 2e-3, 0.01, 0.001)
@@ -361,6 +363,7 @@ def test_a_rig_that_fits(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
     assert told["findings"] == []
     assert told["channels"][0]["lag_up_s"] == pytest.approx(0.06, abs=0.01)
     assert told["channels"][0]["displacement_m"][0] == pytest.approx(-3.2e-3, rel=0.1)
+    assert told["tracker"]["tip_delay_s"] == pytest.approx(0.01, abs=0.02)
     assert told["tracker"]["noise_m"] == pytest.approx(3e-5, rel=0.2)
     files = {each.name for each in (tmp_path / "first").iterdir()}
     assert files >= {"record.yaml", "report.md", "commissioning.csv", "commissioning.png"}

@@ -169,7 +169,8 @@ _SUFFIXES = {
     "gauge_noise": "_pa", "dead_time": "_s", "lag_up": "_s", "lag_down": "_s",
     "rate_up": "_pa_per_s", "rate_down": "_pa_per_s", "position": "_m",
     "orientation": "_quaternion_wxyz", "noise": "_m", "angular_noise": "_rad", "rate": "_hz",
-    "latency": "_s", "frequency": "_hz", "frequency_deviation": "_hz", "amplitude": "_m",
+    "latency": "_s", "tip_delay": "_s",
+    "frequency": "_hz", "frequency_deviation": "_hz", "amplitude": "_m",
     "step": "_pa", "unexplained": "_m",
 }  # fmt: skip
 

@@ -149,6 +149,7 @@ def record_of(rig: Rig, found: Commissioning, log: str | None = None) -> Commiss
             angular_noise=None if seen.turn is None else _rounded(seen.angular_noise),
             rate=_rounded(seen.rate),
             latency=_rounded(seen.latency),
+            tip_delay=_rounded(seen.tip_delay) if np.isfinite(seen.tip_delay) else None,
             missing=_rounded(seen.missing),
         ),
         channels=tuple(_channel(found, k) for k in range(found.expected.n)),

@@ -112,6 +112,8 @@ def causes_of(expected: ExpectedSteps) -> list[Cause]:
         Cause("length", along(*lengths, by=1.0).sum(axis=1, keepdims=True) * _WIDE["length"]),
         Cause("response", along(*moduli, by=1.0).sum(axis=1, keepdims=True) * _WIDE["response"]),
     ]
+    every = along(*range(gains, gains + n), by=1.0).sum(axis=1, keepdims=True)
+    found.append(Cause("gain", every * _WIDE["response"]))
     for s in range(segments) if segments > 1 else ():
         found.append(Cause("length", along(lengths[s], by=_WIDE["length"]), s))
         found.append(Cause("response", along(moduli[s], by=_WIDE["response"]), s))

@@ -166,7 +166,11 @@ def _listed(items: Sequence[object]) -> str:
 def _causes(
     expected: ExpectedSteps, explainer: Explainer, best: SetupExplanation
 ) -> Iterator[Finding]:
+    alike: set[str] = set()
     for cause in best.causes:
+        if (words := cause_words(cause, expected, best)) in alike:
+            continue
+        alike.add(words)
         rivals = explainer.rivals(best, cause)
         others = [pair for pair in rivals if pair[0] is not cause]
         sizes = [cause_size(each, expected, e) for each, e in rivals]
@@ -175,7 +179,8 @@ def _causes(
         if cause.name.startswith("frame"):
             orders = [e for e in explainer.wiring_rivals(best) if e.wiring != explainer.ordinary]
             told |= dict.fromkeys(wiring_words(e.wiring) for e in orders)
-        text = cause_words(cause, expected, best)
+        told.pop(words, None)
+        text = words
         if told:
             text += f"; or {'; or '.join(told)}: what was seen does not tell these apart"
         names = dict.fromkeys(each.name for each, _ in [(cause, best), *others])
@@ -208,28 +213,44 @@ def cause_size(
     value, spread = _number(cause, expected, explanation)
     if cause.name == "length":
         return abs(value) / LIMITS.length, spread / LIMITS.length
-    if cause.name == "gain":
-        limit = float(np.log(1 + LIMITS.gain))
-        return abs(value) / limit, spread / limit
     limit = abs(float(np.log(LIMITS.weak if value < 0 else LIMITS.soft)))
+    if cause.name == "gain" and cause.about >= 0:
+        limit = float(np.log(1 + LIMITS.gain))
     return abs(value) / limit, spread / limit
 
 
-def _number(cause: Cause, expected: ExpectedSteps, e: SetupExplanation) -> tuple[float, float]:
-    """Logarithm of a length, of a segment's response or of a gain, and its deviation."""
-    segments = expected.description.n_segments
-    weights = np.zeros(len(e.values))
-    chosen = range(segments) if cause.about < 0 else [cause.about]
-    counts = [segment.n_channels for segment in expected.description.segments]
-    first = np.cumsum([NUMBERS + 2 * segments, *counts])
+def _channels(cause: Cause, expected: ExpectedSteps) -> list[int]:
+    """Channels (from 0) that a cause about the arm's numbers concerns."""
+    if cause.about < 0:
+        return list(range(expected.n))
     if cause.name == "gain":
-        weights[first[0] + cause.about] = 1.0
-    for s in chosen if cause.name != "gain" else ():
-        if cause.name == "length":
-            weights[NUMBERS + s] = 1 / len(chosen)
-        else:
-            weights[NUMBERS + segments + s] = -1 / len(chosen)
-            weights[first[s] : first[s + 1]] = 1 / counts[s] / len(chosen)
+        return [cause.about]
+    counts = [segment.n_channels for segment in expected.description.segments]
+    first = sum(counts[: cause.about])
+    return list(range(first, first + counts[cause.about]))
+
+
+def _ratio(cause: Cause, expected: ExpectedSteps, e: SetupExplanation) -> float:
+    """How far the channels that a cause concerns move the tip, over what the model expects."""
+    rows = [expected.row((k,)) for k in _channels(cause, expected)]
+    expected_way = expected.shift[rows]
+    way = expected_way + expected.shift_slope[rows] @ e.values[FORCE.start :]
+    ratios = np.linalg.norm(way, axis=1) / np.linalg.norm(expected_way, axis=1)
+    return float(ratios.mean())
+
+
+def _number(cause: Cause, expected: ExpectedSteps, e: SetupExplanation) -> tuple[float, float]:
+    """Logarithm of a length, of a segment's modulus or of a gain, and its deviation."""
+    segments, weights = expected.description.n_segments, np.zeros(len(e.values))
+    channels = _channels(cause, expected)
+    chosen = range(segments) if cause.about < 0 else [cause.about]
+    if cause.name == "gain":
+        weights[[NUMBERS + 2 * segments + k for k in channels]] = 1 / len(channels)
+    elif cause.name == "length":
+        weights[[NUMBERS + s for s in chosen]] = 1 / len(chosen)
+    else:
+        weights[[NUMBERS + segments + s for s in chosen]] = -1 / len(chosen)
+        weights[[NUMBERS + 2 * segments + k for k in channels]] = 1 / len(channels)
     return float(weights @ e.values), float(np.sqrt(weights @ e.covariance @ weights))
 
 
@@ -272,11 +293,17 @@ def cause_words(cause: Cause, expected: ExpectedSteps, e: SetupExplanation) -> s
     if cause.name == "load":
         return _load_words(expected, v[FORCE], float(deviation[FORCE][:2].max()))
     value, spread = _number(cause, expected, e)
-    factor, about = float(np.exp(value)), _about(cause, expected)
+    factor, about = _ratio(cause, expected, e), _about(cause, expected)
     if cause.name == "length":
         return f"{about} is {100 * value:+.1f} +- {100 * spread:.1f} % longer than its file says"
-    what = "modulus or gain" if cause.name == "response" else "gain"
-    return f"{about} moves the tip {factor:.2f} +- {factor * spread:.2f} times as far ({what})"
+    moves = f"{about} moves the tip {factor:.2f} times as far as modelled"
+    if cause.name == "gain" and cause.about >= 0:
+        return f"{moves}: gain {np.exp(value):.2f} +- {np.exp(value) * spread:.2f}"
+    by = float(np.exp(-value))
+    return (
+        f"{moves}: a modulus {by:.2f} +- {by * spread:.2f} times that of its file, or a gain of "
+        "all its channels that does the same"
+    )
 
 
 def _load_words(expected: ExpectedSteps, force: Array, spread: float) -> str:
@@ -292,7 +319,7 @@ def _load_words(expected: ExpectedSteps, force: Array, spread: float) -> str:
 
 
 def _about(cause: Cause, expected: ExpectedSteps) -> str:
-    if cause.name == "gain":
+    if cause.name == "gain" and cause.about >= 0:
         return f"channel {cause.about + 1}"
     several = expected.description.n_segments > 1
     return f"segment {cause.about + 1}" if cause.about >= 0 and several else "the arm"
@@ -400,6 +427,13 @@ def _tracker(rig: Rig, seen: Responses, control: ControlSettings) -> Iterator[Fi
             "tracker", f"the tracker's samples are {1e3 * seen.latency:.0f} ms old when they "
             f"come, and the rig file has {1e3 * usual:.0f} ms", False,
             "look for a filter or a busy network between tracker and computer",
+            ("tracker.latency",),
+        )  # fmt: skip
+    if seen.tip_delay > LIMITS.tip_delay:
+        yield Finding(
+            "tracker", f"the tip follows the gauges {1e3 * seen.tip_delay:.0f} ms late, by the "
+            "tracker's own times: its poses are older than it says", False,
+            f"raise tracker.latency by {1e3 * seen.tip_delay:.0f} ms, or switch off its filter",
             ("tracker.latency",),
         )  # fmt: skip
     if seen.missing > 0.1:

@@ -108,6 +108,7 @@ class RecordedTracker(Schema):
     noise, angular_noise : standard deviation of a sample, each axis.
     rate : samples per second.
     latency : usual age of a sample on arrival.
+    tip_delay : by which the tip follows the gauges, by the tracker's times; absent without gauges.
     missing : share of the samples that did not see the tip.
     """
 
@@ -117,6 +118,7 @@ class RecordedTracker(Schema):
     angular_noise: Angle | None = None
     rate: Frequency
     latency: Duration
+    tip_delay: Duration | None = None
     missing: Ratio
 
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from stiffopt.commissioning.expected import rotation_vectors
 from stiffopt.commissioning.procedure import ChannelStep, StepReadings
-from stiffopt.commissioning.timing import Delays, Swing, delays_of, fit_swing, settled
+from stiffopt.commissioning.timing import Delays, Swing, delays_of, fit_swing, settled, tip_delay
 
 Array = NDArray[np.float64]
 
@@ -36,6 +36,7 @@ class Responses:
     gauge_deviation : of each of these.
     size : of the steps, in Pa.
     delays : of the regulators, by channel.
+    tip_delay : by which the tip follows the gauges later than they and the arm explain, in s.
     swing : of the tip, or None.
     """
 
@@ -58,6 +59,7 @@ class Responses:
     gauge_deviation: float
     size: float
     delays: Delays
+    tip_delay: float
     swing: Swing | None
 
 
@@ -108,6 +110,7 @@ def responses_of(readings: StepReadings) -> Responses:
         gauge_deviation=deviation,
         size=r.size,
         delays=delays_of(r),
+        tip_delay=tip_delay(r, np.array(shift), swing),
         swing=swing,
     )
 

@@ -88,6 +88,7 @@ class Limits:
     unexplained : share of a step's displacement that nothing explains.
     noise : factor on the noise that the rig file has.
     latency : of the tracker, in s, above what the rig file has.
+    tip_delay : by which the tip may follow the gauges, in s, by the tracker's own times.
     slower : time by which the regulators may be slower than the rig file has it, in s.
     frequency : factor between the swing's frequency and the modelled one.
     drift : share of its displacement that the tip may come back while a pressure is held.
@@ -105,14 +106,15 @@ class Limits:
     bend: float = 8e-3
     length: float = 0.03
     gain: float = 0.25
-    soft: float = 1.45
-    weak: float = 0.62
+    soft: float = 1.35
+    weak: float = 0.68
     dead: float = 0.2
     gauge: float = 0.04
     gauge_least: float = 400.0
     unexplained: float = 0.5
     noise: float = 1.7
     latency: float = 0.05
+    tip_delay: float = 0.08
     slower: float = 0.1
     frequency: float = 1.4
     drift: float = 0.1

@@ -18,6 +18,8 @@ _DAMPINGS = (0.02, 0.1)
 _LAGS = (0.01, 0.03, 0.06, 0.12, 0.25, 0.5, 1.0)  # s
 _DEAD_TIMES = (0.0, 0.02, 0.06, 0.15, 0.3)  # s
 _LOOK = 1.5  # s after a step, in which a regulator is looked at
+_FINE = 0.005  # s, at which the tip's delay is looked for
+_TIP_DELAYS = np.arange(-0.05, 0.6, _FINE)  # s
 _RISE = (0.1, 0.9)  # shares of a step between which its rate is taken
 
 
@@ -150,7 +152,8 @@ def delays_of(readings: StepReadings) -> Delays:
             _delay(r, k, begin, min(begin + _LOOK, end))
             for begin, end in ((step.up, step.down), (step.down, step.end))
         )
-        found.append((float(np.nanmean([up[0], down[0]])), up[1], down[1], up[2], down[2]))
+        dead = [each[0] for each in (up, down) if np.isfinite(each[0])]
+        found.append((float(np.mean(dead)) if dead else np.nan, up[1], down[1], up[2], down[2]))
     return Delays(*np.array(found).T)
 
 
@@ -189,4 +192,54 @@ def _followed(time: Array, command: Array, lag: float) -> Array:
     found = command.copy()
     for i, share in enumerate(-np.expm1(-np.diff(time) / lag), start=1):
         found[i] = found[i - 1] + share * (command[i - 1] - found[i - 1])
+    return found
+
+
+# -- the tip ---------------------------------------------------------------------------------------
+
+
+def tip_delay(readings: StepReadings, shift: Array, swing: Swing | None) -> float:
+    """How much later than its gauge the tip moves after a step, by the tracker's times, in s.
+
+    The tip is a sum of the pressure, its creep and, of an arm that swings, the response of a damped
+    oscillator to it, all later by the same time. NaN without gauges.
+
+    Parameters
+    ----------
+    readings : StepReadings
+    shift : displacements (n, 3) by the steps.
+    swing : of the tip, or None.
+    """
+    r, total = readings, np.zeros(len(_TIP_DELAYS))
+    for step in r.steps:
+        gauge = r.measured[:, step.channel]
+        known = np.isfinite(gauge)
+        rows = (r.time > step.up - 0.2) & (r.time < min(step.up + _LOOK, step.down))
+        rows &= np.isfinite(r.position).all(axis=1)
+        way = r.position[rows] @ shift[step.channel]
+        if known.sum() < 50 or np.ptp(gauge[known]) < 0.2 * r.size or not rows.any():
+            continue
+        fine = np.arange(step.first - 0.3, step.up + _LOOK + 0.1, _FINE)
+        pressure = np.interp(fine, r.tick[known], gauge[known])
+        shapes = [pressure, _followed(fine, pressure, _CREEP)]
+        if swing is not None:
+            shapes.append(_oscillator(pressure, swing))
+        for index, delay in enumerate(_TIP_DELAYS):
+            moments = r.time[rows] - delay
+            basis = np.stack(
+                [np.ones_like(way), *(np.interp(moments, fine, each) for each in shapes)], axis=1
+            )
+            miss = way - basis @ np.linalg.lstsq(basis, way, rcond=None)[0]
+            total[index] += float(miss @ miss) / float(shift[step.channel] @ shift[step.channel])
+    return float(_TIP_DELAYS[np.argmin(total)]) if total.any() else np.nan
+
+
+def _oscillator(driven: Array, swing: Swing) -> Array:
+    """Response (m,) of a damped oscillator at rest to what drives it, in steps of `_FINE`."""
+    omega, damping = 2 * np.pi * swing.frequency, swing.damping
+    found, speed = np.full_like(driven, driven[0]), 0.0
+    for i in range(1, len(driven)):
+        force = omega**2 * (driven[i - 1] - found[i - 1]) - 2 * damping * omega * speed
+        speed += _FINE * force
+        found[i] = found[i - 1] + _FINE * speed
     return found
