@@ -16,11 +16,14 @@ import pytest
 
 import stiffopt as so
 from stiffopt.control import planner as planner_module
+from stiffopt.control.adaptation import Learning, Window
 from stiffopt.control.planner import PlannerEnd, PlanningEnd, ProcessPlanner
 from stiffopt.control.planning import Plan, PlanRequest
+from stiffopt.control.tuning import AdaptationTuning
 from stiffopt.optimise.goal import StiffnessGoal, StiffnessMeasure
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import Task
+from stiffopt.optimise.tip import TipModel
 
 ROBOT = "stiff-flop-1"
 OFFSET = np.array([1e-3, -2e-3, 0.1 + 0.2, -0.0, 5e-324, 1 / 3])
@@ -184,3 +187,37 @@ def test_a_system_that_cannot_be_told_to_yield_is_no_failure(
     planner_module._set_batch_policy(os.getpid())
     monkeypatch.delattr(os, "sched_setscheduler")
     planner_module._set_batch_policy(os.getpid())
+
+
+def test_windows_and_what_is_learned_from_them_arrive(ends: Ends) -> None:
+    """And both sides then speak of the same arm, which a later request does not send again."""
+    the_task, robot = task(), so.load_robot(ROBOT)
+    pose = robot.tip_pose(np.array([0.3e5, 0.2e5, 0.0]))
+    seen = Window(1.0, np.array([0.3e5, 0.2e5, 0.0]), 1.05 * pose[:3, 3], None)
+    asked = PlanRequest(1, the_task, the_task.target, OFFSET, BESIDE, windows=(seen,))
+    got = ends.passes(asked)
+    assert got.windows[0].position.tolist() == seen.position.tolist()
+    learning = Learning(robot.description, AdaptationTuning(least_step=1e-6))
+    estimate = learning.estimate(got.windows, got.adapted, TipModel(robot))
+    assert estimate is not None
+    ends.theirs.answer(
+        Plan(1, BESIDE, got.offset, got.target, True, 1.0, "", deviation=0.1, estimate=estimate)
+    )
+    plan = ends.ours.receive()
+    assert isinstance(plan, Plan)
+    assert plan.deviation == 0.1
+    assert plan.adapted is asked.adapted is None
+    assert plan.estimate is not None
+    assert plan.estimate.numbers == estimate.numbers
+    proposal = plan.estimate.proposal
+    assert proposal is not None
+    assert estimate.proposal is not None
+    assert proposal.applied.tolist() == estimate.proposal.applied.tolist()
+    there = ends.passes(replace(asked, adapted=proposal))
+    assert there.adapted is not None
+    assert there.adapted.description == proposal.description
+    again = learning.estimate(there.windows, there.adapted, TipModel(robot))
+    assert again is not None
+    assert again.proposal is None  # it is there already
+    assert ends.passes(replace(asked, adapted=proposal)).adapted is there.adapted
+    assert learning.estimate(there.windows, there.adapted, TipModel(robot)) is None
