@@ -55,12 +55,12 @@ class Belief:
     rest_position, rest_angle : the same, at rest.
     """
 
-    tilt: float = float(np.radians(0.6))
+    tilt: float = float(np.radians(0.5))
     turn: float = float(np.radians(1.0))
     move: float = 1e-3
     sensor: float = 6e-4
     sensor_angle: float = float(np.radians(0.8))
-    base_tilt: float = float(np.radians(0.6))
+    base_tilt: float = float(np.radians(0.5))
     sag: float = 3e-4
     length: float = 0.008
     modulus: float = 0.17
@@ -95,7 +95,7 @@ class Limits:
     """
 
     clear: float = 0.5
-    same: float = 5.0
+    same: float = 6.0
     swapped: float = -7.0
     lines: float = -5.0
     tilt: float = float(np.radians(2.8))
