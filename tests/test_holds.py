@@ -47,6 +47,19 @@ def test_a_hold_of_a_client_lasts() -> None:
     assert "hold-timeout" in arm.kinds
 
 
+def test_a_stream_of_targets_does_not_keep_a_hold_alive() -> None:
+    arm = lab()
+    arm.controller.valid = False
+    arm.until(State.HOLDING)
+    begin = arm.now
+    while arm.state is not State.INACTIVE:
+        if "hold-timeout" not in arm.kinds:
+            arm.loop.set_target(Target(position=(0.0, 0.0, 0.1)))
+        arm.ticks(5)
+        assert arm.now < begin + 2.0
+    assert "hold-timeout" in arm.kinds
+
+
 def test_a_doubt_holds_until_there_is_a_task_and_not_a_target() -> None:
     arm = lab()
     arm.controller.said = DOUBT
@@ -89,7 +102,10 @@ def test_a_hold_stops_the_arm_where_the_chambers_are_and_not_where_the_commands_
 
 def test_a_hold_never_commands_more_than_was_commanded_whatever_a_gauge_reads() -> None:
     arm = lab()
+    arm.controller.wanted = np.zeros(3)
+    arm.ticks(15)  # falling: the chambers have more than is commanded
     before = arm.loop.snapshot().commanded
+    assert before.max() > 1e4
     arm.world.inject("supply", "wrong", channel=2)  # reads 0.2 bar of an empty chamber
     arm.controller.said = DOUBT
     arm.tick()

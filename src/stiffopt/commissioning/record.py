@@ -209,6 +209,11 @@ def _hash(content: Any) -> str:
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
 
 
+def is_record_of(record: CommissioningRecord, robot: RobotDescription, rig: Any) -> bool:
+    """Whether a record is of this very robot, supply, tracker and registration."""
+    return (record.rig_hash, record.robot_hash) == fingerprints(robot, rig)
+
+
 def problems_of_record(
     record: CommissioningRecord, robot: RobotDescription, rig: Any, max_age: float
 ) -> Iterator[str]:
@@ -228,4 +233,6 @@ def problems_of_record(
 
 def _age(seconds: float) -> str:
     hours = seconds / 3600
+    if abs(hours) < 1:
+        return f"{seconds / 60:.3g} min"
     return f"{hours:.3g} h" if abs(hours) < 48 else f"{hours / 24:.3g} days"

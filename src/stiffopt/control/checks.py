@@ -16,7 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel
 
-from stiffopt.commissioning.record import CommissioningRecord, load_record, problems_of_record
+from stiffopt.commissioning.record import (
+    CommissioningRecord,
+    is_record_of,
+    load_record,
+    problems_of_record,
+)
 from stiffopt.control.gauge_watch import GaugeWatch
 from stiffopt.control.interface import Controller
 from stiffopt.control.tracker_watch import Sight, TrackerWatch
@@ -262,8 +267,8 @@ def check_commissioned(
     noisy = [False] * rig.supply.n
     if record is not None:
         problems = list(problems_of_record(record, rig.robot, rig.settings, settings.max_age))
-        is_of_this = len(problems) == (not record.fits)
-        if is_of_this and not problems:
+        is_of_this = is_record_of(record, rig.robot, rig.settings)
+        if not problems:
             noisy = [bool(channel.gauge_noise) for channel in record.channels]
             problems = list(_changed(record, rig, tracker, reading))
         if required or is_of_this:

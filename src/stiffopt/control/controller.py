@@ -142,7 +142,9 @@ class TipController:
         self._errors = TipErrors()
         self._windows = WindowWatch(tuning.windows)
         self._adapts = control.adaptation != "none"
-        self._watch = MotionWatch(robot.description, tuning.motion)
+        self._watch = MotionWatch(
+            robot.description, replace(tuning.motion, scatter=control.tracker_noise)
+        )
         self._model: LinearisedTip | None = None  # at the effective pressures
         self._path_model: LinearisedTip | None = None  # on the reference's path
         self._waypoint_model: TipModel | None = None  # at a trajectory's waypoints
@@ -192,6 +194,7 @@ class TipController:
         """Pursue a task; see `Controller.set_task`."""
         with refusing("task"):
             self._pursue_task(task)
+            self._watch.forgive()
 
     def set_target(self, target: Target) -> None:
         """Go to another target; see `Controller.set_target`."""
@@ -203,10 +206,11 @@ class TipController:
         with refusing("trajectory"):
             if trajectory.pressures is not None:
                 self._follow_posture(trajectory, trajectory.pressures, now)
-                return
-            estimate = self._estimator.estimate
-            course = Course(trajectory, now, estimate.position, estimate.rotation)
-            self._pursue_target(course.at(now), course)
+            else:
+                estimate = self._estimator.estimate
+                course = Course(trajectory, now, estimate.position, estimate.rotation)
+                self._pursue_target(course.at(now), course)
+            self._watch.forgive()
 
     def set_channels(self, without: Sequence[int]) -> None:
         """Do without some channels; see `Controller.set_channels`."""
@@ -312,7 +316,7 @@ class TipController:
         if isinstance(course, PostureCourse) and pause > 0:
             course.wait(pause)
         self._computed_at = now
-        self._watch.begin()
+        self._watch.go_on()
         offset, pressures = self._estimator.offset, self._pressures
         self._corrected_offset = offset
         self._reference.begin(

@@ -47,6 +47,8 @@ class GaugeWatch:
         noisy : whether that gauge had noise when it was commissioned.
         """
         if len(self._readings) < _ENOUGH:
+            if any(measured):
+                yield f"read {len(self._readings)} times, {_ENOUGH} are needed; wait a moment"
             return
         readings = np.array(self._readings)
         silent = np.isnan(readings).all(axis=0) & np.asarray(measured)

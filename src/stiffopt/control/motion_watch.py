@@ -83,6 +83,18 @@ class MotionWatch:
         self._swings = [_Swings(self._tuning) for _ in range(3)]
         self.doubt: Doubt | None = None
 
+    def go_on(self) -> None:
+        """Go on after a pause, in which the arm was not steered, or not seen."""
+        self._intended.clear()
+        self._misses = self._slips = 0
+        self._swings = [_Swings(self._tuning) for _ in range(3)]
+        self.forgive()
+
+    def forgive(self) -> None:
+        """Doubt no more what was doubted: somebody has looked at it."""
+        if self.doubt is not None:
+            self.begin()
+
     def change_model(self, change: Array) -> None:
         """Go on with another model, from which the tip is off by another offset (6,)."""
         rows = self._rows[: self._count]
@@ -128,6 +140,8 @@ class MotionWatch:
         intended = self._intended_at(time)
         if intended is None or self._is_early(time) or self.doubt is not None:
             return
+        if not (np.isfinite(seen).all() and np.isfinite(predicted).all()):
+            return
         if self._count == len(self._rows):
             self._rows[: self._kept] = self._rows[-self._kept :]
             self._count = self._kept
@@ -161,7 +175,8 @@ class MotionWatch:
     def _explained(self, changes: Array, jacobian: Array) -> Array:
         """Errors (k,) of the model's motion that are no surprise, in m.
 
-        `changes` (k, 17 + n) of samples; Jacobian (3, n) of the tip's position, base axes.
+        `changes` (k, 17 + n) from sample to sample; Jacobian (3, n) of the tip's position, base
+        axes.
         """
         moved = np.zeros(len(changes))
         for channels in self._segments:
@@ -187,7 +202,9 @@ class MotionWatch:
         speeds = np.sqrt((steps[:, _PREDICTED] ** 2).sum(axis=1)) / steps[:, _TIME]
         late = tuning.late * (speeds[suspects] + speeds[-1:])  # y than s, in m
         swing = rows[suspects, _SWING] + rows[-1, _SWING]
-        explained = self._explained(ways[suspects], jacobian) + late + swing + tuning.noise
+        # along the way, on which segments may have moved the tip against each other
+        own = np.cumsum(self._explained(steps, jacobian)[::-1])[::-1][suspects]
+        explained = own + late + swing + tuning.noise + 6 * tuning.scatter
         missed = suspects[off > explained]
         self._misses = self._misses + 1 if len(missed) else 0
         if self._misses < tuning.misses:
@@ -210,10 +227,11 @@ class MotionWatch:
     def _slip(self, jacobian: Array, tip: TipAt) -> Doubt | None:
         """The offset has changed as no force, wherever it acts, changes it."""
         tuning, rows = self._tuning, self._since(self._tuning.slip_window)
-        ways = rows[-1] - rows
-        moved, turned = ways[0, _OFFSET], ways[0, _TURN]
+        way = rows[-1] - rows[0]
+        moved, turned = way[_OFFSET], way[_TURN]
+        own = float(self._explained(np.diff(rows, axis=0), jacobian).sum())
         wrong = False
-        if float(np.linalg.norm(moved)) > self._least + self._explained(ways, jacobian).max():
+        if float(np.linalg.norm(moved)) > self._least / 2 + own + 6 * tuning.scatter:
             bent = turn_of_a_push(tip) @ moved
             missing = float(np.linalg.norm(bent - turned))
             size = float(np.linalg.norm(bent))
@@ -255,7 +273,8 @@ class MotionWatch:
         size = float(np.linalg.norm(drift))
         along = np.diff(offsets, axis=0) @ drift / max(size, 1e-9)
         explained = self._explained(np.diff(marks, axis=0), jacobian)
-        if (along - explained < scale.least_speed * scale.interval).any():
+        least = scale.least_speed * scale.interval + 2 * self._tuning.scatter
+        if (along - explained < least).any():
             return 0.0
         return size / duration
 
@@ -293,7 +312,7 @@ class _Swings:
         beyond = now.error - self._extreme.error
         if (beyond > 0) is self._rising:
             self._extreme = now
-        elif abs(beyond) > self._tuning.turn:
+        elif abs(beyond) > self._tuning.turn + 6 * self._tuning.scatter:
             self._turns.append(self._extreme)
             self._extreme, self._rising = now, not self._rising
 
@@ -306,6 +325,8 @@ class _Swings:
             abs(after.error - before.error) - tuning.model_error * (after.path - before.path)
             for before, after in pairwise(turns)
         ]
-        if min(sizes) < tuning.least_swing or sizes[-1] < tuning.decay * max(sizes):
+        if min(sizes) < tuning.least_swing + 6 * tuning.scatter or sizes[-1] < tuning.decay * max(
+            sizes
+        ):
             return 0.0
         return sizes[-1]

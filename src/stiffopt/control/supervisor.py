@@ -43,10 +43,9 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class _Hold:
-    """Why pressures are held since a time, in s; a `lasting` one ends only by a request."""
+    """Why pressures are held; a `lasting` hold ends only by a request."""
 
     reason: str
-    since: float
     lasting: bool = False
 
 
@@ -128,6 +127,8 @@ class Supervisor:
         self.saturated = self._no_channels  # (n,) at a limit that keeps them from their goal
         self._exchanged: PressureReading | None = None  # with the last command
         self._holds: dict[str, _Hold] = {}  # of each kind
+        # since when the loop has held by itself, again and again, and when it did so last, in s
+        self._held_since = self._held_until = -np.inf
         self._ramp: _Ramp | None = None
         self.vented = True  # the supply has accepted the command to vent, and no pressure since
         self._trouble: Trouble | None = None
@@ -325,26 +326,25 @@ class Supervisor:
         self._command(now, let_down(ramp.pressures, ramp.share(now), self.outlet.limits))
 
     def _present_pressures(self) -> Array:
-        """Pressures (n,) that stop the arm: those in the chambers, which lag behind the commands.
+        """Pressures (n,) that stop the arm: what the chambers have that lag behind rising commands.
 
-        They are within what was commanded lately, whatever the gauges read.
+        Whatever the gauges read, none is above the last command, or below all recent ones.
         """
-        recent = np.array(self._recent)
-        low, high = recent.min(axis=0), recent.max(axis=0)
-        measured = self.reading.pressures
         last = np.minimum(self._requested, self.commanded)
-        return np.where(np.isfinite(measured), np.clip(measured, low, high), last)
+        measured = np.maximum(self.reading.pressures, np.min(self._recent, axis=0))
+        held: Array = np.fmin(measured, last)  # NaN: not measured
+        return held
 
     def _end_a_long_hold(self, now: float) -> None:
         """Let down what is held for longer than the rig permits, but for a client's own hold."""
         most = self._safety.hold_timeout
-        if self._ramp is not None or most is None:
+        own = [hold for hold in self._holds.values() if not hold.lasting]
+        if self._ramp is not None or not own:
             return
-        for hold in self._holds.values():
-            if not hold.lasting and now - hold.since >= most:
-                text = f"held for {most:g} s, and still: {hold.reason}"
-                self._let_down(now, "hold-timeout", text)
-                return
+        self._held_until = now
+        if most is not None and now - self._held_since >= most:
+            text = f"held for {most:g} s, and still: {own[0].reason}"
+            self._let_down(now, "hold-timeout", text)
 
     def _command(self, now: float, pressures: Array, *, controlled: bool = False) -> bool:
         """Hand pressures (n,) to the outlet; return whether it accepted them."""
@@ -396,11 +396,11 @@ class Supervisor:
     # -- transitions --------------------------------------------------------------------------
 
     def _hold(self, now: float, kind: str, reason: str, *, lasting: bool = False) -> None:
-        before = self._holds.get(kind)
-        if before is None:
+        if kind not in self._holds:
             self.events.add(now, f"hold-{kind}", f"pressures are held: {reason}", Severity.WARNING)
-        since = now if before is None or before.lasting else before.since
-        self._holds[kind] = _Hold(reason, since, lasting)
+        if not lasting and now - self._held_until > self._tuning.hold_memory:
+            self._held_since = now
+        self._holds[kind] = _Hold(reason, lasting)
         if self.lifecycle.state is State.ACTIVE:
             self._held = None
             self.lifecycle.change(State.HOLDING, reason)
@@ -528,7 +528,7 @@ class Supervisor:
         self._monitor.clear()
         self._gauges.forget()
         self._tracker.begin(now)
-        self._doubted_at = -np.inf
+        self._doubted_at = self._held_since = self._held_until = -np.inf
         self._exchanged, self._failures, self._ticked_at = None, 0, now
         self._holds.clear()
         self.lifecycle.change(State.ACTIVE)

@@ -227,6 +227,8 @@ class SupervisionTuning:
     force_alarm: float = 0.5
     max_failures: int = 3  # failures of the controller in a row after which pressures are held
     chamber_lag: float = 0.3  # by which the pressures in the chambers may lag behind commands, in s
+    # time of steering after which a hold is a new one, and its timeout begins anew, in s
+    hold_memory: float = 2.0
     # time after a doubt in which another one lets the pressures down at once, in s
     doubt_memory: float = 30.0
     vent_attempts: int = 3  # to vent when the loop ends
@@ -255,6 +257,7 @@ class MotionTuning:
     # by what share of what each segment moves the tip the model may be wrong
     model_error: float = 0.35
     noise: float = 1e-3  # of a motion that is seen, in m
+    scatter: float = 5e-5  # standard deviation of a tracked position in each axis, in m
     # way from which on a response is looked at: a length in m, and a share of the arm's length
     least_motion: float = 3e-3
     least_motion_share: float = 0.025

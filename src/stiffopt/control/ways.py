@@ -6,6 +6,7 @@ effective ones, and an arm that differs from its model is as much nearer or fart
 
 from __future__ import annotations
 
+import math
 import time
 from itertools import pairwise
 
@@ -28,8 +29,8 @@ _EXACT = 5e-4  # m, to which a shortfall is found
 _STATIONS = 13  # along the body, whose ways are measured
 _SAMPLES = 64  # pressures at which the body's speed is measured
 _FASTER = 1.5  # than there, it may be elsewhere
-_DOWN = 8  # states on each piece of a way down
-_MOST_COST = 3e-3  # s, of looking for a way down, which a tick has to wait for
+_DOWN = 5  # states on each piece of a way down
+_MOST_COST = 5e-3  # s, of looking for a way down, which a tick has to wait for
 
 
 class Ways:
@@ -108,15 +109,21 @@ class ClearanceWatch:
         at = np.linspace(0.0, robot.length, _STATIONS)
         jacobians = robot.body_jacobian(samples, at)[:, :, :3]  # (N, stations, 3, n)
         self._speed = _FASTER * np.linalg.norm(jacobians, axis=2).max(axis=(0, 1))
-        robot.clearance(samples[:1], self._scene)
-        begin = time.perf_counter()
-        robot.clearance(samples[:_DOWN], self._scene)
-        self._cost = (time.perf_counter() - begin) / _DOWN
+        self._measure_cost()
 
     def begin(self) -> None:
         """Start anew: nothing is known of where the body is."""
         self._at = np.zeros(self._robot.n_pressures)
         self._clearance = -np.inf
+        if math.isfinite(self._cost):
+            self._measure_cost()  # what was compiled in the background since then is quicker
+
+    def _measure_cost(self) -> None:
+        robot = self._robot
+        states = np.linspace(robot.pressure_min, robot.pressure_max, _DOWN)
+        begin = time.perf_counter()
+        robot.clearance(states, self._scene)
+        self._cost = (time.perf_counter() - begin) / _DOWN
 
     def too_near(self, pressures: Array) -> str:
         """Why the body must not go to effective pressures (n,) in Pa; empty if it may.
