@@ -91,10 +91,10 @@ def _slipped(*way: float) -> Callable[[LoopRun], object]:
 
     def slip(run: LoopRun) -> None:
         camera = run.rig.world.camera
-        see = camera._sensor_in_tracker
+        see = camera.sensor_in_tracker
         moved = np.eye(4)
         moved[:3, 3] = way
-        camera._sensor_in_tracker = lambda: see() @ moved
+        camera.sensor_in_tracker = lambda: see() @ moved
 
     return slip
 

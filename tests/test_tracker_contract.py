@@ -92,7 +92,7 @@ class WorldControl:
         T = np.eye(4)
         T[:3, :3], T[:3, 3] = Rotation.from_quat([x, y, z, w]).as_matrix(), position
         assert self.world.camera is not None
-        self.world.camera.sensor_in_tracker = lambda noise: T  # type: ignore[method-assign]
+        self.world.camera._noisy = lambda pose, noise: T  # type: ignore[method-assign]
         self.world.inject("tracker", "flip" if w < 0 else "ok")
 
     def drop(self) -> None:

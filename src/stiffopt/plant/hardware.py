@@ -202,9 +202,9 @@ class Camera:
         if fault != self._fault:
             self._fault, self._began = fault, now
         elapsed = now - self._began
-        if fault == "loose":  # lies where it fell, and is seen with its noise
+        if fault == "loose" and self._seen:  # lies where it fell, and is seen with its noise
             return self._noisy(self._seen[-1], noise)
-        self._seen.append(self._sensor_in_tracker())
+        self._seen.append(self.sensor_in_tracker())
         if fault == "lagging":  # an older pose, told as new
             age = round(sizes.lag_growth * elapsed * self.settings.rate)
             return self._noisy(self._seen[max(-1 - age, -len(self._seen))], noise)
@@ -217,17 +217,15 @@ class Camera:
             T[:3, 3] += np.array(sizes.shake) * math.sin(2 * math.pi * sizes.shake_rate * elapsed)
         return T
 
-    def sensor_in_tracker(self, noise: Array) -> Array:
-        """Pose (4, 4) of the sensor in the tracker's frame; `noise` (6,) in standard deviations."""
-        return self._noisy(self._sensor_in_tracker(), noise)
-
-    def _sensor_in_tracker(self) -> Array:
+    def sensor_in_tracker(self) -> Array:
+        """Pose (4, 4) of the sensor in the tracker's frame, without noise."""
         off = self._plant.mismatch.registration.inverse()
         return np.asarray(
             self.settings.registration.sensor_in_tracker(off @ self._plant.tip_pose())
         )
 
     def _noisy(self, pose: Array, noise: Array) -> Array:
+        """The same with noise (6,), in standard deviations."""
         settings, T = self.settings, pose.copy()
         T[:3, 3] += settings.noise * noise[:3]
         small = np.concatenate(([1.0], 0.5 * settings.angular_noise * noise[3:]))
