@@ -172,7 +172,7 @@ def _causes(
             continue
         alike.add(words)
         rivals = explainer.rivals(best, cause)
-        others = [pair for pair in rivals if pair[0] is not cause]
+        others = [pair for pair in rivals if not (pair[0] is cause or _are_one(cause, pair[0]))]
         sizes = [cause_size(each, expected, e) for each, e in rivals]
         fits = all(size < 1 or size < _WORST * deviation for size, deviation in sizes)
         told = dict.fromkeys(cause_words(other, expected, e) for other, e in others)
@@ -189,6 +189,12 @@ def _causes(
         if keys and not told:
             tells = f"correct {_listed(keys)}; to be sure, {tells}"
         yield Finding(cause.name, text, fits, tells if told or not fits else "", keys)
+
+
+def _are_one(cause: Cause, other: Cause) -> bool:
+    """Whether both say that the whole arm, or the same segment, responds otherwise."""
+    names = {cause.name, other.name}
+    return cause.about == other.about < 0 and names <= {"gain", "response"}
 
 
 def cause_size(
@@ -240,7 +246,7 @@ def _ratio(cause: Cause, expected: ExpectedSteps, e: SetupExplanation) -> float:
 
 
 def _number(cause: Cause, expected: ExpectedSteps, e: SetupExplanation) -> tuple[float, float]:
-    """Logarithm of a length, of a segment's modulus or of a gain, and its deviation."""
+    """Relative change of a length, or of a response, to first order, and its deviation."""
     segments, weights = expected.description.n_segments, np.zeros(len(e.values))
     channels = _channels(cause, expected)
     chosen = range(segments) if cause.about < 0 else [cause.about]
@@ -297,12 +303,12 @@ def cause_words(cause: Cause, expected: ExpectedSteps, e: SetupExplanation) -> s
     if cause.name == "length":
         return f"{about} is {100 * value:+.1f} +- {100 * spread:.1f} % longer than its file says"
     moves = f"{about} moves the tip {factor:.2f} times as far as modelled"
+    share = max(1 + value, 0.01)  # of the modelled response, in which the estimate is linear
     if cause.name == "gain" and cause.about >= 0:
-        return f"{moves}: gain {np.exp(value):.2f} +- {np.exp(value) * spread:.2f}"
-    by = float(np.exp(-value))
+        return f"{moves}: gain {share:.2f} +- {spread:.2f}"
     return (
-        f"{moves}: a modulus {by:.2f} +- {by * spread:.2f} times that of its file, or a gain of "
-        "all its channels that does the same"
+        f"{moves}: a modulus {1 / share:.2f} +- {spread / share**2:.2f} times that of its file, or "
+        "a gain of all its channels that does the same"
     )
 
 
