@@ -446,6 +446,15 @@ def test_a_shaken_arm_is_not_moved(tmp_path: Path, touched: Any) -> None:
 def test_bad_input(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = rig_file(tmp_path)
     assert commissioned(path, "--out", str(path)) == 2
+    (tmp_path / "elsewhere").mkdir()
+    assert commissioned(path, "--out", str(tmp_path / "elsewhere" / "better.yaml")) == 2
+    assert "expected a place beside" in capsys.readouterr().err
+    assert not (tmp_path / "runs").exists()  # nothing has moved
+    nowhere = f"commissioning: {{record: {tmp_path / 'nowhere' / 'record.yaml'}}}\n"
+    path.write_text(path.read_text() + nowhere, encoding="utf-8")
+    assert commissioned(path) == 2
+    assert "the record cannot be written" in capsys.readouterr().err
+    path = rig_file(tmp_path)
     assert commissioned(path, "--folder", str(tmp_path)) == 2
     assert "is not empty" in capsys.readouterr().err
     path.write_text(path.read_text().replace("tracker:", "# tracker:"), encoding="utf-8")

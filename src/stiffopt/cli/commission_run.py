@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from contextlib import suppress
 from pathlib import Path
 
@@ -11,7 +12,7 @@ from stiffopt.cli.exits import MISFIT, SOLVED, InterruptBetweenSteps, interrupti
 from stiffopt.cli.outputs import check_new_file
 from stiffopt.cli.rig_work import RigStoppedError, new_name, on_rig, open_rig_for, rig_of
 from stiffopt.commissioning.commission import Commissioning, evaluate, record_of, stopped_record
-from stiffopt.commissioning.correction import corrections, write_corrected
+from stiffopt.commissioning.correction import check_place, corrections, write_corrected
 from stiffopt.commissioning.expected import ExpectedSteps, expected_steps
 from stiffopt.commissioning.procedure import LOG, StepReadings, run_steps
 from stiffopt.commissioning.record import save_record
@@ -40,12 +41,14 @@ def run(
     require_package("foxglove-sdk", "log", "foxglove")
     if out is not None:
         check_new_file(out, (".yaml", ".yml"))
+        check_place(out, rig_file)
     with interruptible(), warnings_as_notes(quiet=quiet):
         rig, name, rate, log_folder = rig_of(rig_file)
         if rig.tracker is None:
             raise InputError("this rig has no tracker; without one nothing can be found out")
         rig.supply.check_arming()
         expected = expected_steps(rig.robot, rig.supply.limits)
+        _check_record(rig.settings.commissioning.record)
         place = Path(log_folder) / new_name("commissioning", name) if folder is None else folder
         target = _made(Path(place))
     try:
@@ -57,6 +60,13 @@ def run(
         frequency = _frequency(expected)
         found = evaluate(rig, expected, readings, quick=fast, frequency=frequency)
         return _reported(rig, rig_file, found, target, out, plot, as_json=as_json, quiet=quiet)
+
+
+def _check_record(path: str) -> None:
+    """Refuse a record that could not be written, before the arm moves."""
+    folder = Path(path).resolve().parent
+    if not os.access(folder, os.W_OK):
+        raise FileError(path, f"the record cannot be written: {folder} is no folder to write to")
 
 
 def _made(folder: Path) -> Path:

@@ -65,6 +65,12 @@ def corrections(
     return data, changed
 
 
+def check_place(out: str | os.PathLike[str], path: str) -> None:
+    """Refuse a place for the corrected file from which the files that it names are not found."""
+    if Path(out).resolve().parent != Path(path).resolve().parent:
+        raise FileError(out, f"expected a place beside {path}: it names files relative to itself")
+
+
 def write_corrected(
     out: str | os.PathLike[str], path: str, data: dict[str, Any], changed: Sequence[str]
 ) -> None:
@@ -75,8 +81,7 @@ def write_corrected(
     FileError
         It is in another folder, from which the files that it names are not found, or it is wrong.
     """
-    if Path(out).resolve().parent != Path(path).resolve().parent:
-        raise FileError(out, f"expected a place beside {path}: it names files relative to itself")
+    check_place(out, path)
     comment = [
         f"{path}, corrected by 'stiffopt commission' in: {', '.join(changed)}.",
         "Comments of that file are not in here.",
