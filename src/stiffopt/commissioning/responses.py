@@ -13,7 +13,7 @@ from stiffopt.commissioning.timing import Delays, Swing, delays_of, fit_swing, s
 
 Array = NDArray[np.float64]
 
-_BEGIN = 0.35  # s after a step, until regulators have followed
+_BEGIN = 0.25  # s after a step, until regulators have followed
 
 
 @dataclass(frozen=True, eq=False)

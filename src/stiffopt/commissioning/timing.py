@@ -62,6 +62,9 @@ class Delays:
 # -- swings ----------------------------------------------------------------------------------------
 
 
+_SWINGS_FOR = (3.5, 1.2)  # s after a step in which a swing is looked for
+
+
 def _shapes(time: Array, frequency: float, damping: float) -> Array:
     """Basis (m, 4): a constant, creep, and a damped swing."""
     omega = 2 * np.pi * frequency
@@ -82,9 +85,17 @@ def fit_swing(windows: Sequence[tuple[Array, Array]], noise: float) -> Swing | N
 
     Returns
     -------
-    None where no swing stands out of the noise.
+    None where no swing stands out of the noise, neither for long nor just after the steps.
     """
-    used = [(t[t < 3.5], x[t < 3.5]) for t, x in windows if (t < 3.5).sum() > 24]
+    for duration in _SWINGS_FOR:
+        used = [(t[t < duration], x[t < duration]) for t, x in windows]
+        if (swing := _fit_swing([each for each in used if len(each[0]) > 24], noise)) is not None:
+            return swing
+    return None
+
+
+def _fit_swing(used: Sequence[tuple[Array, Array]], noise: float) -> Swing | None:
+    """Fit one damped swing to windows; None where it does not stand out of the noise."""
     if not used:
         return None
 
