@@ -180,7 +180,7 @@ def _believed(description: RobotDescription, parameters: Sequence[Parameter]) ->
 
 
 def rotation_vectors(rotations: Array) -> Array:
-    """Rotation vectors (N, 3) of rotations (N, 3, 3) by less than a half turn."""
+    """Rotation vectors (..., 3) of one or N rotations (..., 3, 3) by less than a half turn."""
     from scipy.spatial.transform import Rotation
 
     return np.asarray(Rotation.from_matrix(rotations).as_rotvec())

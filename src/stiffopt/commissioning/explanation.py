@@ -24,7 +24,7 @@ from itertools import combinations, permutations
 import numpy as np
 from numpy.typing import NDArray
 
-from stiffopt.commissioning.expected import ExpectedSteps, Source
+from stiffopt.commissioning.expected import ExpectedSteps, Source, rotation_vectors
 from stiffopt.commissioning.responses import Responses
 from stiffopt.commissioning.settings import BELIEF, LIMITS
 
@@ -285,7 +285,7 @@ class Explainer:
             )
             turn = _rotation(step[TURN]) @ _rotation(values[TURN])
             values = values + step
-            values[TURN] = _rotation_vector(turn)
+            values[TURN] = rotation_vectors(turn)
         misses, slopes = self._misses(rows, values)
         precision = slopes.T @ slopes + weight
         evidence = -0.5 * float(misses @ misses + values @ weight @ values)
@@ -302,7 +302,7 @@ class Explainer:
             expected = np.vstack([expected, 0.1 * self._expected.turn[rows]])
             seen = np.vstack([seen, 0.1 * self._seen.turn])
         u, _, vt = np.linalg.svd(seen.T @ expected)
-        return _rotation_vector(u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt)
+        return rotation_vectors(u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt)
 
     def _misses(self, rows: Sequence[int], values: Array) -> tuple[Array, Array]:
         """What is seen less what is expected, over its deviation, and slopes of the latter."""
@@ -333,7 +333,7 @@ class Explainer:
             slopes.append(slope.reshape(-1, len(values)) / noises[:, np.newaxis])
             bent = _rotation(e.rest_slope[3:] @ numbers) @ e.rest[:3, :3]
             axes = turn @ bent @ _rotation(values[SENSOR_TURN])
-            off = _rotation_vector(seen.rest_rotation @ axes.T)  # base axes
+            off = rotation_vectors(seen.rest_rotation @ axes.T)  # base axes
             rest = np.zeros((3, len(values)))
             rest[:, TURN], rest[:, SENSOR_TURN] = np.eye(3), turn @ bent
             rest[:, FORCE.start :] = turn @ e.rest_slope[3:]
@@ -367,9 +367,3 @@ def _rotation(vector: Array) -> Array:
     from scipy.spatial.transform import Rotation
 
     return np.asarray(Rotation.from_rotvec(vector).as_matrix())
-
-
-def _rotation_vector(rotation: Array) -> Array:
-    from scipy.spatial.transform import Rotation
-
-    return np.asarray(Rotation.from_matrix(rotation).as_rotvec())

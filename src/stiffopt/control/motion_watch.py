@@ -61,7 +61,7 @@ class MotionWatch:
 
     Attributes
     ----------
-    doubt : what is doubted; it stands until `begin`.
+    doubt : what is doubted; it stands until it is forgiven, or the arm goes on.
     """
 
     def __init__(self, robot: RobotDescription, tuning: MotionTuning) -> None:
@@ -175,8 +175,8 @@ class MotionWatch:
     def _explained(self, changes: Array, jacobian: Array) -> Array:
         """Errors (k,) of the model's motion that are no surprise, in m.
 
-        `changes` (k, 17 + n) from sample to sample; Jacobian (3, n) of the tip's position, base
-        axes.
+        `changes` (k, 17 + n) are differences of samples; Jacobian (3, n) of the tip's position,
+        base axes.
         """
         moved = np.zeros(len(changes))
         for channels in self._segments:

@@ -263,7 +263,7 @@ class MotionTuning:
     least_motion_share: float = 0.025
     response_window: float = 0.6  # in which the tip must have moved as the model has it, in s
     least_response: float = 0.25  # share of that way by which it must have moved along it
-    most_across: float = 0.75  # share of what it has moved that may be across that way
+    most_across: float = 0.75  # share of that way by which it may have moved across it
     late: float = 0.01  # by which the tip may move later than the model has it, in s
     misses: int = 2  # samples in a row that show no response
     slip_window: float = 1.0  # in which a slip is looked for, in s
