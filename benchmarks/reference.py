@@ -69,7 +69,7 @@ class Reference:
     """A task as a nonlinear program for SciPy."""
 
     def __init__(self, robot: Manipulator, task: Task) -> None:
-        load = task.load
+        load = task.tip_load
         self.robot = robot.with_load(load.force, load.moment, load.frame) if load else robot
         self.task = task
         lower, upper = task.pressure_bounds(robot.description)

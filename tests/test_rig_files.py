@@ -23,9 +23,9 @@ from stiffopt.rig.settings import ServiceSettings
 from stiffopt.safety.rigs import open_rig
 
 RIGS = sorted((Path(__file__).parent.parent / "rig").glob("*.yaml"))
-SIMULATED = ("sim", "sim-two-segment", "paper")
+SIMULATED = ("sim", "sim-two-segment", "paper", "palpation")
 EXPECTED = {
-    *("sim", "sim-two-segment", "paper", "virtual-lab"),
+    *("sim", "sim-two-segment", "paper", "palpation", "virtual-lab"),
     *("modbus-aurora", "nidaq-aurora", "openigtlink"),
 }
 

@@ -156,7 +156,7 @@ def main() -> int:
         task = load_task(PROBLEMS / f"{name}.yaml")
         robot = load_robot(task.resolve_robot())
         solution = solve_pressure(robot, task)
-        loaded = robot.is_loaded or task.load is not None
+        loaded = robot.is_loaded or task.tip_load is not None
         starts = given.starts_loaded if loaded else given.starts
         good, text, spread = check(robot, task, solution, starts, given.seed)
         print(f"{'ok   ' if good else 'WRONG'} {name}: {solution.status}, {text}", flush=True)

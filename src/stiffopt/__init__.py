@@ -57,6 +57,7 @@ if TYPE_CHECKING:
     from stiffopt.optimise.goal import StiffnessGoal as StiffnessGoal
     from stiffopt.optimise.goal import StiffnessMeasure as StiffnessMeasure
     from stiffopt.optimise.pareto import pareto_front as pareto_front
+    from stiffopt.optimise.press import Press as Press
     from stiffopt.optimise.solution import PressureSolution as PressureSolution
     from stiffopt.optimise.solver import PressureSolver as PressureSolver
     from stiffopt.optimise.solver import solve_batch as solve_batch
@@ -122,6 +123,7 @@ _NAMES = {
     "stiffopt.optimise.solution": ("PressureSolution",),
     "stiffopt.optimise.solver": ("PressureSolver", "solve_batch", "solve_pressure"),
     "stiffopt.optimise.target": ("Target", "Tolerance"),
+    "stiffopt.optimise.press": ("Press",),
     "stiffopt.optimise.task": ("Load", "Task", "load_task"),
     "stiffopt.optimise.warm": ("WarmAnswer",),
     "stiffopt.paths.motion": ("plan_motion",),

@@ -27,6 +27,8 @@ Examples:
   stiffopt run rig/sim.yaml --task task.yaml --arm
   stiffopt run rig/sim.yaml --task task.yaml --arm --no-service --duration '20 s'
   stiffopt run rig/sim.yaml --play motion.csv --arm --duration '20 s'
+  stiffopt run rig/palpation.yaml --task problems/two_segment_palpation.yaml --arm \\
+    --no-service --duration '25 s' --plot palpation.png
 
 \b
 Exit codes:
@@ -66,6 +68,13 @@ def run(
         str | None,
         typer.Option(metavar="FOLDER", help="Record here, not where the rig file says."),
     ] = None,
+    plot: Annotated[
+        str | None,
+        typer.Option(
+            metavar="FILE.png",
+            help="Draw the run into this file (.png, .pdf, .svg) when it has ended.",
+        ),
+    ] = None,
     plain: Annotated[
         bool, typer.Option("--plain", help="Print lines for people, no live status.")
     ] = False,
@@ -83,5 +92,5 @@ def run(
     style = "plain" if plain else "live" if is_terminal and not json_lines else "json"
     return run(
         rig, task=task, play=play, arm=arm, duration=duration, service=not no_service,
-        log_folder=log_folder, style=style,
+        log_folder=log_folder, plot=plot, style=style,
     )  # fmt: skip

@@ -16,8 +16,9 @@ from queue import Empty, SimpleQueue
 from types import FrameType
 from typing import TYPE_CHECKING, Self
 
-from stiffopt.cli.console import report_error, showing_slow_warnings
+from stiffopt.cli.console import report_error, report_note, showing_slow_warnings
 from stiffopt.cli.exits import BAD_INPUT, ENDING_SIGNALS, FAULT, SOLVED, handled
+from stiffopt.cli.outputs import check_picture
 from stiffopt.cli.quantities import quantity
 from stiffopt.cli.run_display import Lines, LiveStatus, write_at_once
 from stiffopt.control.state import State
@@ -45,12 +46,14 @@ def run(
     duration: str | None,
     service: bool,
     log_folder: str | None,
+    plot: str | None,
     style: str,
 ) -> int:
     """Run the daemon of a rig until it is ended; return the exit code.
 
     `rig`, `task` and `play` are paths of files, `duration` is text with a unit, `service` says
-    whether ports are opened, `style` is ``live``, ``plain`` or ``json``.
+    whether ports are opened, `plot` is the path of a figure of the run, `style` is ``live``,
+    ``plain`` or ``json``.
     """
     if task is not None and not arm:
         raise InputError("--task needs --arm: a task is pursued once the arm is armed")
@@ -65,6 +68,8 @@ def run(
             "a service must not arm by itself, for it would do so whenever it is restarted; let a "
             "client arm ('stiffopt.Client')"
         )
+    if plot is not None:
+        check_picture(plot)
     seconds = float("inf") if duration is None else quantity("--duration", duration, "s", "time")
     if not seconds > 0:
         raise InputError("--duration: expected a time above 0 s")
@@ -83,6 +88,8 @@ def run(
             code = _verdict(daemon, watch, state, refused)
             if not screen.finish(_LAST_OUTPUT) or daemon.hung:
                 leave(code)
+    if plot is not None:
+        _draw(daemon.recording, plot)
     return code
 
 
@@ -135,6 +142,21 @@ def _verdict(daemon: Daemon, watch: _Watch, state: State, refused: str) -> int:
         watch.report(f"ended in the state fault, vented: {daemon.loop.snapshot().reason}")
         return FAULT
     return BAD_INPUT if refused else SOLVED
+
+
+def _draw(recording: str | None, path: str) -> None:
+    """Draw a run that has ended; what fails there is reported and changes nothing else."""
+    try:
+        from stiffopt.daemon.run_log import read_run
+        from stiffopt.plots import save_figure
+        from stiffopt.plots.run import plot_run
+
+        if recording is None:
+            raise InputError("nothing was recorded")
+        save_figure(plot_run(read_run(recording)), path)
+        report_note(f"the run is drawn in {path}")
+    except StiffoptError as error:
+        report_error(f"--plot: {error}")
 
 
 class _Watch:

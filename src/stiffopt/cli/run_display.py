@@ -282,11 +282,12 @@ def _stiffness(now: Snapshot) -> list[tuple[str, RenderableType]]:
             share = now.stiffness / now.best_stiffness
             text += f" of {unit.number(now.best_stiffness, '.3g')} ({share:.0%})"
         rows.append(("stiffness", text))
-    force, moment = now.wrench[:3], now.wrench[3:]
-    if all(map(math.isfinite, now.wrench.tolist())):
-        milli = DisplayUnit("", 1e3)
-        forces, moments = _triple(force, milli, ".1f"), _triple(moment, milli, ".2f")
-        rows.append(("wrench", f"{forces} mN, {moments} mN m"))
+    if now.contact:
+        force, milli = now.wrench[:3], DisplayUnit("", 1e3)
+        text = f"felt at the tip: {_triple(force, milli, '.1f')} mN"
+        if math.isfinite(now.press_force):
+            text += f"; presses with {1e3 * now.press_force:.1f} of {1e3 * now.press_goal:g} mN"
+        rows.append(("force", text))
     return rows
 
 

@@ -3,6 +3,7 @@
 from collections.abc import Iterable
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 from rich.console import Group, RenderableType
 from rich.table import Table
@@ -14,6 +15,7 @@ from stiffopt.cli.tables import STATUS_COLOURS, block_title, labelled
 from stiffopt.display import FIGURES, display_units
 from stiffopt.errors import printable
 from stiffopt.optimise.goal import MatchMatrix, StiffnessMeasure
+from stiffopt.optimise.press import POSITION_ERROR, Feeling
 from stiffopt.optimise.settings import OBSTACLES
 from stiffopt.optimise.solution import PressureSolution
 from stiffopt.optimise.term import Term
@@ -56,6 +58,7 @@ def _lines(solved: SolvedTask) -> Iterable[Line]:
         return
     yield "pressures", _pressures(solved, solution.pressures)
     yield from _tip(solution, solution.tip_pose)
+    yield from _press(solution, solution.tip_pose)
     yield from _clearance(solution)
     yield from _uncertainty(solved)
     yield from _stiffnesses(solved)
@@ -104,6 +107,20 @@ def _tip(solution: PressureSolution, pose: Vector) -> Iterable[Line]:
     yield "tip at", Text(f"({x}, {y}, {z}) {unit}, pointing {vector_text(pose[:3, 2])}")
     for number, term in enumerate(solution.task.target.terms):
         yield "" if number else "tip error", _error(term, solution.errors[term.name])
+
+
+def _press(solution: PressureSolution, pose: Vector) -> Iterable[Line]:
+    """What the tip presses with, and how well that is felt."""
+    press, compliance = solution.task.press, solution.compliance
+    if press is None or compliance is None:
+        return
+    R, unit = pose[:3, :3], display_units().force
+    felt = Feeling.of(press.direction_in_base(R), R @ compliance[:3, :3] @ R.T)
+    yield (
+        "press",
+        f"{unit.text(press.force, '.3g')} along {vector_text(np.array(press.direction))}, "
+        f"{press.frame} axes; felt to {unit.text(felt.deviation(POSITION_ERROR), '.2g')}",
+    )
 
 
 def _clearance(solution: PressureSolution) -> Iterable[Line]:

@@ -26,6 +26,8 @@ from stiffopt.control.gauge_watch import GaugeWatch
 from stiffopt.control.interface import Controller
 from stiffopt.control.tracker_watch import Sight, TrackerWatch
 from stiffopt.errors import CommandError, InputError, StiffoptError
+from stiffopt.model.manipulator import Manipulator
+from stiffopt.optimise.solver import PressureSolver
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import PressureRange, Task
 from stiffopt.paths.trajectory import Trajectory, Waypoint
@@ -130,6 +132,22 @@ def check_rates(times: Array, pressures: Array, slew: Array, *, before_first: in
 def highest_pressures(task: Task, limits: PressureLimits) -> Array:
     """Return the highest pressures (n,) that a task permits on a rig, in Pa."""
     return np.array(limited_range(task.pressure, limits).max, dtype=float)
+
+
+def check_press(robot: Manipulator, limits: PressureLimits, task: Task) -> None:
+    """Refuse a press that the arm cannot hold within the rig's limits, or cannot feel.
+
+    Raises
+    ------
+    InputError
+        It says why.
+    """
+    if task.press is None:
+        return
+    pressure = limited_range(task.pressure, limits)
+    solution = PressureSolver(robot, task.model_copy(update={"pressure": pressure})).solve()
+    if not solution.found:
+        raise task.error_at("press", f"the arm cannot press like that there: {solution.message}")
 
 
 def limited_range(pressure: PressureRange, limits: PressureLimits) -> PressureRange:

@@ -19,7 +19,8 @@ from numpy.typing import ArrayLike, NDArray
 from stiffopt.control.adaptation import Adapted
 from stiffopt.control.allocation import Allocation
 from stiffopt.control.channels import Channels
-from stiffopt.control.checks import check_rates, limited_range, refusing
+from stiffopt.control.checks import check_press, check_rates, limited_range, refusing
+from stiffopt.control.contact import ContactEstimator
 from stiffopt.control.course import Course
 from stiffopt.control.estimator import TipEstimator
 from stiffopt.control.feedback import GainSchedule, tracking_rows
@@ -29,11 +30,12 @@ from stiffopt.control.linearised_tip import LinearisedTip
 from stiffopt.control.motion_watch import MotionWatch
 from stiffopt.control.planner import InlinePlanner, ProcessPlanner
 from stiffopt.control.posture import PostureCourse
+from stiffopt.control.pressing import Phase, Pressing
 from stiffopt.control.reference import Reference
 from stiffopt.control.regulators import PressureEstimator
-from stiffopt.control.replanning import Pursuit, Replanner
+from stiffopt.control.replanning import AnyCourse, Pursuit, Replanner
 from stiffopt.control.state import ControllerStatus, Severity
-from stiffopt.control.tip_errors import TipErrors, target_arrays, wrench_at
+from stiffopt.control.tip_errors import TipErrors, target_arrays
 from stiffopt.control.tuning import ControlTuning
 from stiffopt.control.vibration import BendingMode
 from stiffopt.control.windows import WindowWatch
@@ -119,6 +121,14 @@ class TipController:
             damping=control.damping,
         )
         self._estimator = TipEstimator(period, n, mode, filter_tuning)
+        self._contact = ContactEstimator(
+            [segment.n_channels for segment in robot.description.segments],
+            vibrates=mode is not None,
+            damping=control.damping,
+            tuning=replace(
+                tuning.contact, noise=max(tuning.contact.noise, 2 * control.tracker_noise)
+            ),
+        )
         self._reference = Reference(
             period, slew, lag, control.damping, 6, tuning.reference.slew_share
         )
@@ -173,6 +183,7 @@ class TipController:
         self.replanner.begin()
         self._pressures.begin()
         self._estimator.begin()
+        self._contact.begin()
         self._watch.begin()
         zero = self._pressures.command
         self._reference.begin(np.concatenate([zero, np.zeros(6)]))
@@ -193,7 +204,9 @@ class TipController:
     def set_task(self, task: Task) -> None:
         """Pursue a task; see `Controller.set_task`."""
         with refusing("task"):
-            self._pursue_task(task)
+            press = task.press
+            course = None if press is None else Pressing(press, task.target, self._tuning.pressing)
+            self._pursue_task(task, course)
             self._watch.forgive()
 
     def set_target(self, target: Target) -> None:
@@ -246,7 +259,13 @@ class TipController:
             return self._reference.goal
         pressures = self._pressures
         posture = pressures.command + pressures.history_offset
-        return np.concatenate([posture, self._estimator.offset])
+        return np.concatenate([posture, self._offset])
+
+    @property
+    def _offset(self) -> Array:
+        """Offset of the tip (6,) that is made up for: all but what a press wants."""
+        course, offset = self.replanner.pursuit.course, self._estimator.offset
+        return course.corrected(offset) if isinstance(course, Pressing) else offset
 
     def _is_held(self, now: float) -> bool:
         """Whether the pressures are not those that the reference leads to."""
@@ -264,14 +283,14 @@ class TipController:
                 "time, in which the arm goes there, or go there before"
             )
 
-    def _pursue_task(self, task: Task, course: Course | PostureCourse | None = None) -> None:
+    def _pursue_task(self, task: Task, course: AnyCourse | None = None) -> None:
         limited = _within_limits(task, self.robot, self.limits)
         lower, upper = limited.pressure_bounds(self.robot.description)
         self.replanner.pursue(Pursuit.of(task, limited, course))
         self._adapted_at = -math.inf
         self._permitted = lower, upper  # last, since it cannot fail: the pursuit has changed
 
-    def _pursue_target(self, target: Target, course: Course | PostureCourse | None = None) -> None:
+    def _pursue_target(self, target: Target, course: AnyCourse | None = None) -> None:
         """Go to a target, with goal and limits of the task, if there is one."""
         pursuit = self.replanner.pursuit
         if pursuit.task is None:
@@ -285,6 +304,8 @@ class TipController:
 
     def check_ahead(self, request: Task | Target | Trajectory) -> None:
         """Refuse what would lead the arm too near to the scene; any thread may ask."""
+        if isinstance(request, Task):
+            check_press(self.robot, self.limits, request)
         forecast = self.forecast
         if forecast is None:
             return
@@ -317,7 +338,7 @@ class TipController:
             course.wait(pause)
         self._computed_at = now
         self._watch.go_on()
-        offset, pressures = self._estimator.offset, self._pressures
+        offset, pressures = self._offset, self._pressures
         self._corrected_offset = offset
         self._reference.begin(
             np.concatenate([pressures.command + pressures.history_offset, offset])
@@ -343,8 +364,18 @@ class TipController:
         counts = self._estimator.take(samples)
         sample = self._estimator.sample
         if counts.used and sample is not None:
+            predicted = self._estimator.predicted
+            course, pushed = self.replanner.pursuit.course, np.zeros(3)
+            presses = isinstance(course, Pressing) and course.touches_on_purpose
+            self._contact.stiffness_error = self.replanner.deviation
+            self._contact.expect(presses)
+            self._contact.take(
+                sample.time, sample.position - predicted, effective, tip, self._estimator.omega
+            )
+            if presses:
+                pushed = self._contact.felt.displacement
             self._watch.take(
-                sample.time, sample.position, self._estimator.predicted, self._estimator.offset,
+                sample.time, sample.position - pushed, predicted, self._estimator.offset,
                 effective, tip, turns=self._estimator.turn_known, swing=self._estimator.swing,
             )  # fmt: skip
         if self.forecast is not None:
@@ -376,6 +407,7 @@ class TipController:
         omega, command_offset = estimator.omega, pressures.command_offset
         if self._adapts:
             self._adapt(now)
+        self._press(now)
         plan = self._plan(now)
         last, n = pressures.command, len(pressures.command)
         if plan is None:  # nothing to do, or no plan yet
@@ -422,9 +454,28 @@ class TipController:
         reference.slew_share = share
         way = None if self.forecast is None else self._way(now)
         return replanner.update(
-            now, estimator.offset, self._pressures.command_offset, estimator.omega,
+            now, self._offset, self._pressures.command_offset, estimator.omega,
             reference.delay, self._channels.available(), way, self._windows.windows,
         )  # fmt: skip
+
+    def _press(self, now: float) -> None:
+        """Go on with a press."""
+        course, tip = self.replanner.pursuit.course, self._tip
+        if not isinstance(course, Pressing) or tip is None:
+            return
+        R = tip.pose[:3, :3]
+        elapsed = min(now - self._computed_at, _HELD * self._period)
+        course.advance(
+            elapsed, self._rests(now), self._is_known(now), self._estimator.estimate.position,
+            self._estimator.offset, self._contact.felt, R, R @ tip.compliance[:3, :3] @ R.T,
+        )  # fmt: skip
+
+    def _is_known(self, now: float) -> bool:
+        """Whether the arm's stiffness is known as well as it can be at once."""
+        if not self._adapts:
+            return True
+        known, calm = self.replanner.known, self._tuning.adaptation.calm_time
+        return known is not None and known.proposal is None and now - self._adapted_at > calm
 
     def _adapt(self, now: float) -> None:
         """Watch the tip at rest, and go on with other numbers of the arm when it is time."""
@@ -432,7 +483,7 @@ class TipController:
             return
         self._watched_at = now
         windows, known = self._windows, self.replanner.known
-        if self._rests(now):
+        if self._rests(now) and not self._contact.felt.touches:
             windows.look(now, self._pressures.effective, self._estimator)
         else:
             windows.begin()
@@ -447,7 +498,9 @@ class TipController:
         sample = estimator.sample
         if sample is None or now - sample.time > t.seen or self._is_held(now):
             return False
-        if self.replanner.pursuit.course is not None or not self._has_arrived():
+        course = self.replanner.pursuit.course
+        goes = course is None or (isinstance(course, Pressing) and course.phase is Phase.GOING)
+        if not goes or not self._has_arrived():
             return False
         return float(np.abs(estimator.vibration[0]).max()) < t.vibration
 
@@ -474,6 +527,7 @@ class TipController:
         change = self._estimator.change_model(before, after)
         self._corrected_offset = self._corrected_offset + change
         self._watch.change_model(change)
+        self._contact.change_model(change)
         self._reference.shift(change)
         self.replanner.go_on_with(adapted, change)
 
@@ -500,7 +554,13 @@ class TipController:
         if tip is None:
             return ControllerStatus(plan=np.full(n, np.nan))
         estimate = self._estimator.estimate
-        target = self._led_to or pursuit.target_at(now)
+        felt = self._contact.felt
+        touches = felt.touches
+        target, press_force, press_goal = self._led_to or pursuit.target_at(now), math.nan, math.nan
+        if isinstance(pursuit.course, Pressing):
+            target = pursuit.course.shown(estimate.position)
+            press_force, press_goal = pursuit.course.force, pursuit.course.press.force
+            touches = touches or pursuit.course.phase is Phase.PRESSING
         position, pointing, quaternion = target_arrays(target)
         position_error, angle_error = self._errors.at(target, estimate.position, estimate.rotation)
         sample, plan = self._estimator.sample, self.replanner.plan
@@ -508,7 +568,6 @@ class TipController:
         if pursuit.stiffness is not None:
             stiffness = pursuit.stiffness(tip.compliance, tip.pose[:3, :3])
         ratio = math.exp(_NORMAL * self.replanner.deviation)  # NaN if it is not known
-        turn = estimate.turn if self._estimator.turn_known else None
         planned = np.full(n, np.nan)
         if self._led_to is not None:
             planned = self._reference.goal[:n] - self._pressures.history_offset
@@ -531,7 +590,11 @@ class TipController:
             adapted=() if self.replanner.known is None else self.replanner.known.numbers,
             best_stiffness=math.nan if plan is None else plan.stiffness,
             disturbance=estimate.offset,
-            wrench=wrench_at(tip, estimate.offset, turn),
+            contact=touches,
+            wrench=np.concatenate([felt.force, np.zeros(3)]),
+            wrench_covariance=felt.covariance.ravel(),
+            press_force=press_force,
+            press_goal=press_goal,
             task=pursuit.kind,
             stiffness_unit=pursuit.unit,
             model_position=estimate.static,
@@ -542,6 +605,9 @@ class TipController:
     def notices(self) -> tuple[Notice, ...]:
         """Return what is wrong."""
         notices = (*self.replanner.notices(self._away()), *self._channels.notices())
+        course = self.replanner.pursuit.course
+        if isinstance(course, Pressing):
+            notices = (*notices, *course.notices())
         if self._model_is_wrong():
             away = 1e3 * float(np.linalg.norm(self._estimator.offset[:3]))
             text = (
@@ -590,7 +656,7 @@ class TipController:
         if math.isfinite(omega):
             share = -math.expm1(-self._tuning.feedback.offset_rate * omega * self._period)
         offset = self._corrected_offset
-        self._corrected_offset = offset + share * (self._estimator.offset - offset)
+        self._corrected_offset = offset + share * (self._offset - offset)
 
     def _vibration_inputs(self) -> tuple[ArrayLike, ...]:
         """Inputs of `tracking_rows` for an arm that vibrates."""
@@ -622,4 +688,4 @@ def _within_limits(task: Task, robot: Manipulator, limits: PressureLimits) -> Ta
     lower, upper = on_rig.pressure_bounds(robot.description)
     pressure = PressureRange(min=tuple(lower.tolist()), max=tuple(upper.tolist()))
     # a load shows in the tip's offset, by as much as there is of it
-    return task.model_copy(update={"pressure": pressure, "load": None})
+    return task.model_copy(update={"pressure": pressure, "load": None, "press": None})

@@ -16,12 +16,14 @@ from stiffopt.control.interface import Notice
 from stiffopt.control.planner import InlinePlanner, ProcessPlanner
 from stiffopt.control.planning import Plan, PlanRequest, nearest_words
 from stiffopt.control.posture import PostureCourse
+from stiffopt.control.pressing import Pressing
 from stiffopt.control.tip_errors import stiffness_function, target_arrays
 from stiffopt.control.tuning import ReplanningTuning
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import Task
 
 Array = NDArray[np.float64]
+AnyCourse = Course | PostureCourse | Pressing
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,20 +32,20 @@ class Pursuit:
 
     task: Task | None = None  # within the limits of the rig; None: nothing is pursued
     target: Target | None = None  # takes the place of the task's own
-    # a trajectory under way, which takes the place of the target
-    course: Course | PostureCourse | None = None
+    # a trajectory or a press under way, which takes the place of the target
+    course: AnyCourse | None = None
     prescribed: Array = field(default_factory=lambda: np.zeros(5))  # see `prescribed_components`
     stiffness: Callable[[Array, Array], float] | None = None  # in the task's first direction
     unit: str = "N/m"  # of that stiffness
 
     @classmethod
-    def of(cls, task: Task, limited: Task, course: Course | PostureCourse | None = None) -> Pursuit:
+    def of(cls, task: Task, limited: Task, course: AnyCourse | None = None) -> Pursuit:
         """Return the pursuit of a task, given with the limits of the rig as well."""
         prescribed = prescribed_components(task.target)
         unit = task.measures[0].unit if task.measures else "N/m"
         return cls(limited, task.target, course, prescribed, stiffness_function(task), unit)
 
-    def to(self, target: Target, course: Course | PostureCourse | None = None) -> Pursuit:
+    def to(self, target: Target, course: AnyCourse | None = None) -> Pursuit:
         """Return the pursuit of another target, or course that begins there."""
         prescribed = prescribed_components(target)
         return replace(self, target=target, course=course, prescribed=prescribed)
@@ -62,7 +64,9 @@ class Pursuit:
 
     @property
     def kind(self) -> str:
-        """``trajectory``, ``target``, or empty."""
+        """``press``, ``trajectory``, ``target``, or empty."""
+        if isinstance(self.course, Pressing):
+            return "press"
         if self.course is not None:
             return "trajectory"
         return "" if self.target is None else "target"

@@ -229,16 +229,35 @@ class ControllerStatus:
     disturbance: Annotated[Array, _tip("offset of the tip from the model", "m", size=3)] = field(
         default_factory=_nan3
     )
+    contact: Annotated[bool, _tip("whether a force on the tip is felt", key="contact")] = False
     wrench: Annotated[
         Array,
         _tip(
-            "force and moment at the tip that would explain the offset",
+            "force on the tip that is felt, where the tip is soft, and its moment about the tip, "
+            "which is zero",
             "N",
             size=6,
             json=("wrench_force_n", "wrench_moment_nm"),
             key="wrench",
         ),
     ] = field(default_factory=_nan6)
+    wrench_covariance: Annotated[
+        Array,
+        _tip(
+            "covariance of that force, row by row",
+            size=9,
+            json=("wrench_covariance_n2",),
+            key="wrench_covariance",
+            decimals=9,
+        ),
+    ] = field(default_factory=partial(np.full, 9, np.nan))
+    press_force: Annotated[
+        float,
+        _tip("force with which the tip presses along the task's direction", "N", decimals=5),
+    ] = math.nan
+    press_goal: Annotated[float, _tip("the force that the task asks for", "N", decimals=5)] = (
+        math.nan
+    )
     adapted: Annotated[
         tuple[AdaptedNumber, ...],
         Shown("numbers of the arm as they are estimated while it is at work"),

@@ -132,21 +132,6 @@ def stiffness_function(task: Task) -> Callable[[Array, Array], float] | None:
     return stiffness
 
 
-def wrench_at(tip: TipAt, offset: Array, turn: Array | None) -> Array:
-    """Return the wrench (6,), base axes, that would displace the model's tip by an offset (3,).
-
-    Without a `turn` of the orientation, a rotation vector (3,), it is a force alone.
-    """
-    rotation = tip.pose[:3, :3]
-    if turn is not None:
-        motion = np.concatenate([rotation.T @ offset, rotation.T @ turn])
-        wrench = np.linalg.solve(tip.compliance, motion)
-    else:
-        force = np.linalg.solve(tip.compliance[:3, :3], rotation.T @ offset)
-        wrench = np.concatenate([force, np.zeros(3)])
-    return np.concatenate([rotation @ wrench[:3], rotation @ wrench[3:]])
-
-
 def turn_of_a_push(tip: TipAt) -> Array:
     """Turn of the tip per displacement by a force at the tip (3, 3), base axes, in rad/m.
 

@@ -284,6 +284,75 @@ class MotionTuning:
 
 
 @dataclass(frozen=True)
+class ContactTuning:
+    """Noise of what is between model and tip, and when a force is believed (`ContactEstimator`)."""
+
+    force: float = 0.1  # standard deviation of forces that are thought possible, in N
+    stiffness_error: float = 0.1  # of the arm, relative, where it is not known
+    noise: float = 1e-4  # of a position, in m
+    late: float = 0.01  # by which the tip may move later than the model has it, in s
+    # error of the model, as a share of the way of the last moments, and how long these last, in s
+    model_error: float = 0.03
+    motion_time: float = 0.6
+    # what a fast motion adds to that share, and how fast that is, in m/s
+    fast_error: float = 0.15
+    fast: float = 0.1
+    drift: float = 1e-4  # growth of its standard deviation at rest, in m / sqrt(s)
+    # rate of creep after a motion, as a share of its way, in 1/s; the time in which it decays, in
+    # s; and its growth at random, as a share of the way of that time, in 1/s / sqrt(s)
+    creep: float = 0.06
+    creep_time: float = 5.0
+    creep_change: float = 0.02
+    # share of a motion that may excite the vibration beyond what the model has
+    swing_error: float = 0.1
+    # growth of the standard deviation of the vibration's speed, in m/s / sqrt(s); and, as a share,
+    # by how much its frequency may be off
+    agitation: float = 2e-3
+    detuned: float = 0.06
+    # standard deviations when it begins: in m, m/s, m and m/s
+    first_error: float = 0.02
+    first_rate: float = 1e-3
+    first_swing: float = 0.01
+    first_speed: float = 0.03
+    longest_gap: float = 1.0  # between samples, after which it begins anew, in s
+    spacing: float = 0.1  # between the beginnings of hypotheses, in s
+    hypothesis_time: float = 2.0  # after which one is given up, in s
+    jump: float = 0.012  # standard deviation of a force when a hypothesis begins, in N
+    # growth of a force's standard deviation, in N / sqrt(s): while a hypothesis is open, for so
+    # many seconds, and later
+    open_rate: float = 0.05
+    open_time: float = 0.3
+    force_rate: float = 0.003
+    rate: float = 0.02  # standard deviation of the rate of a force that changes, in N/s
+    rate_time: float = 0.7  # in which that rate decays, in s
+    evidence: float = 15.0  # logarithm of the likelihood ratio from which one is believed
+    samples: int = 3  # in a row in which it must be
+    least_force: float = 3e-3  # that counts, in N
+    gone_share: float = 0.7  # share of it below which a force is none any more
+    quiet: int = 20  # after so many samples in a row
+    surely: float = 3.0  # standard deviations from which an expected force is told
+
+
+@dataclass(frozen=True)
+class PressingTuning:
+    """How the tip presses on something (`Pressing`)."""
+
+    # time at the target before the approach begins, in s; and the longest time that it waits until
+    # the arm's stiffness is known better
+    rest: float = 0.5
+    longest_rest: float = 8.0
+    time: float = 0.7  # time constant of the force against a rigid surface, in s
+    touch_share: float = 0.2  # share of the force from which something is felt
+    lost: float = 0.4  # time without a contact after which it is lost, in s
+    # largest share of the force that may be felt, or that the arm's compliance explains; and by
+    # how much the tip may be held back beyond that, in m
+    most_force: float = 1.6
+    held_back: float = 2e-3
+    settled: float = 0.5  # time within the tolerance after which it is told, in s
+    patience: float = 5.0  # time beyond it after which there is an alarm, in s
+
+
+@dataclass(frozen=True)
 class TrackerTuning:
     """What is known of a tracker's rhythm, and when it is trusted again."""
 
@@ -308,3 +377,5 @@ class ControlTuning:
     adaptation: AdaptationTuning = field(default_factory=AdaptationTuning)
     windows: WindowTuning = field(default_factory=WindowTuning)
     motion: MotionTuning = field(default_factory=MotionTuning)
+    contact: ContactTuning = field(default_factory=ContactTuning)
+    pressing: PressingTuning = field(default_factory=PressingTuning)

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt import lie
 from stiffopt.control.state import Event, SeenPose, Severity, Snapshot, State, Timing
 from stiffopt.control.state_fields import Entry, Kind, entries
 from stiffopt.daemon.state_json import plain
@@ -100,6 +101,11 @@ BASE, TIP, TARGET, SEEN = "base", "tip", "target", "tip_seen"
 _SELDOM = ("/state", "/limits")
 _TARGET_SIZE = 0.004  # m
 _ARM_COLOUR, _TARGET_COLOUR = (0.31, 0.47, 0.65, 0.7), (0.84, 0.15, 0.16, 0.8)
+_FORCE_COLOUR = (0.55, 0.34, 0.29, 1.0)
+_FORCE_THICKNESS = 0.002  # m
+_LENGTH_OF_FORCE = 1.0  # m per N that a force is drawn with: a millimetre for each mN
+_WITHIN_95 = 2.8  # standard deviations in three dimensions
+_LARGEST_ELLIPSOID = 0.2  # m, along an axis in which nothing can be felt
 
 
 class TelemetryChannels:
@@ -204,6 +210,8 @@ class TelemetryChannels:
             size = Vector3(x=_TARGET_SIZE, y=_TARGET_SIZE, z=_TARGET_SIZE)
             ball = SpherePrimitive(pose=place, size=size, color=_colour(_TARGET_COLOUR))
             entities.append(_entity(moment, TARGET, spheres=[ball]))
+        if now.contact:
+            entities.append(_force(moment, now))
         self._scene.log(SceneUpdate(entities=entities), log_time=moment)
 
     def log_frames(self, now: Snapshot) -> None:
@@ -266,6 +274,34 @@ def _entity(moment: int, name: str, **shapes: Any) -> Any:
 
     stamp, soon = _timestamp(moment), Duration(1)
     return SceneEntity(timestamp=stamp, frame_id=BASE, id=name, lifetime=soon, **shapes)
+
+
+def _force(moment: int, now: Snapshot) -> Any:
+    """Return the force on the tip as a line from the tip, with its 95 % ellipsoid at the end."""
+    from foxglove.messages import (
+        LinePrimitive,
+        Point3,
+        Pose,
+        Quaternion,
+        SpherePrimitive,
+        Vector3,
+    )
+
+    end = now.tip_position + _LENGTH_OF_FORCE * now.wrench[:3]
+    variances, axes = np.linalg.eigh(now.wrench_covariance.reshape(3, 3))
+    if np.linalg.det(axes) < 0:
+        axes[:, 0] *= -1
+    sizes = 2 * _WITHIN_95 * _LENGTH_OF_FORCE * np.sqrt(np.maximum(variances, 0.0))
+    w, x, y, z = np.asarray(lie.quaternion_from_rotation(axes)).tolist()
+    points = [Point3(x=a, y=b, z=c) for a, b, c in (now.tip_position.tolist(), end.tolist())]
+    a, b, c = end.tolist()
+    place = Pose(position=Vector3(x=a, y=b, z=c), orientation=Quaternion(x=x, y=y, z=z, w=w))
+    a, b, c = np.minimum(sizes, _LARGEST_ELLIPSOID).tolist()
+    colour = _colour(_FORCE_COLOUR)
+    line = LinePrimitive(points=points, thickness=_FORCE_THICKNESS, color=colour)
+    pale = _colour((*_FORCE_COLOUR[:3], 0.25))
+    ball = SpherePrimitive(pose=place, size=Vector3(x=a, y=b, z=c), color=pale)
+    return _entity(moment, "force", lines=[line], spheres=[ball])
 
 
 def _target_place(now: Snapshot) -> Array | None:

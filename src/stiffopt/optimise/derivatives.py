@@ -446,7 +446,7 @@ def _evaluation(problem: PressureProblem) -> Callable[[Vector, Vector], ProgramP
     """Everything at pressures (n,), as shares, and parameters; from rest under loads."""
     robot, task = problem.robot, problem.task
     program = Program.of(task, robot.description)
-    bare = task.model_copy(update={"load": None})  # which the arm carries already
+    bare = task.model_copy(update={"load": None, "press": None})  # which the arm carries already
     fast = prepared(robot, bare, 0).fast(program) if robot.is_loaded else None
     radii = np.array([c.radius for c in program.constraints(robot.length)])
     own = slice(program.n_own_rows)

@@ -39,7 +39,7 @@ class Prepared:
     """
 
     def __init__(self, robot: Manipulator, task: Task, seed: int) -> None:
-        load = task.load
+        load = task.tip_load
         self.robot = robot.with_load(load.force, load.moment, load.frame) if load else robot
         task.check_scene(robot.description)
         self.lower, self.upper = task.pressure_bounds(robot.description)
@@ -120,7 +120,7 @@ def prepared(robot: Manipulator, task: Task, seed: int) -> Prepared:
         If the task's pressure limits do not suit the robot.
     """
     scene = None if task.scene is None else SceneKey(task.scene)
-    key = (task.stiffness, task.load, task.pressure, scene, robot.tip_load, seed)
+    key = (task.stiffness, task.tip_load, task.pressure, scene, robot.tip_load, seed)
     return _recent(robot, "prepared", key, lambda: Prepared(robot, task, seed))
 
 

@@ -109,7 +109,7 @@ class PressureSolver:
         with giving_up(timeout, cancel):
             solution = self._compiled(task, start) or self._otherwise(task, start)
         solution.timings.update(watch.timings())
-        return solution
+        return _felt(solution)
 
     def warm(
         self,
@@ -779,14 +779,24 @@ def _solved(
         solution.timings.update(shares)
         for name, time in watch.timings().items():
             solution.timings[name] = shares.get(name, 0.0) + time
-        solutions.append(solution)
+        solutions.append(_felt(solution))
     return solutions
+
+
+def _felt(solution: PressureSolution) -> PressureSolution:
+    """The solution, which is none if the arm could not feel there how hard it presses."""
+    press, pose, compliance = solution.task.press, solution.tip_pose, solution.compliance
+    if press is None or not solution.found or pose is None or compliance is None:
+        return solution
+    R = pose[:3, :3]
+    reason = press.refusal(R, R @ compliance[:3, :3] @ R.T)
+    return replace(solution, status="unreachable", message=reason) if reason else solution
 
 
 def stiffness_blind(solver: PressureSolver, solution: PressureSolution) -> PressureSolution:
     """The pose of a solution with the least pressure: what a plain solver would answer."""
-    task = solution.task.model_copy(update={"stiffness": None})
-    blind = PressureSolver(solver.robot, task.model_copy(update={"load": None}), seed=solver.seed)
+    plain = {"stiffness": None, "load": None, "press": None}
+    blind = PressureSolver(solver.robot, solution.task.model_copy(update=plain), seed=solver.seed)
     return blind.solve(guess=solution.pressures)
 
 

@@ -16,7 +16,14 @@ from typing import Annotated, Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BeforeValidator, Discriminator, Field, Tag, ValidationInfo
+from pydantic import (
+    BeforeValidator,
+    Discriminator,
+    Field,
+    Tag,
+    ValidationInfo,
+    model_validator,
+)
 from pydantic_core import PydanticKnownError
 
 from stiffopt.directions import Frame
@@ -27,6 +34,7 @@ from stiffopt.model.robot_files import load_description
 from stiffopt.model.scene import SceneOrFile
 from stiffopt.notebook import ShownInNotebook
 from stiffopt.optimise.goal import StiffnessGoal, StiffnessMeasure
+from stiffopt.optimise.press import Press
 from stiffopt.optimise.target import Target
 from stiffopt.schema import BadKeyError, Items, Schema, Vector
 from stiffopt.units import Force, Moment, Pressure, read_from_file, within
@@ -196,6 +204,7 @@ class Task(ForRobot):
     target : tip pose.
     stiffness : stiffness goal, or None: the pose with the least pressure.
     load : load at the tip, or None.
+    press : what the tip presses with at the target, in place of a load, or None.
     pressure : limits that tighten the robot's.
     scene : what is around the arm, or None.
     source : the file that the task was read from, or None.
@@ -203,12 +212,39 @@ class Task(ForRobot):
 
     target: Target
     stiffness: StiffnessGoal | None = None
+    press: Press | None = None
+
+    @model_validator(mode="after")
+    def _can_press(self) -> Task:
+        press = self.press
+        if press is None:
+            return self
+        if self.load is not None:
+            raise BadKeyError("press", "cannot be combined with load; remove one of the two")
+        position = self.target.position or (None, None, None)
+        needed = [press.frame == "tip" or abs(part) > 1e-9 for part in press.direction]
+        if any(axis is None for axis, need in zip(position, needed, strict=True) if need):
+            raise BadKeyError(
+                "press", "needs a target with a position along its direction, where it begins"
+            )
+        return self
+
+    @property
+    def tip_load(self) -> Load | None:
+        """The load at the tip in the wanted state: what was given, or the reaction of a press."""
+        press = self.press
+        if press is None:
+            return self.load
+        reaction = tuple(-press.force * part for part in press.direction)
+        return Load(force=cast("tuple[float, float, float]", reaction), frame=press.frame)
 
     def __repr__(self) -> str:
         parts = [] if self.robot is None else [self.robot]
         parts.append(repr(self.target))
         if self.stiffness is not None:
             parts.append(repr(self.stiffness))
+        if self.press is not None:
+            parts.append(repr(self.press))
         return f"Task({', '.join([*parts, *self._conditions()])})"
 
     __str__ = __repr__

@@ -99,7 +99,7 @@ class MotionRequest:
         scene = self.scene
         if scene is not None:
             scene = scene.model_copy(update={"clearance": self.asked})
-        return task.model_copy(update={"load": self.load, "scene": scene})
+        return task.model_copy(update={"load": self.load, "press": None, "scene": scene})
 
     def without_answer(self, message: str, status: Status) -> PathSolution:
         """Solution with nothing but its message."""
@@ -116,7 +116,7 @@ def _load_of(tasks: list[Task], load: Load | None) -> Load | None:
         if not isinstance(load, Load):
             raise InputError(f"load must be a Load; got {shown(load)}")
         return load
-    loads = [task.load for task in tasks]
+    loads = [task.tip_load for task in tasks]
     if any(each != loads[0] for each in loads):
         raise InputError("the tasks of a motion must have the same load; give one for all of them")
     return loads[0] if loads else None

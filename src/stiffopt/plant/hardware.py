@@ -308,7 +308,12 @@ class SimulatedStage:
     def place_plate(self, steps: int) -> None:
         """Tell the plant where the plate is, and how it moves in the steps to come."""
         if self._axis is None:
-            self._plant.set_plate(None)
+            surface = self._plant.settings.surface
+            if surface is None:
+                self._plant.set_plate(None)
+            else:
+                at = float(np.dot(surface.normal, surface.point))
+                self._plant.set_plate(surface.normal, at, surface.stiffness)
             return
         duration = steps * self._plant.step
         speed = self._movement(duration) / duration if steps else 0.0

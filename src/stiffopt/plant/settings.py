@@ -12,6 +12,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
+from stiffopt.directions import Direction
 from stiffopt.model.description import RobotDescription
 from stiffopt.registration import Placement
 from stiffopt.rig.device import MisfitError, RigSection
@@ -170,6 +171,21 @@ class PlantLoad(Schema):
     at: Annotated[Length, NotNegative] | None = None
 
 
+class Surface(Schema):
+    """A flat soft surface that the tip may press on, without friction.
+
+    Attributes
+    ----------
+    point : on it, in the base frame, in m.
+    normal : unit vector out of it.
+    stiffness : force per depth of the tip's centre in it, in N/m.
+    """
+
+    point: Vector[Length]
+    normal: Direction
+    stiffness: Annotated[TranslationalStiffness, Positive]
+
+
 class Discretisation(Schema):
     """Of the rod, per segment.
 
@@ -210,6 +226,7 @@ class PlantSettings(RigSection):
     payload : mass at the tip that the robot file does not know of, in kg.
     gravity : acceleration in the base frame, in m/s^2, where it is not that of the robot file.
     load : acts all the time; None for none.
+    surface : what the tip may press on, where no probe is mounted; None for nothing.
     faults : whether faults may be injected while the rig runs.
     """
 
@@ -221,6 +238,7 @@ class PlantSettings(RigSection):
     payload: Annotated[Mass, NotNegative] = 0.0
     gravity: Vector[Acceleration] | None = None
     load: PlantLoad | None = None
+    surface: Surface | None = None
     faults: bool = False
     discretisation: Discretisation = Discretisation()
 

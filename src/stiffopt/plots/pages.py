@@ -133,6 +133,8 @@ def _task_rows(task: Task) -> Iterable[Row]:
         yield term.key, term.asked()
     if task.stiffness is not None:
         yield "stiffness", repr(task.stiffness).partition("(")[2].removesuffix(")")
+    if task.press is not None:
+        yield "press", repr(task.press).partition("(")[2].removesuffix(")")
     yield from _condition_rows(task)
 
 

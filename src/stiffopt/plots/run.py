@@ -1,4 +1,4 @@
-"""Figure of a closed-loop run: tip, error, pressures, stiffness, states, alarms and events."""
+"""Figure of a closed-loop run: tip, error, force, pressures, stiffness, states and events."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from stiffopt.plots.style import (
     AXES,
     DARK,
     ELLIPSOID,
+    FORCE,
     GREY,
     TARGET,
     channel_colour,
@@ -63,7 +64,8 @@ def plot_run(run: RecordedRun, *, title: str | None = None) -> Figure:
     listed = _listed(run.events)
     stiff = bool(np.isfinite(run.stiffness).any())
     angles = bool(np.isfinite(run.angle_error).any())
-    heights = [_PANEL] * (4 + angles + len(run.channels) + stiff)
+    forces = bool(np.isfinite(run.press_goal).any() or np.nan_to_num(run.wrench).any())
+    heights = [_PANEL] * (4 + angles + forces + len(run.channels) + stiff)
     heights.append(_ROW * (1.6 + len(_alarm_kinds(run)) + bool(run.events)))
     below = _FOOT + _LINE * (len(listed) + 1.2) * bool(listed)
     figure, grid = stacked_panels(
@@ -77,6 +79,8 @@ def plot_run(run: RecordedRun, *, title: str | None = None) -> Figure:
     _draw_error(next(rest), run, stages)
     if angles:
         _draw_angle(next(rest), run)
+    if forces:
+        _draw_force(next(rest), run)
     first = 0
     for segment, count in enumerate(run.channels):
         _draw_pressures(next(rest), run, segment, range(first, first + count))
@@ -150,6 +154,28 @@ def _draw_angle(axes: Any, run: RecordedRun) -> None:
     )  # fmt: skip
     axes.set_ylabel(f"error ({unit})")
     axes.set_ylim(bottom=0)
+    axes.grid(alpha=0.25, axis="y")
+    legend_beside(axes)
+
+
+def _draw_force(axes: Any, run: RecordedRun) -> None:
+    """Draw the force that is felt: of a press along its direction, else its size."""
+    force = run.wrench[:, :3]
+    size = np.linalg.norm(force, axis=1)
+    felt = np.where(np.isfinite(run.press_force), run.press_force, size)
+    covariance = run.wrench_covariance.reshape(-1, 3, 3)
+    way = force / np.maximum(size, 1e-12)[:, None]
+    band = 2 * np.sqrt(np.einsum("ti,tij,tj->t", way, covariance, way))
+    axes.plot(*thinned(run.time, 1e3 * felt), color=FORCE, linewidth=1.3, label="felt")
+    time, low = thinned(run.time, 1e3 * (felt - band))
+    _, high = thinned(run.time, 1e3 * (felt + band))
+    axes.fill_between(time, low, high, color=FORCE, alpha=0.18, linewidth=0, label="95 %")
+    if np.isfinite(run.press_goal).any():
+        axes.plot(
+            *thinned(run.time, 1e3 * run.press_goal), color=TARGET, linewidth=1.3,
+            linestyle=(0, (4, 2)), label="wanted",
+        )  # fmt: skip
+    axes.set_ylabel("force (mN)")
     axes.grid(alpha=0.25, axis="y")
     legend_beside(axes)
 

@@ -374,7 +374,7 @@ def draw_task(axes: Any, robot: Manipulator, task: Task, *, view: View | None = 
 
 
 def _loaded(robot: Manipulator, task: Task) -> Manipulator:
-    load = task.load
+    load = task.tip_load
     return robot.with_load(load.force, load.moment, load.frame) if load else robot
 
 
@@ -496,13 +496,14 @@ class _Drawing(ArmDrawing):
 
     def draw_loads(self) -> None:
         """The force at the tip and the pull of gravity."""
-        load = self.solution.task.load
+        task = self.solution.task
+        load, name = task.tip_load, "load" if task.press is None else "reaction of the press"
         if load is not None and any(load.force):
             force = np.array(load.force)
             way = (self.rotation @ force if load.frame == "tip" else force) / np.linalg.norm(force)
             self.draw_arrow(self.tip - 0.2 * self.size * way, 0.2 * self.size * way, style.LOAD, 9)
             size = display_units().force.text(float(np.linalg.norm(force)), ".3g")
-            self.add_line(style.LOAD, f"load {size}")
+            self.add_line(style.LOAD, f"{name} {size}")
         gravity = np.array(self.robot.description.gravity)
         if gravity.any():
             way = gravity / np.linalg.norm(gravity)

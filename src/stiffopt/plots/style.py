@@ -39,6 +39,7 @@ SEGMENTS = ("#7fa8c9", "#a9c47f", "#c9a27f", "#a58fc4", "#7fc4b8")
 """Of segments in turn."""
 DIRECTIONS = ("#c2571a", "#8c2d04", "#e0a100", "#b5547a")
 """Of the stiffnesses that a task names, in turn."""
+FORCE = "#8c564b"
 ELLIPSOID = "#6a3d9a"
 AT_LIMIT = "#f28e2b"
 LEAST_STIFF_TEXT = "#b35c00"

@@ -117,7 +117,7 @@ class AnswerView:
 
     def _show_load(self, answer: StudioAnswer) -> None:
         """The force at the tip."""
-        load, forces, pose = answer.design.task.load, [], _pose(answer)
+        load, forces, pose = answer.design.task.tip_load, [], _pose(answer)
         if load is not None and any(load.force):
             force = np.array(load.force)
             if load.frame == "tip":

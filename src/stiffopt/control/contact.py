@@ -1,0 +1,360 @@
+"""What touches the tip: a force, told apart from errors of the model, creep and vibration.
+
+The tip is seen at y, the model predicts it at s for the present pressures. What is between them is
+estimated in each axis, for displacements u, e and xi, a rate b of e, and a speed eta::
+
+    y - s = u + e + xi,      e' = b,      b' = -b / T,      xi' = eta,
+    eta' = -2 zeta omega eta - omega^2 xi
+
+A force F on the tip displaces it by u = C F in the directions in which it is soft; along a stiff
+axis no force can be felt. e is the error of the model. It changes with motion, by a share of the
+way, and creeps at the rate b, which motion sets off. xi is the vibration of the first bending mode
+that pressures do not account for. A force that begins displaces the equilibrium and not the tip:
+u + xi stays, so that the swing which follows tells its size before it has decayed.
+
+Force and error look alike in one sample, and differ in how they begin. While nothing touches the
+tip, u is zero. At intervals a hypothesis begins: that a force has begun or changed just then, or
+has gone. Each is a Kalman filter of its own; the logarithm of its likelihood is compared with that
+of the present filter (the generalised likelihood ratio test of Willsky and Jones, 1976). One that
+is better by far replaces the present filter. A push that grows for seconds is found in parts.
+
+Noise is alike in all axes, so that each filter has one covariance (6, 6) and a mean (6, 3).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stiffopt.control.tuning import ContactTuning
+from stiffopt.optimise.press import SOFT_SHARE
+from stiffopt.optimise.tip import TipAt
+
+Array = NDArray[np.float64]
+
+_U, _R, _E, _B, _XI, _ETA = range(6)
+
+
+@dataclass(frozen=True)
+class TipForce:
+    """Force on the tip, base axes.
+
+    Attributes
+    ----------
+    touches : whether something is felt; else the force is zero.
+    force : (3,), in N; nothing along axes in which the arm cannot feel.
+    covariance : of the force (3, 3), in N^2. Along an axis without feeling, it is that of all
+        forces that are thought possible.
+    displacement : of the tip by the force (3,), in m.
+    """
+
+    touches: bool
+    force: Array
+    covariance: Array
+    displacement: Array
+
+
+@dataclass
+class _Filters:
+    """The present filter, and after it the hypotheses, k in all."""
+
+    means: Array  # (k, 6, 3)
+    covariances: Array  # (k, 6, 6)
+    evidence: Array  # (k,) logarithms of likelihoods over that of the present filter
+    since: Array  # (k,) when they began, in s
+    released: NDArray[np.bool_]  # (k,) whether the force has gone then
+
+    def keep(self, chosen: Array | list[int]) -> _Filters:
+        return _Filters(
+            self.means[chosen], self.covariances[chosen], self.evidence[chosen],
+            self.since[chosen], self.released[chosen],
+        )  # fmt: skip
+
+    def with_one(self, mean: Array, covariance: Array, since: float, released: bool) -> _Filters:
+        return _Filters(
+            np.concatenate([self.means, mean[None]]),
+            np.concatenate([self.covariances, covariance[None]]),
+            np.append(self.evidence, 0.0),
+            np.append(self.since, since),
+            np.append(self.released, released),
+        )
+
+
+class ContactEstimator:
+    """Estimates the force on the tip.
+
+    Parameters
+    ----------
+    segments :
+        Number of channels of each segment.
+    vibrates :
+        Whether the arm vibrates.
+    damping :
+        Damping ratio of the vibration.
+    tuning :
+        Noise, and when a force is believed.
+
+    Attributes
+    ----------
+    felt : the force, as of the last sample; NaN before the first.
+    stiffness_error : relative deviation of the arm's stiffness; NaN where it is not known.
+    """
+
+    def __init__(
+        self, segments: list[int], *, vibrates: bool, damping: float, tuning: ContactTuning
+    ) -> None:
+        self._tuning, self._damping, self._vibrates = tuning, damping, vibrates
+        self._ends = np.cumsum([0, *segments[:-1]])
+        swings = float(vibrates)
+        self._seen = np.array([1.0, 0.0, 1.0, 0.0, swings, 0.0])  # of the state, in y - s
+        self._expected = False  # whether a force may come at any moment
+        self._begins = np.array(
+            [1.0, 0.0, 0.0, 0.0, -swings, 0.0]
+        )  # change of the state by a force
+        self.begin()
+
+    def begin(self) -> None:
+        """Start anew, with nothing at the tip."""
+        t = self._tuning
+        deviations = [0.0, 0.0, t.first_error, t.first_rate, 0.0, 0.0]
+        if self._vibrates:
+            deviations[_XI:] = [t.first_swing, t.first_speed]
+        self._filters = _Filters(
+            np.zeros((1, 6, 3)), np.diag(np.square(deviations))[None], np.zeros(1),
+            np.array([-math.inf]), np.array([False]),
+        )  # fmt: skip
+        self._believed = False  # that there is a force
+        self._time = -math.inf
+        self._pressures: Array = np.zeros(0)
+        self._way = 0.0  # of the model's tip in the last moments, in m
+        # displacement (3, s) in the time of creep, by each segment; parts to and fro cancel
+        self._recent_way = np.zeros((3, len(self._ends)))
+        self._better = self._quiet = 0  # samples in a row
+        self._begun = -math.inf  # the last hypothesis
+        self._compliances, self._axes = np.ones(3), np.eye(3)
+        self.stiffness_error = math.nan
+        unknown = np.full(3, np.nan)
+        self.felt = TipForce(False, unknown, np.full((3, 3), np.nan), np.zeros(3))
+
+    def expect(self, expected: bool) -> None:
+        """Be prepared for a force that grows slowly, as when the tip approaches something."""
+        if self._expected and not expected and not self._believed:
+            self._merge()
+        self._expected = expected
+
+    @property
+    def _may_touch(self) -> bool:
+        """Whether the present filter has a force."""
+        return self._believed or self._expected
+
+    def change_model(self, change: Array) -> None:
+        """Go on with another model, from which the tip is off by another offset (6,)."""
+        self._filters.means[:, _E] += change[:3]
+
+    def take(
+        self, time: float, away: Array, pressures: Array, tip: TipAt, omega: float = math.inf
+    ) -> None:
+        """Take in a sample of the tracker.
+
+        Parameters
+        ----------
+        time :
+            Of its capture, in s.
+        away :
+            Position (3,) seen less the one that the model predicts for that moment, with the
+            vibration that pressures excite, in m.
+        pressures :
+            Effective ones (n,), in Pa.
+        tip :
+            The model's tip at these.
+        omega :
+            Angular frequency of the vibration, in rad/s.
+        """
+        t = self._tuning
+        elapsed = time - self._time
+        if not (elapsed > 0 and np.isfinite(away).all()):
+            return
+        if elapsed > t.longest_gap:
+            self.begin()
+            self._pressures, self._filters.means[0, _E], elapsed = pressures.copy(), away, 0.0
+        self._look_at(tip)
+        moved = self._moved(pressures, tip)
+        self._time = time
+        F, Q = self._process(elapsed, moved, omega)
+        speed = _length(moved) / elapsed if elapsed > 0 else 0.0
+        self._update(F, Q, away, t.noise**2 + (t.late * speed) ** 2)
+        self._decide()
+        self.felt = self._force()
+
+    def _force(self) -> TipForce:
+        t, (inverse, felt) = self._tuning, self._inverse()
+        displacement = self._filters.means[0, _U] if self._may_touch else np.zeros(3)
+        force = inverse @ displacement
+        size, deviation = float(np.linalg.norm(force)), self._deviation()
+        touches = self._believed or size > max(t.least_force, t.surely * deviation)
+        error = self.stiffness_error if math.isfinite(self.stiffness_error) else t.stiffness_error
+        covariance = self._variance() * inverse @ inverse + error**2 * np.outer(force, force)
+        covariance += t.force**2 * (np.eye(3) - felt)
+        return TipForce(touches and self._may_touch, force, covariance, felt @ displacement)
+
+    def _variance(self) -> float:
+        """Variance of u; where nothing is felt, that of a force which could have been felt."""
+        filters = self._filters
+        if self._may_touch or len(filters.since) == 1:
+            return float(filters.covariances[0, _U, _U])
+        off = np.abs(self._time - filters.since[1:] - self._tuning.open_time)
+        return float(filters.covariances[1 + int(np.argmin(off)), _U, _U])
+
+    def _inverse(self) -> tuple[Array, Array]:
+        """Inverse of the compliance in the directions of feeling, and projection on these."""
+        soft = self._compliances > SOFT_SHARE * self._compliances[2]
+        axes = self._axes[:, soft]
+        return axes / self._compliances[soft] @ axes.T, axes @ axes.T
+
+    def _look_at(self, tip: TipAt) -> None:
+        """Find the directions in which the tip is soft."""
+        R = tip.pose[:3, :3]
+        self._compliances, self._axes = np.linalg.eigh(R @ tip.compliance[:3, :3] @ R.T)
+
+    def _moved(self, pressures: Array, tip: TipAt) -> Array:
+        """Displacement (3, s) of the model's tip by each segment since the last sample, in m."""
+        columns = tip.jacobian[:3] * (pressures - self._pressures)
+        self._pressures = pressures.copy()
+        moved: Array = np.add.reduceat(columns, self._ends, axis=1)
+        return moved
+
+    def _process(self, elapsed: float, moved: Array, omega: float) -> tuple[Array, Array]:
+        """Transition (6, 6) and covariance (6, 6) of its noise.
+
+        The errors of a motion in one direction add up, not their squares: the variance grows with
+        the square of the way of the last moments.
+        """
+        t = self._tuning
+        before = self._way * math.exp(-elapsed / t.motion_time)
+        self._way = before + _length(moved)
+        grown = self._way**2 - before**2
+        self._recent_way = self._recent_way * math.exp(-elapsed / t.creep_time) + moved
+        F, Q = np.eye(6), np.zeros((6, 6))
+        F[:, _R] = elapsed * self._begins
+        F[_R, _R] = math.exp(-elapsed / t.rate_time)
+        F[_E, _B], F[_B, _B] = elapsed, math.exp(-elapsed / t.creep_time)
+        hurry = min(1.0, _length(moved) / (elapsed * t.fast)) if elapsed > 0 else 0.0
+        Q[_E, _E] = (t.model_error**2 + (t.fast_error * hurry) ** 2) * grown + t.drift**2 * elapsed
+        Q[_B, _B] = t.creep**2 * grown + (t.creep_change * _length(self._recent_way)) ** 2 * elapsed
+        if self._vibrates:
+            F[_XI:, _XI:] = _vibration(omega, self._damping, elapsed)
+            mean = self._filters.means[0]
+            swing = math.hypot(*mean[_XI], *(mean[_ETA] / omega))
+            excited = t.swing_error**2 * grown
+            Q[_XI, _XI] = excited
+            Q[_ETA, _ETA] = omega**2 * excited + elapsed * (
+                t.agitation**2 + t.detuned**2 * omega**3 * swing**2
+            )
+        return F, Q
+
+    def _update(self, F: Array, Q: Array, away: Array, noise: float) -> None:
+        """Predict and correct all filters."""
+        t, f, seen = self._tuning, self._filters, self._seen
+        softest = self._compliances[2]
+        elapsed = float(F[_E, _B])
+        is_open = self._time - f.since < t.open_time
+        rate = np.where(is_open, t.open_rate, t.force_rate) * softest
+        rate[f.released] = 0.0
+        if not self._may_touch:
+            rate[0] = 0.0
+        noises = Q + (rate**2 * elapsed)[:, None, None] * np.outer(self._begins, self._begins)
+        spread = 2 * elapsed / t.rate_time * (t.rate * softest) ** 2  # keeps the deviation of r
+        noises[:, _R, _R] = np.where(rate > 0, spread, 0.0)
+        means = F @ f.means
+        covariances = F @ f.covariances @ F.T + noises
+        missed = away - seen @ means
+        seen_with = covariances @ seen
+        variances = seen_with @ seen + noise
+        gains = seen_with / variances[:, None]
+        _, felt = self._inverse()
+        soft = missed @ felt
+        stiff = gains.copy()  # along a stiff axis no force is felt, and nothing vibrates
+        stiff[:, [_U, _R, _XI, _ETA]] = 0.0
+        f.means = means + gains[:, :, None] * soft[:, None]
+        f.means += stiff[:, :, None] * (missed - soft)[:, None]
+        f.covariances = covariances - gains[:, :, None] * seen_with[:, None]
+        squares = 0.5 * (soft**2).sum(axis=1) / variances
+        widths = np.log(variances)
+        # a filter without force is narrower, which is no evidence that a force has gone
+        f.evidence += squares[0] - squares + np.where(f.released, 0.0, widths[0] - widths)
+
+    def _decide(self) -> None:
+        """Take a hypothesis that is better by far, begin others, and let a small force go."""
+        t, f = self._tuning, self._filters
+        best = int(np.argmax(f.evidence))
+        inverse, _ = self._inverse()
+        change = float(np.linalg.norm(inverse @ (f.means[best, _U] - f.means[0, _U])))
+        counts = f.released[best] or change > t.least_force
+        is_better = best > 0 and f.evidence[best] > t.evidence and counts
+        self._better = self._better + 1 if is_better else 0
+        if self._better >= t.samples:
+            self._believed = not f.released[best]
+            self._filters = f.keep([best])
+            self._filters.evidence[:], self._filters.released[:] = 0.0, False
+            self._better = self._quiet = 0
+        elif self._time - self._begun >= t.spacing - 1e-9:
+            self._begin_hypotheses()
+        if self._believed:
+            self._let_go(inverse)
+
+    def _begin_hypotheses(self) -> None:
+        """That a force has begun, or changed, just now; and that it has gone."""
+        t, f = self._tuning, self._filters
+        self._begun = self._time
+        kept = np.flatnonzero(self._time - f.since[1:] < t.hypothesis_time) + 1
+        f = f.keep([0, *kept.tolist()])
+        mean, covariance = f.means[0], f.covariances[0]
+        jump = (t.jump * self._compliances[2]) ** 2 * np.outer(self._begins, self._begins)
+        jump[_R, _R] = (t.rate * self._compliances[2]) ** 2
+        f = f.with_one(mean, covariance + jump, self._time, released=False)
+        if self._believed:
+            gone = np.eye(6)  # the tip stays where it is, and its equilibrium does not
+            gone[:, _U] -= self._begins
+            gone[_R, _R] = 0.0
+            f = f.with_one(gone @ mean, gone @ covariance @ gone.T, self._time, released=True)
+        self._filters = f
+
+    def _let_go(self, inverse: Array) -> None:
+        """Feel no force any more that has been small for a while: its rest is an error."""
+        t = self._tuning
+        force = float(np.linalg.norm(inverse @ self._filters.means[0, _U]))
+        least = max(t.gone_share * t.least_force, self._deviation())
+        self._quiet = self._quiet + 1 if force < least else 0
+        if self._quiet < t.quiet:
+            return
+        self._believed, self._quiet = False, 0
+        if not self._expected:
+            self._merge()
+
+    def _deviation(self) -> float:
+        """Standard deviation of the force of the present filter where the tip is softest, in N."""
+        return math.sqrt(self._filters.covariances[0, _U, _U]) / float(self._compliances[2])
+
+    def _merge(self) -> None:
+        """Take what is left of a force for an error, and forget the hypotheses."""
+        merged = np.eye(6)
+        merged[_E, _U], merged[_U, _U], merged[_R, _R] = 1.0, 0.0, 0.0
+        self._filters = self._filters.keep([0])
+        self._filters.means = merged @ self._filters.means
+        self._filters.covariances = merged @ self._filters.covariances @ merged.T
+
+
+def _length(way: Array) -> float:
+    """Sum of the lengths of the segments' ways (3, s)."""
+    return float(np.sqrt((way**2).sum(axis=0)).sum())
+
+
+def _vibration(omega: float, damping: float, duration: float) -> Array:
+    """Transition (2, 2) of a free vibration; see `stiffopt.control.vibration.transition`."""
+    damped = omega * math.sqrt(1 - damping**2)
+    decay = math.exp(-damping * omega * duration)
+    c, s = decay * math.cos(damped * duration), decay * math.sin(damped * duration) / damped
+    return np.array([[c + damping * omega * s, s], [-(omega**2) * s, c - damping * omega * s]])

@@ -1,0 +1,111 @@
+"""`Press`, the part ``press`` of a task file: to press on something with a given force."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from stiffopt.directions import Direction, Frame
+from stiffopt.schema import Schema
+from stiffopt.units import Force, Length, Speed, within
+
+Array = NDArray[np.float64]
+
+SOFT_SHARE = 0.15
+"""Compliance, as a share of the largest, below which a direction is too stiff to feel in."""
+LEAST_SHARE = 0.5
+"""Share of a force, squared, that must act in the directions in which the tip is soft."""
+POSITION_ERROR = 5e-4
+"""m; error of the model's tip that develops on the short way of an approach."""
+FELT_SHARE, FELT_FORCE = 0.2, 3e-3
+"""How well a force must be felt: as a share of it, and in N."""
+
+
+class Press(Schema):
+    """A force with which the tip presses, from the target on along a direction.
+
+    Attributes
+    ----------
+    force : in N.
+    direction : unit vector in which the tip pushes.
+    frame : base, or tip: the axes of the tip at the target.
+    tolerance : by how much the estimated force may be off, in N.
+    speed : greatest speed of the approach, in m/s.
+    travel : greatest way of the tip along the direction, in m.
+    """
+
+    force: Annotated[Force, Field(gt=0), within(1e6, "N")]
+    direction: Direction
+    frame: Frame = "base"
+    tolerance: Annotated[Force, Field(gt=0)] = 3e-3
+    speed: Annotated[Speed, Field(gt=0)] = 5e-3
+    travel: Annotated[Length, Field(gt=0)] = 0.01
+
+    def direction_in_base(self, rotation: Array) -> Array:
+        """Return the direction (3,) in base axes, for a tip with axes (3, 3)."""
+        direction = np.array(self.direction)
+        return rotation @ direction if self.frame == "tip" else direction
+
+    def __repr__(self) -> str:
+        axes = "" if self.frame == "base" else " of the tip"
+        return f"Press({1e3 * self.force:g} mN along ({_numbers(self.direction)}){axes})"
+
+    def refusal(self, rotation: Array, compliance: Array) -> str:
+        """Say why a force along the direction could not be felt; empty if it could.
+
+        Parameters
+        ----------
+        rotation, compliance :
+            Of the tip in base axes (3, 3), and of its position by a force, in m/N.
+        """
+        felt = Feeling.of(self.direction_in_base(rotation), compliance)
+        most = FELT_SHARE * self.force + FELT_FORCE
+        deviation = felt.deviation(POSITION_ERROR)
+        if felt.share >= LEAST_SHARE and deviation <= most:
+            return ""
+        return (
+            f"the arm cannot feel how hard it presses along ({_numbers(self.direction)})"
+            f"{' of the tip' if self.frame == 'tip' else ''}: it is too stiff there, "
+            f"{1 / felt.compliance:.3g} N/m, so that {1e3 * POSITION_ERROR:g} mm of error look "
+            f"like {1e3 * deviation:.3g} mN; press along a softer direction, or harder"
+        )
+
+
+@dataclass(frozen=True)
+class Feeling:
+    """How a force along a direction shows at the tip.
+
+    Attributes
+    ----------
+    share : of the force that acts in the directions in which the tip is soft, squared.
+    compliance : displacement along the direction by a force along it, in m/N.
+    """
+
+    share: float
+    compliance: float
+
+    @classmethod
+    def of(cls, direction: Array, compliance: Array) -> Feeling:
+        """Along a unit vector (3,), with the compliance (3, 3) of the tip's position."""
+        felt = soft_directions(compliance)
+        return cls(float(direction @ felt @ direction), float(direction @ compliance @ direction))
+
+    def deviation(self, error: float) -> float:
+        """Return the deviation of a felt force, in N, from that of the tip's position, in m."""
+        return error / max(self.compliance, 1e-12)
+
+
+def _numbers(direction: tuple[float, ...]) -> str:
+    return ", ".join(f"{part:.3g}" for part in direction)
+
+
+def soft_directions(compliance: Array) -> Array:
+    """Projection (3, 3) on the directions in which a tip of compliance (3, 3) is soft."""
+    sizes, axes = np.linalg.eigh(compliance)
+    soft = axes[:, sizes > SOFT_SHARE * sizes[-1]]
+    projection: Array = soft @ soft.T
+    return projection
