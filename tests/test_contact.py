@@ -1,376 +1,307 @@
-"""The force on the tip, from tips that are made up here by other formulas, and pressing with it."""
+"""Arms that lean on objects: closed forms, an independent rod, differences, and what is lost."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import json
+from functools import cache
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
-from scipy.integrate import solve_ivp
 
-from stiffopt import Press, StiffnessGoal, StiffnessMeasure, Target, Task, load_robot, load_task
-from stiffopt.control.contact import ContactEstimator, TipForce
-from stiffopt.control.controller import TipController
-from stiffopt.control.pressing import Phase, Pressing
-from stiffopt.control.tuning import ContactTuning, PressingTuning
-from stiffopt.errors import InputError
-from stiffopt.model.robot_files import load_description
-from stiffopt.optimise.solver import PressureSolver
-from stiffopt.optimise.task import Load
-from stiffopt.optimise.tip import TipModel
-from stiffopt.plant.devices import SimulatedRig
-from stiffopt.plant.settings import Surface
-from stiffopt.rig.assembly import make_rig
-from stiffopt.rig.config import limits_of, load_rig_description, slew_of
+import stiffopt
+from independent import ARMS, FLOP, Arm, rod_section
+from stiffopt.errors import EquilibriumError, InputError
+from stiffopt.model.contact.stability import stiffness_left
+from stiffopt.model.scene import Scene
 
-Array = NDArray[np.float64]
-
-ROOT = Path(__file__).parent.parent
-FRAME, NOISE = 0.025, 5e-5
-ROBOT = load_robot("stiff-flop-1")
-P = np.array([3e4, 1e4, 6e4])
-TIP = TipModel(ROBOT).at(P)
-R = TIP.pose[:3, :3]
-C = R @ TIP.compliance[:3, :3] @ R.T
-SOFT = np.linalg.eigh(C)[1][:, 1:]  # two axes
-PUSH = SOFT @ np.array([0.025, -0.02])
-OMEGA = 18.0
+TWO = Arm((FLOP, FLOP))
+REST = np.zeros(6)
+X = (1.0, 0.0, 0.0)
+REFERENCES = json.loads((Path(__file__).parent / "contact_reference.json").read_text())
 
 
-def felt(
-    away: Callable[[float], Array],
-    until: float,
-    pressures: Callable[[float], Array] = lambda t: P,
-    *,
-    vibrates: bool = False,
-    expected: bool = False,
-) -> tuple[list[float], list[TipForce]]:
-    """What is felt at each sample of a tip that is off the model by `away`."""
-    estimator = ContactEstimator([3], vibrates=vibrates, damping=0.04, tuning=ContactTuning())
-    estimator.expect(expected)
-    rng, times, forces = np.random.default_rng(3), np.arange(0, until, FRAME).tolist(), []
-    for time in times:
-        seen = away(time) + NOISE * rng.standard_normal(3)
-        estimator.take(time, seen, pressures(time), TIP, OMEGA)
-        forces.append(estimator.felt)
-    return times, forces
+@cache
+def robot(arm: Arm = TWO) -> stiffopt.Manipulator:
+    return stiffopt.Manipulator(stiffopt.RobotDescription(**arm.mapping()))
 
 
-def within(force: TipForce, true: Array) -> bool:
-    return float(np.linalg.norm(force.force - true)) < 0.2 * np.linalg.norm(true) + 3e-3
-
-
-def test_a_push_is_felt_at_once_and_its_end_too() -> None:
-    bias = np.array([4e-3, -2e-3, 1e-3])
-    times, forces = felt(lambda t: bias + C @ PUSH * (3.0 < t < 6.0), 9.0)
-    for time, force in zip(times, forces, strict=True):
-        if time < 3.0 or time > 7.0:
-            assert not force.touches
-            assert not force.force.any()
-        elif 3.3 < time < 6.0:
-            assert force.touches
-            assert within(force, PUSH)
-
-
-def test_a_push_on_an_arm_with_inertia_is_felt_before_the_swing_has_decayed() -> None:
-    """The tip is a mass on a spring, integrated by SciPy."""
-
-    def motion(t: float, y: Array) -> Array:
-        goal = C @ PUSH * (t > 3.0)
-        return np.concatenate([y[3:], -(OMEGA**2) * (y[:3] - goal) - 0.08 * OMEGA * y[3:]])
-
-    found = solve_ivp(motion, (0, 6), np.zeros(6), max_step=2e-3, dense_output=True)
-    times, forces = felt(lambda t: found.sol(t)[:3], 6.0, vibrates=True)
-    after = [force for time, force in zip(times, forces, strict=True) if 4.0 < time < 4.5]
-    assert np.ptp([found.sol(t)[:3] @ PUSH for t in np.arange(4.0, 4.5, 0.01)]) > 0.5 * (
-        PUSH @ C @ PUSH
-    ), "it still swings"
-    assert all(force.touches and within(force, PUSH) for force in after)
-
-
-def test_neither_motion_with_errors_nor_creep_is_felt() -> None:
-    """The arm moves by 10 mm, the model errs by 8 % of it, and creep adds 5 % of it later."""
-    way = np.array([0.0, 3e4, -2e4])
-    moved = R @ TIP.jacobian[:3] @ way
-
-    def progress(t: float) -> float:
-        return float(np.clip((t - 2.0) / 0.8, 0, 1))
-
-    def away(t: float) -> Array:
-        creep = 1 - np.exp(-max(t - 2.4, 0.0) / 3.0)
-        return moved * (0.08 * progress(t) + 0.05 * creep)
-
-    _, forces = felt(away, 12.0, lambda t: P + way * progress(t))
-    assert np.linalg.norm(moved) > 4e-3
-    assert not any(force.touches for force in forces)
-
-
-def test_along_a_stiff_axis_nothing_is_felt_and_nothing_is_known() -> None:
-    stiff = np.linalg.eigh(C)[1][:, 0]
-    _, forces = felt(lambda t: 2e-3 * stiff * (t > 2.0), 5.0)
-    assert not any(force.touches for force in forces)
-    last = forces[-1]
-    assert stiff @ last.covariance @ stiff == pytest.approx(ContactTuning().force ** 2)
-    assert SOFT[:, 0] @ last.covariance @ SOFT[:, 0] < 0.2 * ContactTuning().force ** 2
-
-
-def test_the_covariance_has_that_of_the_stiffness() -> None:
-    _, forces = felt(lambda t: C @ PUSH * (t > 2.0), 4.0)
-    along = PUSH / np.linalg.norm(PUSH)
-    deviation = np.sqrt(along @ forces[-1].covariance @ along)
-    assert deviation > 0.1 * np.linalg.norm(PUSH)  # of the arm, where no more is known
-    assert deviation < 0.5 * np.linalg.norm(PUSH)
-
-
-def test_a_force_that_is_expected_is_followed_while_it_grows() -> None:
-    """As when the tip approaches something: 12 mN/s."""
-    direction = PUSH / np.linalg.norm(PUSH)
-
-    def force(t: float) -> Array:
-        return direction * float(np.clip(0.012 * (t - 2.0), 0.0, 0.03))
-
-    times, forces = felt(lambda t: C @ force(t), 8.0, expected=True)
-    for time, found in zip(times, forces, strict=True):
-        assert np.linalg.norm(found.force - force(time)) < 0.2 * np.linalg.norm(force(time)) + 5e-3
-
-
-def test_a_model_that_changes_is_no_force() -> None:
-    estimator = ContactEstimator([3], vibrates=False, damping=0.04, tuning=ContactTuning())
-    shift = np.array([5e-3, -4e-3, 1e-3])
-    for time in np.arange(0, 4, FRAME):
-        if abs(time - 2.0) < FRAME / 2:
-            estimator.change_model(np.concatenate([shift, np.zeros(3)]))
-        estimator.take(time, shift if time > 2.0 - FRAME / 2 else np.zeros(3), P, TIP)
-        assert not estimator.felt.touches
-
-
-def test_after_a_long_gap_it_begins_anew() -> None:
-    times, forces = felt(lambda t: C @ PUSH * (t > 2.0), 4.0)
-    assert forces[-1].touches
-    estimator = ContactEstimator([3], vibrates=False, damping=0.04, tuning=ContactTuning())
-    for time in [*times, *(10.0 + np.array(times))]:
-        estimator.take(time, C @ PUSH * (time > 2.0), P, TIP)
-    assert not estimator.felt.touches  # the offset is an error as well as a force then
-
-
-# A press -----------------------------------------------------------------------------------------
-
-N = np.array([1.0, 0.0, 0.0])
-COMPLIANCE = np.diag([0.1, 0.1, 5e-4])  # m/N
-TARGET = Target(position=(0.02, 0.0, 0.1))
-PRESS = Press(force=0.03, direction=(1, 0, 0), travel=0.01)
-
-
-class Spring:
-    """An arm as a spring, before a surface: what a `Pressing` sees of them.
-
-    `late` is how late the force is felt, in ticks of 10 ms.
-    """
-
-    def __init__(self, at: float, stiffness: float, press: Press = PRESS, late: int = 10) -> None:
-        self.pressing = Pressing(press, TARGET, PressingTuning())
-        self.at, self.stiffness, self.late = at, stiffness, late
-        self.forces: list[float] = []
-        self.kinds: list[str] = []
-
-    def run(self, seconds: float) -> None:
-        for _ in range(round(seconds / 0.01)):
-            position = self.pressing.at(0.0).position
-            assert position is not None
-            free = cast("float", position[0]) - 0.02
-            depth = max(0.0, free - self.at) / (1 + self.stiffness * COMPLIANCE[0, 0])
-            self.forces.append(self.stiffness * depth)
-            tip = np.array([0.02 + free - COMPLIANCE[0, 0] * self.forces[-1], 0.0, 0.1])
-            seen = self.forces[-self.late] if len(self.forces) > self.late else 0.0
-            force = TipForce(seen > 3e-3, -seen * N, 1e-6 * np.eye(3), -0.1 * seen * N)
-            offset = np.concatenate([tip - [0.02 + free, 0.0, 0.1], np.zeros(3)])
-            self.pressing.advance(0.01, True, True, tip, offset, force, np.eye(3), COMPLIANCE)
-            self.kinds += [n.kind for n in self.pressing.notices() if n.kind not in self.kinds]
-
-
-@pytest.mark.parametrize("stiffness", [20.0, 200.0, 1e4])
-def test_a_force_is_reached_and_held_without_overshoot(stiffness: float) -> None:
-    arm = Spring(0.003, stiffness)
-    arm.run(12.0)
-    assert arm.pressing.phase is Phase.PRESSING
-    assert arm.forces[-1] == pytest.approx(0.03, abs=5e-4)
-    assert max(arm.forces) < 1.15 * 0.03
-    assert arm.kinds == ["touch", "pressing"]
-
-
-def test_the_approach_keeps_its_speed() -> None:
-    arm = Spring(0.008, 500.0, PRESS.model_copy(update={"speed": 2e-3}))
-    places = []
-    for _ in range(400):
-        arm.run(0.01)
-        position = arm.pressing.at(0.0).position
-        assert position is not None
-        places.append(position[0])
-    assert np.diff(places).max() <= 2e-3 * 0.01 + 1e-12
-
-
-@pytest.mark.parametrize(
-    ("at", "stiffness", "why"),
-    [(0.05, 100.0, "nothing was felt within 10 mm"), (0.004, 2.0, "not reached within 10 mm")],
-)
-def test_it_goes_back_where_there_is_nothing_or_not_enough(
-    at: float, stiffness: float, why: str
-) -> None:
-    arm = Spring(at, stiffness)
-    arm.run(40.0)
-    assert arm.pressing.phase is Phase.ENDED
-    assert arm.pressing.at(0.0) == TARGET
-    (notice,) = arm.pressing.notices()
-    assert notice.kind == "press-failed"
-    assert notice.standing
-    assert why in notice.text
-
-
-def test_it_goes_back_when_the_contact_is_lost() -> None:
-    arm = Spring(0.003, 200.0)
-    arm.run(8.0)
-    arm.at = 1.0  # it gives way
-    arm.run(4.0)
-    assert arm.pressing.phase is Phase.ENDED
-    assert "lost" in arm.pressing.notices()[0].text
-
-
-def test_it_goes_back_when_too_much_is_felt_or_nothing_although_it_is_held_back() -> None:
-    arm = Spring(0.003, 200.0)
-    arm.run(8.0)
-    arm.at = -0.0003  # it comes nearer
-    arm.run(4.0)
-    assert "presses with" in arm.pressing.notices()[0].text
-    numb = Spring(0.003, 1e4, late=10_000)
-    numb.run(8.0)
-    assert "held back" in numb.pressing.notices()[0].text
-    assert max(numb.forces) < 0.06
-
-
-def test_the_offset_is_kept_along_the_direction_only() -> None:
-    arm = Spring(0.003, 200.0)
-    arm.run(6.0)
-    offset = np.array([-3e-3, 1e-3, 2e-3, 0.1, 0.2, 0.3])
-    np.testing.assert_allclose(arm.pressing.corrected(offset), [0, *offset[1:]], atol=1e-12)
-    waiting = Pressing(PRESS, TARGET, PressingTuning())
-    assert waiting.corrected(offset) is offset
-
-
-@pytest.mark.parametrize("dynamics", ["quasi-static", "full"])
-def test_the_simulated_arm_presses_as_hard_as_it_is_told(dynamics: str) -> None:
-    """The shipped palpation, on an arm that nobody has tuned it for."""
-    description = load_rig_description(ROOT / "rig" / "palpation.yaml")
-    plant = cast("Any", description.plant).model_copy(update={"dynamics": dynamics, "seed": 11})
-    description = description.model_copy(update={"plant": plant})
-    robot = load_description(description.robot)
-    rig = cast("SimulatedRig", make_rig(description, robot))
-    controller = TipController(
-        load_robot(robot), limits_of(description, robot), slew_of(description, robot),
-        period=0.01, control=description.control, safety=description.safety,
-        vibrates=dynamics == "full",
-    )  # fmt: skip
-    controller.check()
-    command, forces, kinds = np.zeros(robot.n_pressures), [], set()
-    with rig:
-        rig.supply.arm()
-        controller.begin(rig.clock.now())
-        controller.set_task(load_task(ROOT / "problems" / "two_segment_palpation.yaml"))
-        for _ in range(2200):
-            now = rig.clock.now()
-            controller.observe(now, command, rig.supply.read(), rig.tracker.read())
-            command = controller.compute(now).pressures
-            rig.supply.command(command)
-            rig.clock.sleep_until(now + 0.01)
-            forces.append(rig.world.plant.contact_force())
-            kinds |= {notice.kind for notice in controller.notices()}
-        status = controller.status(rig.clock.now())
-        tip = rig.world.plant.tip_pose()[:3, 3]
-    controller.close()
-    assert np.mean(forces[-300:]) == pytest.approx(0.03, abs=0.2 * 0.03 + 3e-3)
-    assert max(forces) < 1.6 * 0.03 + 6e-3
-    assert status.press_force == pytest.approx(0.03, abs=3e-3)
-    assert status.press_goal == 0.03
-    assert status.contact
-    assert status.wrench[0] < -0.02
-    assert status.task == "press"
-    assert {"touch", "pressing"} <= kinds
-    assert "press-failed" not in kinds
-    assert abs(tip[1]) < 2e-3
-    assert abs(tip[2] - 0.195) < 3e-3
-
-
-# Tasks with a press ------------------------------------------------------------------------------
-
-
-def asked(**update: Any) -> Task:
-    given: dict[str, Any] = {
-        "target": Target(position=(0.01, 0.0, 0.195)),
-        "press": Press(force=0.03, direction=(1, 0, 0)),
-        "stiffness": StiffnessGoal(maximise=StiffnessMeasure(direction=(1, 0, 0))),
-    }
-    return Task(**{**given, **update})
-
-
-HANGING = load_robot("stiff-flop-2-hanging")
-
-
-def test_a_press_is_planned_as_its_reaction() -> None:
-    pressed = PressureSolver(HANGING, asked()).solve()
-    load = Load(force=(-0.03, 0.0, 0.0))
-    loaded = PressureSolver(HANGING, asked(press=None, load=load)).solve()
-    assert pressed.found
-    assert pressed.pressures is not None
-    np.testing.assert_allclose(pressed.pressures, loaded.pressures, atol=1.0)
-    assert np.linalg.norm(pressed.tip_position - np.array([0.01, 0.0, 0.195])) < 1.1e-4
-
-
-@pytest.mark.parametrize(
-    ("press", "why"),
-    [
-        (Press(force=0.03, direction=(0, 0, 1)), "cannot feel"),
-        (Press(force=0.5, direction=(1, 0, 0)), "closest configuration"),
-    ],
-)
-def test_what_cannot_be_held_or_felt_is_refused(press: Press, why: str) -> None:
-    solution = PressureSolver(HANGING, asked(press=press)).solve()
-    assert not solution.found
-    assert why in solution.message
-    controller = TipController(
-        HANGING, limits_of(*_rig()), np.full(6, 5e5), period=0.01, vibrates=False
+def scene(*shapes: dict[str, Any], **contact: Any) -> Scene:
+    allowed = {"allowed": True, **contact}
+    return Scene(
+        objects=[{"name": f"{k}", "contact": allowed, **shape} for k, shape in enumerate(shapes)]
     )
-    with pytest.raises(InputError, match="press: the arm cannot press like that"):
-        controller.check_ahead(asked(press=press))
-    controller.close()
 
 
-def _rig() -> tuple[Any, Any]:
-    description = load_rig_description(ROOT / "rig" / "palpation.yaml")
-    return description, load_description(description.robot)
+def post(at: float, gap: float = 0.0, radius: float = 0.005) -> dict[str, Any]:
+    """A post across the x axis, that far from a straight arm."""
+    x = 0.015 + radius + gap
+    return {"capsule": {"from": (x, -0.05, at), "to": (x, 0.05, at), "radius": radius}}
 
 
-@pytest.mark.parametrize(
-    ("update", "why"),
-    [
-        ({"load": Load(force=(0, 0, 0.1))}, "cannot be combined with load"),
-        ({"target": Target(position=(None, 0, 0.2))}, "needs a target with a position"),
-        ({"target": Target(pointing=(0, 0, 1))}, "needs a target with a position"),
-    ],
-)
-def test_a_press_that_makes_no_sense_is_refused(update: dict[str, Any], why: str) -> None:
-    with pytest.raises(ValueError, match=why):
-        asked(**update)
+def push(force: float, *direction: float) -> np.ndarray:
+    return np.array([*(force * np.array(direction or X)), 0.0, 0.0, 0.0])
 
 
-def test_a_surface_pushes_back_and_a_mounted_probe_takes_its_place() -> None:
-    description, robot = _rig()
-    surface = Surface(point=(0.0, 0.0, 0.0), normal=(-1, 0, 0), stiffness=100.0)
-    plant = description.plant.model_copy(update={"surface": surface, "dynamics": "quasi-static"})
-    rig = cast("SimulatedRig", make_rig(description.model_copy(update={"plant": plant}), robot))
-    with rig:
-        rig.world.plant.settle(np.array([0.6e5, 0, 0, 0, 0, 0]))
-        rig.clock.sleep(1.0)
-        x = float(rig.world.plant.tip_pose()[0, 3])
-        assert rig.world.plant.contact_force() == pytest.approx(100 * max(x, 0.0), abs=1e-6)
+def flexibilities(at: float) -> tuple[float, float, float]:
+    """Of a straight arm across x: tip, between tip and a point, and of the point (m/N)."""
+    law = rod_section(FLOP, np.zeros(3), TWO.gravity)
+    bend, shear, length = law.compliance[4, 4], law.compliance[0, 0], TWO.length
+    between = bend * (at**2 * length / 2 - at**3 / 6) + shear * at
+    return bend * length**3 / 3 + shear * length, between, bend * at**3 / 3 + shear * at
+
+
+# -- closed forms ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("share", [0.5, 0.65, 0.8])
+def test_small_pushes_on_a_straight_arm_are_those_of_beam_theory(share):
+    """``C_tt - C_ts C_ss^-1 C_st`` along the normal; the gap is closed by the first of the push."""
+    at, gap, force = share * TWO.length, 1e-5, 1e-4
+    tip, between, own = flexibilities(at)
+    found = robot().contact_equilibrium(REST, scene(post(at, gap)), load=push(force))
+    (contact,) = found.contacts
+    expected = (between * force - gap) / own
+    assert contact.force == pytest.approx([-expected, 0, 0], abs=1e-3 * expected)
+    assert contact.at == pytest.approx(at, abs=1e-5)
+    assert contact.position == pytest.approx([0.015 + gap, 0, at], abs=1e-5)
+    assert found.tip_pose[0, 3] == pytest.approx(tip * force - between * expected, rel=1e-3)
+    assert found.stiffness(X) == pytest.approx(1 / (tip - between**2 / own), rel=1e-3)
+    lost = found.lift_off([-1, 0, 0])
+    assert (lost.how, lost.contact) == ("lifts off", 0)
+    assert lost.force == pytest.approx(force - gap / between, rel=2e-3)
+    assert lost.stiffness_after == pytest.approx(1 / tip, rel=1e-3)
+
+
+def test_a_soft_object_is_a_spring():
+    at, force, stiffness = 0.12, 1e-4, 20.0
+    tip, between, own = flexibilities(at)
+    found = robot().contact_equilibrium(
+        REST, scene(post(at), stiffness=stiffness), load=push(force)
+    )
+    own += 1 / stiffness
+    assert -found.contacts[0].force[0] == pytest.approx(between * force / own, rel=1e-3)
+    assert found.stiffness(X) == pytest.approx(1 / (tip - between**2 / own), rel=1e-3)
+
+
+def test_leaning_softens_across_the_normal():
+    """A sphere's curvature times the force, with the arm's own stiffness where it touches."""
+    at, radius = 0.12, 0.005
+    tip, between, own = flexibilities(at)
+    sphere = {"sphere": {"centre": (0.02, 0.0, at), "radius": radius}}
+    found = robot().contact_equilibrium(REST, scene(sphere), load=push(0.01))
+    force = np.linalg.norm(found.contacts[0].force)
+    curvature = force / (0.015 + radius)
+    expected = tip + between**2 * curvature / (1 - own * curvature)
+    assert 1 / found.stiffness([0, 1, 0]) == pytest.approx(expected, rel=0.01)
+    assert found.stiffness([0, 1, 0]) < 0.95 * robot().stiffness(REST, [0, 1, 0])
+    assert found.stable
+
+
+def test_the_tip_is_a_hemisphere():
+    """A wall before the tip, pressed by an arm that lengthens."""
+    p = np.full(6, 1.5e4)
+    free, C = robot().tip_pose(p)[2, 3], robot().tip_compliance(p)[2, 2]
+    wall = {"half_space": {"point": (0, 0, free + 0.015 - 0.1 * C), "normal": (0, 0, -1)}}
+    found = robot().contact_equilibrium(p, scene(wall))
+    (contact,) = found.contacts
+    assert contact.at == TWO.length
+    assert found.tip_pose[2, 3] == pytest.approx(free - 0.1 * C, abs=1e-5)
+    assert contact.force == pytest.approx([0, 0, -0.1], abs=1e-3)
+
+
+# -- no contact -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("arm", [TWO, ARMS["3 segments, mixed"], TWO.under((0, 0, 9.81), 0.02)])
+def test_without_contact_it_is_the_free_arm(arm):
+    p = np.random.default_rng(3).uniform(0, 0.8e5, arm.n)
+    found = robot(arm).contact_equilibrium(p, scene(post(0.1, gap=0.3)))
+    assert found.contacts == ()
+    assert found.stable
+    assert found.tip_pose == pytest.approx(robot(arm).tip_pose(p), abs=1e-5)
+    scale = np.abs(robot(arm).tip_compliance(p)).max()
+    assert found.tip_compliance == pytest.approx(robot(arm).tip_compliance(p), abs=1e-4 * scale)
+    jacobian = robot(arm).tip_jacobian(p)
+    assert found.tip_jacobian == pytest.approx(jacobian, abs=1e-4 * np.abs(jacobian).max())
+    line = robot(arm).backbone(p, 20)[:, :3, 3]
+    assert found.backbone(20) == pytest.approx(line, abs=2e-4)
+    assert found.lift_off(X).how == "holds"
+
+
+def test_objects_that_allow_no_contact_are_not_leant_on():
+    found = robot().contact_equilibrium(REST, scene(post(0.1), allowed=False), load=push(0.01))
+    assert found.contacts == ()
+
+
+# -- an independent rod ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("case", REFERENCES, ids=[str(case["seed"]) for case in REFERENCES])
+def test_against_the_energy_of_a_discrete_rod(case):
+    """One to three contacts, with and without weight."""
+    arm = ARMS[case["arm"]].under(case["gravity"], case["tip_mass"])
+    found = robot(arm).contact_equilibrium(
+        np.array(case["pressures"]), scene(*case["objects"]), load=push(1, *case["force"])
+    )
+    forces = np.zeros(len(case["objects"]))
+    for contact in found.contacts:
+        forces[int(contact.object)] += np.linalg.norm(contact.force)
+    tip = np.linalg.norm(found.tip_pose[:3, 3] - case["tip"])
+    assert tip < 1e-3 * arm.length
+    assert forces == pytest.approx(case["forces"], rel=0.01, abs=5e-4)
+    assert found.stable
+    R = found.tip_pose[:3, :3]
+    flexibility = np.diag(R @ found.tip_compliance[:3, :3] @ R.T)
+    assert flexibility == pytest.approx(case["flexibilities"], rel=0.05)
+
+
+# -- derivatives ----------------------------------------------------------------------------------
+
+BENT = np.array([0.9e5, 0.1e5, 0.0, 0.2e5, 0.7e5, 0.1e5])
+
+
+@cache
+def around(arm: Arm) -> Scene:
+    """Two posts that the free arm at `BENT` would enter by millimetres."""
+    T = robot(arm).pose(BENT, [0.11, 0.17])
+    shapes = []
+    for pose, depth, radius in zip(T, (0.006, 0.003), (0.005, 0.008), strict=True):
+        centre = pose[:3, 3] - pose[:3, 0] * (0.015 + radius - depth)
+        side = 0.05 * pose[:3, 1]
+        ends = {"from": tuple(centre - side), "to": tuple(centre + side)}
+        shapes.append({"capsule": {**ends, "radius": radius}})
+    return scene(*shapes, friction=0.3)
+
+
+@cache
+def leaning(arm: Arm) -> stiffopt.ContactEquilibrium:
+    return robot(arm).contact_equilibrium(BENT, around(arm))
+
+
+WITH_AND_WITHOUT_WEIGHT = pytest.mark.parametrize("arm", [TWO, TWO.under((0, 0, 9.81), 0.01)])
+
+
+@WITH_AND_WITHOUT_WEIGHT
+def test_derivatives_are_those_of_equilibria_nearby(arm):
+    found = leaning(arm)
+    assert found.contacts
+    step, n = 20.0, robot(arm).n_pressures
+    moves, forces, stations = [], [], []
+    for e in step * np.eye(n):
+        a, b = (
+            robot(arm).contact_equilibrium(BENT + sign * e, around(arm), nearby=found)
+            for sign in (1, -1)
+        )
+        moves.append((a.tip_pose - b.tip_pose)[:3, 3] / (2 * step))
+        pairs = list(zip(a.contacts, b.contacts, strict=True))
+        norms = [[np.linalg.norm(each.force) for each in pair] for pair in pairs]
+        forces.append([(x - y) / (2 * step) for x, y in norms])
+        stations.append([(x.at - y.at) / (2 * step) for x, y in pairs])
+    slope = found.tip_pose[:3, :3] @ found.tip_jacobian[:3]
+    assert slope == pytest.approx(np.array(moves).T, abs=1e-6 * np.abs(slope).max())
+    for gradients, rows in ((found.force_gradients, forces), (found.station_gradients, stations)):
+        expected = np.array(rows).T
+        assert gradients == pytest.approx(expected, abs=1e-5 * np.abs(expected).max())
+    gradient = found.stiffness_gradient(X, step=50.0)
+    other = found.stiffness_gradient(X, step=200.0)
+    assert gradient == pytest.approx(other, abs=1e-3 * np.abs(gradient).max())
+
+
+@WITH_AND_WITHOUT_WEIGHT
+def test_compliance_is_that_of_pushes_and_symmetric(arm):
+    found = leaning(arm)
+    raw, R = found._per_wrench(), found.tip_pose[:3, :3]
+    assert raw == pytest.approx(raw.T, abs=1e-3 * np.abs(raw).max())
+    C = R @ found.tip_compliance[:3, :3] @ R.T
+    for direction in np.eye(3):
+        ends = [
+            robot(arm).contact_equilibrium(
+                BENT, around(arm), load=push(sign * 1e-5, *direction), nearby=found
+            )
+            for sign in (1, -1)
+        ]
+        move = (ends[0].tip_pose - ends[1].tip_pose)[:3, 3] / 2e-5
+        assert move == pytest.approx(C @ direction, abs=1e-3 * np.abs(C).max())
+
+
+def test_the_stiffness_of_the_nodes_has_the_same_compliance():
+    """What decides on stability, turned round."""
+    found = leaning(TWO)
+    K = stiffness_left(found._problem, found._state, found._system)
+    assert np.linalg.eigvalsh((K + K.T) / 2)[0] > 0
+    assert pytest.approx(K.T, abs=1e-3 * np.abs(K).max()) == K
+
+
+def test_sticking_is_stiffer_than_sliding():
+    found = leaning(TWO)
+    for direction in np.eye(3):
+        sliding, sticking = (
+            found.stiffness(direction, contacts=grip) for grip in ("sliding", "sticking")
+        )
+        assert sticking > 0.999 * sliding
+    free = robot().stiffness(BENT, X)
+    assert found.stiffness(X) > 2 * free
+
+
+# -- approach, and what cannot be -----------------------------------------------------------------
+
+
+def test_overlaps_of_15_mm_are_reached_by_both_approaches():
+    T = robot().pose(BENT, 0.15)
+    centre, side = T[:3, 3] - T[:3, 0] * (0.02 - 0.015), 0.05 * T[:3, 1]
+    ends = {"from": tuple(centre - side), "to": tuple(centre + side)}
+    around = scene({"capsule": {**ends, "radius": 0.005}})
+    assert robot().clearance(BENT, around) == pytest.approx(-0.015, abs=2e-4)
+    first, second = (
+        robot().contact_equilibrium(BENT, around, approach=way) for way in ("pressures", "objects")
+    )
+    assert first.contacts
+    assert first.tip_pose == pytest.approx(second.tip_pose, abs=1e-7)
+    assert first.stable
+
+
+def test_an_arm_that_is_swept_past_a_post_stays_on_its_side():
+    """At the full pressures the free arm is beyond the post and clear of it."""
+    p = np.array([1.5e5, 0, 0, 1.5e5, 0, 0])
+    line = robot().backbone(0.35 * p, 50)[-8, :3, 3]
+    post = {"capsule": {"from": (line[0] - 0.022, -0.08, line[2]), "radius": 0.004,
+                        "to": (line[0] - 0.022, 0.08, line[2])}}  # fmt: skip
+    assert robot().clearance(REST, scene(post)) > 0
+    assert robot().clearance(p, scene(post)) > 0.002
+    found = robot().contact_equilibrium(0.6 * p, scene(post))
+    assert found.contacts
+    assert found.tip_pose[0, 3] > robot().tip_pose(0.6 * p)[0, 3] + 0.005
+
+
+def test_an_arm_that_is_pressed_on_a_wall_along_its_axis_buckles():
+    """At Euler's load of a rod that is clamped at one end, less what shear takes of it."""
+    wall = {"half_space": {"point": (0, 0, 0.2), "normal": (0, 0, -1)}}
+    message = r"beyond \d+% of its pressures and load, leaning on 0: the arm slips off, snaps"
+    with pytest.raises(EquilibriumError, match=message):
+        robot().contact_equilibrium(np.full(6, 1.5e5), scene(wall))
+    law = rod_section(FLOP, np.full(3, 2e4), TWO.gravity)
+    euler = np.pi**2 / (4 * (1.01 * TWO.length) ** 2 * law.compliance[4, 4])
+    euler /= 1 + euler * law.compliance[0, 0]
+    forces = []
+    for p in np.linspace(1.8e4, 2.2e4, 11):
+        try:
+            found = robot().contact_equilibrium(np.full(6, p), scene(wall))
+        except EquilibriumError:
+            break
+        forces.append(float(np.linalg.norm(found.contacts[0].force)))
+    assert len(forces) > 2
+    assert forces[-1] == pytest.approx(euler, rel=0.1)
+
+
+def test_bad_input_is_named():
+    with pytest.raises(InputError, match="expected a Scene"):
+        robot().contact_equilibrium(REST, "post")
+    with pytest.raises(InputError, match="approach"):
+        robot().contact_equilibrium(REST, scene(post(0.1)), approach="sideways")
+    found = robot().contact_equilibrium(REST, scene(post(0.1)))
+    with pytest.raises(InputError, match="contacts"):
+        found.compliance("glued")
+    with pytest.raises(InputError, match="limit"):
+        found.lift_off(X, limit=0)

@@ -1,0 +1,351 @@
+"""The equilibrium of an arm that leans on objects, and what it can take."""
+
+from __future__ import annotations
+
+from functools import cached_property, lru_cache
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from stiffopt import lie
+from stiffopt.errors import EquilibriumError, InputError
+from stiffopt.model.arguments import check_choice, checked_measure
+from stiffopt.model.arm_clearance import SceneKey, measured_scene
+from stiffopt.model.compliance import Boundary, Frame, Kind
+from stiffopt.model.contact.push import ContactLoss, GrowingPush
+from stiffopt.model.contact.rod import Condition, Rod
+from stiffopt.model.contact.solve import ContactProblem
+from stiffopt.model.contact.stability import is_stable
+from stiffopt.model.contact.surface import ContactSurface
+from stiffopt.model.contact.system import Contacts, ContactSystem
+from stiffopt.model.scene import Scene
+from stiffopt.model.screws import Wrench, checked_wrench
+
+if TYPE_CHECKING:
+    from stiffopt.model.manipulator import Manipulator
+
+Vector = NDArray[np.float64]
+Approach = Literal["pressures", "objects"]
+Grip = Literal["sliding", "sticking"]
+
+
+class Contact(NamedTuple):
+    """Where an arm leans on an object.
+
+    Attributes
+    ----------
+    object : its name.
+    at : arc length at rest of the station that is nearest to it, in m.
+    force : on the arm (3,), in base axes, in N.
+    position : of the surface there (3,), in m.
+    normal : unit vector (3,) from the surface to the arm.
+    max_force : that the scene allows, in N; infinite where it says nothing.
+    """
+
+    object: str
+    at: float
+    force: Vector
+    position: Vector
+    normal: Vector
+    max_force: float
+
+
+class ContactEquilibrium:
+    """An equilibrium with contacts; see `Manipulator.contact_equilibrium`.
+
+    Attributes
+    ----------
+    pressures : (n,), in Pa.
+    contacts : tuple of Contact, from the base.
+    """
+
+    def __init__(self, problem: ContactProblem, state: Contacts, system: ContactSystem) -> None:
+        order = np.argsort([touch.station for touch in state.touches], kind="stable")
+        if len(order) > 1 and (np.diff(order) < 0).any():
+            touches = tuple(state.touches[i] for i in order)
+            mesh = state.mesh._replace(
+                node=state.mesh.node[order], per_station=state.mesh.per_station[:, order]
+            )
+            state = state._replace(touches=touches, mesh=mesh)
+            system = ContactSystem(problem, state, system.linear.sections)
+        self._problem, self._state, self._system = problem, state, system
+        self.pressures = state.condition.pressures
+        self.contacts = tuple(
+            Contact(
+                problem.surfaces[touch.surface].name,
+                touch.station,
+                touch.force,
+                system.linear.position[node] - row.point.distance * row.point.normal,
+                row.point.normal,
+                problem.surfaces[touch.surface].max_force,
+            )
+            for touch, node, row in zip(state.touches, state.mesh.node, system.rows, strict=True)
+        )
+
+    def __repr__(self) -> str:
+        where = ", ".join(
+            f"{each.object} at {1e3 * each.at:.1f} mm with {np.linalg.norm(each.force):.4g} N"
+            for each in self.contacts
+        )
+        return f"ContactEquilibrium({where or 'no contact'})"
+
+    # -- shape ------------------------------------------------------------------------------
+
+    @property
+    def tip_pose(self) -> Vector:
+        """Pose of the tip in the base frame, (4, 4)."""
+        linear = self._system.linear
+        return np.asarray(lie.transform(linear.rotation[0], linear.position[0]))
+
+    def backbone(self, n: int = 50) -> Vector:
+        """Points (n, 3) of the centre line, equally spaced at rest from the base to the tip."""
+        at, points, _ = self._problem.body(self._system, samples=8)
+        at, points = np.insert(at, 0, 0.0), np.insert(points, 0, 0.0, axis=0)
+        wanted = np.linspace(0.0, self._problem.rod.arm.length, n)
+        return np.stack([np.interp(wanted, at, column) for column in points.T], axis=1)
+
+    @cached_property
+    def stable(self) -> bool:
+        """Whether it is a minimum of the energy (of loads without a potential: no divergence)."""
+        return is_stable(self._problem, self._state, self._system)
+
+    @property
+    def within_limits(self) -> bool:
+        """Whether no contact force exceeds what the scene allows."""
+        return all(np.linalg.norm(each.force) <= each.max_force for each in self.contacts)
+
+    # -- compliance -------------------------------------------------------------------------
+
+    @property
+    def tip_compliance(self) -> Vector:
+        """Tangent compliance (6, 6) of the braced tip, in tip axes, linear first.
+
+        All contacts stay and slide without friction; see `compliance` for other bounds.
+        """
+        return self.compliance("sliding")
+
+    def compliance(self, contacts: Grip = "sliding") -> Vector:
+        """Tangent compliance (6, 6) of the tip, in tip axes, linear first.
+
+        Parameters
+        ----------
+        contacts : {"sliding", "sticking"}
+            Whether contacts slide on their surfaces without resistance or roll on them without
+            slipping. With friction the truth is in between; small pushes on an arm whose contacts
+            carry no tangential force leave them sticking.
+        """
+        check_choice("contacts", contacts, get_args(Grip))
+        per_wrench = self._per_wrench(contacts == "sticking")
+        R = self._system.linear.rotation[0]
+        turn = np.zeros((6, 6))
+        turn[:3, :3] = turn[3:, 3:] = R
+        found: Vector = turn.T @ per_wrench @ turn
+        if self._is_conservative and contacts == "sliding":
+            found = (found + found.T) / 2  # symmetric but for the integrator's error
+        return found
+
+    @property
+    def _is_conservative(self) -> bool:
+        condition = self._state.condition
+        return not (condition.follower.any() or condition.dead[3:].any())
+
+    def _per_wrench(self, sticking: bool = False) -> Vector:
+        """Twist of the tip per wrench on it, (6, 6), in base axes."""
+        system = self._system_for("tip wrench", sticking)
+        changes, moves = system.along(system.solution())
+        return np.concatenate([moves[0], changes[0, :3]])
+
+    def _system_for(self, extras: str, sticking: bool = False) -> ContactSystem:
+        return ContactSystem(
+            self._problem, self._state, self._system.linear.sections, extras, sticking
+        )
+
+    def stiffness(
+        self,
+        direction: ArrayLike,
+        kind: Kind = "translation",
+        boundary: Boundary = "free",
+        frame: Frame = "base",
+        contacts: Grip = "sliding",
+    ) -> float:
+        """Stiffness of the braced tip along a direction (N/m), or about it (N m/rad).
+
+        See `Manipulator.stiffness` for the arguments and `compliance` for `contacts`.
+        """
+        return _stiffness(self.compliance(contacts), self._system.linear.rotation[0],
+                          checked_measure(direction, kind, boundary, frame))  # fmt: skip
+
+    # -- derivatives ------------------------------------------------------------------------
+
+    @cached_property
+    def _per_pressure(self) -> tuple[Vector, Vector, Vector]:
+        system = self._system_for("pressures")
+        solution = system.solution()
+        changes, moves = system.along(solution)
+        u = system.linear.unknowns
+        return np.concatenate([moves[0], changes[0, :3]]), solution[u:], solution[9:u:7]
+
+    @property
+    def tip_jacobian(self) -> Vector:
+        """Twist of the tip in tip axes per pressure, (6, n), the same contacts staying closed."""
+        R = self._system.linear.rotation[0]
+        twist = self._per_pressure[0]
+        return np.concatenate([R.T @ twist[:3], R.T @ twist[3:]])
+
+    @property
+    def force_gradients(self) -> Vector:
+        """Derivatives (contacts, n) of the normal forces by the pressures, in N/Pa."""
+        return self._per_pressure[1]
+
+    @property
+    def station_gradients(self) -> Vector:
+        """Derivatives (contacts, n) of the contacts' arc lengths by the pressures, in m/Pa."""
+        return self._per_pressure[2]
+
+    def stiffness_gradient(
+        self,
+        direction: ArrayLike,
+        kind: Kind = "translation",
+        boundary: Boundary = "free",
+        frame: Frame = "base",
+        contacts: Grip = "sliding",
+        step: float = 50.0,
+    ) -> Vector:
+        """Derivative (n,) of `stiffness` by the pressures, the same contacts staying closed.
+
+        By central differences over a step in Pa, of equilibria that are exact to rounding.
+        """
+        measure = (direction, kind, boundary, frame, contacts)
+        found = []
+        for k in range(len(self.pressures)):
+            values = [
+                self._nearby(step * sign * np.eye(len(self.pressures))[k]).stiffness(*measure)
+                for sign in (1, -1)
+            ]
+            found.append((values[0] - values[1]) / (2 * step))
+        return np.array(found)
+
+    def _nearby(self, change: Vector) -> ContactEquilibrium:
+        condition = self._state.condition
+        there = condition._replace(pressures=condition.pressures + change)
+        found = self._problem.correct(self._state._replace(condition=there))
+        if found is None:
+            raise EquilibriumError("the equilibrium is lost where pressures change by little")
+        return ContactEquilibrium(self._problem, *found)
+
+    # -- pushes -----------------------------------------------------------------------------
+
+    def lift_off(
+        self, direction: ArrayLike, limit: float = 1.0, contacts: Grip = "sliding"
+    ) -> ContactLoss:
+        """The push at the tip by which the first contact is lost.
+
+        Parameters
+        ----------
+        direction : (3,)
+            Of the push, in base axes; of any length.
+        limit : float
+            Largest push that is looked at, in N.
+        contacts : {"sliding", "sticking"}
+            How contacts meet the push; one that sticks may slip where its friction ends.
+
+        Returns
+        -------
+        ContactLoss
+        """
+        d = np.asarray(checked_measure(direction, "translation", "free", "base").direction)
+        check_choice("contacts", contacts, get_args(Grip))
+        if limit <= 0:
+            raise InputError(f"limit must be positive; got {limit!r}")
+        push = GrowingPush(self._problem, d, limit, contacts == "sticking")
+        return push.loss(self._state, self._system)
+
+
+def contact_equilibrium(
+    arm: Manipulator,
+    p: ArrayLike,
+    scene: Scene,
+    load: ArrayLike | Wrench | None = None,
+    approach: Approach = "pressures",
+    nearby: ContactEquilibrium | None = None,
+) -> ContactEquilibrium:
+    """See `Manipulator.contact_equilibrium`."""
+    pressures = arm.checked_pressures(p)
+    arm._check_margin(pressures[np.newaxis], "")
+    check_choice("approach", approach, get_args(Approach))
+    problem = contact_problem(arm, scene)
+    wrench = np.zeros(6) if load is None else checked_wrench(load)
+    tip = np.array(arm.tip_load)
+    end = Condition(
+        pressures, tip[:6] + wrench, tip[6:], np.array(arm.description.gravity),
+        np.zeros(len(problem.surfaces)),
+    )  # fmt: skip
+    if nearby is not None:
+        state, system, share = problem.follow(nearby._state, end)
+        return _arrived(problem, state, system, share, "the way from the nearby equilibrium")
+    rest = problem.straight(end)
+    hanging = end._replace(
+        pressures=np.zeros_like(pressures), dead=np.zeros(6), follower=np.zeros(6)
+    )
+    if approach == "objects":
+        alone = ContactProblem(problem.rod, ())
+        free = alone.straight(end._replace(retreat=np.zeros(0)))
+        for target in (hanging, end):
+            free, system, share = alone.follow(free, target._replace(retreat=np.zeros(0)))
+            _arrived(alone, free, system, share, "its weight, pressures and load, free of objects")
+        state = free._replace(condition=end._replace(retreat=problem.retreat(system)))
+    else:
+        state, system, share = problem.follow(rest, hanging)
+        _arrived(problem, state, system, share, "its own weight and payload")
+    state, system, share = problem.follow(state, end)
+    what = "the objects' way to it" if approach == "objects" else "its pressures and load"
+    return _arrived(problem, state, system, share, what)
+
+
+def _arrived(
+    problem: ContactProblem, state: Contacts, system: ContactSystem, share: float, what: str
+) -> ContactEquilibrium:
+    if share < 1.0:
+        names = {problem.surfaces[touch.surface].name for touch in state.touches}
+        on = f", leaning on {' and '.join(sorted(names))}" if names else ""
+        raise EquilibriumError(
+            f"no equilibrium is reached continuously beyond {share:.0%} of {what}{on}: the arm "
+            "slips off, snaps through or buckles there"
+        )
+    return ContactEquilibrium(problem, state, system)
+
+
+def contact_problem(arm: Manipulator, scene: Scene) -> ContactProblem:
+    """The arm among the objects of a scene that it may lean on, made once."""
+    rod = arm.kept("contact rod", lambda: Rod(arm))
+    return _problem(rod, SceneKey(scene))
+
+
+@lru_cache(maxsize=64)
+def _problem(rod: Rod, key: SceneKey) -> ContactProblem:
+    measured = measured_scene(key.scene, rod.arm.description)
+    pairs = zip(key.scene.objects, measured.items, strict=True)
+    return ContactProblem(
+        rod,
+        tuple(
+            ContactSurface(item, known.begin)
+            for item, known in pairs
+            if item.contact is not None and item.contact.allowed
+        ),
+    )
+
+
+def _stiffness(C: Vector, R: Vector, measure: Any) -> float:
+    """Stiffness of a compliance (6, 6) in axes R; see `Manipulator.stiffness`."""
+    d = np.asarray(measure.direction)
+    d = R.T @ d if measure.frame == "base" else d
+    own, other = slice(0, 3), slice(3, 6)
+    if measure.kind == "rotation":
+        own, other = other, own
+    if measure.boundary == "free":
+        return float(1 / (d @ C[own, own] @ d))
+    block = C[own, own]
+    if measure.boundary == "clamped":
+        block = block - C[own, other] @ np.linalg.solve(C[other, other], C[other, own])
+    return float(d @ np.linalg.solve(block, d))
