@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
 from stiffopt import Press, StiffnessGoal, StiffnessMeasure, Target, Task, load_robot, load_task
-from stiffopt.control.contact import ContactEstimator, TipForce
 from stiffopt.control.controller import TipController
 from stiffopt.control.pressing import Phase, Pressing
-from stiffopt.control.tuning import ContactTuning, PressingTuning
+from stiffopt.control.touch import TipForce, TouchEstimator
+from stiffopt.control.tuning import PressingTuning, TouchTuning
 from stiffopt.errors import InputError
 from stiffopt.model.robot_files import load_description
 from stiffopt.optimise.solver import PressureSolver
@@ -46,11 +46,11 @@ def felt(
     pressures: Callable[[float], Array] = lambda t: P,
     *,
     vibrates: bool = False,
-    expected: bool = False,
+    approach: Array | None = None,
 ) -> tuple[list[float], list[TipForce]]:
     """What is felt at each sample of a tip that is off the model by `away`."""
-    estimator = ContactEstimator([3], vibrates=vibrates, damping=0.04, tuning=ContactTuning())
-    estimator.expect(expected)
+    estimator = TouchEstimator([3], vibrates=vibrates, damping=0.04, tuning=TouchTuning())
+    estimator.expect(approach, 5e-3)
     rng, times, forces = np.random.default_rng(3), np.arange(0, until, FRAME).tolist(), []
     for time in times:
         seen = away(time) + NOISE * rng.standard_normal(3)
@@ -113,8 +113,8 @@ def test_along_a_stiff_axis_nothing_is_felt_and_nothing_is_known() -> None:
     _, forces = felt(lambda t: 2e-3 * stiff * (t > 2.0), 5.0)
     assert not any(force.touches for force in forces)
     last = forces[-1]
-    assert stiff @ last.covariance @ stiff == pytest.approx(ContactTuning().force ** 2)
-    assert SOFT[:, 0] @ last.covariance @ SOFT[:, 0] < 0.2 * ContactTuning().force ** 2
+    assert stiff @ last.covariance @ stiff == pytest.approx(TouchTuning().force ** 2)
+    assert SOFT[:, 0] @ last.covariance @ SOFT[:, 0] < 0.2 * TouchTuning().force ** 2
 
 
 def test_the_covariance_has_that_of_the_stiffness() -> None:
@@ -132,13 +132,13 @@ def test_a_force_that_is_expected_is_followed_while_it_grows() -> None:
     def force(t: float) -> Array:
         return direction * float(np.clip(0.012 * (t - 2.0), 0.0, 0.03))
 
-    times, forces = felt(lambda t: C @ force(t), 8.0, expected=True)
+    times, forces = felt(lambda t: C @ force(t), 8.0, approach=direction)
     for time, found in zip(times, forces, strict=True):
         assert np.linalg.norm(found.force - force(time)) < 0.2 * np.linalg.norm(force(time)) + 5e-3
 
 
 def test_a_model_that_changes_is_no_force() -> None:
-    estimator = ContactEstimator([3], vibrates=False, damping=0.04, tuning=ContactTuning())
+    estimator = TouchEstimator([3], vibrates=False, damping=0.04, tuning=TouchTuning())
     shift = np.array([5e-3, -4e-3, 1e-3])
     for time in np.arange(0, 4, FRAME):
         if abs(time - 2.0) < FRAME / 2:
@@ -150,7 +150,7 @@ def test_a_model_that_changes_is_no_force() -> None:
 def test_after_a_long_gap_it_begins_anew() -> None:
     times, forces = felt(lambda t: C @ PUSH * (t > 2.0), 4.0)
     assert forces[-1].touches
-    estimator = ContactEstimator([3], vibrates=False, damping=0.04, tuning=ContactTuning())
+    estimator = TouchEstimator([3], vibrates=False, damping=0.04, tuning=TouchTuning())
     for time in [*times, *(10.0 + np.array(times))]:
         estimator.take(time, C @ PUSH * (time > 2.0), P, TIP)
     assert not estimator.felt.touches  # the offset is an error as well as a force then
@@ -293,7 +293,7 @@ def test_the_simulated_arm_presses_as_hard_as_it_is_told(dynamics: str) -> None:
     assert max(forces) < 1.6 * 0.03 + 6e-3
     assert status.press_force == pytest.approx(0.03, abs=3e-3)
     assert status.press_goal == 0.03
-    assert status.contact
+    assert status.touches
     assert status.wrench[0] < -0.02
     assert status.task == "press"
     assert {"touch", "pressing"} <= kinds

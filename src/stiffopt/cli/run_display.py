@@ -282,7 +282,7 @@ def _stiffness(now: Snapshot) -> list[tuple[str, RenderableType]]:
             share = now.stiffness / now.best_stiffness
             text += f" of {unit.number(now.best_stiffness, '.3g')} ({share:.0%})"
         rows.append(("stiffness", text))
-    if now.contact:
+    if now.touches:
         force, milli = now.wrench[:3], DisplayUnit("", 1e3)
         text = f"felt at the tip: {_triple(force, milli, '.1f')} mN"
         if math.isfinite(now.press_force):

@@ -20,7 +20,6 @@ from stiffopt.control.adaptation import Adapted
 from stiffopt.control.allocation import Allocation
 from stiffopt.control.channels import Channels
 from stiffopt.control.checks import check_press, check_rates, limited_range, refusing
-from stiffopt.control.contact import ContactEstimator
 from stiffopt.control.course import Course
 from stiffopt.control.estimator import TipEstimator
 from stiffopt.control.feedback import GainSchedule, tracking_rows
@@ -36,6 +35,7 @@ from stiffopt.control.regulators import PressureEstimator
 from stiffopt.control.replanning import AnyCourse, Pursuit, Replanner
 from stiffopt.control.state import ControllerStatus, Severity
 from stiffopt.control.tip_errors import TipErrors, target_arrays
+from stiffopt.control.touch import TouchEstimator
 from stiffopt.control.tuning import ControlTuning
 from stiffopt.control.vibration import BendingMode
 from stiffopt.control.windows import WindowWatch
@@ -121,13 +121,11 @@ class TipController:
             damping=control.damping,
         )
         self._estimator = TipEstimator(period, n, mode, filter_tuning)
-        self._contact = ContactEstimator(
+        self._touch = TouchEstimator(
             [segment.n_channels for segment in robot.description.segments],
             vibrates=mode is not None,
             damping=control.damping,
-            tuning=replace(
-                tuning.contact, noise=max(tuning.contact.noise, 2 * control.tracker_noise)
-            ),
+            tuning=replace(tuning.touch, noise=max(tuning.touch.noise, 2 * control.tracker_noise)),
         )
         self._reference = Reference(
             period, slew, lag, control.damping, 6, tuning.reference.slew_share
@@ -183,7 +181,7 @@ class TipController:
         self.replanner.begin()
         self._pressures.begin()
         self._estimator.begin()
-        self._contact.begin()
+        self._touch.begin()
         self._watch.begin()
         zero = self._pressures.command
         self._reference.begin(np.concatenate([zero, np.zeros(6)]))
@@ -367,13 +365,16 @@ class TipController:
             predicted = self._estimator.predicted
             course, pushed = self.replanner.pursuit.course, np.zeros(3)
             presses = isinstance(course, Pressing) and course.touches_on_purpose
-            self._contact.stiffness_error = self.replanner.deviation
-            self._contact.expect(presses)
-            self._contact.take(
+            self._touch.stiffness_error = self.replanner.deviation
+            if isinstance(course, Pressing) and presses:
+                self._touch.expect(course.direction, course.press.speed)
+            else:
+                self._touch.expect(None)
+            self._touch.take(
                 sample.time, sample.position - predicted, effective, tip, self._estimator.omega
             )
             if presses:
-                pushed = self._contact.felt.displacement
+                pushed = self._touch.felt.displacement
             self._watch.take(
                 sample.time, sample.position - pushed, predicted, self._estimator.offset,
                 effective, tip, turns=self._estimator.turn_known, swing=self._estimator.swing,
@@ -467,7 +468,7 @@ class TipController:
         elapsed = min(now - self._computed_at, _HELD * self._period)
         course.advance(
             elapsed, self._rests(now), self._is_known(now), self._estimator.estimate.position,
-            self._estimator.offset, self._contact.felt, R, R @ tip.compliance[:3, :3] @ R.T,
+            self._estimator.offset, self._touch.felt, R, R @ tip.compliance[:3, :3] @ R.T,
         )  # fmt: skip
 
     def _is_known(self, now: float) -> bool:
@@ -483,7 +484,7 @@ class TipController:
             return
         self._watched_at = now
         windows, known = self._windows, self.replanner.known
-        if self._rests(now) and not self._contact.felt.touches:
+        if self._rests(now) and not self._touch.felt.touches:
             windows.look(now, self._pressures.effective, self._estimator)
         else:
             windows.begin()
@@ -527,7 +528,7 @@ class TipController:
         change = self._estimator.change_model(before, after)
         self._corrected_offset = self._corrected_offset + change
         self._watch.change_model(change)
-        self._contact.change_model(change)
+        self._touch.change_model(change)
         self._reference.shift(change)
         self.replanner.go_on_with(adapted, change)
 
@@ -554,7 +555,7 @@ class TipController:
         if tip is None:
             return ControllerStatus(plan=np.full(n, np.nan))
         estimate = self._estimator.estimate
-        felt = self._contact.felt
+        felt = self._touch.felt
         touches = felt.touches
         target, press_force, press_goal = self._led_to or pursuit.target_at(now), math.nan, math.nan
         if isinstance(pursuit.course, Pressing):
@@ -590,7 +591,7 @@ class TipController:
             adapted=() if self.replanner.known is None else self.replanner.known.numbers,
             best_stiffness=math.nan if plan is None else plan.stiffness,
             disturbance=estimate.offset,
-            contact=touches,
+            touches=touches,
             wrench=np.concatenate([felt.force, np.zeros(3)]),
             wrench_covariance=felt.covariance.ravel(),
             press_force=press_force,

@@ -21,9 +21,9 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from stiffopt.control.contact import TipForce
 from stiffopt.control.interface import Notice
 from stiffopt.control.state import Severity
+from stiffopt.control.touch import TipForce
 from stiffopt.control.tuning import PressingTuning
 from stiffopt.optimise.press import Feeling, Press
 from stiffopt.optimise.target import Target
@@ -65,7 +65,7 @@ class Pressing:
         self._start: Array = np.zeros(3)  # tip (3,) when the approach began
         self._offset: Array = np.zeros(6)  # d then
         self._waited = self._felt_nothing = self._within = self._off = 0.0  # times in s
-        self._why = ""
+        self._touched, self._why = False, ""
         self._told: list[Notice] = []
 
     def at(self, now: float) -> Target:
@@ -90,6 +90,11 @@ class Pressing:
             for axis, step in zip(position, along.tolist(), strict=True)
         )
         return self._target.model_copy(update={"position": moved})
+
+    @property
+    def direction(self) -> Array:
+        """Direction (3,) of the approach, base axes."""
+        return self._direction
 
     @property
     def touches_on_purpose(self) -> bool:
@@ -148,7 +153,7 @@ class Pressing:
         self.force = -float(n @ felt.force) / max(feeling.share, 0.1)
         gone = float(n @ (tip - self._start))
         if self.phase is Phase.APPROACHING:
-            self._approach(elapsed, gone, feeling.compliance, felt.touches)
+            self._approach(elapsed, gone, feeling.compliance)
         elif self.phase is Phase.PRESSING:
             self._keep_the_force(elapsed, gone, feeling.compliance)
         elif self.phase is Phase.RETREATING:
@@ -156,11 +161,10 @@ class Pressing:
             if not self._shift:
                 self.phase, self.force = Phase.ENDED, math.nan
 
-    def _approach(self, elapsed: float, gone: float, compliance: float, touches: bool) -> None:
+    def _approach(self, elapsed: float, gone: float, compliance: float) -> None:
         press, t = self.press, self._tuning
-        if touches and self.force > t.touch_share * press.force:
+        if self.force > t.touch_share * press.force:
             self.phase = Phase.PRESSING
-            self._tell("touch", f"something is felt, after {1e3 * gone:.1f} mm")
         elif gone > press.travel:
             self._retreat(f"nothing was felt within {1e3 * press.travel:g} mm")
         elif self._held_back(gone) > press.force * compliance + t.held_back:
@@ -191,6 +195,9 @@ class Pressing:
             rate = compliance * missing / t.time
             limit = press.speed
             self._shift = max(0.0, self._shift + float(np.clip(rate, -limit, limit)) * elapsed)
+        if self.force > press.force / 2 and not self._touched:
+            self._touched = True
+            self._tell("touch", f"something is felt, after {1e3 * gone:.1f} mm")
         if self._within >= t.settled and not self._why:
             self._why = "held"
             self._tell("pressing", f"presses with {1e3 * self.force:.0f} mN")

@@ -229,7 +229,7 @@ class ControllerStatus:
     disturbance: Annotated[Array, _tip("offset of the tip from the model", "m", size=3)] = field(
         default_factory=_nan3
     )
-    contact: Annotated[bool, _tip("whether a force on the tip is felt", key="contact")] = False
+    touches: Annotated[bool, _tip("whether a force on the tip is felt", key="touches")] = False
     wrench: Annotated[
         Array,
         _tip(

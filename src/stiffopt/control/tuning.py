@@ -284,8 +284,8 @@ class MotionTuning:
 
 
 @dataclass(frozen=True)
-class ContactTuning:
-    """Noise of what is between model and tip, and when a force is believed (`ContactEstimator`)."""
+class TouchTuning:
+    """Noise of what is between model and tip, and when a force is believed (`TouchEstimator`)."""
 
     force: float = 0.1  # standard deviation of forces that are thought possible, in N
     stiffness_error: float = 0.1  # of the arm, relative, where it is not known
@@ -300,9 +300,9 @@ class ContactTuning:
     drift: float = 1e-4  # growth of its standard deviation at rest, in m / sqrt(s)
     # rate of creep after a motion, as a share of its way, in 1/s; the time in which it decays, in
     # s; and its growth at random, as a share of the way of that time, in 1/s / sqrt(s)
-    creep: float = 0.06
+    creep: float = 0.03
     creep_time: float = 5.0
-    creep_change: float = 0.02
+    creep_change: float = 0.01
     # share of a motion that may excite the vibration beyond what the model has
     swing_error: float = 0.1
     # growth of the standard deviation of the vibration's speed, in m/s / sqrt(s); and, as a share,
@@ -330,7 +330,10 @@ class ContactTuning:
     least_force: float = 3e-3  # that counts, in N
     gone_share: float = 0.7  # share of it below which a force is none any more
     quiet: int = 20  # after so many samples in a row
-    surely: float = 3.0  # standard deviations from which an expected force is told
+    # while the tip approaches something: the way in which the model's error there is learned, in m,
+    # and its deviation before, as a share of the way
+    learning_way: float = 1.5e-3
+    approach_error: float = 0.1
 
 
 @dataclass(frozen=True)
@@ -342,7 +345,7 @@ class PressingTuning:
     rest: float = 0.5
     longest_rest: float = 8.0
     time: float = 0.7  # time constant of the force against a rigid surface, in s
-    touch_share: float = 0.2  # share of the force from which something is felt
+    touch_share: float = 0.2  # share of the force from which the approach slows down
     lost: float = 0.4  # time without a contact after which it is lost, in s
     # largest share of the force that may be felt, or that the arm's compliance explains; and by
     # how much the tip may be held back beyond that, in m
@@ -377,5 +380,5 @@ class ControlTuning:
     adaptation: AdaptationTuning = field(default_factory=AdaptationTuning)
     windows: WindowTuning = field(default_factory=WindowTuning)
     motion: MotionTuning = field(default_factory=MotionTuning)
-    contact: ContactTuning = field(default_factory=ContactTuning)
+    touch: TouchTuning = field(default_factory=TouchTuning)
     pressing: PressingTuning = field(default_factory=PressingTuning)

@@ -210,7 +210,7 @@ class TelemetryChannels:
             size = Vector3(x=_TARGET_SIZE, y=_TARGET_SIZE, z=_TARGET_SIZE)
             ball = SpherePrimitive(pose=place, size=size, color=_colour(_TARGET_COLOUR))
             entities.append(_entity(moment, TARGET, spheres=[ball]))
-        if now.contact:
+        if now.touches:
             entities.append(_force(moment, now))
         self._scene.log(SceneUpdate(entities=entities), log_time=moment)
 

@@ -1,16 +1,18 @@
 """What touches the tip: a force, told apart from errors of the model, creep and vibration.
 
 The tip is seen at y, the model predicts it at s for the present pressures. What is between them is
-estimated in each axis, for displacements u, e and xi, a rate b of e, and a speed eta::
+estimated in each axis, for displacements u, e and xi, rates r of u and b of e, and a speed eta::
 
-    y - s = u + e + xi,      e' = b,      b' = -b / T,      xi' = eta,
-    eta' = -2 zeta omega eta - omega^2 xi
+    y - s = u + e + xi,    u' = r,    r' = -r / T_r,    e' = b + g s_n',    b' = -b / T,
+    xi' = eta,    eta' = -2 zeta omega eta - omega^2 xi
 
 A force F on the tip displaces it by u = C F in the directions in which it is soft; along a stiff
 axis no force can be felt. e is the error of the model. It changes with motion, by a share of the
 way, and creeps at the rate b, which motion sets off. xi is the vibration of the first bending mode
 that pressures do not account for. A force that begins displaces the equilibrium and not the tip:
-u + xi stays, so that the swing which follows tells its size before it has decayed.
+u + xi stays, so that the swing which follows tells its size before it has decayed. While the tip
+approaches something along n, g is the error per way s_n of the model's tip along n: it is learned
+before the tip touches.
 
 Force and error look alike in one sample, and differ in how they begin. While nothing touches the
 tip, u is zero. At intervals a hypothesis begins: that a force has begun or changed just then, or
@@ -18,7 +20,7 @@ has gone. Each is a Kalman filter of its own; the logarithm of its likelihood is
 of the present filter (the generalised likelihood ratio test of Willsky and Jones, 1976). One that
 is better by far replaces the present filter. A push that grows for seconds is found in parts.
 
-Noise is alike in all axes, so that each filter has one covariance (6, 6) and a mean (6, 3).
+Noise is alike in all axes, so that each filter has one covariance (7, 7) and a mean (7, 3).
 """
 
 from __future__ import annotations
@@ -29,13 +31,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from stiffopt.control.tuning import ContactTuning
+from stiffopt.control.tuning import TouchTuning
 from stiffopt.optimise.press import SOFT_SHARE
 from stiffopt.optimise.tip import TipAt
 
 Array = NDArray[np.float64]
 
-_U, _R, _E, _B, _XI, _ETA = range(6)
+_U, _R, _E, _B, _G, _XI, _ETA = range(7)
 
 
 @dataclass(frozen=True)
@@ -61,8 +63,8 @@ class TipForce:
 class _Filters:
     """The present filter, and after it the hypotheses, k in all."""
 
-    means: Array  # (k, 6, 3)
-    covariances: Array  # (k, 6, 6)
+    means: Array  # (k, 7, 3)
+    covariances: Array  # (k, 7, 7)
     evidence: Array  # (k,) logarithms of likelihoods over that of the present filter
     since: Array  # (k,) when they began, in s
     released: NDArray[np.bool_]  # (k,) whether the force has gone then
@@ -83,7 +85,7 @@ class _Filters:
         )
 
 
-class ContactEstimator:
+class TouchEstimator:
     """Estimates the force on the tip.
 
     Parameters
@@ -104,26 +106,28 @@ class ContactEstimator:
     """
 
     def __init__(
-        self, segments: list[int], *, vibrates: bool, damping: float, tuning: ContactTuning
+        self, segments: list[int], *, vibrates: bool, damping: float, tuning: TouchTuning
     ) -> None:
         self._tuning, self._damping, self._vibrates = tuning, damping, vibrates
         self._ends = np.cumsum([0, *segments[:-1]])
         swings = float(vibrates)
-        self._seen = np.array([1.0, 0.0, 1.0, 0.0, swings, 0.0])  # of the state, in y - s
-        self._expected = False  # whether a force may come at any moment
+        self._seen = np.array([1.0, 0.0, 1.0, 0.0, 0.0, swings, 0.0])  # of the state, in y - s
+        # direction and speed of an approach, on which a force may come at any moment
+        self._approach: tuple[Array, float] | None = None
+        self._approached = 0.0  # way of the model's tip since it began, in m
         self._begins = np.array(
-            [1.0, 0.0, 0.0, 0.0, -swings, 0.0]
+            [1.0, 0.0, 0.0, 0.0, 0.0, -swings, 0.0]
         )  # change of the state by a force
         self.begin()
 
     def begin(self) -> None:
         """Start anew, with nothing at the tip."""
         t = self._tuning
-        deviations = [0.0, 0.0, t.first_error, t.first_rate, 0.0, 0.0]
+        deviations = [0.0, 0.0, t.first_error, t.first_rate, 0.0, 0.0, 0.0]
         if self._vibrates:
             deviations[_XI:] = [t.first_swing, t.first_speed]
         self._filters = _Filters(
-            np.zeros((1, 6, 3)), np.diag(np.square(deviations))[None], np.zeros(1),
+            np.zeros((1, 7, 3)), np.diag(np.square(deviations))[None], np.zeros(1),
             np.array([-math.inf]), np.array([False]),
         )  # fmt: skip
         self._believed = False  # that there is a force
@@ -139,16 +143,32 @@ class ContactEstimator:
         unknown = np.full(3, np.nan)
         self.felt = TipForce(False, unknown, np.full((3, 3), np.nan), np.zeros(3))
 
-    def expect(self, expected: bool) -> None:
-        """Be prepared for a force that grows slowly, as when the tip approaches something."""
-        if self._expected and not expected and not self._believed:
+    def expect(self, direction: Array | None, speed: float = 0.0) -> None:
+        """Be prepared for a force that grows slowly, as when the tip approaches something.
+
+        Parameters
+        ----------
+        direction :
+            Of the approach (3,), base axes; None: there is none. Nothing touches when it begins.
+        speed :
+            Of the approach, in m/s.
+        """
+        if direction is None:
+            self._approach = None
+            return
+        if self._approach is None:
+            self._believed, self._approached = False, 0.0
             self._merge()
-        self._expected = expected
+            f = self._filters
+            f.means[:, _G] = f.covariances[:, _G] = f.covariances[:, :, _G] = 0.0
+            f.covariances[:, _G, _G] = self._tuning.approach_error**2
+        self._approach = direction, speed
 
     @property
-    def _may_touch(self) -> bool:
-        """Whether the present filter has a force."""
-        return self._believed or self._expected
+    def _has_force(self) -> bool:
+        """Whether the present filter has a force: a believed one, or one that may come."""
+        learned = self._approach is not None and self._approached > self._tuning.learning_way
+        return self._believed or learned
 
     def change_model(self, change: Array) -> None:
         """Go on with another model, from which the tip is off by another offset (6,)."""
@@ -191,19 +211,17 @@ class ContactEstimator:
 
     def _force(self) -> TipForce:
         t, (inverse, felt) = self._tuning, self._inverse()
-        displacement = self._filters.means[0, _U] if self._may_touch else np.zeros(3)
+        displacement = self._filters.means[0, _U] if self._has_force else np.zeros(3)
         force = inverse @ displacement
-        size, deviation = float(np.linalg.norm(force)), self._deviation()
-        touches = self._believed or size > max(t.least_force, t.surely * deviation)
         error = self.stiffness_error if math.isfinite(self.stiffness_error) else t.stiffness_error
         covariance = self._variance() * inverse @ inverse + error**2 * np.outer(force, force)
         covariance += t.force**2 * (np.eye(3) - felt)
-        return TipForce(touches and self._may_touch, force, covariance, felt @ displacement)
+        return TipForce(self._believed, force, covariance, felt @ displacement)
 
     def _variance(self) -> float:
         """Variance of u; where nothing is felt, that of a force which could have been felt."""
         filters = self._filters
-        if self._may_touch or len(filters.since) == 1:
+        if self._has_force or len(filters.since) == 1:
             return float(filters.covariances[0, _U, _U])
         off = np.abs(self._time - filters.since[1:] - self._tuning.open_time)
         return float(filters.covariances[1 + int(np.argmin(off)), _U, _U])
@@ -227,7 +245,7 @@ class ContactEstimator:
         return moved
 
     def _process(self, elapsed: float, moved: Array, omega: float) -> tuple[Array, Array]:
-        """Transition (6, 6) and covariance (6, 6) of its noise.
+        """Transition (7, 7) and covariance (7, 7) of its noise.
 
         The errors of a motion in one direction add up, not their squares: the variance grows with
         the square of the way of the last moments.
@@ -237,9 +255,12 @@ class ContactEstimator:
         self._way = before + _length(moved)
         grown = self._way**2 - before**2
         self._recent_way = self._recent_way * math.exp(-elapsed / t.creep_time) + moved
-        F, Q = np.eye(6), np.zeros((6, 6))
+        F, Q = np.eye(7), np.zeros((7, 7))
         F[:, _R] = elapsed * self._begins
         F[_R, _R] = math.exp(-elapsed / t.rate_time)
+        if self._approach is not None:
+            F[_E, _G] = float(self._approach[0] @ moved.sum(axis=1))
+            self._approached += F[_E, _G]
         F[_E, _B], F[_B, _B] = elapsed, math.exp(-elapsed / t.creep_time)
         hurry = min(1.0, _length(moved) / (elapsed * t.fast)) if elapsed > 0 else 0.0
         Q[_E, _E] = (t.model_error**2 + (t.fast_error * hurry) ** 2) * grown + t.drift**2 * elapsed
@@ -263,10 +284,10 @@ class ContactEstimator:
         is_open = self._time - f.since < t.open_time
         rate = np.where(is_open, t.open_rate, t.force_rate) * softest
         rate[f.released] = 0.0
-        if not self._may_touch:
+        if not self._has_force:
             rate[0] = 0.0
         noises = Q + (rate**2 * elapsed)[:, None, None] * np.outer(self._begins, self._begins)
-        spread = 2 * elapsed / t.rate_time * (t.rate * softest) ** 2  # keeps the deviation of r
+        spread = 2 * elapsed / t.rate_time * self._rate() ** 2  # keeps the deviation of r
         noises[:, _R, _R] = np.where(rate > 0, spread, 0.0)
         means = F @ f.means
         covariances = F @ f.covariances @ F.T + noises
@@ -313,10 +334,10 @@ class ContactEstimator:
         f = f.keep([0, *kept.tolist()])
         mean, covariance = f.means[0], f.covariances[0]
         jump = (t.jump * self._compliances[2]) ** 2 * np.outer(self._begins, self._begins)
-        jump[_R, _R] = (t.rate * self._compliances[2]) ** 2
+        jump[_R, _R] = self._rate() ** 2
         f = f.with_one(mean, covariance + jump, self._time, released=False)
         if self._believed:
-            gone = np.eye(6)  # the tip stays where it is, and its equilibrium does not
+            gone = np.eye(7)  # the tip stays where it is, and its equilibrium does not
             gone[:, _U] -= self._begins
             gone[_R, _R] = 0.0
             f = f.with_one(gone @ mean, gone @ covariance @ gone.T, self._time, released=True)
@@ -331,16 +352,20 @@ class ContactEstimator:
         if self._quiet < t.quiet:
             return
         self._believed, self._quiet = False, 0
-        if not self._expected:
-            self._merge()
+        self._merge()
 
     def _deviation(self) -> float:
         """Standard deviation of the force of the present filter where the tip is softest, in N."""
         return math.sqrt(self._filters.covariances[0, _U, _U]) / float(self._compliances[2])
 
+    def _rate(self) -> float:
+        """Standard deviation of the rate of u while a force changes, in m/s."""
+        rate = self._tuning.rate * float(self._compliances[2])
+        return rate if self._approach is None else max(rate, self._approach[1])
+
     def _merge(self) -> None:
         """Take what is left of a force for an error, and forget the hypotheses."""
-        merged = np.eye(6)
+        merged = np.eye(7)
         merged[_E, _U], merged[_U, _U], merged[_R, _R] = 1.0, 0.0, 0.0
         self._filters = self._filters.keep([0])
         self._filters.means = merged @ self._filters.means

@@ -1,6 +1,6 @@
 """What the loop feels: pushes on the tip of simulated arms, false alarms, and presses.
 
-    python benchmarks/contact.py --arms 4 --seed 700
+    python benchmarks/touch.py --arms 4 --seed 700
 
 Arms differ from their robot files at random (`control_cases.py`). Each goes to targets, rests for
 three seconds, and is pushed at the tip with 10 to 50 mN in a random lateral direction, all at once,
@@ -24,6 +24,7 @@ from control_cases import DYNAMICS, RIG, _mismatch, without_memory
 from report import table
 from stiffopt import Press, Target, Task, load_robot
 from stiffopt.control.controller import TipController
+from stiffopt.control.pressing import Phase
 from stiffopt.control.state import ControllerStatus
 from stiffopt.errors import InputError
 from stiffopt.model.robot_files import load_description
@@ -176,7 +177,7 @@ def free(name: str, seed: int, dynamics: str, found: Found) -> None:
 
 
 def _onsets(states: list[ControllerStatus]) -> int:
-    touches = np.array([state.contact for state in states], dtype=int)
+    touches = np.array([state.touches for state in states], dtype=int)
     return int((np.diff(touches, prepend=0) == 1).sum())
 
 
@@ -205,10 +206,11 @@ def press(name: str, seed: int, dynamics: str, found: Found) -> None:
     )  # fmt: skip
     with Arm(name, seed, dynamics, surface) as arm:
         arm.controller.set_task(task)
-        forces, states = [], []
+        forces, course = [], arm.controller.replanner.pursuit.course
         for _ in range(round(HOLD / 0.05)):
-            states += arm.go(0.05)
-            forces.append(arm.rig.world.plant.contact_force())
+            arm.go(0.05)
+            going = course.phase is Phase.GOING  # the surface may be in its way to the target
+            forces.append(0.0 if going else arm.rig.world.plant.contact_force())
         found.failed += [n.text for n in arm.controller.notices() if n.kind == "press-failed"]
         tip = arm.rig.world.plant.tip_pose()[:3, 3] - pose[:3, 3]
         found.aside.append(float(np.linalg.norm(tip - way * float(way @ tip))))
