@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import atexit
 import ctypes
 import shutil
 import subprocess
+import tempfile
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +19,14 @@ from board_host import SET, Report, body_of, command, frame_of, report_of
 
 FIRMWARE = Path(__file__).resolve().parent.parent / "firmware"
 TICK = 2  # ms
+
+
+@cache
+def logic(**settings: int) -> Path:
+    """Return the library, built once for all tests of this process."""
+    folder = tempfile.mkdtemp(prefix="firmware-")
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return make(Path(folder), "loop.so", **settings)
 
 
 class Air(ctypes.Structure):
@@ -91,11 +103,15 @@ class Loop:
         self._c.loop_run(self._it, ticks, trace.ctypes.data_as(ctypes.c_void_p))
         return trace[:, : self.n]
 
-    def send(self, data: bytes) -> list[bytes]:
-        """Send bytes; return the bodies of the answers."""
+    def receive(self, data: bytes) -> bytes:
+        """Send bytes; return the bytes of the answers."""
         replies = ctypes.create_string_buffer(62 * (data.count(b"\0") + 1))
         length = self._c.loop_receive(self._it, data, len(data), replies)
-        frames = replies.raw[:length].split(b"\0")
+        return replies.raw[:length]
+
+    def send(self, data: bytes) -> list[bytes]:
+        """Send bytes; return the bodies of the answers."""
+        frames = self.receive(data).split(b"\0")
         assert frames.pop() == b""
         return [body_of(frame + b"\0") for frame in frames]
 
@@ -125,3 +141,42 @@ class Loop:
     def force(self, sensor: int, counts: int) -> None:
         """Let a sensor (that of the line comes last) show counts of 0 to 1023; 0: the truth."""
         self._c.loop_force(self._it, sensor, counts)
+
+
+class LoopPort:
+    """In place of pyserial's port: a board whose time is that of a clock.
+
+    Attributes
+    ----------
+    wire : moment, channel and set-point in Pa whenever a frame has changed them.
+    """
+
+    def __init__(self, library: Path, clock: Any) -> None:
+        self.loop = Loop(library)
+        self.wire: list[tuple[float, int, float]] = []
+        self._clock, self._at = clock, clock.now()
+        self._answers = b""
+        self._held: tuple[int, ...] = ()
+
+    @property
+    def in_waiting(self) -> int:
+        return len(self._answers)
+
+    def reset_input_buffer(self) -> None:
+        self._answers = b""
+
+    def close(self) -> None: ...
+
+    def read(self, count: int) -> bytes:
+        got, self._answers = self._answers[:count], self._answers[count:]
+        return got
+
+    def write(self, data: bytes) -> None:
+        now = self._clock.now()
+        self.loop.run(min(1e3 * (now - self._at), 2000.0))
+        self._at = now
+        self._answers += self.loop.receive(data)
+        pressures = self.loop.report(6).set_points
+        if pressures != self._held:  # else it was a question
+            self.wire.extend((now, channel, 10.0 * p) for channel, p in enumerate(pressures))
+        self._held = pressures

@@ -249,10 +249,7 @@ class BoardLine:
     def _ready(self) -> Any:
         """Return the port, open and silent."""
         if self._serial is None:
-            serial = library("serial", "pyserial", EXTRA)
-            self._serial = serial.Serial(
-                self.port, self.baudrate, timeout=_LOOK, write_timeout=self.timeout
-            )
+            self._serial = self._port()
             self._doubtful = True
         if self._doubtful:
             self._serial.reset_input_buffer()
@@ -263,6 +260,10 @@ class BoardLine:
                 "program on this line?"
             )
         return self._serial
+
+    def _port(self) -> Any:
+        serial = library("serial", "pyserial", EXTRA)
+        return serial.Serial(self.port, self.baudrate, timeout=_LOOK, write_timeout=self.timeout)
 
     def _answer(self, line: Any, kind: int, timeout: float) -> bytes:
         end, received = time.monotonic() + timeout, b""
