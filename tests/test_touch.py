@@ -125,14 +125,26 @@ def test_the_covariance_has_that_of_the_stiffness() -> None:
     assert deviation < 0.5 * np.linalg.norm(PUSH)
 
 
-def test_a_force_that_is_expected_is_followed_while_it_grows() -> None:
-    """As when the tip approaches something: 12 mN/s."""
-    direction = PUSH / np.linalg.norm(PUSH)
+def test_a_force_on_an_approach_is_followed_while_it_grows() -> None:
+    """The tip comes to a rigid surface at 5 mm/s, by a model that errs by 8 % of the way."""
+    way = SOFT[:, 0]
+    compliance = float(way @ C @ way)
+    per_metre = np.linalg.pinv(R @ TIP.jacobian[:3]) @ way
+    last = 4e-3 + 0.03 * compliance  # 30 mN
+
+    def shift(t: float) -> float:
+        return min(5e-3 * max(t - 1.0, 0.0), last)
 
     def force(t: float) -> Array:
-        return direction * float(np.clip(0.012 * (t - 2.0), 0.0, 0.03))
+        return -way * max(shift(t) - 4e-3, 0.0) / compliance
 
-    times, forces = felt(lambda t: C @ force(t), 8.0, approach=direction)
+    times, forces = felt(
+        lambda t: -0.08 * shift(t) * way + C @ force(t),
+        8.0,
+        lambda t: P + per_metre * shift(t),
+        approach=way,
+    )
+    assert np.linalg.norm(force(8.0)) == pytest.approx(0.03)
     for time, found in zip(times, forces, strict=True):
         assert np.linalg.norm(found.force - force(time)) < 0.2 * np.linalg.norm(force(time)) + 5e-3
 
@@ -259,7 +271,8 @@ def test_the_offset_is_kept_along_the_direction_only() -> None:
     assert waiting.corrected(offset) is offset
 
 
-@pytest.mark.parametrize("dynamics", ["quasi-static", "full"])
+@pytest.mark.usefixtures("compiled")
+@pytest.mark.parametrize("dynamics", [pytest.param("quasi-static", marks=pytest.mark.long), "full"])
 def test_the_simulated_arm_presses_as_hard_as_it_is_told(dynamics: str) -> None:
     """The shipped palpation, on an arm that nobody has tuned it for."""
     description = load_rig_description(ROOT / "rig" / "palpation.yaml")
@@ -278,7 +291,7 @@ def test_the_simulated_arm_presses_as_hard_as_it_is_told(dynamics: str) -> None:
         rig.supply.arm()
         controller.begin(rig.clock.now())
         controller.set_task(load_task(ROOT / "problems" / "two_segment_palpation.yaml"))
-        for _ in range(2200):
+        for _ in range(1900):
             now = rig.clock.now()
             controller.observe(now, command, rig.supply.read(), rig.tracker.read())
             command = controller.compute(now).pressures
