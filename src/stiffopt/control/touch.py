@@ -46,7 +46,7 @@ class TipForce:
 
     Attributes
     ----------
-    touches : whether something is felt; else the force is zero.
+    touches : whether something is felt; else the force is zero, but on an approach.
     force : (3,), in N; nothing along axes in which the arm cannot feel.
     covariance : of the force (3, 3), in N^2. Along an axis without feeling, it is that of all
         forces that are thought possible.
@@ -115,9 +115,8 @@ class TouchEstimator:
         # direction and speed of an approach, on which a force may come at any moment
         self._approach: tuple[Array, float] | None = None
         self._approached = 0.0  # way of the model's tip since it began, in m
-        self._begins = np.array(
-            [1.0, 0.0, 0.0, 0.0, 0.0, -swings, 0.0]
-        )  # change of the state by a force
+        # change of the state by a force that begins
+        self._begins = np.array([1.0, 0.0, 0.0, 0.0, 0.0, -swings, 0.0])
         self.begin()
 
     def begin(self) -> None:
@@ -154,6 +153,8 @@ class TouchEstimator:
             Of the approach, in m/s.
         """
         if direction is None:
+            if self._approach is not None and not self._believed:
+                self._merge()
             self._approach = None
             return
         if self._approach is None:
