@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
@@ -14,11 +15,10 @@ from stiffopt.model.arguments import check_choice, checked_measure
 from stiffopt.model.arm_clearance import SceneKey, measured_scene
 from stiffopt.model.compliance import Boundary, Frame, Kind
 from stiffopt.model.contact.push import ContactLoss, GrowingPush
-from stiffopt.model.contact.rod import Condition, Rod
+from stiffopt.model.contact.rod import Condition, Rod, rotations
 from stiffopt.model.contact.solve import ContactProblem
-from stiffopt.model.contact.stability import is_stable
 from stiffopt.model.contact.surface import ContactSurface
-from stiffopt.model.contact.system import Contacts, ContactSystem
+from stiffopt.model.contact.system import ContactSystem, LeaningArm
 from stiffopt.model.scene import Scene
 from stiffopt.model.screws import Wrench, checked_wrench
 
@@ -57,30 +57,25 @@ class ContactEquilibrium:
     Attributes
     ----------
     pressures : (n,), in Pa.
-    contacts : tuple of Contact, from the base.
+    contacts : tuple of Contact.
     """
 
-    def __init__(self, problem: ContactProblem, state: Contacts, system: ContactSystem) -> None:
-        order = np.argsort([touch.station for touch in state.touches], kind="stable")
-        if len(order) > 1 and (np.diff(order) < 0).any():
-            touches = tuple(state.touches[i] for i in order)
-            mesh = state.mesh._replace(
-                node=state.mesh.node[order], per_station=state.mesh.per_station[:, order]
-            )
-            state = state._replace(touches=touches, mesh=mesh)
-            system = ContactSystem(problem, state, system.linear.sections)
-        self._problem, self._state, self._system = problem, state, system
-        self.pressures = state.condition.pressures
+    def __init__(self, arm: LeaningArm) -> None:
+        self._arm = arm
+        self.pressures = arm.state.condition.pressures
+        surfaces = [arm.problem.surfaces[touch.surface] for touch in arm.state.touches]
         self.contacts = tuple(
             Contact(
-                problem.surfaces[touch.surface].name,
+                surface.name,
                 touch.station,
                 touch.force,
-                system.linear.position[node] - row.point.distance * row.point.normal,
+                arm.shape.position[node] - row.point.distance * row.point.normal,
                 row.point.normal,
-                problem.surfaces[touch.surface].max_force,
+                surface.max_force,
             )
-            for touch, node, row in zip(state.touches, state.mesh.node, system.rows, strict=True)
+            for surface, touch, node, row in zip(
+                surfaces, arm.state.touches, arm.state.mesh.node, arm.rows, strict=True
+            )
         )
 
     def __repr__(self) -> str:
@@ -95,20 +90,29 @@ class ContactEquilibrium:
     @property
     def tip_pose(self) -> Vector:
         """Pose of the tip in the base frame, (4, 4)."""
-        linear = self._system.linear
-        return np.asarray(lie.transform(linear.rotation[0], linear.position[0]))
+        shape = self._arm.shape
+        return np.asarray(lie.transform(shape.rotation[0], shape.position[0]))
+
+    def poses(self, at: ArrayLike) -> Vector:
+        """Poses (k, 4, 4) at arc lengths (k,) at rest, in m."""
+        wanted = np.asarray(at, dtype=float)
+        shape, up = self._arm.shape, slice(None, None, -1)
+        q = [np.interp(wanted, shape.mesh.at[up], row[up]) for row in shape.nodes.quaternion.T]
+        found = np.zeros((len(wanted), 4, 4))
+        found[:, :3, :3] = rotations(np.stack(q, axis=1))
+        found[:, :3, 3] = self._arm.problem.body(self._arm, wanted)[0]
+        found[:, 3, 3] = 1
+        return found
 
     def backbone(self, n: int = 50) -> Vector:
         """Points (n, 3) of the centre line, equally spaced at rest from the base to the tip."""
-        at, points, _ = self._problem.body(self._system, samples=8)
-        at, points = np.insert(at, 0, 0.0), np.insert(points, 0, 0.0, axis=0)
-        wanted = np.linspace(0.0, self._problem.rod.arm.length, n)
-        return np.stack([np.interp(wanted, at, column) for column in points.T], axis=1)
+        wanted = np.linspace(0.0, self._arm.problem.rod.arm.length, n)
+        return self._arm.problem.body(self._arm, wanted)[0]
 
-    @cached_property
+    @property
     def stable(self) -> bool:
         """Whether it is a minimum of the energy (of loads without a potential: no divergence)."""
-        return is_stable(self._problem, self._state, self._system)
+        return self._arm.is_stable
 
     @property
     def within_limits(self) -> bool:
@@ -136,30 +140,24 @@ class ContactEquilibrium:
             carry no tangential force leave them sticking.
         """
         check_choice("contacts", contacts, get_args(Grip))
-        per_wrench = self._per_wrench(contacts == "sticking")
-        R = self._system.linear.rotation[0]
+        per_wrench = self._per_wrench(range(len(self.contacts)) if contacts == "sticking" else ())
+        R = self._arm.shape.rotation[0]
         turn = np.zeros((6, 6))
         turn[:3, :3] = turn[3:, 3:] = R
         found: Vector = turn.T @ per_wrench @ turn
-        if self._is_conservative and contacts == "sliding":
+        if self._arm.state.condition.is_conservative and contacts == "sliding":
             found = (found + found.T) / 2  # symmetric but for the integrator's error
         return found
 
-    @property
-    def _is_conservative(self) -> bool:
-        condition = self._state.condition
-        return not (condition.follower.any() or condition.dead[3:].any())
-
-    def _per_wrench(self, sticking: bool = False) -> Vector:
+    def _per_wrench(self, sticking: Collection[int] = ()) -> Vector:
         """Twist of the tip per wrench on it, (6, 6), in base axes."""
         system = self._system_for("tip wrench", sticking)
         changes, moves = system.along(system.solution())
         return np.concatenate([moves[0], changes[0, :3]])
 
-    def _system_for(self, extras: str, sticking: bool = False) -> ContactSystem:
-        return ContactSystem(
-            self._problem, self._state, self._system.linear.sections, extras, sticking
-        )
+    def _system_for(self, extras: str, sticking: Collection[int] = ()) -> ContactSystem:
+        arm = self._arm
+        return ContactSystem(arm.problem, arm.state, arm.shape.sections, extras, sticking)
 
     def stiffness(
         self,
@@ -173,7 +171,7 @@ class ContactEquilibrium:
 
         See `Manipulator.stiffness` for the arguments and `compliance` for `contacts`.
         """
-        return _stiffness(self.compliance(contacts), self._system.linear.rotation[0],
+        return _stiffness(self.compliance(contacts), self._arm.shape.rotation[0],
                           checked_measure(direction, kind, boundary, frame))  # fmt: skip
 
     # -- derivatives ------------------------------------------------------------------------
@@ -189,7 +187,7 @@ class ContactEquilibrium:
     @property
     def tip_jacobian(self) -> Vector:
         """Twist of the tip in tip axes per pressure, (6, n), the same contacts staying closed."""
-        R = self._system.linear.rotation[0]
+        R = self._arm.shape.rotation[0]
         twist = self._per_pressure[0]
         return np.concatenate([R.T @ twist[:3], R.T @ twist[3:]])
 
@@ -227,12 +225,12 @@ class ContactEquilibrium:
         return np.array(found)
 
     def _nearby(self, change: Vector) -> ContactEquilibrium:
-        condition = self._state.condition
+        condition = self._arm.state.condition
         there = condition._replace(pressures=condition.pressures + change)
-        found = self._problem.correct(self._state._replace(condition=there))
+        found = self._arm.problem.correct(self._arm.state._replace(condition=there))
         if found is None:
             raise EquilibriumError("the equilibrium is lost where pressures change by little")
-        return ContactEquilibrium(self._problem, *found)
+        return ContactEquilibrium(found)
 
     # -- pushes -----------------------------------------------------------------------------
 
@@ -248,7 +246,8 @@ class ContactEquilibrium:
         limit : float
             Largest push that is looked at, in N.
         contacts : {"sliding", "sticking"}
-            How contacts meet the push; one that sticks may slip where its friction ends.
+            Without friction, and exact for large pushes; or with the friction that the scene
+            gives: contacts stick until one slips or lifts off, linear about this equilibrium.
 
         Returns
         -------
@@ -258,8 +257,8 @@ class ContactEquilibrium:
         check_choice("contacts", contacts, get_args(Grip))
         if limit <= 0:
             raise InputError(f"limit must be positive; got {limit!r}")
-        push = GrowingPush(self._problem, d, limit, contacts == "sticking")
-        return push.loss(self._state, self._system)
+        push = GrowingPush(self._arm.problem, d, limit)
+        return push.loss(self._arm) if contacts == "sliding" else push.slip(self._arm)
 
 
 def contact_equilibrium(
@@ -282,38 +281,34 @@ def contact_equilibrium(
         np.zeros(len(problem.surfaces)),
     )  # fmt: skip
     if nearby is not None:
-        state, system, share = problem.follow(nearby._state, end)
-        return _arrived(problem, state, system, share, "the way from the nearby equilibrium")
-    rest = problem.straight(end)
+        found = problem.follow(nearby._arm, end)
+        return _arrived(*found, "the way from the nearby equilibrium")
     hanging = end._replace(
         pressures=np.zeros_like(pressures), dead=np.zeros(6), follower=np.zeros(6)
     )
-    if approach == "objects":
-        alone = ContactProblem(problem.rod, ())
-        free = alone.straight(end._replace(retreat=np.zeros(0)))
-        for target in (hanging, end):
-            free, system, share = alone.follow(free, target._replace(retreat=np.zeros(0)))
-            _arrived(alone, free, system, share, "its weight, pressures and load, free of objects")
-        state = free._replace(condition=end._replace(retreat=problem.retreat(system)))
-    else:
-        state, system, share = problem.follow(rest, hanging)
-        _arrived(problem, state, system, share, "its own weight and payload")
-    state, system, share = problem.follow(state, end)
-    what = "the objects' way to it" if approach == "objects" else "its pressures and load"
-    return _arrived(problem, state, system, share, what)
+    if approach == "pressures":
+        rest, share = problem.follow(problem.straight(end), hanging)
+        _arrived(rest, share, "its own weight and payload")
+        return _arrived(*problem.follow(rest, end), "its pressures and load")
+    alone, nothing = ContactProblem(problem.rod, ()), np.zeros(0)
+    free = alone.straight(end._replace(retreat=nothing))
+    for target in (hanging, end):
+        free, share = alone.follow(free, target._replace(retreat=nothing))
+        _arrived(free, share, "its weight, pressures and load, free of objects")
+    found = problem.follow(problem.clear(free), end)
+    return _arrived(*found, "the objects' way to it")
 
 
-def _arrived(
-    problem: ContactProblem, state: Contacts, system: ContactSystem, share: float, what: str
-) -> ContactEquilibrium:
+def _arrived(arm: LeaningArm, share: float, what: str) -> ContactEquilibrium:
     if share < 1.0:
-        names = {problem.surfaces[touch.surface].name for touch in state.touches}
-        on = f", leaning on {' and '.join(sorted(names))}" if names else ""
+        touches = arm.state.touches
+        names = sorted({arm.problem.surfaces[touch.surface].name for touch in touches})
+        on = f", leaning on {' and '.join(names)}" if names else ""
         raise EquilibriumError(
             f"no equilibrium is reached continuously beyond {share:.0%} of {what}{on}: the arm "
             "slips off, snaps through or buckles there"
         )
-    return ContactEquilibrium(problem, state, system)
+    return ContactEquilibrium(arm)
 
 
 def contact_problem(arm: Manipulator, scene: Scene) -> ContactProblem:

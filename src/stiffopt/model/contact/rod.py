@@ -48,6 +48,11 @@ class Condition(NamedTuple):
     gravity: Vector
     retreat: Vector
 
+    @property
+    def is_conservative(self) -> bool:
+        """Whether all loads are dead forces, which have a potential."""
+        return not (self.follower.any() or self.dead[3:].any())
+
     def towards(self, other: "Condition", share: float) -> "Condition":
         """What is at a share of the straight way to another one."""
         return Condition(*((1 - share) * a + share * b for a, b in zip(self, other, strict=True)))
@@ -243,7 +248,36 @@ class PointLoads(NamedTuple):
     moment: Vector
 
 
-class LinearRod:
+class RodShape:
+    """Where a rod is.
+
+    Attributes
+    ----------
+    h : lengths of the steps at rest, (N,), in m.
+    position : of the nodes, (N + 1, 3).
+    near, far : tangents (N, 3) of the centre line at starts and ends of the steps.
+    force_far, moment_far : at the nodes, (N + 1, 3), on their distal sides.
+    J : changes (N, 9, 10) of the steps' ends, see `stiffopt.model.contact.steps`.
+    """
+
+    mesh: RodMesh
+    nodes: RodNodes
+    sections: RodSections
+    h: Vector
+    position: Vector
+    near: Vector
+    far: Vector
+    force_far: Vector
+    moment_far: Vector
+    J: Vector
+
+    @cached_property
+    def rotation(self) -> Vector:
+        """Axes (N + 1, 3, 3) of the nodes."""
+        return rotations(self.nodes.quaternion)
+
+
+class LinearRod(RodShape):
     """The rod about a state: where it is, and how that changes.
 
     Columns of changes are first the unknowns (turn of the tip; force, moment and station of each
@@ -251,12 +285,8 @@ class LinearRod:
 
     Attributes
     ----------
-    position : of the nodes, (N + 1, 3).
-    near, far : tangents (N, 3) of the centre line at starts and ends of the steps.
-    force_near, force_far : forces (N + 1, 3) there.
     changes : (N + 1, 9, c) of turn, moment and force at the nodes, on their distal sides.
     moves : (N + 1, 3, c) of the positions.
-    defect : largest turn that a step's end lacks, in rad.
     """
 
     def __init__(
@@ -267,7 +297,6 @@ class LinearRod:
         count, k = len(mesh.segment), len(mesh.node)
         h = mesh.at[:-1] - mesh.at[1:]
         self.h = h
-        self.rotation = rotations(nodes.quaternion)
         n = len(condition.pressures)
         width = {"defects": 1, "tip wrench": 6, "pressures": n}[extras]
         self.unknowns = 3 + 7 * k

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.model.contact.native import CONVERGED, LOST, MOST_CONTACTS, NativeContacts
 from stiffopt.model.contact.rod import (
     MOMENT,
     TURN,
@@ -14,12 +15,12 @@ from stiffopt.model.contact.rod import (
     Rod,
     RodMesh,
     RodNodes,
+    RodSections,
     interpolated,
     turned,
 )
-from stiffopt.model.contact.stability import is_stable
 from stiffopt.model.contact.surface import ContactSurface
-from stiffopt.model.contact.system import Contacts, ContactSystem, Touch
+from stiffopt.model.contact.system import Contacts, ContactSystem, LeaningArm, Touch
 
 Vector = NDArray[np.float64]
 
@@ -27,12 +28,16 @@ _LARGEST_TURN = 0.5  # rad, by which one correction may turn a part of the arm
 _LARGEST_SLIDE = 0.02  # m, by which one may move a contact along the arm
 _TURN_LEFT, _SLIDE_LEFT = 1e-6, 1e-7  # rad and m; convergence being quadratic, 1e-12 is left
 _MOST_ITERATIONS = 14
+_MOST_MESHES = 8  # that contacts are followed on from range to range
 _MOST_SETS = 10  # of contacts that are tried in a step
 _DEEPEST = 0.3  # of the body's radius, by which a step may enter a surface
+_ENTERED = 2e-3  # m, by which to enter a surface that was entered too deep
 _TILT = 0.5  # rad, by which a step may turn a normal
 _PENETRATION = 2e-6  # m, which no one minds
-_SEEN_FROM = 2e-4  # m of clearance at the places that are looked at, some millimetres apart
-_SWEPT = 0.5  # of the body's radius, by which the body may move in a step
+_LOOKED_AT = 4e-3  # m along the arm between stations at which gaps are looked at
+_CLOSELY = 17  # stations about a local minimum of a gap
+_SEEN_FROM = 2e-4  # m of a gap there, above which there is no contact between two of them
+_SWEPT = 1.0  # of the body's radius, by which a station may move in a step anyhow
 _AS_NEAR = 1e-5  # m of penetration beside a contact, which its neighbourhood may have
 _BESIDE = 1e-3  # m along the arm from a contact that belong to it at least
 _ONE = 2e-4  # m between contacts of a surface that are one
@@ -41,20 +46,25 @@ _MOST_CROSSINGS = 3  # of an end of a range, after which a contact is pinned the
 _APART = 1e-4  # m between an arm and surfaces that are moved back from it
 _SHORTEST_STEP = 1e-4  # of the way from rest; less means that it has ended
 
-Found = tuple[Contacts, ContactSystem]
-
 
 class ContactProblem:
     """An arm among surfaces."""
 
     def __init__(self, rod: Rod, surfaces: tuple[ContactSurface, ...]) -> None:
         self.rod, self.surfaces = rod, surfaces
+        self._in_c: NativeContacts | None = None
+        self._deepest: tuple[int, float] | None = None  # surface and gap of a step that failed
+        count = int(np.ceil(rod.arm.length / _LOOKED_AT))
+        self.stations = np.linspace(0.0, rod.arm.length, count + 1)
 
     # -- Newton's method --------------------------------------------------------------------
 
-    def correct(self, state: Contacts) -> Found | None:
+    def correct(self, state: Contacts) -> LeaningArm | None:
         """Equilibrium in which just the given contacts are closed; None if it is not near."""
         sections = self.rod.sections(state.condition)
+        native = self._native
+        if native is not None and len(state.touches) <= MOST_CONTACTS:
+            return self._correct_in_c(native, state, sections)
         previous = np.inf
         for iteration in range(_MOST_ITERATIONS):
             system = ContactSystem(self, state, sections)
@@ -83,7 +93,33 @@ class ContactProblem:
                 previous = max(size, _TURN_LEFT)
             state = Contacts(state.condition, mesh, nodes, touches)
             if is_same and size < _TURN_LEFT and slide < _SLIDE_LEFT:
-                return state, system
+                system.state = state
+                return system
+        return None
+
+    @property
+    def _native(self) -> NativeContacts | None:
+        """Newton's method in C, if there is machine code and every surface has a formula."""
+        if self._in_c is None and not any(each.is_interpolated for each in self.surfaces):
+            code = self.rod.step.code
+            self._in_c = None if code is None else NativeContacts(code, self.rod, self.surfaces)
+        return self._in_c
+
+    def _correct_in_c(
+        self, native: NativeContacts, state: Contacts, sections: RodSections
+    ) -> LeaningArm | None:
+        for _ in range(_MOST_MESHES):
+            outcome, moved, shape, rows, stable = native.correct(state, sections)
+            if outcome == CONVERGED:
+                found = LeaningArm(self, moved, shape, rows)
+                found.minimum = stable if state.condition.is_conservative else None
+                return found
+            if outcome == LOST:
+                return None
+            touches = tuple(each if each.pinned else self._within(each) for each in moved.touches)
+            mesh = self.rod.mesh(np.array([touch.station for touch in touches]))
+            nodes = interpolated(moved.nodes, _at_moved(moved, touches), mesh)
+            state = Contacts(state.condition, mesh, nodes, touches)
         return None
 
     def _moved(
@@ -125,29 +161,28 @@ class ContactProblem:
 
     # -- active set -------------------------------------------------------------------------
 
-    def settle(self, state: Contacts) -> Found | None:
+    def settle(self, state: Contacts) -> LeaningArm | None:
         """Equilibrium near a state where no contact pulls and none is missed; None if not near."""
         touches = tuple(replace(touch, crossings=0) for touch in state.touches)
         start = state = state._replace(touches=touches)
         for _ in range(_MOST_SETS):
             found = self.correct(state)
-            if found is None or self.is_far(start, *found):
+            if found is None or self.is_far(start, found):
                 return None
-            settled, system = found
-            changed = self._changed(settled, system)
+            changed = self._changed(found)
             if changed is None:
-                missed = self.missed(settled, system)
+                missed = self.missed(found)
                 if missed is None:
                     return None
                 if not missed:
                     return found
-                changed = (*settled.touches, *missed)
-            state = self.with_touches(settled, changed)
+                changed = (*found.state.touches, *missed)
+            state = self.with_touches(found.state, changed)
         return None
 
-    def is_far(self, start: Contacts, state: Contacts, system: ContactSystem) -> bool:
+    def is_far(self, start: Contacts, arm: LeaningArm) -> bool:
         """Whether the normal of a contact has turned too much for a step."""
-        for old, new, row in zip(start.touches, state.touches, system.rows, strict=False):
+        for old, new, row in zip(start.touches, arm.state.touches, arm.rows, strict=False):
             if old.surface != new.surface:
                 return False  # another set of contacts: what is left of them was looked at
             size = float(np.linalg.norm(old.force))
@@ -160,14 +195,14 @@ class ContactProblem:
         mesh = self.rod.mesh(np.array([touch.station for touch in touches]))
         return Contacts(state.condition, mesh, interpolated(state.nodes, state.mesh, mesh), touches)
 
-    def _changed(self, state: Contacts, system: ContactSystem) -> tuple[Touch, ...] | None:
+    def _changed(self, arm: LeaningArm) -> tuple[Touch, ...] | None:
         """Contacts without the one that pulls most, or with one that is set free or merged."""
-        touches = list(state.touches)
+        touches = list(arm.state.touches)
         pull = [touch.normal_force for touch in touches]
         if touches and min(pull) < 0:
             del touches[pull.index(min(pull))]
             return tuple(touches)
-        for j, (touch, row) in enumerate(zip(touches, system.rows, strict=True)):
+        for j, (touch, row) in enumerate(zip(touches, arm.rows, strict=True)):
             here = self.rod.ranges[touch.range]
             up = touch.station > (here.start + here.end) / 2
             inwards = row.slope if up else -row.slope
@@ -186,29 +221,35 @@ class ContactProblem:
                     return tuple(touches)
         return None
 
-    def missed(self, state: Contacts, system: ContactSystem) -> list[Touch] | None:
+    def missed(self, arm: LeaningArm) -> list[Touch] | None:
         """Contacts that are open and should not be; None if a surface is entered too deeply."""
         found = []
-        at, points, radii = self.body(system)
-        for index, surface in enumerate(self.surfaces):
-            gaps = surface.distances(points) - radii + state.condition.retreat[index]
-            gaps[at < surface.begin] = np.inf
-            system.clearances[index] = gaps.min()
+        arm.gaps = self.gaps(arm, self.stations) + arm.state.condition.retreat[:, None]
+        for index, gaps in enumerate(arm.gaps):
             if gaps.min() > _SEEN_FROM:
                 continue
-            own = [j for j, touch in enumerate(state.touches) if touch.surface == index]
-            for s, gap in minima(at, gaps):
-                if gap > -_PENETRATION or any(self._is_of(state, system, j, s, gap) for j in own):
+            own = [j for j, touch in enumerate(arm.state.touches) if touch.surface == index]
+            for i in dips(gaps):
+                if gaps[i] > _SEEN_FROM:
                     continue
-                if gap < -_DEEPEST * radii.min():
+                ends = self.stations[[i - 1, min(i + 1, len(gaps) - 1)]]
+                around = np.linspace(ends[0], ends[1], _CLOSELY)
+                closely = self.gaps(arm, around, index)[0] + arm.state.condition.retreat[index]
+                s, gap = float(around[closely.argmin()]), float(closely.min())
+                if gap > -_PENETRATION or any(self._is_of(arm, j, s, gap) for j in own):
+                    continue
+                if gap < -_DEEPEST * arm.shape.sections.radius.min():
+                    self._deepest = (index, gap)
                     return None
                 found.append(self._touch(index, s))
         return found
 
-    def _is_of(self, state: Contacts, system: ContactSystem, j: int, s: float, gap: float) -> bool:
+    def _is_of(self, arm: LeaningArm, j: int, s: float, gap: float) -> bool:
         """Whether what seems to be a contact belongs to one that is closed."""
-        touch = state.touches[j]
-        depth, reach = system.kink(j)
+        touch = arm.state.touches[j]
+        if abs(s - touch.station) < _BESIDE and gap > -_AS_NEAR:
+            return True
+        depth, reach = arm.kink(j)
         allowed = 2 * depth + _AS_NEAR
         allowed += self.surfaces[touch.surface].softness * touch.normal_force
         return abs(s - touch.station) < 1.5 * reach + _BESIDE and gap > -allowed
@@ -222,68 +263,72 @@ class ContactProblem:
         none = np.zeros(3)
         return Touch(surface, index, length if pinned else inside, pinned, none, 0.0, none)
 
-    def retreat(self, system: ContactSystem) -> Vector:
-        """By how much surfaces (k,) are moved back to be clear of an arm."""
-        at, points, radii = self.body(system)
+    def gaps(self, arm: LeaningArm, at: Vector, only: int | None = None) -> Vector:
+        """Gaps (surfaces, k) of all surfaces or of one at arc lengths (k,), in m."""
+        points, radii = self.body(arm, at)
+        code = None if self._native is None else self._native.code
         found = []
-        for surface in self.surfaces:
-            gaps = (surface.distances(points) - radii)[at >= surface.begin]
-            found.append(_APART - gaps.min() if gaps.min() < 0 else 0.0)
-        return np.array(found)
+        for surface in self.surfaces if only is None else self.surfaces[only : only + 1]:
+            own = surface.distances(points, code) - radii
+            own[at < surface.begin] = np.inf
+            found.append(own)
+        return np.array(found).reshape(len(found), len(at))
 
-    def body(self, system: ContactSystem, samples: int = 5) -> tuple[Vector, Vector, Vector]:
-        """Arc lengths (k,), points (k, 3) and radii (k,) along the arm, from above its base."""
-        linear = system.linear
-        at = linear.mesh.at[:-1, None] - linear.h[:, None] * np.arange(samples) / samples
-        x = (np.arange(samples) / samples)[:, None]
-        h = linear.h[:, None, None]
-        start, end = linear.position[:-1, None], linear.position[1:, None]
-        first, last = -h * linear.near[:, None], -h * linear.far[:, None]
-        points = (
-            (1 + 2 * x) * (1 - x) ** 2 * start
-            + x * (1 - x) ** 2 * first
-            + x**2 * (3 - 2 * x) * end
-            + x**2 * (x - 1) * last
+    def body(self, system: LeaningArm, at: Vector) -> tuple[Vector, Vector]:
+        """Points (k, 3) of the centre line at arc lengths (k,), and radii (k,) there."""
+        shape, marks = system.shape, system.shape.mesh.at
+        i = np.clip(np.searchsorted(-marks, -at, side="right") - 1, 0, len(marks) - 2)
+        h = shape.h[i, None]
+        x = (marks[i] - at)[:, None] / h
+        start, first = shape.position[i], -h * shape.near[i]
+        end, last = shape.position[i + 1], -h * shape.far[i]
+        way = end - start
+        points = start + x * (
+            first + x * (3 * way - 2 * first - last + x * (first + last - 2 * way))
         )
-        radii = np.repeat(linear.sections.radius[linear.mesh.segment], samples)
-        up = slice(None, None, -1)
-        return at.ravel()[up], points.reshape(-1, 3)[up], radii[up]
+        return points, shape.sections.radius[shape.mesh.segment[i]]
 
     # -- continuation -----------------------------------------------------------------------
 
-    def follow(self, start: Contacts, end: Condition) -> tuple[Contacts, ContactSystem, float]:
+    def follow(self, start: LeaningArm, end: Condition) -> tuple[LeaningArm, float]:
         """Equilibrium reached on the straight way to another condition, and at what share of it."""
-        state, share, step, halved = start, 0.0, 1.0, False
-        system = ContactSystem(self, start, self.rod.sections(start.condition))
-        self.missed(start, system)
+        arm, share, step, halved = start, 0.0, 1.0, False
         while share < 1.0:
             target = min(1.0, share + step)
-            found = self.settle(self._guess(state, start.condition.towards(end, target)))
-            if found is None or self._leaves(state, system, *found):
-                step, halved = step / 2, True
+            condition = start.state.condition.towards(end, target)
+            self._deepest = None
+            found = self.settle(self._guess(arm.state, condition))
+            if found is None or self._leaves(arm, found):
+                step = (target - share) * (0.5 if found else self._share_to_touch(arm))
+                halved = True
                 if step < _SHORTEST_STEP:
                     break
                 continue
-            (state, system), share = found, target
+            arm, share = found, target
             step, halved = (step if halved else 2 * step), False
-        return state, system, share
+        return arm, share
 
-    def _leaves(
-        self, start: Contacts, before: ContactSystem, state: Contacts, system: ContactSystem
-    ) -> bool:
+    def _share_to_touch(self, arm: LeaningArm) -> float:
+        """Which share of a step that has failed to try: half, or to where the body just touches."""
+        if self._deepest is None:
+            return 0.5
+        index, gap = self._deepest
+        before = float(arm.gaps[index].min())
+        return float(np.clip((before + _ENTERED) / (before - gap), 0.1, 0.9))
+
+    def _leaves(self, before: LeaningArm, after: LeaningArm) -> bool:
         """Whether stability is lost, or the body may have passed through a surface in a step."""
-        if not is_stable(self, state, system):
+        if not after.is_stable:
             return True
-        at, points, _ = self.body(before)
-        new, others, radii = self.body(system)
-        there = np.stack([np.interp(at, new, column) for column in others.T], axis=1)
-        way = float(np.linalg.norm(there - points, axis=1).max())
-        if way < _SWEPT * radii.min():
+        if not self.surfaces:
             return False
-        clearances = before.clearances + system.clearances
-        for touch in (*start.touches, *state.touches):
-            clearances[touch.surface] = np.inf
-        return bool((clearances < 1.2 * way).any())  # ways are not quite straight
+        (old, radii), (new, _) = (self.body(each, self.stations) for each in (before, after))
+        ways = np.linalg.norm(new - old, axis=1)
+        # gaps change by no more than the way, which is not quite straight
+        least = (before.gaps + after.gaps - 1.05 * ways) / 2
+        least[:, ways < _SWEPT * radii] = np.inf
+        least[[touch.surface for touch in before.state.touches]] = np.inf
+        return bool((least < -_DEEPEST * radii).any())
 
     def _guess(self, state: Contacts, condition: Condition) -> Contacts:
         """A state near which the equilibrium at a condition may be."""
@@ -292,14 +337,24 @@ class ContactProblem:
             return state._replace(condition=condition)
         return Contacts(condition, state.mesh, self.rod.free(condition, state.mesh), ())
 
-    def straight(self, like: Condition) -> Contacts:
+    def straight(self, like: Condition) -> LeaningArm:
         """The unpressurised arm without weight, clear of all surfaces."""
         mesh = self.rod.mesh(np.zeros(0))
         q = np.tile([1.0, 0.0, 0.0, 0.0], (len(mesh.at), 1))
         zero = Condition(*(np.zeros_like(each) for each in like))
-        state = Contacts(zero, mesh, RodNodes(q, np.zeros((len(mesh.at), 3))), ())
-        retreat = self.retreat(ContactSystem(self, state, self.rod.sections(zero)))
-        return state._replace(condition=zero._replace(retreat=retreat))
+        nodes = RodNodes(q, np.zeros((len(mesh.at), 3)))
+        found = self.correct(Contacts(zero, mesh, nodes, ()))
+        assert found is not None  # it is there already
+        return self.clear(found)
+
+    def clear(self, arm: LeaningArm) -> LeaningArm:
+        """The same arm without contacts, the surfaces moved back as far as they would touch it."""
+        least = (_APART - self.gaps(arm, self.stations)).max(axis=1, initial=0.0)
+        retreat = np.where(least > _APART, least, 0.0)
+        state = arm.state._replace(condition=arm.state.condition._replace(retreat=retreat))
+        found = LeaningArm(self, state, arm.shape, [])
+        self.missed(found)
+        return found
 
 
 def _is_same(touches: tuple[Touch, ...], before: tuple[Touch, ...]) -> bool:
@@ -318,20 +373,8 @@ def _at_moved(state: Contacts, touches: tuple[Touch, ...]) -> RodMesh:
     return state.mesh._replace(at=at)
 
 
-def minima(at: Vector, gaps: Vector) -> list[tuple[float, float]]:
-    """Stations and values of the local minima of gaps along an arm, but for one at its base."""
-    found = []
-    for i in range(1, len(at)):
-        if not gaps[i - 1] > gaps[i] or np.isinf(gaps[i - 1]):
-            continue
-        if i == len(at) - 1:
-            found.append((float(at[i]), float(gaps[i])))
-            continue
-        if gaps[i] > gaps[i + 1]:
-            continue
-        a, b = at[i] - at[i - 1], at[i + 1] - at[i]
-        first, second = (gaps[i] - gaps[i - 1]) / a, (gaps[i + 1] - gaps[i]) / b
-        bend, slope = 2 * (second - first) / (a + b), (first * b + second * a) / (a + b)
-        shift = float(np.clip(-slope / bend, -a, b))
-        found.append((float(at[i] + shift), float(gaps[i] + slope * shift + bend * shift**2 / 2)))
-    return found
+def dips(gaps: Vector) -> list[int]:
+    """Where gaps along an arm have a local minimum, but for one at its base."""
+    low = np.isfinite(gaps[:-1]) & (gaps[:-1] > gaps[1:])
+    low[:-1] &= gaps[1:-1] <= gaps[2:]
+    return [int(i) for i in np.flatnonzero(low) + 1]

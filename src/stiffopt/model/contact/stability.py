@@ -19,10 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt.model.contact.rod import hat
-from stiffopt.model.contact.system import Contacts, ContactSystem
 
 if TYPE_CHECKING:
-    from stiffopt.model.contact.solve import ContactProblem
+    from stiffopt.model.contact.system import LeaningArm
 
 Vector = NDArray[np.float64]
 
@@ -30,10 +29,10 @@ _RIGID = 1e-3  # compliance of what is rigid, as a share of that of its segment
 _FLATTEST = 1e-3  # 1/m: a gap that is bent less is a line
 
 
-def is_stable(problem: ContactProblem, state: Contacts, system: ContactSystem) -> bool:
+def is_stable(arm: LeaningArm) -> bool:
     """Whether the energy is at a minimum; of loads without a potential, whether none diverges."""
-    K = stiffness_left(problem, state, system)
-    if not (state.condition.follower.any() or state.condition.dead[3:].any()):
+    K = stiffness_left(arm)
+    if arm.state.condition.is_conservative:
         try:
             np.linalg.cholesky((K + K.T) / 2)
         except np.linalg.LinAlgError:
@@ -43,9 +42,9 @@ def is_stable(problem: ContactProblem, state: Contacts, system: ContactSystem) -
     return not (values.real <= -np.abs(values.imag)).any()
 
 
-def stiffness_left(problem: ContactProblem, state: Contacts, system: ContactSystem) -> Vector:
+def stiffness_left(arm: LeaningArm) -> Vector:
     """Stiffness (k, k) in N/m of what contacts leave free; turns are motions at an arm's length."""
-    linear = system.linear
+    problem, state, linear = arm.problem, arm.state, arm.shape
     count, length = len(linear.h), problem.rod.arm.length
     size = 6 * count
     K = np.zeros((size + 6, size + 6))
@@ -82,7 +81,7 @@ def stiffness_left(problem: ContactProblem, state: Contacts, system: ContactSyst
     K[3:6, :3] += hat(R0 @ follower[:3])
 
     held = []
-    for j, (touch, row) in enumerate(zip(state.touches, system.rows, strict=True)):
+    for j, (touch, row) in enumerate(zip(state.touches, arm.rows, strict=True)):
         node, f = int(state.mesh.node[j]), touch.normal_force
         n, H = row.point.normal, row.point.curvature
         at = slice(6 * node + 3, 6 * node + 6)
@@ -95,8 +94,8 @@ def stiffness_left(problem: ContactProblem, state: Contacts, system: ContactSyst
         else:
             held.append(gap)
         if not touch.pinned:
-            slope = _slope_change(problem, state, system, j, responses)
-            bend = max(system.bend(j), _FLATTEST)
+            slope = _slope_change(arm, j, responses)
+            bend = max(arm.bend(j), _FLATTEST)
             K += f / bend * np.outer(slope, slope)
     scale = np.tile(np.r_[np.full(3, 1 / length), np.ones(3)], count)
     K = scale[:, None] * K * scale
@@ -108,19 +107,13 @@ def stiffness_left(problem: ContactProblem, state: Contacts, system: ContactSyst
     return np.asarray(K)
 
 
-def _slope_change(
-    problem: ContactProblem,
-    state: Contacts,
-    system: ContactSystem,
-    j: int,
-    responses: list[Vector],
-) -> Vector:
+def _slope_change(arm: LeaningArm, j: int, responses: list[Vector]) -> Vector:
     """Change of the gap's slope at a contact by the poses of the nodes."""
-    linear = system.linear
+    state, linear = arm.state, arm.shape
     node = int(state.mesh.node[j])
     size = 6 * len(linear.h)
-    touch, row = state.touches[j], system.rows[j]
-    here = problem.rod.ranges[touch.range]
+    touch, row = state.touches[j], arm.rows[j]
+    here = arm.problem.rod.ranges[touch.range]
     n, H, mean = row.point.normal, row.point.curvature, row.mean
     found = np.zeros(size + 6)
     at = 6 * node

@@ -14,7 +14,10 @@ from numpy.typing import NDArray
 from stiffopt import lie
 from stiffopt.model.batch import BatchFunction, InterpretedFunction
 from stiffopt.model.codegen import dense
-from stiffopt.model.compiled import library
+from stiffopt.model.compiled import Library, library
+from stiffopt.model.compiler import NATIVE
+from stiffopt.model.contact.surface import surface_function
+from stiffopt.model.obstacles import OBSTACLES
 from stiffopt.model.shooting import slopes
 
 Vector = NDArray[np.float64]
@@ -23,6 +26,8 @@ STEP_LENGTH = 1.5
 """Longest step, in outer radii of the segment at rest."""
 
 _NAME = "contact_step"
+_SOURCES = (str(NATIVE / "contact.c"),)
+_LOOKED_FOR_AGAIN = 64  # calls, while machine code is being made
 _STAGES = ((0.0, 1 / 6), (0.5, 1 / 3), (0.5, 1 / 3), (1.0, 1 / 6))  # share of the step, weight
 
 
@@ -38,29 +43,36 @@ class StepFunction:
 
     def __init__(self, sparsity: ca.Sparsity, weighted: bool, eccentric: bool) -> None:
         self._key = (tuple(sparsity.row()), tuple(sparsity.colind()), weighted, eccentric)
-        self._make = partial(step_functions, *self._key)
-        self._best: BatchFunction | None = None
+        self._code: Library | None = None
         self._interpreted: BatchFunction | None = None
         self._calls = 0
 
+    @property
+    def code(self) -> Library | None:
+        """Machine code of the step, of all surfaces and of native/contact.c, if there is any."""
+        if self._code is None and self._calls % _LOOKED_FOR_AGAIN == 0:
+            self._code = library(
+                ("contacts of a rod", *self._key), partial(contact_functions, *self._key), _SOURCES
+            )
+        self._calls += 1
+        return self._code
+
     def __call__(self, *arguments: Vector) -> list[Vector]:
         """Many steps; the arguments are those of `step_function`, with a leading axis."""
-        if self._best is None and self._calls % 64 == 0:
-            code = library(("steps of a rod", *self._key), self._make)
-            self._best = None if code is None else code.function(_NAME)
-        self._calls += 1
-        if self._best is not None:
-            return self._best.many(*arguments, threads=1)
+        if self.code is not None:
+            return self.code.function(_NAME).many(*arguments, threads=1)
         if self._interpreted is None:
-            self._interpreted = InterpretedFunction(dense(self._make()[0]))
+            self._interpreted = InterpretedFunction(dense(contact_functions(*self._key)[0]))
         return self._interpreted.many(*arguments)
 
 
-def step_functions(
+def contact_functions(
     rows: tuple[int, ...], starts: tuple[int, ...], weighted: bool, eccentric: bool
 ) -> list[ca.Function]:
-    """The function of `StepFunction`."""
-    return [step_function(ca.Sparsity(6, 6, starts, rows), weighted, eccentric)]
+    """The step of some sections, and the surfaces of all kinds of objects that have a formula."""
+    step = step_function(ca.Sparsity(6, 6, starts, rows), weighted, eccentric)
+    kinds = [kind for kind in OBSTACLES.values() if not kind.is_interpolated]
+    return [step, *(dense(surface_function(kind)) for kind in kinds)]
 
 
 def step_function(sparsity: ca.Sparsity, weighted: bool, eccentric: bool) -> ca.Function:

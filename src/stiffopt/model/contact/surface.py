@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from stiffopt.model.batch import InterpretedFunction
 from stiffopt.model.codegen import dense
+from stiffopt.model.compiled import Library
 from stiffopt.model.distances import MeasuredObject
 from stiffopt.model.obstacle import Obstacle
 from stiffopt.model.obstacles.mesh import Mesh
@@ -38,6 +39,8 @@ class ContactSurface:
     friction : coefficient.
     softness : by how much it gives way, in m/N.
     begin : arc length at rest from which the arm's body counts, in m.
+    key, pieces : kind of the object, and the numbers (k, size) of its formula.
+    is_interpolated : whether it has a grid instead.
     """
 
     def __init__(self, item: SceneObject, begin: float) -> None:
@@ -48,23 +51,28 @@ class ContactSurface:
         self.softness = 0.0 if item.contact.stiffness is None else 1 / item.contact.stiffness
         self.begin = begin
         self._shape = item.shape
-        self._pieces = np.array(item.shape.pieces, dtype=float)
-        self._function = None if item.shape.is_interpolated else _second_order(type(item.shape))
+        self.key, self.pieces = item.shape.key, np.array(item.shape.pieces, dtype=float)
+        self.is_interpolated = item.shape.is_interpolated
+        self._function = None if self.is_interpolated else _second_order(type(item.shape))
 
     @cached_property
     def _measured(self) -> MeasuredObject:
         return MeasuredObject(self._shape, self.begin)
 
-    def distances(self, points: Vector) -> Vector:
-        """Distances (k,) of points (k, 3), in m."""
-        return self._measured.distances(points).values
+    def distances(self, points: Vector, code: Library | None = None) -> Vector:
+        """Distances (k,) of points (k, 3), in m; by machine code of the formulas if it is given."""
+        if code is None or self.is_interpolated:
+            return self._measured.distances(points).values
+        formula = code.function(f"surface_{self.key}")
+        found = [formula.many(points, piece, threads=1)[0][:, 0, 0] for piece in self.pieces]
+        return np.asarray(np.max(found, axis=0))
 
     def at(self, point: Vector) -> SurfacePoint:
         """Distance of one point (3,) with its derivatives."""
         if self._function is None:
             return self._smoothed(point)
         best = None
-        for piece in self._pieces:
+        for piece in self.pieces:
             value, normal, curvature = self._function(point, piece)
             if best is None or value[0, 0] > best.distance:
                 best = SurfacePoint(float(value[0, 0]), normal[:, 0], curvature)
@@ -94,9 +102,14 @@ _FIT = np.linalg.pinv(
 )
 
 
-@cache
-def _second_order(kind: type[Obstacle]) -> InterpretedFunction:
+def surface_function(kind: type[Obstacle]) -> ca.Function:
+    """Distance, gradient and second derivatives of a kind's formula, for a point and a piece."""
     point, q = ca.SX.sym("point", 3), ca.SX.sym("parameters", kind.n_parameters)
     hessian, gradient = ca.hessian(kind.formula(point, q), point)
     outputs = ca.cse([kind.formula(point, q), ca.densify(gradient), ca.densify(hessian)])
-    return InterpretedFunction(dense(ca.Function("surface", [point, q], outputs)))
+    return dense(ca.Function(f"surface_{kind.key}", [point, q], outputs))
+
+
+@cache
+def _second_order(kind: type[Obstacle]) -> InterpretedFunction:
+    return InterpretedFunction(surface_function(kind))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -16,8 +17,10 @@ from stiffopt.model.contact.rod import (
     RodMesh,
     RodNodes,
     RodSections,
+    RodShape,
     hat,
 )
+from stiffopt.model.contact.stability import is_stable
 from stiffopt.model.contact.surface import SurfacePoint
 
 if TYPE_CHECKING:
@@ -71,24 +74,81 @@ class ContactRow:
     radius: float
     gap: float
     mean: Vector
-    mean_change: Vector
     slope: float
 
 
-class ContactSystem:
+class LeaningArm:
+    """An arm in contact: where it is, and what is known of its contacts.
+
+    Attributes
+    ----------
+    rows : of each contact.
+    gaps : of the surfaces (surfaces, k) at stations of the body, once they were looked at, in m.
+    """
+
+    def __init__(
+        self,
+        problem: ContactProblem,
+        state: Contacts,
+        shape: RodShape,
+        rows: list[ContactRow],
+    ) -> None:
+        self.problem, self.state, self.shape, self.rows = problem, state, shape, rows
+        self.gaps = np.full((len(problem.surfaces), 1), np.inf)
+        self.minimum: bool | None = None  # of the energy; None: not known yet
+
+    @property
+    def is_stable(self) -> bool:
+        """Whether the energy is at a minimum, see `stiffopt.model.contact.stability`."""
+        if self.minimum is None:
+            self.minimum = is_stable(self)
+        return self.minimum
+
+    def bend(self, j: int) -> float:
+        """Second derivative of the gap along the arm at a contact, in 1/m."""
+        shape, touch, row = self.shape, self.state.touches[j], self.rows[j]
+        here, n, t = self.problem.rod.ranges[touch.range], row.point.normal, row.mean
+        own = float(t @ row.point.curvature @ t)
+        if here.rigid:
+            return own
+        node = self.state.mesh.node[j]
+        R, C = shape.rotation[node], shape.sections.compliance[here.segment]
+        force = R.T @ (shape.force_far[node] + touch.force / 2)
+        moment = R.T @ shape.moment_far[node]
+        xi = shape.sections.strain[here.segment] + C @ np.concatenate([force, moment])
+        v, u = xi[:3], xi[3:]
+        slope = np.concatenate([-np.cross(u, force), -np.cross(v, force) - np.cross(u, moment)])
+        return own + float(n @ R @ (np.cross(u, v) + C[:3] @ slope))
+
+    def kink(self, j: int) -> tuple[float, float]:
+        """How deep and how far, in m, the centre line's kink at a force enters a surface.
+
+        Shear bends the line towards the surface on both sides of a point force; in truth the
+        force is spread over this length, along which the line follows the surface.
+        """
+        shape, touch, row = self.shape, self.state.touches[j], self.rows[j]
+        here = self.problem.rod.ranges[touch.range]
+        if here.rigid:
+            return 0.0, 0.0
+        d = shape.rotation[self.state.mesh.node[j]].T @ row.point.normal
+        shear = touch.normal_force * float(d @ shape.sections.compliance[here.segment, :3, :3] @ d)
+        bend = max(self.bend(j), _FLAT)
+        return shear**2 / (8 * bend), shear / bend
+
+
+class ContactSystem(LeaningArm):
     """The linear equations about a state: of the rod and of its contacts.
 
     Unknown are those of `LinearRod` and the normal forces.
 
     Parameters
     ----------
-    sticking : whether contacts roll without slipping, as those with friction do at first, instead
-        of sliding.
+    sticking : which contacts roll without slipping, as those with friction do at first; the others
+        slide.
 
     Attributes
     ----------
     matrix, right : of the equations, (u, u) and (u, e) for each extra.
-    clearances : of the surfaces, in m, where they were looked at.
     """
 
     def __init__(
@@ -97,9 +157,8 @@ class ContactSystem:
         state: Contacts,
         sections: RodSections,
         extras: str = "defects",
-        sticking: bool = False,
+        sticking: Collection[int] = (),
     ) -> None:
-        self._problem, self._state = problem, state
         touches, k = state.touches, len(state.touches)
         forces = np.array([touch.force for touch in touches]).reshape(k, 3)
         self.loads = PointLoads(forces, np.zeros((k, 3)))
@@ -109,9 +168,13 @@ class ContactSystem:
         u = linear.unknowns
         size, width = u + k, linear.changes.shape[2] - u
         self.matrix, self.right = np.zeros((size, size)), np.zeros((size, width))
+        super().__init__(problem, state, linear, [])
+        changes = []
+        for j in range(k):
+            row, change = self._row(j)
+            self.rows.append(row)
+            changes.append(change)
         self._require(slice(0, 3), linear.changes[-1, TURN])
-        self.rows = [self._row(j) for j in range(k)]
-        self.clearances = np.full(len(problem.surfaces), np.inf)
         for j, (touch, row) in enumerate(zip(touches, self.rows, strict=True)):
             surface = problem.surfaces[touch.surface]
             node, first = int(state.mesh.node[j]), 3 + 7 * j
@@ -125,7 +188,7 @@ class ContactSystem:
             if touch.pinned:
                 self.matrix[first + 6, first + 6] = 1
             else:
-                self._require(first + 6, row.mean @ H @ dc + n @ row.mean_change)
+                self._require(first + 6, row.mean @ H @ dc + n @ changes[j])
             self._require(u + j, n @ dc)
             self.matrix[u + j, u + j] = surface.softness
             if linear.section_slopes is not None:
@@ -135,20 +198,20 @@ class ContactSystem:
                 self.right[force, 0] += touch.normal_force * (n + touch.drag) - touch.force
                 self.right[first + 6, 0] -= 0 if touch.pinned else row.slope
                 self.right[u + j, 0] -= row.gap
-            if sticking:
+            if j in sticking:
                 self._stick(j)
 
-    def _row(self, j: int) -> ContactRow:
-        """What the equations of a contact need."""
-        state, linear = self._state, self.linear
+    def _row(self, j: int) -> tuple[ContactRow, Vector]:
+        """What the equations of a contact need, and the change (3, c) of the mean tangent."""
+        state, linear = self.state, self.linear
         touch = state.touches[j]
-        here, surface = self._problem.rod.ranges[touch.range], self._problem.surfaces[touch.surface]
+        here, surface = self.problem.rod.ranges[touch.range], self.problem.surfaces[touch.surface]
         point = surface.at(linear.position[state.mesh.node[j]])
         mean, change = linear.tangent_change(j, self.loads, here.segment, here.rigid)
         radius = float(linear.sections.radius[here.segment])
         gap = point.distance - radius + float(state.condition.retreat[touch.surface])
         gap += surface.softness * touch.normal_force
-        return ContactRow(point, radius, gap, mean, change, float(point.normal @ mean))
+        return ContactRow(point, radius, gap, mean, float(point.normal @ mean)), change
 
     def _require(self, at: Any, change: Vector) -> None:
         """Have a change (..., c) vanish."""
@@ -158,9 +221,9 @@ class ContactSystem:
 
     def _stick(self, j: int) -> None:
         """Force and moment of a contact whose point of the body stays where it is."""
-        linear, touch, row = self.linear, self._state.touches[j], self.rows[j]
-        node, first, u = int(self._state.mesh.node[j]), 3 + 7 * j, linear.unknowns
-        here = self._problem.rod.ranges[touch.range]
+        linear, touch, row = self.linear, self.state.touches[j], self.rows[j]
+        node, first, u = int(self.state.mesh.node[j]), 3 + 7 * j, linear.unknowns
+        here = self.problem.rod.ranges[touch.range]
         n, H, lever = row.point.normal, row.point.curvature, -row.radius * row.point.normal
         dc, turn = linear.moves[node].copy(), linear.changes[node, TURN].copy()
         # of the material section, which the station moves along
@@ -182,37 +245,6 @@ class ContactSystem:
         self._require(moment, -turning)
         self.matrix[moment, moment] += np.eye(3)
         self.matrix[moment, force] -= hat(lever)
-
-    def bend(self, j: int) -> float:
-        """Second derivative of the gap along the arm at a contact, in 1/m."""
-        linear, touch, row = self.linear, self._state.touches[j], self.rows[j]
-        here, n, t = self._problem.rod.ranges[touch.range], row.point.normal, row.mean
-        own = float(t @ row.point.curvature @ t)
-        if here.rigid:
-            return own
-        node = self._state.mesh.node[j]
-        R, C = linear.rotation[node], linear.sections.compliance[here.segment]
-        force = R.T @ (linear.force_far[node] + touch.force / 2)
-        moment = R.T @ linear.moment_far[node]
-        xi = linear.sections.strain[here.segment] + C @ np.concatenate([force, moment])
-        v, u = xi[:3], xi[3:]
-        slope = np.concatenate([-np.cross(u, force), -np.cross(v, force) - np.cross(u, moment)])
-        return own + float(n @ R @ (np.cross(u, v) + C[:3] @ slope))
-
-    def kink(self, j: int) -> tuple[float, float]:
-        """How deep and how far, in m, the centre line's kink at a force enters a surface.
-
-        Shear bends the line towards the surface on both sides of a point force; in truth the
-        force is spread over this length, along which the line follows the surface.
-        """
-        linear, touch, row = self.linear, self._state.touches[j], self.rows[j]
-        here = self._problem.rod.ranges[touch.range]
-        if here.rigid:
-            return 0.0, 0.0
-        d = linear.rotation[self._state.mesh.node[j]].T @ row.point.normal
-        shear = touch.normal_force * float(d @ linear.sections.compliance[here.segment, :3, :3] @ d)
-        bend = max(self.bend(j), _FLAT)
-        return shear**2 / (8 * bend), shear / bend
 
     def solution(self) -> Vector:
         """Unknowns (u, e) of each extra."""
