@@ -31,7 +31,7 @@ from stiffopt.model.robot_files import load_description
 from stiffopt.optimise.press import soft_directions
 from stiffopt.paths.trajectory import Trajectory, Waypoint
 from stiffopt.plant.plant import Plant
-from stiffopt.plant.settings import PlantLoad, PlantSettings, Surface
+from stiffopt.plant.settings import PlantLoad, PlantSettings, SoftSurface
 from stiffopt.rig.assembly import make_rig
 from stiffopt.rig.config import limits_of, load_rig_description, slew_of
 
@@ -63,7 +63,9 @@ class Found:
 class Arm:
     """An arm under control, in simulated time."""
 
-    def __init__(self, name: str, seed: int, dynamics: str, surface: Surface | None = None) -> None:
+    def __init__(
+        self, name: str, seed: int, dynamics: str, surface: SoftSurface | None = None
+    ) -> None:
         description = load_rig_description(RIG)
         robot = load_description(name)
         rng = np.random.default_rng([seed, 21])
@@ -200,7 +202,7 @@ def press(name: str, seed: int, dynamics: str, found: Found) -> None:
         else:
             return
     stiffness, away = float(np.exp(rng.uniform(np.log(100), np.log(1000)))), rng.uniform(2e-3, 8e-3)
-    surface = Surface(
+    surface = SoftSurface(
         point=tuple((pose[:3, 3] + away * way).tolist()), normal=tuple((-way).tolist()),
         stiffness=stiffness,
     )  # fmt: skip

@@ -22,7 +22,7 @@ from stiffopt.optimise.solver import PressureSolver
 from stiffopt.optimise.task import Load
 from stiffopt.optimise.tip import TipModel
 from stiffopt.plant.devices import SimulatedRig
-from stiffopt.plant.settings import Surface
+from stiffopt.plant.settings import SoftSurface
 from stiffopt.rig.assembly import make_rig
 from stiffopt.rig.config import limits_of, load_rig_description, slew_of
 
@@ -379,7 +379,7 @@ def test_a_press_that_makes_no_sense_is_refused(update: dict[str, Any], why: str
 
 def test_a_surface_pushes_back_and_a_mounted_probe_takes_its_place() -> None:
     description, robot = _rig()
-    surface = Surface(point=(0.0, 0.0, 0.0), normal=(-1, 0, 0), stiffness=100.0)
+    surface = SoftSurface(point=(0.0, 0.0, 0.0), normal=(-1, 0, 0), stiffness=100.0)
     plant = description.plant.model_copy(update={"surface": surface, "dynamics": "quasi-static"})
     rig = cast("SimulatedRig", make_rig(description.model_copy(update={"plant": plant}), robot))
     with rig:

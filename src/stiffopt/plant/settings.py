@@ -171,7 +171,7 @@ class PlantLoad(Schema):
     at: Annotated[Length, NotNegative] | None = None
 
 
-class Surface(Schema):
+class SoftSurface(Schema):
     """A flat soft surface that the tip may press on, without friction.
 
     Attributes
@@ -238,7 +238,7 @@ class PlantSettings(RigSection):
     payload: Annotated[Mass, NotNegative] = 0.0
     gravity: Vector[Acceleration] | None = None
     load: PlantLoad | None = None
-    surface: Surface | None = None
+    surface: SoftSurface | None = None
     faults: bool = False
     discretisation: Discretisation = Discretisation()
 
