@@ -240,6 +240,32 @@ def nidaq(limits: Limits) -> Iterator[Bench]:
 
 
 @contextmanager
+def open_regulator(limits: Limits) -> Iterator[Bench]:
+    """The firmware's own logic on this machine, in a loop with pneumatics, on the bench's clock."""
+    from firmware_loop import LoopPort, logic
+    from stiffopt.rig.drivers.open_regulator import OpenRegulatorSettings, OpenRegulatorSupply
+    from stiffopt.rig.drivers.open_regulator_line import BoardLine
+
+    clock = HandClock()
+    bounds = [high for high in (limits.channel, limits.register) if high is not None]
+    channel: dict[str, Any] = {"max": min(bounds)} if bounds else {}
+    channels = [{"output": k + 1, **channel} for k in range(N)]
+    port = LoopPort(logic(), clock)
+
+    class Line(BoardLine):
+        def _port(self) -> Any:
+            return port
+
+    class Supply(OpenRegulatorSupply):
+        def _new_line(self) -> BoardLine:
+            return Line("loop", 500_000, 1, 5.0)
+
+    settings = OpenRegulatorSettings(port="loop", startup=0.1, channels=channels)
+    supply = Supply(settings, settings.limits_within(_robot_limits()), clock)
+    yield Bench(supply, clock, limits, 10.0, _safety(limits), port.wire)
+
+
+@contextmanager
 def simulated(limits: Limits) -> Iterator[Bench]:
     from stiffopt.rig.assembly import make_rig
     from stiffopt.rig.config import RigDescription
@@ -287,6 +313,7 @@ DRIVERS: dict[str, Callable[[Limits], AbstractContextManager[Bench]]] = {
     "modbus": modbus,
     "modbus-at-once": lambda limits: modbus(limits, table="holding"),
     "nidaq": nidaq,
+    "open-regulator": open_regulator,
     "third-party": third_party,
 }
 

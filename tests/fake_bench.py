@@ -59,6 +59,13 @@ class FakeBench:
             self.commands.append((channel, float(pressure)))
             self.pressures[channel] = pressure
 
+    def fill(self, pressures: ArrayLike) -> None:
+        with self._lock:
+            self.pressures = np.array(pressures, float)
+
+    def channel_faults(self) -> dict[int, str]:
+        return dict.fromkeys(range(self.n), self.fault("supply"))
+
     def measured(self) -> Array:
         return self.pressures_in_arm if self.readings is None else np.array(self.readings, float)
 

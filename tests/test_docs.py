@@ -106,6 +106,7 @@ SECTIONS = {  # of files.md, by how the module of a schema begins; the first tha
     "stiffopt.rig.drivers.nidaq": "Driver nidaq",
     "stiffopt.rig.drivers.aurora": "Drivers aurora and openigtlink",
     "stiffopt.rig.drivers.openigtlink": "Drivers aurora and openigtlink",
+    "stiffopt.rig.drivers.open_regulator": "Driver open-regulator",
     "stiffopt.rig.drivers": "Driver probe",
     "stiffopt.rig": "Rig file",
     "stiffopt.plant": "Rig file",

@@ -34,7 +34,7 @@ from stiffopt.safety.vent import vent_rig
 ROOT = Path(__file__).parent.parent
 ROBOT = load_description("stiff-flop-1")
 BUILT_IN = {
-    "supply": ("simulated", "modbus", "nidaq"),
+    "supply": ("simulated", "modbus", "nidaq", "open-regulator"),
     "tracker": ("simulated", "aurora", "openigtlink"),
     "probe": ("simulated", "probe"),
 }
@@ -256,7 +256,7 @@ def test_mistakes_in_its_keys_are_told_as_those_of_any_driver(
 @pytest.mark.parametrize(
     ("driver", "said"),
     [
-        ("lime", "did you mean 'line'.*expected simulated, modbus, nidaq or line"),
+        ("lime", "did you mean 'line'.*expected simulated, modbus, nidaq, open-regulator or line"),
         ("nowhere_at_all:Settings", "is not installed: there is no module 'nowhere_at_all'"),
         ("line_driver.deeper:Settings", "is not installed"),
         ("line_driver:Nobody", "has no class 'Nobody'"),

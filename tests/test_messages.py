@@ -243,7 +243,11 @@ SHAPES: list[dict[str, Any]] = [
 SCENE = Scene(
     clearance=0.001,
     objects=[
-        {"name": f"{k}", "contact": {"allowed": True, "max_force": 0.3, "friction": 0.2}, **shape}
+        {
+            "name": f"{k}",
+            "contact": {"allowed": True, "max_force": 0.3, "friction": 0.2, "stiffness": 50.0},
+            **shape,
+        }
         for k, shape in enumerate(SHAPES)
     ],
 )

@@ -389,7 +389,7 @@ objects:
   - {name: table, half_space: {point: [0 mm, 0 mm, 260 mm], normal: [0, 0, -1]}}
   - name: post
     sphere: {centre: [0 mm, 40 mm, 120 mm], radius: 5 mm}
-    contact: {allowed: true, max_force: 0.3 N, friction: 0.2}
+    contact: {allowed: true, max_force: 0.3 N, friction: 0.2, stiffness: 50 N/m}
   - {name: organ, mesh: {file: organ.stl, scale: 1 mm, centre: [0 mm, 90 mm, 100 mm]}}
   - name: lumen
     inside_tube: {points: [[0 mm, 0 mm, -5 mm], [0 mm, 0 mm, 300 mm]], radius: 150 mm}
@@ -416,7 +416,8 @@ def test_a_scene_file_is_read(folder):
     )
     contact = scene.objects[2].contact
     assert contact is not None
-    assert (contact.allowed, contact.max_force, contact.friction) == (True, 0.3, 0.2)
+    assert (contact.allowed, contact.max_force) == (True, 0.3)
+    assert (contact.friction, contact.stiffness) == (0.2, 50.0)
     mesh = scene.objects[3].shape
     assert isinstance(mesh, Mesh)
     assert mesh.file == folder / "organ.stl"
@@ -462,8 +463,8 @@ BAD = {
     "file: organ.stl": ("file: lung.stl", 9, "objects[3].mesh.file", "there is no file"),
     "file: organ": ("file: ../organ", 9, "objects[3].mesh.file", "there is no file"),
     "scale: 1 mm": ("scale: 0 mm", 9, "objects[3].mesh.scale", "must be greater than 0"),
-    "{allowed: true": ("{allowed: true, stiffness: 3", 8, "objects[2].contact.stiffness",
-                       "the keys here are allowed, max_force, friction"),
+    "{allowed: true": ("{allowed: true, grip: 3", 8, "objects[2].contact.grip",
+                       "the keys here are allowed, max_force, friction, stiffness"),
     "max_force: 0.3 N": ("max_force: 0.3 m", 8, "objects[2].contact.max_force", "not a unit of"),
     "block, box: {": ("block, sphere: {centre: [1 m, 1 m, 1 m], radius: 1 mm}, box: {", 13,
                       "objects[6].sphere", "second shape, beside box"),

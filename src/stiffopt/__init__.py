@@ -38,6 +38,9 @@ if TYPE_CHECKING:
     from stiffopt.logs import read_log as read_log
     from stiffopt.logs import read_mcap_log as read_mcap_log
     from stiffopt.logs import read_stiffness_table as read_stiffness_table
+    from stiffopt.model.contact.equilibrium import Contact as Contact
+    from stiffopt.model.contact.equilibrium import ContactEquilibrium as ContactEquilibrium
+    from stiffopt.model.contact.push import ContactLoss as ContactLoss
     from stiffopt.model.description import RobotDescription as RobotDescription
     from stiffopt.model.history import History as History
     from stiffopt.model.history import Memory as Memory
@@ -108,6 +111,8 @@ _NAMES = {
     "stiffopt.logs": (
         *("Log", "StiffnessTable", "read_log", "read_mcap_log", "read_stiffness_table"),
     ),
+    "stiffopt.model.contact.equilibrium": ("Contact", "ContactEquilibrium"),
+    "stiffopt.model.contact.push": ("ContactLoss",),
     "stiffopt.model.description": ("RobotDescription",),
     "stiffopt.model.history": ("History", "Memory"),
     "stiffopt.model.manipulator": ("Manipulator", "load_robot"),

@@ -27,7 +27,8 @@ LAB_HELP = """\
 Start a simulated arm in real time behind the protocols of a rig file's devices.
 
 The devices of RIG are emulated on this machine: a Modbus server, an NDI Aurora on a
-pseudo-terminal, an OpenIGTLink server, an NI-DAQ gRPC server, a Zaber stage on TCP. The rig file
+pseudo-terminal, an OpenIGTLink server, an NI-DAQ gRPC server, a Zaber stage on TCP, the firmware of
+an open regulator in a simulated microcontroller. The rig file
 that is printed drives them with the real drivers. Simulated devices of RIG are replaced by real
 ones (--supply, --tracker). Ends with Ctrl-C.
 
@@ -60,7 +61,7 @@ def lab(
         str,
         typer.Option(
             metavar="DRIVER",
-            help="In place of a simulated supply: modbus, nidaq or that of an installed package.",
+            help="In place of a simulated supply: modbus, nidaq, open-regulator or a package's.",
         ),
     ] = "modbus",
     tracker: Annotated[

@@ -10,10 +10,10 @@ from concurrent.futures import Future
 from contextlib import AbstractAsyncContextManager, suppress
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from stiffopt.errors import DeviceError, InputError
 from stiffopt.rig.device import DeviceSettings
@@ -108,6 +108,14 @@ class Bench:
         """Give a regulator (counted from 0) its set-point, in Pa."""
         self.world.command_channel(channel, pressure)
 
+    def fill(self, pressures: ArrayLike) -> None:
+        """Put pressures (n,), in Pa, into the chambers: a peer has regulators of its own."""
+        self.world.fill(pressures)
+
+    def channel_faults(self) -> dict[int, str]:
+        """Return the supply's faults by channel, counted from 0."""
+        return self.world.channel_faults()
+
     def measured(self) -> Array:
         """Pressures (n,) that the regulators report, in Pa."""
         return self.world.measured()
@@ -172,7 +180,13 @@ class DevicePeer(ABC, Generic[SettingsT]):
         scales, channels), so that a lab can rehearse with its own file.
     bench :
         What is behind it.
+
+    Attributes
+    ----------
+    faults : what this device can do wrong beyond the faults of all devices of its kind.
     """
+
+    faults: ClassVar[tuple[str, ...]] = ()
 
     def __init__(self, settings: SettingsT, bench: Bench) -> None:
         self.settings = settings

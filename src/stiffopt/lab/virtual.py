@@ -128,6 +128,7 @@ class VirtualLab:
                     continue
                 peer = _peer_class(type(settings))(settings, self.bench)
                 self._peers.append(peer)
+                self.world.known_faults[name] += peer.faults
                 addressed[name] = peer.start()
             self.bench.start()
             stack.pop_all()

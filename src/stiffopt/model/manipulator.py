@@ -21,6 +21,11 @@ from stiffopt.model.arm import Arm, Values
 from stiffopt.model.arm_clearance import ArmClearance, Clearances
 from stiffopt.model.body_symbols import Along, body_function
 from stiffopt.model.compliance import Boundary, Frame, Kind
+from stiffopt.model.contact.equilibrium import (
+    Approach,
+    ContactEquilibrium,
+    contact_equilibrium,
+)
 from stiffopt.model.description import Compensation, RobotDescription
 from stiffopt.model.equilibrium import dead_and_follower
 from stiffopt.model.history import NO_HISTORY
@@ -147,6 +152,43 @@ class Manipulator(Arm, ShownInNotebook):
         values = self._checked(p)
         found = ArmClearance(self, _checked_scene(scene)).each(np.atleast_2d(values))
         return found.only() if values.ndim == 1 else found
+
+    # -- contact ----------------------------------------------------------------------------
+
+    def contact_equilibrium(
+        self,
+        p: ArrayLike,
+        scene: Scene,
+        load: ArrayLike | Wrench | None = None,
+        approach: Approach = "pressures",
+        nearby: ContactEquilibrium | None = None,
+    ) -> ContactEquilibrium:
+        """Equilibrium of the arm leaning on those objects of a scene that allow contact.
+
+        Surfaces only push, along their normals; the body is that of `clearance`. What objects
+        that allow no contact would do is left out: see `clearances`.
+
+        Parameters
+        ----------
+        p : (n,)
+            Pressures in Pa.
+        scene : Scene
+        load : (6,), optional
+            A further dead force and moment at the tip, in base axes, in N and N m.
+        approach : {"pressures", "objects"}
+            How the equilibrium is reached from rest, where there are several: the objects are in
+            place and pressures and loads grow together, or the objects come, each along its
+            normals, to the arm that is already under pressure and load.
+        nearby : ContactEquilibrium, optional
+            Instead: the straight way from this one, of the same arm and scene.
+
+        Raises
+        ------
+        EquilibriumError
+            If none is reached continuously: the arm slips off an object, snaps or buckles on the
+            way. The message says where.
+        """
+        return contact_equilibrium(self, p, _checked_scene(scene), load, approach, nearby)
 
     # -- compliance -------------------------------------------------------------------------
 

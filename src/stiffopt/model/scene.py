@@ -28,7 +28,7 @@ from stiffopt.model.description import RobotDescription
 from stiffopt.model.obstacle import Obstacle
 from stiffopt.model.obstacles import OBSTACLES
 from stiffopt.schema import BadKeyError, Items, Schema
-from stiffopt.units import Force, Length, Number
+from stiffopt.units import Force, Length, Number, TranslationalStiffness
 
 
 class AllowedContact(Schema):
@@ -36,14 +36,16 @@ class AllowedContact(Schema):
 
     Attributes
     ----------
-    allowed : whether tasks may brace the arm on it or press it.
+    allowed : whether the arm may lean on it, and tasks may brace it there or press it.
     max_force : largest force on it, in N, or None for no limit.
     friction : coefficient of friction.
+    stiffness : force per depth with which a soft object gives way, in N/m, or None: it is rigid.
     """
 
     allowed: bool = False
     max_force: Annotated[Force, Field(gt=0)] | None = None
     friction: Annotated[Number, Field(ge=0)] = 0.0
+    stiffness: Annotated[TranslationalStiffness, Field(gt=0)] | None = None
 
 
 if TYPE_CHECKING:

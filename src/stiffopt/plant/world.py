@@ -82,6 +82,8 @@ class World:
         self.lock = threading.RLock()
         self.supply = supply
         self.faults = dict.fromkeys(FAULTS, "ok")
+        self.known_faults = dict(FAULTS)
+        """What can be injected; a device of the virtual lab may add faults of its own."""
         self._faulty: dict[int, str] = {}
         self._real_time = real_time
         n, step = limits.n, self.plant.step
@@ -101,6 +103,7 @@ class World:
         self.set_point = np.zeros(n)
         """What the regulators were told (n,), in Pa."""
         self._commanded_at = 0.0
+        self._filled: Array | None = None  # pressures that something else than the regulators makes
         self.pressures = np.zeros(n)
         """In the chambers (n,), in Pa."""
         streams = np.random.SeedSequence([plant.seed, 2]).spawn(4)
@@ -159,16 +162,21 @@ class World:
 
     def _run(self, steps: int) -> None:
         trace = np.empty((steps, self._n))
-        ripple = self.supply.ripple * self._ripple.standard_normal((steps, self._n))
-        self._first = regulate(
-            self._regulators,
-            self._delayed,
-            self._first,
-            self.set_point,
-            self.pressures,
-            ripple,
-            trace,
-        )
+        if self._filled is None:
+            ripple = self.supply.ripple * self._ripple.standard_normal((steps, self._n))
+            self._first = regulate(
+                self._regulators,
+                self._delayed,
+                self._first,
+                self.set_point,
+                self.pressures,
+                ripple,
+                trace,
+            )
+        elif steps:
+            midway = (np.arange(steps) + 0.5)[:, None] / steps
+            trace[:] = self.pressures + (self._filled - self.pressures) * midway
+            self.pressures[:] = self._filled
         self.stage.place_plate(steps)
         self.plant.follow(trace)
         self.stage.advance(steps)
@@ -197,6 +205,14 @@ class World:
             p = self.set_point.copy()
             p[channel] = pressure
             self.command(p)
+
+    def fill(self, pressures: ArrayLike) -> None:
+        """Put pressures (n,), in Pa, into the chambers; the regulators of the world are idle then.
+
+        The chambers reach them by the next step in which time passes.
+        """
+        with self.lock:
+            self._filled = np.array(pressures, dtype=float)
 
     def measured(self) -> Array:
         """Return the pressures (n,) that the regulators measure, in Pa."""
@@ -234,7 +250,7 @@ class World:
         Parameters
         ----------
         device, fault :
-            See `FAULTS`.
+            See `known_faults`.
         channel :
             Of the supply (from 0) that misbehaves; by default all do.
 
@@ -245,8 +261,9 @@ class World:
         """
         if not self.plant.settings.faults:
             raise InputError("faults are not enabled; say 'faults: true' in the rig file's plant")
-        if fault not in FAULTS.get(device, ()):
-            known = "; ".join(f"{name}: {', '.join(names)}" for name, names in FAULTS.items())
+        if fault not in self.known_faults.get(device, ()):
+            faults = self.known_faults.items()
+            known = "; ".join(f"{name}: {', '.join(names)}" for name, names in faults)
             raise InputError(f"there is no fault '{fault}' of '{device}'; there are {known}")
         if channel is not None and (device != "supply" or not 0 <= channel < self._n):
             raise InputError(f"there is no channel {channel + 1} of '{device}'")
@@ -257,6 +274,11 @@ class World:
                 self._set_faulty(fault, range(self._n) if channel is None else [channel])
             if device == "probe" and fault in IMMOBILE:
                 self.stage.stop()
+
+    def channel_faults(self) -> dict[int, str]:
+        """Return the supply's faults by channel, counted from 0."""
+        with self.lock:
+            return dict(self._faulty)
 
     def _set_faulty(self, fault: str, channels: range | list[int]) -> None:
         regulators, settings = self._regulators, self.supply

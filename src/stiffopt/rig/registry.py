@@ -36,6 +36,7 @@ _BUILT_IN = {
         "simulated": "stiffopt.plant.settings:SimulatedSupplySettings",
         "modbus": "stiffopt.rig.drivers.modbus:ModbusSettings",
         "nidaq": "stiffopt.rig.drivers.nidaq:NidaqSettings",
+        "open-regulator": "stiffopt.rig.drivers.open_regulator:OpenRegulatorSettings",
     },
     "tracker": {
         "simulated": "stiffopt.plant.settings:SimulatedTrackerSettings",

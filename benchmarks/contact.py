@@ -1,0 +1,249 @@
+"""Equilibria of arms that lean on objects, against an independent rod (`pressed_rod.py`).
+
+    python benchmarks/contact.py --cases 100 --out out/contact
+
+Random arms, with and without weight, at random pressures, half of them with a load, among one to
+three spheres, capsules and walls that the free arm would enter by up to 20 mm. A case is kept in
+the folder, and not computed again. JAX is needed; a case takes half a minute.
+
+Metrics, each the largest of a case's objects or directions: how far the tip is off, over the arm's
+length; the contact forces, over the largest of them; the tip's stiffness along a random direction,
+against that between two pushes of 0.1 mN; contacts above 1 mN that only one of the two has. Where a
+contact of more than 2 mN is lost by a push below 0.3 N, whether the independent rod has it at
+0.9 of that push and has it no more at 1.1.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+
+import stiffopt
+from independent import ARMS, Arm
+from report import table
+from stiffopt.errors import EquilibriumError
+
+_ELEMENTS = {"1 segment": 32, "2 segments": 16}
+
+
+def draw(seed: int) -> dict[str, Any]:
+    """A random case: arm, pressures, load and objects, clear of the arm at rest."""
+    rng = np.random.default_rng([20, seed])
+    name = ("2 segments", "1 segment", "2 segments")[seed % 3]
+    hangs, count = bool(seed // 3 % 2), 1 + seed // 6 % 3
+    arm = ARMS[name]
+    if hangs:
+        arm = arm.under((0, 0, 9.81), float(rng.uniform(0, 0.02)))
+    robot = stiffopt.Manipulator(stiffopt.RobotDescription(**arm.mapping()))
+    rest = robot.backbone(np.zeros(arm.n), 61)[:, :3, 3]
+    while True:
+        p = rng.uniform(0, 1.2e5, arm.n) * (rng.random(arm.n) < 0.8)
+        force = rng.normal(size=3) * 0.04 * (rng.random() < 0.5)
+        try:
+            T = robot.with_load(force).backbone(p, 61)
+        except EquilibriumError:
+            continue
+        objects = [_object(rng, T, arm.tubes[0].outer_radius) for _ in range(count)]
+        clear = all(_nearest(each, rest) > arm.tubes[0].outer_radius + 0.001 for each in objects)
+        if clear and T[-1, 2, 2] > np.cos(2):
+            break
+    direction = rng.normal(size=3)
+    return {
+        "seed": seed, "arm": name, "gravity": list(arm.gravity), "tip_mass": arm.tip_mass,
+        "pressures": p.tolist(), "force": force.tolist(), "objects": objects,
+        "direction": (direction / np.linalg.norm(direction)).tolist(),
+    }  # fmt: skip
+
+
+def _object(rng: np.random.Generator, T: Any, radius: float) -> tuple[int, list[float]]:
+    """One that presses the body at a random station from a random side."""
+    pose = T[round(rng.uniform(0.3, 1.0) * 60)]
+    angle, depth, own = (
+        rng.uniform(0, 2 * np.pi),
+        rng.uniform(0.001, 0.02),
+        rng.uniform(0.003, 0.02),
+    )
+    side = pose[:3, :3] @ [np.cos(angle), np.sin(angle), 0]
+    kind = rng.choice(["sphere", "capsule", "wall"], p=[0.25, 0.5, 0.25])
+    if kind == "wall":
+        return 1, [*(pose[:3, 3] - side * (radius - depth)), *side, 0.0]
+    centre = pose[:3, 3] - side * (radius + own - depth)
+    across = np.cross(side, rng.normal(size=3))
+    across *= 0.0 if kind == "sphere" else 0.06 / np.linalg.norm(across)
+    return 0, [*(centre - across), *(centre + across), own]
+
+
+def _nearest(item: tuple[int, list[float]], points: Any) -> float:
+    kind, numbers = item
+    a, b, r = np.array(numbers[:3]), np.array(numbers[3:6]), numbers[6]
+    if kind == 1:
+        return float(((points - a) @ b).min())
+    way = b - a
+    share = np.clip((points - a) @ way / max(way @ way, 1e-12), 0, 1)
+    return float(np.linalg.norm(points - a - share[:, None] * way, axis=1).min() - r)
+
+
+def scene_of(case: dict[str, Any]) -> stiffopt.Scene:
+    """The objects of a case as stiffopt takes them."""
+    objects = []
+    for index, (kind, numbers) in enumerate(case["objects"]):
+        a, b, r = numbers[:3], numbers[3:6], numbers[6]
+        shape: dict[str, Any] = {"capsule": {"from": a, "to": b, "radius": r}}
+        if kind == 1:
+            shape = {"half_space": {"point": a, "normal": b}}
+        elif a == b:
+            shape = {"sphere": {"centre": a, "radius": r}}
+        objects.append({"name": f"{index}", "contact": {"allowed": True}, **shape})
+    return stiffopt.Scene(objects=objects)
+
+
+def arm_of(case: dict[str, Any]) -> Arm:
+    """The arm of a case."""
+    return ARMS[case["arm"]].under(case["gravity"], case["tip_mass"])
+
+
+def found_by_stiffopt(case: dict[str, Any]) -> dict[str, Any]:
+    """What the model says of a case."""
+    robot = stiffopt.Manipulator(stiffopt.RobotDescription(**arm_of(case).mapping()))
+    p, d = np.array(case["pressures"]), np.array(case["direction"])
+    try:
+        eq = robot.contact_equilibrium(p, scene_of(case), load=[*case["force"], 0, 0, 0])
+    except EquilibriumError as error:
+        return {"error": str(error)}
+    forces = np.zeros(len(case["objects"]))
+    for contact in eq.contacts:
+        forces[int(contact.object)] += np.linalg.norm(contact.force)
+    free = robot.with_load(case["force"]).tip_pose(p)[:3, :3]
+    turn = np.arccos(np.clip((np.trace(free.T @ eq.tip_pose[:3, :3]) - 1) / 2, -1, 1))
+    loss = eq.lift_off(d, limit=0.3)
+    smallest = min((np.linalg.norm(each.force) for each in eq.contacts), default=0.0)
+    known = loss.object is not None and len(eq.contacts) == np.count_nonzero(forces)
+    return {
+        "tip": eq.tip_pose[:3, 3].tolist(), "forces": forces.tolist(), "stable": bool(eq.stable),
+        "stiffness": eq.stiffness(d), "turned_deg": float(np.degrees(turn)),
+        "free_stiffness": robot.with_load(case["force"]).stiffness(p, d),
+        "lost_at": loss.force if known and smallest > 2e-3 else None,
+        "lost": int(loss.object) if known else None,
+    }  # fmt: skip
+
+
+def found_by_rod(case: dict[str, Any], lost_at: float | None) -> dict[str, Any]:
+    """What the independent rod says of it."""
+    from pressed_rod import pressed, pushed
+
+    n, objects, d = _ELEMENTS[case["arm"]], case["objects"], np.array(case["direction"])
+    try:
+        state = pressed(arm_of(case), case["pressures"], objects, case["force"], n)
+        ends = [pushed(state, objects, sign * 1e-4 * d) for sign in (1, -1)]
+        around = []
+        if lost_at is not None and lost_at < 0.3:
+            first = pushed(state, objects, 0.9 * lost_at * d, steps=4)
+            second = pushed(first, objects, 0.2 * lost_at * d, steps=2)
+            around = [each.forces.tolist() for each in (first, second)]
+    except ArithmeticError as error:
+        return {"error": str(error)}
+    return {
+        "tip": state.tip.tolist(), "forces": state.forces.tolist(), "at": state.at.tolist(),
+        "stiffness": float(2e-4 / ((ends[0].tip - ends[1].tip) @ d)), "around": around,
+    }  # fmt: skip
+
+
+def run(cases: int, folder: Path) -> Iterator[dict[str, Any]]:
+    """All cases, from the folder where they are there; the model's part always anew."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for seed in range(cases):
+        file = folder / f"{seed}.json"
+        case = json.loads(file.read_text()) if file.exists() else draw(seed)
+        case["stiffopt"] = found_by_stiffopt(case)
+        if "rod" not in case:
+            case["rod"] = found_by_rod(case, case["stiffopt"].get("lost_at"))
+        file.write_text(json.dumps(case))
+        yield case
+
+
+def measured(case: dict[str, Any]) -> dict[str, float]:
+    """Errors of a case, in percent but for contacts that one of the two lacks."""
+    own, other = case["stiffopt"], case["rod"]
+    forces, expected = np.array(own["forces"]), np.array(other["forces"])
+    length = arm_of(case).length
+    return {
+        "tip": 100 * float(np.linalg.norm(np.subtract(own["tip"], other["tip"]))) / length,
+        "force": 100 * float(np.abs(forces - expected).max() / max(expected.max(), 1e-3)),
+        "stiffness": 100 * abs(own["stiffness"] / other["stiffness"] - 1),
+        "contacts": float(((forces > 1e-3) & (expected < 1e-5)).sum()
+                          + ((expected > 1e-3) & (forces < 1e-5)).sum()),
+    }  # fmt: skip
+
+
+def report(cases: list[dict[str, Any]]) -> str:
+    """The tables of a run, as Markdown."""
+    failed = [case for case in cases if "error" in case["stiffopt"] or "error" in case["rod"]]
+    good = [case for case in cases if case not in failed]
+    bars = {"tip": 0.5, "force": 5.0, "stiffness": 5.0, "contacts": 0.5}
+    units = {"tip": "% of length", "force": "%", "stiffness": "%", "contacts": "false or missed"}
+    errors = [measured(case) for case in good]
+    rows = []
+    for key, bar in bars.items():
+        values = np.array([each[key] for each in errors])
+        within = f"{(values <= bar).sum()} of {len(values)}"
+        cells = (f"{np.median(values):.3g}", f"{np.quantile(values, 0.95):.3g}")
+        rows.append([key, units[key], *cells, f"{values.max():.3g}", within])
+    turned = np.array([case["stiffopt"]["turned_deg"] for case in good])
+    gains = [case["stiffopt"]["stiffness"] / case["stiffopt"]["free_stiffness"] for case in good]
+    around = [case for case in good if case["rod"]["around"]]
+    held = sum(case["rod"]["around"][0][case["stiffopt"]["lost"]] > 1e-5 for case in around)
+    gone = sum(case["rod"]["around"][1][case["stiffopt"]["lost"]] < 1e-4 for case in around)
+    lines = [
+        f"{len(good)} cases; the tip turned by the contacts by {np.median(turned):.0f} degrees in "
+        f"the median, by {turned.max():.0f} at most; stiffness {np.median(gains):.2f} times that "
+        f"of the free arm in the median, {max(gains):.1f} at most.",
+        "",
+        *table(["what", "unit", "median", "95 %", "largest", "within the bar"], rows),
+        "",
+        f"Lift-off: of {len(around)} losses, {held} contacts are there at 0.9 of the push and "
+        f"{gone} are gone at 1.1.",
+        "",
+    ]
+    for case in failed:
+        reason = case["stiffopt"].get("error") or case["rod"]["error"]
+        lines.append(f"- case {case['seed']}: {reason}")
+    worse = [
+        (case["seed"], key, each[key])
+        for case, each in zip(good, errors, strict=True)
+        for key, bar in bars.items()
+        if each[key] > bar
+    ]
+    lines += [f"- case {seed}: {key} {value:.3g} {units[key]}" for seed, key, value in worse]
+    return "\n".join(lines) + "\n"
+
+
+def main() -> None:
+    """Run, and print the report."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--cases", type=int, default=100)
+    parser.add_argument("--out", type=Path, default=Path("out/contact"))
+    parser.add_argument("--keep", type=Path, help="write the report here too")
+    arguments = parser.parse_args()
+    warnings.simplefilter("ignore")
+    cases = []
+    for case in run(arguments.cases, arguments.out):
+        cases.append(case)
+        error = case["stiffopt"].get("error") or case["rod"].get("error")
+        print(case["seed"], error or measured(case), flush=True)
+    text = report(cases)
+    print(text)
+    if arguments.keep:
+        arguments.keep.write_text(text)
+
+
+if __name__ == "__main__":
+    main()

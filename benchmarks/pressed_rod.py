@@ -1,0 +1,208 @@
+"""An arm pressed on objects, by other means: the energy of a discrete rod on fine stiff springs.
+
+Nothing here imports stiffopt. The rod has elements of constant strain; its body meets surfaces
+through springs so many and so stiff that tenths of newtons enter a surface by hundredths of a
+millimetre. The energy is differentiated by JAX and minimised by Newton's method while pressures and
+load grow from rest in small steps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from independent import Arm, rod_section
+
+jax.config.update("jax_enable_x64", True)
+
+Array = Any
+SPRINGS = {"coarse": (8, 6.4e6), "fine": (24, 2e7)}
+"""Springs along an element, and their stiffness in N/m per m along the arm."""
+_OF_TIP = 0.003  # m along the arm, that the spring of the hemisphere at the tip stands for
+_ENERGY_LEFT = 1e-17  # J
+
+
+class Rod(NamedTuple):
+    """Elements (k, ...) of an arm at some pressures under some load."""
+
+    h: Array
+    free: Array
+    root: Array  # of an element's compliance
+    weight: Array
+    centroid: Array
+    connector: Array
+    radius: Array
+    force: Array
+
+
+@dataclass(frozen=True)
+class Pressed:
+    """An equilibrium: tip (3,), its rotation (3, 3), and force and mean station of each object."""
+
+    tip: Array
+    rotation: Array
+    forces: Array
+    at: Array
+    strains: Array
+    rod: Rod
+
+
+def make_rod(arm: Arm, p: Array, n: int, force: Array) -> Rod:
+    """N elements for each segment."""
+    gravity = np.asarray(arm.gravity)
+    laws = [rod_section(t, own, gravity) for t, own in zip(arm.tubes, arm.split(p), strict=True)]
+    h = np.repeat([tube.length / n for tube in arm.tubes], n)
+    connector = np.zeros(n * len(arm.tubes))
+    connector[n - 1 :: n] = [tube.connector for tube in arm.tubes]
+    root = np.repeat([np.linalg.cholesky(law.compliance) for law in laws], n, axis=0)
+    return Rod(
+        h=h,
+        free=np.repeat([law.strain for law in laws], n, axis=0),
+        root=root / np.sqrt(h)[:, None, None],
+        weight=np.repeat([law.weight for law in laws], n, axis=0),
+        centroid=np.repeat([law.centroid for law in laws], n, axis=0),
+        connector=connector,
+        radius=np.repeat([tube.outer_radius for tube in arm.tubes], n),
+        force=np.asarray(force, float) + arm.tip_mass * gravity,
+    )
+
+
+def _exponential(v: Array, w: Array) -> tuple[Array, Array]:
+    """Rotation and way of a small twist, by power series."""
+    x, zero = w @ w, 0.0 * w[0]
+    first = 1 - x / 6 * (1 - x / 20 * (1 - x / 42 * (1 - x / 72)))
+    second = (1 - x / 12 * (1 - x / 30 * (1 - x / 56 * (1 - x / 90)))) / 2
+    third = (1 - x / 20 * (1 - x / 42 * (1 - x / 72 * (1 - x / 110)))) / 6
+    W = jnp.array([[zero, -w[2], w[1]], [w[2], zero, -w[0]], [-w[1], w[0], zero]])
+    W2 = W @ W
+    return jnp.eye(3) + first * W + second * W2, v + second * (W @ v) + third * (W2 @ v)
+
+
+def _distance(kind: Array, numbers: Array, x: Array) -> Array:
+    """Of points (k, 3) from a capsule or sphere (kind 0), or a half-space (1)."""
+    a, b, radius = numbers[:3], numbers[3:6], numbers[6]
+    way = b - a
+    share = jnp.clip(((x - a) @ way) / jnp.maximum(way @ way, 1e-12), 0, 1)
+    beside = x - a - share[:, None] * way
+    return jnp.where(kind == 1, (x - a) @ b, jnp.sqrt((beside**2).sum(-1) + 1e-24) - radius)
+
+
+def _chain(rod: Rod, y: Array, samples: int) -> tuple[Array, Array, Array, Array]:
+    """Places of samples (k, samples, 3), tip, its rotation, and the energy without springs."""
+    strains = rod.free + jnp.einsum("kij,kj->ki", rod.root, y)
+    shares = (jnp.arange(samples) + 0.5) / samples
+
+    def along(carry: Array, item: Array) -> tuple[Array, Array]:
+        R, r, energy = carry
+        xi, h, f, c, connector = item
+        places = jax.vmap(
+            lambda s: r + R @ _exponential(xi[:3] * h * s, xi[3:] * h * s)[1]
+        )(shares)  # fmt: skip
+        R_half, half = _exponential(xi[:3] * h / 2, xi[3:] * h / 2)
+        R_whole, whole = _exponential(xi[:3] * h, xi[3:] * h)
+        middle = r + R @ (half + R_half @ c)
+        R_next = R @ R_whole
+        return (R_next, r + R @ whole + connector * R_next[:, 2], energy - h * middle @ f), places
+
+    start = (jnp.eye(3), jnp.zeros(3), 0.0)
+    items = (strains, rod.h, rod.weight, rod.centroid, rod.connector)
+    (R, tip, energy), places = jax.lax.scan(along, start, items)
+    return places, tip, R, energy + 0.5 * (y**2).sum() - tip @ rod.force
+
+
+def _springs(rod: Rod, y: Array, objects: Array, fineness: str) -> tuple[Array, ...]:
+    samples, stiffness = SPRINGS[fineness]
+    places, tip, R, energy = _chain(rod, y, samples)
+    points = jnp.concatenate([places.reshape(-1, 3), tip[None]])
+    radii = jnp.concatenate([jnp.repeat(rod.radius, samples), rod.radius[-1:]])
+    depths = jax.vmap(lambda kind, numbers: radii - _distance(kind, numbers, points))(*objects)
+    own = jnp.concatenate([jnp.repeat(rod.h / samples, samples), jnp.array([_OF_TIP])]) * stiffness
+    return own * jnp.maximum(depths, 0), jnp.maximum(depths, 0), tip, R, energy
+
+
+def _energy(y: Array, rod: Rod, objects: Array, fineness: str) -> Array:
+    forces, depths, _, _, energy = _springs(rod, y.reshape(-1, 6), objects, fineness)
+    return energy + 0.5 * (forces * depths).sum()
+
+
+_value = jax.jit(_energy, static_argnums=3)
+_seen = jax.jit(_springs, static_argnums=3)
+
+
+@partial(jax.jit, static_argnums=3)
+def _derivatives(y: Array, rod: Rod, objects: Array, fineness: str) -> tuple[Array, ...]:
+    arguments = (y, rod, objects, fineness)
+    return _energy(*arguments), jax.grad(_energy)(*arguments), jax.hessian(_energy)(*arguments)
+
+
+def _minimum(y: Array, rod: Rod, objects: Array, fineness: str) -> Array:
+    """Newton's method with a line search, shifted where the energy is not convex."""
+    for _ in range(300):
+        f, g, H = (np.asarray(each) for each in _derivatives(y, rod, objects, fineness))
+        shift = 0.0
+        while True:
+            try:
+                L = np.linalg.cholesky(H + shift * np.eye(len(g)))
+                break
+            except np.linalg.LinAlgError:
+                shift = max(10 * shift, 1e-3)
+        step = -np.linalg.solve(L.T, np.linalg.solve(L, g))
+        slope = float(step @ g)
+        if -slope < _ENERGY_LEFT and shift == 0:
+            return y
+        size = min(1.0, 0.02 / float(np.linalg.norm(step)))
+        while _value(y + size * step, rod, objects, fineness) > f + 1e-4 * size * slope + 1e-18:
+            size /= 2
+            if size < 1e-6:
+                return y
+        y = y + size * step
+    raise ArithmeticError("no minimum was found")
+
+
+def _read(y: Array, rod: Rod, objects: Array, fineness: str) -> Pressed:
+    seen = _seen(rod, y.reshape(-1, 6), objects, fineness)
+    loads, _, tip, R, _ = (np.asarray(each) for each in seen)
+    samples = SPRINGS[fineness][0]
+    ends = np.cumsum(rod.h + rod.connector)
+    shares = (np.arange(samples) + 0.5) / samples
+    at = ((ends - rod.h - rod.connector)[:, None] + rod.h[:, None] * shares).ravel()
+    at = np.append(at, ends[-1])
+    forces = loads.sum(axis=1)
+    mean = np.divide(loads @ at, forces, out=np.full(len(forces), np.nan), where=forces > 0)
+    return Pressed(tip, R, forces, mean, y, rod)
+
+
+def _numbers(objects: Sequence[tuple[int, Sequence[float]]]) -> Array:
+    return np.array([kind for kind, _ in objects]), np.array([each for _, each in objects], float)
+
+
+def pressed(
+    arm: Arm, p: Array, objects: Sequence[tuple[int, Sequence[float]]], force: Array, n: int,
+    steps: int = 12,
+) -> Pressed:  # fmt: skip
+    """The arm after pressures and a force at the tip have grown from rest.
+
+    Objects are (0, both ends and radius) of a capsule, (1, point, normal, 0) of a half-space.
+    """
+    known, y = _numbers(objects), np.zeros(6 * n * len(arm.tubes))
+    for share in np.arange(steps + 1) / steps:
+        rod = make_rod(arm, share * np.asarray(p), n, share * np.asarray(force, float))
+        y = _minimum(y, rod, known, "coarse")
+    return _read(_minimum(y, rod, known, "fine"), rod, known, "fine")
+
+
+def pushed(
+    state: Pressed, objects: Sequence[tuple[int, Sequence[float]]], force: Array, steps: int = 1
+) -> Pressed:
+    """The same with one more force at the tip, grown in steps."""
+    known, y = _numbers(objects), state.strains
+    for share in np.arange(1, steps + 1) / steps:
+        rod = state.rod._replace(force=state.rod.force + share * np.asarray(force, float))
+        y = _minimum(y, rod, known, "fine")
+    return _read(y, rod, known, "fine")

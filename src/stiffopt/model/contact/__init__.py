@@ -1,0 +1,1 @@
+"""Arms that lean on objects: equilibria with unilateral contacts along the body."""

@@ -1,0 +1,333 @@
+"""The equilibrium of an arm that leans on objects, and what it can take."""
+
+from __future__ import annotations
+
+from functools import cached_property, lru_cache
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from stiffopt import lie
+from stiffopt.errors import EquilibriumError, InputError
+from stiffopt.model.arguments import check_choice, checked_measure
+from stiffopt.model.arm_clearance import SceneKey, measured_scene
+from stiffopt.model.compliance import Boundary, Frame, Kind
+from stiffopt.model.contact.push import ContactLoss, GrowingPush
+from stiffopt.model.contact.rod import Condition, Rod
+from stiffopt.model.contact.solve import ContactProblem
+from stiffopt.model.contact.surface import ContactSurface
+from stiffopt.model.contact.system import ContactSystem, LeaningArm
+from stiffopt.model.scene import Scene
+from stiffopt.model.screws import Wrench, checked_wrench
+
+if TYPE_CHECKING:
+    from stiffopt.model.manipulator import Manipulator
+
+Vector = NDArray[np.float64]
+Approach = Literal["pressures", "objects"]
+Grip = Literal["sliding", "sticking"]
+
+
+class Contact(NamedTuple):
+    """Where an arm leans on an object.
+
+    Attributes
+    ----------
+    object : its name.
+    at : arc length at rest of the station that is nearest to it, in m.
+    force : on the arm (3,), in base axes, in N.
+    position : of the surface there (3,), in m.
+    normal : unit vector (3,) from the surface to the arm.
+    max_force : that the scene allows, in N; infinite where it says nothing.
+    """
+
+    object: str
+    at: float
+    force: Vector
+    position: Vector
+    normal: Vector
+    max_force: float
+
+
+class ContactEquilibrium:
+    """An equilibrium with contacts; see `Manipulator.contact_equilibrium`.
+
+    Attributes
+    ----------
+    pressures : (n,), in Pa.
+    contacts : tuple of Contact.
+    """
+
+    def __init__(self, arm: LeaningArm) -> None:
+        self._arm = arm
+        self.pressures = arm.state.condition.pressures
+        surfaces = [arm.problem.surfaces[touch.surface] for touch in arm.state.touches]
+        self.contacts = tuple(
+            Contact(
+                surface.name,
+                touch.station,
+                touch.force,
+                arm.shape.position[node] - row.point.distance * row.point.normal,
+                row.point.normal,
+                surface.max_force,
+            )
+            for surface, touch, node, row in zip(
+                surfaces, arm.state.touches, arm.state.mesh.node, arm.rows, strict=True
+            )
+        )
+
+    def __repr__(self) -> str:
+        where = ", ".join(
+            f"{each.object} at {1e3 * each.at:.1f} mm with {np.linalg.norm(each.force):.4g} N"
+            for each in self.contacts
+        )
+        return f"ContactEquilibrium({where or 'no contact'})"
+
+    # -- shape ------------------------------------------------------------------------------
+
+    @property
+    def tip_pose(self) -> Vector:
+        """Pose of the tip in the base frame, (4, 4)."""
+        shape = self._arm.shape
+        return np.asarray(lie.transform(shape.rotation[0], shape.position[0]))
+
+    def backbone(self, n: int = 50) -> Vector:
+        """Points (n, 3) of the centre line, equally spaced at rest from the base to the tip."""
+        wanted = np.linspace(0.0, self._arm.problem.rod.arm.length, n)
+        return self._arm.problem.body(self._arm, wanted)[0]
+
+    @property
+    def stable(self) -> bool:
+        """Whether it is a minimum of the energy (of loads without a potential: no divergence)."""
+        return self._arm.is_stable
+
+    @property
+    def within_limits(self) -> bool:
+        """Whether no contact force exceeds what the scene allows."""
+        return all(np.linalg.norm(each.force) <= each.max_force for each in self.contacts)
+
+    # -- compliance -------------------------------------------------------------------------
+
+    @property
+    def tip_compliance(self) -> Vector:
+        """Tangent compliance (6, 6) of the braced tip, in tip axes, linear first.
+
+        All contacts stay and slide without friction; see `compliance` for other bounds.
+        """
+        return self.compliance("sliding")
+
+    def compliance(self, contacts: Grip = "sliding") -> Vector:
+        """Tangent compliance (6, 6) of the tip, in tip axes, linear first.
+
+        Parameters
+        ----------
+        contacts : {"sliding", "sticking"}
+            Whether contacts slide on their surfaces without resistance or roll on them without
+            slipping. With friction the truth is in between; small pushes on an arm whose contacts
+            carry no tangential force leave them sticking.
+        """
+        check_choice("contacts", contacts, get_args(Grip))
+        per_wrench = self._per_wrench(contacts == "sticking")
+        R = self._arm.shape.rotation[0]
+        turn = np.zeros((6, 6))
+        turn[:3, :3] = turn[3:, 3:] = R
+        found: Vector = turn.T @ per_wrench @ turn
+        if self._arm.state.condition.is_conservative and contacts == "sliding":
+            found = (found + found.T) / 2  # symmetric but for the integrator's error
+        return found
+
+    def _per_wrench(self, sticking: bool = False) -> Vector:
+        """Twist of the tip per wrench on it, (6, 6), in base axes."""
+        system = self._system_for("tip wrench", sticking)
+        changes, moves = system.along(system.solution())
+        return np.concatenate([moves[0], changes[0, :3]])
+
+    def _system_for(self, extras: str, sticking: bool = False) -> ContactSystem:
+        arm = self._arm
+        return ContactSystem(arm.problem, arm.state, arm.shape.sections, extras, sticking)
+
+    def stiffness(
+        self,
+        direction: ArrayLike,
+        kind: Kind = "translation",
+        boundary: Boundary = "free",
+        frame: Frame = "base",
+        contacts: Grip = "sliding",
+    ) -> float:
+        """Stiffness of the braced tip along a direction (N/m), or about it (N m/rad).
+
+        See `Manipulator.stiffness` for the arguments and `compliance` for `contacts`.
+        """
+        return _stiffness(self.compliance(contacts), self._arm.shape.rotation[0],
+                          checked_measure(direction, kind, boundary, frame))  # fmt: skip
+
+    # -- derivatives ------------------------------------------------------------------------
+
+    @cached_property
+    def _per_pressure(self) -> tuple[Vector, Vector, Vector]:
+        system = self._system_for("pressures")
+        solution = system.solution()
+        changes, moves = system.along(solution)
+        u = system.linear.unknowns
+        return np.concatenate([moves[0], changes[0, :3]]), solution[u:], solution[9:u:7]
+
+    @property
+    def tip_jacobian(self) -> Vector:
+        """Twist of the tip in tip axes per pressure, (6, n), the same contacts staying closed."""
+        R = self._arm.shape.rotation[0]
+        twist = self._per_pressure[0]
+        return np.concatenate([R.T @ twist[:3], R.T @ twist[3:]])
+
+    @property
+    def force_gradients(self) -> Vector:
+        """Derivatives (contacts, n) of the normal forces by the pressures, in N/Pa."""
+        return self._per_pressure[1]
+
+    @property
+    def station_gradients(self) -> Vector:
+        """Derivatives (contacts, n) of the contacts' arc lengths by the pressures, in m/Pa."""
+        return self._per_pressure[2]
+
+    def stiffness_gradient(
+        self,
+        direction: ArrayLike,
+        kind: Kind = "translation",
+        boundary: Boundary = "free",
+        frame: Frame = "base",
+        contacts: Grip = "sliding",
+        step: float = 50.0,
+    ) -> Vector:
+        """Derivative (n,) of `stiffness` by the pressures, the same contacts staying closed.
+
+        By central differences over a step in Pa, of equilibria that are exact to rounding.
+        """
+        measure = (direction, kind, boundary, frame, contacts)
+        found = []
+        for k in range(len(self.pressures)):
+            values = [
+                self._nearby(step * sign * np.eye(len(self.pressures))[k]).stiffness(*measure)
+                for sign in (1, -1)
+            ]
+            found.append((values[0] - values[1]) / (2 * step))
+        return np.array(found)
+
+    def _nearby(self, change: Vector) -> ContactEquilibrium:
+        condition = self._arm.state.condition
+        there = condition._replace(pressures=condition.pressures + change)
+        found = self._arm.problem.correct(self._arm.state._replace(condition=there))
+        if found is None:
+            raise EquilibriumError("the equilibrium is lost where pressures change by little")
+        return ContactEquilibrium(found)
+
+    # -- pushes -----------------------------------------------------------------------------
+
+    def lift_off(
+        self, direction: ArrayLike, limit: float = 1.0, contacts: Grip = "sliding"
+    ) -> ContactLoss:
+        """The push at the tip by which the first contact is lost.
+
+        Parameters
+        ----------
+        direction : (3,)
+            Of the push, in base axes; of any length.
+        limit : float
+            Largest push that is looked at, in N.
+        contacts : {"sliding", "sticking"}
+            How contacts meet the push; one that sticks may slip where its friction ends.
+
+        Returns
+        -------
+        ContactLoss
+        """
+        d = np.asarray(checked_measure(direction, "translation", "free", "base").direction)
+        check_choice("contacts", contacts, get_args(Grip))
+        if limit <= 0:
+            raise InputError(f"limit must be positive; got {limit!r}")
+        push = GrowingPush(self._arm.problem, d, limit, contacts == "sticking")
+        return push.loss(self._arm)
+
+
+def contact_equilibrium(
+    arm: Manipulator,
+    p: ArrayLike,
+    scene: Scene,
+    load: ArrayLike | Wrench | None = None,
+    approach: Approach = "pressures",
+    nearby: ContactEquilibrium | None = None,
+) -> ContactEquilibrium:
+    """See `Manipulator.contact_equilibrium`."""
+    pressures = arm.checked_pressures(p)
+    arm._check_margin(pressures[np.newaxis], "")
+    check_choice("approach", approach, get_args(Approach))
+    problem = contact_problem(arm, scene)
+    wrench = np.zeros(6) if load is None else checked_wrench(load)
+    tip = np.array(arm.tip_load)
+    end = Condition(
+        pressures, tip[:6] + wrench, tip[6:], np.array(arm.description.gravity),
+        np.zeros(len(problem.surfaces)),
+    )  # fmt: skip
+    if nearby is not None:
+        found = problem.follow(nearby._arm, end)
+        return _arrived(*found, "the way from the nearby equilibrium")
+    hanging = end._replace(
+        pressures=np.zeros_like(pressures), dead=np.zeros(6), follower=np.zeros(6)
+    )
+    if approach == "pressures":
+        rest, share = problem.follow(problem.straight(end), hanging)
+        _arrived(rest, share, "its own weight and payload")
+        return _arrived(*problem.follow(rest, end), "its pressures and load")
+    alone, nothing = ContactProblem(problem.rod, ()), np.zeros(0)
+    free = alone.straight(end._replace(retreat=nothing))
+    for target in (hanging, end):
+        free, share = alone.follow(free, target._replace(retreat=nothing))
+        _arrived(free, share, "its weight, pressures and load, free of objects")
+    found = problem.follow(problem.clear(free), end)
+    return _arrived(*found, "the objects' way to it")
+
+
+def _arrived(arm: LeaningArm, share: float, what: str) -> ContactEquilibrium:
+    if share < 1.0:
+        touches = arm.state.touches
+        names = sorted({arm.problem.surfaces[touch.surface].name for touch in touches})
+        on = f", leaning on {' and '.join(names)}" if names else ""
+        raise EquilibriumError(
+            f"no equilibrium is reached continuously beyond {share:.0%} of {what}{on}: the arm "
+            "slips off, snaps through or buckles there"
+        )
+    return ContactEquilibrium(arm)
+
+
+def contact_problem(arm: Manipulator, scene: Scene) -> ContactProblem:
+    """The arm among the objects of a scene that it may lean on, made once."""
+    rod = arm.kept("contact rod", lambda: Rod(arm))
+    return _problem(rod, SceneKey(scene))
+
+
+@lru_cache(maxsize=64)
+def _problem(rod: Rod, key: SceneKey) -> ContactProblem:
+    measured = measured_scene(key.scene, rod.arm.description)
+    pairs = zip(key.scene.objects, measured.items, strict=True)
+    return ContactProblem(
+        rod,
+        tuple(
+            ContactSurface(item, known.begin)
+            for item, known in pairs
+            if item.contact is not None and item.contact.allowed
+        ),
+    )
+
+
+def _stiffness(C: Vector, R: Vector, measure: Any) -> float:
+    """Stiffness of a compliance (6, 6) in axes R; see `Manipulator.stiffness`."""
+    d = np.asarray(measure.direction)
+    d = R.T @ d if measure.frame == "base" else d
+    own, other = slice(0, 3), slice(3, 6)
+    if measure.kind == "rotation":
+        own, other = other, own
+    if measure.boundary == "free":
+        return float(1 / (d @ C[own, own] @ d))
+    block = C[own, own]
+    if measure.boundary == "clamped":
+        block = block - C[own, other] @ np.linalg.solve(C[other, other], C[other, own])
+    return float(d @ np.linalg.solve(block, d))

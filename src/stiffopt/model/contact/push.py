@@ -1,0 +1,100 @@
+"""Pushes at the tip of an arm that leans on objects, and when they take contacts away."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stiffopt.model.contact.solve import ContactProblem
+from stiffopt.model.contact.system import ContactSystem, LeaningArm
+
+Vector = NDArray[np.float64]
+
+_LARGEST_SWING = 0.2  # rad, that the tip turns by in a step of a push
+_FORCE_LEFT = 1e-7  # N, of a contact that lifts off
+_SHORTEST = 1e-6  # of the largest push; a shorter step means that the equilibrium is lost
+
+
+class ContactLoss(NamedTuple):
+    """When and how a push takes a contact away.
+
+    Attributes
+    ----------
+    force : of the push at the tip, in N; infinite if no contact is lost.
+    object : on which a contact is lost, or None.
+    at : arc length of that contact at rest, in m, or None.
+    how : "lifts off" or "slips", "snaps" where the equilibrium is lost instead, or "holds".
+    stiffness : along the push just before, in N/m.
+    stiffness_after : and without the contact, or with it slipping.
+    """
+
+    force: float
+    object: str | None
+    at: float | None
+    how: str
+    stiffness: float
+    stiffness_after: float
+
+
+class GrowingPush:
+    """A push at the tip that grows from nothing, along a unit direction (3,) in base axes."""
+
+    def __init__(
+        self, problem: ContactProblem, direction: Vector, limit: float, sticking: bool
+    ) -> None:
+        self._problem, self._direction = problem, direction
+        self._limit, self._sticking = limit, sticking
+
+    def loss(self, arm: LeaningArm) -> ContactLoss:
+        """The first contact that is lost on the way from an equilibrium."""
+        without, force, step = arm.state.condition.dead, 0.0, np.inf
+        while True:
+            own = _forces(arm)
+            slopes, turn, stiffness = self._rates(arm)
+            # a contact is lost where its force is zero, by Newton's method from one side
+            until = np.divide(own, -slopes, out=np.full(len(own), np.inf), where=slopes < 0)
+            step = min(step, _LARGEST_SWING / max(turn, 1e-9), self._limit - force)
+            ahead = min(step, float(until.min(initial=np.inf)))
+            dead = without + np.concatenate([(force + ahead) * self._direction, np.zeros(3)])
+            start = arm.state._replace(condition=arm.state.condition._replace(dead=dead))
+            found = self._problem.correct(start)
+            if found is None or self._problem.is_far(start, found):
+                if ahead < _SHORTEST * self._limit:
+                    return ContactLoss(force, None, None, "snaps", stiffness, 0.0)
+                step = ahead / 2
+                continue
+            forces = _forces(found)
+            if (forces < -_FORCE_LEFT).any():
+                step = ahead * min(0.9, max(0.1, float((own / (own - forces))[forces < 0].min())))
+                continue
+            arm, force, step = found, force + ahead, np.inf
+            if (forces < _FORCE_LEFT).any():
+                return self._lifted(arm, force, int(np.argmin(forces)))
+            if force >= self._limit * (1 - 1e-12):
+                return ContactLoss(np.inf, None, None, "holds", stiffness, stiffness)
+            if self._problem.missed(arm):
+                arm = self._problem.settle(arm.state) or arm
+
+    def _rates(self, arm: LeaningArm) -> tuple[Vector, float, float]:
+        """Changes (k,) of the normal forces and of the tip's turn per push; stiffness along it."""
+        sections = arm.shape.sections
+        there = ContactSystem(self._problem, arm.state, sections, "tip wrench", self._sticking)
+        solution = there.solution()
+        changes, moves = there.along(solution)
+        way = float(self._direction @ moves[0][:, :3] @ self._direction)
+        turn = float(np.linalg.norm(changes[0, :3, :3] @ self._direction))
+        return solution[there.linear.unknowns :, :3] @ self._direction, turn, 1 / way
+
+    def _lifted(self, arm: LeaningArm, force: float, lost: int) -> ContactLoss:
+        state = arm.state
+        *_, before = self._rates(arm)
+        touches = (*state.touches[:lost], *state.touches[lost + 1 :])
+        found = self._problem.correct(self._problem.with_touches(state, touches))
+        after = 0.0 if found is None else self._rates(found)[2]
+        touch = state.touches[lost]
+        name = self._problem.surfaces[touch.surface].name
+        return ContactLoss(force, name, touch.station, "lifts off", before, after)
+
+
+def _forces(arm: LeaningArm) -> Vector:
+    return np.array([touch.normal_force for touch in arm.state.touches])

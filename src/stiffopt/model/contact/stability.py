@@ -1,0 +1,135 @@
+"""Whether an arm in contact is at a minimum of its energy.
+
+The steps of the rod are finite elements: with the changes of a step's end along turn, moment and
+force at its start, the wrenches at both ends follow from the poses of both.  The poses of the nodes
+then have a stiffness matrix, to which a contact adds what its force does with the curvature of the
+gap, less what the contact gains by moving along the arm,
+
+    -f (dc' H dc - (d slope)^2 / bend),
+
+and poses are held where a rigid surface is touched.  The arm is stable if the matrix is positive
+definite on what is left.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stiffopt.model.contact.rod import hat
+
+if TYPE_CHECKING:
+    from stiffopt.model.contact.system import LeaningArm
+
+Vector = NDArray[np.float64]
+
+_RIGID = 1e-3  # compliance of what is rigid, as a share of that of its segment
+_FLATTEST = 1e-3  # 1/m: a gap that is bent less is a line
+
+
+def is_stable(arm: LeaningArm) -> bool:
+    """Whether the energy is at a minimum; of loads without a potential, whether none diverges."""
+    K = stiffness_left(arm)
+    if arm.state.condition.is_conservative:
+        try:
+            np.linalg.cholesky((K + K.T) / 2)
+        except np.linalg.LinAlgError:
+            return False
+        return True
+    values = np.linalg.eigvals(K)
+    return not (values.real <= -np.abs(values.imag)).any()
+
+
+def stiffness_left(arm: LeaningArm) -> Vector:
+    """Stiffness (k, k) in N/m of what contacts leave free; turns are motions at an arm's length."""
+    problem, state, linear = arm.problem, arm.state, arm.shape
+    count, length = len(linear.h), problem.rod.arm.length
+    size = 6 * count
+    K = np.zeros((size + 6, size + 6))
+    responses = []
+    for i in range(count):
+        J = linear.J[i]
+        by_wrench = J[:6, 3:9].copy()
+        if linear.mesh.rigid[i]:
+            R = linear.rotation[i]
+            C = linear.sections.compliance[linear.mesh.segment[i]]
+            turn = np.zeros((6, 6))
+            turn[:3, :3] = R @ C[3:, 3:] @ R.T
+            turn[3:, 3:] = R @ C[:3, :3] @ R.T
+            by_wrench -= _RIGID * linear.h[i] * turn
+        # of both ends' turns and positions
+        known = np.zeros((6, 12))
+        known[:3, 6:9] = np.eye(3)
+        known[3:, 9:] = np.eye(3)
+        known[3:, 3:6] = -np.eye(3)
+        known[:, :3] -= J[:6, :3]
+        start = np.linalg.solve(by_wrench, known)  # moment and force at the start, (6, 12)
+        end = J[6:, 3:9] @ start
+        end[:, :3] += J[6:, :3]
+        rows, columns = slice(6 * i, 6 * i + 6), slice(6 * i, 6 * i + 12)
+        K[rows, columns] += start
+        K[6 * i + 6 : 6 * i + 9, columns] -= end
+        K[6 * i + 9 : 6 * i + 12, columns] -= start[3:]
+        responses.append(start)
+    K = K[:size, :size]
+    # loads at the tip that turn with it
+    follower = state.condition.follower
+    R0 = linear.rotation[0]
+    K[:3, :3] += hat(R0 @ follower[3:])
+    K[3:6, :3] += hat(R0 @ follower[:3])
+
+    held = []
+    for j, (touch, row) in enumerate(zip(state.touches, arm.rows, strict=True)):
+        node, f = int(state.mesh.node[j]), touch.normal_force
+        n, H = row.point.normal, row.point.curvature
+        at = slice(6 * node + 3, 6 * node + 6)
+        K[at, at] -= f * H
+        gap = np.zeros(size)
+        gap[at] = n
+        softness = problem.surfaces[touch.surface].softness
+        if softness > 0:
+            K += np.outer(gap, gap) / softness
+        else:
+            held.append(gap)
+        if not touch.pinned:
+            slope = _slope_change(arm, j, responses)
+            bend = max(arm.bend(j), _FLATTEST)
+            K += f / bend * np.outer(slope, slope)
+    scale = np.tile(np.r_[np.full(3, 1 / length), np.ones(3)], count)
+    K = scale[:, None] * K * scale
+    if held:
+        A = np.array(held) * scale
+        Q, _ = np.linalg.qr(A.T, mode="complete")
+        free = Q[:, len(held) :]
+        K = free.T @ K @ free
+    return np.asarray(K)
+
+
+def _slope_change(arm: LeaningArm, j: int, responses: list[Vector]) -> Vector:
+    """Change of the gap's slope at a contact by the poses of the nodes."""
+    state, linear = arm.state, arm.shape
+    node = int(state.mesh.node[j])
+    size = 6 * len(linear.h)
+    touch, row = state.touches[j], arm.rows[j]
+    here = arm.problem.rod.ranges[touch.range]
+    n, H, mean = row.point.normal, row.point.curvature, row.mean
+    found = np.zeros(size + 6)
+    at = 6 * node
+    found[at + 3 : at + 6] += H @ mean
+    R = linear.rotation[node]
+    if here.rigid:
+        found[at : at + 3] -= n @ hat(R[:, 2])
+        return found[:size]
+    C = linear.sections.compliance[here.segment]
+    own, crossed = R @ C[:3, :3] @ R.T, R @ C[:3, 3:] @ R.T
+    force = linear.force_far[node] + touch.force / 2
+    found[at : at + 3] += n @ (
+        -hat(mean) + own @ hat(force) + crossed @ hat(linear.moment_far[node])
+    )
+    near = responses[node]
+    found[at : at + 12] += n @ (own @ near[3:] / 2 + crossed @ near[:3])
+    if node > 0:  # the force on the distal side is that at the start of the step before
+        found[at - 6 : at + 6] += n @ own @ responses[node - 1][3:] / 2
+    return found[:size]

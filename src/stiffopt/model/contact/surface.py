@@ -1,0 +1,115 @@
+"""Surfaces that an arm may touch: distances with their first and second derivatives."""
+
+from functools import cache, cached_property
+from itertools import product
+from typing import NamedTuple
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from stiffopt.model.batch import InterpretedFunction
+from stiffopt.model.codegen import dense
+from stiffopt.model.compiled import Library
+from stiffopt.model.distances import MeasuredObject
+from stiffopt.model.obstacle import Obstacle
+from stiffopt.model.obstacles.mesh import Mesh
+from stiffopt.model.scene import SceneObject
+
+Vector = NDArray[np.float64]
+
+_STENCIL = 1.5  # cubes of a grid, over which its distances are smoothed
+
+
+class SurfacePoint(NamedTuple):
+    """The distance of a point in m, its gradient (3,) and its second derivatives (3, 3)."""
+
+    distance: float
+    normal: Vector
+    curvature: Vector
+
+
+class ContactSurface:
+    """An object that an arm may touch.
+
+    Attributes
+    ----------
+    name : of the object.
+    max_force : largest force on it, in N; infinite where none is given.
+    friction : coefficient.
+    softness : by how much it gives way, in m/N.
+    begin : arc length at rest from which the arm's body counts, in m.
+    key, pieces : kind of the object, and the numbers (k, size) of its formula.
+    is_interpolated : whether it has a grid instead.
+    """
+
+    def __init__(self, item: SceneObject, begin: float) -> None:
+        assert item.contact is not None
+        self.name = item.name
+        self.max_force = np.inf if item.contact.max_force is None else item.contact.max_force
+        self.friction = item.contact.friction
+        self.softness = 0.0 if item.contact.stiffness is None else 1 / item.contact.stiffness
+        self.begin = begin
+        self._shape = item.shape
+        self.key, self.pieces = item.shape.key, np.array(item.shape.pieces, dtype=float)
+        self.is_interpolated = item.shape.is_interpolated
+        self._function = None if self.is_interpolated else _second_order(type(item.shape))
+
+    @cached_property
+    def _measured(self) -> MeasuredObject:
+        return MeasuredObject(self._shape, self.begin)
+
+    def distances(self, points: Vector, code: Library | None = None) -> Vector:
+        """Distances (k,) of points (k, 3), in m; by machine code of the formulas if it is given."""
+        if code is None or self.is_interpolated:
+            return self._measured.distances(points).values
+        formula = code.function(f"surface_{self.key}")
+        found = [formula.many(points, piece, threads=1)[0][:, 0, 0] for piece in self.pieces]
+        return np.asarray(np.max(found, axis=0))
+
+    def at(self, point: Vector) -> SurfacePoint:
+        """Distance of one point (3,) with its derivatives."""
+        if self._function is None:
+            return self._smoothed(point)
+        best = None
+        for piece in self.pieces:
+            value, normal, curvature = self._function(point, piece)
+            if best is None or value[0, 0] > best.distance:
+                best = SurfacePoint(float(value[0, 0]), normal[:, 0], curvature)
+        assert best is not None
+        return best
+
+    def _smoothed(self, point: Vector) -> SurfacePoint:
+        """A quadratic through distances about the point, which a grid's are not smooth for."""
+        assert isinstance(self._shape, Mesh)
+        size = _STENCIL * self._shape.spacing
+        values = self.distances(point + size * _OFFSETS)
+        constant, *rest = _FIT @ values
+        slope = np.array(rest[:3]) / size
+        xx, yy, zz, xy, xz, yz = np.array(rest[3:]) / size**2
+        curvature = np.array([[2 * xx, xy, xz], [xy, 2 * yy, yz], [xz, yz, 2 * zz]])
+        steepness = float(np.linalg.norm(slope))
+        normal = slope / steepness
+        along = np.eye(3) - np.outer(normal, normal)
+        distance = float(constant) + self._shape.error_at(float(constant))
+        return SurfacePoint(distance, normal, along @ curvature @ along / steepness)
+
+
+_OFFSETS = np.array(list(product((-1.0, 0.0, 1.0), repeat=3)))
+_x, _y, _z = _OFFSETS.T
+_FIT = np.linalg.pinv(
+    np.stack([np.ones(27), _x, _y, _z, _x**2, _y**2, _z**2, _x * _y, _x * _z, _y * _z], axis=1)
+)
+
+
+def surface_function(kind: type[Obstacle]) -> ca.Function:
+    """Distance, gradient and second derivatives of a kind's formula, for a point and a piece."""
+    point, q = ca.SX.sym("point", 3), ca.SX.sym("parameters", kind.n_parameters)
+    hessian, gradient = ca.hessian(kind.formula(point, q), point)
+    outputs = ca.cse([kind.formula(point, q), ca.densify(gradient), ca.densify(hessian)])
+    return dense(ca.Function(f"surface_{kind.key}", [point, q], outputs))
+
+
+@cache
+def _second_order(kind: type[Obstacle]) -> InterpretedFunction:
+    return InterpretedFunction(surface_function(kind))

@@ -1,0 +1,257 @@
+"""The equations of an arm that touches surfaces, linear about a state."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stiffopt.model.contact.rod import (
+    TURN,
+    Condition,
+    LinearRod,
+    PointLoads,
+    RodMesh,
+    RodNodes,
+    RodSections,
+    RodShape,
+    hat,
+)
+from stiffopt.model.contact.stability import is_stable
+from stiffopt.model.contact.surface import SurfacePoint
+
+if TYPE_CHECKING:
+    from stiffopt.model.contact.solve import ContactProblem
+
+Vector = NDArray[np.float64]
+
+_FLAT = 0.5  # 1/m: a gap that is bent less does not spread a contact further
+
+
+@dataclass(frozen=True)
+class Touch:
+    """A contact.
+
+    Attributes
+    ----------
+    surface : which one is touched.
+    range : which of the rod's ranges the contact is on.
+    station : arc length at rest, in m.
+    pinned : whether it stays there: at the tip, or where two segments meet.
+    force : on the arm (3,), in N.
+    normal_force : in N.
+    drag : friction's force (3,) per normal force, of a contact that slides.
+    crossings : how often it went from one range to the next while it was looked for.
+    """
+
+    surface: int
+    range: int
+    station: float
+    pinned: bool
+    force: Vector
+    normal_force: float
+    drag: Vector
+    crossings: int = 0
+
+
+class Contacts(NamedTuple):
+    """An equilibrium with its contacts."""
+
+    condition: Condition
+    mesh: RodMesh
+    nodes: RodNodes
+    touches: tuple[Touch, ...]
+
+
+@dataclass(frozen=True)
+class ContactRow:
+    """What of a contact the equations need."""
+
+    point: SurfacePoint
+    radius: float
+    gap: float
+    mean: Vector
+    slope: float
+
+
+class LeaningArm:
+    """An arm in contact: where it is, and what is known of its contacts.
+
+    Attributes
+    ----------
+    rows : of each contact.
+    gaps : of the surfaces (surfaces, k) at stations of the body, once they were looked at, in m.
+    """
+
+    def __init__(
+        self,
+        problem: ContactProblem,
+        state: Contacts,
+        shape: RodShape,
+        rows: list[ContactRow],
+    ) -> None:
+        self.problem, self.state, self.shape, self.rows = problem, state, shape, rows
+        self.gaps = np.full((len(problem.surfaces), 1), np.inf)
+        self.minimum: bool | None = None  # of the energy; None: not known yet
+
+    @property
+    def is_stable(self) -> bool:
+        """Whether the energy is at a minimum, see `stiffopt.model.contact.stability`."""
+        if self.minimum is None:
+            self.minimum = is_stable(self)
+        return self.minimum
+
+    def bend(self, j: int) -> float:
+        """Second derivative of the gap along the arm at a contact, in 1/m."""
+        shape, touch, row = self.shape, self.state.touches[j], self.rows[j]
+        here, n, t = self.problem.rod.ranges[touch.range], row.point.normal, row.mean
+        own = float(t @ row.point.curvature @ t)
+        if here.rigid:
+            return own
+        node = self.state.mesh.node[j]
+        R, C = shape.rotation[node], shape.sections.compliance[here.segment]
+        force = R.T @ (shape.force_far[node] + touch.force / 2)
+        moment = R.T @ shape.moment_far[node]
+        xi = shape.sections.strain[here.segment] + C @ np.concatenate([force, moment])
+        v, u = xi[:3], xi[3:]
+        slope = np.concatenate([-np.cross(u, force), -np.cross(v, force) - np.cross(u, moment)])
+        return own + float(n @ R @ (np.cross(u, v) + C[:3] @ slope))
+
+    def kink(self, j: int) -> tuple[float, float]:
+        """How deep and how far, in m, the centre line's kink at a force enters a surface.
+
+        Shear bends the line towards the surface on both sides of a point force; in truth the
+        force is spread over this length, along which the line follows the surface.
+        """
+        shape, touch, row = self.shape, self.state.touches[j], self.rows[j]
+        here = self.problem.rod.ranges[touch.range]
+        if here.rigid:
+            return 0.0, 0.0
+        d = shape.rotation[self.state.mesh.node[j]].T @ row.point.normal
+        shear = touch.normal_force * float(d @ shape.sections.compliance[here.segment, :3, :3] @ d)
+        bend = max(self.bend(j), _FLAT)
+        return shear**2 / (8 * bend), shear / bend
+
+
+class ContactSystem(LeaningArm):
+    """The linear equations about a state: of the rod and of its contacts.
+
+    Unknown are those of `LinearRod` and the normal forces.
+
+    Parameters
+    ----------
+    sticking : whether contacts roll without slipping, as those with friction do at first, instead
+        of sliding.
+
+    Attributes
+    ----------
+    matrix, right : of the equations, (u, u) and (u, e) for each extra.
+    """
+
+    def __init__(
+        self,
+        problem: ContactProblem,
+        state: Contacts,
+        sections: RodSections,
+        extras: str = "defects",
+        sticking: bool = False,
+    ) -> None:
+        touches, k = state.touches, len(state.touches)
+        forces = np.array([touch.force for touch in touches]).reshape(k, 3)
+        self.loads = PointLoads(forces, np.zeros((k, 3)))
+        self.linear = linear = LinearRod(
+            problem.rod, state.condition, sections, state.mesh, state.nodes, self.loads, extras
+        )
+        u = linear.unknowns
+        size, width = u + k, linear.changes.shape[2] - u
+        self.matrix, self.right = np.zeros((size, size)), np.zeros((size, width))
+        super().__init__(problem, state, linear, [])
+        changes = []
+        for j in range(k):
+            row, change = self._row(j)
+            self.rows.append(row)
+            changes.append(change)
+        self._require(slice(0, 3), linear.changes[-1, TURN])
+        for j, (touch, row) in enumerate(zip(touches, self.rows, strict=True)):
+            surface = problem.surfaces[touch.surface]
+            node, first = int(state.mesh.node[j]), 3 + 7 * j
+            n, H = row.point.normal, row.point.curvature
+            dc = linear.moves[node]
+            force, moment = slice(first, first + 3), slice(first + 3, first + 6)
+            self._require(force, -touch.normal_force * H @ dc)
+            self.matrix[force, force] += np.eye(3)
+            self.matrix[force, u + j] = -(n + touch.drag)
+            self.matrix[moment, moment] = np.eye(3)
+            if touch.pinned:
+                self.matrix[first + 6, first + 6] = 1
+            else:
+                self._require(first + 6, row.mean @ H @ dc + n @ changes[j])
+            self._require(u + j, n @ dc)
+            self.matrix[u + j, u + j] = surface.softness
+            if linear.section_slopes is not None:
+                here = problem.rod.ranges[touch.range]
+                self.right[u + j] += linear.section_slopes[2][here.segment]
+            if extras == "defects":
+                self.right[force, 0] += touch.normal_force * (n + touch.drag) - touch.force
+                self.right[first + 6, 0] -= 0 if touch.pinned else row.slope
+                self.right[u + j, 0] -= row.gap
+            if sticking:
+                self._stick(j)
+
+    def _row(self, j: int) -> tuple[ContactRow, Vector]:
+        """What the equations of a contact need, and the change (3, c) of the mean tangent."""
+        state, linear = self.state, self.linear
+        touch = state.touches[j]
+        here, surface = self.problem.rod.ranges[touch.range], self.problem.surfaces[touch.surface]
+        point = surface.at(linear.position[state.mesh.node[j]])
+        mean, change = linear.tangent_change(j, self.loads, here.segment, here.rigid)
+        radius = float(linear.sections.radius[here.segment])
+        gap = point.distance - radius + float(state.condition.retreat[touch.surface])
+        gap += surface.softness * touch.normal_force
+        return ContactRow(point, radius, gap, mean, float(point.normal @ mean)), change
+
+    def _require(self, at: Any, change: Vector) -> None:
+        """Have a change (..., c) vanish."""
+        u = self.linear.unknowns
+        self.matrix[at, :u] = change[..., :u]
+        self.right[at] = -change[..., u:]
+
+    def _stick(self, j: int) -> None:
+        """Force and moment of a contact whose point of the body stays where it is."""
+        linear, touch, row = self.linear, self.state.touches[j], self.rows[j]
+        node, first, u = int(self.state.mesh.node[j]), 3 + 7 * j, linear.unknowns
+        here = self.problem.rod.ranges[touch.range]
+        n, H, lever = row.point.normal, row.point.curvature, -row.radius * row.point.normal
+        dc, turn = linear.moves[node].copy(), linear.changes[node, TURN].copy()
+        # of the material section, which the station moves along
+        bending = np.zeros(3) if here.rigid else linear.bending(j, self.loads, here.segment)
+        dc[:, first + 6] -= row.mean
+        turn[:, first + 6] -= bending
+        slip = dc - hat(lever) @ turn
+        across = np.linalg.svd(n[None])[2][1:]
+        force, moment = slice(first, first + 3), slice(first + 3, first + 6)
+        self.matrix[force], self.matrix[moment] = 0, 0
+        # the normal force is that along the normal, which turns
+        along = touch.force @ H @ linear.moves[node]
+        self._require(first, along)
+        self.matrix[first, force] += n
+        self.matrix[first, u + j] = -1
+        self._require(slice(first + 1, first + 3), across @ slip)
+        # the force acts at the surface
+        turning = -row.radius * hat(touch.force) @ H @ linear.moves[node]
+        self._require(moment, -turning)
+        self.matrix[moment, moment] += np.eye(3)
+        self.matrix[moment, force] -= hat(lever)
+
+    def solution(self) -> Vector:
+        """Unknowns (u, e) of each extra."""
+        return np.asarray(np.linalg.solve(self.matrix, self.right))
+
+    def along(self, solution: Vector) -> tuple[Vector, Vector]:
+        """Changes (N + 1, 9, e) and moves (N + 1, 3, e) of the nodes."""
+        linear, u = self.linear, self.linear.unknowns
+        found = linear.changes[:, :, :u] @ solution[:u] + linear.changes[:, :, u:]
+        moves = linear.moves[:, :, :u] @ solution[:u] + linear.moves[:, :, u:]
+        return found, moves
