@@ -127,6 +127,13 @@ def found_by_stiffopt(case: dict[str, Any]) -> dict[str, Any]:
     loss = eq.lift_off(d, limit=0.3)
     smallest = min((np.linalg.norm(each.force) for each in eq.contacts), default=0.0)
     known = loss.object is not None and len(eq.contacts) == np.count_nonzero(forces)
+    if known:  # not where another contact on the same object is left
+        after = np.array([*case["force"], 0, 0, 0]) + 1.05 * loss.force * np.r_[d, 0, 0, 0]
+        try:
+            left = robot.contact_equilibrium(p, scene_of(case), load=after, nearby=eq).contacts
+            known = all(each.object != loss.object for each in left)
+        except EquilibriumError:
+            known = False
     return {
         "tip": eq.tip_pose[:3, 3].tolist(), "forces": forces.tolist(), "stable": bool(eq.stable),
         "stiffness": eq.stiffness(d), "turned_deg": float(np.degrees(turn)),
@@ -199,7 +206,9 @@ def report(cases: list[dict[str, Any]]) -> str:
         rows.append([key, units[key], *cells, f"{values.max():.3g}", within])
     turned = np.array([case["stiffopt"]["turned_deg"] for case in good])
     gains = [case["stiffopt"]["stiffness"] / case["stiffopt"]["free_stiffness"] for case in good]
-    around = [case for case in good if case["rod"]["around"]]
+    around = [
+        case for case in good if case["rod"]["around"] and case["stiffopt"]["lost"] is not None
+    ]
     held = sum(case["rod"]["around"][0][case["stiffopt"]["lost"]] > 1e-5 for case in around)
     gone = sum(case["rod"]["around"][1][case["stiffopt"]["lost"]] < 1e-4 for case in around)
     lines = [

@@ -246,6 +246,26 @@ def test_sticking_is_stiffer_than_sliding():
     assert found.stiffness(X) > 2 * free
 
 
+@pytest.mark.parametrize("friction", [0.05, 0.2])
+def test_a_sticking_contact_slips_at_its_friction(friction):
+    """A straight arm on a post: pushed along the post, which holds the touched point."""
+    at, force = 0.12, 2e-3
+    tip, between, own = flexibilities(at)
+    found = robot().contact_equilibrium(REST, scene(post(at), friction=friction), load=push(force))
+    normal = float(np.linalg.norm(found.contacts[0].force))
+    # across, the touched point is held by turning the arm about its axis too
+    law = rod_section(FLOP, np.zeros(3), TWO.gravity)
+    held = own + 0.015**2 * law.compliance[5, 5] * at
+    lost = found.lift_off([0, 1, 0], contacts="sticking")
+    assert (lost.how, lost.object) == ("slips", "0")
+    assert lost.force == pytest.approx(friction * normal / (between / held), rel=0.02)
+    assert lost.stiffness == pytest.approx(1 / (tip - between**2 / held), rel=0.02)
+    assert lost.stiffness_after == pytest.approx(1 / tip, rel=0.05)
+    away = found.lift_off([-1, 0, 0], contacts="sticking")
+    assert away.how in ("slips", "lifts off")
+    assert away.force <= 1.01 * found.lift_off([-1, 0, 0]).force
+
+
 # -- approach, and what cannot be -----------------------------------------------------------------
 
 
@@ -286,7 +306,7 @@ def test_an_arm_that_is_pressed_on_a_wall_along_its_axis_buckles():
     euler = np.pi**2 / (4 * (1.01 * TWO.length) ** 2 * law.compliance[4, 4])
     euler /= 1 + euler * law.compliance[0, 0]
     forces = []
-    for p in np.linspace(1.8e4, 2.2e4, 11):
+    for p in np.arange(1.9e4, 2.3e4, 200):
         try:
             found = robot().contact_equilibrium(np.full(6, p), scene(wall))
         except EquilibriumError:

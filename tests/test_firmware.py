@@ -278,7 +278,8 @@ CONDITIONS: dict[str, dict[str, float]] = {
     "weak valves": {"valve_flow": 0.17},
     "strong valves": {"valve_flow": 0.23},
     "quick valves": {"valve_lag": 0.003},
-    "valves open early": {"offset": 5.0},
+    "valves open early": {"offset": 2.0},
+    "valves open late": {"offset": -2.0},
 }
 STEPS = ((0.0, 0.5), (0.5, 1.0), (1.0, 1.5), (1.5, 1.0))
 

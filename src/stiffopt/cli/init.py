@@ -179,7 +179,8 @@ def init_rig(
     file: Annotated[str, _file("rig")] = "my-rig.yaml",
     robot: Robot = None,
     supply: Annotated[
-        str | None, typer.Option(metavar="DRIVER", help="simulated, modbus or nidaq.")
+        str | None,
+        typer.Option(metavar="DRIVER", help="simulated, modbus, nidaq or open-regulator."),
     ] = None,
     tracker: Annotated[
         str | None,

@@ -361,7 +361,7 @@ def _scene(answers: _Answers, path: str) -> tuple[str, list[str]]:
 
 def _rig(answers: _Answers, path: str) -> tuple[str, list[str]]:
     _, written, robot = answers.robot()
-    supply = answers.choice("supply", "Regulators", "simulated", "modbus", "nidaq")
+    supply = answers.choice("supply", "Regulators", *_SUPPLIES)
     devices = ["simulated"] if supply == "simulated" else ["aurora", "openigtlink"]
     tracker = answers.choice("tracker", "Tracker", *devices, "none")
     n = robot.n_pressures
@@ -407,7 +407,22 @@ def _nidaq(n: int) -> str:
     )
 
 
-_SUPPLIES = {"simulated": lambda _: "  driver: simulated\n", "modbus": _modbus, "nidaq": _nidaq}
+def _open_regulator(n: int) -> str:
+    lines = "".join(f"    - {{output: {k + 1}}}\n" for k in range(n))
+    return (
+        "  driver: open-regulator\n"
+        "  port: /dev/ttyUSB0                   # better: /dev/serial/by-id/...\n"
+        "  board: 1                             # another one is refused\n"
+        f"  channels:                            # outputs of the board\n{lines}"
+    )
+
+
+_SUPPLIES = {
+    "simulated": lambda _: "  driver: simulated\n",
+    "modbus": _modbus,
+    "nidaq": _nidaq,
+    "open-regulator": _open_regulator,
+}
 _REGISTRATION = """\
   registration:                        # where the tracker and its sensor are: measure both
     tracker_in_base: {position: [0 mm, 0 mm, 0 mm], orientation: [1, 0, 0, 0]}

@@ -174,6 +174,63 @@ def workspace(
     return 0
 
 
+CONTACT_HELP = """\
+Lean an arm on the objects of a scene that allow contact, and say how stiff it is.
+
+Prints the contacts with their forces, the stiffness of the tip free and braced, with contacts that
+slide and that stick, and the pushes by which the first contact is lost. The equilibrium is the one
+that is reached from rest as the pressures grow together. ROBOT is the name of a built-in robot or a
+robot file.
+"""
+
+_CONTACT_EPILOG = f"""\
+\b
+Examples:
+  stiffopt map contact stiff-flop-2 --scene scene.yaml --pressures '0.6, 0, 0.2, 0, 0, 0.4 bar'
+  stiffopt map contact my-arm.yaml --scene scene.yaml --pressures '0.3, 0, 0 bar' --json
+{_CODES.format(or_late="")}"""
+
+
+@map_app.command("contact", help=CONTACT_HELP, epilog=_CONTACT_EPILOG)
+@with_exit_code
+def contact(
+    robot: RobotArgument,
+    scene: Annotated[str, typer.Option(metavar="FILE", help="A scene file.")],
+    pressures: Annotated[
+        str,
+        typer.Option(
+            metavar="LIST", help="Of all channels, proximal segment first: '0.2, 0, 0.3 bar'."
+        ),
+    ],
+    plot: Annotated[
+        str | None, typer.Option(metavar="FILE.png", help="Draw the arm and its contacts.")
+    ] = None,
+    as_json: Json = False,
+    units: Units = None,
+    quiet: Quiet = False,
+) -> None:
+    """Find the equilibrium of an arm that leans on objects; print and draw it."""
+    check_picture(plot)
+    from stiffopt.cli import contact_report, quantities
+    from stiffopt.model.manipulator import load_robot
+    from stiffopt.model.scene import load_scene
+
+    p = quantities.listed("--pressures", pressures, "Pa", "pressure")
+    with interruptible_work(quiet=quiet):
+        arm, around = load_robot(robot), load_scene(scene)
+        around.check_against(arm.description)
+        found = arm.contact_equilibrium(p, around)
+    if plot is not None:
+        from stiffopt.plots import save_figure
+        from stiffopt.plots.contact import plot_contact
+
+        save_figure(plot_contact(arm, found, around), plot)
+    if as_json:
+        write_json(contact_report.record(arm, found))
+    elif not quiet:
+        show(contact_report.summary(arm, found))
+
+
 ARM_HELP = """\
 Map the stiffness along an arm, from near its base to its tip, as in figure 6 of the paper.
 

@@ -21,7 +21,8 @@ from stiffopt.plots.view import View, ViewAngles, fill_panel
 
 Vector = NDArray[np.float64]
 
-_STATIONS = 24  # of the tube, per segment
+TUBE_STATIONS = 24
+"""Stations of the tube, per segment."""
 _SPOKES = 28  # of the tube, around
 _ALONG = 24  # points of an arrow that no text should lie on
 _LEAST_SIDES = (0.5, 0.3, 0.5)  # of the box, as shares of its longest
@@ -122,10 +123,15 @@ class ArmDrawing:
         self.axes.plot(*rim, color="#5c6670", linewidth=1.2, zorder=1)
         self.corners.append(rim.T)
 
-    def draw_tube(self, pressures: Vector, shade: float = 0.38) -> None:
-        """Tube with each segment in its colour, its backbone, and a ring at each end."""
+    def draw_tube(
+        self, pressures: Vector, shade: float = 0.38, poses: Vector | None = None
+    ) -> None:
+        """Tube with each segment in its colour, its backbone, and a ring at each end.
+
+        The poses (segments, k, 4, 4) are those at the pressures unless they are given.
+        """
         description = self.robot.description
-        poses = segment_poses(self.robot, pressures, _STATIONS)
+        poses = segment_poses(self.robot, pressures, TUBE_STATIONS) if poses is None else poses
         angle = np.linspace(0, 2 * np.pi, _SPOKES + 1)
         for number, segment in enumerate(description.segments):
             mine = poses[number]

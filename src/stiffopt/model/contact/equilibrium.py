@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
@@ -14,7 +15,7 @@ from stiffopt.model.arguments import check_choice, checked_measure
 from stiffopt.model.arm_clearance import SceneKey, measured_scene
 from stiffopt.model.compliance import Boundary, Frame, Kind
 from stiffopt.model.contact.push import ContactLoss, GrowingPush
-from stiffopt.model.contact.rod import Condition, Rod
+from stiffopt.model.contact.rod import Condition, Rod, rotations
 from stiffopt.model.contact.solve import ContactProblem
 from stiffopt.model.contact.surface import ContactSurface
 from stiffopt.model.contact.system import ContactSystem, LeaningArm
@@ -92,6 +93,17 @@ class ContactEquilibrium:
         shape = self._arm.shape
         return np.asarray(lie.transform(shape.rotation[0], shape.position[0]))
 
+    def poses(self, at: ArrayLike) -> Vector:
+        """Poses (k, 4, 4) at arc lengths (k,) at rest, in m."""
+        wanted = np.asarray(at, dtype=float)
+        shape, up = self._arm.shape, slice(None, None, -1)
+        q = [np.interp(wanted, shape.mesh.at[up], row[up]) for row in shape.nodes.quaternion.T]
+        found = np.zeros((len(wanted), 4, 4))
+        found[:, :3, :3] = rotations(np.stack(q, axis=1))
+        found[:, :3, 3] = self._arm.problem.body(self._arm, wanted)[0]
+        found[:, 3, 3] = 1
+        return found
+
     def backbone(self, n: int = 50) -> Vector:
         """Points (n, 3) of the centre line, equally spaced at rest from the base to the tip."""
         wanted = np.linspace(0.0, self._arm.problem.rod.arm.length, n)
@@ -128,7 +140,7 @@ class ContactEquilibrium:
             carry no tangential force leave them sticking.
         """
         check_choice("contacts", contacts, get_args(Grip))
-        per_wrench = self._per_wrench(contacts == "sticking")
+        per_wrench = self._per_wrench(range(len(self.contacts)) if contacts == "sticking" else ())
         R = self._arm.shape.rotation[0]
         turn = np.zeros((6, 6))
         turn[:3, :3] = turn[3:, 3:] = R
@@ -137,13 +149,13 @@ class ContactEquilibrium:
             found = (found + found.T) / 2  # symmetric but for the integrator's error
         return found
 
-    def _per_wrench(self, sticking: bool = False) -> Vector:
+    def _per_wrench(self, sticking: Collection[int] = ()) -> Vector:
         """Twist of the tip per wrench on it, (6, 6), in base axes."""
         system = self._system_for("tip wrench", sticking)
         changes, moves = system.along(system.solution())
         return np.concatenate([moves[0], changes[0, :3]])
 
-    def _system_for(self, extras: str, sticking: bool = False) -> ContactSystem:
+    def _system_for(self, extras: str, sticking: Collection[int] = ()) -> ContactSystem:
         arm = self._arm
         return ContactSystem(arm.problem, arm.state, arm.shape.sections, extras, sticking)
 
@@ -234,7 +246,8 @@ class ContactEquilibrium:
         limit : float
             Largest push that is looked at, in N.
         contacts : {"sliding", "sticking"}
-            How contacts meet the push; one that sticks may slip where its friction ends.
+            Without friction, and exact for large pushes; or with the friction that the scene
+            gives: contacts stick until one slips or lifts off, linear about this equilibrium.
 
         Returns
         -------
@@ -244,8 +257,8 @@ class ContactEquilibrium:
         check_choice("contacts", contacts, get_args(Grip))
         if limit <= 0:
             raise InputError(f"limit must be positive; got {limit!r}")
-        push = GrowingPush(self._arm.problem, d, limit, contacts == "sticking")
-        return push.loss(self._arm)
+        push = GrowingPush(self._arm.problem, d, limit)
+        return push.loss(self._arm) if contacts == "sliding" else push.slip(self._arm)
 
 
 def contact_equilibrium(

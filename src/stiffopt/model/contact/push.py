@@ -1,5 +1,6 @@
 """Pushes at the tip of an arm that leans on objects, and when they take contacts away."""
 
+from collections.abc import Collection
 from typing import NamedTuple
 
 import numpy as np
@@ -39,11 +40,58 @@ class ContactLoss(NamedTuple):
 class GrowingPush:
     """A push at the tip that grows from nothing, along a unit direction (3,) in base axes."""
 
-    def __init__(
-        self, problem: ContactProblem, direction: Vector, limit: float, sticking: bool
-    ) -> None:
-        self._problem, self._direction = problem, direction
-        self._limit, self._sticking = limit, sticking
+    def __init__(self, problem: ContactProblem, direction: Vector, limit: float) -> None:
+        self._problem, self._direction, self._limit = problem, direction, limit
+
+    def slip(self, arm: LeaningArm) -> ContactLoss:
+        """The first contact that slips or lifts off, linear about an equilibrium.
+
+        Contacts whose friction is not zero stick, and carry no tangential force at first. One
+        slips where the tangential force has grown to the coefficient of friction times the normal
+        one.
+        """
+        touches = arm.state.touches
+        friction = [self._problem.surfaces[touch.surface].friction for touch in touches]
+        sticking = [j for j, each in enumerate(friction) if each > 0]
+        system, solution, stiffness = self._tangent(arm, sticking)
+        _, moves = system.along(solution)
+        first, lost, how = self._limit, None, "holds"
+        for j, touch in enumerate(touches):
+            own = solution[3 + 7 * j : 6 + 7 * j, :3] @ self._direction
+            change = float(solution[system.linear.unknowns + j, :3] @ self._direction)
+            point = arm.rows[j].point
+            moved = moves[arm.state.mesh.node[j]][:, :3] @ self._direction
+            turned = touch.normal_force * point.curvature @ moved
+            across = float(np.linalg.norm(own - change * point.normal - turned))
+            ways = [("lifts off", -change, touch.normal_force)]
+            if friction[j] > 0:
+                least = friction[j] * touch.normal_force
+                ways.append(("slips", across - friction[j] * change, least))
+            for name, rate, until in ways:
+                if rate > 0 and until / rate < first:
+                    first, lost, how = until / rate, j, name
+        if lost is None:
+            return ContactLoss(np.inf, None, None, how, stiffness, stiffness)
+        if how == "slips":
+            after = self._tangent(arm, [j for j in sticking if j != lost])[2]
+        else:
+            rest = (*touches[:lost], *touches[lost + 1 :])
+            found = self._problem.correct(self._problem.with_touches(arm.state, rest))
+            kept = [j - (j > lost) for j in sticking if j != lost]
+            after = 0.0 if found is None else self._tangent(found, kept)[2]
+        name = self._problem.surfaces[touches[lost].surface].name
+        return ContactLoss(first, name, touches[lost].station, how, stiffness, after)
+
+    def _tangent(
+        self, arm: LeaningArm, sticking: Collection[int] = ()
+    ) -> tuple[ContactSystem, Vector, float]:
+        """Equations for forces at the tip, their solution (u, 6), and stiffness along the push."""
+        sections = arm.shape.sections
+        system = ContactSystem(self._problem, arm.state, sections, "tip wrench", sticking)
+        solution = system.solution()
+        _, moves = system.along(solution)
+        way = float(self._direction @ moves[0][:, :3] @ self._direction)
+        return system, solution, 1 / way
 
     def loss(self, arm: LeaningArm) -> ContactLoss:
         """The first contact that is lost on the way from an equilibrium."""
@@ -77,13 +125,10 @@ class GrowingPush:
 
     def _rates(self, arm: LeaningArm) -> tuple[Vector, float, float]:
         """Changes (k,) of the normal forces and of the tip's turn per push; stiffness along it."""
-        sections = arm.shape.sections
-        there = ContactSystem(self._problem, arm.state, sections, "tip wrench", self._sticking)
-        solution = there.solution()
-        changes, moves = there.along(solution)
-        way = float(self._direction @ moves[0][:, :3] @ self._direction)
+        system, solution, stiffness = self._tangent(arm)
+        changes, _ = system.along(solution)
         turn = float(np.linalg.norm(changes[0, :3, :3] @ self._direction))
-        return solution[there.linear.unknowns :, :3] @ self._direction, turn, 1 / way
+        return solution[system.linear.unknowns :, :3] @ self._direction, turn, stiffness
 
     def _lifted(self, arm: LeaningArm, force: float, lost: int) -> ContactLoss:
         state = arm.state

@@ -327,7 +327,7 @@ class ContactProblem:
         # gaps change by no more than the way, which is not quite straight
         least = (before.gaps + after.gaps - 1.05 * ways) / 2
         least[:, ways < _SWEPT * radii] = np.inf
-        least[[touch.surface for each in (before, after) for touch in each.state.touches]] = np.inf
+        least[[touch.surface for touch in before.state.touches]] = np.inf
         return bool((least < -_DEEPEST * radii).any())
 
     def _guess(self, state: Contacts, condition: Condition) -> Contacts:

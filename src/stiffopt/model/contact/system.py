@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -142,8 +143,8 @@ class ContactSystem(LeaningArm):
 
     Parameters
     ----------
-    sticking : whether contacts roll without slipping, as those with friction do at first, instead
-        of sliding.
+    sticking : which contacts roll without slipping, as those with friction do at first; the others
+        slide.
 
     Attributes
     ----------
@@ -156,7 +157,7 @@ class ContactSystem(LeaningArm):
         state: Contacts,
         sections: RodSections,
         extras: str = "defects",
-        sticking: bool = False,
+        sticking: Collection[int] = (),
     ) -> None:
         touches, k = state.touches, len(state.touches)
         forces = np.array([touch.force for touch in touches]).reshape(k, 3)
@@ -197,7 +198,7 @@ class ContactSystem(LeaningArm):
                 self.right[force, 0] += touch.normal_force * (n + touch.drag) - touch.force
                 self.right[first + 6, 0] -= 0 if touch.pinned else row.slope
                 self.right[u + j, 0] -= row.gap
-            if sticking:
+            if j in sticking:
                 self._stick(j)
 
     def _row(self, j: int) -> tuple[ContactRow, Vector]:

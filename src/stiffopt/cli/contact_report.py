@@ -1,0 +1,103 @@
+"""An arm that leans on objects, as text for the terminal and as JSON."""
+
+from typing import Any
+
+import numpy as np
+from rich.console import Group, RenderableType
+
+from stiffopt.cli.tables import TextTable, labelled, title
+from stiffopt.display import FIGURES, display_units
+from stiffopt.errors import printable
+from stiffopt.model.contact.equilibrium import ContactEquilibrium
+from stiffopt.model.contact.push import ContactLoss
+from stiffopt.model.manipulator import Manipulator
+from stiffopt.plots.wording import vector_text
+
+_AXES = dict(zip("xyz", np.eye(3), strict=True))
+
+
+def record(robot: Manipulator, found: ContactEquilibrium) -> dict[str, Any]:
+    """Return what there is to say about an equilibrium, for JSON, in SI units."""
+    return {
+        "robot": robot.description.name,
+        "pressures_pa": found.pressures,
+        "tip_position_m": found.tip_pose[:3, 3],
+        "stable": found.stable,
+        "within_limits": found.within_limits,
+        "contacts": [
+            {
+                "object": each.object,
+                "at_m": each.at,
+                "force_n": each.force,
+                "position_m": each.position,
+                "max_force_n": each.max_force if np.isfinite(each.max_force) else None,
+            }
+            for each in found.contacts
+        ],
+        "stiffness": {name: _stiffness(robot, found, d) for name, d in _AXES.items()},
+    }
+
+
+def _stiffness(robot: Manipulator, found: ContactEquilibrium, d: Any) -> dict[str, Any]:
+    return {
+        "free_n_per_m": robot.stiffness(found.pressures, d),
+        "sliding_n_per_m": found.stiffness(d),
+        "sticking_n_per_m": found.stiffness(d, contacts="sticking"),
+        "lost": [_loss(found.lift_off(sign * d)) for sign in (1, -1)],
+    }
+
+
+def _loss(loss: ContactLoss) -> dict[str, Any]:
+    return {
+        "force_n": loss.force if np.isfinite(loss.force) else None,
+        "object": loss.object,
+        "how": loss.how,
+        "stiffness_after_n_per_m": loss.stiffness_after,
+    }
+
+
+def summary(robot: Manipulator, found: ContactEquilibrium) -> RenderableType:
+    """Return the report of an equilibrium."""
+    units = display_units()
+    said = record(robot, found)
+    facts: list[tuple[str, RenderableType]] = [
+        ("tip", f"{vector_text(found.tip_pose[:3, 3], units.length)} {units.length}"),
+        ("stable", "yes" if found.stable else "no"),
+    ]
+    if not found.contacts:
+        facts.append(("contacts", "none"))
+    parts: list[RenderableType] = [
+        title(f"{printable(robot.description.name)}: leaning on objects"), labelled(facts),
+    ]  # fmt: skip
+    if found.contacts:
+        rows = tuple(
+            (
+                printable(each.object),
+                units.length.number(each.at, ".1f"),
+                f"{np.linalg.norm(each.force):.4g}",
+                f"{each.max_force:.4g}" if np.isfinite(each.max_force) else "-",
+            )
+            for each in found.contacts
+        )
+        heading = ("contact", f"at ({units.length})", "force (N)", "at most (N)")
+        parts.append(TextTable("", heading, rows).renderable())
+    lines = tuple(
+        (
+            name,
+            *(units.stiffness.number(each[key], FIGURES) for key in
+              ("free_n_per_m", "sliding_n_per_m", "sticking_n_per_m")),
+            *(_loss_text(loss) for loss in each["lost"]),
+        )
+        for name, each in said["stiffness"].items()
+    )  # fmt: skip
+    headings = ("along", "free", "sliding", "sticking", "lost at +", "lost at -")
+    remark = (
+        f"{units.stiffness}, contacts sliding and sticking; lost: the push at the tip, along and "
+        "against the axis, by which the first contact lifts off if all slide, in N"
+    )
+    parts.append(TextTable("", headings, lines, remark).renderable())
+    return Group(*parts)
+
+
+def _loss_text(loss: dict[str, Any]) -> str:
+    return "-" if loss["force_n"] is None else f"{loss['force_n']:.3g}"

@@ -1,0 +1,75 @@
+"""Figure of an arm that leans on objects: its shape, the free one, and the contact forces."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from stiffopt.display import display_units
+from stiffopt.model.contact.equilibrium import ContactEquilibrium
+from stiffopt.model.manipulator import Manipulator
+from stiffopt.model.scene import Scene
+from stiffopt.plots import style
+from stiffopt.plots.arm import TUBE_STATIONS, ArmDrawing
+from stiffopt.plots.view import View
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_LONGEST = 0.35  # arrow, as a share of the arm's length
+
+
+def plot_contact(
+    robot: Manipulator, equilibrium: ContactEquilibrium, scene: Scene, *, view: View | None = None
+) -> Figure:
+    """Draw an arm that leans on objects, with its contact forces and the free arm as a line.
+
+    Parameters
+    ----------
+    robot : Manipulator
+    equilibrium : ContactEquilibrium
+        Of that arm in that scene.
+    scene : Scene
+    view : (elevation, azimuth), optional
+        See `draw_arm`.
+    """
+    figure = style.new_figure(6.6, 6.6)
+    axes = style.add_space(figure, (0.02, 0.02, 0.96, 0.94))
+    style.legend_in_corner(axes, draw_contact(axes, robot, equilibrium, scene, view=view))
+    return figure
+
+
+def draw_contact(
+    axes: Any,
+    robot: Manipulator,
+    equilibrium: ContactEquilibrium,
+    scene: Scene,
+    *,
+    view: View | None = None,
+) -> list[Any]:
+    """Draw the same into axes in 3-D; see `draw_arm` for these, and for what is returned."""
+    drawing = ArmDrawing(axes, robot)
+    unit = display_units().length
+    drawing.draw_base()
+    poses, start = [], 0.0
+    for segment in robot.description.segments:
+        end = start + segment.length + segment.connector
+        poses.append(equilibrium.poses(np.linspace(start, end, TUBE_STATIONS)))
+        start = end
+    drawing.draw_tube(equilibrium.pressures, poses=np.array(poses))
+    drawing.explain_segments()
+    free = unit.of(robot.backbone(equilibrium.pressures, 60)[:, :3, 3])
+    axes.plot(*free.T, color=style.DARK, linewidth=1.2, linestyle="--", zorder=3)
+    drawing.add_body(free)
+    drawing.add_line(style.DARK, "free", "--")
+    drawing.draw_objects(scene)
+    largest = max((np.linalg.norm(each.force) for each in equilibrium.contacts), default=1.0)
+    for each in equilibrium.contacts:
+        arrow = _LONGEST * drawing.size * each.force / largest
+        drawing.draw_arrow(unit.of(each.position), arrow, style.LOAD, 6)
+        text = f"{np.linalg.norm(each.force):.3g} N"
+        drawing.add_label(unit.of(each.position) + arrow, text, style.LOAD)
+    if equilibrium.contacts:
+        drawing.add_line(style.LOAD, "force on the arm")
+    return drawing.finish(view)
