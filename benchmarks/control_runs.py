@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from control_baselines import PERIOD, MakeController
 from control_cases import DIRECTIONS, Case, Path8, settling_time
 from stiffopt import Task
-from stiffopt.control.interface import Controller
+from stiffopt.control.interface import Controller, Notice
 from stiffopt.control.loop import ControlLoop
 from stiffopt.control.state import State
 from stiffopt.paths.trajectory import Trajectory, Waypoint
@@ -150,6 +150,10 @@ class Run:
         """Follow a trajectory."""
         self._controller.follow(trajectory, self.rig.clock.now())
 
+    def notices(self) -> tuple[Notice, ...]:
+        """What the controller says is wrong."""
+        return self._controller.notices()
+
     def go(self, duration: float) -> Trace:
         """Let the controller steer."""
         rig, rows = self.rig, []
@@ -226,7 +230,7 @@ class LoopRun(Run):
 
 
 @contextmanager
-def _started(case: Case, make: MakeController, dynamics: str, in_loop: bool) -> Iterator[Run]:
+def started(case: Case, make: MakeController, dynamics: str, in_loop: bool) -> Iterator[Run]:
     """Context with a controller that steers a rig."""
     rig = case.rig(dynamics)
     controller = make(rig, case.believed, dynamics)
@@ -248,7 +252,7 @@ def run_case(
     """Go from target to target."""
     rng = np.random.default_rng([case.seed, 9])
     steps = []
-    with _started(case, make, dynamics, in_loop) as run:
+    with started(case, make, dynamics, in_loop) as run:
         before = run.tip()
         last = np.zeros(case.robot.n_pressures)
         for k, aim in enumerate(case.aims):
@@ -326,7 +330,7 @@ def run_path(
         Waypoint(time=time, target=case.target(place))
         for time, place in zip(path.times.tolist(), path.positions, strict=True)
     ]
-    with _started(case, make, dynamics, in_loop) as run:
+    with started(case, make, dynamics, in_loop) as run:
         run.set_task(case.task(path.positions[0], "axial"))
         run.go(SETTLE_FIRST)
         run.follow(Trajectory(waypoints=points))

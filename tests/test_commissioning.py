@@ -29,6 +29,7 @@ from stiffopt.commissioning.findings import Finding, findings_of
 from stiffopt.commissioning.record import (
     CommissioningRecord,
     RecordedFinding,
+    commissioned_control,
     fingerprints,
     load_record,
     save_record,
@@ -44,6 +45,7 @@ from stiffopt.plant.settings import Mismatch, PlantLoad, PlantSettings
 from stiffopt.registration import Placement, Registration
 from stiffopt.rig.config import RigDescription, load_rig_description
 from stiffopt.rig.interface import PressureLimits, Rig
+from stiffopt.rig.settings import ControlSettings
 from stiffopt.safety.rigs import rig_for_programs
 
 Array = NDArray[np.float64]
@@ -566,6 +568,31 @@ def test_arming_asks_for_a_record_that_fits(tmp_path: Path) -> None:
     armed = Armed(tmp_path)
     armed.path.write_text("format: stiffopt-commissioning/1\n", encoding="utf-8")
     assert "cannot be read" in armed.refused()
+
+
+def test_the_loop_gets_the_swing_that_was_found(tmp_path: Path) -> None:
+    swing = {
+        "frequency": 1.7, "frequency_deviation": 1e-3, "damping": 0.035,
+        "damping_deviation": 1e-3, "amplitude": 3e-3,
+    }  # fmt: skip
+
+    def settings_with(armed: Armed, **control: Any) -> tuple[float | None, float]:
+        rig = armed.lab.rig
+        update = {"control": ControlSettings(**control)}
+        found = commissioned_control(rig.settings.model_copy(update=update), rig.robot)
+        return found.frequency, found.damping
+
+    assert settings_with(Armed(tmp_path, swing=swing)) == (1.7, 0.035)
+    # the rig file's own word counts more
+    assert settings_with(Armed(tmp_path, swing=swing), damping=0.06) == (1.7, 0.06)
+    assert settings_with(Armed(tmp_path, swing=swing), frequency=2.0) == (2.0, 0.035)
+    for changes in ({"fits": False}, {"robot_hash": "0" * 16}, {"swing": None}):
+        assert settings_with(Armed(tmp_path, **{"swing": swing} | changes)) == (None, 0.06)
+    armed = Armed(tmp_path)
+    armed.path.write_text("format: stiffopt-commissioning/1\n", encoding="utf-8")
+    assert settings_with(armed) == (None, 0.06)
+    armed.path.unlink()
+    assert settings_with(armed) == (None, 0.06)
 
 
 def test_arming_compares_the_vented_arm_with_the_record(tmp_path: Path) -> None:

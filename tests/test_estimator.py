@@ -27,7 +27,7 @@ BASE = np.array([0.01, 0.0, 0.18])
 J = np.array([[3e-7, 0.0], [0.0, 3e-7], [0.0, 0.5e-7]])
 SHARES = np.array([0.9, 0.6])
 SWINGING = BendingMode(MASS, SHARES)
-PLAIN = EstimatorTuning(model_error=0.0, frequency_error=0.0, damping=ZETA)
+PLAIN = EstimatorTuning(model_error=0.0, excitation_error=0.0, frequency_error=0.0, damping=ZETA)
 
 
 def tip_at(p, rotation=None):
@@ -81,6 +81,13 @@ class Truth:
             self.eta[1] += self.agitation * root * self.rng.normal(size=2)
             self.offset = self.offset + self.drift * root * self.rng.normal(size=3)
             self.positions.append(self.position)
+
+
+def test_frequency_where_the_tip_is_that_of_the_model():
+    estimator = TipEstimator(PERIOD, 2, SWINGING, PLAIN)
+    estimator.set_frequency(1.3 * OMEGA, tip_at(np.zeros(2)))
+    estimator.advance(0.0, np.zeros(2), tip_at(np.zeros(2)))
+    assert estimator.omega == pytest.approx(1.3 * OMEGA, rel=1e-9)
 
 
 def pressures(k):

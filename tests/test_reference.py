@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.signal import cont2discrete
 
-from stiffopt.control.reference import Reference
+from stiffopt.control.reference import Reference, VibrationFilter
 
 BAR = 1e5
 SLEW = np.array([5 * BAR, 5 * BAR])
@@ -149,3 +149,53 @@ def test_change_of_rate_leaves_the_path_where_it_is():
     path = reference.path.copy()
     reference.rate = 20.0
     assert np.array_equal(reference.path, path)
+
+
+@pytest.mark.parametrize("period", [0.002, 0.01])
+@pytest.mark.parametrize("omega", [6.0, 9.7, 20.0])
+def test_average_over_a_vibration_moves_the_mode_on_its_path_and_leaves_no_vibration(period, omega):
+    damping, end = 0.04, 2 * np.pi / omega
+    averaged = VibrationFilter(period, damping, 1)
+    values, paths, rates = [], [], []
+    for k in range(round(3 * end / period)):
+        averaged.advance(np.array([1.0 if k * period > 0.2 * end else 0.0]), omega)
+        values.append(averaged.value[0])
+        paths.append(averaged.motion[0, 0])
+        rates.append(averaged.motion[1, 0])
+    A, B = (
+        np.array([[0.0, 1.0], [-(omega**2), -2 * damping * omega]]),
+        np.array([[0.0], [omega**2]]),
+    )
+    F, G, *_ = cont2discrete((A, B, np.eye(2), np.zeros((2, 1))), period)
+    x, tip = np.zeros(2), []
+    for value in values:
+        tip.append(x.copy())
+        x = F @ x + G[:, 0] * value
+    bound = 3 * omega * period / (2 * np.pi)
+    assert np.abs(np.array(tip)[:, 0] - paths).max() < bound
+    assert np.abs(np.array(tip)[:, 1] - rates).max() < 2 * omega * bound
+    assert paths[-1] == pytest.approx(1.0, abs=1e-9)
+    assert values[-1] == pytest.approx(1.0, abs=1e-9)
+    # nothing is left when the average has arrived, one vibration after the step
+    late = np.arange(len(tip)) * period > 1.2 * end + 2 * period
+    assert np.abs(np.array(tip)[late, 0] - 1).max() < 0.3 * bound
+
+
+def test_average_without_a_vibration_is_the_value_itself():
+    averaged = VibrationFilter(0.01, 0.04, 2)
+    averaged.begin(np.array([1.0, -1.0]))
+    averaged.advance(np.array([2.0, -3.0]), np.inf)
+    assert averaged.value == pytest.approx([2.0, -3.0])
+    assert averaged.motion[0] == pytest.approx([2.0, -3.0])
+
+
+def test_average_is_shifted_as_a_whole():
+    averaged = VibrationFilter(0.01, 0.04, 1)
+    for k in range(80):
+        averaged.advance(np.array([np.sin(0.1 * k)]), 9.0)
+    before, path = averaged.value.copy(), averaged.motion.copy()
+    averaged.shift(np.array([0.5]))
+    assert averaged.value == pytest.approx(before + 0.5)
+    assert averaged.motion == pytest.approx(path + np.array([[0.5], [0.0]]))
+    averaged.advance(np.array([np.sin(8.0) + 0.5]), 9.0)
+    assert averaged.value == pytest.approx(before + 0.5, abs=0.05)

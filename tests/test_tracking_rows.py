@@ -33,6 +33,7 @@ def drawn(seed):
     swing = (
         rng.normal(size=(2, 3)) * [[1e-3], [1e-2]], root @ root.T / 4, 9.0,
         rng.uniform(0, 1, 3), *(rng.uniform(0, 1e5, N) for _ in range(3)), rng.normal(size=N) * 1e5,
+        rng.normal(size=(2, 3)) * [[1e-3], [1e-2]],
     )  # fmt: skip
     return pose, jacobian, correction, swing
 
@@ -85,15 +86,15 @@ def test_rows_are_those_of_the_task(name, swings):
 def test_feedback_of_an_arm_that_swings(seed):
     target, system = TARGETS["position"], tracking_rows(N, ARM, DAMPING, DEAD_TIME)
     pose, jacobian, correction, swing = drawn(seed)
-    now, across, omega, gains, ahead, chamber, path, rate = swing
+    now, across, omega, gains, ahead, chamber, path, rate, intended = swing
     given = (pose, jacobian, prescribed_components(target), correction, *swing)
     rows, values, linear = evaluated(system, *given)
     own = across @ linear @ np.diag(ARM.participation)  # of the mode
-    home = ARM.participation.mean() * across @ correction[:3]
+    home, (there, moving) = across @ correction[:3], intended @ across
     free = np.array([[0, 1], [-(omega**2), -2 * DAMPING * omega]])
     later = expm(DEAD_TIME * free) @ now
     sigma = own @ (ahead - chamber) - home
-    tip, speed = own @ (ahead - path) + later[0] - home, later[1] - own @ rate
+    tip, speed = own @ (ahead - path) + later[0] - there, later[1] - own @ rate - moving
     feedback = -(gains[0] * sigma + gains[1] * tip + gains[2] * speed)
     expected, wanted = task(pose, jacobian, correction, target, feedback)
     assert rows[:3] == pytest.approx(expected, rel=1e-12)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -106,6 +107,33 @@ def test_participation_is_what_the_true_mode_has_of_the_static_shape(tip_mass):
         x = beam.bent(0.09 * index, 0.09 * (index + 1))
         share = beam.shape @ beam.M @ x / (beam.shape @ beam.M @ beam.shape) / x[-2]
         assert found.participation[3 * index : 3 * index + 3] == pytest.approx(share, abs=0.035)
+
+
+def test_participation_of_a_hanging_arm_is_that_of_the_modes_of_its_model():
+    """Masses at stations, their compliances to each other and their Jacobians, under gravity."""
+    robot = so.load_robot(TWO)
+    description = robot.description
+    ends = np.concatenate([[0], np.cumsum([s.length for s in description.segments])])
+    at = np.concatenate([a + (b - a) * (np.arange(6) + 0.5) / 6 for a, b in pairwise(ends)])
+    at = np.append(at, ends[-1])
+    masses = np.append(np.full(12, section_mass() * 0.09 / 6), description.tip_mass)
+    p, n = np.zeros(6), len(at)
+    first, second = (each.ravel() for each in np.meshgrid(at, at, indexing="ij"))
+    C = robot.compliance_between(p, first, second)[:, 0, 0].reshape(n, n)  # along x
+    root = np.sqrt(masses)
+    phi = eigh(root[:, None] * C * root)[1][:, -1] / root
+    jacobian = np.array([robot.body_jacobian(p, s)[0] for s in at])  # straight: base axes
+    eta = phi @ (masses[:, None] * jacobian) / (phi @ (masses * phi))
+    strong = np.abs(jacobian[-1]) > 1e-7
+    share = (phi[-1] * eta / np.where(strong, jacobian[-1], 1.0))[strong]
+    assert BendingMode.of(description).participation[strong] == pytest.approx(share, abs=0.06)
+    assert share.min() < 0.55 < 0.95 < share.max()
+
+
+def test_mode_of_a_known_frequency():
+    found = BendingMode.of(drawn(0.09)).at_frequency(12.0, 3.0)
+    assert found.frequency(3.0) == pytest.approx(12.0)
+    assert found.frequency(12.0) == pytest.approx(24.0)
 
 
 def test_heavy_tip_takes_part_in_everything_fully():

@@ -19,6 +19,7 @@ from stiffopt.directions import Quaternion
 from stiffopt.errors import InputError
 from stiffopt.files import read_file, save_file
 from stiffopt.model.description import RobotDescription
+from stiffopt.rig.settings import ControlSettings
 from stiffopt.schema import Items, Schema, Vector
 from stiffopt.units import Angle, Duration, Frequency, Length, Number, Pressure, PressureRate, Ratio
 
@@ -212,6 +213,32 @@ def _hash(content: Any) -> str:
 def is_record_of(record: CommissioningRecord, robot: RobotDescription, rig: Any) -> bool:
     """Whether a record is of this very robot, supply, tracker and registration."""
     return (record.rig_hash, record.robot_hash) == fingerprints(robot, rig)
+
+
+def commissioned_control(rig: Any, robot: RobotDescription) -> ControlSettings:
+    """Return the settings of a rig's control loop, with the swing that commissioning found.
+
+    What the rig file itself says of the swing stays, and so does all if there is no record of this
+    very rig that fits.
+
+    Parameters
+    ----------
+    rig : RigDescription
+    robot : RobotDescription
+    """
+    control: ControlSettings = rig.control
+    path = rig.commissioning.record
+    if path is None or not os.path.exists(path):
+        return control
+    try:
+        record = load_record(path)
+    except InputError:  # of which the check before arming tells
+        return control
+    if record.swing is None or not record.fits or not is_record_of(record, robot, rig):
+        return control
+    found = {"frequency": record.swing.frequency, "damping": record.swing.damping}
+    own = control.model_fields_set
+    return control.model_copy(update={k: v for k, v in found.items() if k not in own})
 
 
 def problems_of_record(

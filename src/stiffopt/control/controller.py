@@ -30,7 +30,7 @@ from stiffopt.control.motion_watch import MotionWatch
 from stiffopt.control.planner import InlinePlanner, ProcessPlanner
 from stiffopt.control.posture import PostureCourse
 from stiffopt.control.pressing import Phase, Pressing
-from stiffopt.control.reference import Reference
+from stiffopt.control.reference import Reference, VibrationFilter
 from stiffopt.control.regulators import PressureEstimator
 from stiffopt.control.replanning import AnyCourse, Pursuit, Replanner
 from stiffopt.control.state import ControllerStatus, Severity
@@ -130,6 +130,7 @@ class TipController:
         self._reference = Reference(
             period, slew, lag, control.damping, 6, tuning.reference.slew_share
         )
+        self._averaged = VibrationFilter(period, control.damping, 6)  # the offset
         effort = tuning.feedback.effort
         self._gains = GainSchedule(period, lag, control.damping, effort) if vibrates else None
         self._allocation = Allocation(
@@ -146,6 +147,7 @@ class TipController:
         self.forecast: Forecast | None = None
         if scene is not None:
             self.forecast = Forecast(Planner(robot, scene), tuning.forecast)
+        self._frequency = control.frequency
         self._lead = dead_time + 0.5 * period
         self._errors = TipErrors()
         self._windows = WindowWatch(tuning.windows)
@@ -173,7 +175,14 @@ class TipController:
         self._model, self._path_model = model, path_model
         self._waypoint_model = TipModel(self.robot)
         self._robot = self.robot
+        self._set_frequency()
         self.begin(self._now)
+
+    def _set_frequency(self) -> None:
+        """Let the vented arm swing as the settings say, whatever its model."""
+        if self._frequency is not None and self._waypoint_model is not None:
+            vented = self._waypoint_model.at(np.zeros(self.robot.n_pressures))
+            self._estimator.set_frequency(2 * math.pi * self._frequency, vented)
 
     def begin(self, now: float) -> None:
         """Start anew with a vented arm and no task."""
@@ -185,7 +194,7 @@ class TipController:
         self._watch.begin()
         zero = self._pressures.command
         self._reference.begin(np.concatenate([zero, np.zeros(6)]))
-        self._corrected_offset = np.zeros(6)
+        self._averaged.begin(np.zeros(6))
         self._saturated = np.zeros(len(zero), dtype=bool)
         self._permitted = self.limits.low, self.limits.high  # commands (n,), by the task
         self._tip: TipAt | None = None
@@ -337,10 +346,10 @@ class TipController:
         self._computed_at = now
         self._watch.go_on()
         offset, pressures = self._offset, self._pressures
-        self._corrected_offset = offset
         self._reference.begin(
             np.concatenate([pressures.command + pressures.history_offset, offset])
         )
+        self._averaged.begin(offset)
         self._at_rest = False
 
     def observe(
@@ -405,7 +414,7 @@ class TipController:
 
     def _compute(self, now: float) -> ControlOutput:
         reference, estimator, pressures = self._reference, self._estimator, self._pressures
-        omega, command_offset = estimator.omega, pressures.command_offset
+        command_offset = pressures.command_offset
         if self._adapts:
             self._adapt(now)
         self._press(now)
@@ -420,7 +429,7 @@ class TipController:
         if self._model_is_wrong():
             return ControlOutput(last.copy(), False, self._saturated.copy())
         self._set_reference_rate()
-        reference.omega = omega
+        reference.omega = estimator.omega
         reference.advance(plan)
         tip = self._models()[1].at(reference.path[:n])
         self._watch.intend(now, tip.pose[:3, 3] + reference.path[n : n + 3])
@@ -428,9 +437,8 @@ class TipController:
         self._led_to = None
         if isinstance(course, PostureCourse):
             self._led_to = course.target(tip.pose, reference.path[n:])
-        self._update_corrected_offset(omega)
-        correction = reference.path[n:] - self._corrected_offset
         prescribed = self.replanner.pursuit.prescribed
+        correction = reference.path[n:] - self._correct(estimator)
         self._allocation.limit(*self._channels.commands(reference.path[:n], *self._permitted))
         command, held, residual = self._allocation.solve(
             (tip.pose, tip.jacobian, prescribed, correction, *self._vibration_inputs()),
@@ -525,11 +533,12 @@ class TipController:
                 each.change(last)
             return
         self._robot, self._tip, self._adapted_at = robot, after, self._now
+        self._set_frequency()
         change = self._estimator.change_model(before, after)
-        self._corrected_offset = self._corrected_offset + change
         self._watch.change_model(change)
         self._touch.change_model(change)
         self._reference.shift(change)
+        self._averaged.shift(change)
         self.replanner.go_on_with(adapted, change)
 
     def _has_arrived(self) -> bool:
@@ -647,17 +656,16 @@ class TipController:
             return self._models()
         return self._model, self._path_model
 
-    def _update_corrected_offset(self, omega: float) -> None:
-        """Let the offset that feedback corrects follow the estimate.
+    def _correct(self, estimator: TipEstimator) -> Array:
+        """Offset (6,) that feedback corrects now.
 
-        In an arm that vibrates it is filtered: part of each vibration is mistaken for an offset,
-        and all of the higher modes, which the estimator does not model.
+        That of an arm that vibrates is averaged over a vibration, except along its stiff axis.
         """
-        share = 1.0
-        if math.isfinite(omega):
-            share = -math.expm1(-self._tuning.feedback.offset_rate * omega * self._period)
-        offset = self._corrected_offset
-        self._corrected_offset = offset + share * (self._offset - offset)
+        self._averaged.advance(self._offset, estimator.omega)
+        offset = self._averaged.value.copy()
+        behind = self._offset[:3] - offset[:3]
+        offset[:3] += behind - estimator.soft_plane @ behind
+        return offset
 
     def _vibration_inputs(self) -> tuple[ArrayLike, ...]:
         """Inputs of `tracking_rows` for an arm that vibrates."""
@@ -669,6 +677,7 @@ class TipController:
             estimator.vibration, estimator.soft_plane, estimator.omega,
             self._gains.at(estimator.omega), self._pressures.effective_ahead,
             self._reference.chamber, motion[0, :n], motion[1, :n],
+            motion[:2, n : n + 3] - self._averaged.motion[:, :3],
         )  # fmt: skip
 
 

@@ -32,7 +32,7 @@ from stiffopt import lie
 from stiffopt.control.formula import Formula
 from stiffopt.control.interface import SampleCounts
 from stiffopt.control.tuning import EstimatorTuning
-from stiffopt.control.vibration import BendingMode, transition
+from stiffopt.control.vibration import BendingMode, lateral_stiffness, transition
 from stiffopt.optimise.tip import TipAt
 from stiffopt.rig.interface import PoseSample
 
@@ -214,6 +214,12 @@ class TipEstimator:
             self._unchanged = self._unchanged[0], self._unchanged[1] + shift
         return change
 
+    def set_frequency(self, omega: float, tip: TipAt) -> None:
+        """Let the mode have a frequency, in rad/s, where the model's tip is this one."""
+        if self._mode is not None:
+            compliances = np.linalg.eigvalsh(tip.compliance[:3, :3])
+            self._mode = self._mode.at_frequency(omega, lateral_stiffness(compliances))
+
     def _update_mode(self, tip: TipAt) -> None:
         """Compute frequency, soft plane and lean from the compliance, every few steps."""
         self._ticks += 1
@@ -225,7 +231,7 @@ class TipEstimator:
         # in a strongly bent arm no direction is entirely stiff
         share = np.minimum(1.0, compliances / (self._tuning.soft_share * compliances[2]))
         self.soft_plane = axes * share @ axes.T
-        omega = self._mode.frequency(2 / float(compliances[1] + compliances[2]))
+        omega = self._mode.frequency(lateral_stiffness(compliances))
         self.omega = max(self._tuning.least_frequency, omega)
         self._times[0] = self.omega
         turning = rotation @ tip.compliance[3:, :3] @ rotation.T
@@ -360,7 +366,7 @@ def _correction(tuning: EstimatorTuning, vibrates: bool) -> Formula:
     vibration = driven
     if vibrates:
         vibration = driven + transition(omega, t.damping, -age) @ free
-        excited = t.model_error * displacements[1]
+        excited = t.excitation_error * displacements[1]
         detuned = t.frequency_error * omega**2 * elapsed * ca.norm_2(vibration[0, :])
         Q = [excited**2, t.agitation**2 * elapsed + (omega * excited) ** 2 + detuned**2, drift]
         F = ca.diagcat(transition(omega, t.damping, elapsed), 1)

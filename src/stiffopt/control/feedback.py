@@ -96,16 +96,18 @@ def tracking_rows(
     inputs, mode_rows, mode_values = [pose, jacobian, prescribed, correction], [], []
     if mode is not None:
         vibration, soft_plane = ca.SX.sym("vibration", 2, 3), ca.SX.sym("soft_plane", 3, 3)
+        intended = ca.SX.sym("intended", 2, 3)
         omega, gains = ca.SX.sym("omega"), ca.SX.sym("gains", 3)
         ahead, chamber = ca.SX.sym("ahead", n), ca.SX.sym("chamber", n)
         path, rate = ca.SX.sym("path", n), ca.SX.sym("rate", n)
-        inputs += [vibration, soft_plane, omega, gains, ahead, chamber, path, rate]
+        inputs += [vibration, soft_plane, omega, gains, ahead, chamber, path, rate, intended]
         M = soft_plane @ (linear @ ca.diag(ca.DM(mode.participation)))  # Jacobian of the mode
         later = transition(omega, damping, dead_time) @ vibration
-        goal = float(np.mean(mode.participation)) * (soft_plane @ shift)
+        goal = soft_plane @ shift
+        reached = intended @ soft_plane
         sigma = M @ (ahead - chamber) - goal
-        epsilon = M @ (ahead - path) + later[0, :].T - goal
-        speed = later[1, :].T - M @ rate
+        epsilon = M @ (ahead - path) + later[0, :].T - reached[0, :].T
+        speed = later[1, :].T - M @ rate - reached[1, :].T
         feedback = -(gains[0] * sigma + gains[1] * epsilon + gains[2] * speed)
         shift = shift + feedback
         mode_rows, mode_values = [mode_weight * M], [mode_weight * (goal + feedback)]

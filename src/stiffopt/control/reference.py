@@ -24,6 +24,7 @@ from stiffopt.control.formula import Formula
 Array = NDArray[np.float64]
 
 _LAGS = 4
+_LONGEST = 2.0  # s, of half a vibration; values of a slower one are averaged over twice this
 # of the lags' states: the last one, and its derivatives in units of the rate
 _DIFFERENCES = np.array(
     [[0, 0, 0, 0, 1], [0, 0, 0, 1, -1], [0, 0, 1, -2, 1], [0, 1, -3, 3, -1]], dtype=float
@@ -112,6 +113,63 @@ class Reference:
             np.array([1.0, c1 + tau, c2 + tau * c1, tau * c2]),
             np.array([1.0, c1, c2, 0.0]),
         )
+
+
+class VibrationFilter:
+    """Averages what feedback corrects over one vibration, so that correcting it excites none.
+
+    The average of a value over the period T of the vibration has zeros at its frequency and at all
+    multiples of it, near which the second bending mode is in some postures. The first mode, of a
+    damping ratio zeta, follows the average on a path without a residue: with D = T / 2, it is the
+    response to two steps of half the height, D apart (zero-vibration shaping), averaged over D.
+    """
+
+    def __init__(self, period: float, damping: float, m: int) -> None:
+        self._period, self._damping = period, damping
+        self._kept = 2 * math.ceil(_LONGEST / period) + 4
+        self.begin(np.zeros(m))
+
+    def begin(self, values: Array) -> None:
+        """Start anew, with values (m,) that have not changed for long."""
+        # the newest first, twice: any `_kept` in a row are in one piece
+        self._past = np.tile(values, (2 * self._kept, 1))
+        self._newest = self._kept
+        self._omega, self._weights = math.inf, np.array([[1.0], [1.0], [0.0]])
+        self.value = values  # the average
+        self.motion = np.stack([values, np.zeros(len(values))])  # path of the mode, and its rate
+
+    def shift(self, change: Array) -> None:
+        """Add a change (m,) to all values, past ones as well."""
+        self._past += change
+        self.value = self.value + change
+        self.motion = self.motion + np.stack([change, np.zeros(len(change))])
+
+    def advance(self, values: Array, omega: float) -> None:
+        """Take in values (m,) at an angular frequency, in rad/s; infinite: no vibration."""
+        self._newest = (self._newest or self._kept) - 1
+        self._past[self._newest] = self._past[self._newest + self._kept] = values
+        if omega != self._omega:
+            self._omega, self._weights = omega, self._shape(omega)
+        past = self._past[self._newest : self._newest + self._weights.shape[1]]
+        self.value, *motion = self._weights @ past
+        self.motion = np.stack(motion)
+
+    def _shape(self, omega: float) -> Array:
+        """Weights (3, k), for the newest value first, of average, path and its rate."""
+        half = min(math.pi / omega, _LONGEST) / self._period
+        if half < 1:
+            return np.array([[1.0, 0.0], [1.0, 0.0], [1 / self._period, -1 / self._period]])
+        whole = math.ceil(half)
+        times = np.arange(whole + 1)
+        later = 1 / (1 + math.exp(self._damping * omega * self._period * half))
+        steps = np.zeros(whole + 1)
+        steps[[0, whole - 1, whole]] = 1 - later, later * (whole - half), later * (1 - whole + half)
+        mode = np.exp(-self._damping * omega * self._period * times)
+        mode *= np.maximum(np.sin(math.pi * times / half), 0.0)
+        box = np.clip(half - times, 0.0, 1.0) / half
+        value, path = np.convolve(steps, box), np.convolve(mode / mode.sum(), box)
+        rate = np.diff(path, prepend=0.0) / self._period
+        return np.stack([value, path, rate])
 
 
 def _step(reach: Array, extra: int) -> Formula:

@@ -19,11 +19,13 @@ class EstimatorTuning:
     # fastest that a tip moves, in m/s; samples that would need more are rejected
     max_speed: float = 1.0
     model_error: float = 0.2  # error of the model's displacement, as a share of that displacement
+    # error of what excites the vibration, as a share of the mode's displacement
+    excitation_error: float = 0.05
     drift: float = 3e-4  # growth of the offset's standard deviation at rest, in m / sqrt(s)
     angular_drift: float = 3e-3  # the same of the orientation's offset, in rad / sqrt(s)
     # growth of the standard deviation of the vibration's speed, in m/s / sqrt(s)
     agitation: float = 2e-3
-    frequency_error: float = 0.2  # relative error of the square of the vibration's frequency
+    frequency_error: float = 0.1  # relative error of the square of the vibration's frequency
     damping: float = 0.04  # damping ratio of the vibration
     memory: float = 0.4  # age beyond which a sample is dropped, in s
     # compliance, as a share of the largest, below which a direction vibrates less
@@ -70,7 +72,7 @@ class ReferenceTuning:
     """Bandwidth of the reference filter."""
 
     # rate of its lags over the angular frequency of an arm that vibrates
-    vibrating_rate: float = 1.2
+    vibrating_rate: float = 1.4
     # largest rate of its lags, and that of an arm that does not vibrate, in 1/s
     rigid_rate: float = 100.0
     # share of the slew that the reference may take; the rest is for feedback
@@ -90,10 +92,7 @@ class FeedbackTuning:
     lever: float = 0.05  # weight of an angle against a length, in m/rad
     # weight of the vibration's part of the tip's motion against the motion itself
     mode_weight: float = 3.0
-    effort: float = 1.0  # weight of effort against error in the linear-quadratic regulator
-    # rate with which the offset of a vibrating arm is corrected, over its angular frequency; part
-    # of each vibration is mistaken for an offset
-    offset_rate: float = 0.6
+    effort: float = 3.0  # weight of effort against error in the linear-quadratic regulator
     # change of the tip's position below which a change of pressure is left to the plan, in m/bar:
     # the square root of epsilon of the quadratic program
     posture_weight: float = 0.3e-3

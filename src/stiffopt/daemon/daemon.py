@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.commissioning.record import commissioned_control
 from stiffopt.control.controller import TipController
 from stiffopt.control.lifecycle import ARMED
 from stiffopt.control.loop import ControlLoop
@@ -135,7 +136,7 @@ class Daemon:
             self.link.limits,
             guarded.slew,
             period=period,
-            control=description.control,
+            control=commissioned_control(description, self.robot.description),
             safety=description.safety,
             vibrates=_vibrates(description),
             scene=scene,

@@ -10,7 +10,7 @@ from pydantic import BeforeValidator, Field, ValidationInfo, model_validator
 
 from stiffopt.model.description import PerChannelPressure, PerChannelRate
 from stiffopt.schema import BadKeyError, Schema
-from stiffopt.units import Duration, Force, Length, Ratio, Speed
+from stiffopt.units import Duration, Force, Frequency, Length, Ratio, Speed
 
 
 def _none(value: Any) -> Any:
@@ -105,7 +105,10 @@ class ControlSettings(Schema):
     vibration : ``modelled``: the arm swings as its robot file says; ``none``: it follows its
         pressures at once, as a damped arm does; ``auto``: ``none`` on a simulated rig without
         inertia, else ``modelled``.
-    damping : share of critical damping of that vibration.
+    damping : share of critical damping of that vibration; where the rig file has none, that which
+        commissioning has found.
+    frequency : of the swing of the vented arm, in Hz; None: what commissioning has found, or else
+        what the robot file implies.
     solver : of the small quadratic program of each tick.
     adaptation : ``auto``: the arm's numbers are adapted to where the tip is seen at rest; ``none``.
     """
@@ -115,6 +118,7 @@ class ControlSettings(Schema):
     tracker_noise: Annotated[Length, Field(gt=0)] = 5e-5
     vibration: Literal["auto", "modelled", "none"] = "auto"
     damping: Annotated[Ratio, Field(ge=0, lt=1)] = 0.06
+    frequency: Annotated[Frequency, Field(gt=0, le=50)] | None = None
     solver: Literal["daqp", "osqp"] = "daqp"
     adaptation: Literal["auto", "none"] = "auto"
 
