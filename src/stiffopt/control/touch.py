@@ -137,7 +137,9 @@ class TouchEstimator:
         self._recent_way = np.zeros((3, len(self._ends)))
         self._better = self._quiet = 0  # samples in a row
         self._begun = -math.inf  # the last hypothesis
-        self._compliances, self._axes = np.ones(3), np.eye(3)
+        self._softest = 1.0  # largest compliance, in m/N
+        # stiffness (3, 3) of the tip in the directions of feeling, and projection on these
+        self._stiffness, self._felt_axes = np.eye(3), np.eye(3)
         self.stiffness_error = math.nan
         unknown = np.full(3, np.nan)
         self.felt = TipForce(False, unknown, np.full((3, 3), np.nan), np.zeros(3))
@@ -211,11 +213,11 @@ class TouchEstimator:
         self.felt = self._force()
 
     def _force(self) -> TipForce:
-        t, (inverse, felt) = self._tuning, self._inverse()
+        t, stiffness, felt = self._tuning, self._stiffness, self._felt_axes
         displacement = self._filters.means[0, _U] if self._has_force else np.zeros(3)
-        force = inverse @ displacement
+        force = stiffness @ displacement
         error = self.stiffness_error if math.isfinite(self.stiffness_error) else t.stiffness_error
-        covariance = self._variance() * inverse @ inverse + error**2 * np.outer(force, force)
+        covariance = self._variance() * stiffness @ stiffness + error**2 * np.outer(force, force)
         covariance += t.force**2 * (np.eye(3) - felt)
         return TipForce(self._believed, force, covariance, felt @ displacement)
 
@@ -227,16 +229,13 @@ class TouchEstimator:
         off = np.abs(self._time - filters.since[1:] - self._tuning.open_time)
         return float(filters.covariances[1 + int(np.argmin(off)), _U, _U])
 
-    def _inverse(self) -> tuple[Array, Array]:
-        """Inverse of the compliance in the directions of feeling, and projection on these."""
-        soft = self._compliances > SOFT_SHARE * self._compliances[2]
-        axes = self._axes[:, soft]
-        return axes / self._compliances[soft] @ axes.T, axes @ axes.T
-
     def _look_at(self, tip: TipAt) -> None:
-        """Find the directions in which the tip is soft."""
+        """Find the directions in which the tip is soft, and the stiffness there."""
         R = tip.pose[:3, :3]
-        self._compliances, self._axes = np.linalg.eigh(R @ tip.compliance[:3, :3] @ R.T)
+        compliances, axes = np.linalg.eigh(R @ tip.compliance[:3, :3] @ R.T)
+        soft = compliances > SOFT_SHARE * compliances[2]
+        self._softest, axes = float(compliances[2]), axes[:, soft]
+        self._stiffness, self._felt_axes = axes / compliances[soft] @ axes.T, axes @ axes.T
 
     def _moved(self, pressures: Array, tip: TipAt) -> Array:
         """Displacement (3, s) of the model's tip by each segment since the last sample, in m."""
@@ -280,10 +279,9 @@ class TouchEstimator:
     def _update(self, F: Array, Q: Array, away: Array, noise: float) -> None:
         """Predict and correct all filters."""
         t, f, seen = self._tuning, self._filters, self._seen
-        softest = self._compliances[2]
         elapsed = float(F[_E, _B])
         is_open = self._time - f.since < t.open_time
-        rate = np.where(is_open, t.open_rate, t.force_rate) * softest
+        rate = np.where(is_open, t.open_rate, t.force_rate) * self._softest
         rate[f.released] = 0.0
         if not self._has_force:
             rate[0] = 0.0
@@ -296,8 +294,7 @@ class TouchEstimator:
         seen_with = covariances @ seen
         variances = seen_with @ seen + noise
         gains = seen_with / variances[:, None]
-        _, felt = self._inverse()
-        soft = missed @ felt
+        soft = missed @ self._felt_axes
         stiff = gains.copy()  # along a stiff axis no force is felt, and nothing vibrates
         stiff[:, [_U, _R, _XI, _ETA]] = 0.0
         f.means = means + gains[:, :, None] * soft[:, None]
@@ -312,8 +309,8 @@ class TouchEstimator:
         """Take a hypothesis that is better by far, begin others, and let a small force go."""
         t, f = self._tuning, self._filters
         best = int(np.argmax(f.evidence))
-        inverse, _ = self._inverse()
-        change = float(np.linalg.norm(inverse @ (f.means[best, _U] - f.means[0, _U])))
+        displaced = f.means[best, _U] - f.means[0, _U]
+        change = float(np.linalg.norm(self._stiffness @ displaced))
         counts = f.released[best] or change > t.least_force
         is_better = best > 0 and f.evidence[best] > t.evidence and counts
         self._better = self._better + 1 if is_better else 0
@@ -325,7 +322,7 @@ class TouchEstimator:
         elif self._time - self._begun >= t.spacing - 1e-9:
             self._begin_hypotheses()
         if self._believed:
-            self._let_go(inverse)
+            self._let_go()
 
     def _begin_hypotheses(self) -> None:
         """That a force has begun, or changed, just now; and that it has gone."""
@@ -334,7 +331,7 @@ class TouchEstimator:
         kept = np.flatnonzero(self._time - f.since[1:] < t.hypothesis_time) + 1
         f = f.keep([0, *kept.tolist()])
         mean, covariance = f.means[0], f.covariances[0]
-        jump = (t.jump * self._compliances[2]) ** 2 * np.outer(self._begins, self._begins)
+        jump = (t.jump * self._softest) ** 2 * np.outer(self._begins, self._begins)
         jump[_R, _R] = self._rate() ** 2
         f = f.with_one(mean, covariance + jump, self._time, released=False)
         if self._believed:
@@ -344,10 +341,10 @@ class TouchEstimator:
             f = f.with_one(gone @ mean, gone @ covariance @ gone.T, self._time, released=True)
         self._filters = f
 
-    def _let_go(self, inverse: Array) -> None:
+    def _let_go(self) -> None:
         """Feel no force any more that has been small for a while: its rest is an error."""
         t = self._tuning
-        force = float(np.linalg.norm(inverse @ self._filters.means[0, _U]))
+        force = float(np.linalg.norm(self._stiffness @ self._filters.means[0, _U]))
         least = max(t.gone_share * t.least_force, self._deviation())
         self._quiet = self._quiet + 1 if force < least else 0
         if self._quiet < t.quiet:
@@ -357,11 +354,11 @@ class TouchEstimator:
 
     def _deviation(self) -> float:
         """Standard deviation of the force of the present filter where the tip is softest, in N."""
-        return math.sqrt(self._filters.covariances[0, _U, _U]) / float(self._compliances[2])
+        return math.sqrt(self._filters.covariances[0, _U, _U]) / self._softest
 
     def _rate(self) -> float:
         """Standard deviation of the rate of u while a force changes, in m/s."""
-        rate = self._tuning.rate * float(self._compliances[2])
+        rate = self._tuning.rate * self._softest
         return rate if self._approach is None else max(rate, self._approach[1])
 
     def _merge(self) -> None:
