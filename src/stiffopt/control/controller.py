@@ -376,7 +376,7 @@ class TipController:
             presses = isinstance(course, Pressing) and course.touches_on_purpose
             self._touch.stiffness_error = self.replanner.deviation
             if isinstance(course, Pressing) and presses:
-                self._touch.expect(course.direction, course.press.speed)
+                self._touch.expect(course.direction, course.press.speed, presses=course.presses)
             else:
                 self._touch.expect(None)
             self._touch.take(

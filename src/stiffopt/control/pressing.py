@@ -92,6 +92,11 @@ class Pressing:
         return self._target.model_copy(update={"position": moved})
 
     @property
+    def presses(self) -> bool:
+        """Whether the tip presses on something by now."""
+        return self.phase is Phase.PRESSING and self._touched
+
+    @property
     def direction(self) -> Array:
         """Direction (3,) of the approach, base axes."""
         return self._direction

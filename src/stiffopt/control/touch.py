@@ -115,6 +115,7 @@ class TouchEstimator:
         # direction and speed of an approach, on which a force may come at any moment
         self._approach: tuple[Array, float] | None = None
         self._approached = 0.0  # way of the model's tip since it began, in m
+        self._presses = False
         # change of the state by a force that begins
         self._begins = np.array([1.0, 0.0, 0.0, 0.0, 0.0, -swings, 0.0])
         self.begin()
@@ -144,7 +145,7 @@ class TouchEstimator:
         unknown = np.full(3, np.nan)
         self.felt = TipForce(False, unknown, np.full((3, 3), np.nan), np.zeros(3))
 
-    def expect(self, direction: Array | None, speed: float = 0.0) -> None:
+    def expect(self, direction: Array | None, speed: float = 0.0, *, presses: bool = False) -> None:
         """Be prepared for a force that grows slowly, as when the tip approaches something.
 
         Parameters
@@ -153,7 +154,11 @@ class TouchEstimator:
             Of the approach (3,), base axes; None: there is none. Nothing touches when it begins.
         speed :
             Of the approach, in m/s.
+        presses :
+            Whether the tip presses on something by now: it hardly moves along the direction then,
+            and what the pressures would move it by, the force displaces it by.
         """
+        self._presses = presses
         if direction is None:
             if self._approach is not None and not self._believed:
                 self._merge()
@@ -163,7 +168,8 @@ class TouchEstimator:
             self._believed, self._approached = False, 0.0
             self._merge()
             f = self._filters
-            f.means[:, _G] = f.covariances[:, _G] = f.covariances[:, :, _G] = 0.0
+            for state in (_G, _B):  # the arm has rested: it creeps no more
+                f.means[:, state] = f.covariances[:, state] = f.covariances[:, :, state] = 0.0
             f.covariances[:, _G, _G] = self._tuning.approach_error**2
         self._approach = direction, speed
 
@@ -258,13 +264,20 @@ class TouchEstimator:
         F, Q = np.eye(7), np.zeros((7, 7))
         F[:, _R] = elapsed * self._begins
         F[_R, _R] = math.exp(-elapsed / t.rate_time)
-        if self._approach is not None:
-            F[_E, _G] = float(self._approach[0] @ moved.sum(axis=1))
-            self._approached += F[_E, _G]
         F[_E, _B], F[_B, _B] = elapsed, math.exp(-elapsed / t.creep_time)
         hurry = min(1.0, _length(moved) / (elapsed * t.fast)) if elapsed > 0 else 0.0
         Q[_E, _E] = (t.model_error**2 + (t.fast_error * hurry) ** 2) * grown + t.drift**2 * elapsed
         Q[_B, _B] = t.creep**2 * grown + (t.creep_change * _length(self._recent_way)) ** 2 * elapsed
+        self._pressed = np.zeros(3)
+        if self._approach is not None:
+            Q[_B, _B] = 0.0  # or the beginning of a contact would be taken for creep
+            along = float(self._approach[0] @ moved.sum(axis=1))
+            self._approached += along
+            if self._presses:
+                self._pressed = -t.held_share * along * self._approach[0]
+                Q[_U, _U] = (t.held_error * along) ** 2
+            else:
+                F[_E, _G] = along
         if self._vibrates:
             F[_XI:, _XI:] = _vibration(omega, self._damping, elapsed)
             mean = self._filters.means[0]
@@ -289,6 +302,7 @@ class TouchEstimator:
         spread = 2 * elapsed / t.rate_time * self._rate() ** 2  # keeps the deviation of r
         noises[:, _R, _R] = np.where(rate > 0, spread, 0.0)
         means = F @ f.means
+        means[:, _U] += self._pressed
         covariances = F @ f.covariances @ F.T + noises
         missed = away - seen @ means
         seen_with = covariances @ seen

@@ -333,6 +333,10 @@ class TouchTuning:
     # and its deviation before, as a share of the way
     learning_way: float = 1.5e-3
     approach_error: float = 0.1
+    # while it presses: the share of a motion by which the force displaces the tip back, and its
+    # deviation
+    held_share: float = 0.9
+    held_error: float = 0.15
 
 
 @dataclass(frozen=True)
