@@ -313,6 +313,11 @@ class TouchEstimator:
         stiff[:, [_U, _R, _XI, _ETA]] = 0.0
         f.means = means + gains[:, :, None] * soft[:, None]
         f.means += stiff[:, :, None] * (missed - soft)[:, None]
+        if self._approach is not None:  # what the tip comes to pushes it back, and never on
+            ahead = np.maximum(f.means[:, _U] @ self._approach[0], 0.0)
+            onward = ahead[:, None] * self._approach[0]
+            f.means[:, _U] -= onward
+            f.means[:, _E] += onward
         f.covariances = covariances - gains[:, :, None] * seen_with[:, None]
         squares = 0.5 * (soft**2).sum(axis=1) / variances
         widths = np.log(variances)
