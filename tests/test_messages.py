@@ -38,6 +38,7 @@ from stiffopt.optimise.goal import (
     StiffnessGoal,
     StiffnessMeasure,
 )
+from stiffopt.optimise.press import Press
 from stiffopt.optimise.target import Target, Tolerance
 from stiffopt.optimise.task import Load, PressureRange, Task, load_task
 from stiffopt.optimise.terms.above import Plane
@@ -52,7 +53,7 @@ SLEW = np.full(3, 5e5)
 X = (1.0, 0.0, 0.0)
 MESSAGES: tuple[type[Schema], ...] = (
     *(Task, Target, Tolerance, StiffnessGoal, StiffnessMeasure, AtLeast, MatchValue, MatchMatrix),
-    *(Load, PressureRange, Plane, Waypoint, Trajectory),
+    *(Load, Press, PressureRange, Plane, Waypoint, Trajectory),
     *(Scene, SceneObject, AllowedContact, *(kind for kind in OBSTACLES.values() if kind != Mesh)),
 )
 UNSAID: dict[type[Schema], set[str]] = {
@@ -271,6 +272,13 @@ EVERYTHING: list[Schema] = [
         ),
         load=Load(force=(0.0, 0.1, -0.02), moment=(1e-3, 0.0, 0.0), frame="tip"),
         pressure=PressureRange(min=1e3, max=(None, 1.2e5, 1e5)),
+    ),
+    Task(
+        robot="stiff-flop-1",
+        target=Target(position=(0.01, 0.0, 0.1)),
+        press=Press(
+            force=0.03, direction=X, frame="tip", tolerance=1e-3, speed=1e-3, travel=5e-3
+        ),
     ),
     task(
         target=Target(orientation=(0.6, 0.0, 0.8, 0.0)),
