@@ -14,8 +14,9 @@ from scipy.integrate import solve_ivp
 from stiffopt import Press, StiffnessGoal, StiffnessMeasure, Target, Task, load_robot, load_task
 from stiffopt.control.controller import TipController
 from stiffopt.control.pressing import Phase, Pressing
-from stiffopt.control.touch import TipForce, TouchEstimator
+from stiffopt.control.touch import TipForce, TouchEstimator, _vibration
 from stiffopt.control.tuning import PressingTuning, TouchTuning
+from stiffopt.control.vibration import transition
 from stiffopt.errors import InputError
 from stiffopt.model.robot_files import load_description
 from stiffopt.optimise.solver import PressureSolver
@@ -106,6 +107,12 @@ def test_neither_motion_with_errors_nor_creep_is_felt() -> None:
     _, forces = felt(away, 12.0, lambda t: P + way * progress(t))
     assert np.linalg.norm(moved) > 4e-3
     assert not any(force.touches for force in forces)
+
+
+def test_its_vibration_is_that_of_the_tip_estimator() -> None:
+    for duration in (0.005, 0.025, 0.4):
+        expected = np.array(transition(OMEGA, 0.04, duration))
+        np.testing.assert_allclose(_vibration(OMEGA, 0.04, duration), expected, rtol=1e-12)
 
 
 def test_along_a_stiff_axis_nothing_is_felt_and_nothing_is_known() -> None:

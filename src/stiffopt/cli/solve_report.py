@@ -110,7 +110,7 @@ def _tip(solution: PressureSolution, pose: Vector) -> Iterable[Line]:
 
 
 def _press(solution: PressureSolution, pose: Vector) -> Iterable[Line]:
-    """What the tip presses with, and how well that is felt."""
+    """The force of a press, and how well the arm feels it."""
     press, compliance = solution.task.press, solution.compliance
     if press is None or compliance is None:
         return

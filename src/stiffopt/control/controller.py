@@ -480,7 +480,7 @@ class TipController:
         )  # fmt: skip
 
     def _is_known(self, now: float) -> bool:
-        """Whether the arm's stiffness is known as well as it can be at once."""
+        """Whether the arm's stiffness is known, and will not be known better soon."""
         if not self._adapts:
             return True
         known, calm = self.replanner.known, self._tuning.adaptation.calm_time

@@ -212,9 +212,10 @@ class TouchEstimator:
         self._look_at(tip)
         moved = self._moved(pressures, tip)
         self._time = time
-        F, Q = self._process(elapsed, moved, omega)
+        F, Q, pressed = self._process(elapsed, moved, omega)
         speed = _length(moved) / elapsed if elapsed > 0 else 0.0
-        self._update(F, Q, away, t.noise**2 + (t.late * speed) ** 2)
+        self._predict(elapsed, F, Q, pressed)
+        self._correct(away, t.noise**2 + (t.late * speed) ** 2)
         self._decide()
         self.felt = self._force()
 
@@ -250,8 +251,8 @@ class TouchEstimator:
         moved: Array = np.add.reduceat(columns, self._ends, axis=1)
         return moved
 
-    def _process(self, elapsed: float, moved: Array, omega: float) -> tuple[Array, Array]:
-        """Transition (7, 7) and covariance (7, 7) of its noise.
+    def _process(self, elapsed: float, moved: Array, omega: float) -> tuple[Array, Array, Array]:
+        """Transition (7, 7), covariance (7, 7) of its noise, and change (3,) of u by the motion.
 
         The errors of a motion in one direction add up, not their squares: the variance grows with
         the square of the way of the last moments.
@@ -268,13 +269,13 @@ class TouchEstimator:
         hurry = min(1.0, _length(moved) / (elapsed * t.fast)) if elapsed > 0 else 0.0
         Q[_E, _E] = (t.model_error**2 + (t.fast_error * hurry) ** 2) * grown + t.drift**2 * elapsed
         Q[_B, _B] = t.creep**2 * grown + (t.creep_change * _length(self._recent_way)) ** 2 * elapsed
-        self._pressed = np.zeros(3)
+        pressed = np.zeros(3)
         if self._approach is not None:
             Q[_B, _B] = 0.0  # or the beginning of a contact would be taken for creep
             along = float(self._approach[0] @ moved.sum(axis=1))
             self._approached += along
             if self._presses:
-                self._pressed = -t.held_share * along * self._approach[0]
+                pressed = -t.held_share * along * self._approach[0]
                 Q[_U, _U] = (t.held_error * along) ** 2
             else:
                 F[_E, _G] = along
@@ -287,12 +288,11 @@ class TouchEstimator:
             Q[_ETA, _ETA] = omega**2 * excited + elapsed * (
                 t.agitation**2 + t.detuned**2 * omega**3 * swing**2
             )
-        return F, Q
+        return F, Q, pressed
 
-    def _update(self, F: Array, Q: Array, away: Array, noise: float) -> None:
-        """Predict and correct all filters."""
-        t, f, seen = self._tuning, self._filters, self._seen
-        elapsed = float(F[_E, _B])
+    def _predict(self, elapsed: float, F: Array, Q: Array, pressed: Array) -> None:
+        """Predict all filters."""
+        t, f = self._tuning, self._filters
         is_open = self._time - f.since < t.open_time
         rate = np.where(is_open, t.open_rate, t.force_rate) * self._softest
         rate[f.released] = 0.0
@@ -301,9 +301,14 @@ class TouchEstimator:
         noises = Q + (rate**2 * elapsed)[:, None, None] * np.outer(self._begins, self._begins)
         spread = 2 * elapsed / t.rate_time * self._rate() ** 2  # keeps the deviation of r
         noises[:, _R, _R] = np.where(rate > 0, spread, 0.0)
-        means = F @ f.means
-        means[:, _U] += self._pressed
-        covariances = F @ f.covariances @ F.T + noises
+        f.means = F @ f.means
+        f.means[:, _U] += pressed
+        f.covariances = F @ f.covariances @ F.T + noises
+
+    def _correct(self, away: Array, noise: float) -> None:
+        """Correct all filters by a position (3,), and compare them."""
+        f, seen = self._filters, self._seen
+        means, covariances = f.means, f.covariances
         missed = away - seen @ means
         seen_with = covariances @ seen
         variances = seen_with @ seen + noise
