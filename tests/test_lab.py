@@ -47,6 +47,12 @@ def anywhere(description: RigDescription) -> RigDescription:
     return description.model_copy(update={"supply": supply.model_copy(update={"tcp": tcp})})
 
 
+def patient(description: RigDescription) -> RigDescription:
+    """Wait longer for the devices than one should for real ones: the machine may be busy."""
+    supply = description.supply.model_copy(update={"timeout": 5.0})
+    return description.model_copy(update={"supply": supply})
+
+
 def free_port() -> int:
     with socket.create_server(("127.0.0.1", 0)) as server:
         return int(server.getsockname()[1])
@@ -82,7 +88,7 @@ def test_a_simulated_rig_is_driven_over_real_protocols(supply: str, tracker: str
     description = load_rig_description(RIGS / "sim.yaml").model_copy(update={"probe": None})
     with VirtualLab(description, ROBOT, supply, tracker) as lab:
         lab.description = anywhere(lab.description)
-        addressed = lab.start()
+        addressed = patient(lab.start())
         moves(make_rig(addressed, ROBOT), lab)
 
 
