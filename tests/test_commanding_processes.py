@@ -22,6 +22,8 @@ from stiffopt.logs import read_log
 from stiffopt.model.robot_files import load_description
 from stiffopt.rig.drivers.modbus import ModbusSettings
 
+pytestmark = pytest.mark.real_time
+
 AREAS = np.array(load_description("stiff-flop-1").channel_areas)
 SIM = """\
 format: stiffopt-rig/1

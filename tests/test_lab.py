@@ -26,6 +26,8 @@ from stiffopt.rig.config import RigDescription, load_rig_description
 from stiffopt.rig.interface import Rig
 from stiffopt.safety.rigs import open_rig
 
+pytestmark = pytest.mark.real_time
+
 RIGS = Path(__file__).parent.parent / "rig"
 ROBOT = load_description("stiff-flop-1")
 

@@ -31,6 +31,8 @@ from stiffopt.rig.config import load_rig_description
 from stiffopt.rig.drivers.open_regulator import OpenRegulatorSettings, OpenRegulatorSupply
 from stiffopt.rig.interface import PressureLimits
 
+pytestmark = pytest.mark.real_time
+
 LIMITS = PressureLimits(np.zeros(3), np.full(3, 1.5e5))
 PRESSURES = np.array([1e5, 0.5e5, 0.8e5])
 PLANT = {"seed": 3, "spread": {"modulus": "5 %", "length": "0.5 %"}, "faults": True}
