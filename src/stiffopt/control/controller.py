@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from stiffopt.control.adaptation import Adapted
 from stiffopt.control.allocation import Allocation
+from stiffopt.control.bracing import BracePhase, Bracing
 from stiffopt.control.channels import Channels
 from stiffopt.control.checks import check_press, check_rates, limited_range, refusing
 from stiffopt.control.course import Course
@@ -25,7 +26,7 @@ from stiffopt.control.estimator import TipEstimator
 from stiffopt.control.feedback import GainSchedule, tracking_rows
 from stiffopt.control.forecast import Forecast, Present
 from stiffopt.control.interface import ControlOutput, Notice, SampleCounts
-from stiffopt.control.linearised_tip import LinearisedTip
+from stiffopt.control.linearised_tip import LeaningTip, LinearisedTip
 from stiffopt.control.motion_watch import MotionWatch
 from stiffopt.control.planner import InlinePlanner, ProcessPlanner
 from stiffopt.control.posture import PostureCourse
@@ -39,7 +40,7 @@ from stiffopt.control.touch import TouchEstimator
 from stiffopt.control.tuning import ControlTuning
 from stiffopt.control.vibration import BendingMode
 from stiffopt.control.windows import WindowWatch
-from stiffopt.errors import InputError, StiffoptError
+from stiffopt.errors import InputError, StiffoptError, dotted
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.scene import Scene
 from stiffopt.optimise.target import Target
@@ -48,6 +49,7 @@ from stiffopt.optimise.tip import TipAt, TipModel
 from stiffopt.paths.trajectory import Trajectory
 from stiffopt.rig.interface import PoseSample, PressureLimits, PressureReading
 from stiffopt.rig.settings import ControlSettings, Safety
+from stiffopt.schema import BadKeyError
 
 Array = NDArray[np.float64]
 
@@ -100,7 +102,7 @@ class TipController:
         plan_in_process: bool = False,
         tuning: ControlTuning | None = None,
     ) -> None:
-        self.robot, self.limits = robot, limits
+        self.robot, self.limits, self._scene = robot, limits, scene
         control, safety = control or ControlSettings(), safety or Safety()
         self._tuning = tuning = tuning or ControlTuning()
         self._period, n = period, robot.n_pressures
@@ -198,7 +200,10 @@ class TipController:
         self._saturated = np.zeros(len(zero), dtype=bool)
         self._permitted = self.limits.low, self.limits.high  # commands (n,), by the task
         self._tip: TipAt | None = None
+        self._looked_at = now  # capture of the last sample, in s
+        self._leaning: LeaningTip | None = None  # the braced tip, while the arm may lean
         if self._model is not None:
+            self._model.lean(None)
             self._tip = self._model.at(zero)
             self._estimator.advance(now, zero, self._tip)
         self._at_rest = True  # the reference begins at the present pressures
@@ -211,19 +216,33 @@ class TipController:
     def set_task(self, task: Task) -> None:
         """Pursue a task; see `Controller.set_task`."""
         with refusing("task"):
-            press = task.press
-            course = None if press is None else Pressing(press, task.target, self._tuning.pressing)
-            self._pursue_task(task, course)
+            course: AnyCourse | None = None
+            if task.press is not None:
+                course = Pressing(task.press, task.target, self._tuning.pressing)
+            elif task.brace is not None:
+                task = self._in_the_rigs_scene(task)
+                course = Bracing(task, self._tuning.bracing)
+            if self._bracing is not None and self._bracing.leans:
+                _within_limits(task, self.robot, self.limits)  # refuse it now or never
+                self._bracing.release(task)
+            else:
+                self._pursue_task(task, course)
             self._watch.forgive()
 
     def set_target(self, target: Target) -> None:
         """Go to another target; see `Controller.set_target`."""
+        bracing = self._bracing
+        if bracing is not None:
+            self.set_task(bracing.task.model_copy(update={"target": target}))
+            return
         with refusing("target"):
             self._pursue_target(target)
 
     def follow(self, trajectory: Trajectory, now: float) -> None:
         """Follow a trajectory; see `Controller.follow`."""
         with refusing("trajectory"):
+            if self._bracing is not None:
+                raise InputError("the arm leans on objects; give it a task without 'brace' first")
             if trajectory.pressures is not None:
                 self._follow_posture(trajectory, trajectory.pressures, now)
             else:
@@ -231,6 +250,23 @@ class TipController:
                 course = Course(trajectory, now, estimate.position, estimate.rotation)
                 self._pursue_target(course.at(now), course)
             self._watch.forgive()
+
+    @property
+    def _bracing(self) -> Bracing | None:
+        course = self.replanner.pursuit.course
+        return course if isinstance(course, Bracing) else None
+
+    def _in_the_rigs_scene(self, task: Task) -> Task:
+        """Return a task in the rig's scene, which must have the objects that it leans on."""
+        if self._scene is None:
+            raise InputError("brace: the rig file has no scene, so nothing to lean on is known")
+        there = task.model_copy(update={"scene": self._scene})
+        assert there.brace is not None
+        try:
+            there.brace.check(there)
+        except BadKeyError as error:
+            raise InputError(f"{dotted(error.loc)}: {error}; that is of the rig's scene") from None
+        return there
 
     def set_channels(self, without: Sequence[int]) -> None:
         """Do without some channels; see `Controller.set_channels`."""
@@ -313,8 +349,11 @@ class TipController:
         """Refuse what would lead the arm too near to the scene; any thread may ask."""
         if isinstance(request, Task):
             check_press(self.robot, self.limits, request)
+            if request.brace is not None:
+                self._in_the_rigs_scene(request)
+                return  # planned, and its way checked, when it is pursued
         forecast = self.forecast
-        if forecast is None:
+        if forecast is None or self._bracing is not None:
             return
         if isinstance(request, Trajectory) and request.pressures is not None:
             forecast.check_posture(request, request.pressures)
@@ -371,26 +410,37 @@ class TipController:
         counts = self._estimator.take(samples)
         sample = self._estimator.sample
         if counts.used and sample is not None:
-            predicted = self._estimator.predicted
-            course, pushed = self.replanner.pursuit.course, np.zeros(3)
-            presses = isinstance(course, Pressing) and course.touches_on_purpose
-            self._touch.stiffness_error = self.replanner.deviation
-            if isinstance(course, Pressing) and presses:
-                self._touch.expect(course.direction, course.press.speed, presses=course.presses)
+            bracing, leaning = self._bracing, self._leaning
+            if bracing is not None and leaning is not None:
+                assert leaning.equilibrium is not None  # the tip was evaluated
+                elapsed = sample.time - self._looked_at
+                bracing.look(elapsed, sample.position, tip, leaning.equilibrium)
+                self._looked_at = sample.time
             else:
-                self._touch.expect(None)
-            self._touch.take(
-                sample.time, sample.position - predicted, effective, tip, self._estimator.omega
-            )
-            if presses:
-                pushed = self._touch.felt.displacement
-            self._watch.take(
-                sample.time, sample.position - pushed, predicted, self._estimator.offset,
-                effective, tip, turns=self._estimator.turn_known, swing=self._estimator.swing,
-            )  # fmt: skip
+                self._feel(sample, effective, tip)
         if self.forecast is not None:
             self.forecast.present = self._present(now)
         return counts
+
+    def _feel(self, sample: PoseSample, effective: Array, tip: TipAt) -> None:
+        """What a sample tells of forces on the tip, and whether it is as the pressures say."""
+        predicted = self._estimator.predicted
+        course, pushed = self.replanner.pursuit.course, np.zeros(3)
+        presses = isinstance(course, Pressing) and course.touches_on_purpose
+        self._touch.stiffness_error = self.replanner.deviation
+        if isinstance(course, Pressing) and presses:
+            self._touch.expect(course.direction, course.press.speed, presses=course.presses)
+        else:
+            self._touch.expect(None)
+        self._touch.take(
+            sample.time, sample.position - predicted, effective, tip, self._estimator.omega
+        )
+        if presses:
+            pushed = self._touch.felt.displacement
+        self._watch.take(
+            sample.time, sample.position - pushed, predicted, self._estimator.offset,
+            effective, tip, turns=self._estimator.turn_known, swing=self._estimator.swing,
+        )  # fmt: skip
 
     def _present(self, now: float) -> Present:
         estimate, replanner = self._estimator.estimate, self.replanner
@@ -410,7 +460,8 @@ class TipController:
         """Compute the next command; see `Controller.compute`."""
         output = self._compute(now)
         self._computed_at = now
-        return replace(output, posture=output.pressures + self._pressures.command_offset)
+        posture = output.pressures + self._pressures.command_offset
+        return replace(output, posture=posture, leans=self._leaning is not None)
 
     def _compute(self, now: float) -> ControlOutput:
         reference, estimator, pressures = self._reference, self._estimator, self._pressures
@@ -431,6 +482,8 @@ class TipController:
         self._set_reference_rate()
         reference.omega = estimator.omega
         reference.advance(plan)
+        if self._leaning is not None:
+            return self._held_to(reference.command - command_offset, last)
         tip = self._models()[1].at(reference.path[:n])
         self._watch.intend(now, tip.pose[:3, 3] + reference.path[n : n + 3])
         course = self.replanner.pursuit.course
@@ -451,6 +504,14 @@ class TipController:
         self._saturated = held if reported else np.zeros(n, dtype=bool)
         return ControlOutput(command, True, self._saturated.copy())
 
+    def _held_to(self, pressures: Array, last: Array) -> ControlOutput:
+        """Command pressures (n,) as they are: contacts change how the arm swings."""
+        most = self._slew * self._period
+        low, high = self._channels.commands(self._reference.path[: len(last)], *self._permitted)
+        command = np.clip(np.clip(pressures, last - most, last + most), low, high)
+        self._saturated = np.zeros(len(last), dtype=bool)
+        return ControlOutput(command, True, self._saturated.copy())
+
     def _plan(self, now: float) -> Array | None:
         """Pressures and offset (n + 6,) that the reference is to lead to; None without a plan."""
         reference, estimator, replanner = self._reference, self._estimator, self.replanner
@@ -458,14 +519,88 @@ class TipController:
         if isinstance(course, PostureCourse):
             reference.slew_share = tuning.posture.slew_share
             return course.goal(now + reference.delay + self._lead)
+        if isinstance(course, Bracing) and course.phase is not BracePhase.PLANNING:
+            return self._brace(course, now)
         calm = now - self._adapted_at < tuning.adaptation.calm_time
         share = tuning.adaptation.slew_share if calm else tuning.reference.slew_share
         reference.slew_share = share
         way = None if self.forecast is None else self._way(now)
-        return replanner.update(
+        found = replanner.update(
             now, self._offset, self._pressures.command_offset, estimator.omega,
             reference.delay, self._channels.available(), way, self._windows.windows,
         )  # fmt: skip
+        if isinstance(course, Bracing):
+            return self._brace_planned(course, found, now)
+        return found
+
+    def _brace_planned(self, course: Bracing, found: Array | None, now: float) -> Array | None:
+        """Begin a brace when its plan is there; until then the arm stays where it is."""
+        plan = self.replanner.current
+        if plan is None:
+            return None if self._at_rest else self._start(now)
+        if plan.approach is None:  # the arm does better to keep clear of the objects
+            self.replanner.pursue(self.replanner.pursuit.to(course.task.target))
+            return found
+        course.begin(plan.approach, self._start(now)[: self.robot.n_pressures])
+        return self._brace(course, now)
+
+    def _brace(self, course: Bracing, now: float) -> Array | None:
+        """Go on with a brace; see `_plan`. The tip's offset is left as it is."""
+        self._reference.slew_share = self._tuning.reference.slew_share
+        before = course.pressures
+        is_there = not self._is_held(now) and self._is_near(before)
+        course.advance(min(now - self._computed_at, _HELD * self._period), is_there)
+        if course.leans is not (self._leaning is not None) and course.approach is not None:
+            self._lean_on(course.approach.scene if course.leans else None)
+        if course.phase is BracePhase.RELEASED and course.next is not None:
+            self.set_task(course.next)
+            return self._plan(now)
+        if course.phase is BracePhase.HELD:
+            self._correct_brace(course, now)
+        return np.concatenate([course.pressures, self._estimator.offset])
+
+    def _is_near(self, pressures: Array) -> bool:
+        """Whether the reference rests at pressures (n,)."""
+        n, tuning = len(pressures), self._tuning.reference
+        off = float(np.abs(self._reference.path[:n] - pressures).max())
+        return off < tuning.there and bool(
+            np.abs(self._reference.motion[1, :n]).max() <= tuning.at_rest
+        )
+
+    def _correct_brace(self, course: Bracing, now: float) -> None:
+        """Bring the braced tip to its target."""
+        tip, leaning = self._tip, self._leaning
+        if tip is None or leaning is None or leaning.equilibrium is None:
+            return
+        wanted, _, _ = target_arrays(course.task.target)
+        if wanted is None or not leaning.equilibrium.contacts:
+            return
+        error = np.nan_to_num(wanted - self._estimator.position)
+        jacobian = tip.pose[:3, :3] @ tip.jacobian[:3]
+        course.correct(
+            min(now - self._computed_at, _HELD * self._period), error, jacobian,
+            leaning.equilibrium,
+        )  # fmt: skip
+
+    def _lean_on(self, scene: Scene | None) -> None:
+        """Go on with the model of an arm that leans on a scene; None: of the free one."""
+        model, effective = self._models()[0], self._pressures.effective
+        before = model.at(effective)
+        self._leaning = None if scene is None else LeaningTip(self._robot, scene)
+        model.lean(self._leaning)
+        self._tip = model.at(effective)
+        self._shift(before, self._tip)
+        self._touch.begin()
+        self._watch.go_on()
+
+    def _shift(self, before: TipAt, after: TipAt) -> Array:
+        """Let the offset (6,) take up what the model changes by, everywhere in the loop."""
+        change = self._estimator.change_model(before, after)
+        self._watch.change_model(change)
+        self._touch.change_model(change)
+        self._reference.shift(change)
+        self._averaged.shift(change)
+        return change
 
     def _press(self, now: float) -> None:
         """Go on with a press."""
@@ -534,12 +669,7 @@ class TipController:
             return
         self._robot, self._tip, self._adapted_at = robot, after, self._now
         self._set_frequency()
-        change = self._estimator.change_model(before, after)
-        self._watch.change_model(change)
-        self._touch.change_model(change)
-        self._reference.shift(change)
-        self._averaged.shift(change)
-        self.replanner.go_on_with(adapted, change)
+        self.replanner.go_on_with(adapted, self._shift(before, after))
 
     def _has_arrived(self) -> bool:
         """Whether the reference rests on the plan."""
@@ -564,8 +694,11 @@ class TipController:
         if tip is None:
             return ControllerStatus(plan=np.full(n, np.nan))
         estimate = self._estimator.estimate
-        felt = self._touch.felt
-        touches = felt.touches
+        felt, bracing = self._touch.felt, self._bracing
+        touches, force = felt.touches, felt.force
+        if bracing is not None and bracing.leans:
+            force = bracing.push
+            touches = bool(force.any())
         target, press_force, press_goal = self._led_to or pursuit.target_at(now), math.nan, math.nan
         if isinstance(pursuit.course, Pressing):
             target = pursuit.course.shown(estimate.position)
@@ -601,10 +734,13 @@ class TipController:
             best_stiffness=math.nan if plan is None else plan.stiffness,
             disturbance=estimate.offset,
             touches=touches,
-            wrench=np.concatenate([felt.force, np.zeros(3)]),
+            wrench=np.concatenate([force, np.zeros(3)]),
             wrench_covariance=felt.covariance.ravel(),
             press_force=press_force,
             press_goal=press_goal,
+            brace="" if bracing is None else bracing.phase.value,
+            brace_force=math.nan if bracing is None else bracing.force,
+            brace_margin=math.nan if bracing is None else bracing.margin,
             task=pursuit.kind,
             stiffness_unit=pursuit.unit,
             model_position=estimate.static,
@@ -616,7 +752,7 @@ class TipController:
         """Return what is wrong."""
         notices = (*self.replanner.notices(self._away()), *self._channels.notices())
         course = self.replanner.pursuit.course
-        if isinstance(course, Pressing):
+        if isinstance(course, Pressing | Bracing):
             notices = (*notices, *course.notices())
         if self._model_is_wrong():
             away = 1e3 * float(np.linalg.norm(self._estimator.offset[:3]))

@@ -41,6 +41,7 @@ class ControlOutput:
     saturated: NDArray[np.bool_]  # channels (n,) at a limit that keeps the tip from its target
     # effective pressures (n,) to which the command leads, in Pa; None: the command
     posture: Array | None = None
+    leans: bool = False  # whether the arm may touch objects of the scene: a brace's own checks hold
 
 
 @dataclass(frozen=True)

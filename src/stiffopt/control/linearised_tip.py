@@ -12,10 +12,43 @@ from numpy.typing import NDArray
 
 from stiffopt.control.formula import Formula
 from stiffopt.errors import EquilibriumError, PressureError, StiffoptError
+from stiffopt.model.contact.equilibrium import ContactEquilibrium
 from stiffopt.model.manipulator import Manipulator
+from stiffopt.model.scene import Scene
 from stiffopt.optimise.tip import TipAt, TipModel
 
 Array = NDArray[np.float64]
+
+_LEANING = 4.0  # times the range of a free arm: equilibria in contact take milliseconds
+
+
+class LeaningTip:
+    """The tip of an arm that may lean on objects, each equilibrium followed from the one before.
+
+    Parameters
+    ----------
+    robot, scene :
+        The arm, and the objects that it may lean on.
+
+    Attributes
+    ----------
+    equilibrium : the last one, or None before the first.
+    """
+
+    def __init__(self, robot: Manipulator, scene: Scene) -> None:
+        self._robot, self._scene = robot, scene
+        self.equilibrium: ContactEquilibrium | None = None
+
+    def at(self, pressures: Array) -> TipAt:
+        """Return the braced tip at pressures (n,), in Pa; `EquilibriumError` if there is none."""
+        try:
+            found = self._robot.contact_equilibrium(pressures, self._scene, nearby=self.equilibrium)
+        except EquilibriumError:
+            if self.equilibrium is None:
+                raise
+            found = self._robot.contact_equilibrium(pressures, self._scene)  # from rest
+        self.equilibrium = found
+        return TipAt(found.tip_pose, found.tip_jacobian, found.tip_compliance)
 
 
 class LinearisedTip:
@@ -35,6 +68,7 @@ class LinearisedTip:
 
     def __init__(self, robot: Manipulator, linear_range: float = 600.0) -> None:
         self._model = TipModel(robot)
+        self._leaning: LeaningTip | None = None
         self._linear_range = linear_range
         self._linearisation = _linearisation(robot.pressure_min, robot.pressure_max)
         self._tip: TipAt | None = None  # at the operating point
@@ -51,6 +85,11 @@ class LinearisedTip:
         self._operating_point = np.full(robot.n_pressures, np.inf)
         self._model.change(robot)
 
+    def lean(self, leaning: LeaningTip | None) -> None:
+        """Go on with an arm that leans on objects; None: with the free one."""
+        self._leaning, self._tip = leaning, None
+        self._operating_point = np.full_like(self._operating_point, np.inf)
+
     def at(self, pressures: Array) -> TipAt:
         """Return the tip at pressures (n,), in Pa; `StiffoptError` without an equilibrium there."""
         tip, there = self._tip, self._operating_point
@@ -58,10 +97,11 @@ class LinearisedTip:
             p, _, _ = self._linearisation(pressures, there, np.eye(4), np.zeros((6, len(there))))
         else:
             p, distance, pose = self._linearisation(pressures, there, tip.pose, tip.jacobian)
-            if distance[0] < self._linear_range:
+            factor = 1.0 if self._leaning is None else _LEANING
+            if distance[0] < factor * self._linear_range:
                 return TipAt(pose, tip.jacobian, tip.compliance)
         try:
-            self._tip = self._model.at(p)
+            self._tip = (self._leaning or self._model).at(p)
         except (EquilibriumError, PressureError) as error:
             raise StiffoptError(f"the model has no answer: {error}") from error
         self._operating_point = p

@@ -32,6 +32,8 @@ from stiffopt.optimise.solver import PressureSolver
 from stiffopt.optimise.target import Target, Tolerance
 from stiffopt.optimise.task import PressureRange, Task
 from stiffopt.optimise.tip import TipModel
+from stiffopt.paths.configurations import Unsolved
+from stiffopt.paths.leaning import BraceApproach, approach_to
 
 Array = NDArray[np.float64]
 
@@ -78,6 +80,7 @@ class Plan:
     adapted: Adapted | None = None  # the arm that it was made with, as in the request
     deviation: float = math.nan  # of the stiffness there, relative
     estimate: Estimate | None = None  # of the arm's numbers, if it is new
+    approach: BraceApproach | None = None  # from rest to an arm that leans on objects there
 
 
 class Planning:
@@ -93,6 +96,7 @@ class Planning:
         self._last: Plan | None = None
         self._searched_at: Array = np.zeros(6)
         self._advantage, self._refused = self._tuning.advantage, 0
+        self._leaning: tuple[int, Plan | None] = (-1, None)
 
     def _put(self, robot: Manipulator) -> None:
         """Plan for this arm from now on."""
@@ -134,7 +138,7 @@ class Planning:
         deviation = self._deviation(plan, request.task)
         plan = replace(plan, deviation=deviation, estimate=estimate)
         plan = replace(plan, doubt=self._robot.description.extrapolation(plan.pressures))
-        if self._ways is None or not len(request.way):
+        if self._ways is None or not len(request.way) or plan.approach or plan.blocked:
             return plan
         blocked = self._ways.blocked(np.vstack([request.way, plan.pressures]))
         return replace(plan, blocked=blocked)
@@ -148,6 +152,12 @@ class Planning:
         return Plan(request.serial, pressures, request.offset, None, True, math.nan, "", blocked)
 
     def _planned(self, request: PlanRequest, task: Task, asked: Target) -> Plan:
+        if task.brace is not None:
+            if self._leaning[0] != request.serial:
+                self._leaning = request.serial, self._braced(request, task, asked)
+            if self._leaning[1] is not None:
+                return self._leaning[1]
+            task = task.unbraced
         if request.serial != self._serial:
             self._serial, self._last, self._solver = request.serial, None, None
         if self._solver is None or self._last is None:
@@ -174,6 +184,25 @@ class Planning:
         else:
             self._last = self._nearest(request, task, target)
         return self._last
+
+    def _braced(self, request: PlanRequest, task: Task, asked: Target) -> Plan | None:
+        """Plan for an arm that leans on something; None where it does better to keep clear."""
+        solution = PressureSolver(self._robot, task.model_copy(update={"target": asked})).solve()
+        if not solution.contacts or solution.pressures is None:
+            return None
+        plan = Plan(
+            request.serial, np.array(solution.pressures), request.offset, asked, True,
+            float(solution.stiffness or math.nan), "", adapted=request.adapted,
+        )  # fmt: skip
+        try:
+            approach = approach_to(self._robot, solution)
+        except Unsolved as reason:
+            return replace(plan, blocked=str(reason))
+        blocked = ""
+        if self._ways is not None and len(request.way):  # first down to rest, clear of everything
+            rest = np.zeros_like(plan.pressures)
+            blocked = self._ways.blocked(np.vstack([request.way[:1], rest]))
+        return replace(plan, approach=approach, blocked=blocked)
 
     def _effective_limits(self, request: PlanRequest) -> tuple[Array, Array]:
         """Limits (n,) of effective pressures that some permitted command has, in Pa.

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt.control.adaptation import Adapted, Estimate, Window
+from stiffopt.control.bracing import Bracing
 from stiffopt.control.course import Course
 from stiffopt.control.feedback import prescribed_components
 from stiffopt.control.interface import Notice
@@ -23,7 +24,7 @@ from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import Task
 
 Array = NDArray[np.float64]
-AnyCourse = Course | PostureCourse | Pressing
+AnyCourse = Course | PostureCourse | Pressing | Bracing
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +65,9 @@ class Pursuit:
 
     @property
     def kind(self) -> str:
-        """``press``, ``trajectory``, ``target``, or empty."""
+        """``press``, ``brace``, ``trajectory``, ``target``, or empty."""
+        if isinstance(self.course, Bracing):
+            return "brace"
         if isinstance(self.course, Pressing):
             return "press"
         if self.course is not None:
@@ -174,6 +177,11 @@ class Replanner:
             )  # fmt: skip
             self._planner.request(request if way is None else replace(request, way=way))
         return self.latest()
+
+    @property
+    def current(self) -> Plan | None:
+        """The newest plan, unless it is of the task before."""
+        return self.plan if self.plan is not None and self.plan.serial == self._serial else None
 
     def go_on_with(self, adapted: Adapted, change: Array) -> None:
         """Plan for an arm with other numbers, of which the offset differs by a change (6,)."""

@@ -258,6 +258,19 @@ class ControllerStatus:
     press_goal: Annotated[float, _tip("the force that the task asks for", "N", decimals=5)] = (
         math.nan
     )
+    brace: Annotated[
+        str,
+        _tip(
+            "where a brace is: `planning`, `going to rest`, `approaching`, `held`, `releasing` or "
+            "`released`; empty without one"
+        ),
+    ] = ""
+    brace_force: Annotated[
+        float, _tip("smallest force of its contacts along their normals", "N", decimals=5)
+    ] = math.nan
+    brace_margin: Annotated[
+        float, _tip("further push, as it is felt, by which a contact is lost", "N", decimals=5)
+    ] = math.nan
     adapted: Annotated[
         tuple[AdaptedNumber, ...],
         Shown("numbers of the arm as they are estimated while it is at work"),

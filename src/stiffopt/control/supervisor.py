@@ -133,6 +133,7 @@ class Supervisor:
         self.vented = True  # the supply has accepted the command to vent, and no pressure since
         self._trouble: Trouble | None = None
         self._failures = 0  # of the controller, in a row
+        self._leans = False  # whether the arm may touch objects of the scene
         self._force_limited_at = -np.inf
         self._alarm_kinds: frozenset[str] = frozenset()
         self._doubted_at = -np.inf
@@ -299,7 +300,8 @@ class Supervisor:
 
     def _too_near(self, output: ControlOutput) -> str:
         """Why a command would bring the body too near to the scene; empty if it does not."""
-        if self._clearance is None:
+        self._leans = output.leans
+        if self._clearance is None or output.leans:
             return ""
         posture = output.pressures if output.posture is None else output.posture
         return self._clearance.too_near(posture)
@@ -422,7 +424,7 @@ class Supervisor:
         if self._ramp is not None:
             return
         shares, warning = np.array([self._zero + 1, self._zero]), ""
-        if self._clearance is not None:
+        if self._clearance is not None and not self._leans:  # it lets go as it came: all together
             shares, warning = self._clearance.way_down(self.commanded)
         self._ramp = _Ramp(now, self._safety.ramp_time, self.commanded, reason, shares)
         if self.lifecycle.state is State.ACTIVE:
@@ -531,6 +533,7 @@ class Supervisor:
         self._doubted_at = self._held_since = self._held_until = -np.inf
         self._exchanged, self._failures, self._ticked_at = None, 0, now
         self._holds.clear()
+        self._leans = False
         self.lifecycle.change(State.ACTIVE)
         self.events.add(now, "armed", "armed: pressures may change from now on")
         if late:

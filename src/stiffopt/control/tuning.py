@@ -359,6 +359,39 @@ class PressingTuning:
 
 
 @dataclass(frozen=True)
+class BracingTuning:
+    """How the arm leans on objects (`Bracing`)."""
+
+    at_rest: float = 2e3  # pressure below which the arm is at rest, in Pa
+    to_rest: float = 3.0  # time in which it goes to rest, in s
+    settle: float = 1.0  # time at the end of the approach before it is held, in s
+    # distance between the tips of the braced and the free arm that can be told apart, in m; share
+    # of it from which the arm is free; and samples in a row
+    told_apart: float = 4e-3
+    free_share: float = 0.6
+    samples: int = 3
+    swing_time: float = 0.08  # over which the seen tip is averaged, in s
+    # displacement of the tip from which a push is felt, in m; time constant with which what is
+    # smaller becomes the model's error, in s; and time after which a push does, too
+    felt: float = 6e-4
+    error_time: float = 2.0
+    # at first, while the tip goes to its target and the arm creeps most: for how long, and with
+    # which time constant, in s
+    settling: float = 8.0
+    settling_time: float = 0.3
+    longest_push: float = 60.0
+    # deviation of that displacement, in m, and of pushes, in N
+    deviation: float = 5e-4
+    usual_push: float = 0.1
+    every: float = 0.05  # between two looks at what the contacts hold, in s
+    looks: int = 2  # in a row
+    time: float = 3.0  # time constant with which the tip goes to its target, in s
+    force_weight: float = 0.1  # error of the tip that a change of a contact force counts as, in m/N
+    pressure_weight: float = 2e-8  # likewise of a pressure, in m/Pa
+    most_change: float = 1e4  # largest change of a planned pressure, in Pa
+
+
+@dataclass(frozen=True)
 class TrackerTuning:
     """What is known of a tracker's rhythm, and when it is trusted again."""
 
@@ -385,3 +418,4 @@ class ControlTuning:
     motion: MotionTuning = field(default_factory=MotionTuning)
     touch: TouchTuning = field(default_factory=TouchTuning)
     pressing: PressingTuning = field(default_factory=PressingTuning)
+    bracing: BracingTuning = field(default_factory=BracingTuning)

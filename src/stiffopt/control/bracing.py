@@ -1,0 +1,266 @@
+"""`Bracing`: an arm goes to rest, leans on objects of the scene from there, holds, and lets go.
+
+Where it leans is planned (`stiffopt.paths.leaning`). All pressures then grow together, as fast as
+the approach says, so that the arm comes into contact slowly and at the wanted equilibrium. Going
+back on the same way lets go of the objects.
+
+While the arm is held, its tip is seen at y and the braced model has it at s. Of y - s, what changes
+slowly is the model's error and creep, b. The rest is the work of a push F at the tip, which is
+taken for the one that is most likely: with the compliance C of the braced tip, the deviation sigma
+of y - s - b and that of the pushes, f,
+
+    F = C (C C + (sigma / f)^2)^-1 (y - s - b).
+
+Contacts hold as long as the model's do under this push.
+"""
+
+from __future__ import annotations
+
+import math
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stiffopt.control.interface import Notice
+from stiffopt.control.state import Severity
+from stiffopt.control.tuning import BracingTuning
+from stiffopt.errors import EquilibriumError
+from stiffopt.model.contact.equilibrium import ContactEquilibrium
+from stiffopt.optimise.target import Target
+from stiffopt.optimise.task import Task
+from stiffopt.optimise.tip import TipAt
+from stiffopt.paths.leaning import BraceApproach
+
+Array = NDArray[np.float64]
+
+
+class BracePhase(StrEnum):
+    """Where a brace is."""
+
+    PLANNING = "planning"
+    TO_REST = "going to rest"
+    APPROACHING = "approaching"
+    HELD = "held"
+    RELEASING = "releasing"
+    RELEASED = "released"
+
+
+class Bracing:
+    """A brace under way: pressures for each moment, and whether the contacts hold.
+
+    Parameters
+    ----------
+    task :
+        What is wanted.
+    tuning :
+        Times and limits.
+
+    Attributes
+    ----------
+    phase : where it is.
+    next : what takes its place when the arm has let go; None: it stays at rest.
+    force : smallest normal force of the contacts, as it is estimated, in N; NaN without contact.
+    margin : further push at the tip by which a contact is lost, in N; NaN while nothing pushes.
+    push : at the tip, as it is estimated (3,), base axes, in N; zero while nothing is felt.
+    displacement : of the tip by it (3,), in m.
+    """
+
+    def __init__(self, task: Task, tuning: BracingTuning) -> None:
+        self.task, self._tuning = task, tuning
+        self.phase, self.next = BracePhase.PLANNING, None
+        self.force = self.margin = math.nan
+        self.push, self.displacement = np.zeros(3), np.zeros(3)
+        self._error: Array | None = None  # b (3,)
+        self._residual: Array = np.zeros(3)  # y - s, without swings
+        self._held = self._pushed = 0.0  # for how long, in s
+        self.approach: BraceApproach | None = None
+        self._start: Array = np.zeros(0)  # pressures (n,) from which the arm goes to rest
+        self._left = 1.0  # share of them
+        self._time = 0.0  # on the way of the approach, in s
+        self._waited = 0.0  # at its end, in s
+        self._change: Array = np.zeros(0)  # of the planned pressures (n,), to be at the target
+        self._free = 0  # samples in a row at which the tip is rather where a free arm has it
+        self._lost = 0  # looks in a row at which the model's contacts do not hold
+        self._looked = 0.0  # since it was looked what the contacts hold, in s
+        self._why = ""
+        self._told: list[Notice] = []
+
+    def at(self, now: float) -> Target:
+        """Return the target, at any time."""
+        return self.task.target
+
+    @property
+    def leans(self) -> bool:
+        """Whether the arm is in contact, or on its way into it or out of it."""
+        return self.phase in (BracePhase.APPROACHING, BracePhase.HELD, BracePhase.RELEASING)
+
+    @property
+    def pressures(self) -> Array:
+        """Effective pressures (n,) now, in Pa."""
+        approach = self.approach
+        if approach is None or self.phase is BracePhase.TO_REST:
+            return self._left * self._start
+        rows = approach.pressures
+        on_way = np.array([np.interp(self._time, approach.times, row) for row in rows.T])
+        share = self._time / approach.times[-1]
+        found: Array = on_way + share * self._change
+        return found
+
+    def begin(self, approach: BraceApproach, pressures: Array) -> None:
+        """Go to rest from pressures (n,), and lean then."""
+        self.approach, self._start = approach, pressures
+        self._left = float(bool(np.abs(pressures).max() > self._tuning.at_rest))
+        self._change = np.zeros_like(pressures)
+        self.phase = BracePhase.TO_REST
+
+    def release(self, then: Task | None = None, why: str = "") -> None:
+        """Let go, and pursue something else afterwards."""
+        self.next = then or self.next
+        if self.phase in (BracePhase.APPROACHING, BracePhase.HELD):
+            self.phase, self._why = BracePhase.RELEASING, why
+            self.force = self.margin = math.nan
+            self.push = self.displacement = np.zeros(3)
+            text = "goes back on the way that it came"
+            if why:
+                text = f"{why}; the arm {text}, and stays at rest until there is a new task"
+                self._told.append(Notice("brace-lost", text, Severity.ERROR))
+            else:
+                self._told.append(Notice("release", f"the arm lets go: it {text}", Severity.INFO))
+        elif self.phase is not BracePhase.RELEASING:
+            self.phase = BracePhase.RELEASED
+
+    def advance(self, elapsed: float, is_there: bool) -> None:
+        """Go on by a tick of so many seconds; `is_there`: the reference has come to `pressures`."""
+        t, approach = self._tuning, self.approach
+        if approach is None:
+            return
+        if self.phase is BracePhase.TO_REST:
+            self._left = max(0.0, self._left - elapsed / t.to_rest)
+            if not self._left and is_there:
+                self.phase = BracePhase.APPROACHING
+        elif self.phase is BracePhase.APPROACHING:
+            self._time = min(self._time + elapsed, float(approach.times[-1]))
+            done = is_there and self._time >= approach.times[-1]
+            self._waited = self._waited + elapsed if done else 0.0
+            if self._waited >= t.settle:
+                self.phase = BracePhase.HELD
+                self._told.append(Notice("braced", self._words(approach), Severity.INFO))
+        elif self.phase is BracePhase.RELEASING:
+            self._time = max(0.0, self._time - elapsed)
+            if not self._time and is_there:
+                self.phase = BracePhase.RELEASED
+
+    def _words(self, approach: BraceApproach) -> str:
+        where = [
+            f"'{each.object}' at {1e3 * each.at:.0f} mm with "
+            f"{1e3 * float(np.linalg.norm(each.force)):.0f} mN"
+            for each in approach.contacts
+        ]
+        return f"the arm leans on {' and '.join(where)}"
+
+    def look(
+        self, elapsed: float, seen: Array, tip: TipAt, equilibrium: ContactEquilibrium
+    ) -> None:
+        """Look whether the contacts hold, at a sample of the tracker.
+
+        A tip that is nearer to where the free arm would have it is in contact no more, whatever
+        pushes it.
+
+        Parameters
+        ----------
+        elapsed :
+            Since the last sample, in s.
+        seen :
+            Position (3,) of the tip, in m.
+        tip, equilibrium :
+            Of the braced arm at the present pressures.
+        """
+        if self.phase is not BracePhase.HELD or self.approach is None:
+            return
+        t, residual = self._tuning, seen - tip.pose[:3, 3]
+        if self._error is None:
+            self._error = self._residual = residual
+        self._residual = self._residual + min(elapsed / t.swing_time, 1.0) * (
+            residual - self._residual
+        )
+        residual = self._residual
+        apart = self.approach.free_tip - self.approach.tip_poses[-1][:3, 3]
+        distance = float(np.linalg.norm(apart))
+        share = float(residual @ apart) / max(distance, 1e-9) ** 2
+        is_free = distance > t.told_apart and share > t.free_share
+        self._free = self._free + 1 if is_free else 0
+        if self._free >= t.samples:
+            self.release(why="the tip is where an arm without contact has it: the brace is lost")
+            return
+        off, settles = residual - self._error, self._held < t.settling
+        self._held += elapsed
+        if settles or float(np.linalg.norm(off)) < t.felt or self._pushed > t.longest_push:
+            time = t.settling_time if settles else t.error_time
+            self._error = self._error + min(elapsed / time, 1.0) * off
+            self._pushed = self._pushed * float(np.linalg.norm(off) > t.felt)
+            self.push = self.displacement = np.zeros(3)
+            self.force, self.margin = _least_force(equilibrium), math.nan
+            return
+        self._pushed += elapsed
+        R = tip.pose[:3, :3]
+        C = R @ tip.compliance[:3, :3] @ R.T
+        doubt = (t.deviation / t.usual_push) ** 2
+        self.push = C @ np.linalg.solve(C @ C + doubt * np.eye(3), off)
+        self.displacement = off
+        self._looked += elapsed
+        if self._looked >= t.every:
+            self._looked = 0.0
+            self._judge(equilibrium)
+
+    def _judge(self, equilibrium: ContactEquilibrium) -> None:
+        """Whether the contacts hold the push."""
+        size = float(np.linalg.norm(self.push))
+        loss = equilibrium.lift_off(self.push / size, contacts="sticking")
+        try:
+            self.force = _least_force(equilibrium.shifted(push=self.push))
+        except EquilibriumError:
+            self.force = math.nan
+        self.margin = max(loss.force - size, 0.0)
+        how = "lifts off" if self.force <= 0 else "" if self.margin else loss.how
+        self._lost = self._lost + 1 if how else 0
+        if self._lost >= self._tuning.looks:
+            name = f"'{loss.object}'" if loss.object else "an object"
+            self.release(why=f"a contact on {name} {how} under a push of {1e3 * size:.0f} mN")
+
+    def correct(
+        self, elapsed: float, error: Array, jacobian: Array, equilibrium: ContactEquilibrium
+    ) -> None:
+        """Bring the braced tip to its target, slowly, with contact forces that stay as they are.
+
+        Parameters
+        ----------
+        elapsed :
+            In s.
+        error :
+            Of the tip (3,), in m, zero in components that the target leaves open.
+        jacobian :
+            Of the braced tip's position, base axes (3, n), in m/Pa.
+        equilibrium :
+            At the present pressures.
+        """
+        if self.displacement.any():  # nothing is to be made up for that pushes the tip
+            return
+        t = self._tuning
+        rows = np.vstack([jacobian, t.force_weight * equilibrium.force_gradients])
+        wanted = np.concatenate([error, np.zeros(len(rows) - 3)])
+        H = rows.T @ rows + t.pressure_weight**2 * np.eye(rows.shape[1])
+        step = np.linalg.solve(H, rows.T @ wanted) * elapsed / t.time
+        self._change = np.clip(self._change + step, -t.most_change, t.most_change)
+
+    def notices(self) -> tuple[Notice, ...]:
+        """Return what has happened since the last call, and what is wrong."""
+        told, self._told = tuple(self._told), []
+        if self._why and self.phase in (BracePhase.RELEASING, BracePhase.RELEASED):
+            told = (*told, Notice("brace-lost", self._why, Severity.ERROR, standing=True))
+        return told
+
+
+def _least_force(equilibrium: ContactEquilibrium) -> float:
+    forces = equilibrium.normal_forces
+    return float(forces.min()) if len(forces) else math.nan
