@@ -15,6 +15,7 @@ import stiffopt
 from stiffopt.cli.path_records import csv_text
 from stiffopt.errors import FileError, InputError
 from stiffopt.model.calibration import Calibration, ErrorModel
+from stiffopt.plots.shapes import surface_mesh
 from stiffopt.studio import objects, texts
 from stiffopt.studio.cloud import StiffnessCloud, check_map
 from stiffopt.studio.design import Design
@@ -341,7 +342,7 @@ def test_objects_are_placed_moved_and_saved(kind: str, design: Design, tmp_path:
     size = objects.size_of(first.shape)
     if size is not None:
         assert objects.size_of(objects.resized(moved, 2 * size).shape) == pytest.approx(2 * size)
-    vertices, faces = objects.surface_mesh(moved.shape, 0.2)
+    vertices, faces = surface_mesh(moved.shape, 0.2)
     assert faces.max() < len(vertices)
     with_both = design.with_objects([first, second])
     changed = with_both.with_objects(objects.replaced(with_both.objects, moved))

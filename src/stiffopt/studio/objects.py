@@ -97,23 +97,6 @@ def save_scene(path: str | os.PathLike[str], scene: Scene) -> None:
     save_file(path, "scene", scene)
 
 
-def surface_mesh(shape: Obstacle, length: float) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
-    """Return vertices and triangles of a shape, cut off at about a length where it has no end."""
-    vertices, faces, begin = [], [], 0
-    for surface in shape.outline(length):
-        rows, columns = surface.shape[1:]
-        corners = np.arange(rows * columns).reshape(rows, columns) + begin
-        vertices.append(surface.reshape(3, -1).T)
-        if shape.key == "mesh":
-            faces.append(corners)  # each row is a triangle
-        else:
-            a, b = corners[:-1, :-1].ravel(), corners[:-1, 1:].ravel()
-            c, d = corners[1:, :-1].ravel(), corners[1:, 1:].ravel()
-            faces += [np.stack([a, b, c], axis=1), np.stack([b, d, c], axis=1)]
-        begin += rows * columns
-    return np.concatenate(vertices).astype(np.float32), np.concatenate(faces).astype(np.uint32)
-
-
 def _with_shape(item: SceneObject, **parts: Any) -> SceneObject:
     return changed(item, **{item.shape.key: changed(item.shape, **parts)})
 

@@ -11,6 +11,7 @@ from stiffopt.display import display_units
 from stiffopt.errors import StiffoptError
 from stiffopt.model.scene import SceneObject
 from stiffopt.plots import style
+from stiffopt.plots.shapes import surface_mesh
 from stiffopt.studio import objects, texts
 from stiffopt.studio.design import Design
 from stiffopt.studio.drawing import Vector, place, rgb
@@ -161,7 +162,7 @@ class SceneView:
         before = self._drawn.get(item.name)
         if before is not None and before[0] == item:
             return
-        vertices, faces = objects.surface_mesh(item.shape, self._length)
+        vertices, faces = surface_mesh(item.shape, self._length)
         if before is not None and before[0].shape.key == item.shape.key:
             _, mesh, label = before
             mesh.vertices = vertices
