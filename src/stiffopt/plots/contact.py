@@ -12,6 +12,7 @@ from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.scene import Scene
 from stiffopt.plots import style
 from stiffopt.plots.arm import TUBE_STATIONS, ArmDrawing
+from stiffopt.plots.shapes import segment_stations
 from stiffopt.plots.view import View
 
 if TYPE_CHECKING:
@@ -52,12 +53,9 @@ def draw_contact(
     drawing = ArmDrawing(axes, robot)
     unit = display_units().length
     drawing.draw_base()
-    poses, start = [], 0.0
-    for segment in robot.description.segments:
-        end = start + segment.length + segment.connector
-        poses.append(equilibrium.poses(np.linspace(start, end, TUBE_STATIONS)))
-        start = end
-    drawing.draw_tube(equilibrium.pressures, poses=np.array(poses))
+    stations = segment_stations(robot, TUBE_STATIONS)
+    poses = equilibrium.poses(stations.ravel()).reshape(*stations.shape, 4, 4)
+    drawing.draw_tube(equilibrium.pressures, poses=poses)
     drawing.explain_segments()
     free = unit.of(robot.backbone(equilibrium.pressures, 60)[:, :3, 3])
     axes.plot(*free.T, color=style.DARK, linewidth=1.2, linestyle="--", zorder=3)
