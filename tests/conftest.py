@@ -43,6 +43,13 @@ def is_long() -> bool:
     return os.environ.get("STIFFOPT_LONG", "") not in ("", "0")
 
 
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Leave out files without such tests where only `real_time` ones are asked for: quicker."""
+    if config.getoption("markexpr") != "real_time" or collection_path.suffix != ".py":
+        return None
+    return "pytest.mark.real_time" not in collection_path.read_text() or None
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     if not is_long():
         skip = pytest.mark.skip(reason="long: run with --long or STIFFOPT_LONG=1")

@@ -31,6 +31,8 @@ from stiffopt.rig.drivers import ndi_reader
 from stiffopt.rig.drivers.aurora import AuroraSettings, AuroraTracker
 from stiffopt.rig.interface import PoseSample, SystemClock
 
+pytestmark = pytest.mark.real_time
+
 PLACE = (0.0123, -0.0456, -0.1512)  # m
 TURN = np.array([0.2, 0.4, -0.5, 0.7]) / np.sqrt(0.94)  # w first
 reference_crc = crcmod.predefined.mkPredefinedCrcFun("crc-16")

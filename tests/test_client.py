@@ -40,6 +40,8 @@ from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import Task
 from stiffopt.paths.trajectory import Trajectory, Waypoint
 
+pytestmark = pytest.mark.real_time
+
 TOKEN = "a-secret-of-the-tests"
 HEARTBEAT = 1.0
 ROBOT = load_description("stiff-flop-2")

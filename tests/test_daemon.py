@@ -40,6 +40,8 @@ from stiffopt.daemon.server import MAX_CONNECTIONS
 from stiffopt.errors import CommandError, DeviceError, FileError, InputError
 from stiffopt.rig.settings import Safety, ServiceSettings
 
+pytestmark = pytest.mark.real_time
+
 ROOT = Path(__file__).resolve().parent.parent
 
 

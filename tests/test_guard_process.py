@@ -32,6 +32,8 @@ from stiffopt.safety.guard_client import GuardLink
 from stiffopt.safety.rigs import guarded_rig
 from stiffopt.safety.settings import CLIENT
 
+pytestmark = pytest.mark.real_time
+
 HERE = Path(__file__).parent
 RIGS = HERE.parent / "rig"
 ROBOT = load_description("stiff-flop-1")

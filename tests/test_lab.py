@@ -26,6 +26,8 @@ from stiffopt.rig.config import RigDescription, load_rig_description
 from stiffopt.rig.interface import Rig
 from stiffopt.safety.rigs import open_rig
 
+pytestmark = pytest.mark.real_time
+
 RIGS = Path(__file__).parent.parent / "rig"
 ROBOT = load_description("stiff-flop-1")
 
@@ -45,6 +47,12 @@ def anywhere(description: RigDescription) -> RigDescription:
         return description
     tcp = supply.tcp.model_copy(update={"port": free_port()})
     return description.model_copy(update={"supply": supply.model_copy(update={"tcp": tcp})})
+
+
+def patient(description: RigDescription) -> RigDescription:
+    """Wait longer for the devices than one should for real ones: the machine may be busy."""
+    supply = description.supply.model_copy(update={"timeout": 5.0})
+    return description.model_copy(update={"supply": supply})
 
 
 def free_port() -> int:
@@ -82,7 +90,7 @@ def test_a_simulated_rig_is_driven_over_real_protocols(supply: str, tracker: str
     description = load_rig_description(RIGS / "sim.yaml").model_copy(update={"probe": None})
     with VirtualLab(description, ROBOT, supply, tracker) as lab:
         lab.description = anywhere(lab.description)
-        addressed = lab.start()
+        addressed = patient(lab.start())
         moves(make_rig(addressed, ROBOT), lab)
 
 

@@ -29,6 +29,8 @@ from stiffopt.rig.drivers.modbus_registers import PressureRegister, PressureScal
 from stiffopt.rig.interface import Clock, PressureLimits
 from stiffopt.schema import Schema
 
+pytestmark = pytest.mark.real_time
+
 LIMITS = PressureLimits(np.zeros(3), np.full(3, 1.5e5))
 P = (1e5, 0.5e5, 1.2e5)
 COUNTS = (1000, 500, 1200)  # at 1 mbar per count

@@ -30,6 +30,8 @@ from stiffopt.rig.drivers.daqmx import (
 from stiffopt.rig.drivers.nidaq import NidaqSettings, NidaqSupply
 from stiffopt.rig.interface import PressureLimits
 
+pytestmark = pytest.mark.real_time
+
 LIMITS = PressureLimits(np.zeros(2), np.full(2, 1.5e5))
 VALVE = {"line": "Dev1/port0/line0"}
 

@@ -31,6 +31,8 @@ from stiffopt.rig.config import load_rig_description
 from stiffopt.rig.drivers.open_regulator import OpenRegulatorSettings, OpenRegulatorSupply
 from stiffopt.rig.interface import PressureLimits
 
+pytestmark = pytest.mark.real_time
+
 LIMITS = PressureLimits(np.zeros(3), np.full(3, 1.5e5))
 PRESSURES = np.array([1e5, 0.5e5, 0.8e5])
 PLANT = {"seed": 3, "spread": {"modulus": "5 %", "length": "0.5 %"}, "faults": True}
@@ -305,7 +307,7 @@ def test_two_boards_on_one_line_end_vented_and_told() -> None:
             press(supply, bench)
             line.joined = 2
             told = end_of(supply)
-            assert re.search("second board|noise|something else|does not take", told)
+            assert re.search("second board|noise|something else|does not (take|hold|answer)", told)
             wait_for(lambda: vented(first, bench))
             assert second.dump_open
             with suppress(DeviceError):
@@ -383,9 +385,10 @@ def pressed(watched: Watched) -> int:
 def test_the_firmware_vents_after_100_ms_of_its_own_time(watched: Watched) -> None:
     last = pressed(watched)
     since = len(watched.shown) - 1
-    # its clock began with the simulation's; a line is shown every 5 ms, a tick takes 2
+    # its clock began with the simulation's; a line is shown every 5 ms, a tick takes 2, and a
+    # report is up to 10 ms younger than the command before it
     opened = watched.first(lambda row: row[-1] == 0 and row[0] > last, since)[0]
-    assert 90 <= opened - last <= 110
+    assert 80 <= opened - last <= 110
     empty = watched.first(lambda row: max(row[1:4]) < 2e3, since)[0]
     assert empty - opened < 400
     report = watched.host.report()

@@ -24,6 +24,8 @@ from stiffopt.lab.openigtlink_peer import OpenIGTLinkPeer
 from stiffopt.rig.drivers.openigtlink import OpenIGTLinkSettings, OpenIGTLinkTracker, SenderClock
 from stiffopt.rig.interface import PoseSample
 
+pytestmark = pytest.mark.real_time
+
 PLACE = (0.0123, -0.0456, -0.1512)  # m
 QUARTER = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # about z
 ROOT = np.sqrt(0.5)

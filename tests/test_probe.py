@@ -27,6 +27,8 @@ from stiffopt.rig.drivers.probe import (
 )
 from stiffopt.rig.interface import SystemClock
 
+pytestmark = pytest.mark.real_time
+
 ENDING = ("daq", "zaber", "Thread-")  # names of threads that must end with their peer
 MICROSTEP = 0.047625e-6  # m; of the X-LSM100A, from its data sheet
 

@@ -21,6 +21,8 @@ from stiffopt.safety.claim import Claim
 from stiffopt.safety.rescue import GuardWatch, vent_directly
 from stiffopt.safety.settings import CLIENT
 
+pytestmark = pytest.mark.real_time
+
 PATIENCE = 20.0  # s, that a test waits for another thread on a busy machine
 
 

@@ -50,6 +50,8 @@ from stiffopt.daemon.run_log import read_run
 from stiffopt.model.manipulator import load_robot
 from stiffopt.paths.solution import PathSolution
 
+pytestmark = pytest.mark.real_time
+
 ROOT = Path(__file__).resolve().parent.parent
 EDGES, COUNTS = (1e-4, 1e-3, 1e-2), (90, 8, 2, 0)
 

@@ -23,6 +23,8 @@ from stiffopt.studio import rig_watch, texts
 from stiffopt.studio.rig_watch import RigWatch, pressures_now
 from stiffopt.studio.workbench import Workbench
 
+pytestmark = pytest.mark.real_time
+
 ROOT = Path(__file__).resolve().parent.parent
 TOKEN = "a-secret-of-the-tests"
 HEARTBEAT = 1.5

@@ -14,6 +14,8 @@ import pytest
 
 from fake_bench import FakeBench
 
+pytestmark = pytest.mark.real_time
+
 pytest.register_assert_rewrite("supply_contract")
 
 from stiffopt.rig.interface import PressureLimits  # noqa: E402

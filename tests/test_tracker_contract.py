@@ -24,6 +24,8 @@ from stiffopt.rig.interface import PoseTracker
 from stiffopt.rig.registry import driver_names
 from tracker_contract import CHECKS, PLACE, TURN, Control, Factory
 
+pytestmark = pytest.mark.real_time
+
 
 class BenchControl:
     """What the sensor on a bench does."""

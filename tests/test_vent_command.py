@@ -32,6 +32,8 @@ from stiffopt.safety.rigs import guarded_rig
 from stiffopt.safety.vent import vent_rig
 from stiffopt.safety.vent_line import Reply, SocketPeer
 
+pytestmark = pytest.mark.real_time
+
 RIGS = Path(__file__).parent.parent / "rig"
 BOUND = 45.0  # s, with the start of a Python on a machine that is busy
 GUARD = b"python\0-P\0-m\0stiffopt.safety.guard\x0042\0"

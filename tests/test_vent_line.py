@@ -21,6 +21,8 @@ from stiffopt.safety import vent_line as module
 from stiffopt.safety.claim import address_of
 from stiffopt.safety.vent_line import Caller, Reply, SocketPeer, VentLine, ask_to_vent, guards_of
 
+pytestmark = pytest.mark.real_time
+
 STRANGER = 54321
 """A user who is nobody."""
 ME = SocketPeer(os.getpid(), os.getuid())

@@ -28,6 +28,9 @@ if TYPE_CHECKING:
     from stiffopt.errors import StiffoptError as StiffoptError
     from stiffopt.errors import StoppedError as StoppedError
     from stiffopt.errors import UnfitWarning as UnfitWarning
+    from stiffopt.export.mesh import save_mesh as save_mesh
+    from stiffopt.export.mesh import surface_mesh as surface_mesh
+    from stiffopt.export.mjcf import mjcf as mjcf
     from stiffopt.identify.calibration import CalibrationResult as CalibrationResult
     from stiffopt.identify.calibration import calibrate as calibrate
     from stiffopt.identify.results import Comparison as Comparison
@@ -106,6 +109,8 @@ _NAMES = {
         ),
         *("ServiceError", "SlowWarning", "StiffoptError", "StoppedError", "UnfitWarning"),
     ),
+    "stiffopt.export.mesh": ("save_mesh", "surface_mesh"),
+    "stiffopt.export.mjcf": ("mjcf",),
     "stiffopt.identify.calibration": ("CalibrationResult", "calibrate"),
     "stiffopt.identify.results": ("Comparison",),
     "stiffopt.identify.settings": ("CalibrationSettings",),

@@ -21,6 +21,7 @@ from stiffopt.cli.commission import COMMISSION_EPILOG, COMMISSION_HELP, commissi
 from stiffopt.cli.console import Closed, report_error, warnings_as_notes
 from stiffopt.cli.exits import BAD_INPUT, CLOSED_PIPE, INTERRUPTED
 from stiffopt.cli.experiment import experiment_app
+from stiffopt.cli.export import export_app
 from stiffopt.cli.init import init_app
 from stiffopt.cli.lab import LAB_EPILOG, LAB_HELP, lab
 from stiffopt.cli.log import log_app
@@ -86,6 +87,7 @@ app.command(
 )(vent)
 app.add_typer(map_app, name="map", short_help="Map an arm: workspace and stiffness.")
 app.add_typer(experiment_app, name="experiment")
+app.add_typer(export_app, name="export", short_help="Write an arm for MuJoCo, or as a mesh.")
 app.add_typer(log_app, name="log")
 app.command(
     "calibrate",

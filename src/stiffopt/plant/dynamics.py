@@ -6,9 +6,10 @@ With inertia, a variational integrator: the discrete Lagrangian of a step from q
 
 where X are the positions and section axes of the nodes and U the potential of gravity. Momenta
 p0 = -dL/dq0 and p1 = dL/dq1, with the forces that have no potential split in the same way. It has
-no numerical damping; elasticity and contact are implicit, gravity and loads are explicit. Without
-inertia, backward Euler: stresses, viscosity included, are in equilibrium with all loads at the
-end of the step.
+no numerical damping; elasticity and contact are implicit, gravity and loads are explicit. Contact
+along the body is that of the step's end, which damps it (`stiffopt.plant.contact`). Without
+inertia, backward Euler: stresses, viscosity included, are in equilibrium with all loads at the end
+of the step.
 
 Newton's method uses a tangent by finite differences that is kept over many steps.
 """
@@ -19,6 +20,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from stiffopt.plant.contact import (
+    ContactForces,
+    Surroundings,
+    add_wrenches,
+    no_forces,
+    touch,
+)
 from stiffopt.plant.jit import jit
 from stiffopt.plant.material import (
     FibreMemory,
@@ -62,8 +70,10 @@ class RodState(NamedTuple):
     rotations, positions : of the nodes (N, 3, 3), (N, 3), always those of q.
     inverse : of the tangent (n, n).
     tangent_of : step and kind of equations that the tangent belongs to (2,); 0 where there is none.
-    totals : energy dissipated, work of the pressures, and of loads and contact, so far (3,), J.
+    totals : energy dissipated, work of the pressures, and of loads and the plate, so far, and the
+        energy in the contact along the body (4,), J.
     memory : of the fibres.
+    grip : stretch of the contact's springs across the normals, see `ContactForces` (k, P, 3), m.
     """
 
     q: Array
@@ -76,6 +86,7 @@ class RodState(NamedTuple):
     tangent_of: Array
     totals: Array
     memory: FibreMemory
+    grip: Array
 
 
 @jit
@@ -148,13 +159,14 @@ class Step(NamedTuple):
 
     Attributes
     ----------
-    rod, material, scheme : see there.
+    rod, around, material, scheme : see there.
     loads : at its end.
     inertia : whether the arm has any.
     pressures : in the chambers, constant (n,), Pa.
     """
 
     rod: DiscreteRod
+    around: Surroundings
     material: SectionMaterial
     scheme: Scheme
     loads: RodLoads
@@ -163,7 +175,10 @@ class Step(NamedTuple):
 
 
 class StepBuffers(NamedTuple):
-    """Arrays that a step works in: Jacobians, poses and forces. Made once per call."""
+    """Arrays that a step works in: Jacobians, poses and forces. Made once per call.
+
+    `touch` is of the plate, `body` of the objects along the body.
+    """
 
     jacobian: Array
     rotations: Array
@@ -176,6 +191,8 @@ class StepBuffers(NamedTuple):
     tangent: Array
     guess: Array
     touch: Array
+    body: Array
+    contact: ContactForces
 
 
 @jit
@@ -188,6 +205,18 @@ def residual(step: Step, state: RodState, work: StepBuffers, q: Array, out: Arra
         rod, step.material, step.scheme, state.memory, step.pressures, state.q, q, work.inner
     )
     depth = depth_of(loads, work.positions[last])
+    meets = len(step.around.kind) > 0
+    if meets:
+        touch(
+            step.around,
+            work.rotations,
+            work.positions,
+            state.rotations,
+            state.positions,
+            state.grip,
+            step.scheme.history,
+            work.contact,
+        )
     if step.inertia:  # work.jacobian and work.outer are those of the beginning
         _inertia(
             rod,
@@ -211,6 +240,10 @@ def residual(step: Step, state: RodState, work: StepBuffers, q: Array, out: Arra
         add_contact(loads, depth, work.rotations[last], work.jacobian[last], work.outer)
         for k in range(len(q)):
             out[k] = work.inner[k] - work.outer[k]
+    if meets:
+        axes = state.rotations if step.inertia else work.rotations
+        add_wrenches(work.contact, axes, work.jacobian, work.body)
+        out -= work.body
 
 
 @jit
@@ -285,7 +318,7 @@ def _solve(step: Step, state: RodState, work: StepBuffers, q: Array) -> bool:
 
 
 @jit
-def make_work(n: int, nodes: int) -> StepBuffers:
+def make_work(n: int, nodes: int, around: Surroundings) -> StepBuffers:
     """Room for a step."""
     return StepBuffers(
         np.empty((nodes, n, 6)),
@@ -299,6 +332,8 @@ def make_work(n: int, nodes: int) -> StepBuffers:
         np.empty((n, n)),
         np.empty(n),
         np.empty(n),
+        np.zeros(n),
+        no_forces(around),
     )
 
 
@@ -333,6 +368,10 @@ def take(step: Step, before: RodLoads, state: RodState, work: StepBuffers) -> bo
         moved = work.positions[end.node, i] - state.positions[end.node, i]
         turned = work.rotations[end.node, i, 2] - state.rotations[end.node, i, 2]
         done += force * (moved + end.lever * turned)
+    meets = len(step.around.kind) > 0
+    if meets:
+        for k in range(n):
+            state.totals[0] -= 0.5 * work.body[k] * (q[k] - state.q[k])
     if step.inertia:
         jacobians(rod, q, work.jacobian)
         _inertia(
@@ -348,9 +387,17 @@ def take(step: Step, before: RodLoads, state: RodState, work: StepBuffers) -> bo
         external_forces(rod, end, work.rotations, work.positions, work.jacobian, work.outer)
         work.touch[:] = 0.0
         add_contact(end, mean, work.rotations[last], work.jacobian[last], work.touch)
+        if meets:
+            add_wrenches(work.contact, work.rotations, work.jacobian, work.body)
         for k in range(n):
-            force = work.inner[k] - work.outer[k] - work.touch[k]
+            force = work.inner[k] - work.outer[k] - work.touch[k] - work.body[k]
             state.momentum[k] = work.residual[k] / h - 0.5 * h * force
+    if meets:
+        for k in range(n):
+            state.totals[0] -= 0.5 * work.body[k] * (q[k] - state.q[k])
+        state.totals[0] -= work.contact.energy[0] - state.totals[3]
+        state.totals[3] = work.contact.energy[0]
+        state.grip[:] = work.contact.grip
     lost, pushed = remember(
         rod, step.material, step.scheme, state.memory, step.pressures, state.q, q
     )
@@ -369,6 +416,7 @@ def take(step: Step, before: RodLoads, state: RodState, work: StepBuffers) -> bo
 @jit
 def run(
     rod: DiscreteRod,
+    around: Surroundings,
     material: SectionMaterial,
     scheme: Scheme,
     loads: RodLoads,
@@ -380,7 +428,7 @@ def run(
 
     Returns how many steps worked.
     """
-    work = make_work(len(state.q), len(state.positions))
+    work = make_work(len(state.q), len(state.positions), around)
     if inertia:
         jacobians(rod, state.q, work.jacobian)
         external_forces(rod, loads, state.rotations, state.positions, work.jacobian, work.outer)
@@ -390,7 +438,7 @@ def run(
         while left > 1e-9 * scheme.step:
             part = Scheme(min(h, left), scheme.share, scheme.history)
             end = loads_after(loads, part.step)
-            step = Step(rod, material, part, end, inertia, pressures[i])
+            step = Step(rod, around, material, part, end, inertia, pressures[i])
             if take(step, loads, state, work):
                 left -= part.step
                 loads = end

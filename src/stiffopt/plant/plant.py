@@ -15,13 +15,14 @@ from __future__ import annotations
 import copy
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stiffopt.errors import DeviceError, EquilibriumError, InputError, PressureError
 from stiffopt.model.description import RobotDescription
-from stiffopt.plant import dynamics, material, rod
+from stiffopt.plant import contact, dynamics, material, rod
 from stiffopt.plant.build import (
     draw,
     make_channels,
@@ -54,8 +55,8 @@ class Energies:
     kinetic : of the motion.
     elastic : in the silicone, the springs of creep and hysteresis included.
     gravity : potential, zero where the arm's mass is at the base.
-    contact : in the contact with the probe.
-    dissipated : by viscosity, creep and hysteresis so far.
+    contact : in the contact with the probe and with objects.
+    dissipated : by viscosity, creep, hysteresis, impacts and friction so far.
     work : of the pressures so far.
     load_work : of the load's force and of the moving probe so far (moments are not counted).
     """
@@ -67,6 +68,23 @@ class Energies:
     dissipated: float
     work: float
     load_work: float
+
+
+class ObjectForce(NamedTuple):
+    """What an object does to the arm.
+
+    Attributes
+    ----------
+    object : its name.
+    force : on the arm (3,), in base axes, in N.
+    at : arc length at rest of the middle of what is touched, in m.
+    depth : greatest, by which the body is in the object, in m.
+    """
+
+    object: str
+    force: Array
+    at: float
+    depth: float
 
 
 @dataclass(frozen=True)
@@ -138,6 +156,7 @@ class Plant:
 
     def _mesh(self, station: float | None) -> None:
         self._rod = make_rod(self.robot, self.settings, self.mismatch, station)
+        self._around = contact.make_surroundings(self.settings.scene, self.robot, self._rod)
 
     def _at_rest(self) -> RodState:
         parts, n = self._material, self._rod.per_segment * self.robot.n_segments
@@ -152,12 +171,13 @@ class Plant:
             positions=np.empty((nodes, 3)),
             inverse=np.zeros((n, n)),
             tangent_of=np.zeros(2),
-            totals=np.zeros(3),
+            totals=np.zeros(4),
             memory=FibreMemory(
                 strain=np.zeros(shape),
                 creep=np.zeros((*shape[:2], len(parts.creep_share), shape[2])),
                 slip=np.zeros((*shape[:2], len(parts.slip_share), shape[2])),
             ),
+            grip=np.zeros((len(self._around.kind), len(self._around.at), 3)),
         )
         rod.poses(self._rod, state.q, state.rotations, state.positions)
         return state
@@ -230,6 +250,21 @@ class Plant:
         loads = self._loads()
         return float(contact_force(loads, depth_of(loads, self._state.positions[-1])))
 
+    def object_forces(self) -> tuple[ObjectForce, ...]:
+        """What each object of the scene does to the arm that touches it now."""
+        scene, state = self.settings.scene, self._state
+        forces = contact.no_forces(self._around)
+        R, r = state.rotations, state.positions
+        contact.touch(self._around, R, r, R, r, state.grip, True, forces)
+        rows = zip(forces.force, forces.middle, forces.deepest, strict=True)
+        return tuple(
+            ObjectForce(item.name, force, float(middle), float(deepest))
+            for item, (force, middle, deepest) in zip(
+                () if scene is None else scene.objects, rows, strict=True
+            )
+            if deepest > 0
+        )
+
     def advance(self, duration: float, pressures: ArrayLike) -> None:
         """Let time pass at constant pressures in the chambers.
 
@@ -263,6 +298,7 @@ class Plant:
             effective = self._past.run(self.step, pressures)
         done = dynamics.run(
             self._rod,
+            self._around,
             self._material,
             scheme,
             self._loads(),
@@ -317,7 +353,7 @@ class Plant:
         step = settling.first
         for _ in range(settling.tries):
             scheme = Scheme(step, 1.0, False)
-            args = (self._rod, slow, scheme, self._loads(), False, self._state)
+            args = (self._rod, self._around, slow, scheme, self._loads(), False, self._state)
             self._state.tangent_of[:] = 0.0
             if dynamics.run(*args, acting):
                 if step >= settling.last:
@@ -333,7 +369,7 @@ class Plant:
             raise EquilibriumError("the simulated arm finds no equilibrium")
         self._state.momentum[:] = 0.0
         self._state.tangent_of[:] = 0.0
-        self._state.totals[:] = 0.0
+        self._state.totals[:3] = 0.0
 
     def energies(self) -> Energies:
         """Where the energy is now."""
@@ -350,7 +386,7 @@ class Plant:
                 material.stored(self._rod, self._material, state.memory, self._last_acting, state.q)
             ),
             gravity=-float(self._rod.gravity @ weight),
-            contact=float(contact_energy(loads, depth)),
+            contact=float(contact_energy(loads, depth) + state.totals[3]),
             dissipated=float(state.totals[0]),
             work=float(state.totals[1]),
             load_work=float(state.totals[2]),
@@ -380,9 +416,11 @@ class Plant:
     def _tangent(self, parts: material.SectionMaterial, scheme: Scheme) -> Array:
         """Change of the imbalance without inertia (n, n) with the end of a step from here."""
         q, n = self._state.q.copy(), len(self._state.q)
-        work = dynamics.make_work(n, len(self._state.positions))
+        work = dynamics.make_work(n, len(self._state.positions), self._around)
         K, high, low = np.empty((n, n)), np.empty(n), np.empty(n)
-        step = dynamics.Step(self._rod, parts, scheme, self._loads(), False, self._last_acting)
+        step = dynamics.Step(
+            self._rod, self._around, parts, scheme, self._loads(), False, self._last_acting
+        )
         for k in range(n):
             nudge = dynamics.NUDGE / dynamics.in_strain(self._rod, k)
             q[k] = self._state.q[k] + nudge

@@ -10,10 +10,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from stiffopt.directions import Direction
+from stiffopt.errors import FileError, InputError
 from stiffopt.model.description import RobotDescription
+from stiffopt.model.scene import Scene, SceneOrFile
 from stiffopt.registration import Placement
 from stiffopt.rig.device import MisfitError, RigSection
 from stiffopt.rig.pressure import SupplySettings
@@ -35,6 +37,17 @@ from stiffopt.units import (
     Speed,
     TranslationalStiffness,
 )
+
+LINE, TUBE, PLANE, CYLINDER, BOX = 0, 1, 2, 3, 4
+TOUCHABLE = {
+    "sphere": LINE,
+    "capsule": LINE,
+    "inside_tube": TUBE,
+    "half_space": PLANE,
+    "cylinder": CYLINDER,
+    "box": BOX,
+}
+"""Shapes that the simulated arm can touch, by their keys in files, and how it takes them."""
 
 Positive = Field(gt=0)
 NotNegative = Field(ge=0)
@@ -186,6 +199,24 @@ class SoftSurface(Schema):
     stiffness: Annotated[TranslationalStiffness, Positive]
 
 
+def check_touchable(scene: Scene) -> Scene:
+    """Refuse a scene with a shape that the simulated arm cannot touch.
+
+    Raises
+    ------
+    InputError
+        It names the object.
+    """
+    for item in scene.objects:
+        if item.shape.key not in TOUCHABLE:
+            *most, last = TOUCHABLE
+            raise InputError(
+                f"the simulated arm cannot touch '{item.name}', a {item.shape.key}; give what it "
+                f"meets under plant.scene, as {', '.join(most)} or {last}"
+            )
+    return scene
+
+
 class Discretisation(Schema):
     """Of the rod, per segment.
 
@@ -227,6 +258,8 @@ class PlantSettings(RigSection):
     gravity : acceleration in the base frame, in m/s^2, where it is not that of the robot file.
     load : acts all the time; None for none.
     surface : what the tip may press on, where no probe is mounted; None for nothing.
+    scene : what the body really meets, all of it; None: what of the rig's scene it may lean on.
+        Friction and stiffness are those under ``contact``.
     faults : whether faults may be injected while the rig runs.
     """
 
@@ -239,18 +272,40 @@ class PlantSettings(RigSection):
     gravity: Vector[Acceleration] | None = None
     load: PlantLoad | None = None
     surface: SoftSurface | None = None
+    scene: Annotated[SceneOrFile, AfterValidator(check_touchable)] | None = None
     faults: bool = False
     discretisation: Discretisation = Discretisation()
 
     def check_against(self, rig: Any, robot: RobotDescription) -> None:
-        """Refuse a mismatch of another number of channels or segments than the robot's."""
+        """Refuse a mismatch of another number of channels or segments, or a misplaced scene."""
         self.mismatch.check_lengths(robot)
+        if self.scene is not None:
+            try:
+                self.scene.check_against(robot)
+            except FileError:
+                raise
+            except InputError as error:
+                raise MisfitError(str(error), "plant", "scene") from None
 
 
 def plant_of(description: Any) -> PlantSettings:
-    """Return the plant of a `RigDescription`, or the default one if it has none."""
-    plant = description.plant
-    return plant if isinstance(plant, PlantSettings) else PlantSettings()
+    """Return the plant of a `RigDescription`, or the default one if it has none.
+
+    Without a scene of its own it has the objects of the rig's scene that the arm may lean on.
+
+    Raises
+    ------
+    InputError
+        There is one among them that the simulated arm cannot touch.
+    """
+    plant, scene = description.plant, description.scene
+    plant = plant if isinstance(plant, PlantSettings) else PlantSettings()
+    if plant.scene is None and scene is not None:
+        met = [item for item in scene.objects if item.contact and item.contact.allowed]
+        if met:
+            scene = check_touchable(scene.model_copy(update={"objects": tuple(met)}))
+            plant = plant.model_copy(update={"scene": scene})
+    return plant
 
 
 class SimulatedSupplySettings(SupplySettings):

@@ -11,6 +11,7 @@ from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.scene import Scene
 from stiffopt.plots import style
 from stiffopt.plots.arm import TUBE_STATIONS, ArmDrawing
+from stiffopt.plots.shapes import segment_stations
 from stiffopt.plots.view import View
 
 if TYPE_CHECKING:
@@ -63,12 +64,9 @@ def draw_contact(
 
 def draw_leaning_tube(drawing: ArmDrawing, equilibrium: ContactEquilibrium) -> None:
     """The arm at an equilibrium in contact."""
-    poses, start = [], 0.0
-    for segment in drawing.robot.description.segments:
-        end = start + segment.length + segment.connector
-        poses.append(equilibrium.poses(np.linspace(start, end, TUBE_STATIONS)))
-        start = end
-    drawing.draw_tube(equilibrium.pressures, poses=np.array(poses))
+    stations = segment_stations(drawing.robot, TUBE_STATIONS)
+    poses = equilibrium.poses(stations.ravel()).reshape(*stations.shape, 4, 4)
+    drawing.draw_tube(equilibrium.pressures, poses=poses)
 
 
 def draw_forces(drawing: ArmDrawing, equilibrium: ContactEquilibrium) -> None:

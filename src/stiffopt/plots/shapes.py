@@ -24,16 +24,21 @@ def segment_poses(robot: Manipulator, pressures: ArrayLike, count: int) -> Vecto
     count : int
         Stations of each segment, 2 or more.
     """
-    stations = robot.kept(("segment stations", count), lambda: _stations(robot, count))
+    stations = segment_stations(robot, count).ravel()
     poses = np.concatenate([np.eye(4)[None], robot.pose(pressures, stations[1:])])
     return poses.reshape(robot.n_segments, count, 4, 4)
+
+
+def segment_stations(robot: Manipulator, count: int) -> Vector:
+    """Arc lengths (segments, count) along each segment with its connector, ends included, in m."""
+    return robot.kept(("segment stations", count), lambda: _stations(robot, count))
 
 
 def _stations(robot: Manipulator, count: int) -> Vector:
     lengths = [each.length + each.connector for each in robot.description.segments]
     ends = np.concatenate([[0.0], np.cumsum(lengths)])
     ends[-1] = robot.length
-    return np.concatenate([np.linspace(*pair, count) for pair in pairwise(ends)])
+    return np.array([np.linspace(*pair, count) for pair in pairwise(ends)])
 
 
 class StiffnessEllipsoid(NamedTuple):

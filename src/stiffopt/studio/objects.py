@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from stiffopt.errors import FileError
 from stiffopt.files import save_file
 from stiffopt.model.obstacle import Obstacle
-from stiffopt.model.scene import Scene, SceneObject, load_scene
+from stiffopt.model.scene import AllowedContact, Scene, SceneObject, load_scene
 from stiffopt.studio.design import changed
 
 Vector = NDArray[np.float64]
@@ -72,6 +72,12 @@ def resized(item: SceneObject, size: float) -> SceneObject:
     if edges is not None:
         return _with_shape(item, size=tuple(edge * size / max(edges) for edge in edges))
     return _with_shape(item, radius=size) if hasattr(item.shape, "radius") else item
+
+
+def leant_on(item: SceneObject, *, allowed: bool) -> SceneObject:
+    """Return an object that the arm may lean on, or may not."""
+    contact = item.contact or AllowedContact()
+    return changed(item, contact=changed(contact, allowed=allowed))
 
 
 def replaced(objects: Sequence[SceneObject], item: SceneObject) -> tuple[SceneObject, ...]:

@@ -1,0 +1,1 @@
+"""Arms for other programs: as a model for MuJoCo, and as a mesh."""
