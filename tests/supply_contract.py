@@ -264,7 +264,7 @@ class SupplyContract:
         tests = str(Path(__file__).parent)
         script = CHILD.format(tests=tests, name=case.name, ending=ending)
         child = subprocess.run(
-            [sys.executable, "-c", script], capture_output=True, text=True, timeout=60, check=False
+            [sys.executable, "-c", script], capture_output=True, text=True, timeout=300, check=False
         )
         lines = dict(line.split(maxsplit=1) for line in child.stdout.splitlines())
         assert {"before", "after"} <= lines.keys(), child.stdout + child.stderr

@@ -55,6 +55,7 @@ from stiffopt.rig.settings import (
     CommissioningSettings,
     ControlSettings,
     Published,
+    RosSettings,
     ServiceSettings,
 )
 
@@ -94,7 +95,8 @@ SCHEMAS: list[type[BaseModel]] = [
     *(Scene, SceneObject, AllowedContact, *OBSTACLES.values()),
     *schemas_of(PathDescription, "stiffopt.paths."),
     *(RigDescription, Safety, LogSettings, Registration, Placement),
-    *(ControlSettings, CommissioningSettings, Published, ServiceSettings, Trajectory, Waypoint),
+    *(ControlSettings, CommissioningSettings, Published, RosSettings, ServiceSettings),
+    *(Trajectory, Waypoint),
     *schemas_of(CommissioningRecord, "stiffopt.commissioning."),
     *schemas_of(simulated.PlantSettings, "stiffopt.plant"),
     simulated.LabSettings,

@@ -31,6 +31,7 @@ from stiffopt.errors import InputError
 from stiffopt.model.obstacles import OBSTACLES
 from stiffopt.model.obstacles.mesh import Mesh
 from stiffopt.model.scene import AllowedContact, Scene, SceneObject
+from stiffopt.optimise.brace import Brace
 from stiffopt.optimise.goal import (
     AtLeast,
     MatchMatrix,
@@ -53,7 +54,7 @@ SLEW = np.full(3, 5e5)
 X = (1.0, 0.0, 0.0)
 MESSAGES: tuple[type[Schema], ...] = (
     *(Task, Target, Tolerance, StiffnessGoal, StiffnessMeasure, AtLeast, MatchValue, MatchMatrix),
-    *(Load, Press, PressureRange, Plane, Waypoint, Trajectory),
+    *(Load, Brace, Press, PressureRange, Plane, Waypoint, Trajectory),
     *(Scene, SceneObject, AllowedContact, *(kind for kind in OBSTACLES.values() if kind != Mesh)),
 )
 UNSAID: dict[type[Schema], set[str]] = {
@@ -279,6 +280,21 @@ EVERYTHING: list[Schema] = [
         press=Press(
             force=0.03, direction=X, frame="tip", tolerance=1e-3, speed=1e-3, travel=5e-3
         ),
+    ),
+    goal(maximise=[StiffnessMeasure(direction=X)]).model_copy(
+        update={
+            "scene": Scene(
+                objects=[
+                    SceneObject(
+                        name="post", sphere={"centre": (0.1, 0.0, 0.1), "radius": 0.01},
+                        contact=AllowedContact(allowed=True),
+                    )
+                ]
+            ),
+            "brace": Brace(
+                objects=("post",), margin=0.03, contacts="sticking", approach="objects"
+            ),
+        }
     ),
     task(
         target=Target(orientation=(0.6, 0.0, 0.8, 0.0)),

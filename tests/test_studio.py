@@ -15,6 +15,7 @@ import stiffopt
 from stiffopt.cli.path_records import csv_text
 from stiffopt.errors import FileError, InputError
 from stiffopt.model.calibration import Calibration, ErrorModel
+from stiffopt.plots.shapes import surface_mesh
 from stiffopt.studio import objects, texts
 from stiffopt.studio.cloud import StiffnessCloud, check_map
 from stiffopt.studio.design import Design
@@ -341,7 +342,7 @@ def test_objects_are_placed_moved_and_saved(kind: str, design: Design, tmp_path:
     size = objects.size_of(first.shape)
     if size is not None:
         assert objects.size_of(objects.resized(moved, 2 * size).shape) == pytest.approx(2 * size)
-    vertices, faces = objects.surface_mesh(moved.shape, 0.2)
+    vertices, faces = surface_mesh(moved.shape, 0.2)
     assert faces.max() < len(vertices)
     with_both = design.with_objects([first, second])
     changed = with_both.with_objects(objects.replaced(with_both.objects, moved))
@@ -354,6 +355,38 @@ def test_objects_are_placed_moved_and_saved(kind: str, design: Design, tmp_path:
         objects.save_scene(TASK, changed.task.scene)
     with pytest.raises(FileError, match=r"ends in \.yaml"):
         objects.save_scene(tmp_path / "scene.txt", changed.task.scene)
+
+
+def test_held_pressures_lean_on_an_object_that_is_dragged(bench: Workbench) -> None:
+    assert bench.answer is not None
+    side = np.array([1.0, 0.0, 0.0])
+    middle = bench.answer.robot.pose(bench.answer.pressures, 0.12)[:3, 3]
+    ball = objects.new_object("sphere", (), 0.18)
+    bench.hold(held=True)
+    with pytest.raises(InputError, match="nothing to lean on"):
+        bench.answer_quickly(never)
+    forces = []
+    for gap in (0.06, 0.022, 0.020):  # the arm and the ball are 15 and 11 mm wide
+        item = objects.leant_on(objects.moved(ball, middle + gap * side), allowed=True)
+        bench.change("move", lambda d, item=item: d.with_objects([item]))
+        assert bench.answer_quickly(never)
+        assert not bench.answer_best(never)  # which would move the arm away
+        leaning = bench.leaning
+        forces.append(sum(np.linalg.norm(each.force) for each in leaning.equilibrium.contacts))
+        free, braced = leaning.stiffness
+        said = texts.answer_html(bench)
+        assert "times the free arm" in said
+        assert (f"on {item.name}" in said) == bool(forces[-1])
+        if forces[-1]:
+            assert braced > 5 * free
+            assert leaning.pushes()[0].force > 0
+        else:
+            assert braced == pytest.approx(free, rel=1e-3)
+            assert leaning.pushes() is None
+    assert forces[0] == 0 < forces[1] < forces[2]
+    bench.hold(held=False)
+    assert bench.leaning is None
+    assert bench.answer_best(never)
 
 
 def test_an_object_on_the_base_is_refused(design: Design) -> None:

@@ -140,6 +140,27 @@ def test_direction_and_objects_are_dragged(browser_page: Any, compiled: Path) ->
         moved = view.object_position - handle
         np.testing.assert_allclose(moved, 0.02 * X, atol=0.005)
         page.wait_for_selector("text=clearance")
+
+        page.get_by_label("may be leant on").check()
+        until(lambda: bench.design.objects[0].contact is not None)
+        page.get_by_label("lean: hold the pressures").check()
+        page.wait_for_selector("text=drag an object that may be leant on")
+        pressures = bench.answer.pressures
+        for _ in range(8):  # towards the arm, until they touch
+            handle = view.object_position
+            drag(page, client, handle + 0.025 * X, handle + 0.010 * X)
+            until(lambda: bench.leaning is not None and bench.leaning.design == bench.design)
+            if bench.leaning.equilibrium.contacts:
+                break
+        page.wait_for_selector("text=times the free arm's")
+        page.wait_for_selector("text=on sphere 1")
+        np.testing.assert_array_equal(bench.leaning.equilibrium.pressures, pressures)
+        free, braced = bench.leaning.stiffness
+        assert braced > free
+        leaning = bench.leaning.equilibrium.tip_pose[:3, 3]
+        until(lambda: np.allclose(view.arm_end, leaning, atol=1e-6))
+        page.get_by_label("lean: hold the pressures").uncheck()
+        page.wait_for_selector("text=clearance")
     finally:
         studio.close()
 

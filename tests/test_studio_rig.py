@@ -20,7 +20,7 @@ from stiffopt.errors import DeviceError, InputError
 from stiffopt.model.manipulator import load_robot
 from stiffopt.model.robot_files import load_description
 from stiffopt.studio import rig_watch, texts
-from stiffopt.studio.rig_watch import RigWatch, pressures_now
+from stiffopt.studio.rig_watch import RigWatch
 from stiffopt.studio.workbench import Workbench
 
 pytestmark = pytest.mark.real_time
@@ -201,9 +201,9 @@ def test_another_robot_is_told(rig: Path, watching: Callable[..., RigWatch]) -> 
 
 
 def test_pressures_are_those_measured_or_else_commanded(loop: FakeLoop) -> None:
-    np.testing.assert_array_equal(pressures_now(loop.now), [1.0, 2.0, 0.0, 4.0, 5.0, 6.0])
+    np.testing.assert_array_equal(loop.now.pressures, [1.0, 2.0, 0.0, 4.0, 5.0, 6.0])
     unknown = np.full(6, np.nan)
-    assert pressures_now(replace(loop.now, measured=unknown, commanded=unknown)) is None
+    assert replace(loop.now, measured=unknown, commanded=unknown).pressures is None
 
 
 def test_a_studio_that_commands_is_for_this_machine_alone(rig: Path) -> None:

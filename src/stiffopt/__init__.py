@@ -57,6 +57,7 @@ if TYPE_CHECKING:
     from stiffopt.model.screws import Twist as Twist
     from stiffopt.model.screws import Wrench as Wrench
     from stiffopt.model.uncertainty import TipUncertainty as TipUncertainty
+    from stiffopt.optimise.brace import Brace as Brace
     from stiffopt.optimise.goal import AtLeast as AtLeast
     from stiffopt.optimise.goal import MatchMatrix as MatchMatrix
     from stiffopt.optimise.goal import MatchValue as MatchValue
@@ -133,6 +134,7 @@ _NAMES = {
     "stiffopt.optimise.solution": ("PressureSolution",),
     "stiffopt.optimise.solver": ("PressureSolver", "solve_batch", "solve_pressure"),
     "stiffopt.optimise.target": ("Target", "Tolerance"),
+    "stiffopt.optimise.brace": ("Brace",),
     "stiffopt.optimise.press": ("Press",),
     "stiffopt.optimise.task": ("Load", "Task", "load_task"),
     "stiffopt.optimise.warm": ("WarmAnswer",),

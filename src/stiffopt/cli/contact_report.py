@@ -5,11 +5,11 @@ from typing import Any
 import numpy as np
 from rich.console import Group, RenderableType
 
+from stiffopt.cli.solve_records import contact_record, loss_record
 from stiffopt.cli.tables import TextTable, labelled, title
 from stiffopt.display import FIGURES, display_units
 from stiffopt.errors import printable
 from stiffopt.model.contact.equilibrium import ContactEquilibrium
-from stiffopt.model.contact.push import ContactLoss
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.plots.wording import vector_text
 
@@ -24,16 +24,7 @@ def record(robot: Manipulator, found: ContactEquilibrium) -> dict[str, Any]:
         "tip_position_m": found.tip_pose[:3, 3],
         "stable": found.stable,
         "within_limits": found.within_limits,
-        "contacts": [
-            {
-                "object": each.object,
-                "at_m": each.at,
-                "force_n": each.force,
-                "position_m": each.position,
-                "max_force_n": each.max_force if np.isfinite(each.max_force) else None,
-            }
-            for each in found.contacts
-        ],
+        "contacts": [contact_record(each) for each in found.contacts],
         "stiffness": {name: _stiffness(robot, found, d) for name, d in _AXES.items()},
     }
 
@@ -43,16 +34,7 @@ def _stiffness(robot: Manipulator, found: ContactEquilibrium, d: Any) -> dict[st
         "free_n_per_m": robot.stiffness(found.pressures, d),
         "sliding_n_per_m": found.stiffness(d),
         "sticking_n_per_m": found.stiffness(d, contacts="sticking"),
-        "lost": [_loss(found.lift_off(sign * d)) for sign in (1, -1)],
-    }
-
-
-def _loss(loss: ContactLoss) -> dict[str, Any]:
-    return {
-        "force_n": loss.force if np.isfinite(loss.force) else None,
-        "object": loss.object,
-        "how": loss.how,
-        "stiffness_after_n_per_m": loss.stiffness_after,
+        "lost": [loss_record(found.lift_off(sign * d)) for sign in (1, -1)],
     }
 
 

@@ -30,6 +30,7 @@ from stiffopt.cli.options import Version, command_group
 from stiffopt.cli.path import PATH_EPILOG, PATH_HELP, path
 from stiffopt.cli.plan import PLAN_EPILOG, PLAN_HELP, plan
 from stiffopt.cli.robots import robots
+from stiffopt.cli.ros import ROS_EPILOG, ROS_HELP, ros
 from stiffopt.cli.run import RUN_EPILOG, RUN_HELP, run
 from stiffopt.cli.solve import EXAMPLES, HELP, solve
 from stiffopt.cli.studio import STUDIO_EPILOG, STUDIO_HELP, studio
@@ -82,6 +83,9 @@ app.command(
     help=RUN_HELP,
     epilog=RUN_EPILOG,
 )(run)
+app.command(
+    "ros", short_help="Put an arm on a ROS 2 graph, as a node.", help=ROS_HELP, epilog=ROS_EPILOG
+)(ros)
 app.command(
     "vent", short_help="Let all pressure out of an arm at once.", help=VENT_HELP, epilog=VENT_EPILOG
 )(vent)

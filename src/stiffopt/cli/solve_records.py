@@ -6,6 +6,8 @@ from typing import Any
 
 from stiffopt.cli.console import plain_data
 from stiffopt.cli.solved_task import SolvedTask
+from stiffopt.model.contact.equilibrium import Contact
+from stiffopt.model.contact.push import ContactLoss
 from stiffopt.optimise.solution import PressureSolution, Sensitivities
 from stiffopt.optimise.term import Term
 from stiffopt.plots.wording import least_maximised
@@ -58,6 +60,7 @@ def json_record(solved: SolvedTask) -> Record:
             for term in solution.task.target.terms
         },
         **_clearance(solution),
+        **_brace(solution),
         "stiffness": solution.stiffness,
         "stiffness_unit": solution.stiffness_unit,
         "stiffnesses": solution.stiffnesses,
@@ -89,6 +92,42 @@ def _clearance(solution: PressureSolution) -> Record:
     if solution.mesh_error is not None:
         record["mesh_error_m"] = solution.mesh_error
     return record
+
+
+def _brace(solution: PressureSolution) -> Record:
+    """Where an arm leans, what that gives, and what it holds."""
+    if solution.task.brace is None:
+        return {}
+    return {
+        "contacts": [contact_record(each) for each in solution.contacts],
+        "stiffness_free": solution.stiffness_free,
+        "preload": [
+            {"direction": each.direction, "contacts": each.contacts, **loss_record(each.loss)}
+            for each in solution.preloads
+        ],
+        "limited_by": solution.limited_by,
+    }
+
+
+def contact_record(contact: Contact) -> Record:
+    """A contact for JSON, in SI units."""
+    return {
+        "object": contact.object,
+        "at_m": contact.at,
+        "force_n": contact.force,
+        "position_m": contact.position,
+        "max_force_n": contact.max_force if math.isfinite(contact.max_force) else None,
+    }
+
+
+def loss_record(loss: ContactLoss) -> Record:
+    """The push by which a contact is lost for JSON, in SI units; null where none is."""
+    return {
+        "force_n": loss.force if math.isfinite(loss.force) else None,
+        "object": loss.object,
+        "how": loss.how,
+        "stiffness_after_n_per_m": loss.stiffness_after,
+    }
 
 
 def _json_sensitivities(solution: PressureSolution) -> Record | None:
@@ -147,6 +186,7 @@ def result_record(solved: SolvedTask) -> Record:
         "nearest_object": solution.nearest_object,
         "mesh_error": _quantity(solution.mesh_error, "m", "mm"),
         "stiffness": _stiffnesses(solved),
+        "brace": _brace_with_units(solution),
         "matrix_distance": solution.matrix_distance,
         "compliance": _compliance(solution),
         "active_bounds": list(solution.active_bounds) or None,
@@ -157,6 +197,34 @@ def result_record(solved: SolvedTask) -> Record:
         "solve_time": _quantity(solution.timings.get("total"), "s"),
     }
     return {key: _without_none(value) for key, value in record.items() if value is not None}
+
+
+def _brace_with_units(solution: PressureSolution) -> Record | None:
+    if solution.task.brace is None:
+        return None
+    return {
+        "stiffness_free": _quantity(solution.stiffness_free, solution.stiffness_unit or ""),
+        "contacts": [
+            {
+                "object": each.object,
+                "at": _quantity(each.at, "m", "mm"),
+                "force": _quantities(each.force, "N", "N"),
+            }
+            for each in solution.contacts
+        ]
+        or None,
+        "preload": [
+            {
+                "direction": plain_data(each.direction),
+                "contacts": each.contacts,
+                "push": _quantity(each.loss.force, "N"),
+                "how": each.loss.how,
+            }
+            for each in solution.preloads
+        ]
+        or None,
+        "limited_by": list(solution.limited_by) or None,
+    }
 
 
 def _tip(solution: PressureSolution) -> Record | None:

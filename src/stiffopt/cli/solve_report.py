@@ -16,7 +16,7 @@ from stiffopt.display import FIGURES, display_units
 from stiffopt.errors import printable
 from stiffopt.optimise.goal import MatchMatrix, StiffnessMeasure
 from stiffopt.optimise.press import POSITION_ERROR, Feeling
-from stiffopt.optimise.settings import OBSTACLES
+from stiffopt.optimise.settings import BRACE, OBSTACLES
 from stiffopt.optimise.solution import PressureSolution
 from stiffopt.optimise.term import Term
 from stiffopt.plots.wording import (
@@ -59,6 +59,7 @@ def _lines(solved: SolvedTask) -> Iterable[Line]:
     yield "pressures", _pressures(solved, solution.pressures)
     yield from _tip(solution, solution.tip_pose)
     yield from _press(solution, solution.tip_pose)
+    yield from _brace(solution)
     yield from _clearance(solution)
     yield from _uncertainty(solved)
     yield from _stiffnesses(solved)
@@ -121,6 +122,41 @@ def _press(solution: PressureSolution, pose: Vector) -> Iterable[Line]:
         f"{unit.text(press.force, '.3g')} along {vector_text(np.array(press.direction))}, "
         f"{press.frame} axes; felt to {unit.text(felt.deviation(POSITION_ERROR), '.2g')}",
     )
+
+
+def _brace(solution: PressureSolution) -> Iterable[Line]:
+    """Where the arm leans, how stiff it would be free, what the contacts hold and what limits."""
+    if not solution.contacts:
+        return
+    units = display_units()
+    for number, each in enumerate(solution.contacts):
+        size = units.force.text(float(np.linalg.norm(each.force)), ".3g")
+        most = f" of at most {units.force.text(each.max_force, 'g')}"
+        yield (
+            "" if number else "leans on",
+            Text.assemble(
+                (f"'{printable(each.object)}'", "bold"),
+                f" at {units.length.text(each.at, '.1f')} along the arm with ",
+                (size, "bold"),
+                most if np.isfinite(each.max_force) else "",
+            ),
+        )
+    free, unit = solution.stiffness_free, units.of_si(solution.stiffness_unit)
+    value = solution.stiffness
+    if free is None or value is None:
+        yield "clear of it", "the target cannot be had without leaning on something"
+    else:
+        yield "clear of it", f"{unit.text(free)}; leaning is {value / free:.3g} times as stiff"
+    for number, held in enumerate(solution.preloads):
+        loss, where = held.loss, vector_text(held.direction)
+        grip = f" {held.contacts}" if len({each.contacts for each in solution.preloads}) > 1 else ""
+        text = f"any push along {where} up to {units.force.text(BRACE.largest_push, 'g')}"
+        if np.isfinite(loss.force):
+            text = f"{units.force.text(loss.force, '.3g')} along {where}: then "
+            text += f"'{printable(loss.object)}' {loss.how}" if loss.object else f"it {loss.how}"
+        yield "" if number else "holds", f"{text}{grip and f' ({grip.strip()})'}"
+    if solution.limited_by:
+        yield "limited by", printable(", ".join(solution.limited_by))
 
 
 def _clearance(solution: PressureSolution) -> Iterable[Line]:

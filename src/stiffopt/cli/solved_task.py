@@ -73,7 +73,8 @@ def solve_file(file: str, *, seed: int, pareto: int | None) -> SolvedTask:
 
 def _with_uncertainty(answer: SolvedTask) -> SolvedTask:
     pressures = answer.solution.pressures
-    if answer.robot.description.calibration is None or pressures is None:
+    leans = answer.solution.contacts  # the uncertainty is that of a free arm
+    if answer.robot.description.calibration is None or pressures is None or leans:
         return answer
     try:
         uncertainty = answer.robot.tip_uncertainty(pressures)

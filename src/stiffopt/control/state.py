@@ -324,3 +324,9 @@ class Snapshot(ControllerStatus):
     alarms: Annotated[tuple[Alarm, ...], _state("what is wrong now")] = ()
     timing: Annotated[Timing, Shown("how punctual the loop is")] = Timing()
     samples: tuple[PoseSample, ...] = ()
+
+    @property
+    def pressures(self) -> Array | None:
+        """Measured pressures (n,) in Pa, commanded ones where none are known; None: neither."""
+        found = np.where(np.isfinite(self.measured), self.measured, self.commanded)
+        return found if np.isfinite(found).all() else None

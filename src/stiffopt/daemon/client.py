@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike
 from stiffopt.control.state import Event, Snapshot, State
 from stiffopt.daemon.messages import TargetMessage, TaskMessage, TrajectoryMessage
 from stiffopt.daemon.reports import LEASE_HEADER, RobotReport, error_of
+from stiffopt.daemon.secret import bracketed
 from stiffopt.daemon.state_json import record_of
 from stiffopt.errors import (
     CommandError,
@@ -31,6 +32,7 @@ from stiffopt.errors import (
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import Task, load_task
 from stiffopt.paths.trajectory import Trajectory, Waypoint
+from stiffopt.rig.settings import ServiceSettings
 
 if TYPE_CHECKING:
     from websockets.sync.client import ClientConnection
@@ -543,6 +545,12 @@ class ClientStream:
                 self.superseded += 1
             else:
                 self._refused = error_of(_STATUS.get(error["code"], 409), error["message"])
+
+
+def daemon_url(service: ServiceSettings) -> str:
+    """Return where a client on the daemon's machine reaches it, by the rig file's `service`."""
+    host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(service.host, service.host)
+    return f"http://{bracketed(host)}:{service.port}"
 
 
 def _token(given: str | os.PathLike[str] | None) -> str | None:

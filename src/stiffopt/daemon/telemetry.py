@@ -243,10 +243,8 @@ class Telemetry:
             self._log_arm(now)
 
     def _log_arm(self, now: Snapshot) -> None:
-        if self._backbone is None:
-            return
-        p = np.where(np.isfinite(now.measured), now.measured, now.commanded)
-        if np.isfinite(p).all():
+        p = now.pressures
+        if self._backbone is not None and p is not None:
             with suppress(StiffoptError):  # an arm without a known shape is not drawn
                 self._channels.log_arm(now, self._backbone(p))
 

@@ -201,7 +201,7 @@ class TelemetryChannels:
         points = [Point3(x=x, y=y, z=z) for x, y, z in poses[:, :3, 3].tolist()]
         line = LinePrimitive(points=points, thickness=self._thickness, color=_colour(_ARM_COLOUR))
         entities = [_entity(moment, "arm", lines=[line])]
-        where = _target_place(now)
+        where = target_place(now)
         if where is not None:
             x, y, z = where.tolist()
             place = Pose(
@@ -220,9 +220,9 @@ class TelemetryChannels:
 
         moment = self.nanoseconds(now.time)
         frames = [_frame(moment, TIP, now.tip_position, now.tip_quaternion)]
-        where = _target_place(now)
+        where = target_place(now)
         if where is not None:
-            frames.append(_frame(moment, TARGET, where, _target_turn(now)))
+            frames.append(_frame(moment, TARGET, where, target_turn(now)))
         if self._seen is not None:
             captured = self.nanoseconds(self._seen.time)
             frames.append(_frame(captured, SEEN, self._seen.position, self._seen.quaternion))
@@ -304,7 +304,7 @@ def _force(moment: int, now: Snapshot) -> Any:
     return _entity(moment, "force", lines=[line], spheres=[ball])
 
 
-def _target_place(now: Snapshot) -> Array | None:
+def target_place(now: Snapshot) -> Array | None:
     """Return where the target is (3,), with the tip's coordinate along free axes."""
     if now.target_position is None:
         return None
@@ -312,7 +312,7 @@ def _target_place(now: Snapshot) -> Array | None:
     return where if np.isfinite(where).all() else None
 
 
-def _target_turn(now: Snapshot) -> Array | None:
+def target_turn(now: Snapshot) -> Array | None:
     """Return the target's orientation (4,), or the smallest rotation to its direction."""
     if now.target_quaternion is not None:
         return now.target_quaternion

@@ -25,7 +25,7 @@ from stiffopt.model.arm_clearance import (
     measured_scene,
 )
 from stiffopt.model.body import ModelInC
-from stiffopt.model.clearance import Nearest, nearest_point, range_ends, survey
+from stiffopt.model.clearance import Nearest, StationOf, nearest_point, range_ends, survey
 from stiffopt.model.description import RobotDescription
 from stiffopt.model.distances import MeasuredObject, scene_library
 from stiffopt.model.loaded_arm import LoadedArm
@@ -56,7 +56,7 @@ class _Obstacles(ctypes.Structure):
 
 
 def _quickly_nearest(
-    body: ArmBody, item: MeasuredObject, ranges: Sequence[tuple[float, float, int]]
+    body: StationOf, item: MeasuredObject, ranges: Sequence[tuple[float, float, int]]
 ) -> Nearest:
     """The nearest point of a stretch of the body: around the best of some stations, ever closer."""
     s = np.concatenate(
@@ -156,10 +156,16 @@ class Obstacles:
     def rows(self, arm: Manipulator, p: Vector) -> tuple[Vector, Vector]:
         """Rows (k,) and derivatives (k, n) per Pa at pressures (n,), without machine code."""
         checkpoint()
-        body = ArmBody(arm, p)
+        found = self.nearest(ArmBody(arm, p))
+        distances = np.array([nearest.distance for nearest in found])
+        rows = OBSTACLES.margin - (distances - self.scene.clearance)
+        return rows, -gradients(arm, p, found)
+
+    def nearest(self, body: StationOf) -> list[Nearest]:
+        """Where a body is nearest to the objects, a row each, by a few stations."""
         ranges = range_ends(self.description, OBSTACLES.spacing)
         groups = [ranges[begin:end] for begin, end in pairwise((0, *self.range_groups))]
-        found = [
+        return [
             nearest
             for item in self.measured.items
             for nearest in (
@@ -168,9 +174,12 @@ class Obstacles:
                 else [_quickly_nearest(body, item, group) for group in groups]
             )
         ]
-        distances = np.array([nearest.distance for nearest in found])
-        rows = OBSTACLES.margin - (distances - self.scene.clearance)
-        return rows, -gradients(arm, p, found)
+
+    def exactly_nearest(self, body: StationOf) -> list[Nearest]:
+        """Where all of a body is exactly nearest to each row's object."""
+        ranges = survey(body, range_ends(self.description))
+        found = [nearest_point(body, item, ranges) for item in self.measured.items]
+        return [found[index] for index in self.row_objects]
 
     def exact_rows(self, arm: Manipulator, p: Vector) -> list[float]:
         """Rows (k,) to judge by; each has the exact least distance of the whole arm."""

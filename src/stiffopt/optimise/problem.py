@@ -198,20 +198,25 @@ class PressureProblem:
         self.unit = pressure_ranges(robot.description)
         self.lower, self.upper = lower / self.unit, upper / self.unit
         self.radii: dict[str, float] = {}
-        self.program = Program.of(task, robot.description)
+        self._set_functions()
+        self._set_constraints()
+        self.objective = self._objective()
+        self.floors = floor_bounds(task.stiffness)
+
+    def _set_functions(self) -> None:
+        robot, self.program = self.robot, Program.of(self.task, self.robot.description)
         self.parameters = robot.parameters(self.program.parameters)
         self._functions = functions(robot, self.program)
         self._is_loaded = robot.is_loaded
         self._pose = Evaluator(robot, self._functions["pose"])
         self._full = Evaluator(robot, self._functions["point"])
-        self._set_constraints()
-        self.objective = self._objective()
-        self.floors = floor_bounds(task.stiffness)
+
+    def _all_constraints(self) -> tuple[Constraint, ...]:
+        return self.program.constraints(self.robot.length)
 
     def _set_constraints(self) -> None:
         self.constraints = tuple(
-            c._replace(radius=self.radii.get(c.name, c.radius))
-            for c in self.program.constraints(self.robot.length)
+            c._replace(radius=self.radii.get(c.name, c.radius)) for c in self._all_constraints()
         )
         self.bounding = Bounding(self.constraints)
         own = self.program.n_own_rows

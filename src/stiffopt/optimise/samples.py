@@ -73,21 +73,11 @@ class SampleTable:
     @cached_property
     def flat_poses(self) -> Vector:
         """Position and rotation, this by columns, (N, 12)."""
-        columns = self.poses[:, :3, [3, 0, 1, 2]].swapaxes(1, 2)
-        return np.ascontiguousarray(columns.reshape(-1, 12))
+        return _flattened(self.poses)
 
     def distances(self, terms: tuple[Term, ...], length: float) -> Vector:
         """How far (N,) the samples' tips are from meeting all terms, roughly (see `Nearness`)."""
-        position, rotation = self.flat_poses[:, :3], self.flat_poses[:, 3:]
-        total = np.zeros(len(self.flat_poses))
-        for term in terms:
-            near = term.nearness(length)
-            value = near.offset + position @ np.array(near.linear)
-            value += position**2 @ np.array(near.square) + rotation @ np.array(near.turn)
-            np.maximum(value, 0.0, out=value)
-            value = np.sqrt(value) if near.root else value
-            total += np.maximum(value - near.limit, 0.0)
-        return total
+        return _distances(self.flat_poses, terms, length)
 
     def nearest_first(self, distances: Vector, most: int | None = None) -> NDArray[np.intp]:
         """Indices of the samples with the smallest distances (N,), in order."""
@@ -110,6 +100,29 @@ def _spread_with_edges(count: int, n: int, seed: int) -> Vector:
     shift = np.random.default_rng(seed).random(n)
     points = (shift + np.outer(np.arange(1.0, count + 1), steps)) % 1.0
     return np.clip(1.25 * points - 0.125, 0.0, 1.0)
+
+
+def distances(poses: Vector, terms: tuple[Term, ...], length: float) -> Vector:
+    """How far (N,) tips at poses (N, 4, 4) are from meeting all terms; see `Nearness`."""
+    return _distances(_flattened(poses), terms, length)
+
+
+def _distances(flat: Vector, terms: tuple[Term, ...], length: float) -> Vector:
+    position, rotation = flat[:, :3], flat[:, 3:]
+    total = np.zeros(len(flat))
+    for term in terms:
+        near = term.nearness(length)
+        value = near.offset + position @ np.array(near.linear)
+        value += position**2 @ np.array(near.square) + rotation @ np.array(near.turn)
+        np.maximum(value, 0.0, out=value)
+        value = np.sqrt(value) if near.root else value
+        total += np.maximum(value - near.limit, 0.0)
+    return total
+
+
+def _flattened(poses: Vector) -> Vector:
+    columns = poses[:, :3, [3, 0, 1, 2]].swapaxes(1, 2)
+    return np.ascontiguousarray(columns.reshape(-1, 12))
 
 
 def _unflattened(flat: Vector) -> Vector:

@@ -9,9 +9,10 @@ proved.  How many is a matter of how much the target leaves open (`effort`).
 The folder ``native`` holds the same method in C.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from itertools import islice
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +26,8 @@ from stiffopt.optimise.settings import DESCENT, OBSTACLES, REACH, SEARCH, Effort
 from stiffopt.optimise.solution import Confidence
 
 Vector = NDArray[np.float64]
+Places = Callable[[Any, Iterable[Vector]], Iterator[tuple[int, ProgramPoint | None]]]
+"""Brings candidates to the target: points to descend from, and how many were tried by then."""
 
 
 def effort(rows: int, covered: float, loaded: bool = False) -> Effort:
@@ -72,7 +75,7 @@ def starts(problem: PressureProblem, table: SampleTable) -> tuple[Iterator[Vecto
     order = table.nearest_first(distances)
     mixed = [i for pair in zip(order, range(len(order)), strict=True) for i in pair]
     x = x[list(dict.fromkeys(mixed))]
-    unlike = (x[i] for i in _unlike_first(problem, x))
+    unlike = (x[i] for i in unlike_first(problem, x))
     return islice(unlike, SEARCH.general_starts_loaded), full
 
 
@@ -100,14 +103,16 @@ def search(
     candidates: Iterable[Vector],
     tries: Effort = SEARCH.placed,
     same: float = SEARCH.same_optimum,
+    places: Places | None = None,
 ) -> Search:
     """Run local optimisations from candidates until so many in a row find nothing new.
 
-    `same` is the difference of values below which optima count as one.
+    `same` is the difference of values below which optima count as one; `places` brings candidates
+    to the target.
     """
     trail = _Trail(same, tries.agreeing)
     try:
-        _descend_from(problem, candidates, tries, trail)
+        _descend_from(problem, (places or _places)(problem, candidates), tries, trail)
     except StoppedError:
         if problem.robot.is_loaded or not trail.optima:
             raise  # to judge what there is takes long as well, or there is nothing
@@ -115,11 +120,14 @@ def search(
 
 
 def _descend_from(
-    problem: PressureProblem, candidates: Iterable[Vector], tries: Effort, trail: "_Trail"
+    problem: PressureProblem,
+    places: Iterator[tuple[int, ProgramPoint | None]],
+    tries: Effort,
+    trail: "_Trail",
 ) -> None:
-    """Descend from candidates, until enough has been seen; the trail keeps what is found."""
+    """Descend from places, until enough has been seen; the trail keeps what is found."""
     ends: dict[int, LocalResult] = {}
-    for tried, point in _places(problem, candidates):
+    for tried, point in places:
         trail.starts = tried
         if point is None:
             continue
@@ -211,7 +219,7 @@ def _places(
     promise = {i: _promise(problem, come[i]) for i in set(place)}
     ranked = sorted(range(len(come)), key=lambda i: promise[place[i]])
     points_at: dict[int, ProgramPoint] = {}
-    for i in _unlike_first(problem, come[ranked]):
+    for i in unlike_first(problem, come[ranked]):
         at = place[ranked[i]]
         if at not in points_at:
             points_at[at] = _past_obstacles(problem, come[at])
@@ -251,7 +259,7 @@ def _promise(problem: PressureProblem, x: Vector) -> float:
     return value if np.isfinite(value) else np.inf
 
 
-def _unlike_first(problem: PressureProblem, x: Vector) -> Iterator[int]:
+def unlike_first(problem: PressureProblem, x: Vector) -> Iterator[int]:
     """Indices of pressures (N, n), in order: those far from all before, then the others."""
     range_ = problem.upper - problem.lower
     apart = SEARCH.unlike**2 * float(range_ @ range_)

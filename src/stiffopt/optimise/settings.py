@@ -158,6 +158,41 @@ class ObstacleSettings:
 
 
 @dataclass(frozen=True)
+class BraceSettings:
+    """Search for pressures with which the arm leans on objects (`stiffopt.optimise.leaning`).
+
+    Attributes
+    ----------
+    force : width of a row's bound on a contact force in N, the scale on which the method sees it.
+    scale : what a force is compared with while the target is far, in N.
+    step : of a pressure, as a share of its range, in differences of equilibria.
+    precision : decrease of the objective that no longer matters, which differences can tell.
+    spare : share of tolerances, forces and margins that is left.
+    stations : along the body, at which samples are looked at for what they would lean on.
+    screened : samples whose contact is estimated.
+    effort : starts that are brought to the target in contact, descents in a row that must find
+        nothing new, and most descents.
+    iterations : of a start, to the target and to what contacts have to hold.
+    tried : local optima that are judged in turn, from rest.
+    least_price : of a whole tolerance or limit, as a share of the stiffness, that is worth telling.
+    largest_push : up to which pushes are looked at, in N.
+    """
+
+    force: float = 5e-3
+    scale: float = 1.0
+    step: float = 3e-4
+    precision: float = 1e-4
+    spare: float = 5e-3
+    stations: int = 14
+    screened: int = 1024
+    effort: Effort = field(default=Effort(32, 4, 12))
+    iterations: int = 15
+    tried: int = 8
+    least_price: float = 1e-3
+    largest_push: float = 1.0
+
+
+@dataclass(frozen=True)
 class SampleSettings:
     """Table of sampled configurations (`stiffopt.optimise.samples`).
 
@@ -284,6 +319,7 @@ DESCENT = DescentSettings()
 SEARCH = SearchSettings()
 CLOSEST = ClosestSettings()
 OBSTACLES = ObstacleSettings()
+BRACE = BraceSettings()
 SAMPLES = SampleSettings()
 PRICES = PriceSettings()
 DERIVATIVES = DerivativeSettings()

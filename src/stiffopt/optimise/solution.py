@@ -14,11 +14,14 @@ from stiffopt import lie
 from stiffopt.display import display_units
 from stiffopt.errors import DerivativeError
 from stiffopt.model.arm import Evaluator
-from stiffopt.model.arm_clearance import Clearances
+from stiffopt.model.contact.equilibrium import Contact, ContactEquilibrium, Grip
+from stiffopt.model.contact.push import ContactLoss
 from stiffopt.model.manipulator import Manipulator
+from stiffopt.model.scene import Scene
 from stiffopt.notebook import ShownInNotebook
+from stiffopt.optimise.brace import kept_clear_of, leant_on
 from stiffopt.optimise.functions import functions
-from stiffopt.optimise.obstacles import CLEARANCE_OF
+from stiffopt.optimise.obstacles import CLEARANCE_OF, Obstacles
 from stiffopt.optimise.program import Program
 from stiffopt.optimise.settings import ANSWER, OBSTACLES
 from stiffopt.optimise.task import Task
@@ -27,6 +30,7 @@ Vector = NDArray[np.float64]
 Status = Literal["solved", "unreachable", "failed"]
 
 _explaining = threading.RLock()
+_NOT_KEPT = ("_derivatives", "equilibrium")  # in copies
 
 
 def _protect(owner: object, *names: str) -> None:
@@ -130,6 +134,28 @@ class Sensitivities:
         }
 
 
+class NearestObject(NamedTuple):
+    """The object that a body is nearest to, and how far that is in m."""
+
+    distance: float
+    name: str
+
+
+class Preload(NamedTuple):
+    """What the contacts of a brace hold against a push at the tip.
+
+    Attributes
+    ----------
+    direction : of the push (3,), in base axes.
+    contacts : whether they slide without resistance, or stick where there is friction.
+    loss : the push by which the first contact is lost, and how.
+    """
+
+    direction: Vector
+    contacts: Grip
+    loss: ContactLoss
+
+
 class Explanation(NamedTuple):
     """The fields of a `PressureSolution` that take longer to compute than the solution itself."""
 
@@ -182,6 +208,15 @@ class PressureSolution(ShownInNotebook):
         margin by which it holds, in the term's unit.
     robot : Manipulator or None
         The arm, which carries the task's load.
+    contacts : tuple of Contact
+        Of a task with a brace: where the arm leans; empty if it does best to keep clear. Pose,
+        errors, compliance and stiffness are those of the equilibrium in contact then.
+    free : PressureSolution or None
+        Of a task with a brace: the best answer that keeps clear of all objects.
+    preloads : tuple of Preload
+        What the contacts hold, for each direction that is maximised, both ways.
+    limited_by : tuple of str
+        Of a braced answer: what keeps it from being stiffer, by name.
     """
 
     status: Status
@@ -204,6 +239,10 @@ class PressureSolution(ShownInNotebook):
     timings: dict[str, float] = field(default_factory=dict)
     errors: dict[str, float] = field(default_factory=dict)
     robot: Manipulator | None = None
+    contacts: tuple[Contact, ...] = ()
+    free: Self | None = None
+    preloads: tuple[Preload, ...] = ()
+    limited_by: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         _protect(self, "pressures", "tip_pose", "compliance")
@@ -232,7 +271,7 @@ class PressureSolution(ShownInNotebook):
     def __getstate__(self) -> dict[str, Any]:
         """Support pickling and copying: explain now."""
         _ = self.sensitivities
-        return {key: value for key, value in self.__dict__.items() if key != "_derivatives"}
+        return {key: value for key, value in self.__dict__.items() if key not in _NOT_KEPT}
 
     def __repr__(self) -> str:
         if self.pressures is None or self.tip_position is None:
@@ -248,6 +287,9 @@ class PressureSolution(ShownInNotebook):
             parts.append(f"{length.text(self.position_error, '.3g')} off")
         if self.stiffness is not None:
             parts.append(units.of_si(self.stiffness_unit).text(self.stiffness))
+        for each in self.contacts:
+            force = units.force.text(float(np.linalg.norm(each.force)), ".3g")
+            parts.append(f"leaning on '{each.object}' with {force}")
         return f"PressureSolution({', '.join(parts)})"
 
     def gradient(
@@ -307,19 +349,24 @@ class PressureSolution(ShownInNotebook):
 
         if self.robot is None or self.pressures is None or not self.found:
             raise DerivativeError("only a solution that was found has derivatives")
+        if self.contacts:
+            raise DerivativeError("derivatives of an answer that leans on objects are not known")
         return AnswerDerivatives(self.robot, self.task, self.pressures)
 
     @property
     def clearance(self) -> float | None:
-        """Least distance between the body and the objects of the task's scene, in m."""
+        """Least distance between the body and the objects of the task's scene, in m.
+
+        Of an answer that leans on objects: those that its brace does not name.
+        """
         near = self._clearances
-        return None if near is None else float(near.distances.min())
+        return None if near is None else near.distance
 
     @property
     def nearest_object(self) -> str | None:
         """Name of the object of the scene that the body is nearest to."""
         near = self._clearances
-        return None if near is None else near.nearest
+        return None if near is None else near.name
 
     @property
     def mesh_error(self) -> float | None:
@@ -334,10 +381,43 @@ class PressureSolution(ShownInNotebook):
         return mesh_error(self.robot, self.task.scene, self.nearest_object)
 
     @cached_property
-    def _clearances(self) -> Clearances | None:
+    def _clearances(self) -> NearestObject | None:
         if self.robot is None or self.pressures is None or self.task.scene is None:
             return None
-        return self.robot.clearances(self.pressures, self.task.scene)
+        if self.equilibrium is not None:
+            return self._clearances_in_contact(self.equilibrium, self.robot, self.task.scene)
+        found = self.robot.clearances(self.pressures, self.task.scene)
+        return NearestObject(float(found.distances.min()), found.nearest)
+
+    def _clearances_in_contact(
+        self, eq: ContactEquilibrium, robot: Manipulator, scene: Scene
+    ) -> NearestObject | None:
+        """Of the objects that the arm may not lean on."""
+        assert self.task.brace is not None
+        others = kept_clear_of(scene, self.task.brace)
+        if others is None:
+            return None
+        obstacles = Obstacles(others, robot.description)
+        rows = zip(obstacles.exactly_nearest(eq.line), obstacles.row_objects, strict=True)
+        distance, index = min((near.distance, index) for near, index in rows)
+        return NearestObject(distance, others.objects[index].name)
+
+    @property
+    def stiffness_free(self) -> float | None:
+        """The first stiffness that the task names, of the answer that keeps clear of all objects.
+
+        None for a task without a brace, or where the target cannot be had without leaning.
+        """
+        return None if self.free is None or not self.free.found else self.free.stiffness
+
+    @cached_property
+    def equilibrium(self) -> ContactEquilibrium | None:
+        """Of a braced answer: the equilibrium in contact, reached from rest; else None."""
+        brace, scene = self.task.brace, self.task.scene
+        p, robot = self.pressures, self.robot
+        if not self.contacts or brace is None or scene is None or robot is None or p is None:
+            return None
+        return robot.contact_equilibrium(p, leant_on(scene, brace), approach=brace.approach)
 
     @property
     def found(self) -> bool:

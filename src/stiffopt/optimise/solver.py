@@ -21,7 +21,9 @@ from stiffopt.model.compiled import (
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.stopping import Cancel, checkpoint, giving_up, stop_flag
 from stiffopt.optimise import diagnosis
+from stiffopt.optimise.braced import lean
 from stiffopt.optimise.fast import CompiledAnswer, FastSolver
+from stiffopt.optimise.leaning import BracedProblem
 from stiffopt.optimise.local import LocalResult, descend
 from stiffopt.optimise.prepared import prepared
 from stiffopt.optimise.problem import PressureProblem, ProgramPoint
@@ -107,7 +109,7 @@ class PressureSolver:
         start = self._checked(guess)
         task = self.task if target is None else self.task.model_copy(update={"target": target})
         with giving_up(timeout, cancel):
-            solution = self._compiled(task, start) or self._otherwise(task, start)
+            solution = self._found(task, start)
         solution.timings.update(watch.timings())
         return _felt(solution)
 
@@ -186,13 +188,15 @@ class PressureSolver:
             raise InputError(f"target must be a Target; got {shown(target)}")
         task = self.task if target is None else self.task.model_copy(update={"target": target})
         with giving_up(timeout, cancel):
-            fast = self._fast(task, None)
+            fast = self._fast(task.unbraced, None)
             if fast is not None:
                 found = fast[0].comes(fast[1])
             else:
                 problem = PressureProblem(self.robot, task)
                 candidates, effort = starts(problem, self._prepared.samples)
                 found = comes(problem, list(islice(candidates, effort.screened)))
+            if not found and task.brace is not None:
+                found = self._found(task, None).found
             if not found:
                 checkpoint()
             return found
@@ -226,7 +230,7 @@ class PressureSolver:
     @property
     def is_compiled(self) -> bool:
         """Whether there is compiled code for the task; if not, it is made in the background."""
-        return self._fast(self.task, None) is not None
+        return self._fast(self.task.unbraced, None) is not None
 
     def compile(self) -> bool:
         """Wait for compiled code for the task, unless an arm is armed; return `is_compiled`."""
@@ -242,7 +246,9 @@ class PressureSolver:
     # -- warm calls -------------------------------------------------------------------------
 
     def _prepare_warm_calls(self) -> WarmCalls | None:
-        """Memory for warm calls, once there is compiled code."""
+        """Memory for warm calls, once there is compiled code; none for a task with a brace."""
+        if self.task.brace is not None:
+            return None
         program = self._prepared.program(self.task.target)
         fast = self._prepared.fast(program)
         if fast is not None:
@@ -290,6 +296,21 @@ class PressureSolver:
 
     # -- solutions --------------------------------------------------------------------------
 
+    def _found(self, task: Task, guess: Vector | None) -> PressureSolution:
+        if task.brace is not None:
+            return self._leaning(task, guess)
+        return self._compiled(task, guess) or self._otherwise(task, guess)
+
+    def _leaning(self, task: Task, guess: Vector | None) -> PressureSolution:
+        """The better of the best answer that leans on objects and the best that does not."""
+        plain = task.unbraced
+        free = self._found(plain, guess)
+        if free.status == "failed":
+            return replace(free, task=task)
+        fast = self._fast(plain, None)
+        table = self._prepared.samples if fast is None else fast[0].table
+        return lean(BracedProblem(self.robot, task), table, free, guess)
+
     def _compiled(
         self, task: Task, guess: Vector | None, limits: tuple[Vector, Vector] | None = None
     ) -> PressureSolution | None:
@@ -305,7 +326,9 @@ class PressureSolver:
         return self._accepted(task, program, solver.solve(row))
 
     def _fast(self, task: Task, guess: Vector | None) -> tuple[FastSolver, Vector, Program] | None:
-        """Compiled solver of a task, its row of numbers and its program."""
+        """Compiled solver of a task, its row of numbers and its program; none knows of contacts."""
+        if task.brace is not None:
+            return None
         program = self._prepared.program(task.target)
         fast = self._prepared.fast(program)
         if fast is None:
@@ -774,7 +797,7 @@ def _solved(
         watch = Stopwatch()
         solution = found.get(index)
         if index not in found:  # there was no code then; there may be now
-            solution = solver._compiled(task, guess)
+            solution = solver._found(task, guess)
         solution = solution or solver._otherwise(task, guess)
         solution.timings.update(shares)
         for name, time in watch.timings().items():
@@ -795,7 +818,7 @@ def _felt(solution: PressureSolution) -> PressureSolution:
 
 def stiffness_blind(solver: PressureSolver, solution: PressureSolution) -> PressureSolution:
     """The pose of a solution with the least pressure: what a plain solver would answer."""
-    plain = {"stiffness": None, "load": None, "press": None}
+    plain = {"stiffness": None, "load": None, "press": None, "brace": None}
     blind = PressureSolver(solver.robot, solution.task.model_copy(update=plain), seed=solver.seed)
     return blind.solve(guess=solution.pressures)
 

@@ -33,6 +33,7 @@ from stiffopt.model.description import RobotDescription, one_or_list
 from stiffopt.model.robot_files import load_description
 from stiffopt.model.scene import SceneOrFile
 from stiffopt.notebook import ShownInNotebook
+from stiffopt.optimise.brace import Brace
 from stiffopt.optimise.goal import StiffnessGoal, StiffnessMeasure
 from stiffopt.optimise.press import Press
 from stiffopt.optimise.target import Target
@@ -205,6 +206,7 @@ class Task(ForRobot):
     stiffness : stiffness goal, or None: the pose with the least pressure.
     load : load at the tip, or None.
     press : what the tip presses with at the target, in place of a load, or None.
+    brace : objects of the scene that the arm may lean on to be stiff, or None.
     pressure : limits that tighten the robot's.
     scene : what is around the arm, or None.
     source : the file that the task was read from, or None.
@@ -213,6 +215,13 @@ class Task(ForRobot):
     target: Target
     stiffness: StiffnessGoal | None = None
     press: Press | None = None
+    brace: Brace | None = None
+
+    @model_validator(mode="after")
+    def _can_lean(self) -> Task:
+        if self.brace is not None:
+            self.brace.check(self)
+        return self
 
     @model_validator(mode="after")
     def _can_press(self) -> Task:
@@ -230,6 +239,11 @@ class Task(ForRobot):
         return self
 
     @property
+    def unbraced(self) -> Task:
+        """The same task for an arm that keeps clear of all objects."""
+        return self if self.brace is None else self.model_copy(update={"brace": None})
+
+    @property
     def tip_load(self) -> Load | None:
         """The load at the tip in the wanted state: what was given, or the reaction of a press."""
         press = self.press
@@ -245,6 +259,8 @@ class Task(ForRobot):
             parts.append(repr(self.stiffness))
         if self.press is not None:
             parts.append(repr(self.press))
+        if self.brace is not None:
+            parts.append(repr(self.brace))
         return f"Task({', '.join([*parts, *self._conditions()])})"
 
     __str__ = __repr__

@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from stiffopt.display import display_units
 from stiffopt.model.contact.equilibrium import ContactEquilibrium
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.scene import Scene
 from stiffopt.plots import style
 from stiffopt.plots.arm import TUBE_STATIONS, ArmDrawing
+from stiffopt.plots.shapes import segment_stations
 from stiffopt.plots.view import View
 
 if TYPE_CHECKING:
@@ -50,20 +50,28 @@ def draw_contact(
 ) -> list[Any]:
     """Draw the same into axes in 3-D; see `draw_arm` for these, and for what is returned."""
     drawing = ArmDrawing(axes, robot)
-    unit = display_units().length
     drawing.draw_base()
-    poses, start = [], 0.0
-    for segment in robot.description.segments:
-        end = start + segment.length + segment.connector
-        poses.append(equilibrium.poses(np.linspace(start, end, TUBE_STATIONS)))
-        start = end
-    drawing.draw_tube(equilibrium.pressures, poses=np.array(poses))
+    draw_leaning_tube(drawing, equilibrium)
     drawing.explain_segments()
-    free = unit.of(robot.backbone(equilibrium.pressures, 60)[:, :3, 3])
+    free = drawing.unit.of(robot.backbone(equilibrium.pressures, 60)[:, :3, 3])
     axes.plot(*free.T, color=style.DARK, linewidth=1.2, linestyle="--", zorder=3)
     drawing.add_body(free)
     drawing.add_line(style.DARK, "free", "--")
     drawing.draw_objects(scene)
+    draw_forces(drawing, equilibrium)
+    return drawing.finish(view)
+
+
+def draw_leaning_tube(drawing: ArmDrawing, equilibrium: ContactEquilibrium) -> None:
+    """The arm at an equilibrium in contact."""
+    stations = segment_stations(drawing.robot, TUBE_STATIONS)
+    poses = equilibrium.poses(stations.ravel()).reshape(*stations.shape, 4, 4)
+    drawing.draw_tube(equilibrium.pressures, poses=poses)
+
+
+def draw_forces(drawing: ArmDrawing, equilibrium: ContactEquilibrium) -> None:
+    """The contact forces on the arm as arrows."""
+    unit = drawing.unit
     largest = max((np.linalg.norm(each.force) for each in equilibrium.contacts), default=1.0)
     for each in equilibrium.contacts:
         arrow = _LONGEST * drawing.size * each.force / largest
@@ -72,4 +80,3 @@ def draw_contact(
         drawing.add_label(unit.of(each.position) + arrow, text, style.LOAD)
     if equilibrium.contacts:
         drawing.add_line(style.LOAD, "force on the arm")
-    return drawing.finish(view)

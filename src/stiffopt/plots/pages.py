@@ -135,6 +135,8 @@ def _task_rows(task: Task) -> Iterable[Row]:
         yield "stiffness", repr(task.stiffness).partition("(")[2].removesuffix(")")
     if task.press is not None:
         yield "press", repr(task.press).partition("(")[2].removesuffix(")")
+    if task.brace is not None:
+        yield "brace", repr(task.brace).partition("(")[2].removesuffix(")")
     yield from _condition_rows(task)
 
 

@@ -1,4 +1,4 @@
-"""Shapes that figures and the studio draw: stations along the segments, and the ellipsoid."""
+"""Shapes that are drawn: stations along the segments, objects of a scene, and the ellipsoid."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stiffopt.model.manipulator import Manipulator
+from stiffopt.model.obstacle import Obstacle
 
 Vector = NDArray[np.float64]
 
@@ -24,16 +25,38 @@ def segment_poses(robot: Manipulator, pressures: ArrayLike, count: int) -> Vecto
     count : int
         Stations of each segment, 2 or more.
     """
-    stations = robot.kept(("segment stations", count), lambda: _stations(robot, count))
+    stations = segment_stations(robot, count).ravel()
     poses = np.concatenate([np.eye(4)[None], robot.pose(pressures, stations[1:])])
     return poses.reshape(robot.n_segments, count, 4, 4)
+
+
+def segment_stations(robot: Manipulator, count: int) -> Vector:
+    """Arc lengths (segments, count) along each segment with its connector, ends included, in m."""
+    return robot.kept(("segment stations", count), lambda: _stations(robot, count))
 
 
 def _stations(robot: Manipulator, count: int) -> Vector:
     lengths = [each.length + each.connector for each in robot.description.segments]
     ends = np.concatenate([[0.0], np.cumsum(lengths)])
     ends[-1] = robot.length
-    return np.concatenate([np.linspace(*pair, count) for pair in pairwise(ends)])
+    return np.array([np.linspace(*pair, count) for pair in pairwise(ends)])
+
+
+def surface_mesh(shape: Obstacle, length: float) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
+    """Return vertices and triangles of a shape, cut off at about a length where it has no end."""
+    vertices, faces, begin = [], [], 0
+    for surface in shape.outline(length):
+        rows, columns = surface.shape[1:]
+        corners = np.arange(rows * columns).reshape(rows, columns) + begin
+        vertices.append(surface.reshape(3, -1).T)
+        if shape.key == "mesh":
+            faces.append(corners)  # each row is a triangle
+        else:
+            a, b = corners[:-1, :-1].ravel(), corners[:-1, 1:].ravel()
+            c, d = corners[1:, :-1].ravel(), corners[1:, 1:].ravel()
+            faces += [np.stack([a, b, c], axis=1), np.stack([b, d, c], axis=1)]
+        begin += rows * columns
+    return np.concatenate(vertices).astype(np.float32), np.concatenate(faces).astype(np.uint32)
 
 
 class StiffnessEllipsoid(NamedTuple):

@@ -20,6 +20,7 @@ from stiffopt.optimise.solution import PressureSolution
 from stiffopt.optimise.task import Task
 from stiffopt.plots import style
 from stiffopt.plots.arm import ArmDrawing
+from stiffopt.plots.contact import draw_forces, draw_leaning_tube
 from stiffopt.plots.shapes import StiffnessEllipsoid
 from stiffopt.plots.style import literal, new_figure, tidy
 from stiffopt.plots.view import View
@@ -324,10 +325,17 @@ def draw_solution(
     arm = _loaded(robot, solution.task)
     drawing = _Drawing(axes, arm, solution)
     drawing.draw_base()
-    drawing.draw_tube(np.asarray(solution.pressures))
+    leaning = solution.equilibrium
+    if leaning is None:
+        drawing.draw_tube(np.asarray(solution.pressures))
+    else:
+        draw_leaning_tube(drawing, leaning)
+        draw_forces(drawing, leaning)
     drawing.explain_segments()
     drawing.draw_directions()
     drawing.draw_ellipsoid()
+    if leaning is not None:
+        drawing.draw_free_ellipsoid()
     drawing.draw_target()
     drawing.draw_loads()
     scene = scene or solution.task.scene
@@ -426,6 +434,28 @@ class _Drawing(ArmDrawing):
         self.add_patch(
             style.ELLIPSOID, f"stiffness ellipsoid, radius² ∝ k:\n{listed} {unit}\nalong its axes"
         )
+
+    def draw_free_ellipsoid(self) -> None:
+        """That of the answer that keeps clear of all objects, to the same scale, as an outline."""
+        free = self.solution.free
+        if free is None or not free.found:
+            return
+        braced = StiffnessEllipsoid.of(np.asarray(self.solution.compliance), self.rotation)
+        values, ways = found = StiffnessEllipsoid.of(
+            np.asarray(free.compliance), np.asarray(free.tip_pose)[:3, :3]
+        )
+        share = _ELLIPSOID_SHARE * np.sqrt(values[-1] / braced.stiffnesses[-1])
+        radii = found.radii(share * self.size)
+        turn = np.linspace(0, 2 * np.pi, 61)
+        for k in range(3):
+            ring = np.insert(np.stack([np.cos(turn), np.sin(turn)]), k, 0.0, axis=0)
+            self.axes.plot(
+                *(self.tip[:, None] + ways * radii @ ring), color=style.DARK, linewidth=1.1,
+                linestyle=":", zorder=7,
+            )  # fmt: skip
+        unit = display_units().stiffness
+        listed = ", ".join(unit.number(value, FIGURES) for value in values[::-1])
+        self.add_line(style.DARK, f"ellipsoid clear of objects:\n{listed} {unit}", ":")
 
     def draw_directions(self) -> None:
         """An arrow along each direction whose stiffness the task names."""

@@ -28,6 +28,7 @@ from stiffopt.rig.settings import (
     ControlSettings,
     LogSettings,
     Published,
+    RosSettings,
     Safety,
     ServiceSettings,
 )
@@ -131,6 +132,7 @@ class RigDescription(Schema):
     control : how the daemon's loop steers.
     service : where the daemon listens.
     log : recordings.
+    ros : the node of `stiffopt ros`.
     commissioning : what has to be found before the arm may be armed.
     published : of this arm, which experiments compare themselves with; None for nothing.
     scene : what is around the arm, or None; checked against the robot, see `stiffopt.model.scene`.
@@ -155,6 +157,7 @@ class RigDescription(Schema):
     control: ControlSettings = ControlSettings()
     service: ServiceSettings = ServiceSettings()
     log: LogSettings = LogSettings()
+    ros: RosSettings = RosSettings()
     commissioning: CommissioningSettings = CommissioningSettings()
     published: Published | None = None
     scene: SceneOrFile | None = None

@@ -144,6 +144,43 @@ class ServiceSettings(Schema):
     token_file: str | None = None
 
 
+class RosSettings(Schema):
+    """What `stiffopt ros` shows on a ROS 2 graph, and what it takes from there.
+
+    Attributes
+    ----------
+    commands : whether whoever is on the graph may move the arm; venting is taken in any case.
+    interface : network interface, such as ``eth0``; None: loopback, on which no other machine is.
+        It has to be given, as ``lo`` too, where commands are taken.
+    domain : of DDS; None: the environment variable ROS_DOMAIN_ID, or else 0.
+    distro : by whose layout other nodes are told what there is.
+    namespace, node : of the node.
+    frame_prefix : before the names of the frames: ``base``, ``tip``, ``target``, ``station_1`` ...
+    remap : names of topics and services in the place of others, such as ``~/tip: /arm/tip``.
+    rate : at which the state is published, in Hz.
+    """
+
+    commands: bool = False
+    interface: Annotated[str, Field(min_length=1)] | None = None
+    domain: Annotated[int, Field(ge=0, le=232, strict=True)] | None = None
+    distro: Literal["humble", "jazzy"] = "jazzy"
+    namespace: str = "/"
+    node: Annotated[str, Field(min_length=1)] = "stiffopt"
+    frame_prefix: str = ""
+    remap: dict[str, str] = Field(default_factory=dict)
+    rate: Annotated[Frequency, Field(gt=0, le=100)] = 20.0
+
+    @model_validator(mode="after")
+    def _says_where_from(self) -> RosSettings:
+        if self.commands and self.interface is None:
+            raise BadKeyError(
+                "commands",
+                "needs 'interface': DDS has no token, so whoever is on that network could move the "
+                "arm; 'lo' is this machine alone",
+            )
+        return self
+
+
 class LogSettings(Schema):
     """Settings of recordings.
 

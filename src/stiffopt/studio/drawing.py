@@ -7,10 +7,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from stiffopt.model.contact.equilibrium import ContactEquilibrium
 from stiffopt.model.description import RobotDescription
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.plots import style
-from stiffopt.plots.shapes import segment_poses
+from stiffopt.plots.shapes import segment_poses, segment_stations
 
 Vector = NDArray[np.float64]
 Floats = NDArray[np.float32]
@@ -88,9 +89,18 @@ class ArmTube:
                 )
             )  # fmt: skip
 
-    def show(self, robot: Manipulator, pressures: ArrayLike) -> None:
-        """Draw it at pressures (n,) in Pa."""
-        poses = segment_poses(robot, pressures, _STATIONS)
+    def show(
+        self,
+        robot: Manipulator,
+        pressures: ArrayLike,
+        equilibrium: ContactEquilibrium | None = None,
+    ) -> None:
+        """Draw it at pressures (n,) in Pa; or as it leans on objects there."""
+        if equilibrium is None:
+            poses = segment_poses(robot, pressures, _STATIONS)
+        else:
+            at = segment_stations(robot, _STATIONS)
+            poses = equilibrium.poses(at.ravel()).reshape(*at.shape, 4, 4)
         pairs = zip(self._meshes, robot.description.segments, poses, strict=True)
         for mesh, segment, mine in pairs:
             mesh.vertices = tube_vertices(mine, self._width * segment.outer_radius)

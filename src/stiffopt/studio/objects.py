@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from stiffopt.errors import FileError
 from stiffopt.files import save_file
 from stiffopt.model.obstacle import Obstacle
-from stiffopt.model.scene import Scene, SceneObject, load_scene
+from stiffopt.model.scene import AllowedContact, Scene, SceneObject, load_scene
 from stiffopt.studio.design import changed
 
 Vector = NDArray[np.float64]
@@ -74,6 +74,12 @@ def resized(item: SceneObject, size: float) -> SceneObject:
     return _with_shape(item, radius=size) if hasattr(item.shape, "radius") else item
 
 
+def leant_on(item: SceneObject, *, allowed: bool) -> SceneObject:
+    """Return an object that the arm may lean on, or may not."""
+    contact = item.contact or AllowedContact()
+    return changed(item, contact=changed(contact, allowed=allowed))
+
+
 def replaced(objects: Sequence[SceneObject], item: SceneObject) -> tuple[SceneObject, ...]:
     """Return objects with another one in the place of that with its name."""
     return tuple(item if each.name == item.name else each for each in objects)
@@ -95,23 +101,6 @@ def save_scene(path: str | os.PathLike[str], scene: Scene) -> None:
         except FileError:
             raise FileError(path, "exists and is no scene file; give another name") from None
     save_file(path, "scene", scene)
-
-
-def surface_mesh(shape: Obstacle, length: float) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
-    """Return vertices and triangles of a shape, cut off at about a length where it has no end."""
-    vertices, faces, begin = [], [], 0
-    for surface in shape.outline(length):
-        rows, columns = surface.shape[1:]
-        corners = np.arange(rows * columns).reshape(rows, columns) + begin
-        vertices.append(surface.reshape(3, -1).T)
-        if shape.key == "mesh":
-            faces.append(corners)  # each row is a triangle
-        else:
-            a, b = corners[:-1, :-1].ravel(), corners[:-1, 1:].ravel()
-            c, d = corners[1:, :-1].ravel(), corners[1:, 1:].ravel()
-            faces += [np.stack([a, b, c], axis=1), np.stack([b, d, c], axis=1)]
-        begin += rows * columns
-    return np.concatenate(vertices).astype(np.float32), np.concatenate(faces).astype(np.uint32)
 
 
 def _with_shape(item: SceneObject, **parts: Any) -> SceneObject:

@@ -11,7 +11,7 @@ import numpy as np
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.studio import texts
 from stiffopt.studio.drawing import ArmTube, add_surroundings, place, rgb
-from stiffopt.studio.rig_watch import RigWatch, pressures_now
+from stiffopt.studio.rig_watch import RigWatch
 from stiffopt.studio.task_view import TaskView
 from stiffopt.studio.workbench import Workbench
 
@@ -100,7 +100,7 @@ class RigView:
         state = self.watch.state
         with self.server.atomic():
             if state is not None:
-                pressures = pressures_now(state)
+                pressures = state.pressures
                 if pressures is not None:
                     self._arm.show(self._robot, pressures)
                 self._show_ball("estimated", state.tip_position)

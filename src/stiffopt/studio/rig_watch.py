@@ -20,8 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt.control.state import Event, Snapshot
-from stiffopt.daemon.client import Client
-from stiffopt.daemon.secret import bracketed
+from stiffopt.daemon.client import Client, daemon_url
 from stiffopt.errors import CommandError, InputError, StiffoptError
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.robot_files import load_description, robot_path
@@ -75,8 +74,7 @@ class RigWatch:
         self.design = design.with_task(
             scene=rig.scene, pressure=PressureRange(max=tuple(limits_of(rig, robot).high.tolist()))
         )
-        host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(rig.service.host, rig.service.host)
-        url = f"http://{bracketed(host)}:{rig.service.port}"
+        url = daemon_url(rig.service)
         self.may_command = token is not None
         given = "" if token is None else token  # empty: nor that of the environment
         self._client = Client(url, given, name=NAME, heartbeat="manual")
@@ -107,7 +105,7 @@ class RigWatch:
         state = self.state
         position = None if state is None else state.target_position
         if state is not None and (position is None or not np.isfinite(position).any()):
-            pressures = pressures_now(state)
+            pressures = state.pressures
             with suppress(StiffoptError):  # an arm that has no equilibrium there
                 position = None if pressures is None else robot.tip_pose(pressures)[:3, 3]
         if position is None or not np.isfinite(position).any():
@@ -201,9 +199,3 @@ class RigWatch:
                 self.said = done
             except StiffoptError as error:
                 self.said = str(error)
-
-
-def pressures_now(state: Snapshot) -> Vector | None:
-    """Return measured pressures (n,) in Pa, commanded ones where none are known; None: neither."""
-    found = np.where(np.isfinite(state.measured), state.measured, state.commanded)
-    return found if np.isfinite(found).all() else None

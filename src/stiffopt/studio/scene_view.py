@@ -11,6 +11,7 @@ from stiffopt.display import display_units
 from stiffopt.errors import StiffoptError
 from stiffopt.model.scene import SceneObject
 from stiffopt.plots import style
+from stiffopt.plots.shapes import surface_mesh
 from stiffopt.studio import objects, texts
 from stiffopt.studio.design import Design
 from stiffopt.studio.drawing import Vector, place, rgb
@@ -31,6 +32,8 @@ class SceneView:
         Returns what is shown now.
     change :
         Takes a kind and a change of the design.
+    hold :
+        Takes whether the pressures are held, so that the arm leans on objects.
     """
 
     def __init__(
@@ -38,8 +41,9 @@ class SceneView:
         server: Any,
         design: Callable[[], Design],
         change: Callable[[str, Callable[[Design], Design]], None],
+        hold: Callable[[bool], None],
     ) -> None:
-        self._server, self._design, self._change = server, design, change
+        self._server, self._design, self._change, self._hold = server, design, change, hold
         self._drawn: dict[str, tuple[SceneObject, Any, Any]] = {}
         self.is_held = False
         self._length = design().description.length
@@ -63,6 +67,15 @@ class SceneView:
         self._size.on_update(self._resized)
         self._clearance = add_slider(gui, "clearance", unit, 0.0, 2e-2, 1e-4, 0.0)
         self._clearance.on_update(self._cleared)
+        self._allowed = gui.add_checkbox(
+            "may be leant on", False, hint="The arm may touch this object."
+        )
+        self._allowed.on_update(self._allowed_changed)
+        hold = gui.add_checkbox(
+            "lean: hold the pressures", False,
+            hint="The pressures stay, and objects that may be leant on push the arm.",
+        )  # fmt: skip
+        hold.on_update(lambda event: self._hold(hold.value) if event.client is not None else None)
         remove = gui.add_button("remove this object")
         remove.on_click(self._removed)
         self._kind = gui.add_dropdown("new object", objects.NEW)
@@ -94,6 +107,12 @@ class SceneView:
         if event.client is not None:
             clearance = float(self._unit.to_si(self._clearance.value))
             self._change("clearance", lambda design: design.with_clearance(clearance))
+
+    def _allowed_changed(self, event: Any) -> None:
+        item = self._item()
+        if event.client is not None and item is not None:
+            new = objects.leant_on(item, allowed=self._allowed.value)
+            self._replace(new, f"contact of {item.name}")
 
     def _removed(self, _: Any) -> None:
         item = self._item()
@@ -153,6 +172,7 @@ class SceneView:
         if item is None or self.is_held:
             return
         place(self._handle, objects.place_of(item.shape))
+        self._allowed.value = item.contact is not None and item.contact.allowed
         size = objects.size_of(item.shape)
         if size is not None:
             show_on_slider(self._size, self._unit, size)
@@ -161,7 +181,7 @@ class SceneView:
         before = self._drawn.get(item.name)
         if before is not None and before[0] == item:
             return
-        vertices, faces = objects.surface_mesh(item.shape, self._length)
+        vertices, faces = surface_mesh(item.shape, self._length)
         if before is not None and before[0].shape.key == item.shape.key:
             _, mesh, label = before
             mesh.vertices = vertices

@@ -15,6 +15,7 @@ from stiffopt.studio.answer_view import AnswerView
 from stiffopt.studio.compare_view import CompareView, CopyView
 from stiffopt.studio.design import Design
 from stiffopt.studio.drawing import Vector, add_surroundings, place, rgb, turn
+from stiffopt.studio.leaning import LeaningView
 from stiffopt.studio.map_view import MapView
 from stiffopt.studio.scene_view import SceneView
 from stiffopt.studio.task_inputs import LoadInputs, StiffnessInputs, TargetInputs
@@ -53,7 +54,8 @@ class TaskView:
         add_surroundings(server, bench.design.description)
         self._drawn = AnswerView(server, bench.design.description, is_preview=is_preview)
         self._add_handles()
-        self._scene = SceneView(server, lambda: bench.design, self._change)
+        self._leaning = LeaningView(server, bench.design.description)
+        self._scene = SceneView(server, lambda: bench.design, self._change, self._hold)
         self._add_panel(found, is_preview=is_preview)
         self.worker = NewestWins(self._quickly, self._fully)
         self._show_design()
@@ -81,7 +83,7 @@ class TaskView:
     @property
     def arm_end(self) -> Vector:
         """Where the arm that is drawn ends (3,), in m."""
-        return self._drawn.arm_end
+        return (self._leaning if self._leaning.visible else self._drawn).arm_end
 
     # -- what is there ------------------------------------------------------------------------
 
@@ -174,6 +176,14 @@ class TaskView:
             self.bench.end_step()
             self.worker.request()
 
+    def _hold(self, held: bool) -> None:
+        try:
+            self.bench.hold(held=held)
+        except StiffoptError as error:
+            self.bench.trouble = str(error)
+        self._show_leaning()
+        self.worker.request()
+
     def _undo(self, _: Any) -> None:
         if self.bench.undo():
             self.bench.trouble = ""
@@ -195,10 +205,9 @@ class TaskView:
             found = search(cancel)
         except StiffoptError as error:
             self.bench.trouble, found = str(error), False
-        if found:
+        if found and self.bench.leaning is None:
             self._show_answer()
-        else:
-            self._show_words()
+        self._show_leaning()
 
     # -- drawing ------------------------------------------------------------------------------
 
@@ -240,6 +249,11 @@ class TaskView:
             if self._dragged is None and any(self.bench.design.free):
                 self._show_target(self.bench.design)
             self._compared.show()
+        self._show_words()
+
+    def _show_leaning(self) -> None:
+        with self.server.atomic():
+            self._leaning.show(self.bench.leaning)
         self._show_words()
 
     def _show_words(self) -> None:

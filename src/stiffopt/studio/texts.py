@@ -23,6 +23,7 @@ from stiffopt.optimise.solution import PressureSolution
 from stiffopt.plots import style
 from stiffopt.plots.wording import direction_text, gain_text, stiffness_text
 from stiffopt.studio.design import Design
+from stiffopt.studio.leaning import Leaning, leaning_rows
 from stiffopt.studio.rig_watch import RigWatch
 from stiffopt.studio.timeline import Timeline
 from stiffopt.studio.workbench import StudioAnswer, Workbench
@@ -33,6 +34,7 @@ ROBOT_FILE = "my-arm.yaml"
 _BEST = "best that was found everywhere"
 _LOCAL = "next to the previous one; the best is searched for when you pause"
 _SEARCHING = "searching; the first task of a kind compiles its solver, which takes a while ..."
+_LEANING = "Pressures held (blue: the arm as it leans). Drag an object; untick 'lean' to go on."
 _AT_LIMIT = 1e-3  # of the range, within which a pressure counts as at its limit
 _COPY = "navigator.clipboard.writeText(this.nextElementSibling.value)"
 
@@ -43,6 +45,8 @@ _COPY = "navigator.clipboard.writeText(this.nextElementSibling.value)"
 def answer_html(bench: Workbench) -> str:
     """Return the answer as the panel shows it: status, numbers and pressures."""
     answer = bench.answer
+    if bench.leaning is not None:
+        return _padded(_headline("", _LEANING) + _table(_leaning_rows(bench.leaning)))
     if answer is None:
         return _padded(_headline("failed" if bench.trouble else "", bench.trouble or _SEARCHING))
     solution = answer.solution
@@ -54,6 +58,10 @@ def answer_html(bench: Workbench) -> str:
         + _table(_rows(answer))
         + pressures_html(answer.robot.description, *_bars(answer))
     )
+
+
+def _leaning_rows(leaning: Leaning) -> Iterable[tuple[str, str]]:
+    return ((escape(name), escape(text)) for name, text in leaning_rows(leaning))
 
 
 def _padded(html: str) -> str:

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from stiffopt.plots import style
-from stiffopt.studio import objects, texts
+from stiffopt.plots.shapes import surface_mesh
+from stiffopt.studio import texts
 from stiffopt.studio.drawing import ArmTube, add_surroundings, place, rgb
 from stiffopt.studio.timeline import Timeline, TimelineChart
 
@@ -61,7 +62,7 @@ class TimelineView:
         )
         if timeline.scene is not None:
             for number, item in enumerate(timeline.scene.objects):
-                vertices, faces = objects.surface_mesh(item.shape, self._length)
+                vertices, faces = surface_mesh(item.shape, self._length)
                 scene.add_mesh_simple(
                     f"/scene/{number}", vertices, faces, color=rgb(style.OBSTACLE), opacity=0.5,
                     side="double", cast_shadow=False,

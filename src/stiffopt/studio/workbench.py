@@ -15,12 +15,14 @@ from time import perf_counter
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.errors import InputError
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.stopping import Cancel
 from stiffopt.optimise.solution import PressureSolution, active_bounds
 from stiffopt.optimise.solver import PressureSolver, stiffness_blind
 from stiffopt.plots.wording import least_maximised
 from stiffopt.studio.design import Design
+from stiffopt.studio.leaning import Leaning
 
 QUICK = 0.03
 """Seconds after which a quick search gives up."""
@@ -89,6 +91,7 @@ class Workbench:
     design : what is shown now.
     answer : the newest answer, which may be to an earlier design, or None.
     kept : answers to compare with.
+    leaning : the arm as it leans on objects at held pressures, or None.
     trouble : why there is no answer to the design, or an empty text.
     """
 
@@ -96,7 +99,9 @@ class Workbench:
         self.design = design
         self.answer: StudioAnswer | None = None
         self.kept: list[StudioAnswer] = []
+        self.leaning: Leaning | None = None
         self.trouble = ""
+        self._held: NDArray[np.float64] | None = None  # pressures, in Pa
         self._past: deque[Design] = deque(maxlen=_STEPS)
         self._step = ""
         self._robot: Manipulator | None = None
@@ -143,11 +148,35 @@ class Workbench:
         self.kept.append(self.answer)
         return True
 
+    # -- leaning ------------------------------------------------------------------------------
+
+    def hold(self, *, held: bool) -> None:
+        """Hold the pressures of the answer, so that the arm leans on objects; or no longer.
+
+        Raises
+        ------
+        InputError
+            There is no answer.
+        """
+        if held and self.answer is None:
+            raise InputError("there are no pressures to hold yet")
+        with self._lock:
+            self._held = self.answer.pressures if held and self.answer is not None else None
+            self.leaning = None
+
+    def _lean(self, design: Design, pressures: NDArray[np.float64]) -> bool:
+        self.leaning = None
+        self.leaning = Leaning.of(design, self._solver(design).robot, pressures)
+        self.trouble = ""
+        return True
+
     # -- answers ------------------------------------------------------------------------------
 
     def answer_quickly(self, cancel: Cancel) -> bool:
         """Look next to the previous answer; return whether there is an answer now."""
-        design, before = self.design, self.answer
+        design, before, held = self.design, self.answer, self._held
+        if held is not None:
+            return self._lean(design, held)
         solver = self._solver(design)
         guess = None
         if before is not None and len(before.pressures) == solver.robot.n_pressures:
@@ -163,6 +192,8 @@ class Workbench:
     def answer_best(self, cancel: Cancel) -> bool:
         """Search everywhere; return whether there is another answer now."""
         design, before = self.design, self.answer
+        if self._held is not None:
+            return False
         solver = self._solver(design)
         solution = solver.solve(cancel=cancel)
         if solution.pressures is None:

@@ -29,6 +29,8 @@ Vector = NDArray[np.float64]
 Approach = Literal["pressures", "objects"]
 Grip = Literal["sliding", "sticking"]
 
+_BESIDE = 1e-5  # m along the arm, over which tangents are taken
+
 
 class Contact(NamedTuple):
     """Where an arm leans on an object.
@@ -118,6 +120,19 @@ class ContactEquilibrium:
     def within_limits(self) -> bool:
         """Whether no contact force exceeds what the scene allows."""
         return all(np.linalg.norm(each.force) <= each.max_force for each in self.contacts)
+
+    @property
+    def normal_forces(self) -> Vector:
+        """Forces (contacts,) along the normals, in N; negative where a contact pulls."""
+        return np.array([touch.normal_force for touch in self._arm.state.touches])
+
+    def line(self, at: Vector) -> tuple[Vector, Vector, Vector]:
+        """Centre line (k, 3), unit tangents (k, 3) and radii (k,) at arc lengths (k,)."""
+        body, length = self._arm.problem.body, self._arm.problem.rod.arm.length
+        points, radii = body(self._arm, at)
+        ends = [np.clip(at + step, 0.0, length) for step in (-_BESIDE, _BESIDE)]
+        ways = body(self._arm, ends[1])[0] - body(self._arm, ends[0])[0]
+        return points, ways / np.linalg.norm(ways, axis=1, keepdims=True), radii
 
     # -- compliance -------------------------------------------------------------------------
 
@@ -218,15 +233,34 @@ class ContactEquilibrium:
         found = []
         for k in range(len(self.pressures)):
             values = [
-                self._nearby(step * sign * np.eye(len(self.pressures))[k]).stiffness(*measure)
+                self.shifted(step * sign * np.eye(len(self.pressures))[k]).stiffness(*measure)
                 for sign in (1, -1)
             ]
             found.append((values[0] - values[1]) / (2 * step))
         return np.array(found)
 
-    def _nearby(self, change: Vector) -> ContactEquilibrium:
+    def shifted(
+        self, change: ArrayLike = 0.0, push: ArrayLike = (0.0, 0.0, 0.0)
+    ) -> ContactEquilibrium:
+        """The equilibrium nearby with the same contacts, which stay closed even if they pull.
+
+        Parameters
+        ----------
+        change : (n,)
+            Of the pressures, in Pa.
+        push : (3,)
+            Further force at the tip in base axes, in N.
+
+        Raises
+        ------
+        EquilibriumError
+            If there is none.
+        """
         condition = self._arm.state.condition
-        there = condition._replace(pressures=condition.pressures + change)
+        there = condition._replace(
+            pressures=condition.pressures + np.asarray(change),
+            dead=condition.dead + np.concatenate([np.asarray(push), np.zeros(3)]),
+        )
         found = self._arm.problem.correct(self._arm.state._replace(condition=there))
         if found is None:
             raise EquilibriumError("the equilibrium is lost where pressures change by little")

@@ -1,0 +1,60 @@
+"""The command `stiffopt ros`: its options and its help."""
+
+from typing import Annotated
+
+import typer
+
+from stiffopt.cli.exits import with_exit_code
+from stiffopt.cli.options import RigArgument
+
+ROS_HELP = """\
+Put the arm of RIG on a ROS 2 graph, as a node; no ROS need be installed. Needs the extra 'ros'.
+
+Publishes pressures, tip, target, force, frames, markers and diagnostics. If no daemon of RIG runs,
+one is started, and ended with this command. Only venting is taken from the graph, and only this
+machine is on it, unless the rig file says otherwise ('ros: {commands: true, interface: eth0}'): DDS
+has no token.
+"""
+
+ROS_EPILOG = """\
+\b
+Examples:
+  stiffopt ros rig/sim.yaml
+  stiffopt ros my-rig.yaml --distro humble --domain 7 --namespace lab
+  stiffopt ros my-rig.yaml --remap '~/tip:=/arm/tip'
+
+\b
+Exit codes:
+  0    ended by Ctrl-C or a signal; vented, if the daemon was started here
+  2    bad input, a missing library, or the daemon has ended
+  5    the daemon that was started here ended in the state fault; vented, unless it says otherwise
+"""
+
+
+@with_exit_code
+def ros(
+    rig: RigArgument,
+    distro: Annotated[
+        str | None,
+        typer.Option(metavar="NAME", help="humble or jazzy: by whose layout nodes are listed."),
+    ] = None,
+    domain: Annotated[
+        int | None,
+        typer.Option(metavar="ID", min=0, max=232, help="Of DDS; else ROS_DOMAIN_ID, else 0."),
+    ] = None,
+    namespace: Annotated[str | None, typer.Option(metavar="NAMESPACE", help="Of the node.")] = None,
+    node: Annotated[str | None, typer.Option(metavar="NAME", help="Of the node.")] = None,
+    remap: Annotated[
+        list[str] | None,
+        typer.Option("--remap", "-r", metavar="FROM:=TO", help="Another name; may be repeated."),
+    ] = None,
+    token_file: Annotated[
+        str | None,
+        typer.Option(metavar="FILE", help="The daemon's token, if not where the rig file says."),
+    ] = None,
+) -> int:
+    """Run the node."""
+    from stiffopt.cli.ros_run import run  # here, so that --help waits for no numerics
+
+    given = {"distro": distro, "domain": domain, "namespace": namespace, "node": node}
+    return run(rig, given, remap or [], token_file)

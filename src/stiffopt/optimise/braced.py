@@ -1,0 +1,290 @@
+"""Where to lean: the search for a braced answer, beside the one that keeps clear of all objects.
+
+Samples whose body would enter an object are ranked by where the contact would bring their tip: a
+contact at the station s of least gap g has the force ``f = -g / (n' C_ss n)`` and moves the tip by
+``C_ts n f``, to first order. The most promising ones, unlike each other, are brought to the target
+in contact, exactly and from rest; the descents of `optimise.local` start from the stiffest of them.
+What they end at is judged at the equilibrium that is reached from rest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from copy import copy
+from dataclasses import replace
+from itertools import islice
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stiffopt import lie
+from stiffopt.display import display_units
+from stiffopt.errors import EquilibriumError, StoppedError
+from stiffopt.model.arm_clearance import measured_scene
+from stiffopt.model.contact.equilibrium import ContactEquilibrium
+from stiffopt.model.manipulator import Manipulator
+from stiffopt.optimise.brace import quoted
+from stiffopt.optimise.leaning import BracedProblem
+from stiffopt.optimise.local import LocalResult
+from stiffopt.optimise.prices import prices_at
+from stiffopt.optimise.problem import ProgramPoint
+from stiffopt.optimise.program import Constraint
+from stiffopt.optimise.reach import attempt, reach
+from stiffopt.optimise.samples import SampleTable, distances
+from stiffopt.optimise.search import Search, search, unlike_first
+from stiffopt.optimise.settings import BRACE, Effort
+from stiffopt.optimise.solution import Confidence, Judgement, PressureSolution, active_bounds
+from stiffopt.optimise.task import Task
+
+Vector = NDArray[np.float64]
+
+
+def candidates(problem: BracedProblem, table: SampleTable) -> Iterator[Vector]:
+    """Variables (n,) at which the arm would lean on an object, the most promising first.
+
+    In turn for each of the objects, those unlike each other before others.
+    """
+    robot, terms = problem.robot, problem.program.terms
+    at = np.linspace(0, robot.length, BRACE.stations + 1)[1:]
+    points = robot.pose(table.pressures, at)[..., :3, 3]
+    radii = robot.body_radius(table.pressures, at)
+    rows: list[list[int]] = []
+    for item in measured_scene(problem.scene, robot.description).items:
+        seen = item.distances(points.reshape(-1, 3))
+        gaps = seen.values.reshape(radii.shape) - radii
+        gaps[:, at < item.begin] = np.inf
+        station, deepest = gaps.argmin(axis=1), gaps.min(axis=1)
+        entering = np.flatnonzero(deepest < 0)
+        rough = table.distances(terms, robot.length)[entering]
+        entering = entering[np.argsort(rough, kind="stable")[: BRACE.screened]]
+        normals = seen.normals.reshape(*radii.shape, 3)[entering, station[entering]]
+        if not len(entering):
+            continue
+        moved = _moved_by_contact(
+            robot, table.pressures[entering], at, station[entering], normals, -deepest[entering]
+        )
+        there = _displaced(table.poses[entering], moved)
+        ranked = entering[np.argsort(distances(there, terms, robot.length), kind="stable")]
+        x = table.pressures[ranked] / problem.unit
+        rows.append([int(ranked[i]) for i in unlike_first(problem, x[: 8 * BRACE.effort.screened])])
+    for turn in range(max(map(len, rows), default=0)):
+        for own_rows in rows:
+            if turn < len(own_rows):
+                yield table.pressures[own_rows[turn]] / problem.unit
+
+
+def _moved_by_contact(
+    robot: Manipulator, p: Vector, at: Vector, station: NDArray[np.intp], n: Vector, depth: Vector
+) -> Vector:
+    """Twists (N, 6) of the tip, in base axes, by a contact at one of the stations of each row."""
+    ends = np.full(len(at), robot.length)
+    C = robot.compliance_between(p, np.concatenate([at, ends]), np.concatenate([at, at]))
+    rows = np.arange(len(p))
+    at_contact, to_tip = C[rows, station, :3, :3], C[rows, len(at) + station, :, :3]
+    force = depth / np.einsum("ni,nij,nj->n", n, at_contact, n)
+    moved: Vector = np.einsum("nij,nj,n->ni", to_tip, n, force)
+    return moved
+
+
+def _displaced(poses: Vector, twists: Vector) -> Vector:
+    """Poses (N, 4, 4) moved by twists (N, 6) in base axes."""
+    found = poses.copy()
+    found[:, :3, 3] += twists[:, :3]
+    for T, twist in zip(found, twists, strict=True):
+        T[:3, :3] = lie.exp(np.concatenate([np.zeros(3), twist[3:]]))[:3, :3] @ T[:3, :3]
+    return found
+
+
+def _places(
+    problem: BracedProblem, starts: Iterable[Vector]
+) -> Iterator[tuple[int, ProgramPoint | None]]:
+    """Points at the target in contact to descend from, the stiffest first; see `search`."""
+    found: list[tuple[float, ProgramPoint, ContactEquilibrium]] = []
+    tried = 0
+    for x in starts:
+        tried += 1
+        try:
+            found += _brought(problem, x)
+        except StoppedError:
+            if not found:
+                raise
+            break
+    found.sort(key=lambda each: each[0])
+    if not found:
+        yield tried, None
+        return
+    for i in unlike_first(problem, np.array([point.x for _, point, _ in found])):
+        problem.here = found[i][2]
+        yield tried, found[i][1]
+
+
+def _brought(
+    problem: BracedProblem, x: Vector
+) -> list[tuple[float, ProgramPoint, ContactEquilibrium]]:
+    """A start in contact at the target, with what it is worth, if it comes there."""
+    aside = copy(problem)
+    aside.only_target = True
+    aside.restart()
+    point = reach(aside, x, BRACE.iterations)
+    if point is None or not point.reached:
+        return []
+    problem.here = aside.here
+    point = reach(problem, point.x, BRACE.iterations)
+    if point is None:
+        return []
+    if not point.reached:
+        problem.missed.append(point)
+        return []
+    full = attempt(problem.needed, point.x)
+    if full is None or problem.here is None:
+        return []
+    return [(problem.objective.value(full), full, problem.here)]
+
+
+def braced_answers(problem: BracedProblem, table: SampleTable, guess: Vector | None) -> Search:
+    """Local optima in contact, the best first; those next to a guess (n,) in Pa, if there are."""
+    if guess is not None:
+        nearby = search(problem, [guess / problem.unit], Effort(1, 1, 1), places=_places)
+        if nearby.results:
+            return nearby
+    starts = islice(candidates(problem, table), BRACE.effort.screened)
+    return search(problem, starts, BRACE.effort, places=_places)
+
+
+def from_rest(problem: BracedProblem, result: LocalResult) -> Braced | None:
+    """The equilibrium at an optimum that is reached from rest, judged; None if there is none."""
+    pressures = np.clip(result.point.x, problem.lower, problem.upper) * problem.unit
+    try:
+        eq = problem.robot.contact_equilibrium(
+            pressures, problem.scene, approach=problem.brace.approach
+        )
+    except EquilibriumError:
+        return None
+    return Braced(result, eq, problem.judgement(eq)) if eq.contacts else None
+
+
+class Braced(NamedTuple):
+    """An optimum in contact, with its equilibrium from rest and what that is worth."""
+
+    result: LocalResult
+    equilibrium: ContactEquilibrium
+    judgement: Judgement
+
+    @property
+    def least(self) -> float:
+        """The smallest stiffness that is maximised."""
+        return least_maximised(self.result.problem.task, self.judgement.stiffnesses)
+
+
+def least_maximised(task: Task, stiffnesses: tuple[float, ...]) -> float:
+    """The smallest of those stiffnesses that a task maximises."""
+    assert task.stiffness is not None
+    return min(stiffnesses[: len(task.stiffness.maximise)])
+
+
+def lean(
+    problem: BracedProblem, table: SampleTable, free: PressureSolution, guess: Vector | None
+) -> PressureSolution:
+    """The better of the stiffest answer that leans on something and the one that is free.
+
+    Parameters
+    ----------
+    problem, table : of the task, with its samples.
+    free : answer that keeps clear of all objects.
+    guess : (n,) in Pa, near the braced answer, or None.
+    """
+    task, why = problem.task, ""
+    try:
+        found = braced_answers(problem, table, guess)
+    except StoppedError as error:
+        if not free.found:
+            return replace(free, task=task)
+        return _free_answer(task, free, f"the search for where to lean was ended: {error}")
+    judged = (from_rest(problem, result) for result in found.results[: BRACE.tried])
+    best = next((each for each in judged if each is not None and each.judgement.holds), None)
+    if best is None:
+        return _free_answer(task, free, _no_brace(problem, found))
+    if free.found and least_maximised(task, free.stiffnesses) >= best.least:
+        unit = display_units().stiffness
+        why = (
+            f"leaning on {quoted(problem.brace.objects)} gives no more than {unit.text(best.least)}"
+        )
+        return _free_answer(task, free, why)
+    return _braced_answer(problem, best, free, found.confidence)
+
+
+def _free_answer(task: Task, free: PressureSolution, why: str) -> PressureSolution:
+    message = "; ".join(filter(None, (free.message, why)))
+    return replace(free, task=task, message=message, free=free)
+
+
+def _no_brace(problem: BracedProblem, found: Search) -> str:
+    """Why no braced answer was found."""
+    names = quoted(problem.brace.objects)
+    if not problem.missed:
+        came = "from rest" if found.results else "at the target"
+        return f"no way to lean on {names} was found {came}"
+    point = min(problem.missed, key=_most_missed)
+    lacking = [
+        f"{name}: {display_units().force.text(error - c.radius, '.2g')} short"
+        for name, error, c in _missed(point)
+    ]
+    return f"no way to lean on {names} was found that does; the nearest lacks {'; '.join(lacking)}"
+
+
+def _missed(point: ProgramPoint) -> list[tuple[str, float, Constraint]]:
+    pairs = zip(point.errors, point.constraints, strict=True)
+    return [(c.name, error, c) for error, c in pairs if error > c.radius]
+
+
+def _most_missed(point: ProgramPoint) -> float:
+    return max(((error - c.radius) / c.scale for _, error, c in _missed(point)), default=0.0)
+
+
+def _braced_answer(
+    problem: BracedProblem, best: Braced, free: PressureSolution, confidence: Confidence
+) -> PressureSolution:
+    eq, judgement, task, robot = best.equilibrium, best.judgement, problem.task, problem.robot
+    problem.here = eq
+    return PressureSolution(
+        status="solved",
+        message="",
+        task=task,
+        pressures=eq.pressures,
+        tip_pose=judgement.tip_pose,
+        position_error=judgement.errors.get("position"),
+        angle_error=judgement.errors.get("angle"),
+        compliance=judgement.compliance,
+        stiffness=judgement.stiffnesses[0],
+        stiffness_unit=task.measures[0].unit,
+        stiffnesses=judgement.stiffnesses,
+        active_bounds=tuple(active_bounds(robot, task, eq.pressures)),
+        confidence=confidence,
+        errors=judgement.errors,
+        robot=robot,
+        contacts=eq.contacts,
+        free=free,
+        preloads=tuple(problem.preloads(eq)),
+        limited_by=_limits(problem, best.result),
+    )
+
+
+def _limits(problem: BracedProblem, result: LocalResult) -> tuple[str, ...]:
+    """What keeps a braced answer from being stiffer: constraints and limits with a price."""
+    point = attempt(problem.needed, result.point.x)
+    prices = None if point is None else prices_at(problem, point)
+    if point is None or prices is None:
+        return ()
+    names = [
+        ball.name
+        for ball, pull in zip(point.bounded, prices.balls, strict=True)
+        if float(np.linalg.norm(pull)) * ball.radius > BRACE.least_price
+    ]
+    bounds = active_bounds(problem.robot, problem.task, point.x * problem.unit)
+    names += [
+        name
+        for name, (index, side) in bounds.items()
+        if side * float(prices.bounds[index]) > BRACE.least_price
+    ]
+    return tuple(dict.fromkeys(names))

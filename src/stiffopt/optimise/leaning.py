@@ -1,0 +1,359 @@
+"""The nonlinear program of a task whose arm leans on objects: `PressureProblem` in contact.
+
+What a task asks for is evaluated at the equilibrium in contact. After the rows of the terms, and
+those of the objects that the body keeps clear of, there are for each object that it may lean on:
+the largest contact force, ``|f| <= max_force``, and for each direction that is maximised and both
+signs the normal force that is left under a push of the margin, ``f(push) >= 0``; with sticking
+contacts also the push by which one slips. Derivatives are differences of equilibria with the same
+contacts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import product
+from typing import Any, NamedTuple, cast
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from stiffopt.display import display_units
+from stiffopt.errors import EquilibriumError
+from stiffopt.model.batch import InterpretedFunction
+from stiffopt.model.clearance import Nearest
+from stiffopt.model.codegen import dense
+from stiffopt.model.contact.equilibrium import ContactEquilibrium, Grip
+from stiffopt.model.manipulator import Manipulator
+from stiffopt.model.scene import Scene, SceneObject
+from stiffopt.model.shape import PointOfArm
+from stiffopt.model.stopping import checkpoint
+from stiffopt.optimise.brace import Brace, kept_clear_of, leant_on
+from stiffopt.optimise.measures.directional import StiffnessMeasure
+from stiffopt.optimise.problem import Objective, PressureProblem, ProgramPoint
+from stiffopt.optimise.program import Constraint, Program
+from stiffopt.optimise.settings import BRACE, OBSTACLES
+from stiffopt.optimise.solution import Judgement, Preload, are_within
+from stiffopt.optimise.task import Task
+
+Vector = NDArray[np.float64]
+
+FORCE_ON, MARGIN_ON = "force on ", "margin on "
+"""Begin the names of constraints of contacts."""
+_GRIPS: tuple[Grip, ...] = ("sliding", "sticking")
+
+
+@dataclass(frozen=True)
+class PlacedTip:
+    """A tip, as `stiffopt.model.shape.Shape` has it, whose pose and compliance are symbols."""
+
+    pressures: ca.SX
+    position: ca.SX
+    rotation: ca.SX
+    compliance: ca.SX
+    stations: dict[float, PointOfArm]
+
+    @classmethod
+    def of(cls, n: int) -> PlacedTip:
+        """For n pressures."""
+        p, C = ca.SX.sym("p", n), ca.SX.sym("C", 6, 6)
+        return cls(p, ca.SX.sym("position", 3), ca.SX.sym("rotation", 3, 3), C, {})
+
+    @property
+    def transform(self) -> ca.SX:
+        """Pose (4, 4)."""
+        return ca.vertcat(ca.horzcat(self.rotation, self.position), ca.DM([[0.0, 0.0, 0.0, 1.0]]))
+
+    def flexibility(self, wrench: ca.SX) -> ca.SX:
+        """``w' C w`` of a wrench (6,), in tip axes."""
+        return ca.bilin(self.compliance, wrench, wrench)
+
+    def station(self, at: float) -> PointOfArm:
+        """Another point of the arm, a further input."""
+        if at not in self.stations:
+            name = f"at{len(self.stations)}"
+            self.stations[at] = PointOfArm(ca.SX.sym(name, 3), ca.SX.sym(f"{name}r", 3, 3))
+        return self.stations[at]
+
+
+class PlacedProgram:
+    """Residuals and measures of a program, of an arm whose poses and compliance are known."""
+
+    def __init__(self, program: Program, n: int) -> None:
+        tip, parameters = PlacedTip.of(n), ca.SX.sym("parameters", program.n_parameters)
+        residuals, _, _, values = program.judge(cast("Any", tip), parameters)
+        self.at = np.array(list(tip.stations))
+        places = [part for each in tip.stations.values() for part in (each.position, each.rotation)]
+        inputs = [tip.position, tip.rotation, tip.compliance, *places, parameters]
+        self._function = InterpretedFunction(
+            dense(ca.Function("placed", inputs, [residuals, values]))
+        )
+        self._parameters = program.parameters
+
+    def __call__(self, eq: ContactEquilibrium, C: Vector) -> tuple[Vector, Vector]:
+        """Residuals (m,) of the terms and values (k,) of the measures; C (6, 6) in tip axes."""
+        tip = eq.tip_pose
+        poses = eq.poses(self.at) if len(self.at) else ()
+        places = [part for T in poses for part in (T[:3, 3], T[:3, :3])]
+        found = self._function(tip[:3, 3], tip[:3, :3], C, *places, self._parameters)
+        return found[0][:, 0], found[1][:, 0]
+
+
+class Seen(NamedTuple):
+    """What the program's rows and values are made of, at one equilibrium."""
+
+    residuals: Vector
+    values: Vector
+    distances: Vector
+    forces: Vector
+    pushed: Vector
+    slips: Vector
+
+
+class BracedProblem(PressureProblem):
+    """The nonlinear program of a task with a brace.
+
+    Attributes
+    ----------
+    brace : Brace
+    scene : the objects that the arm may lean on.
+    here : equilibrium from which the next one is sought, or None: from rest.
+    only_target : whether what contacts have to hold does not matter.
+    missed : points at the target where contacts do not hold what they have to.
+    """
+
+    def __init__(self, robot: Manipulator, task: Task) -> None:
+        assert task.brace is not None
+        assert task.scene is not None  # see `Brace.check`
+        self.brace: Brace = task.brace
+        self.scene: Scene = leant_on(task.scene, task.brace)
+        self.here: ContactEquilibrium | None = None
+        self.only_target = False
+        self.missed: list[ProgramPoint] = []
+        super().__init__(robot, task)
+
+    def _set_functions(self) -> None:
+        assert self.task.scene is not None
+        others = kept_clear_of(self.task.scene, self.brace)
+        plain = self.task.unbraced.model_copy(update={"scene": others})
+        self.program = Program.of(plain, self.robot.description)
+        self.judged_by = PlacedProgram(self.program, len(self.unit))
+        self._kept: tuple[bytes, ContactEquilibrium] | None = None
+
+    def _all_constraints(self) -> tuple[Constraint, ...]:
+        inside = 1 - BRACE.spare  # from rest, other steps of the integration may be taken
+        own = [c._replace(radius=inside * c.radius) for c in super()._all_constraints()]
+        for row, name in enumerate(self._row_names, start=own[-1].end if own else 0):
+            own.append(Constraint(name, row, row + 1, BRACE.force, BRACE.scale, one_sided=True))
+        return tuple(own)
+
+    @property
+    def _row_names(self) -> Iterator[str]:
+        """A row for the force on each object, and one for each push of each object."""
+        per_object = len(self.directions) * (2 if self.brace.contacts == "sliding" else 4)
+        for item in self.scene.objects:
+            yield f"{FORCE_ON}{item.name}"
+            yield from [f"{MARGIN_ON}{item.name}"] * per_object
+
+    def _objective(self) -> Objective:
+        return replace(super()._objective(), precision=BRACE.precision)
+
+    @property
+    def directions(self) -> list[StiffnessMeasure]:
+        """What is maximised."""
+        goal = self.task.stiffness
+        assert goal is not None
+        return list(goal.maximise)
+
+    # -- evaluation -------------------------------------------------------------------------
+
+    def restart(self) -> None:
+        """Begin the next equilibrium from rest."""
+        self.here = self._kept = None
+
+    def equilibrium(self, x: Vector) -> ContactEquilibrium:
+        """The equilibrium at pressures x, from `here`; an error if it has no contact."""
+        if self._kept is not None and self._kept[0] == x.tobytes():
+            return self._kept[1]
+        eq = self.robot.contact_equilibrium(
+            x * self.unit, self.scene, approach=self.brace.approach, nearby=self.here
+        )
+        if not eq.contacts:
+            raise EquilibriumError("the arm does not lean on anything there")
+        self.here, self._kept = eq, (x.tobytes(), eq)
+        return eq
+
+    def pose(self, x: Vector) -> ProgramPoint:
+        """See `PressureProblem.pose`."""
+        return self._evaluated(x, full=False)
+
+    def point(self, x: Vector) -> ProgramPoint:
+        """See `PressureProblem.point`."""
+        return self._evaluated(x, full=True)
+
+    def worth(self, x: Vector) -> ProgramPoint:
+        """See `PressureProblem.worth`."""
+        return self._evaluated(x, full=True)
+
+    def _evaluated(self, x: Vector, *, full: bool) -> ProgramPoint:
+        checkpoint()
+        eq = self.equilibrium(x)
+        pushes = [] if self.only_target else list(self.pushes(eq))
+        near = self._nearest(eq, quickly=True)
+        base = self._seen(eq, pushes, near, full)
+        beside = []
+        for k, inwards in enumerate(x > (self.lower + self.upper) / 2):
+            step = (-1.0 if inwards else 1.0) * BRACE.step
+            change = step * self.unit[k] * np.eye(len(x))[k]
+            seen = self._seen(eq.shifted(change), pushes, near, full)
+            beside.append([(b - a) / step for a, b in zip(base, seen, strict=True)])
+        slopes = Seen(*(np.stack(columns, axis=-1) for columns in zip(*beside, strict=True)))
+        residual = np.concatenate([base.residuals, self._rows(eq, base, near)])
+        jacobian = np.vstack([slopes.residuals, self._slopes(eq, base, slopes)])
+        first = len(self.program.measures) - self.program.n_floors
+        if not full:
+            return ProgramPoint(x, residual, jacobian, self.constraints, *_nothing(len(x)))
+        return ProgramPoint(
+            x, residual, jacobian, self.constraints, -base.values[:first], -slopes.values[:first],
+            base.values[first:], slopes.values[first:],
+        )  # fmt: skip
+
+    def pushes(self, eq: ContactEquilibrium) -> Iterator[Vector]:
+        """Unit vectors (3,) of pushes at the tip, both ways along each direction, in base axes."""
+        R = eq.tip_pose[:3, :3]
+        for measure, sign in product(self.directions, (1.0, -1.0)):
+            d = np.array(measure.direction)
+            yield sign * (R @ d if measure.frame == "tip" else d)
+
+    def _seen(
+        self,
+        eq: ContactEquilibrium,
+        pushes: list[Vector],
+        near: list[Nearest],
+        full: bool,
+    ) -> Seen:
+        C = eq.compliance(self.brace.contacts) if full else np.eye(6)
+        residuals, values = self.judged_by(eq, C)
+        margin = (1 + BRACE.spare) * self.brace.margin
+        pushed = np.array([eq.shifted(push=margin * push).normal_forces for push in pushes])
+        slips = np.zeros(0)
+        if self.brace.contacts == "sticking" and pushes:
+            slips = np.array([self._slip(eq, push) for push in pushes])
+        at = np.array([each.s for each in near])
+        points, _, radii = eq.line(at) if near else (np.zeros((0, 3)), None, np.zeros(0))
+        distances = np.array(
+            [each.normal @ x - each.radius_share * r
+             for each, x, r in zip(near, points, radii, strict=True)]
+        )  # fmt: skip
+        return Seen(residuals, values, distances, eq.normal_forces, pushed, slips)
+
+    def _slip(self, eq: ContactEquilibrium, push: Vector) -> float:
+        """Push, of up to twice the margin, by which a sticking contact is lost."""
+        most = 2 * self.brace.margin
+        return min(most, eq.lift_off(push, most, "sticking").force)
+
+    def _rows(self, eq: ContactEquilibrium, seen: Seen, near: list[Nearest]) -> Vector:
+        rows = self.obstacle_rows(near)
+        if self.only_target:
+            return np.array([*rows, *(0.0 for _ in self._row_names)])
+        for item in self.scene.objects:
+            own = self._of(eq, item.name)
+            if not own:
+                rows += [0.0] * (1 + len(seen.pushed) + len(seen.slips))
+                continue
+            most = _most_force(item)
+            force = float(seen.forces[own].max()) - (1 - BRACE.spare) * (most or np.inf)
+            rows.append(BRACE.force + force if most else 0.0)
+            rows += (BRACE.force - seen.pushed[:, own].min(axis=1)).tolist()
+            margin = (1 + BRACE.spare) * self.brace.margin
+            rows += (BRACE.force + margin - seen.slips).tolist()
+        return np.array(rows)
+
+    def obstacle_rows(self, near: list[Nearest]) -> list[float]:
+        """Rows for the objects that the body keeps clear of; see `Obstacles`."""
+        if self.program.obstacles is None:
+            return []
+        asked = self.program.obstacles.scene.clearance
+        return [OBSTACLES.margin - (each.distance - asked) for each in near]
+
+    def _slopes(self, eq: ContactEquilibrium, base: Seen, slopes: Seen) -> Vector:
+        """Derivatives (rows, n) of `_rows`; of several contacts on an object those of the worst."""
+        rows = list(-slopes.distances)
+        none = np.zeros(len(self.unit))
+        if self.only_target:
+            return np.array([*rows, *(none for _ in self._row_names)]).reshape(-1, len(none))
+        for item in self.scene.objects:
+            own = self._of(eq, item.name)
+            if not own:
+                rows += [none] * (1 + len(base.pushed) + len(base.slips))
+                continue
+            first = own[int(base.forces[own].argmax())]
+            rows.append(slopes.forces[first] if _most_force(item) else none)
+            for at_push, slope in zip(base.pushed, slopes.pushed, strict=True):
+                rows.append(-slope[own[int(at_push[own].argmin())]])
+            rows += list(-slopes.slips)
+        return np.array(rows).reshape(-1, len(none))
+
+    @staticmethod
+    def _of(eq: ContactEquilibrium, name: str) -> list[int]:
+        """Which contacts are on an object."""
+        return [j for j, each in enumerate(eq.contacts) if each.object == name]
+
+    def _nearest(self, eq: ContactEquilibrium, *, quickly: bool) -> list[Nearest]:
+        """Where the body is nearest to the objects that it keeps clear of, a row each."""
+        obstacles = self.program.obstacles
+        if obstacles is None:
+            return []
+        return obstacles.nearest(eq.line) if quickly else obstacles.exactly_nearest(eq.line)
+
+    # -- judgement --------------------------------------------------------------------------
+
+    def judgement(self, eq: ContactEquilibrium) -> Judgement:
+        """What of the task holds at an equilibrium."""
+        C = eq.compliance(self.brace.contacts)
+        residuals, values = self.judged_by(eq, C)
+        rows = [*residuals.tolist(), *self.obstacle_rows(self._nearest(eq, quickly=False))]
+        within = are_within(eq.pressures, self.lower * self.unit, self.upper * self.unit)
+        found = Judgement.of(self.program, (rows, eq.tip_pose, C, values.tolist()), within)
+        return found._replace(shortfalls=(*found.shortfalls, *self.refusals(eq)))
+
+    def refusals(self, eq: ContactEquilibrium) -> Iterator[str]:
+        """Why an equilibrium does not do as a brace."""
+        unit = display_units().force
+        for each in eq.contacts:
+            force = float(np.linalg.norm(each.force))
+            if force > each.max_force * (1 + 1e-9):
+                yield (
+                    f"the arm leans on '{each.object}' with {unit.text(force)}; at most "
+                    f"{unit.text(each.max_force)} is allowed"
+                )
+        if not eq.stable:
+            yield "the equilibrium is not stable"
+        grips = _GRIPS[: 1 + (self.brace.contacts == "sticking")]
+        kept = (each.loss.force for each in self.preloads(eq) if each.contacts in grips)
+        least = min(kept, default=np.inf)
+        if least < self.brace.margin * (1 - 1e-6):
+            yield (
+                f"a push of {unit.text(least)} takes a contact away; the margin is "
+                f"{unit.text(self.brace.margin)}"
+            )
+
+    def preloads(self, eq: ContactEquilibrium) -> Iterator[Preload]:
+        """What the first contact is lost by, both ways along each direction.
+
+        Of contacts that slide and, where there is friction, of those that stick.
+        """
+        has_friction = any(item.contact and item.contact.friction for item in self.scene.objects)
+        for d in self.pushes(eq):
+            for grip in _GRIPS if has_friction else _GRIPS[:1]:
+                yield Preload(d, grip, eq.lift_off(d, BRACE.largest_push, grip))
+
+
+def _most_force(item: SceneObject) -> float | None:
+    return None if item.contact is None else item.contact.max_force
+
+
+def _nothing(n: int) -> tuple[Vector, Vector, Vector, Vector]:
+    none = np.zeros((0, n))
+    return none[:, 0], none, none[:, 0], none

@@ -1,0 +1,441 @@
+"""Between a ROS 2 graph and the daemon: publishes the state, and asks for what others command."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from stiffopt.control.state import Event, Severity, Snapshot
+from stiffopt.daemon.client import Client
+from stiffopt.errors import InputError, StiffoptError
+from stiffopt.model.manipulator import Manipulator
+from stiffopt.optimise.solution import PressureSolution
+from stiffopt.optimise.solver import solve_pressure
+from stiffopt.optimise.task import PressureRange, Task
+from stiffopt.rig.config import RigDescription, limits_of
+from stiffopt.ros.lease import GraphLease
+from stiffopt.ros.messages import (
+    Empty,
+    JointState,
+    JointTrajectory,
+    PointStamped,
+    PoseStamped,
+    SolvePressureRequest,
+    SolvePressureResponse,
+    String,
+    TriggerRequest,
+    TriggerResponse,
+)
+from stiffopt.ros.node import Received, RosNode, Service, Subscription, Writer
+from stiffopt.ros.published import PUBLISHED, StateMessages
+from stiffopt.ros.requests import target_of, task_in, trajectory_of
+from stiffopt.safety.vent import vent_rig
+
+SIMPLE = ("arm", "disarm", "hold", "reset")
+"""Commands that say no more than their name: services, and topics of `Empty`."""
+MOTIONS: dict[str, type[Any]] = {
+    "set_target": PoseStamped,
+    "set_target_point": PointStamped,
+    "set_task": String,
+    "follow_trajectory": JointTrajectory,
+}
+"""Topics of commands that set the arm in motion."""
+_FURTHER = ("vent", "renew", "solve", "solution", "solve_pressure")
+NAMES = (*PUBLISHED, *(f"~/{name}" for name in (*SIMPLE, *MOTIONS, *_FURTHER)))
+"""Names of all topics and services."""
+
+_QUICK = 2.0  # s after which the daemon does not answer; the guard is asked to vent then
+_SHAPE = 0.2  # s, between two messages of what the arm looks like
+_SLOW = 1.0  # s, of diagnostics, and of the scene where somebody new reads it
+_EVENTS = 0.2  # s
+_WAITING = 32  # commands; more than any lively node needs
+_SILENT = 5.0  # s without a state, after which the daemon has ended
+_LISTEN = 0.05  # s
+_GONE = "its writer is gone already, and control belongs to a writer as long as it lives"
+
+
+@dataclass(frozen=True)
+class _Job:
+    """A command that waits: `newest` ones are replaced by later ones of the same writer."""
+
+    name: str
+    writer: Writer
+    command: Callable[[], None]
+    done: Callable[[bool, str], None]
+    newest: bool = False
+
+
+class Bridge:
+    """A node that shows a daemon's arm on a ROS 2 graph, and commands it where that is allowed.
+
+    Nothing is decided here that is about safety: commands go through the daemon's interface, with
+    its token and its lease. Venting is asked for at once, by a thread of its own, and of the guard
+    if the daemon does not answer.
+
+    Parameters
+    ----------
+    rig, description, robot :
+        Path and content of the rig file, and the arm.
+    url, token :
+        Of the daemon.
+    node :
+        On which everything is published.
+    say :
+        Is told what people should know.
+    """
+
+    def __init__(
+        self,
+        rig: str,
+        description: RigDescription,
+        robot: Manipulator,
+        url: str,
+        token: str,
+        node: RosNode,
+        say: Callable[[str], None] = lambda text: None,
+    ) -> None:
+        self._rig, self._description, self._robot, self._node = rig, description, robot, node
+        self._say = say
+        name = node.names.full("~/tip").rpartition("/")[0].strip("/")
+        client = partial(Client, url, token, name=f"ros: {name}"[:80], heartbeat="manual")
+        self._client, self._quick = client(), client(timeout=_QUICK)
+        self._lease = GraphLease(self._client, description.safety.heartbeat, self._warn)
+        # the daemon is on this machine, and its clock counts from the same moment as ours
+        epoch = time.time() - time.monotonic()
+        settings = description.ros
+        self._messages = StateMessages(robot, description.name, name, epoch, settings.frame_prefix)
+        self._publishers = {
+            topic: node.publisher(topic, kind, depth, latched=latched)
+            for topic, (kind, depth, latched) in PUBLISHED.items()
+        }
+        self._solution = node.publisher("~/solution", JointState)
+        self._jobs: deque[_Job] = deque()
+        self._questions: deque[tuple[str, PoseStamped | None, Callable[..., None]]] = deque()
+        self._vents: deque[Callable[[bool, str], None]] = deque()
+        self._news = {name: threading.Event() for name in ("jobs", "questions", "vents")}
+        self._over = threading.Event()
+        self._now: Snapshot | None = None
+        self._seen: frozenset[int] = frozenset()
+        self._next_event = 0
+        self._vented = 0  # when what was last to vent was written
+        self._subscribe(commands=settings.commands)
+        node.announce()
+
+    def run(self, over: threading.Event) -> None:
+        """Publish until `over` is set.
+
+        Raises
+        ------
+        ServiceError
+            The daemon has ended.
+        """
+        works = [self._listen, self._command, self._solve, self._vent]
+        threads = [threading.Thread(target=work, daemon=True) for work in works]
+        with ExitStack() as stack:
+            stream = stack.enter_context(self._quick.stream(self._description.ros.rate))
+            for thread in threads:
+                thread.start()
+            stack.callback(self._end, threads)
+            due = dict.fromkeys(("shape", "slow", "events"), 0.0)
+            while not over.is_set():
+                self._now = now = stream.state(_SILENT)
+                self._publish(now, due)
+
+    def close(self) -> None:
+        """Leave the graph."""
+        for client in (self._client, self._quick):
+            client.close()
+        self._node.close()
+
+    def _end(self, threads: list[threading.Thread]) -> None:
+        self._over.set()
+        for event in self._news.values():
+            event.set()
+        for thread in threads:
+            thread.join(20)
+        self._lease.end("the ROS 2 node has ended")
+
+    # Publishing ----------------------------------------------------------------------------------
+
+    def _publish(self, now: Snapshot, due: dict[str, float]) -> None:
+        moment = time.monotonic()
+        for topic, message in self._messages.often(now):
+            self._publishers[topic].publish(message)
+        if moment >= due["shape"]:
+            due["shape"] = moment + _SHAPE
+            with suppress(StiffoptError):  # an arm without a known shape is not drawn
+                for topic, message in self._messages.shape(now):
+                    self._publishers[topic].publish(message)
+        if moment >= due["slow"]:
+            due["slow"] = moment + _SLOW
+            self._publishers["~/state"].publish(self._messages.state(now))
+            control = self._lease.holder
+            self._publishers["/diagnostics"].publish(self._messages.diagnostics(now, control))
+            readers = self._publishers["~/scene"].readers
+            if readers - self._seen:
+                scene = self._messages.scene(self._description.scene, now.time)
+                self._publishers["~/scene"].publish(scene)
+            self._seen = readers
+        if moment >= due["events"]:
+            due["events"] = moment + _EVENTS
+            events, self._next_event = self._quick.events(self._next_event)
+            for event in events:
+                self._publishers["/rosout"].publish(self._messages.log(event))
+
+    def _tell(self, kind: str, text: str, severity: Severity) -> None:
+        """Log something that is no event of the loop."""
+        event = Event(time.monotonic(), kind, text, severity)
+        self._publishers["/rosout"].publish(self._messages.log(event))
+
+    def _warn(self, text: str) -> None:
+        self._tell("ros", text, Severity.WARNING)
+        self._say(text)
+
+    # Listening -----------------------------------------------------------------------------------
+
+    def _subscribe(self, *, commands: bool) -> None:
+        node = self._node
+        for reliable in (True, False):  # whoever vents with either is heard
+            node.subscribe("~/vent", Empty, self._vent_topic, reliable=reliable)
+        node.serve("~/vent", TriggerRequest, self._vent_service)
+        node.subscribe("~/solve", PoseStamped, self._solve_topic, 1)
+        node.serve("~/solve_pressure", SolvePressureRequest, self._solve_service)
+        if not commands:
+            return
+        for name in SIMPLE:
+            node.subscribe(f"~/{name}", Empty, partial(self._simple_topic, name))
+            node.serve(f"~/{name}", TriggerRequest, partial(self._simple_service, name))
+        for name, kind in MOTIONS.items():
+            node.subscribe(f"~/{name}", kind, partial(self._motion_topic, name))
+        node.subscribe("~/renew", Empty, self._renew_topic)
+
+    def _listen(self) -> None:
+        while not self._over.is_set():
+            try:
+                self._node.wait(_LISTEN)
+            except Exception as error:  # one message must not silence the others
+                self._warn(f"a message could not be taken: {type(error).__name__}: {error}")
+
+    def _vent_topic(self, source: Subscription) -> None:
+        for received in source.take():
+            if received.moment != self._vented:  # both subscriptions have it
+                self._vented = received.moment
+                self._post("vents", self._vents, self._answer_topic("vent"))
+
+    def _vent_service(self, service: Service, received: Received) -> None:
+        self._post("vents", self._vents, partial(_answer_trigger, service, received))
+
+    def _solve_topic(self, source: Subscription) -> None:
+        for received in source.take():
+            self._ask("", received.message, self._answer_solution)
+
+    def _solve_service(self, service: Service, received: Received) -> None:
+        asked = received.message
+        target = asked.target if asked.target.header.frame_id else None
+        self._ask(asked.task, target, partial(self._answer_solve, service, received))
+
+    def _simple_topic(self, name: str, source: Subscription) -> None:
+        for received in source.take():
+            self._simple(name, received, self._answer_topic(name))
+
+    def _simple_service(self, name: str, service: Service, received: Received) -> None:
+        self._simple(name, received, partial(_answer_trigger, service, received))
+
+    def _simple(self, name: str, received: Received, done: Callable[[bool, str], None]) -> None:
+        commands: dict[str, Callable[[], None]] = {
+            "arm": self._client.arm,
+            "disarm": self._client.disarm,
+            "hold": partial(self._client.hold, "asked for by ROS 2"),
+            "reset": self._client.reset,
+        }
+        if received.writer is None:
+            done(False, _GONE)
+            return
+        once = partial(self._lease.once, received.writer, commands[name])
+        self._queue(_Job(name, received.writer, once, done))
+
+    def _motion_topic(self, name: str, source: Subscription) -> None:
+        done = self._answer_topic(name)
+        for received in source.take():
+            if received.writer is None:
+                done(False, _GONE)
+                continue
+            command = partial(self._motion, name, received.message)
+            move = partial(self._lease.move, source, received.writer, command)
+            newest = name.startswith("set_target")
+            self._queue(_Job(name, received.writer, move, done, newest))
+
+    def _renew_topic(self, source: Subscription) -> None:
+        for received in source.take():
+            if received.writer is not None:
+                self._lease.hear(received.writer)
+
+    def _queue(self, job: _Job) -> None:
+        self._lease.hear(job.writer)
+        last = self._jobs[-1] if self._jobs else None
+        if job.newest and last is not None and last.newest:
+            if last.writer == job.writer:
+                with suppress(IndexError):  # it is being carried out already
+                    self._jobs.remove(last)
+        elif len(self._jobs) >= _WAITING:
+            job.done(False, "too many commands wait already")
+            return
+        self._post("jobs", self._jobs, job)
+
+    def _ask(self, task: str, target: PoseStamped | None, answer: Callable[..., None]) -> None:
+        if len(self._questions) >= _WAITING:
+            answer(None, "too many questions wait already")
+            return
+        self._post("questions", self._questions, (task, target, answer))
+
+    def _post(self, kind: str, queue: deque[Any], item: Any) -> None:
+        queue.append(item)
+        self._news[kind].set()
+
+    # Working -------------------------------------------------------------------------------------
+
+    def _command(self) -> None:
+        """Carry out commands, and look after the lease between them."""
+        while not self._over.is_set():
+            self._news["jobs"].wait(self._lease.period)
+            self._news["jobs"].clear()
+            self._guarded(self._lease.look)
+            while self._jobs and not self._over.is_set():
+                with suppress(IndexError):  # what waited was dropped by a vent
+                    job = self._jobs.popleft()
+                    self._guarded(partial(self._carry_out, job))
+                    self._guarded(self._lease.look)
+
+    def _carry_out(self, job: _Job) -> None:
+        try:
+            job.command()
+        except StiffoptError as error:
+            job.done(False, str(error))
+        else:
+            job.done(True, "")
+
+    def _motion(self, name: str, message: Any) -> None:
+        now, client = time.time(), self._client
+        if name == "set_task":
+            client.set_task(task_in(message.data, self._robot.description.name))
+        elif name == "follow_trajectory":
+            client.follow_trajectory(trajectory_of(message, self._robot, now))
+        else:
+            client.set_target(target_of(message, self._messages.base, now))
+
+    def _vent(self) -> None:
+        """Vent as soon as somebody asks, whatever else is being done."""
+        while not self._over.is_set():
+            self._news["vents"].wait()
+            self._news["vents"].clear()
+            answers = []
+            while self._vents:
+                answers.append(self._vents.popleft())
+            if answers:
+                with suppress(IndexError):
+                    while True:  # nothing that was asked for before is done after it
+                        self._jobs.popleft().done(False, "not done: somebody vents")
+                self._guarded(partial(self._vent_now, answers))
+
+    def _vent_now(self, answers: list[Callable[[bool, str], None]]) -> None:
+        done, text = True, "vented"
+        try:
+            self._quick.vent()
+        except StiffoptError as error:
+            self._warn(f"the daemon did not vent ({error}); asking the guard")
+            try:
+                text = vent_rig(self._rig)
+            except StiffoptError as failed:
+                done, text = False, f"THE ARM MAY BE UNDER PRESSURE: {failed}"
+        for answer in answers:
+            answer(done, text)
+
+    def _solve(self) -> None:
+        """Answer questions for pressures, one after the other."""
+        while not self._over.is_set():
+            self._news["questions"].wait()
+            self._news["questions"].clear()
+            while self._questions and not self._over.is_set():
+                text, target, answer = self._questions.popleft()
+                self._guarded(partial(self._solve_one, text, target, answer))
+
+    def _solve_one(
+        self, text: str, target: PoseStamped | None, answer: Callable[..., None]
+    ) -> None:
+        try:
+            task = self._task(text, target)
+            now = self._now
+            guess = None if now is None or not np.isfinite(now.commanded).all() else now.commanded
+            answer(solve_pressure(self._robot, task, guess=guess), "")
+        except StiffoptError as error:
+            answer(None, str(error))
+
+    def _task(self, text: str, target: PoseStamped | None) -> Task:
+        """Return the task that is asked, within the rig's limits."""
+        task = task_in(text, self._robot.description.name) if text else None
+        if target is not None:
+            wanted = target_of(target, self._messages.base, time.time())
+            task = Task(target=wanted) if task is None else task.model_copy(
+                update={"target": wanted}
+            )  # fmt: skip
+        if task is None:
+            raise InputError("give a task, or a target with a frame_id")
+        if task.pressure == PressureRange():
+            high = limits_of(self._description, self._robot.description).high
+            task = task.model_copy(update={"pressure": PressureRange(max=tuple(high.tolist()))})
+        return task
+
+    def _guarded(self, work: Callable[[], object]) -> None:
+        """Do some work; a mistake in it is told, and ends nothing else."""
+        try:
+            work()
+        except Exception as error:
+            self._warn(f"unexpected {type(error).__name__}: {error}")
+
+    # Answering -----------------------------------------------------------------------------------
+
+    def _answer_topic(self, name: str) -> Callable[[bool, str], None]:
+        """Return what tells of a command that came by a topic: a refusal, in the log."""
+
+        def answer(done: bool, text: str) -> None:
+            if not done:
+                self._tell("refused", f"{name}: {text}", Severity.ERROR)
+
+        return answer
+
+    def _answer_solution(self, found: PressureSolution | None, text: str) -> None:
+        if found is not None and found.found and found.pressures is not None:
+            self._solution.publish(self._messages.answer(found.pressures, time.monotonic()))
+        else:
+            reason = text if found is None else found.message
+            self._tell("refused", f"solve: {reason}", Severity.ERROR)
+
+    def _answer_solve(
+        self, service: Service, received: Received, found: PressureSolution | None, text: str
+    ) -> None:
+        answer = SolvePressureResponse(status="refused", message=text)
+        if found is not None:
+            nan = float("nan")
+            answer.status, answer.message = found.status, found.message
+            answer.position_error = nan if found.position_error is None else found.position_error
+            answer.angle_error = nan if found.angle_error is None else found.angle_error
+            answer.stiffness = nan if found.stiffness is None else found.stiffness
+            answer.stiffness_unit = found.stiffness_unit or ""
+            now = time.monotonic()
+            if found.pressures is not None:
+                answer.pressures = self._messages.answer(found.pressures, now)
+            if found.tip_pose is not None:
+                answer.tip = self._messages.pose(found.tip_pose, now)
+        service.reply(received, answer)
+
+
+def _answer_trigger(service: Service, received: Received, done: bool, text: str) -> None:
+    service.reply(received, TriggerResponse(success=done, message=text))

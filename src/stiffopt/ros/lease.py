@@ -1,0 +1,152 @@
+"""Control of the arm for those who write on the graph: one at a time, as long as they live."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+
+from stiffopt.daemon.client import Client
+from stiffopt.errors import CommandError, StiffoptError
+from stiffopt.ros.node import Subscription, Writer
+
+_UNANSWERED = 4  # parts of the heartbeat, in one of which control is renewed
+
+
+class GraphLease:
+    """The daemon's control lease, held for one writer on the graph.
+
+    Who sets the arm in motion has control: the writer, with the other writers of its process. It
+    ends with the writer's liveliness: when the writer is gone, when it has not asserted that it
+    lives within the lease that it offers, or, where it offers none or one above the daemon's
+    `heartbeat`, when its process has not written anything to this node for that time. The arm is
+    held then, and let down as after any hold that nobody ends. Other commands need control only
+    while they are carried out.
+
+    Parameters
+    ----------
+    client :
+        Of the daemon, with the heartbeat ``manual``.
+    heartbeat :
+        Of the daemon, in s.
+    tell :
+        Is told why control has ended.
+    """
+
+    def __init__(
+        self,
+        client: Client,
+        heartbeat: float,
+        tell: Callable[[str], None],
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._client, self._heartbeat, self._tell, self._clock = client, heartbeat, tell, clock
+        self._lock = threading.Lock()
+        self._holder: tuple[Subscription, Writer] | None = None
+        self._heard = -math.inf
+        self._renewed = -math.inf
+
+    @property
+    def period(self) -> float:
+        """How often `look` is to be called, in s."""
+        return self._heartbeat / _UNANSWERED
+
+    @property
+    def holder(self) -> str:
+        """Who has control, in words; empty if nobody on the graph has it."""
+        holder = self._holder
+        return "" if holder is None else f"process {holder[1].participant}"
+
+    def hear(self, writer: Writer) -> None:
+        """Note that a process has written something."""
+        with self._lock:
+            if self._holder is not None and self._holder[1].participant == writer.participant:
+                self._heard = self._clock()
+
+    def move(self, source: Subscription, writer: Writer, command: Callable[[], None]) -> None:
+        """Set the arm in motion for a writer, which has control from then on.
+
+        Raises
+        ------
+        StiffoptError
+            Another has control, or the daemon refuses.
+        """
+        self._check(writer)
+        had = self._holder is not None
+        self._client.take_control()
+        try:
+            command()
+        except BaseException:
+            if not had:
+                self._release()
+            raise
+        with self._lock:
+            self._holder = source, writer
+            if not had:
+                self._heard = self._clock()
+
+    def once(self, writer: Writer, command: Callable[[], None]) -> None:
+        """Carry out a command that needs control for no longer; raises as `move`."""
+        self._check(writer)
+        self._client.take_control()
+        try:
+            command()
+        finally:
+            if self._holder is None:
+                self._release()
+
+    def look(self) -> None:
+        """Renew control as long as its holder lives; else hold the arm and give control back."""
+        holder = self._holder
+        if holder is None:
+            return
+        if not self._client.in_control:
+            self._end("the daemon has taken control back")
+            return
+        reason = self._death(*holder)
+        if reason:
+            self.end(reason)
+            return
+        try:
+            self._client.renew()
+        except CommandError as error:
+            self._end(str(error))
+        except StiffoptError as error:
+            self._tell(f"control could not be renewed: {error}")
+
+    def end(self, reason: str) -> None:
+        """Hold the arm, and give control back, if somebody on the graph has it."""
+        if self._holder is None:
+            return
+        with suppress(StiffoptError):  # there may be nothing to hold
+            self._client.hold(reason)
+        self._release()
+        self._end(reason)
+
+    def _death(self, source: Subscription, writer: Writer) -> str:
+        """Return why the writer that has control does not count as alive; empty if it does."""
+        if not source.lives(writer):
+            return "the writer that had control is gone, or does not say that it lives"
+        silent = self._clock() - self._heard
+        if writer.lease > self._heartbeat and silent > self._heartbeat:
+            return (
+                f"nothing was heard for {self._heartbeat:g} s from the writer that had control, "
+                "which offers no such lease of liveliness"
+            )
+        return ""
+
+    def _check(self, writer: Writer) -> None:
+        holder = self._holder
+        if holder is not None and holder[1].participant != writer.participant:
+            raise CommandError("another writer has control; it ends with its liveliness")
+
+    def _release(self) -> None:
+        with suppress(StiffoptError):
+            self._client.release()
+
+    def _end(self, reason: str) -> None:
+        with self._lock:
+            self._holder = None
+        self._tell(f"control has ended: {reason}")

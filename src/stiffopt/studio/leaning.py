@@ -1,0 +1,193 @@
+"""An arm that leans on what the studio shows around it, at pressures that are held.
+
+While an object is dragged, the pressures stay and the arm gives way to it: equilibrium, contact
+forces and braced stiffness follow the object, where a task would move the arm out of its way.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from stiffopt import lie
+from stiffopt.display import FIGURES, display_units
+from stiffopt.errors import InputError
+from stiffopt.model.contact.equilibrium import ContactEquilibrium
+from stiffopt.model.contact.push import ContactLoss
+from stiffopt.model.description import RobotDescription
+from stiffopt.model.manipulator import Manipulator
+from stiffopt.optimise.measures.directional import StiffnessMeasure
+from stiffopt.plots import style
+from stiffopt.plots.shapes import StiffnessEllipsoid
+from stiffopt.studio.design import Design
+from stiffopt.studio.drawing import NOWHERE, ArmTube, Vector, place, rgb, turn
+
+_LARGEST_PUSH = 1.0  # N, within which it is said what lets a contact go
+_ARROW_SHARE, _ELLIPSOID_SHARE = 0.25, 0.22  # of the arm's length
+
+
+@dataclass(frozen=True, eq=False)
+class Leaning:
+    """An arm at held pressures among the objects of a design.
+
+    Attributes
+    ----------
+    design : the scene, and the stiffness that is looked at.
+    robot : the arm, with the task's load.
+    equilibrium : where it comes to rest.
+    """
+
+    design: Design
+    robot: Manipulator
+    equilibrium: ContactEquilibrium
+    _losses: dict[str, ContactLoss] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, design: Design, robot: Manipulator, pressures: Vector) -> Leaning:
+        """Lean an arm on the objects that allow it, as if they were pushed against it.
+
+        Raises
+        ------
+        InputError
+            No object allows contact.
+        EquilibriumError
+            The arm slips off, snaps through or buckles on the way.
+        """
+        scene = design.task.scene
+        if scene is None or not any(
+            each.contact and each.contact.allowed for each in scene.objects
+        ):
+            raise InputError(
+                "there is nothing to lean on; choose an object and tick 'may be leant on'"
+            )
+        found = robot.contact_equilibrium(pressures, scene, approach="objects")
+        return cls(design, robot, found)
+
+    @property
+    def measure(self) -> StiffnessMeasure | None:
+        """The first stiffness of the task that has a direction."""
+        found = (each for each in self.design.task.measures if isinstance(each, StiffnessMeasure))
+        return next(found, None)
+
+    @cached_property
+    def stiffness(self) -> tuple[float, float] | None:
+        """That stiffness of the free arm at these pressures, and of the arm that leans."""
+        m = self.measure
+        if m is None:
+            return None
+        parts = (m.direction, m.kind, m.boundary, m.frame)
+        free = self.robot.stiffness(self.equilibrium.pressures, *parts)
+        return float(free), self.equilibrium.stiffness(*parts)
+
+    def pushes(self) -> tuple[ContactLoss, ContactLoss] | None:
+        """Return the pushes along and against the direction that let the first contact go."""
+        m = self.measure
+        if m is None or m.kind != "translation" or not self.equilibrium.contacts:
+            return None
+        way = np.array(m.direction)
+        if m.frame == "tip":
+            way = self.equilibrium.tip_pose[:3, :3] @ way
+        for name, sign in (("along", 1), ("against", -1)):
+            if name not in self._losses:
+                self._losses[name] = self.equilibrium.lift_off(sign * way, _LARGEST_PUSH)
+        return self._losses["along"], self._losses["against"]
+
+
+def leaning_rows(leaning: Leaning) -> Iterable[tuple[str, str]]:
+    """Yield what the panel says of an arm that leans, as names and plain text."""
+    units = display_units()
+    if leaning.stiffness is not None and leaning.measure is not None:
+        free, braced = leaning.stiffness
+        unit = units.of_si(leaning.measure.unit)
+        yield "braced", f"{unit.text(braced, FIGURES)}, {braced / free:.3g} times the free arm's"
+        yield "free", unit.text(free, FIGURES)
+    for each in leaning.equilibrium.contacts:
+        force = float(np.linalg.norm(each.force))
+        limit = f" of {units.force.text(each.max_force)}" if np.isfinite(each.max_force) else ""
+        over = ", TOO MUCH" if force > each.max_force else ""
+        at = units.length.text(each.at, ".1f")
+        yield (
+            f"on {each.object}",
+            f"{units.force.text(force, '.3g')}{limit}, {at} from the base{over}",
+        )
+    if not leaning.equilibrium.contacts:
+        yield "contacts", "none: drag an object that may be leant on against the arm"
+    pushes = leaning.pushes()
+    if pushes is not None:
+        texts = [_loss_text(each) for each in pushes]
+        yield "a push of", f"{texts[0]} along the direction, {texts[1]} against it loses a contact"
+    if not leaning.equilibrium.stable:
+        yield "stability", "unstable: the arm would not stay so"
+
+
+def _loss_text(loss: ContactLoss) -> str:
+    unit = display_units().force
+    if not np.isfinite(loss.force):
+        return f"more than {unit.text(_LARGEST_PUSH)}"
+    return unit.text(loss.force, ".3g")
+
+
+class LeaningView:
+    """Draws an arm that leans: its shape, the forces on it, and its braced stiffness.
+
+    Parameters
+    ----------
+    server : viser.ViserServer
+    description :
+        The robot.
+    """
+
+    def __init__(self, server: Any, description: RobotDescription) -> None:
+        scene, length = server.scene, description.length
+        self._length = length
+        self._arm = ArmTube(server, "/leaning", description, style.MEASURED, 0.6)
+        self._ellipsoid = scene.add_icosphere(
+            "/leaning/ellipsoid", radius=1.0, subdivisions=3, color=rgb(style.MEASURED),
+            opacity=0.25, visible=False,
+        )  # fmt: skip
+        self._forces = scene.add_arrows(
+            "/leaning/forces", NOWHERE, rgb(style.LOAD), shaft_radius=0.005 * length,
+            head_radius=0.013 * length, head_length=0.04 * length,
+        )  # fmt: skip
+
+    @property
+    def visible(self) -> bool:
+        """Whether it is seen."""
+        return self._arm.visible
+
+    @property
+    def arm_end(self) -> Vector:
+        """Where the arm that is drawn ends (3,), in m."""
+        return self._arm.end
+
+    def show(self, leaning: Leaning | None) -> None:
+        """Draw an arm that leans; None: take it away."""
+        if leaning is None:
+            self._arm.visible = self._ellipsoid.visible = False
+            self._forces.points = NOWHERE
+            return
+        found = leaning.equilibrium
+        self._arm.show(leaning.robot, found.pressures, found)
+        self._show_ellipsoids(leaning)
+        largest = max((np.linalg.norm(each.force) for each in found.contacts), default=1.0)
+        ends = [
+            (each.position - _ARROW_SHARE * self._length * each.force / largest, each.position)
+            for each in found.contacts
+        ]
+        self._forces.points = np.array(ends, dtype=np.float32) if ends else NOWHERE
+
+    def _show_ellipsoids(self, leaning: Leaning) -> None:
+        """The braced one, to the scale of the free arm's, which is drawn with the answer."""
+        pose = leaning.equilibrium.tip_pose
+        braced = StiffnessEllipsoid.of(leaning.equilibrium.tip_compliance, pose[:3, :3])
+        p = leaning.equilibrium.pressures
+        free = StiffnessEllipsoid.of(leaning.robot.tip_compliance(p), np.eye(3))
+        scale = _ELLIPSOID_SHARE * self._length / np.sqrt(free.stiffnesses.max())
+        place(self._ellipsoid, pose[:3, 3])
+        turn(self._ellipsoid, lie.quaternion_from_rotation(braced.axes))
+        self._ellipsoid.scale = tuple((scale * np.sqrt(braced.stiffnesses)).tolist())
+        self._ellipsoid.visible = True

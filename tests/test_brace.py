@@ -1,0 +1,276 @@
+"""Leaning on objects to be stiff: the part ``brace`` of tasks, its search, and what it answers."""
+
+from __future__ import annotations
+
+import json
+import pickle
+from collections.abc import Iterator
+from dataclasses import replace
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+import stiffopt
+from stiffopt.cli.main import main
+from stiffopt.cli.solve_report import block
+from stiffopt.cli.solved_task import SolvedTask
+from stiffopt.control.checks import check_task
+from stiffopt.errors import CommandError, DerivativeError, InputError
+from stiffopt.optimise import braced
+from stiffopt.optimise.leaning import MARGIN_ON, BracedProblem
+from stiffopt.optimise.settings import BRACE, Effort
+from stiffopt.rig.interface import PressureLimits
+
+POST = """
+    - name: post
+      capsule: {from: [-35 mm, -60 mm, 100 mm], to: [-35 mm, 60 mm, 100 mm], radius: 5 mm}
+      contact: {allowed: true, max_force: 0.3 N, friction: 0.2}
+"""
+TASK = f"""format: stiffopt-task/1
+robot: stiff-flop-2
+target: {{position: [-30 mm, 10 mm, 190 mm]}}
+stiffness: {{maximise: {{direction: [1, 0, 0]}}}}
+brace: {{objects: [post], margin: 20 mN}}
+scene:
+  clearance: 1 mm
+  objects:{POST}"""
+RIB = """    - {name: rib, sphere: {centre: [-32 mm, 30 mm, 140 mm], radius: 5 mm}}
+"""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_starts() -> Iterator[None]:
+    """A search of few starts: all of it is what `benchmarks/brace.py` looks at."""
+    with pytest.MonkeyPatch.context() as patch:
+        few = replace(BRACE, effort=Effort(3, 1, 2), screened=256)
+        patch.setattr(braced, "BRACE", few)
+        yield
+
+
+@pytest.fixture(scope="module")
+def robot() -> stiffopt.Manipulator:
+    return stiffopt.load_robot("stiff-flop-2")
+
+
+def written(folder: Path, text: str) -> Path:
+    file = folder / "lean.yaml"
+    file.write_text(text)
+    return file
+
+
+@pytest.fixture(scope="module")
+def task(tmp_path_factory: pytest.TempPathFactory) -> stiffopt.Task:
+    return stiffopt.load_task(written(tmp_path_factory.mktemp("brace"), TASK))
+
+
+@pytest.fixture(scope="module")
+def solution(robot: stiffopt.Manipulator, task: stiffopt.Task) -> stiffopt.PressureSolution:
+    return stiffopt.solve_pressure(robot, task)
+
+
+def test_an_answer_holds_at_the_equilibrium_that_is_reached_from_rest(robot, task, solution):
+    assert solution.found
+    assert solution.pressures is not None
+    post = stiffopt.Scene(objects=task.scene.objects)
+    eq = robot.contact_equilibrium(solution.pressures, post)
+    assert np.linalg.norm(eq.tip_pose[:3, 3] - [-0.03, 0.01, 0.19]) <= 1e-4
+    assert solution.position_error <= 1e-4
+    assert solution.stiffness == pytest.approx(eq.stiffness([1, 0, 0]), rel=1e-9)
+    (contact,) = eq.contacts
+    assert np.linalg.norm(contact.force) <= 0.3
+    assert eq.stable
+    for way in ([1, 0, 0], [-1, 0, 0]):
+        assert eq.lift_off(way).force >= 0.02
+    assert (solution.pressures >= 0).all()
+    assert (solution.pressures <= 1.5e5).all()
+
+
+def test_leaning_is_several_times_as_stiff_as_the_answer_that_keeps_clear(robot, task, solution):
+    free = stiffopt.solve_pressure(robot, task.unbraced)
+    assert solution.stiffness_free == pytest.approx(free.stiffness, rel=1e-6)
+    assert solution.stiffness > 4 * free.stiffness
+    assert solution.free.clearance >= 1e-3 - 1e-5
+    assert solution.clearance is None  # there is no other object
+    assert solution.limited_by
+
+
+def test_nothing_stiffer_is_next_to_an_answer(robot, task, solution):
+    """First-order: no step that all constraints allow gains more than a thousandth."""
+    problem = BracedProblem(robot, task)
+    rng = np.random.default_rng(3)
+    problem.here = solution.equilibrium
+    point = problem.point(solution.pressures / problem.unit)
+    for _ in range(12):
+        d = rng.normal(size=6)
+        d -= np.linalg.pinv(point.jacobian[:3]) @ (point.jacobian[:3] @ d)
+        d *= 3e-3 / np.linalg.norm(d)
+        x = np.clip(point.x + d, problem.lower, problem.upper)
+        problem.here = solution.equilibrium
+        there = problem.point(x)
+        margins = zip(there.constraints, there.errors, strict=True)
+        if all(error <= c.radius for c, error in margins if c.name != "position"):
+            off = max(0.0, there.errors[0] - point.errors[0])
+            gained = point.terms[0] - there.terms[0]
+            assert gained < 2e-3 + 300 * off
+
+
+def test_derivatives_are_differences(robot, task, solution):
+    problem = BracedProblem(robot, task)
+    x = solution.pressures / problem.unit
+    problem.here = solution.equilibrium
+    point = problem.point(x)
+    for k in (0, 3, 5):
+        sides = []
+        for sign in (1, -1):
+            problem.here = solution.equilibrium
+            sides.append(problem.point(x + sign * 1e-3 * np.eye(6)[k]))
+        for name in ("residual", "terms"):
+            slope = (getattr(sides[0], name) - getattr(sides[1], name)) / 2e-3
+            found = point.jacobian[:, k] if name == "residual" else point.term_gradients[:, k]
+            np.testing.assert_allclose(found, slope, rtol=0.02, atol=2e-3)
+
+
+def test_a_larger_margin_costs_stiffness_and_is_held(robot, task, solution):
+    held = min(each.loss.force for each in solution.preloads if each.contacts == "sliding")
+    brace = task.brace.model_copy(update={"margin": 1.02 * held})
+    given = task.model_copy(update={"brace": brace})
+    found = stiffopt.solve_pressure(robot, given, guess=solution.pressures)
+    assert found.found
+    assert found.contacts
+    least = min(each.loss.force for each in found.preloads if each.contacts == "sliding")
+    assert least >= brace.margin
+    assert found.stiffness < solution.stiffness
+    assert f"{MARGIN_ON}post" in found.limited_by
+
+
+def test_a_margin_that_no_contact_holds_leaves_the_free_answer(robot, task):
+    brace = task.brace.model_copy(update={"margin": 5.0})
+    found = stiffopt.solve_pressure(robot, task.model_copy(update={"brace": brace}))
+    assert found.found
+    assert not found.contacts
+    assert found.stiffness == found.stiffness_free
+    assert "no way to lean on 'post' was found" in found.message
+
+
+def test_objects_that_are_not_named_keep_their_clearance(robot, solution, tmp_path):
+    task = stiffopt.load_task(written(tmp_path, TASK + RIB))
+    found = stiffopt.solve_pressure(robot, task, guess=solution.pressures)
+    assert found.found
+    assert {each.object for each in found.contacts} == {"post"}
+    points = found.equilibrium.backbone(400)
+    distance = np.linalg.norm(points - [-0.032, 0.03, 0.14], axis=1).min() - 0.005 - 0.015
+    assert distance >= 1e-3 - 2e-5
+    assert found.clearance == pytest.approx(distance, abs=2e-5)
+    assert found.nearest_object == "rib"
+
+
+def test_sticking_contacts_hold_the_margin_without_slipping(robot, task, solution):
+    brace = task.brace.model_copy(update={"contacts": "sticking"})
+    scene = task.scene.objects[0]
+    rough = scene.contact.model_copy(update={"friction": 0.6})
+    scene = stiffopt.Scene(objects=[scene.model_copy(update={"contact": rough})])
+    given = task.model_copy(update={"brace": brace, "scene": scene})
+    found = stiffopt.solve_pressure(robot, given, guess=solution.pressures)
+    assert found.found
+    assert found.contacts
+    eq = found.equilibrium
+    assert found.stiffness == pytest.approx(eq.stiffness([1, 0, 0], contacts="sticking"), rel=1e-9)
+    for way in ([1, 0, 0], [-1, 0, 0]):
+        assert eq.lift_off(way, contacts="sticking").force >= 0.02 * (1 - 1e-6)
+
+
+def test_a_guess_is_where_the_search_begins(robot, task, solution):
+    again = stiffopt.solve_pressure(robot, task, guess=solution.pressures)
+    assert again.found
+    assert again.stiffness == pytest.approx(solution.stiffness, rel=2e-3)
+    assert str(again.confidence).startswith("local answer")
+
+
+def test_a_search_that_is_ended_keeps_the_free_answer(robot, task):
+    calls = iter(range(10**6))
+    found = stiffopt.solve_pressure(robot, task, cancel=lambda: next(calls) > 2)
+    assert found.status in {"solved", "failed"}
+    assert not found.contacts
+    assert "ended" in found.message or "cancelled" in found.message
+
+
+def test_other_ways_to_solve_lean_too(robot, task, solution):
+    solver = stiffopt.PressureSolver(robot, task)
+    assert solver.solve_at_once() is None
+    assert solver.reachable()
+    answer = solver.warm(None, solution.pressures)
+    assert answer.found
+    assert answer.solution.contacts
+    (batched,) = stiffopt.solve_batch(robot, [task], [solution.pressures])
+    assert batched.contacts
+
+
+def test_an_answer_can_be_copied_and_has_no_derivatives(solution):
+    copied = pickle.loads(pickle.dumps(solution))
+    assert copied.contacts[0].object == "post"
+    np.testing.assert_allclose(copied.equilibrium.tip_pose, solution.equilibrium.tip_pose)
+    with pytest.raises(DerivativeError, match="leans on objects"):
+        solution.gradient("stiffness", by="target")
+    assert "leaning on 'post' with 0." in repr(solution)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("objects: [post]", "objects: [pots]", "no object 'pots' in the scene; it has 'post'"),
+        ("objects: [post]", "objects: [post, post]", "names 'post' twice"),
+        ("objects: [post]", "objects: []", "brace.objects"),
+        ("allowed: true", "allowed: false", "'post' may not be touched"),
+        ("margin: 20 mN", "margin: 0 N", "brace.margin"),
+        ("margin: 20 mN", "margin: 20", "bare number"),
+        ("stiffness: {maximise: {direction: [1, 0, 0]}}\n", "", "needs stiffness.maximise"),
+        ("{maximise: {", "{at_least: {value: 1 N/m, ", "needs stiffness.maximise"),
+        ("[1, 0, 0]}}", "[1, 0, 0], kind: rotation}}", "against translation"),
+        ("brace:", "press: {force: 30 mN, direction: [1, 0, 0]}\nbrace:", "with press"),
+    ],
+)
+def test_refusals(tmp_path, old, new, message):
+    text = TASK.replace(old, new)
+    assert text != TASK
+    with pytest.raises(InputError, match=r"brace|margin") as caught:
+        stiffopt.load_task(written(tmp_path, text))
+    assert message in str(caught.value)
+
+
+def test_a_brace_needs_a_scene(tmp_path):
+    with pytest.raises(InputError, match="brace: needs a scene"):
+        stiffopt.load_task(written(tmp_path, TASK[: TASK.index("scene:")]))
+
+
+def test_the_daemon_refuses_a_brace(task):
+    with pytest.raises((CommandError, InputError), match="does not hold an arm that leans"):
+        check_task(task, PressureLimits([0.0] * 6, [1.5e5] * 6))
+
+
+def test_json_files_and_picture(tmp_path, capsys):
+    file, picture, results = written(tmp_path, TASK), tmp_path / "a.png", tmp_path / "out.yaml"
+    outputs = ["--plot", str(picture), "--out", str(results)]
+    assert main(["solve", "--json", str(file), *outputs]) == 0
+    said: dict[str, Any] = json.loads(capsys.readouterr().out)
+    (contact,) = said["contacts"]
+    assert contact["object"] == "post"
+    assert 0.08 < contact["at_m"] < 0.12
+    assert len(contact["force_n"]) == 3
+    assert said["stiffness"] > 4 * said["stiffness_free"]
+    assert {each["how"] for each in said["preload"]} <= {"lifts off", "slips", "holds", "snaps"}
+    assert said["clearance_m"] is None
+    assert picture.stat().st_size > 20000
+    assert "stiffness_free" in results.read_text()
+
+
+def test_the_table_tells_where_it_leans_and_what_that_gives(robot, solution):
+    text = StringIO()
+    Console(file=text, width=100).print(block(SolvedTask("lean.yaml", robot, solution)))
+    words = ("leans on", "'post' at 100", "of at most 0.3 N", "clear of it", "times as stiff",
+             "'post' lifts off", "limited by")  # fmt: skip
+    for each in words:
+        assert each in text.getvalue()
