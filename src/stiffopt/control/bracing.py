@@ -25,8 +25,6 @@ from numpy.typing import NDArray
 from stiffopt.control.interface import Notice
 from stiffopt.control.state import Severity
 from stiffopt.control.tuning import BracingTuning
-from stiffopt.errors import EquilibriumError
-from stiffopt.model.contact.equilibrium import ContactEquilibrium
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import Task
 from stiffopt.optimise.tip import TipAt
@@ -68,7 +66,8 @@ class Bracing:
 
     def __init__(self, task: Task, tuning: BracingTuning) -> None:
         self.task, self._tuning = task, tuning
-        self.phase, self.next = BracePhase.PLANNING, None
+        self.phase = BracePhase.PLANNING
+        self.next: Task | None = None
         self.force = self.margin = math.nan
         self.push, self.displacement = np.zeros(3), np.zeros(3)
         self._error: Array | None = None  # b (3,)
@@ -81,6 +80,7 @@ class Bracing:
         self._waited = 0.0  # at its end, in s
         self._change: Array = np.zeros(0)  # of the planned pressures (n,), to be at the target
         self._free = 0  # samples in a row at which the tip is rather where a free arm has it
+        self._slips = False
         self._lost = 0  # looks in a row at which the model's contacts do not hold
         self._looked = 0.0  # since it was looked what the contacts hold, in s
         self._why = ""
@@ -124,9 +124,9 @@ class Bracing:
             text = "goes back on the way that it came"
             if why:
                 text = f"{why}; the arm {text}, and stays at rest until there is a new task"
-                self._told.append(Notice("brace-lost", text, Severity.ERROR))
+                self._tell("brace-lost", text, Severity.ERROR)
             else:
-                self._told.append(Notice("release", f"the arm lets go: it {text}", Severity.INFO))
+                self._tell("release", f"the arm lets go: it {text}")
         elif self.phase is not BracePhase.RELEASING:
             self.phase = BracePhase.RELEASED
 
@@ -145,7 +145,7 @@ class Bracing:
             self._waited = self._waited + elapsed if done else 0.0
             if self._waited >= t.settle:
                 self.phase = BracePhase.HELD
-                self._told.append(Notice("braced", self._words(approach), Severity.INFO))
+                self._tell("braced", self._words(approach))
         elif self.phase is BracePhase.RELEASING:
             self._time = max(0.0, self._time - elapsed)
             if not self._time and is_there:
@@ -159,9 +159,7 @@ class Bracing:
         ]
         return f"the arm leans on {' and '.join(where)}"
 
-    def look(
-        self, elapsed: float, seen: Array, tip: TipAt, equilibrium: ContactEquilibrium
-    ) -> None:
+    def look(self, elapsed: float, seen: Array, tip: TipAt, pressures: Array) -> None:
         """Look whether the contacts hold, at a sample of the tracker.
 
         A tip that is nearer to where the free arm would have it is in contact no more, whatever
@@ -173,8 +171,10 @@ class Bracing:
             Since the last sample, in s.
         seen :
             Position (3,) of the tip, in m.
-        tip, equilibrium :
+        tip :
             Of the braced arm at the present pressures.
+        pressures :
+            Effective ones (n,), in Pa.
         """
         if self.phase is not BracePhase.HELD or self.approach is None:
             return
@@ -185,7 +185,7 @@ class Bracing:
             residual - self._residual
         )
         residual = self._residual
-        apart = self.approach.free_tip - self.approach.tip_poses[-1][:3, 3]
+        apart = self.approach.free_tip - self.approach.tips[-1].pose[:3, 3]
         distance = float(np.linalg.norm(apart))
         share = float(residual @ apart) / max(distance, 1e-9) ** 2
         is_free = distance > t.told_apart and share > t.free_share
@@ -200,7 +200,7 @@ class Bracing:
             self._error = self._error + min(elapsed / time, 1.0) * off
             self._pushed = self._pushed * float(np.linalg.norm(off) > t.felt)
             self.push = self.displacement = np.zeros(3)
-            self.force, self.margin = _least_force(equilibrium), math.nan
+            self.force, self.margin = float(self._forces(pressures).min()), math.nan
             return
         self._pushed += elapsed
         R = tip.pose[:3, :3]
@@ -211,26 +211,43 @@ class Bracing:
         self._looked += elapsed
         if self._looked >= t.every:
             self._looked = 0.0
-            self._judge(equilibrium)
+            self._judge(self._forces(pressures))
 
-    def _judge(self, equilibrium: ContactEquilibrium) -> None:
-        """Whether the contacts hold the push."""
-        size = float(np.linalg.norm(self.push))
-        loss = equilibrium.lift_off(self.push / size, contacts="sticking")
-        try:
-            self.force = _least_force(equilibrium.shifted(push=self.push))
-        except EquilibriumError:
-            self.force = math.nan
-        self.margin = max(loss.force - size, 0.0)
-        how = "lifts off" if self.force <= 0 else "" if self.margin else loss.how
+    def _forces(self, pressures: Array) -> Array:
+        """Normal forces (k,) of the contacts at pressures (n,), without a push."""
+        assert self.approach is not None
+        hold, planned = self.approach.hold, self.approach.pressures[-1]
+        found: Array = hold.forces + hold.per_pressure @ (pressures - planned)
+        return found
+
+    def _judge(self, before: Array) -> None:
+        """Whether the contacts, with these normal forces (k,) before, hold the push."""
+        assert self.approach is not None
+        assert self.task.brace is not None
+        hold, size = self.approach.hold, float(np.linalg.norm(self.push))
+        change = hold.per_push @ self.push
+        forces = before + change
+        least = int(forces.argmin())
+        falls = change < 0
+        left = size * float(np.min(forces[falls] / -change[falls], initial=math.inf))
+        slip = float(hold.slips[int(np.argmax(hold.directions @ self.push))]) - size
+        sticks = self.task.brace.contacts == "sticking"
+        self.force = float(forces[least])
+        self.margin = max(min(left, slip) if sticks else left, 0.0)
+        how = "lifts off" if self.force <= 0 else "slips" if sticks and slip <= 0 else ""
         self._lost = self._lost + 1 if how else 0
+        where = f"on '{self.approach.contacts[least].object}'"
+        words = f"under a push of {1e3 * size:.0f} mN"
         if self._lost >= self._tuning.looks:
-            name = f"'{loss.object}'" if loss.object else "an object"
-            self.release(why=f"a contact on {name} {how} under a push of {1e3 * size:.0f} mN")
+            self.release(why=f"the contact {where} {how} {words}")
+        elif slip <= 0 and not self._slips:
+            self._tell("brace-slips", f"the contact {where} slips {words}", Severity.WARNING)
+        self._slips = slip <= 0
 
-    def correct(
-        self, elapsed: float, error: Array, jacobian: Array, equilibrium: ContactEquilibrium
-    ) -> None:
+    def _tell(self, kind: str, text: str, severity: Severity = Severity.INFO) -> None:
+        self._told.append(Notice(kind, text, severity))
+
+    def correct(self, elapsed: float, error: Array, jacobian: Array) -> None:
         """Bring the braced tip to its target, slowly, with contact forces that stay as they are.
 
         Parameters
@@ -241,13 +258,11 @@ class Bracing:
             Of the tip (3,), in m, zero in components that the target leaves open.
         jacobian :
             Of the braced tip's position, base axes (3, n), in m/Pa.
-        equilibrium :
-            At the present pressures.
         """
-        if self.displacement.any():  # nothing is to be made up for that pushes the tip
+        if self.displacement.any() or self.approach is None:  # a push is not made up for
             return
         t = self._tuning
-        rows = np.vstack([jacobian, t.force_weight * equilibrium.force_gradients])
+        rows = np.vstack([jacobian, t.force_weight * self.approach.hold.per_pressure])
         wanted = np.concatenate([error, np.zeros(len(rows) - 3)])
         H = rows.T @ rows + t.pressure_weight**2 * np.eye(rows.shape[1])
         step = np.linalg.solve(H, rows.T @ wanted) * elapsed / t.time
@@ -259,8 +274,3 @@ class Bracing:
         if self._why and self.phase in (BracePhase.RELEASING, BracePhase.RELEASED):
             told = (*told, Notice("brace-lost", self._why, Severity.ERROR, standing=True))
         return told
-
-
-def _least_force(equilibrium: ContactEquilibrium) -> float:
-    forces = equilibrium.normal_forces
-    return float(forces.min()) if len(forces) else math.nan

@@ -75,10 +75,6 @@ def check_task(task: Task, limits: PressureLimits) -> None:
     """Refuse a task that is not valid or needs pressures beyond the limits."""
     with refusing("task"):
         limited_range(validated(task, Task).pressure, limits)
-        if task.brace is not None:
-            raise InputError(
-                "brace: the daemon does not hold an arm that leans on objects; leave 'brace' out"
-            )
 
 
 def check_target(target: Target) -> None:

@@ -410,11 +410,10 @@ class TipController:
         counts = self._estimator.take(samples)
         sample = self._estimator.sample
         if counts.used and sample is not None:
-            bracing, leaning = self._bracing, self._leaning
-            if bracing is not None and leaning is not None:
-                assert leaning.equilibrium is not None  # the tip was evaluated
+            bracing = self._bracing
+            if bracing is not None and self._leaning is not None:
                 elapsed = sample.time - self._looked_at
-                bracing.look(elapsed, sample.position, tip, leaning.equilibrium)
+                bracing.look(elapsed, sample.position, tip, effective)
                 self._looked_at = sample.time
             else:
                 self._feel(sample, effective, tip)
@@ -551,7 +550,7 @@ class TipController:
         is_there = not self._is_held(now) and self._is_near(before)
         course.advance(min(now - self._computed_at, _HELD * self._period), is_there)
         if course.leans is not (self._leaning is not None) and course.approach is not None:
-            self._lean_on(course.approach.scene if course.leans else None)
+            self._lean_on(LeaningTip(course.approach) if course.leans else None)
         if course.phase is BracePhase.RELEASED and course.next is not None:
             self.set_task(course.next)
             return self._plan(now)
@@ -569,25 +568,20 @@ class TipController:
 
     def _correct_brace(self, course: Bracing, now: float) -> None:
         """Bring the braced tip to its target."""
-        tip, leaning = self._tip, self._leaning
-        if tip is None or leaning is None or leaning.equilibrium is None:
-            return
+        tip = self._tip
         wanted, _, _ = target_arrays(course.task.target)
-        if wanted is None or not leaning.equilibrium.contacts:
+        if tip is None or wanted is None:
             return
         error = np.nan_to_num(wanted - self._estimator.position)
-        jacobian = tip.pose[:3, :3] @ tip.jacobian[:3]
-        course.correct(
-            min(now - self._computed_at, _HELD * self._period), error, jacobian,
-            leaning.equilibrium,
-        )  # fmt: skip
+        elapsed = min(now - self._computed_at, _HELD * self._period)
+        course.correct(elapsed, error, tip.pose[:3, :3] @ tip.jacobian[:3])
 
-    def _lean_on(self, scene: Scene | None) -> None:
-        """Go on with the model of an arm that leans on a scene; None: of the free one."""
+    def _lean_on(self, leaning: LeaningTip | None) -> None:
+        """Go on with the model of an arm that leans on objects; None: of the free one."""
         model, effective = self._models()[0], self._pressures.effective
         before = model.at(effective)
-        self._leaning = None if scene is None else LeaningTip(self._robot, scene)
-        model.lean(self._leaning)
+        self._leaning = leaning
+        model.lean(leaning)
         self._tip = model.at(effective)
         self._shift(before, self._tip)
         self._touch.begin()

@@ -12,43 +12,36 @@ from numpy.typing import NDArray
 
 from stiffopt.control.formula import Formula
 from stiffopt.errors import EquilibriumError, PressureError, StiffoptError
-from stiffopt.model.contact.equilibrium import ContactEquilibrium
 from stiffopt.model.manipulator import Manipulator
-from stiffopt.model.scene import Scene
 from stiffopt.optimise.tip import TipAt, TipModel
+from stiffopt.paths.leaning import BraceApproach
 
 Array = NDArray[np.float64]
 
-_LEANING = 4.0  # times the range of a free arm: equilibria in contact take milliseconds
-
 
 class LeaningTip:
-    """The tip of an arm that may lean on objects, each equilibrium followed from the one before.
+    """The tip of an arm on its way into contact, of equilibria that were found before.
 
     Parameters
     ----------
-    robot, scene :
-        The arm, and the objects that it may lean on.
-
-    Attributes
-    ----------
-    equilibrium : the last one, or None before the first.
+    approach :
+        The way; pressures beside it belong to the nearest of its equilibria.
     """
 
-    def __init__(self, robot: Manipulator, scene: Scene) -> None:
-        self._robot, self._scene = robot, scene
-        self.equilibrium: ContactEquilibrium | None = None
+    def __init__(self, approach: BraceApproach) -> None:
+        self._approach, end = approach, approach.pressures[-1]
+        self._along = end / float(end @ end)
 
     def at(self, pressures: Array) -> TipAt:
-        """Return the braced tip at pressures (n,), in Pa; `EquilibriumError` if there is none."""
-        try:
-            found = self._robot.contact_equilibrium(pressures, self._scene, nearby=self.equilibrium)
-        except EquilibriumError:
-            if self.equilibrium is None:
-                raise
-            found = self._robot.contact_equilibrium(pressures, self._scene)  # from rest
-        self.equilibrium = found
-        return TipAt(found.tip_pose, found.tip_jacobian, found.tip_compliance)
+        """Return the tip at pressures (n,), in Pa, linear about the nearest equilibrium."""
+        approach = self._approach
+        share = min(max(float(self._along @ pressures), 0.0), 1.0)
+        index = round(share * (len(approach.tips) - 1))
+        tip = approach.tips[index]
+        pose = tip.pose.copy()
+        change = tip.jacobian[:3] @ (pressures - approach.pressures[index])
+        pose[:3, 3] += pose[:3, :3] @ change
+        return TipAt(pose, tip.jacobian, tip.compliance)
 
 
 class LinearisedTip:
@@ -97,8 +90,7 @@ class LinearisedTip:
             p, _, _ = self._linearisation(pressures, there, np.eye(4), np.zeros((6, len(there))))
         else:
             p, distance, pose = self._linearisation(pressures, there, tip.pose, tip.jacobian)
-            factor = 1.0 if self._leaning is None else _LEANING
-            if distance[0] < factor * self._linear_range:
+            if distance[0] < self._linear_range and self._leaning is None:
                 return TipAt(pose, tip.jacobian, tip.compliance)
         try:
             self._tip = (self._leaning or self._model).at(p)

@@ -266,7 +266,7 @@ class PlanningEnd:
         if isinstance(answer, Plan):
             names = (
                 *("reached", "stiffness", "message", "far", "blocked", "doubt"),
-                *("deviation", "estimate"),
+                *("deviation", "estimate", "approach"),
             )
             own = {name: getattr(answer, name) for name in names}
             self.connection.send({"pressures": answer.pressures.tolist(), **own})

@@ -8,6 +8,8 @@ so that the motion ends in the wanted one or is refused. Played backwards it let
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +22,7 @@ from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.scene import Scene
 from stiffopt.optimise.brace import kept_clear_of, leant_on, quoted
 from stiffopt.optimise.solution import PressureSolution
+from stiffopt.optimise.tip import TipAt
 from stiffopt.paths.configurations import Unsolved
 
 Vector = NDArray[np.float64]
@@ -29,7 +32,27 @@ FORCE_RATE = 0.1  # N/s, at which the force of a contact grows
 _STATES = 61  # of the way that are looked at
 _STATIONS = 41  # of the body
 _SAME = 2e-4  # m, between tips of one equilibrium that was reached on two ways
+_PUSH = 2e-3  # N, of the differences by which forces change with a push at the tip
 _FORGIVEN = 1e-4  # m, by which the body may be nearer to other objects than the clearance
+
+
+class Hold(NamedTuple):
+    """What the contacts of a braced equilibrium hold, k of them, linear about it.
+
+    Attributes
+    ----------
+    forces : along the normals (k,), in N.
+    per_pressure : their change with the pressures (k, n), in N/Pa.
+    per_push : their change with a force at the tip (k, 3), in base axes.
+    directions : unit vectors (m, 3), base axes, in which the tip may be pushed.
+    slips : push in each of them by which a contact slips (m,), in N; infinite where none does.
+    """
+
+    forces: Vector
+    per_pressure: Vector
+    per_push: Vector
+    directions: Vector
+    slips: Vector
 
 
 @dataclass(frozen=True)
@@ -40,20 +63,20 @@ class BraceApproach:
     ----------
     times : (k,), in s.
     pressures : (k, n), in Pa: from none, in proportion.
-    tip_poses : (k, 4, 4), in contact from where the arm touches something.
+    tips : of the equilibria on the way, with their Jacobians and compliances.
     forces : greatest force of a contact (k,), in N.
     contacts : at the end.
+    hold : what they hold.
     free_tip : where the tip would be at the end without contact (3,), in m.
-    scene : the objects that the arm leans on.
     """
 
     times: Vector
     pressures: Vector
-    tip_poses: Vector
+    tips: tuple[TipAt, ...]
     forces: Vector
     contacts: tuple[Contact, ...]
+    hold: Hold
     free_tip: Vector
-    scene: Scene
 
 
 def approach_to(
@@ -114,12 +137,24 @@ def approach_to(
     return BraceApproach(
         times=np.concatenate([[0.0], np.cumsum(np.maximum(least, 1e-3))]),
         pressures=shares[:, None] * p,
-        tip_poses=np.array([eq.tip_pose for eq in states]),
+        tips=tuple(TipAt(eq.tip_pose, eq.tip_jacobian, eq.tip_compliance) for eq in states),
         forces=forces,
         contacts=end.contacts,
+        hold=_hold(end),
         free_tip=robot.tip_pose(p)[:3, 3],
-        scene=scene,
     )
+
+
+def _hold(eq: ContactEquilibrium) -> Hold:
+    pushed = [
+        (eq.shifted(push=step).normal_forces - eq.shifted(push=-step).normal_forces) / (2 * _PUSH)
+        for step in _PUSH * np.eye(3)
+    ]
+    ways = np.array([way for way in product((-1.0, 0.0, 1.0), repeat=3) if any(way)])
+    ways /= np.linalg.norm(ways, axis=1, keepdims=True)
+    losses = [eq.lift_off(way, contacts="sticking") for way in ways]
+    slips = [loss.force if loss.how == "slips" else np.inf for loss in losses]
+    return Hold(eq.normal_forces, eq.force_gradients, np.array(pushed).T, ways, np.array(slips))
 
 
 def _largest(eq: ContactEquilibrium) -> float:
