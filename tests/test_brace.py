@@ -18,12 +18,10 @@ import stiffopt
 from stiffopt.cli.main import main
 from stiffopt.cli.solve_report import block
 from stiffopt.cli.solved_task import SolvedTask
-from stiffopt.control.checks import check_task
-from stiffopt.errors import CommandError, DerivativeError, InputError
+from stiffopt.errors import DerivativeError, InputError
 from stiffopt.optimise import braced
 from stiffopt.optimise.leaning import MARGIN_ON, BracedProblem
 from stiffopt.optimise.settings import BRACE, Effort
-from stiffopt.rig.interface import PressureLimits
 
 POST = """
     - name: post
@@ -244,11 +242,6 @@ def test_refusals(tmp_path, old, new, message):
 def test_a_brace_needs_a_scene(tmp_path):
     with pytest.raises(InputError, match="brace: needs a scene"):
         stiffopt.load_task(written(tmp_path, TASK[: TASK.index("scene:")]))
-
-
-def test_the_daemon_refuses_a_brace(task):
-    with pytest.raises((CommandError, InputError), match="does not hold an arm that leans"):
-        check_task(task, PressureLimits([0.0] * 6, [1.5e5] * 6))
 
 
 def test_json_files_and_picture(tmp_path, capsys):

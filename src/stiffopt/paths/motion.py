@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from time import perf_counter
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stiffopt.display import display_units
-from stiffopt.errors import EquilibriumError, StoppedError
+from stiffopt.errors import EquilibriumError, InputError, StoppedError
 from stiffopt.model.compiled import Stopwatch
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.motion_clearance import MOTION_ERROR, ClearMotions
 from stiffopt.model.scene import Scene
 from stiffopt.model.stopping import giving_up
 from stiffopt.optimise.goal import StiffnessMeasure
+from stiffopt.optimise.solver import solve_pressure
 from stiffopt.optimise.task import Load, Task
 from stiffopt.paths.configurations import (
     Configuration,
@@ -24,7 +26,9 @@ from stiffopt.paths.configurations import (
     TaskConfigurations,
     Unsolved,
     maximised,
+    several,
 )
+from stiffopt.paths.leaning import approach_to
 from stiffopt.paths.motion_request import MotionRequest
 from stiffopt.paths.rates import least_times
 from stiffopt.paths.shortening import rounded, shortened
@@ -70,7 +74,8 @@ def plan_motion(
         A task means all configurations that solve it: the stiffest, and others.  The stiffest to
         which the straight way is clear is taken; if there is none, whichever the trees reach.
         Where that one is softer than 0.95 of the best that is known, as many motions again are
-        tried to reach one that is not.
+        tried to reach one that is not.  A single task with a brace that does better to lean: the
+        motion goes to rest first, and from there into contact (`stiffopt.paths.leaning`).
     scene : Scene, optional
         Instead of that of the tasks.  Without any, the way is straight.
     clearance : float, optional
@@ -97,6 +102,16 @@ def plan_motion(
     MissingExtraError
         The straight way is not clear, and OMPL is not installed.
     """
+    goals = several(goal)
+    if any(isinstance(each, Task) and each.brace is not None for each in (start, *goals)):
+        if not (len(goals) == 1 and isinstance(goals[0], Task) and goals[0].brace is not None):
+            raise InputError(
+                "a task with 'brace' can be the only goal of a motion, and not its start: played "
+                "backwards, the motion there lets go"
+            )
+        task = goals[0] if scene is None else goals[0].model_copy(update={"scene": scene})
+        options: dict[str, Any] = {"clearance": clearance, "load": load, "seed": seed}
+        return _leaning(robot, start, task, slew, options | {"timeout": timeout})
     watch = Stopwatch()
     request = MotionRequest.of(robot, start, goal, scene, clearance, slew, load, seed)
     timings: dict[str, float] = {}
@@ -111,6 +126,39 @@ def plan_motion(
         found = request.without_answer(str(error), "failed")
     found.timings.update(timings | watch.timings())
     return found
+
+
+def _leaning(
+    robot: Manipulator, start: End, goal: Task, slew: Any, options: dict[str, Any]
+) -> PathSolution:
+    """A motion to a task with a brace: to rest, clear of its scene, and from there into contact."""
+    found = solve_pressure(robot, goal)
+    if found.pressures is None or not found.contacts:  # it keeps clear, or there is no answer
+        return plan_motion(robot, start, goal.unbraced, slew=slew, **options)
+    rest = np.zeros(robot.n_pressures)
+    down = plan_motion(robot, start, rest, scene=goal.scene, slew=slew, **options)
+    if not down.found:
+        return down
+    try:
+        way = approach_to(robot, found, np.inf if down.slew is None else down.slew)
+    except Unsolved as reason:
+        own = {name: value for name, value in options.items() if name != "timeout"}
+        request = MotionRequest.of(robot, start, rest, goal.scene, slew=slew, **own)
+        return request.without_answer(str(reason), "unreachable")
+    unit = display_units().force
+    leant = " and ".join(f"'{each.object}'" for each in found.contacts)
+    return replace(
+        down,
+        message=f"from rest on into contact with {leant}, with {unit.text(way.forces[-1], '.3g')} "
+        "at the end; played backwards the motion lets go",
+        times=np.concatenate([down.times, down.times[-1] + way.times[1:]]),
+        pressures=np.concatenate([down.pressures, way.pressures[1:]]),
+        tip_poses=np.concatenate([down.tip_poses, np.array([tip.pose for tip in way.tips[1:]])]),
+        stiffness=None,
+        stiffness_unit=None,
+        clearance=None,
+        confidence=f"{down.confidence}; the equilibria in contact were followed from rest",
+    )
 
 
 @dataclass

@@ -1,0 +1,376 @@
+"""An arm that leans on objects, in the loop: the way into contact, the hold, loss and release."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+import stiffopt
+from stiffopt.control import planning
+from stiffopt.control.bracing import BracePhase, Bracing
+from stiffopt.control.controller import TipController
+from stiffopt.control.linearised_tip import LeaningTip
+from stiffopt.control.state import ControllerStatus
+from stiffopt.control.tuning import BracingTuning
+from stiffopt.errors import InputError
+from stiffopt.optimise import braced
+from stiffopt.optimise.settings import BRACE, Effort
+from stiffopt.optimise.solution import PressureSolution
+from stiffopt.optimise.solver import PressureSolver
+from stiffopt.paths.configurations import Unsolved
+from stiffopt.paths.leaning import FORCE_RATE, SPEED, BraceApproach, approach_to
+from stiffopt.paths.trajectory import Trajectory, Waypoint
+from stiffopt.plant.settings import PlantLoad, PlantSettings, Silicone
+from stiffopt.rig.assembly import make_rig
+from stiffopt.rig.config import RigDescription, limits_of, slew_of
+
+ROBOT = stiffopt.load_robot("stiff-flop-2")
+TASK = stiffopt.load_task("problems/braced/post.yaml")
+PERIOD = 0.01
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_starts() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        few = replace(BRACE, effort=Effort(3, 1, 2), screened=256)
+        patch.setattr(braced, "BRACE", few)
+        yield
+
+
+@pytest.fixture(scope="module")
+def solution() -> PressureSolution:
+    found = stiffopt.solve_pressure(ROBOT, TASK)
+    assert [each.object for each in found.contacts] == ["post"]
+    return found
+
+
+@pytest.fixture(scope="module")
+def approach(solution: PressureSolution) -> BraceApproach:
+    return approach_to(ROBOT, solution)
+
+
+# -- the way ----------------------------------------------------------------------------------
+
+
+def test_the_approach_ends_in_the_answer_slowly(solution, approach):
+    """Its equilibria are the model's, from rest; speeds and rates of force are as they say."""
+    assert not approach.pressures[0].any()
+    assert approach.pressures[-1] == pytest.approx(solution.pressures)
+    assert approach.tips[-1].pose[:3, 3] == pytest.approx(solution.tip_pose[:3, 3], abs=1e-5)
+    middle = len(approach.tips) // 2
+    eq = ROBOT.contact_equilibrium(approach.pressures[middle], TASK.scene)
+    assert approach.tips[middle].pose == pytest.approx(eq.tip_pose, abs=1e-6)
+    assert approach.forces[middle] == pytest.approx(
+        max((np.linalg.norm(each.force) for each in eq.contacts), default=0.0), abs=1e-6
+    )
+    passed = np.diff(approach.times)
+    moved = np.linalg.norm(np.diff([tip.pose[:3, 3] for tip in approach.tips], axis=0), axis=1)
+    assert (moved <= SPEED * passed * (1 + 1e-9)).all()
+    assert (np.abs(np.diff(approach.forces)) <= FORCE_RATE * passed * (1 + 1e-9)).all()
+    limited = approach_to(ROBOT, solution, np.full(6, 1e4))
+    assert limited.times[-1] == pytest.approx(solution.pressures.max() / 1e4)
+
+
+def test_what_contacts_hold_is_that_of_the_equilibrium(approach):
+    eq = ROBOT.contact_equilibrium(approach.pressures[-1], TASK.scene)
+    hold, push = approach.hold, np.array([0.02, 0.01, -0.01])
+    pushed = ROBOT.contact_equilibrium(
+        approach.pressures[-1], TASK.scene, load=[*push, 0, 0, 0]
+    ).normal_forces
+    assert hold.forces + hold.per_push @ push == pytest.approx(pushed, abs=3e-3)
+    along = int(np.argmax(hold.directions @ [1.0, 0.0, 0.0]))
+    loss = eq.lift_off([1, 0, 0], contacts="sticking")
+    assert loss.how == "slips"
+    assert hold.slips[along] == pytest.approx(loss.force, rel=1e-6)
+
+
+def test_a_way_that_is_not_clear_or_ends_elsewhere_is_refused(solution):
+    low = stiffopt.SceneObject(name="rib", sphere={"centre": (-0.045, 0, 0.17), "radius": 0.005})
+    scene = TASK.scene.model_copy(update={"objects": (*TASK.scene.objects, low)})
+    task = solution.task.model_copy(update={"scene": scene})
+    with pytest.raises(Unsolved, match="too near an object"):
+        approach_to(ROBOT, replace(solution, task=task))
+    elsewhere = solution.tip_pose.copy()
+    elsewhere[0, 3] += 0.01
+    with pytest.raises(Unsolved, match="another equilibrium: the tip is 10 mm away"):
+        approach_to(ROBOT, replace(solution, tip_pose=elsewhere))
+
+
+def test_the_tip_on_the_way_is_linear_about_equilibria(approach):
+    tip = LeaningTip(approach)
+    p = 0.97 * approach.pressures[-1] + 300.0
+    eq = ROBOT.contact_equilibrium(p, TASK.scene)
+    found = tip.at(p)
+    assert found.pose[:3, 3] == pytest.approx(eq.tip_pose[:3, 3], abs=5e-5)
+
+
+# -- the course -------------------------------------------------------------------------------
+
+
+def held(approach: BraceApproach, **brace: Any) -> Bracing:
+    task = TASK.model_copy(update={"brace": TASK.brace.model_copy(update=brace)})
+    course = Bracing(task, BracingTuning(settling=0.1))
+    course.begin(approach, np.zeros(6))
+    for _ in range(10_000):
+        course.advance(PERIOD, True)
+        if course.phase is BracePhase.HELD:
+            return course
+    raise AssertionError(course.phase)
+
+
+def samples(course: Bracing, approach: BraceApproach, off: Any, count: int) -> float | None:
+    """Look at samples of a tip that is off the braced one; when it was let go, in s."""
+    tip, p = approach.tips[-1], approach.pressures[-1]
+    for number in range(1, count + 1):
+        course.look(0.025, tip.pose[:3, 3] + off, tip, p)
+        if course.phase is BracePhase.RELEASING:
+            return 0.025 * number
+    return None
+
+
+def pushed(approach: BraceApproach, force: Any) -> Any:
+    """Displacement of the braced tip by a force."""
+    tip = approach.tips[-1]
+    R = tip.pose[:3, :3]
+    return R @ tip.compliance[:3, :3] @ R.T @ np.asarray(force)
+
+
+def test_it_goes_to_rest_leans_holds_and_goes_back(approach):
+    course = Bracing(TASK, BracingTuning())
+    assert course.phase is BracePhase.PLANNING
+    start = np.full(6, 2e4)
+    course.begin(approach, start)
+    course.advance(1.0, False)
+    assert course.pressures == pytest.approx(start * (1 - 1 / BracingTuning().to_rest))
+    course.advance(5.0, False)
+    assert course.phase is BracePhase.TO_REST, "the arm is not there yet"
+    course.advance(0.0, True)
+    assert course.leans
+    course.advance(approach.times[30], True)
+    assert course.pressures == pytest.approx(approach.pressures[30])
+    course.release(then=TASK)
+    assert course.phase is BracePhase.RELEASING
+    course.advance(approach.times[30] - approach.times[10], True)
+    assert course.pressures == pytest.approx(approach.pressures[10])
+    course.advance(100.0, True)
+    assert course.phase is BracePhase.RELEASED
+    assert course.next is TASK
+    assert not course.pressures.any()
+    assert [notice.kind for notice in course.notices()] == ["release"]
+
+
+def test_a_lift_off_is_told_within_300_ms_and_less_is_not(approach):
+    hold = approach.hold
+    way = np.array([1.0, 0.0, 0.0])
+    lifts = float(-hold.forces[0] / (hold.per_push @ way)[0])
+    assert lifts > 0
+    course = held(approach)
+    samples(course, approach, np.zeros(3), 40)
+    assert samples(course, approach, pushed(approach, 0.7 * lifts * way), 40) is None
+    assert course.force == pytest.approx(0.3 * hold.forces[0], rel=0.15)
+    assert course.margin == pytest.approx(0.3 * lifts, rel=0.15)
+    assert np.linalg.norm(course.push - 0.7 * lifts * way) < 0.15 * lifts
+    after = samples(course, approach, pushed(approach, 1.3 * lifts * way), 40)
+    assert after is not None
+    assert after <= 0.3
+    (told,) = [notice for notice in course.notices() if notice.kind == "brace-lost" and
+               not notice.standing]  # fmt: skip
+    assert "the contact on 'post' lifts off under a push of" in told.text
+    (standing,) = [notice for notice in course.notices() if notice.standing]
+    assert standing.kind == "brace-lost"
+
+
+@pytest.mark.parametrize("contacts", ["sliding", "sticking"])
+def test_a_slip_is_told_and_lets_go_where_contacts_are_to_stick(approach, contacts):
+    slips = float(approach.hold.slips[int(np.argmax(approach.hold.directions @ [1.0, 0, 0]))])
+    course = held(approach, contacts=contacts)
+    samples(course, approach, np.zeros(3), 40)
+    after = samples(course, approach, pushed(approach, (1.4 * slips, 0, 0)), 40)
+    kinds = [notice.kind for notice in course.notices()]
+    if contacts == "sliding":
+        assert after is None
+        assert kinds.count("brace-slips") == 1
+    else:
+        assert after is not None
+        assert after <= 0.3
+        assert "brace-lost" in kinds
+
+
+def test_an_arm_without_contact_is_told_whatever_pushes_it(approach):
+    course = held(approach)
+    apart = approach.free_tip - approach.tips[-1].pose[:3, 3]
+    assert np.linalg.norm(apart) > 4e-3
+    after = samples(course, approach, apart, 40)
+    assert after is not None
+    assert after <= 0.3
+    assert "where an arm without contact has it" in course.notices()[-1].text
+
+
+def test_an_error_of_the_model_and_creep_are_no_push(approach):
+    course = held(approach)
+    across = np.cross(approach.free_tip - approach.tips[-1].pose[:3, 3], [0.0, 0.0, 1.0])
+    across *= 3e-3 / np.linalg.norm(across)
+    for step in range(400):  # 0.1 mm/s
+        assert samples(course, approach, across * (1 + step * 0.025 / 30), 1) is None
+    assert not course.push.any()
+    assert math.isnan(course.margin)
+    assert course.force == pytest.approx(approach.hold.forces.min())
+
+
+def test_the_tip_goes_to_its_target_with_the_contact_force_as_it_is(approach):
+    course, tip = held(approach), approach.tips[-1]
+    linear = tip.pose[:3, :3] @ tip.jacobian[:3]
+    error = np.array([0.0, 1e-3, 0.0])
+    for _ in range(2000):
+        left = error - linear @ (course.pressures - approach.pressures[-1])
+        course.correct(PERIOD, left, linear)
+    assert np.linalg.norm(left) < 0.3 * np.linalg.norm(error)
+    change = approach.hold.per_pressure @ (course.pressures - approach.pressures[-1])
+    assert np.abs(change).max() < 0.1 * approach.hold.forces.min()
+
+
+# -- the loop ---------------------------------------------------------------------------------
+
+
+class Loop:
+    """A controller and a simulated arm without inertia, beside the post or without it."""
+
+    def __init__(self, scene: stiffopt.Scene | None = TASK.scene, **plant: Any) -> None:
+        settings = PlantSettings(
+            dynamics="quasi-static",
+            silicone=Silicone(creep=(), hysteresis=()),
+            discretisation={"step": 0.005},
+            **plant,
+        )
+        description = RigDescription(
+            robot="stiff-flop-2",
+            supply={"driver": "simulated"},
+            tracker={"driver": "simulated", "noise": 5e-5},
+            safety={"max_pressure": 1.5e5, "max_slew": 5e5},
+            scene=scene,
+            plant=settings,
+        )
+        self.rig: Any = make_rig(description, ROBOT.description)
+        self.controller = TipController(
+            ROBOT, limits_of(description, ROBOT.description),
+            slew_of(description, ROBOT.description), period=PERIOD, control=description.control,
+            safety=description.safety, vibrates=False, scene=scene,
+        )  # fmt: skip
+        self.controller.check()
+        self.command = np.zeros(6)
+        self.told: list[str] = []
+        self.rig.open()
+        self.rig.supply.arm()
+        self.controller.begin(self.rig.clock.now())
+
+    def until(self, done: Callable[[ControllerStatus], bool], within: float) -> float:
+        """Go on until something is so; how long it took, in s."""
+        controller, clock = self.controller, self.rig.clock
+        begin = clock.now()
+        while clock.now() < begin + within:
+            now = clock.now()
+            controller.observe(now, self.command, self.rig.supply.read(), self.rig.tracker.read())
+            self.command = controller.compute(now).pressures
+            self.rig.supply.command(self.command)
+            self.told += [each.kind for each in controller.notices() if not each.standing]
+            clock.sleep_until(now + PERIOD)
+            self.status = controller.status(now)
+            if done(self.status):
+                return float(clock.now() - begin)
+        raise AssertionError(f"{self.status.brace}: {self.told}")
+
+    def wait(self, seconds: float) -> None:
+        """Go on for so long."""
+        end = self.rig.clock.now() + seconds
+        self.until(lambda _: self.rig.clock.now() >= end, seconds + 1.0)
+
+    @property
+    def force(self) -> float:
+        forces = self.rig.world.plant.object_forces()
+        return sum(float(np.linalg.norm(each.force)) for each in forces)
+
+
+def test_the_loop_leans_holds_tells_a_lift_off_and_lets_go(solution, approach, monkeypatch):
+    def solver(robot: Any, task: stiffopt.Task) -> Any:
+        """What was found before stands for the search."""
+        known = SimpleNamespace(solve=lambda: solution)
+        return known if task.brace is not None else PressureSolver(robot, task)
+
+    monkeypatch.setattr(planning, "PressureSolver", solver)
+    loop = Loop()
+    loop.wait(1.0)
+    loop.controller.check_ahead(TASK)
+    loop.controller.set_task(TASK)
+    loop.until(lambda s: s.brace == "held", 20.0)
+    assert loop.status.task == "brace"
+    assert loop.told == ["braced"]
+    missed = loop.status.position_error
+    loop.wait(8.0)  # in which it goes to the target
+    assert loop.status.position_error < 0.7 * missed
+    assert loop.force == pytest.approx(approach.hold.forces[0], rel=0.15)
+    assert loop.status.brace_force == pytest.approx(loop.force, rel=0.15)
+    assert not loop.status.touches
+    plant = loop.rig.world.plant
+    for push in (0.05, 0.09):
+        plant.set_load(PlantLoad(force=(push, 0, 0)))
+        loop.wait(0.5)
+        assert loop.status.wrench[0] == pytest.approx(push, rel=0.25)
+        assert loop.status.brace_force == pytest.approx(loop.force, abs=0.03)
+    for push in np.linspace(0.09, 0.3, 40):  # too slow for a tip that seems to jump
+        plant.set_load(PlantLoad(force=(push, 0, 0)))
+        loop.wait(0.05)
+        if loop.force == 0 or loop.status.brace == "releasing":
+            break
+    assert loop.until(lambda s: s.brace == "releasing", 1.0) <= 0.3
+    assert "brace-lost" in loop.told
+    plant.set_load(None)
+    loop.until(lambda s: s.brace == "released", 20.0)
+    assert loop.force == 0
+    loop.controller.set_task(TASK)  # again, and then to a target elsewhere: it lets go first
+    loop.until(lambda s: s.brace == "held", 20.0)
+    waypoint = Waypoint(time=1.0, target=TASK.target)
+    with pytest.raises(InputError, match="give it a task without 'brace' first"):
+        loop.controller.follow(Trajectory(waypoints=[waypoint]), loop.rig.clock.now())
+    free = TASK.unbraced.model_copy(update={"scene": None})
+    loop.controller.set_task(free)
+    assert loop.status.brace == "held"
+    loop.until(lambda s: s.task == "target", 20.0)
+    assert "release" in loop.told
+    assert loop.force == 0
+    loop.controller.close()
+
+
+def test_the_loop_tells_that_there_is_nothing_to_lean_on():
+    away = {"sphere": {"centre": (0.2, 0.2, 0.2), "radius": 0.01}}
+    nothing = stiffopt.Scene(objects=[{"name": "far", **away}])
+    loop = Loop(scene=nothing)
+    with pytest.raises(InputError, match=r"no object 'post' in the scene.*the rig's scene"):
+        loop.controller.check_ahead(TASK)
+    loop = Loop(scene=None)
+    with pytest.raises(InputError, match="the rig file has no scene"):
+        loop.controller.set_task(TASK)
+    loop.controller.close()
+
+
+# -- motions ----------------------------------------------------------------------------------
+
+
+def test_a_motion_goes_to_rest_and_then_into_contact(solution, approach):
+    start = np.array([0.0, 0, 2e4, 0, 1e4, 0])
+    found = stiffopt.plan_motion(ROBOT, start, [TASK], slew=2e5)
+    assert found.found
+    assert "into contact with 'post'" in found.message
+    assert found.pressures[0] == pytest.approx(start)
+    assert (np.abs(found.pressures).max(axis=1) < 1e-6).any()
+    assert found.pressures[-1] == pytest.approx(solution.pressures)
+    assert found.tip_poses[-1][:3, 3] == pytest.approx(approach.tips[-1].pose[:3, 3], abs=1e-5)
+    assert (np.abs(np.diff(found.pressures, axis=0)).max(axis=1)
+            <= 2e5 * np.diff(found.times) * (1 + 1e-6)).all()  # fmt: skip
+    with pytest.raises(InputError, match="the only goal of a motion"):
+        stiffopt.plan_motion(ROBOT, TASK, start, slew=2e5)
