@@ -26,9 +26,9 @@ Write a recording as CSV (log v1), from which 'stiffopt calibrate' can calibrate
 
 In CSV each row is a frame of the tracker, at the time at which it was captured, with the pressures
 that were commanded and measured then; nothing that was estimated. Rows without a tip are from times
-in which the tracker saw nothing that can be believed. RUN is a recording (.mcap), whole or cut short,
-also one of an experiment. A bag (--bag, rosbag2 with MCAP) has what 'stiffopt ros' publishes, of a
-run; it needs the extra 'ros'.
+in which the tracker saw nothing that can be believed. A bag (--bag, rosbag2 with MCAP) has what
+'stiffopt ros' publishes, and needs the extra 'ros'. RUN is a recording (.mcap), whole or cut short;
+of CSV also one of an experiment.
 """
 
 _EXPORT_EPILOG = f"""\
