@@ -19,6 +19,7 @@ from stiffopt.plots.shapes import surface_mesh
 from stiffopt.studio import objects, texts
 from stiffopt.studio.cloud import StiffnessCloud, check_map
 from stiffopt.studio.design import Design
+from stiffopt.studio.leaning import force_arrows
 from stiffopt.studio.sources import kind_of, timeline_of
 from stiffopt.studio.timeline import Timeline
 from stiffopt.studio.workbench import NewestWins, Workbench
@@ -465,3 +466,24 @@ def test_an_object_that_was_checked_can_be_moved() -> None:
     moved = objects.moved(item, (0.05, 0.0, 0.1))
     assert moved.sphere is not None
     assert moved.sphere.centre == (0.05, 0.0, 0.1)
+
+
+def test_a_braced_answer_says_where_it_leans(design: Design, compiled: Path) -> None:
+    post = stiffopt.SceneObject(
+        name="post",
+        capsule={"from": (-0.03, -0.04, 0.11), "to": (-0.03, 0.04, 0.11), "radius": 0.005},
+        contact={"allowed": True, "max_force": 0.3},
+    )
+    braced = design.with_task(
+        scene=stiffopt.Scene(objects=[post]), brace=stiffopt.Brace(objects=["post"])
+    )
+    bench = Workbench(braced)
+    assert bench.answer_best(never)
+    assert bench.answer is not None
+    (contact,) = bench.answer.solution.contacts
+    said = texts.answer_html(bench)
+    assert "on post" in said
+    assert "clear of all" in said
+    arrows = force_arrows(bench.answer.solution.equilibrium, 0.18)
+    np.testing.assert_allclose(arrows[0, 1], contact.position, atol=1e-6)
+    assert force_arrows(None, 0.18).shape == (1, 2, 3)

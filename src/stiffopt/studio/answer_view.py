@@ -13,6 +13,7 @@ from stiffopt.plots import style
 from stiffopt.plots.shapes import StiffnessEllipsoid
 from stiffopt.plots.wording import stiffness_text
 from stiffopt.studio.drawing import NOWHERE, ArmTube, Vector, place, rgb, turn
+from stiffopt.studio.leaning import force_arrows
 from stiffopt.studio.workbench import StudioAnswer
 
 _ARROW_SHARE = 0.25  # of the arm's length
@@ -49,6 +50,10 @@ class AnswerView:
             "/loads", NOWHERE, rgb(style.LOAD), shaft_radius=0.005 * length,
             head_radius=0.013 * length, head_length=0.04 * length,
         )  # fmt: skip
+        self._contacts = scene.add_arrows(
+            "/contacts", NOWHERE, rgb(style.LOAD), shaft_radius=0.005 * length,
+            head_radius=0.013 * length, head_length=0.04 * length,
+        )  # fmt: skip
         self._miss = scene.add_line_segments(
             "/miss", NOWHERE, rgb(style.TARGET), thickness=3.0, thickness_units="screen"
         )
@@ -70,7 +75,9 @@ class AnswerView:
         with_plain :
             Whether the arm is drawn with plain pressures too.
         """
-        self._arm.show(answer.robot, answer.pressures)
+        leaning = answer.solution.equilibrium
+        self._arm.show(answer.robot, answer.pressures, leaning)
+        self._contacts.points = force_arrows(leaning, self._length)
         self._show_plain(answer if with_plain else None)
         self._show_ellipsoid(answer)
         self._show_directions(answer)

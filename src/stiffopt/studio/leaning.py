@@ -16,7 +16,7 @@ import numpy as np
 from stiffopt import lie
 from stiffopt.display import FIGURES, display_units
 from stiffopt.errors import InputError
-from stiffopt.model.contact.equilibrium import ContactEquilibrium
+from stiffopt.model.contact.equilibrium import Contact, ContactEquilibrium
 from stiffopt.model.contact.push import ContactLoss
 from stiffopt.model.description import RobotDescription
 from stiffopt.model.manipulator import Manipulator
@@ -97,15 +97,10 @@ class Leaning:
         return self._losses["along"], self._losses["against"]
 
 
-def leaning_rows(leaning: Leaning) -> Iterable[tuple[str, str]]:
-    """Yield what the panel says of an arm that leans, as names and plain text."""
+def contact_rows(contacts: Iterable[Contact]) -> Iterable[tuple[str, str]]:
+    """Yield what the panel says of contacts, as names and plain text."""
     units = display_units()
-    if leaning.stiffness is not None and leaning.measure is not None:
-        free, braced = leaning.stiffness
-        unit = units.of_si(leaning.measure.unit)
-        yield "braced", f"{unit.text(braced, FIGURES)}, {braced / free:.3g} times the free arm's"
-        yield "free", unit.text(free, FIGURES)
-    for each in leaning.equilibrium.contacts:
+    for each in contacts:
         force = float(np.linalg.norm(each.force))
         limit = f" of {units.force.text(each.max_force)}" if np.isfinite(each.max_force) else ""
         over = ", TOO MUCH" if force > each.max_force else ""
@@ -114,6 +109,17 @@ def leaning_rows(leaning: Leaning) -> Iterable[tuple[str, str]]:
             f"on {each.object}",
             f"{units.force.text(force, '.3g')}{limit}, {at} from the base{over}",
         )
+
+
+def leaning_rows(leaning: Leaning) -> Iterable[tuple[str, str]]:
+    """Yield what the panel says of an arm that leans, as names and plain text."""
+    units = display_units()
+    if leaning.stiffness is not None and leaning.measure is not None:
+        free, braced = leaning.stiffness
+        unit = units.of_si(leaning.measure.unit)
+        yield "braced", f"{unit.text(braced, FIGURES)}, {braced / free:.3g} times the free arm's"
+        yield "free", unit.text(free, FIGURES)
+    yield from contact_rows(leaning.equilibrium.contacts)
     if not leaning.equilibrium.contacts:
         yield "contacts", "none: drag an object that may be leant on against the arm"
     pushes = leaning.pushes()
@@ -129,6 +135,17 @@ def _loss_text(loss: ContactLoss) -> str:
     if not np.isfinite(loss.force):
         return f"more than {unit.text(_LARGEST_PUSH)}"
     return unit.text(loss.force, ".3g")
+
+
+def force_arrows(equilibrium: ContactEquilibrium | None, length: float) -> Any:
+    """Arrows (k, 2, 3) of the forces on an arm of a length; they end where it is touched."""
+    contacts = () if equilibrium is None else equilibrium.contacts
+    largest = max((np.linalg.norm(each.force) for each in contacts), default=1.0)
+    ends = [
+        (each.position - _ARROW_SHARE * length * each.force / largest, each.position)
+        for each in contacts
+    ]
+    return np.array(ends, dtype=np.float32) if ends else NOWHERE
 
 
 class LeaningView:
@@ -173,12 +190,7 @@ class LeaningView:
         found = leaning.equilibrium
         self._arm.show(leaning.robot, found.pressures, found)
         self._show_ellipsoids(leaning)
-        largest = max((np.linalg.norm(each.force) for each in found.contacts), default=1.0)
-        ends = [
-            (each.position - _ARROW_SHARE * self._length * each.force / largest, each.position)
-            for each in found.contacts
-        ]
-        self._forces.points = np.array(ends, dtype=np.float32) if ends else NOWHERE
+        self._forces.points = force_arrows(found, self._length)
 
     def _show_ellipsoids(self, leaning: Leaning) -> None:
         """The braced one, to the scale of the free arm's, which is drawn with the answer."""

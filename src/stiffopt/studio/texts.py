@@ -23,7 +23,7 @@ from stiffopt.optimise.solution import PressureSolution
 from stiffopt.plots import style
 from stiffopt.plots.wording import direction_text, gain_text, stiffness_text
 from stiffopt.studio.design import Design
-from stiffopt.studio.leaning import Leaning, leaning_rows
+from stiffopt.studio.leaning import Leaning, contact_rows, leaning_rows
 from stiffopt.studio.rig_watch import RigWatch
 from stiffopt.studio.timeline import Timeline
 from stiffopt.studio.workbench import StudioAnswer, Workbench
@@ -99,9 +99,13 @@ def _rows(answer: StudioAnswer) -> Iterable[tuple[str, str]]:
     limits = _limits_text(answer)
     if limits:
         yield "at a limit", limits
-    if answer.design.task.scene is not None:
-        clearance = answer.robot.clearance(answer.pressures, answer.design.task.scene)
-        yield "clearance", units.length.text(clearance, ".3g")
+    for name, said in contact_rows(solution.contacts):
+        yield escape(name), escape(said)
+    if solution.contacts and solution.stiffness_free is not None:
+        unit = units.of_si(solution.stiffness_unit)
+        yield "clear of all", unit.text(solution.stiffness_free, FIGURES)
+    if solution.clearance is not None:
+        yield "clearance", units.length.text(solution.clearance, ".3g")
     doubt = answer.robot.description.extrapolation(answer.pressures)
     if doubt:
         yield "doubt", doubt
