@@ -13,8 +13,8 @@ The plant has inertia, creep, hysteresis and its own contact with friction.
 
 The stiffness is that of a settled push and pull at the tip, after which the arm is at rest with all
 creep done and no hysteresis or friction left (`Plant.settle`): half of what the answer says that
-the contacts hold, at most 0.1 N. The same is pushed for two seconds each, with all that silicone and
-friction do: contacts stick then, small pushes do not overcome the hysteresis, and the arm is
+the contacts hold, at most 0.1 N. The same is pushed for two seconds each, with all that silicone
+and friction do: contacts stick then, small pushes do not overcome the hysteresis, and the arm is
 stiffer. The reference is the free answer for the same target, on the same arm. Metrics: measured
 over promised stiffness, and the measured multiple over the promised one, for promises of contacts
 that slide.

@@ -62,6 +62,7 @@ class Bracing:
     margin : further push at the tip by which a contact is lost, in N; NaN while nothing pushes.
     push : at the tip, as it is estimated (3,), base axes, in N; zero while nothing is felt.
     displacement : of the tip by it (3,), in m.
+    covariance : of the push (3, 3), in N^2.
     """
 
     def __init__(self, task: Task, tuning: BracingTuning) -> None:
@@ -70,6 +71,7 @@ class Bracing:
         self.next: Task | None = None
         self.force = self.margin = math.nan
         self.push, self.displacement = np.zeros(3), np.zeros(3)
+        self.covariance: Array = tuning.usual_push**2 * np.eye(3)
         self._error: Array | None = None  # b (3,)
         self._residual: Array = np.zeros(3)  # y - s, without swings
         self._held = self._pushed = 0.0  # for how long, in s
@@ -176,9 +178,12 @@ class Bracing:
         pressures :
             Effective ones (n,), in Pa.
         """
+        t = self._tuning
         if self.phase is not BracePhase.HELD or self.approach is None:
             return
-        t, residual = self._tuning, seen - tip.pose[:3, 3]
+        if float(np.abs(pressures - self.pressures).max()) > t.off_plan:  # they are let down
+            return
+        residual = seen - tip.pose[:3, 3]
         if self._error is None:
             self._error = self._residual = residual
         self._residual = self._residual + min(elapsed / t.swing_time, 1.0) * (
@@ -207,6 +212,7 @@ class Bracing:
         C = R @ tip.compliance[:3, :3] @ R.T
         doubt = (t.deviation / t.usual_push) ** 2
         self.push = C @ np.linalg.solve(C @ C + doubt * np.eye(3), off)
+        self.covariance = np.linalg.inv(C @ C / t.deviation**2 + np.eye(3) / t.usual_push**2)
         self.displacement = off
         self._looked += elapsed
         if self._looked >= t.every:

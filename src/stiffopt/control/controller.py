@@ -689,9 +689,9 @@ class TipController:
             return ControllerStatus(plan=np.full(n, np.nan))
         estimate = self._estimator.estimate
         felt, bracing = self._touch.felt, self._bracing
-        touches, force = felt.touches, felt.force
+        touches, force, covariance = felt.touches, felt.force, felt.covariance
         if bracing is not None and bracing.leans:
-            force = bracing.push
+            force, covariance = bracing.push, bracing.covariance
             touches = bool(force.any())
         target, press_force, press_goal = self._led_to or pursuit.target_at(now), math.nan, math.nan
         if isinstance(pursuit.course, Pressing):
@@ -729,7 +729,7 @@ class TipController:
             disturbance=estimate.offset,
             touches=touches,
             wrench=np.concatenate([force, np.zeros(3)]),
-            wrench_covariance=felt.covariance.ravel(),
+            wrench_covariance=covariance.ravel(),
             press_force=press_force,
             press_goal=press_goal,
             brace="" if bracing is None else bracing.phase.value,

@@ -370,6 +370,7 @@ class BracingTuning:
     told_apart: float = 4e-3
     free_share: float = 0.6
     samples: int = 3
+    off_plan: float = 1.5e4  # pressure beside the wanted one from which nothing is judged, in Pa
     swing_time: float = 0.08  # over which the seen tip is averaged, in s
     # displacement of the tip from which a push is felt, in m; time constant with which what is
     # smaller becomes the model's error, in s; and time after which a push does, too
