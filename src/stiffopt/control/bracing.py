@@ -212,7 +212,7 @@ class Bracing:
         C = R @ tip.compliance[:3, :3] @ R.T
         doubt = (t.deviation / t.usual_push) ** 2
         self.push = C @ np.linalg.solve(C @ C + doubt * np.eye(3), off)
-        self.covariance = np.linalg.inv(C @ C / t.deviation**2 + np.eye(3) / t.usual_push**2)
+        self.covariance[:] = np.linalg.inv(C @ C / t.deviation**2 + np.eye(3) / t.usual_push**2)
         self.displacement = off
         self._looked += elapsed
         if self._looked >= t.every:

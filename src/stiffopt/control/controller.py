@@ -546,6 +546,7 @@ class TipController:
     def _brace(self, course: Bracing, now: float) -> Array | None:
         """Go on with a brace; see `_plan`. The tip's offset is left as it is."""
         self._reference.slew_share = self._tuning.reference.slew_share
+        self.replanner.latest()  # an answer that nobody takes would look like a slow planner
         before = course.pressures
         is_there = not self._is_held(now) and self._is_near(before)
         course.advance(min(now - self._computed_at, _HELD * self._period), is_there)
