@@ -228,7 +228,7 @@ SIX = (1e4,) * 6
         (points(SIX, names=["segment_1_channel_1"] * 6), "one of them twice"),
         (points(SIX[:5]), "point 1 has 5 positions for 6 joint names"),
         (points((*SIX[:5], np.nan)), "the positions must be finite"),
-        (points(), "there are no points"),
+        (points(), "there are 0 points; expected 1 to 20000"),
         (points(SIX, SIX, times=(2, 2)), "must increase"),
         (points(SIX, times=(-1,)), "not be negative"),
         (replace(points(SIX), header=m.Header(time_of(NOW - 60), "")), "60.0 s old"),
@@ -536,14 +536,15 @@ def test_nothing_but_venting_is_taken_unless_the_rig_file_says_so(robot: Manipul
         others += [it.peer.writer(f"~/{n}", k, wait=False) for n, k in MOTIONS.items()]
         others.append(it.peer.writer("rq~/arm", m.Empty, wait=False))
         vent.write(m.Empty())
-        wait_for(lambda: it.loop.names == ["vent"])
+        wait_for(lambda: "vent" in it.loop.names)
         assert not any(writer.get_matched_subscriptions() for writer in others)
-        quick = it.peer.writer("~/vent", m.Empty, reliable=False)
+        it.peer.client("~/vent", m.TriggerRequest)(m.TriggerRequest())  # the first is done by now
+        quick, count = it.peer.writer("~/vent", m.Empty, reliable=False), len(it.loop.names)
         quick.write(m.Empty())
-        wait_for(lambda: it.loop.names == ["vent"] * 2)
+        wait_for(lambda: len(it.loop.names) > count)
         done = it.peer.client("~/vent", m.TriggerRequest)(m.TriggerRequest())
         assert (done.success, done.message) == (True, "vented")
-        assert it.loop.names == ["vent"] * 3
+        assert set(it.loop.names) == {"vent"}
 
 
 def test_commands_by_topics(robot: Manipulator) -> None:
@@ -679,8 +680,8 @@ def test_venting_waits_for_nothing_and_what_waited_is_dropped(robot: Manipulator
         wait_for(lambda: "vent" in it.loop.names)
         free.set()
         wait_for(lambda: "arm" in it.loop.names)
-        done = it.peer.client("~/disarm", m.TriggerRequest)(m.TriggerRequest())
-        assert done.success
+        disarm = it.peer.client("~/disarm", m.TriggerRequest)
+        wait_for(lambda: disarm(m.TriggerRequest()).success)
         assert list(dict.fromkeys(it.loop.names)) == ["vent", "arm", "disarm"]
 
 

@@ -8,8 +8,8 @@ import typer
 from stiffopt.cli.console import report_note, write_line
 from stiffopt.cli.exits import interruptible, with_exit_code
 from stiffopt.cli.options import Units, command_group
-from stiffopt.cli.outputs import check_new_file, check_picture
-from stiffopt.errors import FileError
+from stiffopt.cli.outputs import check_new_file, check_new_folder, check_picture, new_folder
+from stiffopt.errors import FileError, require_package
 
 log_app = command_group(help="Look at what 'stiffopt run' has recorded.")
 
@@ -22,12 +22,13 @@ Exit codes:
 """
 
 EXPORT_HELP = """\
-Write a recording as CSV (log v1), from which 'stiffopt calibrate' can calibrate.
+Write a recording as CSV (log v1), from which 'stiffopt calibrate' can calibrate, or as a bag.
 
-Each row is a frame of the tracker, at the time at which it was captured, with the pressures that
-were commanded and measured then; nothing that was estimated. Rows without a tip are from times in
-which the tracker saw nothing that can be believed. RUN is a recording (.mcap), whole or cut short,
-also one of an experiment.
+In CSV each row is a frame of the tracker, at the time at which it was captured, with the pressures
+that were commanded and measured then; nothing that was estimated. Rows without a tip are from times
+in which the tracker saw nothing that can be believed. A bag (--bag, rosbag2 with MCAP) has what
+'stiffopt ros' publishes, and needs the extra 'ros'. RUN is a recording (.mcap), whole or cut short;
+of CSV also one of an experiment.
 """
 
 _EXPORT_EPILOG = f"""\
@@ -35,6 +36,7 @@ _EXPORT_EPILOG = f"""\
 Examples:
   stiffopt log export runs/my-rig-20270115T080000Z.mcap --csv
   stiffopt log export run.mcap --csv --out run.csv
+  stiffopt log export run.mcap --bag --out run_bag
 {_CODES}"""
 
 PLOT_HELP = """\
@@ -61,14 +63,24 @@ Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")
 @with_exit_code
 def export(
     run: Recorded,
-    csv: Annotated[bool, typer.Option("--csv", help="As CSV, log v1: the only format yet.")] = True,
+    csv: Annotated[bool, typer.Option("--csv", help="As CSV, log v1: the default.")] = False,
+    bag: Annotated[
+        bool, typer.Option("--bag", help="As a bag of ROS 2: a folder with MCAP and metadata.")
+    ] = False,
     out: Annotated[
         str | None,
-        typer.Option(metavar="FILE.csv", help="Write here; by default beside the recording."),
+        typer.Option(
+            metavar="FILE.csv", help="Write here, or into this folder; else beside the recording."
+        ),
     ] = None,
     quiet: Quiet = False,
 ) -> None:
-    """Write a recording as log v1."""
+    """Write a recording as log v1, or as a bag."""
+    if csv and bag:
+        raise typer.BadParameter("give --csv or --bag, not both")
+    if bag:
+        _export_bag(run, out, quiet=quiet)
+        return
     with interruptible() as check:
         import numpy as np  # here, so that --help waits for no numerics
 
@@ -88,6 +100,27 @@ def export(
         report_note(f"{run} was cut short or damaged; what is whole was exported")
     seen = int(np.isfinite(log.tip_position).all(axis=1).sum())
     write_line(f"{path}: {len(log)} rows, {seen} with a tip, {log.time[-1] - log.time[0]:.1f} s")
+
+
+def _export_bag(run: str, out: str | None, *, quiet: bool) -> None:
+    """Write a recorded run as a bag."""
+    with interruptible() as check:
+        from stiffopt.daemon.run_log import read_run
+
+        require_package("cyclonedds", "ros")
+        from stiffopt.ros.bag import write_bag
+
+        path = str(Path(run).with_suffix("")) + "_bag" if out is None else out
+        check_new_folder(path)
+        recorded = read_run(run)
+        with new_folder(path) as part:
+            assert part is not None
+            count = write_bag(recorded, part, Path(path).name, check)
+    if quiet:
+        return
+    if not recorded.complete:
+        report_note(f"{run} was cut short or damaged; what is whole was exported")
+    write_line(f"{path}: {count} messages, {recorded.time[-1] - recorded.time[0]:.1f} s")
 
 
 @log_app.command("plot", help=PLOT_HELP, epilog=_PLOT_EPILOG)

@@ -112,7 +112,7 @@ class _Daemon:
     def __init__(self, rig: str, description: RigDescription, token_file: str | None) -> None:
         self._rig, self._description, self._token_file = rig, description, token_file
         self._process: subprocess.Popen[str] | None = None
-        self._ending = False
+        self._asked = False  # to end
         self.left = threading.Event()
         """Set when a daemon that others have started is to be left."""
 
@@ -195,10 +195,10 @@ class _Daemon:
 
         To be asked to end twice, it vents at once.
         """
-        self._ending = True
         if self._process is None:
             self.left.set()
         elif self._process.poll() is None:
+            self._asked = True
             self._process.send_signal(signal.SIGTERM)
 
     def end(self) -> int:
@@ -206,7 +206,7 @@ class _Daemon:
         process = self._process
         if process is None:
             return SOLVED
-        if not self._ending:
+        if not self._asked:
             self.begin_end()
         try:
             code = process.wait(self._description.safety.ramp_time + _LATE)

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stiffopt.control.state import Event, SeenPose, Severity, Snapshot
+from stiffopt.control.state import Event, SeenPose, Severity, Snapshot, State
 from stiffopt.control.state_fields import Entry, Kind, entries
 from stiffopt.daemon.topics import FORMAT, METADATA, STATES
 from stiffopt.errors import FileError
@@ -82,6 +82,24 @@ class RecordedRun:
     def n(self) -> int:
         """Number of channels."""
         return sum(self.channels)
+
+    def snapshots(self) -> Iterator[Snapshot]:
+        """Yield the state in each tick, as far as it was logged; what was not has its default."""
+        places = {entry.name: entry for entry in entries(Snapshot) if entry.name in self.fields}
+        spans = iter(self.states)
+        span = next(spans, None)
+        for row, time in enumerate(self.time.tolist()):
+            while span is not None and span.end <= time and (later := next(spans, None)):
+                span = later
+            logged: dict[str, Any] = {}
+            for name, entry in places.items():
+                value = self.fields[name][row]
+                known = not entry.optional or bool(np.isfinite(value).any())
+                if entry.kind in (Kind.NUMBER, Kind.COUNT):
+                    value = float(value)
+                logged[name] = value if known else None
+            state, reason = (State.UNCONFIGURED, "") if span is None else (span.kind, span.text)
+            yield Snapshot(**{**logged, "time": time, "state": State(state), "reason": reason})
 
 
 def read_run(path: str | os.PathLike[str]) -> RecordedRun:

@@ -37,6 +37,8 @@ class McapWriter:
         Of foxglove.
     metadata :
         Records of metadata, by name.
+    profile :
+        Of the file: by which conventions messages are to be read.
 
     Attributes
     ----------
@@ -48,7 +50,13 @@ class McapWriter:
         The file cannot be written.
     """
 
-    def __init__(self, file: int, context: Any, metadata: Mapping[str, Mapping[str, str]]) -> None:
+    def __init__(
+        self,
+        file: int,
+        context: Any,
+        metadata: Mapping[str, Mapping[str, str]],
+        profile: str = "",
+    ) -> None:
         import foxglove
         from foxglove.mcap import MCAPCompression, MCAPWriteOptions
 
@@ -61,6 +69,7 @@ class McapWriter:
                 self._memory,
                 context=context,
                 writer_options=MCAPWriteOptions(
+                    profile=profile,
                     compression=MCAPCompression.Zstd,
                     compression_level=1,  # twice as fast as the default, and as small
                     compression_threads=0,

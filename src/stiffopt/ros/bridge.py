@@ -6,6 +6,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from functools import partial
@@ -122,10 +123,12 @@ class Bridge:
         self._vents: deque[Callable[[bool, str], None]] = deque()
         self._news = {name: threading.Event() for name in ("jobs", "questions", "vents")}
         self._over = threading.Event()
+        # replies wait for the readers of those who asked, and nothing else waits for replies
+        self._answers = ThreadPoolExecutor(1, "replies")
         self._now: Snapshot | None = None
+        self._state: String | None = None
         self._seen: frozenset[int] = frozenset()
         self._next_event = 0
-        self._vented = 0  # when what was last to vent was written
         self._subscribe(commands=settings.commands)
         node.announce()
 
@@ -161,6 +164,7 @@ class Bridge:
             event.set()
         for thread in threads:
             thread.join(20)
+        self._answers.shutdown()
         self._lease.end("the ROS 2 node has ended")
 
     # Publishing ----------------------------------------------------------------------------------
@@ -174,9 +178,12 @@ class Bridge:
             with suppress(StiffoptError):  # an arm without a known shape is not drawn
                 for topic, message in self._messages.shape(now):
                     self._publishers[topic].publish(message)
+        state = self._messages.state(now)
+        if state != self._state or moment >= due["slow"]:
+            self._state = state
+            self._publishers["~/state"].publish(state)
         if moment >= due["slow"]:
             due["slow"] = moment + _SLOW
-            self._publishers["~/state"].publish(self._messages.state(now))
             control = self._lease.holder
             self._publishers["/diagnostics"].publish(self._messages.diagnostics(now, control))
             readers = self._publishers["~/scene"].readers
@@ -186,9 +193,10 @@ class Bridge:
             self._seen = readers
         if moment >= due["events"]:
             due["events"] = moment + _EVENTS
-            events, self._next_event = self._quick.events(self._next_event)
-            for event in events:
-                self._publishers["/rosout"].publish(self._messages.log(event))
+            with suppress(StiffoptError):  # a daemon that is busy tells them the next time
+                events, self._next_event = self._quick.events(self._next_event)
+                for event in events:
+                    self._publishers["/rosout"].publish(self._messages.log(event))
 
     def _tell(self, kind: str, text: str, severity: Severity) -> None:
         """Log something that is no event of the loop."""
@@ -225,13 +233,11 @@ class Bridge:
                 self._warn(f"a message could not be taken: {type(error).__name__}: {error}")
 
     def _vent_topic(self, source: Subscription) -> None:
-        for received in source.take():
-            if received.moment != self._vented:  # both subscriptions have it
-                self._vented = received.moment
-                self._post("vents", self._vents, self._answer_topic("vent"))
+        for _ in source.take():  # which comes twice, as there are two; to vent twice does no harm
+            self._post("vents", self._vents, self._answer_topic("vent"))
 
     def _vent_service(self, service: Service, received: Received) -> None:
-        self._post("vents", self._vents, partial(_answer_trigger, service, received))
+        self._post("vents", self._vents, self._answer_trigger(service, received))
 
     def _solve_topic(self, source: Subscription) -> None:
         for received in source.take():
@@ -247,7 +253,7 @@ class Bridge:
             self._simple(name, received, self._answer_topic(name))
 
     def _simple_service(self, name: str, service: Service, received: Received) -> None:
-        self._simple(name, received, partial(_answer_trigger, service, received))
+        self._simple(name, received, self._answer_trigger(service, received))
 
     def _simple(self, name: str, received: Received, done: Callable[[bool, str], None]) -> None:
         commands: dict[str, Callable[[], None]] = {
@@ -283,7 +289,7 @@ class Bridge:
         last = self._jobs[-1] if self._jobs else None
         if job.newest and last is not None and last.newest:
             if last.writer == job.writer:
-                with suppress(IndexError):  # it is being carried out already
+                with suppress(ValueError):  # it is being carried out already
                     self._jobs.remove(last)
         elif len(self._jobs) >= _WAITING:
             job.done(False, "too many commands wait already")
@@ -411,6 +417,16 @@ class Bridge:
 
         return answer
 
+    def _answer_trigger(self, service: Service, received: Received) -> Callable[[bool, str], None]:
+        """Return what answers a command that came by a service."""
+
+        def answer(done: bool, text: str) -> None:
+            self._answers.submit(
+                service.reply, received, TriggerResponse(success=done, message=text)
+            )
+
+        return answer
+
     def _answer_solution(self, found: PressureSolution | None, text: str) -> None:
         if found is not None and found.found and found.pressures is not None:
             self._solution.publish(self._messages.answer(found.pressures, time.monotonic()))
@@ -434,8 +450,4 @@ class Bridge:
                 answer.pressures = self._messages.answer(found.pressures, now)
             if found.tip_pose is not None:
                 answer.tip = self._messages.pose(found.tip_pose, now)
-        service.reply(received, answer)
-
-
-def _answer_trigger(service: Service, received: Received, done: bool, text: str) -> None:
-    service.reply(received, TriggerResponse(success=done, message=text))
+        self._answers.submit(service.reply, received, answer)

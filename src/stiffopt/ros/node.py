@@ -80,11 +80,10 @@ class Writer:
 
 @dataclass(frozen=True)
 class Received:
-    """A message, its writer, which is None if nothing is known of it, and when it was written."""
+    """A message, and its writer, which is None if nothing is known of it."""
 
     message: Any
     writer: Writer | None
-    moment: int
 
 
 class Publisher:
@@ -132,7 +131,7 @@ class Subscription:
             writer = self._writer_of(sample.sample_info.publication_handle & _HANDLE)
             if writer is not None:
                 self._lives.lost.discard(writer.handle)
-            yield Received(sample, writer, sample.sample_info.source_timestamp)
+            yield Received(sample, writer)
 
     def lives(self, writer: Writer) -> bool:
         """Whether a writer is there, and has not failed to show it since its last message."""

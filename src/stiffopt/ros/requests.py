@@ -20,6 +20,8 @@ Array = NDArray[np.float64]
 
 MAX_AGE = 1.0
 """Between the stamp of a request and now, in s; a recording that is played moves nothing."""
+MAX_POINTS = 20_000
+"""Of a trajectory; those on straight lines are left out, see `trajectory_through`."""
 _UNIT = 0.01  # by which the length of a quaternion may differ from 1
 
 
@@ -94,8 +96,8 @@ def trajectory_of(message: JointTrajectory, robot: Manipulator, now: float) -> T
             raise InputError(
                 f"point {number} has {len(point.positions)} positions for {len(names)} joint names"
             )
-    if not message.points:
-        raise InputError("there are no points")
+    if not 0 < len(message.points) <= MAX_POINTS:
+        raise InputError(f"there are {len(message.points)} points; expected 1 to {MAX_POINTS}")
     order = [names.index(channel) for channel in channels]
     rows = [[point.positions[k] for k in order] for point in message.points]
     pressures = _finite(rows, "the positions")
