@@ -87,7 +87,7 @@ def agrees(robot: stiffopt.Manipulator, p: np.ndarray, rng: np.random.Generator)
     simulated = Simulated(stiffopt.mjcf(robot, p))
     rest = simulated.settle()
     tip = robot.tip_pose(p)
-    np.testing.assert_allclose(rest, tip[:3, 3], atol=5e-3 * robot.length)
+    np.testing.assert_allclose(rest, tip[:3, 3], atol=2e-3 * robot.length)
     turn = simulated.data.site_xmat[simulated.tip].reshape(3, 3)
     np.testing.assert_allclose(turn, tip[:3, :3], atol=0.02)
     for direction in (np.array([0.0, 0.0, 1.0]), *rng.normal(size=(2, 3))):
@@ -111,7 +111,7 @@ def test_the_simulation_swings_and_comes_to_rest() -> None:
     m, d = simulated.model, simulated.data
     mujoco.mj_forward(m, d)
     rest = np.array(d.site_xpos[simulated.tip])
-    d.qpos[3::6] = 0.05  # bent
+    d.qpos[m.jnt_type == mujoco.mjtJoint.mjJNT_HINGE] = 0.03  # bent
     swings = []
     for _ in range(int(1.5 / m.opt.timestep)):
         mujoco.mj_step(m, d)

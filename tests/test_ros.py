@@ -608,6 +608,14 @@ def test_the_solver_answers(robot: Manipulator) -> None:
             found = ask(bad)
             assert found.status == "refused"
             assert found.message
+        rig = it.bridge._description
+        safety = rig.safety.model_copy(update={"max_pressure": 6e4})
+        it.bridge._description = rig.model_copy(update={"safety": safety})
+        for limits in ("", "pressure: {min: 0.05 bar}\n", "pressure: {max: 1.5 bar}\n"):
+            found = ask(m.SolvePressureRequest(task=text + limits))
+            assert found.pressures.position
+            assert max(found.pressures.position) <= 6e4 + 1  # the rig's limit
+        it.bridge._description = rig
         answers = it.peer.reader("~/solution", m.JointState)
         wait_for(lambda: answers.has_writer)
         asker = it.peer.writer("~/solve", m.PoseStamped)

@@ -7,7 +7,7 @@ its stiffness is the inverse.  MuJoCo knows one stiffness per axis; where axes a
 fixed tendons along the eigenvectors of the stiffness have the same energy.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 from xml.etree import ElementTree as ET
@@ -165,10 +165,12 @@ def _document(robot: Manipulator, links: list[_Link], tip: Vector, delay: float)
     # the arm touches what the world has, but not itself
     _add(_add(root, "default"), "geom", contype="2", conaffinity="1", rgba="0.9 0.8 0.7 1")
     body, tendons = _add(root, "worldbody"), ET.Element("tendon")
+    order = range(6)
     for link in links:
         body = _add(body, "body", name=link.name, **_pose(link.placed))
         if link.stiffness is not None:
-            _add_joint(body, tendons, link.name, link.stiffness, delay)
+            _add_joint(body, tendons, link.name, link.stiffness, delay, order)
+            order = order[::-1]  # turns do not commute: in two joints, the error cancels
         _add_parts(body, link)
     _add(body, "site", name="tip", size=_TIP_RADIUS, **_pose(tip))
     if mass := robot.description.tip_mass:
@@ -182,16 +184,22 @@ def _document(robot: Manipulator, links: list[_Link], tip: Vector, delay: float)
 
 
 def _add_joint(
-    body: ET.Element, tendons: ET.Element, name: str, stiffness: Vector, delay: float
+    body: ET.Element,
+    tendons: ET.Element,
+    name: str,
+    stiffness: Vector,
+    delay: float,
+    order: Sequence[int],
 ) -> None:
     """Add the six axes of a joint, with their springs, or tendons where they are coupled."""
     scale = np.sqrt(np.diag(stiffness))
     between = np.abs(stiffness - np.diag(np.diag(stiffness))) / np.outer(scale, scale)
     coupled = bool((between > _COUPLED).any())
     axes = [f"{name}_{kind}_{axis}" for kind in ("slide", "hinge") for axis in "xyz"]
-    for k, joint in enumerate(axes):
+    for k in order:
         own = {} if coupled else _spring(stiffness[k, k], delay)
-        _add(body, "joint", name=joint, type=joint.split("_")[-2], axis=np.eye(3)[k % 3], **own)
+        kind = axes[k].split("_")[-2]
+        _add(body, "joint", name=axes[k], type=kind, axis=np.eye(3)[k % 3], **own)
     if coupled:
         for k, (value, vector) in enumerate(_eigenvectors(stiffness, scale)):
             tendon = _add(tendons, "fixed", name=f"{name}_{k + 1}", **_spring(value, delay))

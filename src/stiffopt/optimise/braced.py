@@ -25,7 +25,7 @@ from stiffopt.model.arm_clearance import measured_scene
 from stiffopt.model.contact.equilibrium import ContactEquilibrium
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.optimise.brace import quoted
-from stiffopt.optimise.leaning import BracedProblem
+from stiffopt.optimise.leaning import FORCE_ON, MARGIN_ON, BracedProblem
 from stiffopt.optimise.local import LocalResult
 from stiffopt.optimise.prices import prices_at
 from stiffopt.optimise.problem import ProgramPoint
@@ -201,10 +201,14 @@ def lean(
         if not free.found:
             return replace(free, task=task)
         return _free_answer(task, free, f"the search for where to lean was ended: {error}")
-    judged = (from_rest(problem, result) for result in found.results[: BRACE.tried])
-    best = next((each for each in judged if each is not None and each.judgement.holds), None)
-    if best is None:
-        return _free_answer(task, free, _no_brace(problem, found))
+    judged: list[Braced | None] = []
+    for result in found.results[: BRACE.tried]:
+        judged.append(from_rest(problem, result))
+        best = judged[-1]
+        if best is not None and best.judgement.holds:
+            break
+    else:
+        return _free_answer(task, free, _no_brace(problem, judged))
     if free.found and least_maximised(task, free.stiffnesses) >= best.least:
         unit = display_units().stiffness
         why = (
@@ -219,23 +223,39 @@ def _free_answer(task: Task, free: PressureSolution, why: str) -> PressureSoluti
     return replace(free, task=task, message=message, free=free)
 
 
-def _no_brace(problem: BracedProblem, found: Search) -> str:
+def _no_brace(problem: BracedProblem, judged: list[Braced | None]) -> str:
     """Why no braced answer was found."""
     names = quoted(problem.brace.objects)
+    lacking = [why for each in judged if each is not None for why in each.judgement.shortfalls]
+    if lacking:
+        return f"leaning on {names} does not do: {lacking[0]}"
+    if judged:
+        return (
+            f"postures that lean on {names} at the target were found, but the arm comes to other "
+            "ones from rest"
+        )
     if not problem.missed:
-        came = "from rest" if found.results else "at the target"
-        return f"no way to lean on {names} was found {came}"
+        return f"no posture was found that leans on {names} and reaches the target"
     point = min(problem.missed, key=_most_missed)
+    unit = display_units().force
     lacking = [
-        f"{name}: {display_units().force.text(error - c.radius, '.2g')} short"
+        f"{name} by {unit.text(error - c.radius, '.2g')}" if _is_force(name) else name
         for name, error, c in _missed(point)
     ]
-    return f"no way to lean on {names} was found that does; the nearest lacks {'; '.join(lacking)}"
+    return (
+        f"leaning on {names} at the target misses what is asked for; the best attempt misses "
+        f"{', '.join(dict.fromkeys(lacking))}"
+    )
+
+
+def _is_force(name: str) -> bool:
+    return name.startswith((FORCE_ON, MARGIN_ON))
 
 
 def _missed(point: ProgramPoint) -> list[tuple[str, float, Constraint]]:
     pairs = zip(point.errors, point.constraints, strict=True)
-    return [(c.name, error, c) for error, c in pairs if error > c.radius]
+    found = [(c.name, error, c) for error, c in pairs if error > c.radius]
+    return [each for each in found if _is_force(each[0])] or found
 
 
 def _most_missed(point: ProgramPoint) -> float:
@@ -249,7 +269,7 @@ def _braced_answer(
     problem.here = eq
     return PressureSolution(
         status="solved",
-        message="",
+        message=_other_equilibrium(problem, eq),
         task=task,
         pressures=eq.pressures,
         tip_pose=judgement.tip_pose,
@@ -270,6 +290,33 @@ def _braced_answer(
     )
 
 
+def _size(problem: BracedProblem, name: str, radius: float) -> float:
+    """The whole of a limit, of which its price is told: of a force, a margin, or a tolerance."""
+    if name.startswith(MARGIN_ON):
+        return problem.brace.margin
+    forces = {f"{FORCE_ON}{item.name}": item.contact for item in problem.scene.objects}
+    contact = forces.get(name)
+    return radius if contact is None or contact.max_force is None else contact.max_force
+
+
+def _other_equilibrium(problem: BracedProblem, eq: ContactEquilibrium) -> str:
+    """Say so if the arm could touch nothing at the same pressures; else return nothing."""
+    if problem.robot.clearance(eq.pressures, problem.scene) < 0:
+        return ""
+    tip = problem.robot.tip_pose(eq.pressures)[:3, 3]
+    away = display_units().length.text(float(np.linalg.norm(tip - eq.tip_pose[:3, 3])), ".3g")
+    names = quoted(problem.brace.objects)
+    way = (
+        "raise all pressures together from rest"
+        if problem.brace.approach == "pressures"
+        else f"move {names} to the arm when it is under pressure"
+    )
+    return (
+        f"at these pressures the tip may also come to rest {away} away, clear of {names}; {way} "
+        "to reach this answer"
+    )
+
+
 def _limits(problem: BracedProblem, result: LocalResult) -> tuple[str, ...]:
     """What keeps a braced answer from being stiffer: constraints and limits with a price."""
     point = attempt(problem.needed, result.point.x)
@@ -279,7 +326,7 @@ def _limits(problem: BracedProblem, result: LocalResult) -> tuple[str, ...]:
     names = [
         ball.name
         for ball, pull in zip(point.bounded, prices.balls, strict=True)
-        if float(np.linalg.norm(pull)) * ball.radius > BRACE.least_price
+        if float(np.linalg.norm(pull)) * _size(problem, ball.name, ball.radius) > BRACE.least_price
     ]
     bounds = active_bounds(problem.robot, problem.task, point.x * problem.unit)
     names += [

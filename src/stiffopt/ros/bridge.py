@@ -394,10 +394,10 @@ class Bridge:
             )  # fmt: skip
         if task is None:
             raise InputError("give a task, or a target with a frame_id")
-        if task.pressure == PressureRange():
-            high = limits_of(self._description, self._robot.description).high
-            task = task.model_copy(update={"pressure": PressureRange(max=tuple(high.tolist()))})
-        return task
+        low, high = task.pressure_bounds(self._robot.description)
+        high = np.minimum(high, limits_of(self._description, self._robot.description).high)
+        within = PressureRange(min=tuple(low.tolist()), max=tuple(high.tolist()))
+        return task.model_copy(update={"pressure": within})
 
     def _guarded(self, work: Callable[[], object]) -> None:
         """Do some work; a mistake in it is told, and ends nothing else."""

@@ -132,8 +132,8 @@ class GraphLease:
         silent = self._clock() - self._heard
         if writer.lease > self._heartbeat and silent > self._heartbeat:
             return (
-                f"nothing was heard for {self._heartbeat:g} s from the writer that had control, "
-                "which offers no such lease of liveliness"
+                f"the program that had control was silent for {self._heartbeat:g} s; it offers no "
+                "lease of liveliness that would speak for it"
             )
         return ""
 

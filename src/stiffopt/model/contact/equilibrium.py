@@ -150,12 +150,12 @@ class ContactEquilibrium:
         Parameters
         ----------
         contacts : {"sliding", "sticking"}
-            Whether contacts slide on their surfaces without resistance or roll on them without
-            slipping. With friction the truth is in between; small pushes on an arm whose contacts
-            carry no tangential force leave them sticking.
+            Whether contacts slide on their surfaces without resistance, or roll without slipping
+            on those that have friction. With friction the truth is in between; small pushes on an
+            arm whose contacts carry no tangential force leave them sticking.
         """
         check_choice("contacts", contacts, get_args(Grip))
-        per_wrench = self._per_wrench(range(len(self.contacts)) if contacts == "sticking" else ())
+        per_wrench = self._per_wrench(self._with_friction() if contacts == "sticking" else ())
         R = self._arm.shape.rotation[0]
         turn = np.zeros((6, 6))
         turn[:3, :3] = turn[3:, 3:] = R
@@ -163,6 +163,12 @@ class ContactEquilibrium:
         if self._arm.state.condition.is_conservative and contacts == "sliding":
             found = (found + found.T) / 2  # symmetric but for the integrator's error
         return found
+
+    def _with_friction(self) -> list[int]:
+        """Which contacts are on surfaces with friction."""
+        surfaces = self._arm.problem.surfaces
+        touches = enumerate(self._arm.state.touches)
+        return [j for j, touch in touches if surfaces[touch.surface].friction > 0]
 
     def _per_wrench(self, sticking: Collection[int] = ()) -> Vector:
         """Twist of the tip per wrench on it, (6, 6), in base axes."""
