@@ -3,8 +3,9 @@
     python benchmarks/contact.py --cases 100 --out out/contact
 
 Random arms, with and without weight, at random pressures, half of them with a load, among one to
-three spheres, capsules and walls that the free arm would enter by up to 20 mm. A case is kept in
-the folder, and not computed again. JAX is needed; a case takes half a minute.
+three spheres, capsules and walls that the free arm would enter by up to 20 mm. With `--enclosed`
+the arms are in tubes, or pass through rings. A case is kept in the folder, and not computed again.
+JAX is needed; a case takes half a minute.
 
 Metrics, each the largest of a case's objects or directions: how far the tip is off, over the arm's
 length; the contact forces, over the largest of them; the tip's stiffness along a random direction,
@@ -35,8 +36,11 @@ from stiffopt.errors import EquilibriumError
 _ELEMENTS = {"1 segment": 32, "2 segments": 16}
 
 
-def draw(seed: int) -> dict[str, Any]:
-    """A random case: arm, pressures, load and objects, clear of the arm at rest."""
+def draw(seed: int, *, enclosed: bool = False) -> dict[str, Any]:
+    """A random case: arm, pressures, load and objects, clear of the arm at rest.
+
+    If it is enclosed, the arm is in a tube or passes through a ring instead.
+    """
     rng = np.random.default_rng([20, seed])
     name = ("2 segments", "1 segment", "2 segments")[seed % 3]
     hangs, count = bool(seed // 3 % 2), 1 + seed // 6 % 3
@@ -52,8 +56,16 @@ def draw(seed: int) -> dict[str, Any]:
             T = robot.with_load(force).backbone(p, 61)
         except EquilibriumError:
             continue
-        objects = [_object(rng, T, arm.tubes[0].outer_radius) for _ in range(count)]
-        clear = all(_nearest(each, rest) > arm.tubes[0].outer_radius + 0.001 for each in objects)
+        if enclosed:
+            around = _around(rng, arm.length, arm.tubes[0].outer_radius, in_tube=seed % 2 == 0)
+            objects, clear = [around], True
+            gap = robot.with_load(force).clearance(p, scene_of({"objects": objects}))
+            if not (-0.05 if around[0] == 2 else -0.015) < gap < -0.001:
+                continue
+        else:
+            objects = [_object(rng, T, arm.tubes[0].outer_radius) for _ in range(count)]
+            widest = arm.tubes[0].outer_radius + 0.001
+            clear = all(_nearest(each, rest) > widest for each in objects)
         if clear and T[-1, 2, 2] > np.cos(2):
             break
     direction = rng.normal(size=3)
@@ -82,6 +94,21 @@ def _object(rng: np.random.Generator, T: Any, radius: float) -> tuple[int, list[
     return 0, [*(centre - across), *(centre + across), own]
 
 
+def _around(
+    rng: np.random.Generator, length: float, radius: float, *, in_tube: bool
+) -> tuple[int, list[float]]:
+    """A bent tube about the straight arm, or a ring that it passes through."""
+    own = radius + rng.uniform(0.0015, 0.006)
+    if not in_tube:
+        aside = rng.uniform(-0.3, 0.3, 2) * (own - radius)
+        axis = [*rng.uniform(-0.1, 0.1, 2), 1.0]
+        centre = [*aside, rng.uniform(0.4, 0.8) * length]
+        return 3, [*centre, *(axis / np.linalg.norm(axis)), own]
+    bend = rng.uniform(0.4, 0.8) * length
+    beyond = (own - radius) * rng.uniform(-1, 1, 2)
+    return 2, [0, 0, -0.03, 0, 0, bend, own, *(beyond * 1.2), 1.6 * length]
+
+
 def _nearest(item: tuple[int, list[float]], points: Any) -> float:
     kind, numbers = item
     a, b, r = np.array(numbers[:3]), np.array(numbers[3:6]), numbers[6]
@@ -98,7 +125,11 @@ def scene_of(case: dict[str, Any]) -> stiffopt.Scene:
     for index, (kind, numbers) in enumerate(case["objects"]):
         a, b, r = numbers[:3], numbers[3:6], numbers[6]
         shape: dict[str, Any] = {"capsule": {"from": a, "to": b, "radius": r}}
-        if kind == 1:
+        if kind == 2:
+            shape = {"inside_tube": {"points": [a, b, numbers[7:]], "radius": r}}
+        elif kind == 3:
+            shape = {"trocar": {"centre": a, "axis": b, "radius": r}}
+        elif kind == 1:
             shape = {"half_space": {"point": a, "normal": b}}
         elif a == b:
             shape = {"sphere": {"centre": a, "radius": r}}
@@ -164,12 +195,12 @@ def found_by_rod(case: dict[str, Any], lost_at: float | None) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def run(cases: int, folder: Path) -> Iterator[dict[str, Any]]:
+def run(cases: int, folder: Path, *, enclosed: bool) -> Iterator[dict[str, Any]]:
     """All cases, from the folder where they are there; the model's part always anew."""
     folder.mkdir(parents=True, exist_ok=True)
     for seed in range(cases):
         file = folder / f"{seed}.json"
-        case = json.loads(file.read_text()) if file.exists() else draw(seed)
+        case = json.loads(file.read_text()) if file.exists() else draw(seed, enclosed=enclosed)
         case["stiffopt"] = found_by_stiffopt(case)
         if "rod" not in case:
             case["rod"] = found_by_rod(case, case["stiffopt"].get("lost_at"))
@@ -241,10 +272,11 @@ def main() -> None:
     parser.add_argument("--cases", type=int, default=100)
     parser.add_argument("--out", type=Path, default=Path("out/contact"))
     parser.add_argument("--keep", type=Path, help="write the report here too")
+    parser.add_argument("--enclosed", action="store_true", help="in tubes and through rings")
     arguments = parser.parse_args()
     warnings.simplefilter("ignore")
     cases = []
-    for case in run(arguments.cases, arguments.out):
+    for case in run(arguments.cases, arguments.out, enclosed=arguments.enclosed):
         cases.append(case)
         error = case["stiffopt"].get("error") or case["rod"].get("error")
         print(case["seed"], error or measured(case), flush=True)

@@ -85,12 +85,24 @@ def _exponential(v: Array, w: Array) -> tuple[Array, Array]:
 
 
 def _distance(kind: Array, numbers: Array, x: Array) -> Array:
-    """Of points (k, 3) from a capsule or sphere (kind 0), or a half-space (1)."""
-    a, b, radius = numbers[:3], numbers[3:6], numbers[6]
+    """Of points (k, 3) from a capsule (kind 0), half-space (1), inside of a tube (2), ring (3)."""
+    a, b, radius, c = numbers[:3], numbers[3:6], numbers[6], numbers[7:]
+    height = (x - a) @ b
+    across = _length(x - a - height[:, None] * b) - radius
+    inside = radius - jnp.minimum(_from_line(a, b, x), _from_line(b, c, x))
+    ring = jnp.sqrt(height**2 + across**2 + 1e-24)
+    kinds = [kind == 0, kind == 1, kind == 2]
+    return jnp.select(kinds, [_from_line(a, b, x) - radius, height, inside], ring)
+
+
+def _from_line(a: Array, b: Array, x: Array) -> Array:
     way = b - a
     share = jnp.clip(((x - a) @ way) / jnp.maximum(way @ way, 1e-12), 0, 1)
-    beside = x - a - share[:, None] * way
-    return jnp.where(kind == 1, (x - a) @ b, jnp.sqrt((beside**2).sum(-1) + 1e-24) - radius)
+    return _length(x - a - share[:, None] * way)
+
+
+def _length(x: Array) -> Array:
+    return jnp.sqrt((x**2).sum(-1) + 1e-24)
 
 
 def _chain(rod: Rod, y: Array, samples: int) -> tuple[Array, Array, Array, Array]:
@@ -179,7 +191,8 @@ def _read(y: Array, rod: Rod, objects: Array, fineness: str) -> Pressed:
 
 
 def _numbers(objects: Sequence[tuple[int, Sequence[float]]]) -> Array:
-    return np.array([kind for kind, _ in objects]), np.array([each for _, each in objects], float)
+    padded = [[*each, *[0.0] * (10 - len(each))] for _, each in objects]
+    return np.array([kind for kind, _ in objects]), np.array(padded, float)
 
 
 def pressed(
@@ -188,7 +201,9 @@ def pressed(
 ) -> Pressed:  # fmt: skip
     """The arm after pressures and a force at the tip have grown from rest.
 
-    Objects are (0, both ends and radius) of a capsule, (1, point, normal, 0) of a half-space.
+    Objects are (0, both ends and radius) of a capsule, (1, point, normal, 0) of a half-space, (2,
+    two points, radius, a third point) of a tube that the arm is in, (3, centre, axis, radius) of a
+    ring about it.
     """
     known, y = _numbers(objects), np.zeros(6 * n * len(arm.tubes))
     for share in np.arange(steps + 1) / steps:

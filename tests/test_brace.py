@@ -23,6 +23,7 @@ from stiffopt.optimise import braced
 from stiffopt.optimise.leaning import MARGIN_ON, BracedProblem
 from stiffopt.optimise.settings import BRACE, Effort
 
+PROBLEMS = Path(__file__).parents[1] / "problems"
 POST = """
     - name: post
       capsule: {from: [-35 mm, -60 mm, 100 mm], to: [-35 mm, 60 mm, 100 mm], radius: 5 mm}
@@ -242,6 +243,18 @@ def test_refusals(tmp_path, old, new, message):
 def test_a_brace_needs_a_scene(tmp_path):
     with pytest.raises(InputError, match="brace: needs a scene"):
         stiffopt.load_task(written(tmp_path, TASK[: TASK.index("scene:")]))
+
+
+@pytest.mark.parametrize("file", sorted(PROBLEMS.glob("leaning_*.yaml")), ids=lambda p: p.stem)
+def test_the_gallery_holds_at_its_golden_pressures(robot, file):
+    task = stiffopt.load_task(file)
+    golden = json.loads((PROBLEMS / "golden" / f"{file.stem}.json").read_text())
+    problem = BracedProblem(robot, task)
+    eq = robot.contact_equilibrium(np.array(golden["pressures_pa"]), problem.scene)
+    judgement = problem.judgement(eq)
+    assert judgement.holds, judgement.shortfalls
+    assert judgement.stiffnesses[0] == pytest.approx(golden["stiffness"], rel=1e-5)
+    assert {each.object for each in eq.contacts} == set(task.brace.objects)
 
 
 def test_json_files_and_picture(tmp_path, capsys):

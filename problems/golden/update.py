@@ -36,6 +36,7 @@ HERE = Path(__file__).parent
 PROBLEMS = HERE.parent
 sys.path.insert(0, str(PROBLEMS.parent / "benchmarks"))
 
+from brace import Reference as BracedReference  # noqa: E402
 from reference import Answer, Reference  # noqa: E402
 
 NEAR_BEST = 5e-3  # relative
@@ -70,6 +71,8 @@ def check(
     robot: Manipulator, task: Task, solution: PressureSolution, starts: int, seed: int
 ) -> tuple[bool, str, float | None]:
     """Whether the reference finds nothing better, in words, and the spread of its pressures."""
+    if task.brace is not None:
+        return _check_braced(robot, task, solution, starts, seed)
     answer = Reference(robot, task).best(starts, seed)
     goal = task.stiffness
     floored = goal is not None and bool(goal.at_least)
@@ -96,6 +99,17 @@ def check(
     mine = float(pressures @ pressures) / len(pressures)
     good = solution.found and mine <= (1 + NEAR_BEST) * answer.value
     return good, _words("mean square pressure", mine, answer), answer.spread
+
+
+def _check_braced(
+    robot: Manipulator, task: Task, solution: PressureSolution, starts: int, seed: int
+) -> tuple[bool, str, float | None]:
+    """Leaning: the reference of ``benchmarks/brace.py`` finds nothing stiffer in contact."""
+    found = BracedReference(robot, task).best(starts, seed)
+    mine, best = solution.stiffness or 0.0, found["best"] or 0.0
+    good = solution.found and bool(solution.contacts) and mine >= (1 - NEAR_BEST) * best > 0
+    text = f"{found['agreeing']} of {found['ended']} ends of {found['starts']} starts agree"
+    return good, f"stiffness {mine:.6g} (ref. {best:.6g}, {text})", None
 
 
 def _check_floors(
@@ -149,6 +163,7 @@ def main() -> int:
     parser.add_argument("names", nargs="*", metavar="name")
     parser.add_argument("--starts", type=int, default=200, help="of the reference")
     parser.add_argument("--starts-loaded", type=int, default=10, help="the same under loads")
+    parser.add_argument("--starts-braced", type=int, default=40, help="of tasks with a brace")
     parser.add_argument("--seed", type=int, default=7)
     given = parser.parse_args()
     wrong = 0
@@ -158,6 +173,7 @@ def main() -> int:
         solution = solve_pressure(robot, task)
         loaded = robot.is_loaded or task.tip_load is not None
         starts = given.starts_loaded if loaded else given.starts
+        starts = given.starts_braced if task.brace is not None else starts
         good, text, spread = check(robot, task, solution, starts, given.seed)
         print(f"{'ok   ' if good else 'WRONG'} {name}: {solution.status}, {text}", flush=True)
         if not good:

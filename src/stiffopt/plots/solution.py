@@ -143,6 +143,8 @@ def _key_numbers(solution: PressureSolution, plain: float | None) -> str:
         if plain is not None:
             gain = gain_text(solution.stiffness, plain)
             compared = f" (plain: {unit.number(plain, FIGURES)}, {gain})"
+        if solution.contacts and solution.stiffness_free is not None:
+            compared = f" ({unit.number(solution.stiffness_free, FIGURES)} clear of objects)"
         parts.append(
             f"stiffness {unit.text(solution.stiffness, FIGURES)}{compared} "
             f"{direction_text(measure)}"
