@@ -36,7 +36,7 @@ def run(rig: str, given: Mapping[str, Any], remap: Sequence[str], token_file: st
     require_package("cyclonedds", "ros")
     from stiffopt.ros.bridge import NAMES, Bridge
     from stiffopt.ros.names import NodeNames, remap_rules
-    from stiffopt.ros.node import RosNode
+    from stiffopt.ros.node import RosNode, network_interface
 
     description = load_rig_description(rig)
     settings = _settings(description.ros, given, remap_rules(remap))
@@ -47,6 +47,7 @@ def run(rig: str, given: Mapping[str, Any], remap: Sequence[str], token_file: st
             f"there is no topic or service '{strange[0]}' that could have another name"
         )
     domain = _domain() if settings.domain is None else settings.domain
+    network_interface(settings.interface)  # before a daemon is started
     robot = load_robot(robot_path(description.robot, Path(rig).parent))
     over = threading.Event()
     daemon = _Daemon(rig, description, token_file)

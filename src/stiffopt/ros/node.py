@@ -179,6 +179,23 @@ class Service:
         return False
 
 
+def network_interface(name: str | None) -> str:
+    """Return the name of a network interface; None: that of loopback.
+
+    Raises
+    ------
+    InputError
+        There is no such interface.
+    """
+    place = name or _LOOPBACK
+    there = [name for _, name in socket.if_nameindex()]
+    if place not in there:
+        raise InputError(
+            f"there is no network interface '{place}'; this machine has {', '.join(there)}"
+        )
+    return place
+
+
 class RosNode:
     """A node with topics and services, which other nodes find as soon as `announce` is called.
 
@@ -208,12 +225,7 @@ class RosNode:
     ) -> None:
         self.names = names
         self._distro = distro
-        place = interface or _LOOPBACK
-        there = [name for _, name in socket.if_nameindex()]
-        if place not in there:
-            raise InputError(
-                f"there is no network interface '{place}'; this machine has {', '.join(there)}"
-            )
+        place = network_interface(interface)
         # DDS finds others by multicast, which Linux does not claim to have on loopback
         more = 'multicast="true"' if place == _LOOPBACK else ""
         try:
