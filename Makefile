@@ -1,6 +1,6 @@
 # `make demo` and `make test` do all their set-up; `make help` lists the rest.
 PYTHON ?= python3
-PARALLEL ?= -n 2 --dist loadfile
+PARALLEL ?= -n 2 --dist loadfile --no-loadscope-reorder
 VENV ?= .venv
 DEMO ?= problems/two_segment_stiff_x.yaml
 

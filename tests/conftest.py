@@ -15,6 +15,19 @@ from typing import Any
 
 import pytest
 
+LONGEST = (
+    *(
+        "test_fit",
+        "test_controller",
+        "test_touch",
+        "test_soak",
+        "test_commanding",
+        "test_detection",
+    ),
+    *("test_bracing", "test_brace", "test_workspace", "test_posture", "test_experiments"),
+    *("test_calibrate_cli", "test_open_regulator", "test_ros_end_to_end", "test_run_command"),
+    *("test_lab", "test_commanding_processes", "test_supply_contract", "test_world"),
+)
 LOOPBACK = ("127.0.0.1", "::1", "localhost")
 
 os.environ["MPLBACKEND"] = "Agg"
@@ -51,6 +64,8 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with the files that take longest: no process is left alone with one at the end."""
+    items.sort(key=lambda item: item.path.stem not in LONGEST)
     if not is_long():
         skip = pytest.mark.skip(reason="long: run with --long or STIFFOPT_LONG=1")
         for item in items:

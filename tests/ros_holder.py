@@ -29,13 +29,14 @@ def main(domain: str, task: str) -> None:
         time.sleep(0.1)
     tasks.write(String(Path(task).read_text(encoding="utf-8")))
     print("asked", flush=True)
-    goal = target.wait().pose.position
+    target.wait()
 
     def near(pose: PoseStamped) -> bool:
-        place = pose.pose.position
+        target.take()  # the newest: along a free axis it goes with the tip
+        place, goal = pose.pose.position, target.all[-1].pose.position
         return bool(np.linalg.norm([place.x - goal.x, place.y - goal.y, place.z - goal.z]) < 1e-3)
 
-    tip.wait(near)
+    tip.wait(near, 110)
     print("near", flush=True)
     while True:
         tip.wait()

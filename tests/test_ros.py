@@ -46,6 +46,8 @@ from stiffopt.ros.node import RosNode, Writer
 from stiffopt.ros.published import PUBLISHED, StateMessages, channel_names, time_of
 from stiffopt.ros.requests import MAX_AGE, target_of, task_in, trajectory_of
 
+pytestmark = pytest.mark.real_time
+
 TOKEN = "a-secret-of-the-tests"
 RIG = RIGS / "sim-two-segment.yaml"
 SERVICE = Path(m.__file__).parent / "stiffopt_msgs/srv/SolvePressure.srv"

@@ -21,6 +21,8 @@ from stiffopt.daemon.service import create_app
 from stiffopt.model.robot_files import load_description
 from stiffopt.ros import messages as m
 
+pytestmark = pytest.mark.real_time
+
 PLANNER = Path(__file__).resolve().parent.parent / "examples/ros_planner.py"
 TOKEN = "a-secret-of-the-tests"
 COMMANDS = {"commands": True, "interface": "lo"}

@@ -25,6 +25,8 @@ from board_host import need_firmware
 from ros_peer import own_domain
 from running import ONE, Process, guard_of, patient_rig, running, wait_for
 
+pytestmark = pytest.mark.real_time
+
 HOLDER = Path(__file__).with_name("ros_holder.py")
 PLANT = {"seed": 3, "spread": {"modulus": "5 %", "length": "0.5 %"}}
 SAFETY = {"heartbeat": "2 s", "hold_timeout": "1 s"}
