@@ -1,4 +1,4 @@
-"""What `stiffopt ros` does: find or start the daemon, and run the node until a signal comes."""
+"""The work of `stiffopt ros`: find or start the daemon, and run the node until a signal."""
 
 from __future__ import annotations
 

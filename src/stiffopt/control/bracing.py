@@ -94,7 +94,7 @@ class Bracing:
 
     @property
     def leans(self) -> bool:
-        """Whether the arm is in contact, or on its way into it or out of it."""
+        """Whether the arm is in contact, approaches it, or lets go."""
         return self.phase in (BracePhase.APPROACHING, BracePhase.HELD, BracePhase.RELEASING)
 
     @property
@@ -227,7 +227,7 @@ class Bracing:
         return found
 
     def _judge(self, before: Array) -> None:
-        """Whether the contacts, with these normal forces (k,) before, hold the push."""
+        """Judge whether contacts with normal forces (k,) hold the estimated push."""
         assert self.approach is not None
         assert self.task.brace is not None
         hold, size = self.approach.hold, float(np.linalg.norm(self.push))

@@ -422,7 +422,7 @@ class TipController:
         return counts
 
     def _feel(self, sample: PoseSample, effective: Array, tip: TipAt) -> None:
-        """What a sample tells of forces on the tip, and whether it is as the pressures say."""
+        """Estimate the force on the tip from a sample, and check the sample against the model."""
         predicted = self._estimator.predicted
         course, pushed = self.replanner.pursuit.course, np.zeros(3)
         presses = isinstance(course, Pressing) and course.touches_on_purpose
@@ -560,7 +560,7 @@ class TipController:
         return np.concatenate([course.pressures, self._estimator.offset])
 
     def _is_near(self, pressures: Array) -> bool:
-        """Whether the reference rests at pressures (n,)."""
+        """Whether the reference is at rest, at pressures (n,)."""
         n, tuning = len(pressures), self._tuning.reference
         off = float(np.abs(self._reference.path[:n] - pressures).max())
         return off < tuning.there and bool(
@@ -610,7 +610,7 @@ class TipController:
         )  # fmt: skip
 
     def _is_known(self, now: float) -> bool:
-        """Whether the arm's stiffness is known, and will not be known better soon."""
+        """Whether the stiffness is known as well as adaptation will soon know it."""
         if not self._adapts:
             return True
         known, calm = self.replanner.known, self._tuning.adaptation.calm_time

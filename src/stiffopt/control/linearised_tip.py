@@ -25,7 +25,7 @@ class LeaningTip:
     Parameters
     ----------
     approach :
-        The way; pressures beside it belong to the nearest of its equilibria.
+        The way into contact. Pressures off this way take the model of its nearest equilibrium.
     """
 
     def __init__(self, approach: BraceApproach) -> None:

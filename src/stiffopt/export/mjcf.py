@@ -20,6 +20,7 @@ from stiffopt.errors import InputError
 from stiffopt.model.actuation import SectionGeometry
 from stiffopt.model.description import Segment
 from stiffopt.model.manipulator import Manipulator
+from stiffopt.model.shooting import mass_per_length
 
 Vector = NDArray[np.float64]
 
@@ -134,8 +135,7 @@ def _links(robot: Manipulator, p: Vector, pieces: int) -> tuple[list[_Link], Vec
 
 
 def _mass_per_length(segment: Segment) -> float:
-    density = segment.material.density or _SILICONE
-    return float(density * SectionGeometry.of(segment).area)
+    return mass_per_length(segment) or _SILICONE * float(SectionGeometry.of(segment).area)
 
 
 def _slowest_swing(robot: Manipulator, p: Vector, pieces: int) -> float:
