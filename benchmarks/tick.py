@@ -70,8 +70,8 @@ def run(seconds: float, solver: str) -> tuple[dict[str, float], list[tuple[np.nd
         rig.supply, slew=rig.slew, safety=description.safety,
         force_per_pressure=None, clock=rig.clock,
     )  # fmt: skip
-    recorder = Recorder(controller._allocation._solver)
-    controller._allocation._solver = recorder
+    recorder = Recorder(controller._feedback._allocation._solver)
+    controller._feedback._allocation._solver = recorder
     controller.check()
     gate.open()
     rig.tracker.open()

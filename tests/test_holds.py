@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from simulated_loop import TASK, Lab
-from stiffopt.control.checks import late_ticks
+from stiffopt.control.arming import late_ticks
 from stiffopt.control.interface import Notice
 from stiffopt.control.state import State
 from stiffopt.control.ways import ClearanceWatch

@@ -453,7 +453,7 @@ def held(controller: TipController) -> list[Any]:
     inside = [getattr(replanner, name) for name in named]
     parts = [vars(replanner.pursuit)[name] for name in ("task", "target", "course", "unit")]
     prescribed = replanner.pursuit.prescribed.tolist()
-    return [*inside, *parts, prescribed, controller._allocation._high.tolist()]
+    return [*inside, *parts, prescribed, controller._permitted[1].tolist()]
 
 
 def test_a_controller_that_refuses_is_as_before(controller: TipController) -> None:

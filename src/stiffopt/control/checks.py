@@ -1,4 +1,4 @@
-"""Checks of requests before they reach the control thread, and of the rig before it is armed.
+"""Checks of requests before they reach the control thread.
 
 They apply to all requests: of a program in Python, a client of the daemon or the command line. The
 `InputError` of a refusal names the key and, for a pressure, the channel; nothing has changed then.
@@ -6,8 +6,6 @@ They apply to all requests: of a program in Python, a client of the daemon or th
 
 from __future__ import annotations
 
-import math
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, TypeVar
@@ -16,25 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel
 
-from stiffopt.commissioning.record import (
-    CommissioningRecord,
-    is_record_of,
-    load_record,
-    problems_of_record,
-)
-from stiffopt.control.gauge_watch import GaugeWatch
-from stiffopt.control.interface import Controller
-from stiffopt.control.tracker_watch import Sight, TrackerWatch
 from stiffopt.errors import CommandError, InputError, StiffoptError
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.optimise.solver import PressureSolver
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import PressureRange, Task
 from stiffopt.paths.trajectory import Trajectory, Waypoint
-from stiffopt.rig.interface import PressureLimits, PressureReading, Rig, SupplySettings
-from stiffopt.rig.settings import CommissioningSettings
-from stiffopt.safety.gate import Outlet
-from stiffopt.safety.monitors import PressureMonitor
+from stiffopt.rig.interface import PressureLimits
 from stiffopt.schema import Schema
 
 Array = NDArray[np.float64]
@@ -43,13 +29,6 @@ ModelT = TypeVar("ModelT", bound=Schema)
 _NOT_CONTENT = frozenset({"source"})  # the file that a description was read from
 _ROUNDING = 1e-6  # of a rate
 _LISTED = 5  # keys that an error names
-_BUSY = 1.0  # load of a processor from which on it keeps a program waiting
-
-# how far a vented arm may be from how it was commissioned
-_MOVED = 0.04  # of its length; hysteresis and creep leave about half of that
-_NOISIER, _LEAST_NOISE = 2.5, 2e-5  # factor on the tracker's noise, and the least of it, in m
-_LATER = 0.05  # s
-_GAUGE = 0.3  # of `Safety.max_pressure_error`
 
 
 @contextmanager
@@ -183,180 +162,6 @@ def _bound(
             f"{index + 1}, {limits.low[index] * 1e-5:g} to {limits.high[index] * 1e-5:g} bar"
         )
     return np.asarray(np.clip(values, limits.low, limits.high))
-
-
-def check_rig(rig: Rig, outlet: Outlet, controller: Controller) -> Iterator[str]:
-    """Yield the problems of a rig's configuration; each begins with the name of its check."""
-    robot, limits = rig.robot, outlet.limits
-    if rig.tracker is None:
-        yield "tracker: this rig has none, and the loop cannot steer without; add one"
-    if not robot.n_pressures == limits.n == rig.supply.n:
-        yield (
-            f"channels: the robot '{robot.name}' has {robot.n_pressures}, the supply "
-            f"{rig.supply.n} and its gate {limits.n}; take the robot file of this arm"
-        )
-        return
-    same = np.array_equal(limits.low, rig.supply.limits.low) and np.array_equal(
-        limits.high, rig.supply.limits.high
-    )
-    if not same:
-        yield (
-            "limits: those of the gate before the supply are not the supply's; set "
-            "safety.max_pressure in the rig file for both"
-        )
-    slack = 1e-9 * (limits.high - limits.low)
-    if (limits.high > np.array(robot.pressure_max) + slack).any():
-        yield "limits: the supply may go above the robot's pressure.max; lower safety.max_pressure"
-    if (limits.low < np.array(robot.pressure_min) - slack).any():
-        yield "limits: the supply may go below the robot's pressure.min; take this arm's robot file"
-    if not (np.isfinite(rig.slew) & (rig.slew > 0)).all():
-        yield (
-            "slew: there is no limit to how fast pressures may rise; set safety.max_slew in the "
-            "rig file, or pressure.slew in the robot file"
-        )
-    try:
-        controller.check()
-    except InputError as error:
-        yield f"model: {error}"
-
-
-def check_vented_arm(
-    now: float,
-    rig: Rig,
-    controller: Controller,
-    pressures: PressureMonitor,
-    reading: PressureReading,
-    tracker: TrackerWatch,
-    max_offset: float,
-) -> Iterator[str]:
-    """Yield the problems of a vented arm's measurements; each begins with the name of its check.
-
-    `max_offset` of the tip is a share of the arm's length.
-    """
-    trouble = pressures.implausible(now, reading)
-    if trouble is not None:
-        yield f"pressures: {trouble.text}"
-    elif left := pressures.under_pressure(reading):
-        yield f"pressures: {left}; wait until it has emptied, and check its gauge"
-    if tracker.samples < (enough := tracker.tuning.enough):
-        yield (
-            f"tracker: it has seen the tip {tracker.samples} times, {enough} are needed; wait, or "
-            "bring the sensor into its field"
-        )
-        return
-    if tracker.sight(now) is not Sight.SEEN:
-        yield "tracker: the tip is not seen now; bring the sensor into its field"
-        return
-    status = controller.status(now)
-    modelled = status.model_position
-    if modelled is None:
-        modelled = status.tip_position - status.disturbance
-    off = float(np.linalg.norm(tracker.position - modelled))
-    if not off <= max_offset * rig.robot.length:  # NaN is too far as well
-        seen, model = (", ".join(f"{1e3 * x:.1f}" for x in p) for p in (tracker.position, modelled))
-        yield (
-            f"calibration: the vented tip is seen at ({seen}) mm, {1e3 * off:.0f} mm from where "
-            f"the model has it, ({model}) mm; check the tracker's registration and the robot file "
-            "('stiffopt calibrate' makes one)"
-        )
-
-
-def check_commissioned(
-    rig: Rig, gauges: GaugeWatch, tracker: TrackerWatch, reading: PressureReading
-) -> Iterator[str]:
-    """Yield why the record of its commissioning, or its gauges, do not permit to arm a vented arm.
-
-    A rig that was not made from a rig file is not checked.
-    """
-    if rig.settings is None:
-        return
-    settings: CommissioningSettings = rig.settings.commissioning
-    supply: SupplySettings = rig.settings.supply
-    required = not supply.simulated if settings.required is None else settings.required
-    command = "run 'stiffopt commission' on this rig"
-    path, record = settings.record, None
-    if path is not None and os.path.exists(path):
-        try:
-            record = load_record(path)
-        except InputError as error:
-            yield f"commissioning: its record cannot be read, {command}: {error}"
-    elif required:
-        yield f"commissioning: there is no record '{path}'; {command}"
-    noisy = [False] * rig.supply.n
-    if record is not None:
-        problems = list(problems_of_record(record, rig.robot, rig.settings, settings.max_age))
-        is_of_this = is_record_of(record, rig.robot, rig.settings)
-        if not problems:
-            noisy = [bool(channel.gauge_noise) for channel in record.channels]
-            problems = list(_changed(record, rig, tracker, reading))
-        if required or is_of_this:
-            yield from (f"commissioning: {problem}; {command}" for problem in problems)
-    measured = [supply.measures(k) for k in range(rig.supply.n)]
-    yield from (f"gauges: {problem}" for problem in gauges.dead(measured, noisy))
-
-
-def _changed(
-    record: CommissioningRecord, rig: Rig, tracker: TrackerWatch, reading: PressureReading
-) -> Iterator[str]:
-    """Yield how a vented arm differs from what it was when it was commissioned."""
-    then = record.tracker
-    if then is None or not tracker.samples:
-        return
-    off = float(np.linalg.norm(tracker.position - then.position))
-    if off > _MOVED * rig.robot.length:
-        yield (
-            f"the vented tip is {1e3 * off:.1f} mm from where it was: a push, a load, a slipped "
-            "sensor or a moved tracker; look at the arm"
-        )
-    if tracker.noise > _NOISIER * max(then.noise, _LEAST_NOISE):
-        yield (
-            f"the tracker's noise is {1e3 * tracker.noise:.3f} mm and was {1e3 * then.noise:.3f} mm"
-        )
-    if tracker.usual[1] > then.latency + _LATER:
-        yield (
-            f"the tracker's samples are {1e3 * tracker.usual[1]:.0f} ms old when they come and "
-            f"were {1e3 * then.latency:.0f} ms old"
-        )
-    tolerance = np.broadcast_to(rig.settings.safety.max_pressure_error, rig.supply.n)
-    for k, channel in enumerate(record.channels):
-        if channel.gauge_offset is None:
-            continue
-        moved = abs(reading.pressures[k] - channel.gauge_offset)
-        if moved > _GAUGE * tolerance[k] + 6 * (channel.gauge_noise or 0.0):
-            yield (
-                f"the gauge of channel {k + 1} reads {reading.pressures[k] * 1e-5:.3f} bar of the "
-                f"vented arm and read {channel.gauge_offset * 1e-5:.3f} bar"
-            )
-
-
-def late_ticks(lateness: float, guard_timeout: float, load: float = 0.0) -> str:
-    """What to change where the guard may vent because the computer is busy; empty if it is not.
-
-    Parameters
-    ----------
-    lateness :
-        How late ticks began in the last half minute, in s. By half of the guard's patience within
-        that time, they may exceed it within minutes.
-    guard_timeout :
-        The guard's patience, in s.
-    load :
-        Processes that want to run, over the processors that they have.
-    """
-    half = 0.5 * guard_timeout
-    if lateness < half and load < _BUSY:
-        return ""
-    what = f"ticks began {1e3 * lateness:.0f} ms late in the last half minute"
-    if lateness < half:
-        what = f"{load:.1f} processes want each processor of this computer"
-    patience = max(0.1, math.ceil(20 * 2.5 * lateness) / 20)
-    return (
-        f"timing: {what}, and the guard vents after {1e3 * guard_timeout:.0f} ms; give the "
-        "computer less to do, this program real-time rights ('stiffopt run' says how when it "
-        f"starts), or set safety.guard_timeout: {1e3 * patience:.0f} ms"
-    )
-
-
-# what a request holds ---------------------------------------------------------------------------
 
 
 def contents(value: Any) -> Any:

@@ -1,4 +1,4 @@
-"""The model's tip, linearised where it was evaluated last.
+"""The model of the arm in the loop: its tip, linearised where it was evaluated last.
 
 The loaded model takes a good part of a tick. Between two ticks pressures change little, so that it
 is evaluated only where they have left the range in which its linearisation is good enough.
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt.control.formula import Formula
-from stiffopt.errors import EquilibriumError, PressureError, StiffoptError
+from stiffopt.errors import EquilibriumError, InputError, PressureError, StiffoptError
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.optimise.tip import TipAt, TipModel
 from stiffopt.paths.leaning import BraceApproach
@@ -42,6 +42,55 @@ class LeaningTip:
         change = tip.jacobian[:3] @ (pressures - approach.pressures[index])
         pose[:3, 3] += pose[:3, :3] @ change
         return TipAt(pose, tip.jacobian, tip.compliance)
+
+
+class ArmModel:
+    """The model of an arm at the three places where the loop needs its tip.
+
+    Parameters
+    ----------
+    robot :
+        The arm.
+    path_range :
+        Change of pressure over which the tip on the reference's path is taken to be linear, in Pa.
+
+    Attributes
+    ----------
+    chambers, path : LinearisedTip
+        At the effective pressures, and on the reference's path.
+    waypoints : TipModel
+        At a trajectory's waypoints, and wherever else it is asked for seldom.
+
+    Raises
+    ------
+    InputError
+        If the arm is loaded and there is no compiler: too slow for a loop.
+    """
+
+    def __init__(self, robot: Manipulator, path_range: float) -> None:
+        self._robot = robot
+        self.chambers, self.path = LinearisedTip(robot), LinearisedTip(robot, path_range)
+        self.waypoints = TipModel(robot)
+        if not self.chambers.is_fast and robot.is_loaded:
+            raise InputError(
+                "the control loop needs a C compiler for an arm under gravity or a load; "
+                "install one (Debian: apt install gcc) or set STIFFOPT_COMPILER"
+            )
+
+    def change(self, robot: Manipulator, pressures: Array) -> None:
+        """Go on with another arm; `StiffoptError`, and no change, if none stands at (n,) Pa."""
+        last = self._robot
+        try:
+            self._take(robot)
+            self.chambers.at(pressures)
+        except StiffoptError:
+            self._take(last)
+            raise
+
+    def _take(self, robot: Manipulator) -> None:
+        for each in (self.chambers, self.path, self.waypoints):
+            each.change(robot)
+        self._robot = robot
 
 
 class LinearisedTip:

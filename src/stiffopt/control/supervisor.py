@@ -12,14 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from stiffopt.control.checks import (
-    check_commissioned,
-    check_rig,
-    check_vented_arm,
-    highest_pressures,
-    late_ticks,
-    refusing,
-)
+from stiffopt.control.arming import check_commissioned, check_rig, check_vented_arm, late_ticks
+from stiffopt.control.checks import highest_pressures, refusing
 from stiffopt.control.gauge_watch import GaugeWatch
 from stiffopt.control.interface import Controller, ControlOutput
 from stiffopt.control.lifecycle import Alarms, EventBuffer, Lifecycle

@@ -1,0 +1,212 @@
+"""The observer: the state of the arm, from commands, pressure readings and tracker samples."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stiffopt.control.bracing import Bracing
+from stiffopt.control.channels import Channels
+from stiffopt.control.estimator import TipEstimator
+from stiffopt.control.interface import SampleCounts
+from stiffopt.control.linearised_tip import ArmModel, LeaningTip
+from stiffopt.control.motion_watch import MotionWatch
+from stiffopt.control.pressing import Pressing
+from stiffopt.control.regulators import PressureEstimator
+from stiffopt.control.replanning import AnyCourse
+from stiffopt.control.touch import TouchEstimator
+from stiffopt.control.tuning import ControlTuning
+from stiffopt.control.vibration import BendingMode
+from stiffopt.errors import StiffoptError
+from stiffopt.model.description import RobotDescription
+from stiffopt.model.manipulator import Manipulator
+from stiffopt.optimise.tip import TipAt
+from stiffopt.rig.interface import PoseSample, PressureLimits, PressureReading
+from stiffopt.rig.settings import ControlSettings, Safety
+
+Array = NDArray[np.float64]
+
+_MOST_STEPS = 50  # of the estimators in one tick, after a pause
+
+
+class ArmObserver:
+    """Estimates pressures and tip, feels contacts, and watches whether the arm moves as it should.
+
+    Parameters
+    ----------
+    robot, limits, slew, period, control, safety, tuning :
+        See `TipController`; slew (n,), in Pa/s.
+    mode :
+        The arm's first bending mode; None for an arm that does not vibrate.
+
+    Attributes
+    ----------
+    channels, pressures, tip, touch, watch :
+        Its parts; `tip` is the estimator of the tip.
+    model : ArmModel or None
+        None until `check` has compiled it.
+    modelled : TipAt or None
+        The tip that the model has at the effective pressures.
+    leaning : LeaningTip or None
+        The model of the braced tip, while the arm may lean on objects.
+    """
+
+    def __init__(
+        self,
+        robot: Manipulator,
+        limits: PressureLimits,
+        slew: Array,
+        period: float,
+        mode: BendingMode | None,
+        control: ControlSettings,
+        safety: Safety,
+        tuning: ControlTuning,
+    ) -> None:
+        n = robot.n_pressures
+        self._robot, self._period, self._tuning = robot, period, tuning
+        self._frequency = control.frequency
+        tolerance = np.broadcast_to(np.asarray(safety.max_pressure_error, dtype=float), n)
+        self.channels = Channels(limits, slew, tolerance, tuning.regulators)
+        self.pressures = PressureEstimator(
+            robot.description, control, period, slew, tuning.regulators, self.channels
+        )
+        filter_tuning = replace(
+            tuning.estimator,
+            noise=control.tracker_noise,
+            max_speed=safety.max_tip_speed,
+            damping=control.damping,
+        )
+        self.tip = TipEstimator(period, n, mode, filter_tuning)
+        self.touch = TouchEstimator(
+            [segment.n_channels for segment in robot.description.segments],
+            vibrates=mode is not None,
+            damping=control.damping,
+            tuning=replace(tuning.touch, noise=max(tuning.touch.noise, 2 * control.tracker_noise)),
+        )
+        self.watch = MotionWatch(
+            robot.description, replace(tuning.motion, scatter=control.tracker_noise)
+        )
+        self.model: ArmModel | None = None
+        self._now = 0.0
+
+    def check(self) -> None:
+        """Compile and try the model; the errors of `ArmModel`."""
+        if self.model is None:
+            self.model = ArmModel(self._robot, self._tuning.reference.model_range)
+            self._set_frequency()
+            self.begin(self._now)
+
+    @property
+    def compiled(self) -> ArmModel:
+        """The model, which is compiled now if `check` has not been called."""
+        self.check()
+        assert self.model is not None
+        return self.model
+
+    def _set_frequency(self) -> None:
+        """Let the vented arm swing as the settings say, whatever its model."""
+        if self._frequency is not None and self.model is not None:
+            vented = self.model.waypoints.at(np.zeros(self._robot.n_pressures))
+            self.tip.set_frequency(2 * math.pi * self._frequency, vented)
+
+    def begin(self, now: float) -> None:
+        """Start anew with a vented arm."""
+        self._now = now
+        self.pressures.begin()
+        self.tip.begin()
+        self.touch.begin()
+        self.watch.begin()
+        self.modelled: TipAt | None = None
+        self.leaning: LeaningTip | None = None
+        self._looked_at = now  # capture of the last sample, in s
+        if self.model is not None:
+            self.model.chambers.lean(None)
+            zero = self.pressures.command
+            self.modelled = self.model.chambers.at(zero)
+            self.tip.advance(now, zero, self.modelled)
+
+    def observe(
+        self,
+        now: float,
+        commanded: Array,
+        reading: PressureReading,
+        samples: Sequence[PoseSample],
+        course: AnyCourse | None,
+    ) -> SampleCounts:
+        """Estimate pressures and tip; see `Controller.observe`. `course` is under way."""
+        steps = min(max(1, round((now - self._now) / self._period)), _MOST_STEPS)
+        self._now = now
+        self.pressures.advance(steps, commanded, reading.pressures)
+        effective = self.pressures.effective
+        self.modelled = tip = self.compiled.chambers.at(effective)
+        for step in range(steps):
+            moment = now - (steps - 1 - step) * self._period
+            self.tip.advance(moment, effective, tip)
+        counts = self.tip.take(samples)
+        sample = self.tip.sample
+        if counts.used and sample is not None:
+            if isinstance(course, Bracing) and self.leaning is not None:
+                elapsed = sample.time - self._looked_at
+                course.look(elapsed, sample.position, tip, effective)
+                self._looked_at = sample.time
+            else:
+                self._feel(sample, effective, tip, course)
+        return counts
+
+    def _feel(
+        self, sample: PoseSample, effective: Array, tip: TipAt, course: AnyCourse | None
+    ) -> None:
+        """Estimate the force on the tip from a sample, and check the sample against the model."""
+        predicted, pushed = self.tip.predicted, np.zeros(3)
+        presses = isinstance(course, Pressing) and course.touches_on_purpose
+        if isinstance(course, Pressing) and presses:
+            self.touch.expect(course.direction, course.press.speed, presses=course.presses)
+        else:
+            self.touch.expect(None)
+        self.touch.take(sample.time, sample.position - predicted, effective, tip, self.tip.omega)
+        if presses:
+            pushed = self.touch.felt.displacement
+        self.watch.take(
+            sample.time, sample.position - pushed, predicted, self.tip.offset,
+            effective, tip, turns=self.tip.turn_known, swing=self.tip.swing,
+        )  # fmt: skip
+
+    def lean_on(self, leaning: LeaningTip | None) -> Array:
+        """Go on with the model of an arm that leans on objects; None: of the free one.
+
+        Returns the change (6,) of the tip's offset, which takes up what the model changes by.
+        """
+        model, effective = self.compiled.chambers, self.pressures.effective
+        before = model.at(effective)
+        self.leaning = leaning
+        model.lean(leaning)
+        change = self._shift(before, model.at(effective))
+        self.touch.begin()
+        self.watch.go_on()
+        return change
+
+    def change_robot(self, description: RobotDescription) -> Array | None:
+        """Go on with other numbers of the arm; None, and no change, if no such arm stands.
+
+        Returns the change (6,) of the tip's offset, which takes up what the model changes by.
+        """
+        model, effective = self.compiled, self.pressures.effective
+        before = model.chambers.at(effective)
+        try:
+            model.change(Manipulator(description), effective)
+        except StiffoptError:
+            return None
+        self._set_frequency()
+        return self._shift(before, model.chambers.at(effective))
+
+    def _shift(self, before: TipAt, after: TipAt) -> Array:
+        """Let the offset (6,) take up what the model changes by."""
+        self.modelled = after
+        change = self.tip.change_model(before, after)
+        self.watch.change_model(change)
+        self.touch.change_model(change)
+        return change

@@ -1,0 +1,148 @@
+"""From a request to what the controller pursues; what cannot be pursued is refused."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stiffopt.control.bracing import Bracing
+from stiffopt.control.checks import check_press, check_rates, limited_range
+from stiffopt.control.course import Course
+from stiffopt.control.forecast import Forecast
+from stiffopt.control.pressing import Pressing
+from stiffopt.control.replanning import AnyCourse, Pursuit
+from stiffopt.control.tuning import ControlTuning
+from stiffopt.errors import InputError, dotted
+from stiffopt.model.manipulator import Manipulator
+from stiffopt.model.scene import Scene
+from stiffopt.optimise.target import Target
+from stiffopt.optimise.task import PressureRange, Task
+from stiffopt.paths.trajectory import Trajectory
+from stiffopt.rig.interface import PressureLimits
+from stiffopt.schema import BadKeyError
+
+Array = NDArray[np.float64]
+
+_SLACK = 1e-3  # Pa, of a limit, by rounding
+
+
+class Requests:
+    """Makes pursuits of requests, for one arm on one rig.
+
+    All methods raise `InputError` with the reason of a refusal, and change nothing.
+
+    Parameters
+    ----------
+    robot, limits, slew, scene, tuning :
+        See `TipController`; slew (n,), in Pa/s.
+    """
+
+    def __init__(
+        self,
+        robot: Manipulator,
+        limits: PressureLimits,
+        slew: Array,
+        scene: Scene | None,
+        tuning: ControlTuning,
+    ) -> None:
+        self._robot, self._limits, self._slew = robot, limits, slew
+        self._scene, self._tuning = scene, tuning
+
+    def of_task(self, task: Task) -> Pursuit:
+        """Return the pursuit of a task, which may press or brace."""
+        course: AnyCourse | None = None
+        if task.press is not None:
+            course = Pressing(task.press, task.target, self._tuning.pressing)
+        elif task.brace is not None:
+            task = self._in_the_rigs_scene(task)
+            course = Bracing(task, self._tuning.bracing)
+        return Pursuit.of(task, self._limited(task), course)
+
+    def of_target(self, target: Target, last: Pursuit, course: AnyCourse | None = None) -> Pursuit:
+        """Return the pursuit of a target, with goal and limits of the last task, if any."""
+        if last.task is not None:
+            return last.to(target, course)
+        task = Task(robot=self._robot.description.name, target=target)
+        return Pursuit.of(task, self._limited(task), course)
+
+    def check_posture(
+        self, trajectory: Trajectory, pressures: Array, start: Array, task: Task | None
+    ) -> None:
+        """Refuse a trajectory of pressures (k, n) that cannot be had from a start (n,), in Pa.
+
+        Nor may it leave the limits of the task that is pursued.
+        """
+        time = trajectory.waypoints[0].time
+        if time > 0:
+            ends = np.stack([start, pressures[0]])
+            check_rates(np.array([0.0, time]), ends, self._slew, before_first=1)
+        else:
+            self._check_first(pressures[0], start)
+        if task is not None:
+            _check_within(pressures, *task.pressure_bounds(self._robot.description))
+
+    def check_ahead(
+        self, request: Task | Target | Trajectory, forecast: Forecast | None, leans: bool
+    ) -> None:
+        """Refuse what would lead the arm too near to the scene; any thread may ask.
+
+        An arm that leans on objects, or is about to, has its way checked when it is planned.
+        """
+        if isinstance(request, Task):
+            check_press(self._robot, self._limits, request)
+            if request.brace is not None:
+                self._in_the_rigs_scene(request)
+                return
+        if forecast is None or leans:
+            return
+        if isinstance(request, Trajectory) and request.pressures is not None:
+            forecast.check_posture(request, request.pressures)
+        elif isinstance(request, Task):
+            forecast.check(Pursuit.of(request, self._limited(request)))
+        else:
+            here, course = forecast.here(), None
+            if isinstance(request, Trajectory):
+                course = Course(request, 0.0, here.position, here.rotation)
+                request = course.at(0.0)
+            forecast.check(self.of_target(request, here.pursuit, course))
+
+    def _in_the_rigs_scene(self, task: Task) -> Task:
+        """Return a task in the rig's scene, which must have the objects that it leans on."""
+        if self._scene is None:
+            raise InputError("brace: the rig file has no scene, so nothing to lean on is known")
+        there = task.model_copy(update={"scene": self._scene})
+        assert there.brace is not None
+        try:
+            there.brace.check(there)
+        except BadKeyError as error:
+            raise InputError(f"{dotted(error.loc)}: {error}; that is of the rig's scene") from None
+        return there
+
+    def _limited(self, task: Task) -> Task:
+        """Return a task with the rig's limits of pressure as well; see `limited_range`."""
+        description = self._robot.description
+        on_rig = task.model_copy(update={"pressure": limited_range(task.pressure, self._limits)})
+        lower, upper = on_rig.pressure_bounds(description)
+        pressure = PressureRange(min=tuple(lower.tolist()), max=tuple(upper.tolist()))
+        # a load shows in the tip's offset, by as much as there is of it
+        return task.model_copy(update={"pressure": pressure, "load": None, "press": None})
+
+    def _check_first(self, first: Array, start: Array) -> None:
+        """Refuse pressures (n,) of a waypoint at 0 s that the arm does not have at the start."""
+        for channel in np.flatnonzero(np.abs(first - start) > self._tuning.posture.there):
+            raise InputError(
+                f"waypoint 1 is at 0 s and has {first[channel] * 1e-5:.4g} bar in channel "
+                f"{channel + 1}, which has {start[channel] * 1e-5:.4g} bar now; give it a later "
+                "time, in which the arm goes there, or go there before"
+            )
+
+
+def _check_within(pressures: Array, low: Array, high: Array) -> None:
+    """Refuse waypoints' pressures (k, n) beyond the limits of the task that is pursued."""
+    beyond = (pressures < low - _SLACK) | (pressures > high + _SLACK)
+    for index, channel in np.argwhere(beyond):
+        raise InputError(
+            f"waypoints[{index}].pressures: {pressures[index, channel] * 1e-5:g} bar is beyond the "
+            f"limits of the task in channel {channel + 1}, {low[channel] * 1e-5:g} to "
+            f"{high[channel] * 1e-5:g} bar"
+        )

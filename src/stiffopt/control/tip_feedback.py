@@ -1,0 +1,142 @@
+"""From the reference and the observed arm to the next command: correction, damping, limits."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from stiffopt.control.allocation import Allocation
+from stiffopt.control.feedback import GainSchedule, tracking_rows
+from stiffopt.control.observer import ArmObserver
+from stiffopt.control.reference import Reference, VibrationFilter
+from stiffopt.control.tuning import FeedbackTuning
+from stiffopt.control.vibration import BendingMode
+from stiffopt.optimise.tip import TipAt
+from stiffopt.rig.interface import PressureLimits
+from stiffopt.rig.settings import ControlSettings, Safety
+
+Array = NDArray[np.float64]
+
+
+class TipFeedback:
+    """Corrects the tip's offset from the reference, and damps its vibration; see `tracking_rows`.
+
+    Parameters
+    ----------
+    arm :
+        As it is observed.
+    limits, slew, period, control, safety :
+        See `TipController`; slew (n,), in Pa/s.
+    mode :
+        The arm's first bending mode; None for an arm that does not vibrate.
+    tuning :
+        Of the feedback.
+
+    Attributes
+    ----------
+    saturated : channels (n,) at a limit that keeps the tip from its target
+    """
+
+    def __init__(
+        self,
+        arm: ArmObserver,
+        limits: PressureLimits,
+        slew: Array,
+        period: float,
+        mode: BendingMode | None,
+        control: ControlSettings,
+        safety: Safety,
+        tuning: FeedbackTuning,
+    ) -> None:
+        self._arm, self._tuning = arm, tuning
+        lag, dead_time = arm.pressures.lag, arm.pressures.dead_time
+        self._averaged = VibrationFilter(period, control.damping, 6)  # the offset
+        self._gains: GainSchedule | None = None
+        if mode is not None:
+            self._gains = GainSchedule(period, lag, control.damping, tuning.effort)
+        self._allocation = Allocation(
+            tracking_rows(len(slew), mode, control.damping, dead_time, tuning),
+            limits.low,
+            limits.high,
+            slew * period,
+            safety.max_tip_speed * period,
+            control.solver,
+            tuning,
+        )
+
+    def begin(self, offset: Array) -> None:
+        """Start anew with an offset (6,) of the tip."""
+        self._averaged.begin(offset)
+        self.saturated = np.zeros(len(self._arm.pressures.command), dtype=bool)
+
+    def resume(self, offset: Array) -> None:
+        """Go on after a pause with an offset (6,) of the tip."""
+        self._averaged.begin(offset)
+
+    def shift(self, change: Array) -> None:
+        """Let the offset change by as much (6,), as the model does."""
+        self._averaged.shift(change)
+
+    def command(
+        self,
+        tip: TipAt,
+        reference: Reference,
+        prescribed: Array,
+        offset: Array,
+        goal: Array,
+        limits: tuple[Array, Array],
+    ) -> Array | None:
+        """Return the next command (n,), in Pa; None if the solver failed.
+
+        Parameters
+        ----------
+        tip :
+            Of the model, on the reference's path.
+        reference :
+            Where the arm is led to, with the offset that it was planned with.
+        prescribed :
+            Components (5,) that the target prescribes; see `prescribed_components`.
+        offset :
+            Of the tip (6,), estimated now.
+        goal :
+            Command (n,) that the reference asks for, in Pa.
+        limits :
+            Of the command (n,), lowest and highest, in Pa.
+        """
+        n = len(goal)
+        correction = reference.path[n:] - self._correctable(offset)
+        self._allocation.limit(*limits)
+        command, held, residual = self._allocation.solve(
+            (tip.pose, tip.jacobian, prescribed, correction, *self._vibration_inputs(reference)),
+            goal,
+            self._arm.pressures.command,
+        )
+        if command is not None:
+            reported = residual > self._tuning.unreported_error
+            self.saturated = held if reported else np.zeros(n, dtype=bool)
+        return command
+
+    def _correctable(self, offset: Array) -> Array:
+        """Offset (6,) that feedback corrects now.
+
+        That of an arm that vibrates is averaged over a vibration, except along its stiff axis.
+        """
+        estimator = self._arm.tip
+        self._averaged.advance(offset, estimator.omega)
+        corrected = self._averaged.value.copy()
+        behind = offset[:3] - corrected[:3]
+        corrected[:3] += behind - estimator.soft_plane @ behind
+        return corrected
+
+    def _vibration_inputs(self, reference: Reference) -> tuple[ArrayLike, ...]:
+        """Inputs of `tracking_rows` for an arm that vibrates."""
+        if self._gains is None:
+            return ()
+        estimator, pressures = self._arm.tip, self._arm.pressures
+        motion, n = reference.motion, len(pressures.command)
+        return (
+            estimator.vibration, estimator.soft_plane, estimator.omega,
+            self._gains.at(estimator.omega), pressures.effective_ahead,
+            reference.chamber, motion[0, :n], motion[1, :n],
+            motion[:2, n : n + 3] - self._averaged.motion[:, :3],
+        )  # fmt: skip
