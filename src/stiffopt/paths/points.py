@@ -84,7 +84,8 @@ class PathTasks:
     def __init__(self, robot: Manipulator, tasks: Sequence[Task], seed: int) -> None:
         self.tasks = tuple(tasks)
         # the robot carries the load
-        self._without_load = [task.model_copy(update={"load": None}) for task in tasks]
+        plain = {"load": None}
+        self._without_load = [t if t.load is None else t.model_copy(update=plain) for t in tasks]
         self._prepared = prepared(robot, tasks[0], seed)
         self.robot = self._prepared.robot
         self.lower, self.upper = self._prepared.lower, self._prepared.upper

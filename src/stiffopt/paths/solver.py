@@ -199,7 +199,9 @@ class _PathSolver:
         if times is None:
             times = self._fastest(pressures)
         alone = np.array([max((c.value for c in layer), default=np.nan) for layer in layers])
-        solution = self._judged(pressures, times, alone)
+        if self._unreachable is not None:  # the tasks of the path as it is given
+            tasks = PathTasks(self._robot, self._tasks, self._seed)
+        solution = self._judged(tasks, pressures, times, alone)
         branches = max(map(len, layers))
         confidence = (
             f"{starts} starts found at most {branches} local optima at a point; "
@@ -279,10 +281,11 @@ class _PathSolver:
 
     # -- judgement ------------------------------------------------------------------------------
 
-    def _judged(self, pressures: Vector, times: Vector, alone: Vector) -> PathSolution:
-        """The solution at pressures (N, n), judged by the model against the path as given."""
-        own = PathTasks(self._robot, self._tasks, self._seed)
-        judgements = own.judged(pressures)
+    def _judged(
+        self, tasks: PathTasks, pressures: Vector, times: Vector, alone: Vector
+    ) -> PathSolution:
+        """The solution at pressures (N, n), judged by the model against the tasks of the path."""
+        judgements = tasks.judged(pressures)
         known = [j for j in judgements if j is not None]
         if len(known) < len(judgements):
             index = judgements.index(None)
@@ -295,17 +298,17 @@ class _PathSolver:
         solution = PathSolution(
             status="solved",
             message="",
-            robot=own.robot,
+            robot=tasks.robot,
             times=times,
             pressures=pressures,
             tip_poses=np.stack([j.tip_pose for j in known]),
             slew=self._slew,
             stiffness=stiffness,
-            stiffness_unit=own.tasks[0].measures[0].unit if measured else None,
+            stiffness_unit=tasks.tasks[0].measures[0].unit if measured else None,
             alone=alone if measured else None,
             position_errors=_errors(known, "position"),
             angle_errors=_errors(known, "angle"),
-            clearance=None if scene is None else own.robot.clearance(pressures, scene),
+            clearance=None if scene is None else tasks.robot.clearance(pressures, scene),
         )
         wrong = [i for i, j in enumerate(known) if not j.holds]
         if self._unreachable is not None:
