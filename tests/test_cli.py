@@ -32,6 +32,7 @@ from stiffopt.errors import EquilibriumError, FileError
 from stiffopt.model.calibration import Calibration, FittedParameter
 from stiffopt.model.history import History, Play
 from stiffopt.model.robot_files import load_description, save_robot
+from stiffopt.optimise.general_search import GeneralSearch
 from stiffopt.optimise.solution import PressureSolution
 from stiffopt.units import parse_quantity
 
@@ -313,7 +314,7 @@ def test_solver_failure_is_4(write: Write, monkeypatch: pytest.MonkeyPatch) -> N
     def falls_over(self: Any, *args: Any) -> None:
         raise EquilibriumError("the arm falls over")
 
-    monkeypatch.setattr(stiffopt.PressureSolver, "_solve", falls_over)
+    monkeypatch.setattr(GeneralSearch, "_solve", falls_over)
     result = run(write("one.yaml", ONE))
     assert result.exit_code == 4
     assert "the arm falls over" in result.stdout
@@ -643,7 +644,7 @@ def test_plot_of_a_failure_is_no_second_failure(
     def falls_over(self: Any, *args: Any) -> None:
         raise EquilibriumError("the arm falls over")
 
-    monkeypatch.setattr(stiffopt.PressureSolver, "_solve", falls_over)
+    monkeypatch.setattr(GeneralSearch, "_solve", falls_over)
     result = run(write("one.yaml", ONE), "--plot", str(tmp_path / "p.png"))
     assert result.exit_code == 4
     assert "no picture of" in result.stderr

@@ -30,6 +30,7 @@ from stiffopt import (
 from stiffopt.errors import DerivativeError, FileError, InputError
 from stiffopt.model import compiled as code
 from stiffopt.optimise.derivatives import AnswerDerivatives
+from stiffopt.optimise.general_search import GeneralSearch
 from stiffopt.optimise.problem import PressureProblem
 
 Array = NDArray[np.float64]
@@ -295,7 +296,7 @@ def no_general_method(monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: object) -> None:
         raise AssertionError("the general method was called")
 
-    monkeypatch.setattr(PressureSolver, "_solve_generally", refuse)
+    monkeypatch.setattr(GeneralSearch, "solve", refuse)
 
 
 @pytest.mark.usefixtures("compiled", "no_general_method")

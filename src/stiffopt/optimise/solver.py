@@ -1,4 +1,4 @@
-"""From a task to the stiffest pressures: global search, judgement and diagnosis."""
+"""From a task to the stiffest pressures: the calls, and which search answers them."""
 
 from collections.abc import Iterable
 from dataclasses import replace
@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from stiffopt.errors import EquilibriumError, InputError, StoppedError, shown
+from stiffopt.errors import InputError, StoppedError, shown
 from stiffopt.model.arguments import checked_integer, checked_vector
 from stiffopt.model.compiled import (
     CodeReadyError,
@@ -20,34 +20,23 @@ from stiffopt.model.compiled import (
 )
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.stopping import Cancel, checkpoint, giving_up, stop_flag
-from stiffopt.optimise import diagnosis
+from stiffopt.optimise.answers import Answers
 from stiffopt.optimise.braced import lean
-from stiffopt.optimise.fast import CompiledAnswer, FastSolver
+from stiffopt.optimise.compiled_search import CompiledSearch
+from stiffopt.optimise.fast import FastSolver
+from stiffopt.optimise.general_search import GeneralSearch
 from stiffopt.optimise.leaning import BracedProblem
-from stiffopt.optimise.local import LocalResult, descend
 from stiffopt.optimise.prepared import prepared
-from stiffopt.optimise.problem import PressureProblem, ProgramPoint
+from stiffopt.optimise.problem import PressureProblem
 from stiffopt.optimise.program import Program
-from stiffopt.optimise.reach import comes, reach
-from stiffopt.optimise.search import Search, search, starts
-from stiffopt.optimise.settings import ANSWER, CLOSEST, OBSTACLES, PRICES, Effort
-from stiffopt.optimise.solution import (
-    Confidence,
-    Explanation,
-    Judgement,
-    PressureSolution,
-    Sensitivities,
-    active_bounds,
-    are_within,
-    judge,
-)
+from stiffopt.optimise.reach import comes
+from stiffopt.optimise.search import starts
+from stiffopt.optimise.solution import Judgement, PressureSolution, are_within
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import PressureRange, Task
 from stiffopt.optimise.warm import WarmAnswer, WarmCalls, asked_task
 
 Vector = NDArray[np.float64]
-
-_ONE = Effort(1, 1, 1)
 
 
 class PressureSolver:
@@ -76,6 +65,9 @@ class PressureSolver:
         self.seed = checked_integer("seed", seed, 0)
         self._prepared = prepared(robot, task, self.seed)
         self.robot = self._prepared.robot
+        self._answers = Answers(self._prepared, partial(_at_once, robot, self.seed))
+        self._search = CompiledSearch(self._answers)
+        self._generally = GeneralSearch(self._answers)
         self._warm_calls: WarmCalls | None = None
 
     def solve(
@@ -188,7 +180,7 @@ class PressureSolver:
             raise InputError(f"target must be a Target; got {shown(target)}")
         task = self.task if target is None else self.task.model_copy(update={"target": target})
         with giving_up(timeout, cancel):
-            fast = self._fast(task.unbraced, None)
+            fast = self._search.fast(task.unbraced, None)
             if fast is not None:
                 found = fast[0].comes(fast[1])
             else:
@@ -222,7 +214,7 @@ class PressureSolver:
         go on by its general method, which may take minutes for an arm under gravity.
         """
         task = self.task if target is None else self.task.model_copy(update={"target": target})
-        return self._compiled(task, self._checked(guess), limits)
+        return self._search.solve(task, self._checked(guess), limits)
 
     def __repr__(self) -> str:
         return f"PressureSolver({self._given!r}, {self.task!r})"
@@ -230,7 +222,7 @@ class PressureSolver:
     @property
     def is_compiled(self) -> bool:
         """Whether there is compiled code for the task; if not, it is made in the background."""
-        return self._fast(self.task.unbraced, None) is not None
+        return self._search.fast(self.task.unbraced, None) is not None
 
     def compile(self) -> bool:
         """Wait for compiled code for the task, unless an arm is armed; return `is_compiled`."""
@@ -270,7 +262,7 @@ class PressureSolver:
             pressure = PressureRange(min=tuple(low.tolist()), max=tuple(high.tolist()))
             task = task.model_copy(update={"pressure": pressure})
         if self._warm_calls is not None:
-            solution = self._compiled(task, guess, narrow)
+            solution = self._search.solve(task, guess, narrow)
         else:
             start = guess if narrow is None else np.clip(guess, *narrow)
             solution = PressureSolver(self._given, task, seed=self.seed).solve(guess=start)
@@ -292,14 +284,16 @@ class PressureSolver:
         calls = self._warm_calls
         assert calls is not None
         task = calls.task_of(block, self.task)
-        return self._accepted(task, self._prepared.program(task.target), calls.fast.judged(block))
+        return self._answers.if_it_holds(
+            task, self._prepared.program(task.target), calls.fast.judged(block)
+        )
 
     # -- solutions --------------------------------------------------------------------------
 
     def _found(self, task: Task, guess: Vector | None) -> PressureSolution:
         if task.brace is not None:
             return self._leaning(task, guess)
-        return self._compiled(task, guess) or self._otherwise(task, guess)
+        return self._search.solve(task, guess) or self._otherwise(task, guess)
 
     def _leaning(self, task: Task, guess: Vector | None) -> PressureSolution:
         """The better of the best answer that leans on objects and the best that does not."""
@@ -307,396 +301,30 @@ class PressureSolver:
         free = self._found(plain, guess)
         if free.status == "failed":
             return replace(free, task=task)
-        fast = self._fast(plain, None)
+        fast = self._search.fast(plain, None)
         table = self._prepared.samples if fast is None else fast[0].table
         return lean(BracedProblem(self.robot, task), table, free, guess)
-
-    def _compiled(
-        self, task: Task, guess: Vector | None, limits: tuple[Vector, Vector] | None = None
-    ) -> PressureSolution | None:
-        """Answer of the compiled solver, if there is one that holds."""
-        if limits is not None and guess is not None:
-            guess = np.clip(guess, *limits)
-        fast = self._fast(task, guess)
-        if fast is None:
-            return None
-        solver, row, program = fast
-        if limits is not None:
-            solver.limit(row, *limits)
-        return self._accepted(task, program, solver.solve(row))
-
-    def _fast(self, task: Task, guess: Vector | None) -> tuple[FastSolver, Vector, Program] | None:
-        """Compiled solver of a task, its row of numbers and its program; none knows of contacts."""
-        if task.brace is not None:
-            return None
-        program = self._prepared.program(task.target)
-        fast = self._prepared.fast(program)
-        if fast is None:
-            return None
-        solver, row = fast
-        return solver, solver.with_target(row, program, guess), program
-
-    def _accepted(
-        self, task: Task, program: Program, answer: CompiledAnswer | None
-    ) -> PressureSolution | None:
-        """Solution from an answer of the compiled solver, if it holds."""
-        if answer is None:
-            return None
-        p = answer.pressures
-        within = are_within(p, self._prepared.lower, self._prepared.upper)
-        judgement = Judgement.of(program, answer.judged, within)
-        if not judgement.holds:
-            return None
-
-        def explain() -> Explanation:
-            problem = PressureProblem(self.robot, task)
-            point = problem.point(p / problem.unit)
-            result = LocalResult.at(problem, point)
-            return self._explanation(problem, result, judgement, p)
-
-        fields = self._quantities(task, judgement)
-        fields.update(
-            status="solved",
-            pressures=p,
-            confidence=answer.confidence,
-            counts=answer.counts,
-            timings={},
-        )
-        return PressureSolution.explained_later(explain, fields)
 
     def _otherwise(self, task: Task, guess: Vector | None) -> PressureSolution:
         """Answer where the compiled search has none."""
         try:
             checkpoint()
-            found = self._nearest(task)
+            found = self._search.nearest(task)
             if found is None and task.scene is not None:
-                found = self._among_obstacles(task)
+                found = self._search.among_obstacles(task)
             return found or self._general(task, guess)
         except StoppedError as error:
             return PressureSolution("failed", str(error), task)
 
-    def _nearest(self, task: Task, start: Vector | None = None) -> PressureSolution | None:
-        """Closest configuration by compiled code; None if the pose can be had, or for no code.
-
-        Among obstacles the answer from there, if the pose can be had.  A start (n,) is in Pa.
-        """
-        fast = self._fast(task, None)
-        answer = None if fast is None else fast[0].closest(fast[1], start)
-        checkpoint()  # a search that was cut short proves nothing
-        if fast is None or answer is None or answer.slope is None:
-            return None
-        p = answer.pressures
-        within = are_within(p, self._prepared.lower, self._prepared.upper)
-        judgement = Judgement.of(fast[2], answer.judged, within)
-        if judgement.pose_holds and task.scene is not None:
-            return self._compiled(task, p)
-        if judgement.pose_holds or not within:
-            return None
-        active = active_bounds(self.robot, task, p)
-        holding = [*map(repr, judgement.touched), *_pressed(active, -answer.slope)]
-        message = diagnosis.unreachable_message(judgement, task, holding) + self._blocked(
-            task, judgement.touched
-        )
-
-        def explain() -> Explanation:
-            problem = PressureProblem(self.robot, task)
-            last = diagnosis.last_stage(problem, judgement.errors)
-            result = LocalResult.at(last, last.pose(p / problem.unit))
-            return self._explanation(problem, result, judgement, p, message)
-
-        fields = self._quantities(task, judgement)
-        fields.update(
-            status="unreachable",
-            message=message,
-            active_bounds=tuple(active),
-            pressures=p,
-            confidence=replace(answer.confidence, reached=0),  # none came to the pose
-            counts=answer.counts,
-            timings={},
-        )
-        return PressureSolution.explained_later(explain, fields)
-
-    def _among_obstacles(self, task: Task) -> PressureSolution | None:
-        """Answer of compiled code where neither search nor descents to the target had one.
-
-        The pose can be had, but no stiffness that is demanded; or descents start from the clear
-        sample nearest to the target, or from the clearest; or nothing is clear.
-        """
-        fast = self._fast(task, None)
-        if fast is None or task.scene is None:
-            return None
-        solver, row, program = fast
-        answer = solver.solve(row)
-        checkpoint()
-        if answer is not None:
-            within = are_within(answer.pressures, self._prepared.lower, self._prepared.upper)
-            judgement = Judgement.of(program, answer.judged, within)
-            if judgement.pose_holds and judgement.is_clear and within and judgement.shortfalls:
-                return self._too_soft(task, judgement, answer)
-        samples = solver.table.pressures[: OBSTACLES.clearest]
-        distances = self.robot.clearance(samples, task.scene)
-        clear = distances >= task.scene.clearance
-        far = solver.table.distances(program.terms, self.robot.length)[: len(samples)]
-        start = np.where(clear, far, np.inf).argmin() if clear.any() else distances.argmax()
-        found = self._nearest(task, samples[int(start)])
-        if found is None and not clear.any():
-            return self._clearest(task, samples, distances)
-        return found
-
-    def _too_soft(
-        self, task: Task, judgement: Judgement, answer: CompiledAnswer
-    ) -> PressureSolution:
-        """The stiffest that was found, where more is demanded."""
-        return PressureSolution(
-            status="unreachable",
-            message=diagnosis.demands_message(judgement),
-            active_bounds=tuple(active_bounds(self.robot, task, answer.pressures)),
-            **self._quantities(task, judgement),
-            pressures=answer.pressures,
-            confidence=answer.confidence,
-            counts=answer.counts,
-        )
-
-    def _clearest(self, task: Task, samples: Vector, distances: Vector) -> PressureSolution:
-        """Of configurations none of which keeps enough clearance the one with most of it."""
-        p = samples[int(distances.argmax())]
-        judgement = judge(self.robot, task, p)
-        return PressureSolution(
-            status="unreachable",
-            message=diagnosis.no_way_message(judgement, task, len(samples)),
-            active_bounds=tuple(active_bounds(self.robot, task, p)),
-            **self._quantities(task, judgement),
-            pressures=p,
-            confidence=Confidence(len(samples), 0, 0, 0, complete=False),
-        )
-
     def _general(self, task: Task, guess: Vector | None) -> PressureSolution:
         """Answer of the general method, or of the compiled solver if its code comes meanwhile."""
-        awaited = self._fast(task, None) is None
+        awaited = self._search.fast(task, None) is None
         try:
-            with until_ready(lambda: awaited and self._fast(task, None) is not None):
-                return self._solve_generally(task, guess)
+            with until_ready(lambda: awaited and self._search.fast(task, None) is not None):
+                return self._generally.solve(task, guess)
         except CodeReadyError:
-            found = self._compiled(task, guess) or self._nearest(task)
-            return found or self._solve_generally(task, guess)
-
-    def _solve_generally(self, task: Task, guess: Vector | None) -> PressureSolution:
-        try:
-            return self._solve(PressureProblem(self.robot, task), guess)
-        except EquilibriumError as error:
-            return PressureSolution("failed", str(error), task)
-
-    def _solve(self, problem: PressureProblem, guess: Vector | None) -> PressureSolution:
-        if guess is not None:
-            nearby = self._from_guess(problem, guess)
-            if nearby is not None:
-                return nearby
-        found = search(problem, *starts(problem, self._prepared.samples))
-        if not found.results:
-            return self._closest(problem, found)
-        if len(problem.floors) and not found.results[0].holds_floors:
-            return self._without_floors(problem, found)
-        at_once = self._judged(problem, found.results[0], found.confidence)
-        return at_once or self._first_that_holds(problem, found)
-
-    def _from_guess(self, problem: PressureProblem, guess: Vector) -> PressureSolution | None:
-        problem.restart()
-        point = reach(problem, np.clip(guess / problem.unit, problem.lower, problem.upper))
-        if point is None or not point.reached:
-            return None
-        result = descend(problem, point)
-        if not result.converged or not result.holds_floors:
-            return None
-        local = Confidence(1, 1, 1, 1, complete=False)
-        at_once = self._judged(problem, result, local)
-        if at_once is not None:
-            return at_once
-        solution = self._solution(problem, result, local)
-        return solution if solution.found else None
-
-    def _judged(
-        self, problem: PressureProblem, result: LocalResult, confidence: Confidence
-    ) -> PressureSolution | None:
-        """Solution of an arm without loads, if it holds; it is explained when that is asked for."""
-        if self.robot.is_loaded:
-            return None
-        p = np.clip(result.point.x * problem.unit, self._prepared.lower, self._prepared.upper)
-        answer = CompiledAnswer(p, confidence, {}, problem.judged(p))
-        return self._accepted(problem.task, problem.program, answer)
-
-    def _first_that_holds(self, problem: PressureProblem, found: Search) -> PressureSolution:
-        """Best local optimum that the model confirms from rest."""
-        best: PressureSolution | None = None
-        for result in found.results[: ANSWER.tried]:
-            try:
-                solution = self._solution(problem, result, found.confidence)
-            except EquilibriumError:
-                continue
-            if solution.found:
-                return solution
-            best = best or solution
-        if best is None:
-            raise EquilibriumError(
-                "the optima that were found are not reached continuously from rest: the arm "
-                "buckles or falls over on the way; lower the pressure limits or the load"
-            )
-        return best
-
-    # -- what cannot be had -----------------------------------------------------------------
-
-    def _closest(self, problem: PressureProblem, found: Search) -> PressureSolution:
-        """Closest configuration to a pose that no start came to."""
-        near = sorted(found.nearest, key=_beyond)
-        table = self._prepared.samples
-        order = table.nearest_first(
-            table.distances(problem.program.terms, self.robot.length), CLOSEST.samples
-        )
-        any_ = table.pressures[: 2 * CLOSEST.samples]
-        sampled = np.concatenate([table.pressures[order], any_]) / problem.unit
-        candidates = [*(point.x for point in near), *sampled]
-        results = diagnosis.closest_configurations(problem, candidates)
-        if results and _reaches(problem, results[0]):
-            again = search(problem, [results[0].point.x], _ONE)
-            if again.results:
-                return self._first_that_holds(problem, again)
-        results = results[:1]
-        scene = problem.task.scene
-        if not results and scene is not None:
-            clearest = table.pressures[: CLOSEST.samples]
-            clearest = clearest[np.argmax(self.robot.clearance(clearest, scene))]
-            results = [diagnosis.unimproved(problem, clearest / problem.unit)]
-        if self.robot.is_loaded:  # what is found need not be what is reached from rest
-            as_they_are = (diagnosis.unimproved(problem, x) for x in candidates[: ANSWER.tried])
-            results = [*results[: ANSWER.tried], *as_they_are]
-        judged = []
-        for result in results:
-            try:
-                judged.append(self._solution(problem, result, found.confidence))
-            except EquilibriumError:
-                continue  # not reached from rest
-        if not judged:
-            raise EquilibriumError("no stable equilibrium was found near the target")
-        return min(judged, key=_distance)
-
-    def _without_floors(self, problem: PressureProblem, found: Search) -> PressureSolution:
-        """Best that can be had where a stiffness that is demanded was not found."""
-        nearest = problem.changed(problem.best_floors(), floors=False)
-        candidates = (result.point.x for result in found.results)
-        best = search(nearest, candidates)
-        if best.results and best.results[0].value <= 0:
-            again = search(problem, [best.results[0].point.x], _ONE)
-            if again.results and again.results[0].holds_floors:
-                return self._first_that_holds(problem, again)
-        return self._first_that_holds(nearest, best if best.results else found)
-
-    # -- words and numbers ------------------------------------------------------------------
-
-    def _solution(
-        self, problem: PressureProblem, result: LocalResult, confidence: Confidence
-    ) -> PressureSolution:
-        """Judge a result and put it into words."""
-        pressures = np.clip(
-            result.point.x * problem.unit, self._prepared.lower, self._prepared.upper
-        )
-        judgement = judge(self.robot, problem.task, pressures)
-        return PressureSolution(
-            status="solved" if judgement.holds else "unreachable",
-            **self._explanation(problem, result, judgement, pressures)._asdict(),
-            **self._quantities(problem.task, judgement),
-            pressures=pressures,
-            confidence=confidence,
-        )
-
-    def _quantities(self, task: Task, judgement: Judgement) -> dict[str, Any]:
-        """What a solution takes from its judgement."""
-        return {
-            "task": task,
-            "robot": self.robot,
-            "tip_pose": judgement.tip_pose,
-            "errors": judgement.errors,
-            "position_error": judgement.errors.get("position"),
-            "angle_error": judgement.errors.get("angle"),
-            "compliance": judgement.compliance,
-            "stiffness": judgement.stiffnesses[0] if judgement.stiffnesses else None,
-            "stiffness_unit": self._prepared.unit,
-            "stiffnesses": judgement.stiffnesses,
-            "matrix_distance": judgement.matrix_distance,
-        }
-
-    def _explanation(
-        self,
-        problem: PressureProblem,
-        result: LocalResult,
-        judgement: Judgement,
-        pressures: Vector,
-        message: str = "",
-    ) -> Explanation:
-        """Put a judged result into words, unless there are some already."""
-        task = problem.task
-        active = active_bounds(self.robot, task, pressures)
-        sensitivities = self._sensitivities(problem, result, judgement, pressures, active)
-        freedom = diagnosis.freedom(problem, pressures / problem.unit)
-        if not message and not judgement.pose_holds:
-            holding = [*map(repr, judgement.touched), *self._holding(result, active)]
-            message = diagnosis.unreachable_message(judgement, task, holding) + self._blocked(
-                task, judgement.touched
-            )
-        elif not message and not judgement.holds:
-            message = diagnosis.demands_message(judgement)
-        elif not message and freedom == 0 and task.stiffness is not None:
-            message = diagnosis.no_freedom_message(task, self.robot.n_pressures, sensitivities)
-        return Explanation(message, tuple(active), freedom, sensitivities)
-
-    def _blocked(self, task: Task, touched: Iterable[str]) -> str:
-        """What a scene keeps the arm from, if the task is solved without it."""
-        if task.scene is None:
-            return ""
-        coarse = diagnosis.coarse_meshes(self.robot, task.scene, touched)
-        plain = task.model_copy(update={"scene": None})
-        found = PressureSolver(self._given, plain, seed=self.seed).solve_at_once()
-        if found is None or not found.found or found.pressures is None:
-            return coarse
-        return diagnosis.in_the_way(self.robot, task.scene, found.pressures) + coarse
-
-    @staticmethod
-    def _holding(result: LocalResult, active: dict[str, tuple[int, int]]) -> list[str]:
-        """Active limits that the closest configuration presses against."""
-        if result.multipliers is None:
-            return list(active)
-        return _pressed(active, result.multipliers.bounds)
-
-    def _sensitivities(
-        self,
-        problem: PressureProblem,
-        result: LocalResult,
-        judgement: Judgement,
-        pressures: Vector,
-        active: dict[str, tuple[int, int]],
-    ) -> Sensitivities | None:
-        prices = result.multipliers
-        if prices is None:
-            return None
-        gradient = None
-        if problem.task.measures:
-            gradient = problem.task.measures[0].stiffness_gradient(self.robot, pressures)
-        scale = result.objective.gain(result.point)
-
-        per_tolerance: dict[str, float] = {}
-        for ball, pull in zip(result.point.bounded, prices.balls, strict=True):
-            price = scale * _clean(float(np.linalg.norm(pull)))
-            per_tolerance[ball.name] = per_tolerance.get(ball.name, 0.0) + price
-        return Sensitivities(
-            tip_jacobian=self.robot.tip_jacobian(pressures),
-            stiffness_gradient=gradient,
-            per_bound={
-                name: scale
-                * _clean(max(0.0, side * float(prices.bounds[index])))
-                / float(problem.unit[index])
-                for name, (index, side) in active.items()
-            },
-            per_tolerance=per_tolerance,
-            objective_unit=result.objective.unit,
-        )
+            found = self._search.solve(task, guess) or self._search.nearest(task)
+            return found or self._generally.solve(task, guess)
 
     def _checked(self, guess: ArrayLike | None) -> Vector | None:
         if guess is None:
@@ -783,14 +411,14 @@ def _solved(
     found: dict[int, PressureSolution | None] = {}
     groups: dict[FastSolver, list[tuple[int, Vector, Program]]] = {}
     for index, (solver, task, guess) in enumerate(asked):
-        fast = solver._fast(task, guess)
+        fast = solver._search.fast(task, guess)
         if fast is not None:
             groups.setdefault(fast[0], []).append((index, *fast[1:]))
     for fast_solver, members in groups.items():
         answers = fast_solver.solve_all(np.stack([row for _, row, _ in members]), threads)
         for (index, _, program), answer in zip(members, answers, strict=True):
             solver, task, _ = asked[index]
-            found[index] = solver._accepted(task, program, answer)
+            found[index] = solver._answers.if_it_holds(task, program, answer)
     shares = {name: time / max(1, len(asked)) for name, time in watch.timings().items()}
     solutions = []
     for index, (solver, task, guess) in enumerate(asked):
@@ -804,6 +432,10 @@ def _solved(
             solution.timings[name] = shares.get(name, 0.0) + time
         solutions.append(_felt(solution))
     return solutions
+
+
+def _at_once(robot: Manipulator, seed: int, task: Task) -> PressureSolution | None:
+    return PressureSolver(robot, task, seed=seed).solve_at_once()
 
 
 def _felt(solution: PressureSolution) -> PressureSolution:
@@ -821,36 +453,3 @@ def stiffness_blind(solver: PressureSolver, solution: PressureSolution) -> Press
     plain = {"stiffness": None, "load": None, "press": None, "brace": None}
     blind = PressureSolver(solver.robot, solution.task.model_copy(update=plain), seed=solver.seed)
     return blind.solve(guess=solution.pressures)
-
-
-def _reaches(problem: PressureProblem, result: LocalResult) -> bool:
-    """Whether a result of another program lies within the tolerances of this one."""
-    pairs = zip(result.point.errors, problem.constraints, strict=True)
-    return all(error <= constraint.radius for error, constraint in pairs)
-
-
-def _beyond(point: ProgramPoint) -> float:
-    """Sum by which constraints are missed, each over its scale."""
-    pairs = zip(point.errors, point.constraints, strict=True)
-    return sum(max(0.0, error - c.radius * c.one_sided) / c.scale for error, c in pairs)
-
-
-def _distance(solution: PressureSolution) -> list[float]:
-    """Rank of a closest configuration: how far each term is missed, the position last."""
-    terms = sorted(solution.task.target.terms, key=lambda t: (not t.is_inequality, -t.order))
-    rank = []
-    for term in terms:
-        value = solution.errors[term.name]
-        rank.append(-value if term.is_inequality else value - term.radius * (1 + 1e-6))
-    last = rank.pop() if terms[-1].order == 0 else 0.0
-    return [*(max(0.0, value) for value in rank), last]
-
-
-def _pressed(active: dict[str, tuple[int, int]], prices: Vector) -> list[str]:
-    """Those of the active limits that have a price, of prices (n,) that count upwards."""
-    least = 1e-6 * float(np.abs(prices).max())
-    return [name for name, (index, side) in active.items() if side * prices[index] > least]
-
-
-def _clean(price: float) -> float:
-    return price if price > PRICES.least else 0.0

@@ -1,0 +1,161 @@
+"""Answers of machine code: the stiffest pressures, or the closest configuration."""
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stiffopt.model.stopping import checkpoint
+from stiffopt.optimise import diagnosis
+from stiffopt.optimise.answers import Answers, pressed
+from stiffopt.optimise.fast import CompiledAnswer, FastSolver
+from stiffopt.optimise.local import LocalResult
+from stiffopt.optimise.problem import PressureProblem
+from stiffopt.optimise.program import Program
+from stiffopt.optimise.settings import OBSTACLES
+from stiffopt.optimise.solution import (
+    Confidence,
+    Explanation,
+    Judgement,
+    PressureSolution,
+    active_bounds,
+    are_within,
+    judge,
+)
+from stiffopt.optimise.task import Task
+
+Vector = NDArray[np.float64]
+
+
+class CompiledSearch:
+    """Searches by machine code for one kind of task; has no answer until there is some.
+
+    Parameters
+    ----------
+    answers :
+        Of the solver.
+    """
+
+    def __init__(self, answers: Answers) -> None:
+        self._answers, self._prepared = answers, answers.prepared
+        self._robot = answers.robot
+
+    def fast(self, task: Task, guess: Vector | None) -> tuple[FastSolver, Vector, Program] | None:
+        """Compiled solver of a task, its row of numbers and its program; none knows of contacts."""
+        if task.brace is not None:
+            return None
+        program = self._prepared.program(task.target)
+        fast = self._prepared.fast(program)
+        if fast is None:
+            return None
+        solver, row = fast
+        return solver, solver.with_target(row, program, guess), program
+
+    def solve(
+        self, task: Task, guess: Vector | None, limits: tuple[Vector, Vector] | None = None
+    ) -> PressureSolution | None:
+        """Answer of the compiled solver, if there is one that holds."""
+        if limits is not None and guess is not None:
+            guess = np.clip(guess, *limits)
+        fast = self.fast(task, guess)
+        if fast is None:
+            return None
+        solver, row, program = fast
+        if limits is not None:
+            solver.limit(row, *limits)
+        return self._answers.if_it_holds(task, program, solver.solve(row))
+
+    def nearest(self, task: Task, start: Vector | None = None) -> PressureSolution | None:
+        """Closest configuration by compiled code; None if the pose can be had, or for no code.
+
+        Among obstacles the answer from there, if the pose can be had.  A start (n,) is in Pa.
+        """
+        fast = self.fast(task, None)
+        answer = None if fast is None else fast[0].closest(fast[1], start)
+        checkpoint()  # a search that was cut short proves nothing
+        if fast is None or answer is None or answer.slope is None:
+            return None
+        p = answer.pressures
+        within = are_within(p, self._prepared.lower, self._prepared.upper)
+        judgement = Judgement.of(fast[2], answer.judged, within)
+        if judgement.pose_holds and task.scene is not None:
+            return self.solve(task, p)
+        if judgement.pose_holds or not within:
+            return None
+        active = active_bounds(self._robot, task, p)
+        holding = [*map(repr, judgement.touched), *pressed(active, -answer.slope)]
+        message = diagnosis.unreachable_message(
+            judgement, task, holding
+        ) + self._answers.blocked_words(task, judgement.touched)
+
+        def explain() -> Explanation:
+            problem = PressureProblem(self._robot, task)
+            last = diagnosis.last_stage(problem, judgement.errors)
+            result = LocalResult.at(last, last.pose(p / problem.unit))
+            return self._answers.explanation(problem, result, judgement, p, message)
+
+        fields = self._answers.quantities(task, judgement)
+        fields.update(
+            status="unreachable",
+            message=message,
+            active_bounds=tuple(active),
+            pressures=p,
+            confidence=replace(answer.confidence, reached=0),  # none came to the pose
+            counts=answer.counts,
+            timings={},
+        )
+        return PressureSolution.explained_later(explain, fields)
+
+    def among_obstacles(self, task: Task) -> PressureSolution | None:
+        """Answer of compiled code where neither search nor descents to the target had one.
+
+        The pose can be had, but no stiffness that is demanded; or descents start from the clear
+        sample nearest to the target, or from the clearest; or nothing is clear.
+        """
+        fast = self.fast(task, None)
+        if fast is None or task.scene is None:
+            return None
+        solver, row, program = fast
+        answer = solver.solve(row)
+        checkpoint()
+        if answer is not None:
+            within = are_within(answer.pressures, self._prepared.lower, self._prepared.upper)
+            judgement = Judgement.of(program, answer.judged, within)
+            if judgement.pose_holds and judgement.is_clear and within and judgement.shortfalls:
+                return self._too_soft(task, judgement, answer)
+        samples = solver.table.pressures[: OBSTACLES.clearest]
+        distances = self._robot.clearance(samples, task.scene)
+        clear = distances >= task.scene.clearance
+        far = solver.table.distances(program.terms, self._robot.length)[: len(samples)]
+        start = np.where(clear, far, np.inf).argmin() if clear.any() else distances.argmax()
+        found = self.nearest(task, samples[int(start)])
+        if found is None and not clear.any():
+            return self._clearest(task, samples, distances)
+        return found
+
+    def _too_soft(
+        self, task: Task, judgement: Judgement, answer: CompiledAnswer
+    ) -> PressureSolution:
+        """The stiffest that was found, where more is demanded."""
+        return PressureSolution(
+            status="unreachable",
+            message=diagnosis.demands_message(judgement),
+            active_bounds=tuple(active_bounds(self._robot, task, answer.pressures)),
+            **self._answers.quantities(task, judgement),
+            pressures=answer.pressures,
+            confidence=answer.confidence,
+            counts=answer.counts,
+        )
+
+    def _clearest(self, task: Task, samples: Vector, distances: Vector) -> PressureSolution:
+        """Of configurations none of which keeps enough clearance the one with most of it."""
+        p = samples[int(distances.argmax())]
+        judgement = judge(self._robot, task, p)
+        return PressureSolution(
+            status="unreachable",
+            message=diagnosis.no_way_message(judgement, task, len(samples)),
+            active_bounds=tuple(active_bounds(self._robot, task, p)),
+            **self._answers.quantities(task, judgement),
+            pressures=p,
+            confidence=Confidence(len(samples), 0, 0, 0, complete=False),
+        )
