@@ -551,7 +551,7 @@ def test_nothing_but_venting_is_taken_unless_the_rig_file_says_so(robot: Manipul
 
 def test_commands_by_topics(robot: Manipulator) -> None:
     with graph(robot, **COMMANDS) as it:
-        log = it.peer.reader("/rosout", m.LogMessage)
+        log = it.peer.reader("/rosout", m.Log)
         for name in SIMPLE:
             writer = it.peer.writer(f"~/{name}", m.Empty)
             writer.write(m.Empty())
@@ -651,7 +651,7 @@ def test_control_ends_with_the_liveliness_of_its_writer(robot: Manipulator) -> N
 def test_another_process_has_to_wait_and_may_vent(robot: Manipulator) -> None:
     with graph(robot, **COMMANDS) as it:
         other = Peer(own_domain())
-        log = other.reader("/rosout", m.LogMessage)
+        log = other.reader("/rosout", m.Log)
         wait_for(lambda: log.has_writer)
         alive = Policy.Liveliness.Automatic(duration(seconds=1))
         writer = it.peer.writer("~/set_target_point", m.PointStamped, alive)

@@ -27,6 +27,7 @@ from stiffopt.rig.config import RigDescription, load_rig_description
 from stiffopt.rig.settings import RosSettings
 
 _START = 180.0  # s; a first start compiles the model
+_TELL = 10.0  # s, between two notes that the daemon is still starting
 _LATE = 30.0  # s, beyond the ramp, in which a daemon has ended
 _LOOPBACK = (None, "lo")
 
@@ -160,6 +161,7 @@ class _Daemon:
 
     def _start(self, over: threading.Event) -> tuple[str, str]:
         """Start a daemon, in a session of its own, so that Ctrl-C reaches it through here alone."""
+        report_note(f"no daemon of {self._description.name} runs: one is started")
         command = [sys.executable, "-m", "stiffopt", "run", self._rig, "--json-lines"]
         self._process = subprocess.Popen(
             command, stdout=subprocess.PIPE, text=True, start_new_session=True
@@ -167,12 +169,15 @@ class _Daemon:
         started: dict[str, Any] = {}
         there = threading.Event()
         threading.Thread(target=self._listen, args=(started, there), daemon=True).start()
-        end = time.monotonic() + _START
+        begin, told = time.monotonic(), _TELL
         while not there.wait(0.05) and not over.is_set():
             if self._process.poll() is not None:
                 raise ServiceError("the daemon did not start; it says why above")
-            if time.monotonic() > end:
+            if (gone := time.monotonic() - begin) > _START:
                 raise ServiceError(f"the daemon did not start within {_START:g} s")
+            if gone > told:
+                told += _TELL
+                report_note(f"it is starting, for {gone:.0f} s now; a first start compiles models")
         if over.is_set():
             return "", ""
         return started["url"], self._token(started.get("token_file"))

@@ -26,7 +26,7 @@ from stiffopt.ros.messages import (
     Header,
     JointState,
     KeyValue,
-    LogMessage,
+    Log,
     Marker,
     MarkerArray,
     Point,
@@ -39,7 +39,7 @@ from stiffopt.ros.messages import (
     Transform,
     TransformStamped,
     Vector3,
-    WrenchMessage,
+    Wrench,
     WrenchStamped,
 )
 
@@ -58,7 +58,7 @@ PUBLISHED: dict[str, tuple[type[Any], int, bool]] = {
     "~/scene": (MarkerArray, 1, True),
     "/tf": (TFMessage, 100, False),
     "/diagnostics": (DiagnosticArray, 10, False),
-    "/rosout": (LogMessage, 1000, True),
+    "/rosout": (Log, 1000, True),
 }
 """Topics: the type, the depth of the history, and whether who comes later is told the last."""
 
@@ -139,7 +139,7 @@ class StateMessages:
             force = Vector3(*turned.tolist())  # in the tip's axes, as its frame is named
             yield (
                 "~/wrench",
-                WrenchStamped(self.header(now.time, TIP), WrenchMessage(force, Vector3())),
+                WrenchStamped(self.header(now.time, TIP), Wrench(force, Vector3())),
             )
 
     def shape(self, now: Snapshot) -> Iterator[Message]:
@@ -220,9 +220,9 @@ class StateMessages:
             status.append(DiagnosticStatus(_WARN, named, alarm.text, self._rig, []))
         return DiagnosticArray(self.header(now.time, None), status)
 
-    def log(self, event: Event) -> LogMessage:
+    def log(self, event: Event) -> Log:
         """Return an event as a line of the log."""
-        return LogMessage(
+        return Log(
             time_of(self._epoch + event.time), _LEVELS[event.severity], self._node,
             f"{event.kind}: {event.text}",
         )  # fmt: skip
