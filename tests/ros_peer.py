@@ -71,11 +71,11 @@ class Peer:
             wait_for(writer.get_matched_subscriptions)
         return writer
 
-    def client(self, name: str, request: type[Any]) -> Callable[[Any], Any]:
+    def client(self, name: str, request: type[Any], *more: Any) -> Callable[[Any], Any]:
         """Return a function that asks a service and returns its answer."""
         full = self.full(name)
         asks = DataWriter(
-            self.participant, Topic(self.participant, f"rq{full}Request", request), qos=qos()
+            self.participant, Topic(self.participant, f"rq{full}Request", request), qos=qos(*more)
         )
         topic = Topic(self.participant, f"rr{full}Reply", SERVICES[request])
         answers = Reader(DataReader(self.participant, topic, qos=qos()))

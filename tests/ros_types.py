@@ -23,14 +23,73 @@ _IDL = {
     "string": "string",
     "bool": "boolean",
 }
-_IDS = {"int8": 2, "uint8": 3, "int32": 6, "uint32": 7, "int64": 8, "float64": 11, "bool": 15}
-_IDS |= {"string": 17}
+_IDS = {
+    "int8": 2,
+    "uint8": 3,
+    "uint16": 5,
+    "int32": 6,
+    "uint32": 7,
+    "int64": 8,
+    "float64": 11,
+    "bool": 15,
+}
+_IDS |= {"uint16": 5, "string": 17}
+_KINDS = {None: 0, 0: 144}  # added for one value, for any number of them; 48 for a fixed number
 _NUMPY = {"byte": "uint8", "char": "uint8"}
 _MANY = (Nodetype.SEQUENCE, Nodetype.ARRAY)
+_FOLLOW = "control_msgs/action/FollowJointTrajectory"
+CONTROL = {  # of control_msgs 4.0 to 5.8, which are those of Humble and Jazzy; rosbags has none
+    "control_msgs/msg/JointTolerance": """
+        string name
+        float64 position
+        float64 velocity
+        float64 acceleration""",
+    "control_msgs/msg/JointComponentTolerance": """
+        string joint_name
+        uint16 component
+        float64 position
+        float64 velocity
+        float64 acceleration""",
+    f"{_FOLLOW}_Goal": """
+        trajectory_msgs/JointTrajectory trajectory
+        trajectory_msgs/MultiDOFJointTrajectory multi_dof_trajectory
+        control_msgs/JointTolerance[] path_tolerance
+        control_msgs/JointComponentTolerance[] component_path_tolerance
+        control_msgs/JointTolerance[] goal_tolerance
+        control_msgs/JointComponentTolerance[] component_goal_tolerance
+        builtin_interfaces/Duration goal_time_tolerance""",
+    f"{_FOLLOW}_Result": """
+        int32 error_code
+        string error_string""",
+    f"{_FOLLOW}_Feedback": """
+        std_msgs/Header header
+        string[] joint_names
+        trajectory_msgs/JointTrajectoryPoint desired
+        trajectory_msgs/JointTrajectoryPoint actual
+        trajectory_msgs/JointTrajectoryPoint error
+        string[] multi_dof_joint_names
+        trajectory_msgs/MultiDOFJointTrajectoryPoint multi_dof_desired
+        trajectory_msgs/MultiDOFJointTrajectoryPoint multi_dof_actual
+        trajectory_msgs/MultiDOFJointTrajectoryPoint multi_dof_error""",
+}
+ID, TIME = "unique_identifier_msgs/UUID goal_id", "builtin_interfaces/Time stamp"
+# what rosidl makes of an action
+FEEDBACK = {f"{_FOLLOW}_FeedbackMessage": f"{ID}\n{_FOLLOW}_Feedback feedback"}
+CALLS = {
+    "action_msgs/srv/CancelGoal": (
+        "action_msgs/GoalInfo goal_info",
+        "int8 return_code\naction_msgs/GoalInfo[] goals_canceling",
+    ),
+    f"{_FOLLOW}_SendGoal": (f"{ID}\n{_FOLLOW}_Goal goal", f"bool accepted\n{TIME}"),
+    f"{_FOLLOW}_GetResult": (ID, f"int8 status\n{_FOLLOW}_Result result"),
+}
 
 
 def typestore(distro: str) -> Typestore:
-    return get_typestore(STORES[distro])
+    store = get_typestore(STORES[distro])
+    for name, text in {**CONTROL, **FEEDBACK}.items():
+        add_message(store, name, text)
+    return store
 
 
 def add_message(store: Typestore, name: str, text: str) -> None:
@@ -132,8 +191,8 @@ def service_hash(name: str, request: str, response: str, store: Typestore) -> st
             named = sort == Nodetype.NAME
             if named:
                 visit(inner)
-            number = (1 if named else _IDS[inner]) + (0 if count is None else 144)
-            fields.append(_field(field, number, inner if named else ""))
+            number = (1 if named else _IDS[inner]) + _KINDS.get(count, 48)
+            fields.append(_field(field, number, inner if named else "", count or 0))
         described[kind] = fields or [_field("structure_needs_at_least_one_member", 3)]
 
     for part, text in {"Request": request, "Response": response}.items():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import subprocess
 import threading
@@ -75,8 +76,8 @@ def ours(distro: str) -> dict[str, type[Any]]:
 @pytest.mark.parametrize("distro", ["humble", "jazzy"])
 def test_each_message_has_the_bytes_of_the_standard_definition(distro: str) -> None:
     store, types = ros_types.typestore(distro), ours(distro)
-    names = [name for name in types if "/msg/" in name]
-    assert len(names) > 30
+    names = [name for name in types if "/srv/" not in name and name in store.fielddefs]
+    assert len(names) > 40
     for name in names:
         for seed in range(3):
             rng = np.random.default_rng(seed)
@@ -93,35 +94,53 @@ def test_the_header_of_a_service_is_sixteen_bytes() -> None:
     assert bytes(m.TriggerRequest(7, 9).serialize())[20:] == b"\0"
 
 
+def calls() -> dict[str, tuple[str, str]]:
+    """Definitions of all services."""
+    request, response = SERVICE.read_text(encoding="utf-8").split("---")
+    own = {"stiffopt_msgs/srv/SolvePressure": (request, response)}
+    return ros_types.CALLS | own | {"std_srvs/srv/Trigger": ("", "bool success\nstring message")}
+
+
+PUBLISHED_HASHES = {  # of services that are in no file here, and of one that is
+    "example_interfaces/srv/AddTwoInts": (
+        ("int64 a\nint64 b", "int64 sum"),
+        "e118de6bf5eeb66a2491b5bda11202e7b68f198d6f67922cf30364858239c81a",
+    ),
+    "example_interfaces/action/Fibonacci_SendGoal": (
+        (f"{ros_types.ID}\nexample_interfaces/action/Fibonacci_Goal goal",
+         f"bool accepted\n{ros_types.TIME}"),
+        "d1a57fb2a4afe8c21e34fb10db206f16ce6729b28531141472df92277c55b557",
+    ),
+    "action_msgs/srv/CancelGoal": (
+        ros_types.CALLS["action_msgs/srv/CancelGoal"],
+        "573d8b0a534451d7bc2ac8c5ffde8ac14b8593b7001175d0cd6516dcbeb8689a",
+    ),
+}  # fmt: skip
+
+
 def test_the_hashes_are_those_of_the_definitions() -> None:
     store = ros_types.typestore("jazzy")
-    services = {
-        "std_srvs/srv/Trigger": ("", "bool success\nstring message"),
-        "stiffopt_msgs/srv/SolvePressure": SERVICE.read_text(encoding="utf-8").split("---"),
-        # published, and in no file here
-        "example_interfaces/srv/AddTwoInts": ("int64 a\nint64 b", "int64 sum"),
-    }
-    known = "e118de6bf5eeb66a2491b5bda11202e7b68f198d6f67922cf30364858239c81a"
-    found = {name: ros_types.service_hash(name, *parts, store) for name, parts in services.items()}
-    assert found.pop("example_interfaces/srv/AddTwoInts") == known
+    ros_types.add_message(store, "example_interfaces/action/Fibonacci_Goal", "int32 order")
+    for name, (parts, known) in PUBLISHED_HASHES.items():
+        assert ros_types.service_hash(name, *parts, store) == known
+    store = ros_types.typestore("jazzy")
+    found = {name: ros_types.service_hash(name, *parts, store) for name, parts in calls().items()}
     for name in TYPE_HASHES.keys() - found.keys():
         found[name] = store.hash_rihs01(name).removeprefix("RIHS01_")
     assert found == TYPE_HASHES
 
 
-def test_the_service_has_the_fields_of_its_definition() -> None:
+def test_services_have_the_fields_of_their_definitions() -> None:
     store = ros_types.typestore("jazzy")
-    request, response = SERVICE.read_text(encoding="utf-8").split("---")
-    pairs = {"Request": (m.SolvePressureRequest, request)}
-    pairs["Response"] = (m.SolvePressureResponse, response)
-    for part, (kind, text) in pairs.items():
-        name = f"stiffopt_msgs/srv/SolvePressure_{part}"
-        ros_types.add_message(store, name, text)
-        rng = np.random.default_rng(1)
-        mine, theirs = ros_types.random_pair(store, name, TYPES, rng)
-        assert isinstance(mine, kind)
-        expected = bytes(store.serialize_cdr(theirs, name))[4:]
-        assert bytes(mine.serialize())[20:] == expected  # both begin at a multiple of eight
+    kinds = dict(m.SERVICES.items())
+    for name, parts in calls().items():
+        for part, text in zip(("Request", "Response"), parts, strict=True):
+            full = f"{name}_{part}"
+            ros_types.add_message(store, full, text)
+            mine, theirs = ros_types.random_pair(store, full, TYPES, np.random.default_rng(1))
+            assert type(mine) in (kinds if part == "Request" else kinds.values())
+            expected = bytes(store.serialize_cdr(theirs, full))[4:]
+            assert bytes(mine.serialize())[20:] == expected  # both begin at a multiple of eight
 
 
 # names --------------------------------------------------------------------------------------------
@@ -591,6 +610,103 @@ def test_commands_by_services(robot: Manipulator) -> None:
         assert (done.success, done.message) == (False, "not in this state")
 
 
+FOLLOW = "~/follow_joint_trajectory/_action"
+
+
+class Goals:
+    """A client of the action."""
+
+    def __init__(self, it: Graph) -> None:
+        self.loop, peer = it.loop, it.peer
+        latched = Policy.Durability.TransientLocal
+        alive = Policy.Liveliness.Automatic(duration(seconds=1))
+        self.send_goal = peer.client(f"{FOLLOW}/send_goal", m.SendGoalRequest, alive)
+        self.get_result = peer.client(f"{FOLLOW}/get_result", m.GetResultRequest)
+        self.cancel_goal = peer.client(f"{FOLLOW}/cancel_goal", m.CancelGoalRequest)
+        self.feedback = peer.reader(f"{FOLLOW}/feedback", m.FeedbackMessage)
+        self.status = peer.reader(f"{FOLLOW}/status", m.GoalStatusArray, latched)
+
+    def send(self, number: int, *rows: Any, times: Any = None, **more: Any) -> bool:
+        goal = m.FollowGoal(trajectory=points(*rows, times=times), **more)
+        return bool(self.send_goal(m.SendGoalRequest(goal_id=identity(number), goal=goal)).accepted)
+
+    def pass_time(self, seconds: float, **changes: Any) -> None:
+        """Let the state be that of a later moment."""
+        self.loop.now = replace(self.loop.now, time=time.monotonic() + seconds, **changes)
+
+    def cancel(self, number: int, stamp: Any = None) -> tuple[int, list[int]]:
+        info = m.GoalInfo(identity(number), m.Time() if stamp is None else stamp)
+        told = self.cancel_goal(m.CancelGoalRequest(goal_info=info))
+        return told.return_code, [each.goal_id.uuid[0] for each in told.goals_canceling]
+
+    def result(self, number: int) -> tuple[int, str]:
+        found = self.get_result(m.GetResultRequest(goal_id=identity(number)))
+        return found.status, found.result.error_string
+
+
+def identity(number: int) -> Any:
+    return m.UUID(bytes([number]) * 16)
+
+
+def test_a_goal_is_followed_to_its_end(robot: Manipulator) -> None:
+    with graph(robot, **COMMANDS) as it:
+        goals = Goals(it)
+        assert goals.send(1, SIX, (3e4,) * 6, times=(0, 10))
+        assert it.loop.names[-1] == "follow_trajectory"
+        goals.pass_time(5.0, measured=np.full(6, 1.5e4))
+        told = goals.feedback.wait(lambda f: f.feedback.desired.time_from_start.sec == 5)
+        assert told.goal_id == identity(1)
+        told = told.feedback
+        assert told.joint_names == channel_names(robot.description)
+        np.testing.assert_allclose(told.desired.positions, np.full(6, 2e4), rtol=0.05)
+        assert told.actual.positions == [1.5e4] * 6
+        np.testing.assert_allclose(told.error.positions, np.full(6, 5e3), rtol=0.2)
+        goals.pass_time(10.1)
+        assert goals.result(1) == (4, "")
+        goals.status.wait(lambda s: [(g.goal_info.goal_id, g.status) for g in s.status_list] == [
+            (identity(1), 4)
+        ])  # fmt: skip
+        assert goals.result(1) == (4, "")  # asked again
+        assert "hold" not in it.loop.names
+
+
+def test_a_goal_ends_when_it_is_cancelled_replaced_or_the_arm_is_held(robot: Manipulator) -> None:
+    with graph(robot, **COMMANDS) as it:
+        goals = Goals(it)
+        assert goals.send(1, SIX)
+        assert goals.cancel(9) == (2, [])  # unknown
+        assert goals.cancel(0, time_of(time.time() - 60)) == (0, [])  # older ones: none
+        assert goals.cancel(1) == (0, [1])
+        assert it.loop.calls[-1] == ("hold", "the goal was canceled")
+        assert goals.result(1) == (5, "it was canceled")
+        assert goals.cancel(1) == (3, [])  # over
+        assert goals.cancel(0) == (0, [])  # all, of which there are none
+        assert not goals.send(1, SIX)  # the same identity
+        assert goals.send(2, SIX)
+        assert goals.send(3, SIX)
+        assert goals.result(2) == (6, "another motion was asked for")
+        target = it.peer.writer("~/set_target", m.PoseStamped)
+        target.write(pose())
+        assert goals.result(3) == (6, "another motion was asked for")
+        assert goals.send(4, SIX, times=(30,))
+        goals.pass_time(1.0, state=State.HOLDING, reason="no tip is seen")
+        assert goals.result(4) == (6, "the arm is holding: no tip is seen")
+        wait_for(lambda: it.loop.calls[-1] == ("hold", "the goal was aborted"))
+        assert goals.result(7) == (0, "")
+
+
+def test_goals_that_make_no_sense_are_refused(robot: Manipulator) -> None:
+    with graph(robot, **COMMANDS) as it:
+        log, goals = it.peer.reader("/rosout", m.Log), Goals(it)
+        assert not goals.send(1, SIX[:5])
+        assert "positions for 6 joint names" in log.wait(lambda line: "refused" in line.msg).msg
+        assert not goals.send(1, SIX, goal_tolerance=[m.JointTolerance("segment_1_channel_1", 1.0)])
+        it.loop.refusal = CommandError("it is not armed")
+        assert not goals.send(1, SIX)
+        log.wait(lambda line: "follow_joint_trajectory: it is not armed" in line.msg)
+        assert "follow_trajectory" not in it.loop.names
+
+
 def test_the_solver_answers(robot: Manipulator) -> None:
     with graph(robot) as it:  # it moves nothing, so it needs no permission
         ask = it.peer.client("~/solve_pressure", m.SolvePressureRequest)
@@ -816,6 +932,17 @@ def test_topics_both_ways_with_fast_dds(robot: Manipulator, tmp_path: Path) -> N
         assert given["set_target"].position == (0.01, -0.02, 0.19)
         pressures = given["follow_trajectory"].pressures
         np.testing.assert_allclose(pressures, np.outer([1e3, 2e3], np.arange(1, 7)))
+
+
+# the page ----------------------------------------------------------------------------------------
+
+
+def test_the_python_of_the_page_compiles() -> None:
+    page = (RIGS.parent / "docs/ros.md").read_text(encoding="utf-8")
+    blocks = re.findall(r"```python\n(.*?)```", page, re.S)
+    assert len(blocks) == 2
+    for block in blocks:
+        compile(block, "ros.md", "exec")
 
 
 # settings -----------------------------------------------------------------------------------------

@@ -26,8 +26,8 @@ from stiffopt.model.robot_files import robot_path
 from stiffopt.rig.config import RigDescription, load_rig_description
 from stiffopt.rig.settings import RosSettings
 
-_START = 180.0  # s; a first start compiles the model
-_TELL = 10.0  # s, between two notes that the daemon is still starting
+_START = 600.0  # s; a first start compiles the model
+_TELL = 10.0  # s after which a note says that the daemon is still starting; then ever more seldom
 _LATE = 30.0  # s, beyond the ramp, in which a daemon has ended
 _LOOPBACK = (None, "lo")
 
@@ -176,7 +176,7 @@ class _Daemon:
             if (gone := time.monotonic() - begin) > _START:
                 raise ServiceError(f"the daemon did not start within {_START:g} s")
             if gone > told:
-                told += _TELL
+                told *= 2
                 report_note(f"it is starting, for {gone:.0f} s now; a first start compiles models")
         if over.is_set():
             return "", ""

@@ -22,6 +22,8 @@ from stiffopt.optimise.solution import PressureSolution
 from stiffopt.optimise.solver import solve_pressure
 from stiffopt.optimise.task import PressureRange, Task
 from stiffopt.rig.config import RigDescription, limits_of
+from stiffopt.ros.action import NAME as FOLLOW
+from stiffopt.ros.action import Done, FollowAction
 from stiffopt.ros.lease import GraphLease
 from stiffopt.ros.messages import (
     Empty,
@@ -36,7 +38,7 @@ from stiffopt.ros.messages import (
     TriggerResponse,
 )
 from stiffopt.ros.node import Received, RosNode, Service, Subscription, Writer
-from stiffopt.ros.published import PUBLISHED, StateMessages
+from stiffopt.ros.published import PUBLISHED, StateMessages, channel_names
 from stiffopt.ros.requests import target_of, task_in, trajectory_of
 from stiffopt.safety.vent import vent_rig
 
@@ -50,8 +52,8 @@ MOTIONS: dict[str, type[Any]] = {
 }
 """Topics of commands that set the arm in motion."""
 _FURTHER = ("vent", "renew", "solve", "solution", "solve_pressure")
-NAMES = (*PUBLISHED, *(f"~/{name}" for name in (*SIMPLE, *MOTIONS, *_FURTHER)))
-"""Names of all topics and services."""
+NAMES = (*PUBLISHED, FOLLOW, *(f"~/{name}" for name in (*SIMPLE, *MOTIONS, *_FURTHER)))
+"""Names of all topics, services and actions."""
 
 _QUICK = 2.0  # s after which the daemon does not answer; the guard is asked to vent then
 _SHAPE = 0.2  # s, between two messages of what the arm looks like
@@ -70,7 +72,7 @@ class _Job:
     name: str
     writer: Writer
     command: Callable[[], None]
-    done: Callable[[bool, str], None]
+    done: Done
     newest: bool = False
 
 
@@ -120,7 +122,7 @@ class Bridge:
         self._solution = node.publisher("~/solution", JointState)
         self._jobs: deque[_Job] = deque()
         self._questions: deque[tuple[str, PoseStamped | None, Callable[..., None]]] = deque()
-        self._vents: deque[Callable[[bool, str], None]] = deque()
+        self._vents: deque[Done] = deque()
         self._news = {name: threading.Event() for name in ("jobs", "questions", "vents")}
         self._over = threading.Event()
         # replies wait for the readers of those who asked, and nothing else waits for replies
@@ -129,6 +131,7 @@ class Bridge:
         self._state: String | None = None
         self._seen: frozenset[int] = frozenset()
         self._next_event = 0
+        self._action: FollowAction | None = None
         self._subscribe(commands=settings.commands)
         node.announce()
 
@@ -151,6 +154,8 @@ class Bridge:
             while not over.is_set():
                 self._now = now = stream.state(_SILENT)
                 self._publish(now, due)
+                if self._action is not None:
+                    self._action.look(now)
 
     def close(self) -> None:
         """Leave the graph."""
@@ -224,6 +229,16 @@ class Bridge:
         for name, kind in MOTIONS.items():
             node.subscribe(f"~/{name}", kind, partial(self._motion_topic, name))
         node.subscribe("~/renew", Empty, self._renew_topic)
+        self._action = FollowAction(
+            node,
+            self._client,
+            channel_names(self._robot.description),
+            lambda message: trajectory_of(message, self._robot, time.time()),
+            self._move,
+            self._once,
+            self._reply,
+            self._answer_topic("follow_joint_trajectory"),
+        )
 
     def _listen(self) -> None:
         while not self._over.is_set():
@@ -255,28 +270,44 @@ class Bridge:
     def _simple_service(self, name: str, service: Service, received: Received) -> None:
         self._simple(name, received, self._answer_trigger(service, received))
 
-    def _simple(self, name: str, received: Received, done: Callable[[bool, str], None]) -> None:
+    def _simple(self, name: str, received: Received, done: Done) -> None:
         commands: dict[str, Callable[[], None]] = {
             "arm": self._client.arm,
             "disarm": self._client.disarm,
             "hold": partial(self._client.hold, "asked for by ROS 2"),
             "reset": self._client.reset,
         }
-        if received.writer is None:
-            done(False, _GONE)
-            return
-        once = partial(self._lease.once, received.writer, commands[name])
-        self._queue(_Job(name, received.writer, once, done))
+        self._once(name, received, commands[name], done)
 
     def _motion_topic(self, name: str, source: Subscription) -> None:
-        done = self._answer_topic(name)
+        done, newest = self._answer_topic(name), name.startswith("set_target")
         for received in source.take():
-            if received.writer is None:
-                done(False, _GONE)
-                continue
             command = partial(self._motion, name, received.message)
+            self._move(name, source, received, command, done, newest=newest)
+
+    def _once(self, name: str, received: Received, command: Callable[[], None], done: Done) -> None:
+        """Have a command carried out that needs control for no longer."""
+        if received.writer is None:
+            done(False, _GONE)
+        else:
+            once = partial(self._lease.once, received.writer, command)
+            self._queue(_Job(name, received.writer, once, done))
+
+    def _move(
+        self,
+        name: str,
+        source: Subscription,
+        received: Received,
+        command: Callable[[], None],
+        done: Done,
+        *,
+        newest: bool = False,
+    ) -> None:
+        """Have a command carried out that sets the arm in motion."""
+        if received.writer is None:
+            done(False, _GONE)
+        else:
             move = partial(self._lease.move, source, received.writer, command)
-            newest = name.startswith("set_target")
             self._queue(_Job(name, received.writer, move, done, newest))
 
     def _renew_topic(self, source: Subscription) -> None:
@@ -336,6 +367,8 @@ class Bridge:
             client.follow_trajectory(trajectory_of(message, self._robot, now))
         else:
             client.set_target(target_of(message, self._messages.base, now))
+        if self._action is not None:
+            self._action.replaced()
 
     def _vent(self) -> None:
         """Vent as soon as somebody asks, whatever else is being done."""
@@ -351,7 +384,7 @@ class Bridge:
                         self._jobs.popleft().done(False, "not done: somebody vents")
                 self._guarded(partial(self._vent_now, answers))
 
-    def _vent_now(self, answers: list[Callable[[bool, str], None]]) -> None:
+    def _vent_now(self, answers: list[Done]) -> None:
         done, text = True, "vented"
         try:
             self._quick.vent()
@@ -408,7 +441,7 @@ class Bridge:
 
     # Answering -----------------------------------------------------------------------------------
 
-    def _answer_topic(self, name: str) -> Callable[[bool, str], None]:
+    def _answer_topic(self, name: str) -> Done:
         """Return what tells of a command that came by a topic: a refusal, in the log."""
 
         def answer(done: bool, text: str) -> None:
@@ -417,15 +450,16 @@ class Bridge:
 
         return answer
 
-    def _answer_trigger(self, service: Service, received: Received) -> Callable[[bool, str], None]:
+    def _answer_trigger(self, service: Service, received: Received) -> Done:
         """Return what answers a command that came by a service."""
 
         def answer(done: bool, text: str) -> None:
-            self._answers.submit(
-                service.reply, received, TriggerResponse(success=done, message=text)
-            )
+            self._reply(service, received, TriggerResponse(success=done, message=text))
 
         return answer
+
+    def _reply(self, service: Service, received: Received, answer: Any) -> None:
+        self._answers.submit(service.reply, received, answer)
 
     def _answer_solution(self, found: PressureSolution | None, text: str) -> None:
         if found is not None and found.found and found.pressures is not None:
@@ -450,4 +484,4 @@ class Bridge:
                 answer.pressures = self._messages.answer(found.pressures, now)
             if found.tip_pose is not None:
                 answer.tip = self._messages.pose(found.tip_pose, now)
-        self._answers.submit(service.reply, received, answer)
+        self._reply(service, received, answer)

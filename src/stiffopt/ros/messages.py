@@ -17,10 +17,12 @@ from cyclonedds.idl.types import (
     byte,
     float32,
     float64,
+    int8,
     int32,
     int64,
     sequence,
     uint8,
+    uint16,
     uint32,
     uint64,
 )
@@ -131,9 +133,63 @@ SolvePressureResponse: Any = _type(
     status=str, message=str, pressures=JointState, tip=PoseStamped, position_error=float64,
     angle_error=float64, stiffness=float64, stiffness_unit=str,
 )  # fmt: skip
+
+UUID: Any = _type("unique_identifier_msgs/msg/UUID", uuid=array[uint8, 16])
+GoalInfo: Any = _type("action_msgs/msg/GoalInfo", goal_id=UUID, stamp=Time)
+GoalStatus: Any = _type("action_msgs/msg/GoalStatus", goal_info=GoalInfo, status=int8)
+GoalStatusArray: Any = _type("action_msgs/msg/GoalStatusArray", status_list=sequence[GoalStatus])
+CancelGoalRequest: Any = _type("action_msgs/srv/CancelGoal_Request", **_CALL, goal_info=GoalInfo)
+CancelGoalResponse: Any = _type(
+    "action_msgs/srv/CancelGoal_Response", **_CALL,
+    return_code=int8, goals_canceling=sequence[GoalInfo],
+)  # fmt: skip
+
+Twist: Any = _type("geometry_msgs/msg/Twist", linear=Vector3, angular=Vector3)
+MultiDOFJointTrajectoryPoint: Any = _type(
+    "trajectory_msgs/msg/MultiDOFJointTrajectoryPoint", transforms=sequence[Transform],
+    velocities=sequence[Twist], accelerations=sequence[Twist], time_from_start=Duration,
+)  # fmt: skip
+MultiDOFJointTrajectory: Any = _type(
+    "trajectory_msgs/msg/MultiDOFJointTrajectory", header=Header, joint_names=sequence[str],
+    points=sequence[MultiDOFJointTrajectoryPoint],
+)  # fmt: skip
+JointTolerance: Any = _type(
+    "control_msgs/msg/JointTolerance",
+    name=str, position=float64, velocity=float64, acceleration=float64,
+)  # fmt: skip
+JointComponentTolerance: Any = _type(
+    "control_msgs/msg/JointComponentTolerance", joint_name=str, component=uint16,
+    position=float64, velocity=float64, acceleration=float64,
+)  # fmt: skip
+_FOLLOW = "control_msgs/action/FollowJointTrajectory"
+FollowGoal: Any = _type(
+    f"{_FOLLOW}_Goal", trajectory=JointTrajectory, multi_dof_trajectory=MultiDOFJointTrajectory,
+    path_tolerance=sequence[JointTolerance],
+    component_path_tolerance=sequence[JointComponentTolerance],
+    goal_tolerance=sequence[JointTolerance],
+    component_goal_tolerance=sequence[JointComponentTolerance], goal_time_tolerance=Duration,
+)  # fmt: skip
+FollowResult: Any = _type(f"{_FOLLOW}_Result", error_code=int32, error_string=str)
+FollowFeedback: Any = _type(
+    f"{_FOLLOW}_Feedback", header=Header, joint_names=sequence[str],
+    desired=JointTrajectoryPoint, actual=JointTrajectoryPoint, error=JointTrajectoryPoint,
+    multi_dof_joint_names=sequence[str], multi_dof_desired=MultiDOFJointTrajectoryPoint,
+    multi_dof_actual=MultiDOFJointTrajectoryPoint, multi_dof_error=MultiDOFJointTrajectoryPoint,
+)  # fmt: skip
+SendGoalRequest: Any = _type(f"{_FOLLOW}_SendGoal_Request", **_CALL, goal_id=UUID, goal=FollowGoal)
+SendGoalResponse: Any = _type(f"{_FOLLOW}_SendGoal_Response", **_CALL, accepted=bool, stamp=Time)
+GetResultRequest: Any = _type(f"{_FOLLOW}_GetResult_Request", **_CALL, goal_id=UUID)
+GetResultResponse: Any = _type(
+    f"{_FOLLOW}_GetResult_Response", **_CALL, status=int8, result=FollowResult
+)
+FeedbackMessage: Any = _type(f"{_FOLLOW}_FeedbackMessage", goal_id=UUID, feedback=FollowFeedback)
+
 SERVICES: dict[Any, Any] = {
     TriggerRequest: TriggerResponse,
     SolvePressureRequest: SolvePressureResponse,
+    SendGoalRequest: SendGoalResponse,
+    CancelGoalRequest: CancelGoalResponse,
+    GetResultRequest: GetResultResponse,
 }
 """The response to each request."""
 
