@@ -245,7 +245,7 @@ class Loop:
         settings = PlantSettings(
             dynamics="quasi-static",
             silicone=Silicone(creep=(), hysteresis=()),
-            discretisation={"step": 0.005},
+            discretisation={"step": 0.01},
             **plant,
         )
         description = RigDescription(
