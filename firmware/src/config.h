@@ -51,7 +51,7 @@
 
 // When a reading is not believed, or the arm does not do what it should.
 #define OVER_LIMIT 500     // above the channel's limit
-#define HEADROOM 100       // below it: what is controlled to at most, as control is not exact
+#define HEADROOM 200       // below it: what is controlled to at most, as control is not exact
 #define FOLLOW_ERROR 1500  // between where the pressure should be and where it is
 #define FOLLOW_MS 500      // for this long
 #define STUCK_AIR 3000     // so much air was let in, and the reading shows less than a quarter of it
