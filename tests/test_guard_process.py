@@ -480,6 +480,12 @@ def stubbed(folder: Path, monkeypatch: pytest.MonkeyPatch, body: str) -> GuardLi
         ("", DeviceError, "ended before it was ready"),
         ("time.sleep(60)", DeviceError, "was not ready within 0.2 s"),
         (
+            "end.send(GuardNotice('notice', {'text': 'the simulator is compiled'}).pack())\n"
+            "time.sleep(60)",
+            DeviceError,
+            "was not ready within 0.3 s",
+        ),
+        (
             "about = {'kind': 'MissingExtraError', 'args': ['a', 'b']}\n"
             "end.send(GuardNotice('failed', about).pack())",
             MissingExtraError,
@@ -495,7 +501,7 @@ def test_a_guard_that_does_not_start(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     start = 0.2 if body.startswith("time") else CLIENT.start
-    monkeypatch.setattr(guard_client, "CLIENT", replace(CLIENT, start=start, end=0.2))
+    monkeypatch.setattr(guard_client, "CLIENT", replace(CLIENT, start=start, slow=0.3, end=0.2))
     link = stubbed(tmp_path, monkeypatch, body)
     with pytest.raises(error, match=text):
         link.open()

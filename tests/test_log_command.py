@@ -182,7 +182,7 @@ def test_the_page_shows_what_happened(run_file: Path) -> None:
     labels = [axes.get_ylabel() for axes in figure.axes]
     assert labels == [
         "tip x (mm)", "tip y (mm)", "tip z (mm)", "error (mm)", "segment 1\n(bar)",
-        "segment 2\n(bar)", "stiffness\n(N/m, N m/rad)", "",
+        "segment 2\n(bar)", "stiffness\n(N/m)", "",
     ]  # fmt: skip
     x = figure.axes[0]
     drawn = {line.get_label(): np.asarray(line.get_ydata()) for line in x.lines}

@@ -61,6 +61,29 @@ def test_what_needs_no_numbers_waits_for_none(arguments: tuple[str, ...]) -> Non
     assert not loaded(COMMAND, *arguments) & (NUMERICS | NEVER)
 
 
+def test_no_help_waits_for_numbers_nor_cuts_a_description_off() -> None:
+    code = """
+import typer
+from stiffopt.cli.main import app, main
+
+def show(command, words):
+    main([*words, '--help'])
+    for name, each in getattr(command, 'commands', {}).items():
+        show(each, [*words, name])
+
+show(typer.main.get_command(app), [])
+"""
+    script = f"import sys\n{code}\nprint('loaded', *sys.modules)"
+    said = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True
+    ).stdout
+    assert said.count("Usage:") > 30
+    lines = [line for line in said.splitlines() if "Usage:" not in line]
+    assert not [line for line in lines if line.endswith("...")]
+    heavy = (NUMERICS | NEVER) - {"pydantic", "pydantic.v1"}  # typer itself asks for it
+    assert not set(lines[-1].split()) & heavy
+
+
 def test_json_needs_neither_tables_nor_the_registry_of_units(task: str) -> None:
     modules = loaded(COMMAND, "--json", task)
     assert modules >= NUMERICS

@@ -16,7 +16,7 @@ from stiffopt.cli.path_records import csv_text
 from stiffopt.errors import FileError, InputError
 from stiffopt.model.calibration import Calibration, ErrorModel
 from stiffopt.plots.shapes import surface_mesh
-from stiffopt.studio import objects, texts
+from stiffopt.studio import objects, texts, workbench
 from stiffopt.studio.cloud import StiffnessCloud, check_map
 from stiffopt.studio.design import Design
 from stiffopt.studio.leaning import force_arrows
@@ -151,6 +151,20 @@ def test_an_answer_follows_a_drag_and_says_what_limits_it(bench: Workbench) -> N
     compared = texts.compared_html(bench, ("#111111",))
     assert compared.count("<tr>") == 3
     assert "(-28.0, 10.0, " in compared
+
+
+def test_a_drag_out_of_reach_is_followed_without_a_search_everywhere(
+    design: Design, compiled: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench = Workbench(design)
+    bench.answer_best(never)
+    monkeypatch.setattr(workbench, "QUICK", 60.0)
+    monkeypatch.setattr(stiffopt.PressureSolver, "_found", None)
+    bench.change("target", lambda d: d.with_target(position=(-0.15, 0.0, 0.19)))
+    assert bench.answer_quickly(never)
+    assert bench.answer is not None
+    assert bench.answer.solution.status == "unreachable"
+    assert "6.562 mm away; held back by" in texts.answer_html(bench)
 
 
 def test_a_search_that_is_given_up_keeps_the_answer(bench: Workbench) -> None:

@@ -82,7 +82,9 @@ class DisplayUnit:
         """
         if form.endswith("f"):
             form = f".{max(0, int(form[1:-1]) + self.more_decimals)}f"
-        text = f"{self.of(value) + 0.0:{form}}".removesuffix(".")
+        text = f"{self.of(value):{form}}".removesuffix(".")
+        if not text.strip("-0."):
+            text = text.removeprefix("-")
         return f"{Decimal(text):f}" if "e+" in text else text
 
     def text(self, value: float, form: str = ".4g") -> str:

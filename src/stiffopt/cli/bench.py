@@ -44,7 +44,12 @@ def _bench() -> None:
     """Measure methods on recordings of real arms."""
 
 
-@bench_app.command("recordings", help=BENCH_HELP, epilog=_EPILOG)
+@bench_app.command(
+    "recordings",
+    short_help="Fit methods to recordings, and compare them.",
+    help=BENCH_HELP,
+    epilog=_EPILOG,
+)
 @with_exit_code
 def recordings(
     folder: Annotated[str, typer.Argument(metavar="DIR", show_default=False)],

@@ -56,12 +56,17 @@ def summary(robot: Manipulator, found: ContactEquilibrium) -> RenderableType:
             (
                 printable(each.object),
                 units.length.number(each.at, ".1f"),
-                f"{np.linalg.norm(each.force):.4g}",
-                f"{each.max_force:.4g}" if np.isfinite(each.max_force) else "-",
+                units.force.number(float(np.linalg.norm(each.force))),
+                units.force.number(each.max_force) if np.isfinite(each.max_force) else "-",
             )
             for each in found.contacts
         )
-        heading = ("contact", f"at ({units.length})", "force (N)", "at most (N)")
+        heading = (
+            "contact",
+            f"at ({units.length})",
+            f"force ({units.force})",
+            f"at most ({units.force})",
+        )
         parts.append(TextTable("", heading, rows).renderable())
     lines = tuple(
         (
@@ -75,11 +80,11 @@ def summary(robot: Manipulator, found: ContactEquilibrium) -> RenderableType:
     headings = ("along", "free", "sliding", "sticking", "lost at +", "lost at -")
     remark = (
         f"{units.stiffness}, contacts sliding and sticking; lost: the push at the tip, along and "
-        "against the axis, by which the first contact lifts off if all slide, in N"
+        f"against the axis, by which the first contact lifts off if all slide, in {units.force}"
     )
     parts.append(TextTable("", headings, lines, remark).renderable())
     return Group(*parts)
 
 
 def _loss_text(loss: dict[str, Any]) -> str:
-    return "-" if loss["force_n"] is None else f"{loss['force_n']:.3g}"
+    return "-" if loss["force_n"] is None else display_units().force.number(loss["force_n"], ".3g")

@@ -73,7 +73,12 @@ Repetitions = Annotated[
 NoPlot = Annotated[bool, typer.Option("--no-plot", help="Draw no figure.")]
 
 
-@experiment_app.command("kinematics", help=KINEMATICS_HELP, epilog=_KINEMATICS_EPILOG)
+@experiment_app.command(
+    "kinematics",
+    short_help="Press each channel in turn, and record the tip.",
+    help=KINEMATICS_HELP,
+    epilog=_KINEMATICS_EPILOG,
+)
 @with_exit_code
 def kinematics(
     rig: RigArgument,
@@ -134,7 +139,12 @@ def kinematics(
     )  # fmt: skip
 
 
-@experiment_app.command("stiffness", help=STIFFNESS_HELP, epilog=_STIFFNESS_EPILOG)
+@experiment_app.command(
+    "stiffness",
+    short_help="Push the tip with a probe at several pressures.",
+    help=STIFFNESS_HELP,
+    epilog=_STIFFNESS_EPILOG,
+)
 @with_exit_code
 def stiffness(
     rig: RigArgument,
@@ -209,7 +219,12 @@ Examples:
 {_CODES}"""
 
 
-@experiment_app.command("poses", help=POSES_HELP, epilog=_POSES_EPILOG)
+@experiment_app.command(
+    "poses",
+    short_help="Hold the pressures of a file, and record the tip.",
+    help=POSES_HELP,
+    epilog=_POSES_EPILOG,
+)
 @with_exit_code
 def poses(
     file: Annotated[str, typer.Argument(metavar="FILE", show_default=False)],

@@ -59,7 +59,12 @@ Recorded = Annotated[str, typer.Argument(metavar="RUN", help="A recording (.mcap
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")]
 
 
-@log_app.command("export", help=EXPORT_HELP, epilog=_EXPORT_EPILOG)
+@log_app.command(
+    "export",
+    short_help="Write a recording as CSV or as a bag of ROS 2.",
+    help=EXPORT_HELP,
+    epilog=_EXPORT_EPILOG,
+)
 @with_exit_code
 def export(
     run: Recorded,
@@ -123,7 +128,7 @@ def _export_bag(run: str, out: str | None, *, quiet: bool) -> None:
     write_line(f"{path}: {count} messages, {recorded.time[-1] - recorded.time[0]:.1f} s")
 
 
-@log_app.command("plot", help=PLOT_HELP, epilog=_PLOT_EPILOG)
+@log_app.command("plot", short_help="Draw a run on a page.", help=PLOT_HELP, epilog=_PLOT_EPILOG)
 @with_exit_code
 def plot(
     run: Recorded,

@@ -55,7 +55,9 @@ Examples:
 {_CODES.format(or_late=", or --timeout is over")}"""
 
 
-@map_app.command("workspace", help=HELP, epilog=_EPILOG)
+@map_app.command(
+    "workspace", short_help="Where the tip can be, and how stiff.", help=HELP, epilog=_EPILOG
+)
 @with_exit_code
 def workspace(
     robot: RobotArgument,
@@ -191,7 +193,12 @@ Examples:
 {_CODES.format(or_late="")}"""
 
 
-@map_app.command("contact", help=CONTACT_HELP, epilog=_CONTACT_EPILOG)
+@map_app.command(
+    "contact",
+    short_help="How an arm rests against objects of a scene.",
+    help=CONTACT_HELP,
+    epilog=_CONTACT_EPILOG,
+)
 @with_exit_code
 def contact(
     robot: RobotArgument,
@@ -248,7 +255,9 @@ Examples:
 {_CODES.format(or_late="")}"""
 
 
-@map_app.command("arm", help=ARM_HELP, epilog=_ARM_EPILOG)
+@map_app.command(
+    "arm", short_help="How stiff an arm is along its length.", help=ARM_HELP, epilog=_ARM_EPILOG
+)
 @with_exit_code
 def arm(
     robot: RobotArgument,

@@ -283,10 +283,11 @@ def _stiffness(now: Snapshot) -> list[tuple[str, RenderableType]]:
             text += f" of {unit.number(now.best_stiffness, '.3g')} ({share:.0%})"
         rows.append(("stiffness", text))
     if now.touches:
-        force, milli = now.wrench[:3], DisplayUnit("", 1e3)
-        text = f"felt at the tip: {_triple(force, milli, '.1f')} mN"
+        unit = display_units().force
+        text = f"felt at the tip: {_triple(now.wrench[:3], unit, '.4f')} {unit}"
         if math.isfinite(now.press_force):
-            text += f"; presses with {1e3 * now.press_force:.1f} of {1e3 * now.press_goal:g} mN"
+            pressing = unit.number(now.press_force, ".4f")
+            text += f"; presses with {pressing} of {unit.text(now.press_goal)}"
         rows.append(("force", text))
     return rows
 

@@ -225,7 +225,7 @@ class ControllerStatus:
             metric="best_stiffness",
         ),
     ] = math.nan
-    stiffness_unit: Annotated[str, Shown("N/m, or N*m/rad for a rotation", json=())] = "N/m"
+    stiffness_unit: Annotated[str, _tip("N/m, or N*m/rad for a rotation", json=())] = "N/m"
     disturbance: Annotated[Array, _tip("offset of the tip from the model", "m", size=3)] = field(
         default_factory=_nan3
     )

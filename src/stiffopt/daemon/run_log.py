@@ -48,6 +48,7 @@ class RecordedRun:
     time : of the ticks (N,), in s.
     fields : the state in each tick, by the names of `Snapshot`.
     captured : times of capture of the tracker's samples (M,), in s, increasing.
+    stiffness_unit : of its stiffnesses; of recordings of several, or of none, all.
     seen_position, seen_quaternion : of the tip in the samples (M, 3) and (M, 4), w first.
     doubted : samples (M,) that no arm could have moved to, or that came with such a one.
     states, alarms, events : in order of time, which is that of the run.
@@ -67,6 +68,7 @@ class RecordedRun:
     alarms: tuple[RunSpan, ...] = ()
     events: tuple[Event, ...] = ()
     timing: Mapping[str, Any] = field(default_factory=dict)
+    stiffness_unit: str = "N/m, N*m/rad"
     complete: bool = True
 
     def __getattr__(self, name: str) -> Array:
@@ -156,6 +158,7 @@ def _run(about: Mapping[str, str], found: McapContents) -> RecordedRun:
     frames = sorted(found.of_topic("/tracker"), key=lambda frame: float(frame["time_s"]))
     seen = {entry.name: _column(frames, entry, n) for entry in entries(SeenPose)}
     states, timing = found.of_topic("/state"), found.of_topic("/timing")
+    units = {tip.get("stiffness_unit") for tip in found.of_topic("/tip")} - {None}
     return RecordedRun(
         about=about,
         channels=channels,
@@ -172,6 +175,7 @@ def _run(about: Mapping[str, str], found: McapContents) -> RecordedRun:
             for e in found.of_topic("/event")
         ),
         timing=timing[-1] if timing else {},
+        stiffness_unit=str(units.pop()) if len(units) == 1 else RecordedRun.stiffness_unit,
         complete=found.complete,
     )
 

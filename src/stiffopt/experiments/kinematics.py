@@ -221,7 +221,8 @@ def run_kinematics(
         done += coverage.duration(number)
     if restless:
         notes.append(
-            f"in {restless} combined poses the arm was not at rest within {settings.settle:g} s"
+            f"in {restless} combined poses the arm was not at rest within {settings.settle:g} s "
+            "(--settle)"
         )
     return notes
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Field
 
+from stiffopt.display import display_units
 from stiffopt.errors import InputError
 from stiffopt.experiments.conductor import Array, Conductor, check_pressures
 from stiffopt.experiments.folder import Progress, recorded
@@ -61,8 +62,10 @@ def poses_for(rig: Rig, settings: PosesFile) -> Array:
             check_pressures(rig, [p], [channel])
         force = rig.force(np.array(pose))
         if rig.max_force is not None and force > rig.max_force:
+            unit = display_units().force
             raise InputError(
-                f"pose {number} is {force:.3g} N, above safety.max_force, {rig.max_force:g} N"
+                f"pose {number} is {unit.text(force, '.3g')}, above safety.max_force, "
+                f"{unit.text(rig.max_force, 'g')}"
             )
     return np.array(settings.pressures, dtype=float)
 

@@ -193,6 +193,23 @@ class PressureSolver:
                 checkpoint()
             return found
 
+    def follow(self, guess: ArrayLike, *, timeout: float | None = None) -> PressureSolution:
+        """The answer for a picture that follows a hand: sooner than `solve`, out of reach too.
+
+        Where none is found next to the guess, (n,) in Pa, it is the closest configuration that is
+        found at once; only for a pose that can be had it is searched for everywhere.  See `solve`.
+        """
+        start = self._checked(guess)
+        with giving_up(timeout, None):
+            calls = self._prepare_warm_calls()
+            block = None if calls is None else calls.next_to(start, None, None, None)
+            try:
+                found = self._solution_of(block) if block is not None else None
+                found = found or self._nearest(self.task, start)
+            except StoppedError as error:
+                return PressureSolution("failed", str(error), self.task)
+            return _felt(found or self._found(self.task, start))
+
     def solve_at_once(
         self,
         target: Target | None = None,

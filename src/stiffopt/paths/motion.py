@@ -18,7 +18,7 @@ from stiffopt.model.motion_clearance import MOTION_ERROR, ClearMotions
 from stiffopt.model.scene import Scene
 from stiffopt.model.stopping import giving_up
 from stiffopt.optimise.goal import StiffnessMeasure
-from stiffopt.optimise.solver import solve_pressure
+from stiffopt.optimise.solver import PressureSolver, solve_pressure
 from stiffopt.optimise.task import Load, Task
 from stiffopt.paths.configurations import (
     Configuration,
@@ -88,7 +88,7 @@ def plan_motion(
     seed : int
         Of the search.  The same gives the same motion, unless time ended the search.
     timeout : float, optional
-        Seconds after which to give up.
+        Seconds after which to give up; what is compiled once for a kind of task does not count.
 
     Returns
     -------
@@ -115,6 +115,9 @@ def plan_motion(
     watch = Stopwatch()
     request = MotionRequest.of(robot, start, goal, scene, clearance, slew, load, seed)
     timings: dict[str, float] = {}
+    for end in (request.start, *request.goals):
+        if isinstance(end, Task):
+            PressureSolver(request.bare, request.posed(end), seed=request.seed).compile()
     try:
         planner = _Planner(request, timings)
         with giving_up(timeout):

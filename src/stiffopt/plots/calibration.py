@@ -347,7 +347,7 @@ def _panel_title(axes: Any, found: Comparison) -> None:
         text += (
             f"   mean {unit.text(errors.mean, '.2f')}, 95 % below {unit.text(errors.p95, '.2f')}"
         )
-    axes.set_title(literal(text), loc="left", fontsize=9.5, pad=3)
+    axes.set_title(literal(text), loc="left", fontsize=9.5, pad=7)
 
 
 def _line(axes: Any, time: Array, values: Array, colour: str, width: float, label: str) -> None:

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from stiffopt.display import display_units
 from stiffopt.model.contact.equilibrium import ContactEquilibrium
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.scene import Scene
@@ -76,7 +77,7 @@ def draw_forces(drawing: ArmDrawing, equilibrium: ContactEquilibrium) -> None:
     for each in equilibrium.contacts:
         arrow = _LONGEST * drawing.size * each.force / largest
         drawing.draw_arrow(unit.of(each.position), arrow, style.LOAD, 6)
-        text = f"{np.linalg.norm(each.force):.3g} N"
+        text = display_units().force.text(float(np.linalg.norm(each.force)), ".3g")
         drawing.add_label(unit.of(each.position) + arrow, text, style.LOAD)
     if equilibrium.contacts:
         drawing.add_line(style.LOAD, "force on the arm")

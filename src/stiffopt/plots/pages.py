@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable
 from contextlib import suppress
 from functools import singledispatch
 from html import escape
+from importlib import import_module
 from io import BytesIO
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -51,18 +52,21 @@ class _Page(NamedTuple):
 
 
 def page(shown: object) -> str:
-    """Return HTML of an object: its table, and its figure if it can be drawn at once.
+    """Return HTML of an object: its table and its figure, as far as they are had at once.
 
     Raises
     ------
     TypeError
         If there is no page for such an object.
     """
-    with compiling_nothing(), giving_up(_LONGEST):
-        made = _page_of(shown)
-        rows, picture = "".join(map(_row, made.rows)), ""
-        with suppress(StiffoptError):
-            picture = _picture(made.draw())
+    made, rows, picture = _page_of(shown), "", ""
+    with suppress(ImportError):
+        import_module("matplotlib.figure")  # before the time that a page may take begins
+    with suppress(StiffoptError), compiling_nothing(), giving_up(_LONGEST):
+        for row in made.rows:
+            rows += _row(row)
+    with suppress(StiffoptError), compiling_nothing(), giving_up(_LONGEST):
+        picture = _picture(made.draw())
     colour = style.STATUS.get(made.status, style.DARK)
     head = f"<b>{_escaped(made.title)}</b> <span style='color:{colour}'>{made.status}</span>"
     return (
@@ -183,10 +187,13 @@ def _(solution: PressureSolution) -> _Page:
 
 
 def _answer_rows(solution: PressureSolution) -> Iterable[Row]:
-    if solution.message:
+    if solution.pressures is not None and solution.tip_position is not None:
+        yield from _quantity_rows(solution)
+    if solution.message:  # last: what it says of an answer may take long
         yield "note", solution.message
-    if solution.pressures is None or solution.tip_position is None:
-        return
+
+
+def _quantity_rows(solution: PressureSolution) -> Iterable[Row]:
     length, pressure = display_units().length, display_units().pressure
     pressures = ", ".join(pressure.number(p, ".3f") for p in solution.pressures)
     yield "pressures", f"{pressures} {pressure}"

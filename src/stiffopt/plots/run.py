@@ -160,22 +160,22 @@ def _draw_angle(axes: Any, run: RecordedRun) -> None:
 
 def _draw_force(axes: Any, run: RecordedRun) -> None:
     """Draw the force that is felt: of a press along its direction, else its size."""
-    force = run.wrench[:, :3]
+    unit, force = display_units().force, run.wrench[:, :3]
     size = np.linalg.norm(force, axis=1)
     felt = np.where(np.isfinite(run.press_force), run.press_force, size)
     covariance = run.wrench_covariance.reshape(-1, 3, 3)
     way = force / np.maximum(size, 1e-12)[:, None]
     band = 2 * np.sqrt(np.einsum("ti,tij,tj->t", way, covariance, way))
-    axes.plot(*thinned(run.time, 1e3 * felt), color=FORCE, linewidth=1.3, label="felt")
-    time, low = thinned(run.time, 1e3 * (felt - band))
-    _, high = thinned(run.time, 1e3 * (felt + band))
+    axes.plot(*thinned(run.time, unit.of(felt)), color=FORCE, linewidth=1.3, label="felt")
+    time, low = thinned(run.time, unit.of(felt - band))
+    _, high = thinned(run.time, unit.of(felt + band))
     axes.fill_between(time, low, high, color=FORCE, alpha=0.18, linewidth=0, label="95 %")
     if np.isfinite(run.press_goal).any():
         axes.plot(
-            *thinned(run.time, 1e3 * run.press_goal), color=TARGET, linewidth=1.3,
+            *thinned(run.time, unit.of(run.press_goal)), color=TARGET, linewidth=1.3,
             linestyle=(0, (4, 2)), label="wanted",
         )  # fmt: skip
-    axes.set_ylabel("force (mN)")
+    axes.set_ylabel(f"force ({unit})")
     axes.grid(alpha=0.25, axis="y")
     legend_beside(axes)
 
@@ -211,15 +211,17 @@ def _draw_pressures(axes: Any, run: RecordedRun, segment: int, channels: range) 
 
 
 def _draw_stiffness(axes: Any, run: RecordedRun) -> None:
+    unit = display_units().of_si(run.stiffness_unit)
     if np.isfinite(run.best_stiffness).any():
         axes.plot(
-            *thinned(run.time, run.best_stiffness), color=TARGET, linewidth=1.3,
+            *thinned(run.time, unit.of(run.best_stiffness)), color=TARGET, linewidth=1.3,
             linestyle=(0, (4, 2)), label="of the plan",
         )  # fmt: skip
     axes.plot(
-        *thinned(run.time, run.stiffness), color=ELLIPSOID, linewidth=1.3, label="of the arm,\nnow"
+        *thinned(run.time, unit.of(run.stiffness)), color=ELLIPSOID, linewidth=1.3,
+        label="of the arm,\nnow",
     )  # fmt: skip
-    axes.set_ylabel("stiffness\n(N/m, N m/rad)")
+    axes.set_ylabel(f"stiffness\n({unit})")
     axes.grid(alpha=0.25, axis="y")
     legend_beside(axes)
 

@@ -109,19 +109,20 @@ class GuardProcess:
         if self._process.stdin is not None:
             with suppress(BrokenPipeError), self._process.stdin as stdin:
                 pickle.dump(self._rig, stdin)
-        end = time.monotonic() + CLIENT.start
-        while time.monotonic() < end:
+        begin, patience = time.monotonic(), CLIENT.start
+        while time.monotonic() < begin + patience:
             for message in self.channel.receive(_START_SLICE):
                 match message:
                     case GuardNotice("notice", about):
                         warnings.warn(about["text"], SlowWarning, stacklevel=3)
+                        patience = CLIENT.slow
                     case GuardNotice("failed", about):
                         raise _failure(**about)
                     case GuardNotice("ready", about):
                         return str(about["real_time"])
             if self.channel.closed:
                 raise DeviceError("the guard process ended before it was ready")
-        raise DeviceError(f"the guard process was not ready within {CLIENT.start:g} s")
+        raise DeviceError(f"the guard process was not ready within {patience:g} s")
 
     def has_ended(self, wait: float) -> bool:
         """Wait up to `wait` s for the process to end; return whether it has."""

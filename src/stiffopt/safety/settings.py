@@ -65,7 +65,8 @@ class ClientTiming:
 
     Attributes
     ----------
-    start : until a guard is ready; the simulator may have to be compiled first.
+    start : until a guard is ready.
+    slow : the same, once it has said that the simulator is compiled first.
     end : until a guard that was told to end has vented and ended; then it is terminated, killed.
     exit : until a guard whose connection is closed has ended, before the supply is vented directly.
     answer, answer_calls : until a request is answered; number of driver calls it may wait for.
@@ -81,6 +82,7 @@ class ClientTiming:
     """
 
     start: float = 120.0
+    slow: float = 900.0
     end: float = 4.0
     exit: float = 1.0
     answer: float = 2.0

@@ -12,7 +12,7 @@ from stiffopt.optimise.measures.directional import StiffnessMeasure
 from stiffopt.plots import style
 from stiffopt.plots.shapes import StiffnessEllipsoid
 from stiffopt.plots.wording import stiffness_text
-from stiffopt.studio.drawing import NOWHERE, ArmTube, Vector, place, rgb, turn
+from stiffopt.studio.drawing import NOWHERE, ArmTube, Vector, draw, place, rgb, turn
 from stiffopt.studio.leaning import force_arrows
 from stiffopt.studio.workbench import StudioAnswer
 
@@ -77,7 +77,7 @@ class AnswerView:
         """
         leaning = answer.solution.equilibrium
         self._arm.show(answer.robot, answer.pressures, leaning)
-        self._contacts.points = force_arrows(leaning, self._length)
+        draw(self._contacts, force_arrows(leaning, self._length))
         self._show_plain(answer if with_plain else None)
         self._show_ellipsoid(answer)
         self._show_directions(answer)
@@ -110,7 +110,7 @@ class AnswerView:
         """Arrows along what is maximised, and the value at the first."""
         tip, ways = _pose(answer)[:3, 3], _directions(answer)
         reach = _ARROW_SHARE * self._length
-        self._arrows.points = _arrows([(tip, tip + reach * way) for way in ways])
+        draw(self._arrows, _arrows([(tip, tip + reach * way) for way in ways]))
         self._label.visible = bool(ways)
         value, unit = answer.solution.stiffness, answer.solution.stiffness_unit
         if ways and value is not None:
@@ -120,7 +120,7 @@ class AnswerView:
     def _show_miss(self, answer: StudioAnswer, target: Vector) -> None:
         """The way from the tip to a target that it does not reach."""
         far = (answer.solution.position_error or 0.0) > 0.004 * self._length
-        self._miss.points = _arrows([(_pose(answer)[:3, 3], target)] if far else [])
+        draw(self._miss, _arrows([(_pose(answer)[:3, 3], target)] if far else []))
 
     def _show_load(self, answer: StudioAnswer) -> None:
         """The force at the tip."""
@@ -131,7 +131,7 @@ class AnswerView:
                 force = pose[:3, :3] @ force
             way = 0.2 * self._length * force / np.linalg.norm(force)
             forces.append((pose[:3, 3] - way, pose[:3, 3]))
-        self._forces.points = _arrows(forces)
+        draw(self._forces, _arrows(forces))
 
 
 def _pose(answer: StudioAnswer) -> Vector:

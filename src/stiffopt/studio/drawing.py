@@ -145,10 +145,16 @@ def add_surroundings(server: Any, description: RobotDescription) -> None:
         position=(0.0, 0.0, -0.011 * length),
     )  # fmt: skip
     camera = server.initial_camera
-    middle = np.array([0.28 * length, 0.1 * length, 0.55 * length])  # beside the panel
-    camera.position = tuple(middle + np.array([0.62, -0.95, 0.32 * up]) * length)
+    middle = np.array([0.28, 0.1 * up, 0.55]) * length  # x to the right; beside the panel
+    camera.position = tuple(middle + np.array([0.62, -0.95 * up, 0.32 * up]) * length)
     camera.look_at = tuple(middle)
     camera.up = (0.0, 0.0, up)
+
+
+def draw(handle: Any, points: ArrayLike) -> None:
+    """Draw other arrows or lines, (k, 2, 3), if they are not there already."""
+    if not np.array_equal(handle.points, points):
+        handle.points = points
 
 
 def place(handle: Any, position: ArrayLike) -> None:

@@ -24,7 +24,7 @@ from stiffopt.optimise.measures.directional import StiffnessMeasure
 from stiffopt.plots import style
 from stiffopt.plots.shapes import StiffnessEllipsoid
 from stiffopt.studio.design import Design
-from stiffopt.studio.drawing import NOWHERE, ArmTube, Vector, place, rgb, turn
+from stiffopt.studio.drawing import NOWHERE, ArmTube, Vector, draw, place, rgb, turn
 
 _LARGEST_PUSH = 1.0  # N, within which it is said what lets a contact go
 _ARROW_SHARE, _ELLIPSOID_SHARE = 0.25, 0.22  # of the arm's length
@@ -185,12 +185,12 @@ class LeaningView:
         """Draw an arm that leans; None: take it away."""
         if leaning is None:
             self._arm.visible = self._ellipsoid.visible = False
-            self._forces.points = NOWHERE
+            draw(self._forces, NOWHERE)
             return
         found = leaning.equilibrium
         self._arm.show(leaning.robot, found.pressures, found)
         self._show_ellipsoids(leaning)
-        self._forces.points = force_arrows(found, self._length)
+        draw(self._forces, force_arrows(found, self._length))
 
     def _show_ellipsoids(self, leaning: Leaning) -> None:
         """The braced one, to the scale of the free arm's, which is drawn with the answer."""

@@ -68,7 +68,7 @@ class TaskView:
     @property
     def target_position(self) -> Vector:
         """Where the handle of the target is (3,), in m."""
-        return np.asarray(self._target.position)
+        return np.array(self._target.position)
 
     @property
     def direction_position(self) -> Vector:
@@ -205,9 +205,10 @@ class TaskView:
             found = search(cancel)
         except StiffoptError as error:
             self.bench.trouble, found = str(error), False
-        if found and self.bench.leaning is None:
-            self._show_answer()
-        self._show_leaning()
+        with self.server.atomic():
+            if found and self.bench.leaning is None:
+                self._show_answer()
+            self._show_leaning()
 
     # -- drawing ------------------------------------------------------------------------------
 
@@ -249,12 +250,11 @@ class TaskView:
             if self._dragged is None and any(self.bench.design.free):
                 self._show_target(self.bench.design)
             self._compared.show()
-        self._show_words()
 
     def _show_leaning(self) -> None:
         with self.server.atomic():
             self._leaning.show(self.bench.leaning)
-        self._show_words()
+            self._show_words()
 
     def _show_words(self) -> None:
         self._words.content = texts.answer_html(self.bench)

@@ -104,8 +104,12 @@ def _rows(answer: StudioAnswer) -> Iterable[tuple[str, str]]:
     if solution.contacts and solution.stiffness_free is not None:
         unit = units.of_si(solution.stiffness_unit)
         yield "clear of all", unit.text(solution.stiffness_free, FIGURES)
-    if solution.clearance is not None:
-        yield "clearance", units.length.text(solution.clearance, ".3g")
+    if solution.task.scene is not None:  # exact, of the whole body: too slow for a drag
+        clear = solution.clearance if answer.is_best else None
+        yield (
+            "clearance",
+            "told when you pause" if clear is None else units.length.text(clear, ".3g"),
+        )
     doubt = answer.robot.description.extrapolation(answer.pressures)
     if doubt:
         yield "doubt", doubt
@@ -128,7 +132,7 @@ def _limits_text(answer: StudioAnswer) -> str:
 def position_text(position: ArrayLike) -> str:
     """Return a position in the unit of lengths, to a tenth of a millimetre or about that."""
     unit = display_units().length
-    numbers = (unit.number(float(x), ".1f").replace("-0.0", "0.0") for x in np.asarray(position))
+    numbers = (unit.number(float(x), ".1f") for x in np.asarray(position))
     return f"({', '.join(numbers)})"
 
 
@@ -333,7 +337,7 @@ def moment_html(timeline: Timeline, time: float) -> str:
     if moment.seen is not None:
         rows.append(("tip seen (blue)", f"{position_text(moment.seen)} {length}"))
     for when, text in timeline.events_until(time):
-        rows.append((f"{when:.1f} s", escape(text)))
+        rows.append((f"{round(when, 1) + 0.0:.1f} s", escape(text)))
     low, high = timeline.robot.pressure_min, timeline.robot.pressure_max
     at_limit = moment.pressures >= high - _AT_LIMIT * (high - low)
     bars = pressures_html(description, moment.pressures, low, high, at_limit.tolist())

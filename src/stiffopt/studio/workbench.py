@@ -10,6 +10,7 @@ import threading
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from time import perf_counter
 
 import numpy as np
@@ -62,7 +63,7 @@ class StudioAnswer:
         assert self.solution.robot is not None
         return self.solution.robot
 
-    @property
+    @cached_property
     def at_limit(self) -> NDArray[np.int_]:
         """At which limit each pressure (n,) is: -1 at the lowest, 1 at the highest, else 0."""
         found = np.zeros(len(self.pressures), dtype=int)
@@ -183,7 +184,10 @@ class Workbench:
             guess = before.pressures
         if guess is None and not solver.is_compiled:
             return False
-        solution = solver.solve(guess=guess, timeout=QUICK, cancel=cancel)
+        if guess is None:
+            solution = solver.solve(timeout=QUICK, cancel=cancel)
+        else:
+            solution = solver.follow(guess, timeout=QUICK)
         if solution.pressures is None:
             return False
         self._take(design, solver, solution, is_best=guess is None)
