@@ -205,7 +205,7 @@ class PressureSolver:
             block = None if calls is None else calls.next_to(start, None, None, None)
             try:
                 found = self._solution_of(block) if block is not None else None
-                found = found or self._nearest(self.task, start)
+                found = found or self._search.nearest(self.task, start)
             except StoppedError as error:
                 return PressureSolution("failed", str(error), self.task)
             return _felt(found or self._found(self.task, start))

@@ -25,6 +25,7 @@ TUBE_STATIONS = 24
 """Stations of the tube, per segment."""
 _SPOKES = 28  # of the tube, around
 _ALONG = 24  # points of an arrow that no text should lie on
+_SMALL = 4.0  # inches, of a panel
 _LEAST_SIDES = (0.5, 0.3, 0.5)  # of the box, as shares of its longest
 
 
@@ -226,12 +227,16 @@ class ArmDrawing:
         sides = np.maximum(
             sides, sides.max() * np.array(_LEAST_SIDES)
         )  # room for the labels of a slender arm
+        width = self.axes.get_position().width * self.axes.figure.get_figwidth()  # inches
         for name, start, side in zip("xyz", (low + high - sides) / 2, sides, strict=True):
             self.axes.set(**{f"{name}lim": (start, start + side)})
             self.axes.set(**{f"{name}label": f"{name} ({self.unit})"})
             axis = getattr(self.axes, f"{name}axis")
             prune = None if name == "z" else "both"  # two axes meet in a corner
-            axis.set_major_locator(MaxNLocator(max(3, round(7 * side / sides.max())), prune=prune))
+            most = max(3, round(7 * side / sides.max()))
+            if name == "y" and width < _SMALL:  # it is seen nearly end on
+                most = 1
+            axis.set_major_locator(MaxNLocator(most, prune=prune, min_n_ticks=min(2, most)))
             axis.labelpad = 8 if name == "z" else -2
         self.axes.tick_params(labelsize=8, pad=0)
         self.axes.tick_params(axis="z", pad=3)

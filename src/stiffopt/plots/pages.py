@@ -188,19 +188,15 @@ def _(solution: PressureSolution) -> _Page:
 
 def _answer_rows(solution: PressureSolution) -> Iterable[Row]:
     if solution.pressures is not None and solution.tip_position is not None:
-        yield from _quantity_rows(solution)
+        yield from _quantity_rows(solution, solution.pressures, solution.tip_position)
     if solution.message:  # last: what it says of an answer may take long
         yield "note", solution.message
 
 
-def _quantity_rows(solution: PressureSolution) -> Iterable[Row]:
+def _quantity_rows(solution: PressureSolution, pressures: Any, tip: Any) -> Iterable[Row]:
     length, pressure = display_units().length, display_units().pressure
-    pressures = ", ".join(pressure.number(p, ".3f") for p in solution.pressures)
-    yield "pressures", f"{pressures} {pressure}"
-    yield (
-        "tip at",
-        f"({', '.join(length.number(x, '.3f') for x in solution.tip_position)}) {length}",
-    )
+    yield "pressures", f"{', '.join(pressure.number(p, '.3f') for p in pressures)} {pressure}"
+    yield "tip at", f"({', '.join(length.number(x, '.3f') for x in tip)}) {length}"
     for term in solution.task.target.terms:
         if term.name in solution.errors:
             yield f"error in {term.name}", term.words(solution.errors[term.name])
