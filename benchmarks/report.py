@@ -90,12 +90,16 @@ class Section:
 
 def at_most(what: str, limit: float, value: float, unit: str) -> Verdict:
     """Verdict on a figure that should be small; NaN is a miss."""
-    return Verdict(what, f"at most {_with_unit(limit, unit)}", _found(value, unit), value <= limit)
+    return Verdict(
+        what, f"at most {_with_unit(limit, unit)}", _found(value, unit), bool(value <= limit)
+    )
 
 
 def at_least(what: str, limit: float, value: float, unit: str) -> Verdict:
     """Verdict on a figure that should be large; NaN is a miss."""
-    return Verdict(what, f"at least {_with_unit(limit, unit)}", _found(value, unit), value >= limit)
+    return Verdict(
+        what, f"at least {_with_unit(limit, unit)}", _found(value, unit), bool(value >= limit)
+    )
 
 
 def _found(value: float, unit: str) -> str:

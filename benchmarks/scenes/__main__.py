@@ -10,7 +10,8 @@ solved      how many of the tasks;
 shortfall   the most by which a solved one is nearer to an object than the clearance asked, in mm,
             measured from the arm's independently computed centre line (`judge.py`);
 stiffest    share of the compared tasks whose stiffness is not more than 0.5 % below the best of
-            IPOPT's points (`ipopt.py`) that the judge confirms, and how many points that were;
+            IPOPT's points (`ipopt.py`) that the judge confirms, of those tasks in which there is
+            one; in how many of them that is 0.5 % below; and at how many points IPOPT ended;
 cold        median CPU of a solution from the task alone, and its ratio to the same task's without
             the scene.
 
@@ -54,6 +55,7 @@ class Tally:
     shortfall: float = -np.inf
     stiffest: int = 0
     compared: int = 0
+    above: int = 0
     points: int = 0
     seconds: list[tuple[float, float]] = field(default_factory=list)  # without and with the scene
 
@@ -64,7 +66,10 @@ class Tally:
             parts.append(f"shortfall {1e3 * self.shortfall:.4f} mm")
             parts.append(f"cold {1e3 * among:.2f} ms, {among / free:.2f} of without a scene")
         if self.compared:
-            parts.append(f"stiffest {self.stiffest}/{self.compared} ({self.points} points)")
+            parts.append(
+                f"stiffest {self.stiffest}/{self.compared}, IPOPT below in {self.above} "
+                f"({self.points} points)"
+            )
         return ", ".join(parts)
 
 
@@ -115,17 +120,18 @@ def _compared(
     )
     assert answer.stiffness is not None
     tally.points += len(ends)
+    best = next((end for end in ends if _lack(name, case, end[1]) < EXACT), None)
+    if best is None:
+        return f" none of {len(ends)} points of IPOPT is confirmed"
     tally.compared += 1
-    for stiffness, p in ends:
-        if answer.stiffness >= (1 - NEAR_BEST) * stiffness:
-            break
-        if _lack(name, case, p) < EXACT:
-            return (
-                f" {answer.stiffness / stiffness - 1:+.2%} of IPOPT's {stiffness:.5g} at "
-                f"{np.round(p / 1e5, 4).tolist()} bar; {answer.confidence}"
-            )
-    tally.stiffest += 1
-    return ""
+    tally.above += answer.stiffness > best[0] / (1 - NEAR_BEST)
+    if answer.stiffness >= (1 - NEAR_BEST) * best[0]:
+        tally.stiffest += 1
+        return ""
+    return (
+        f" {answer.stiffness / best[0] - 1:+.2%} of IPOPT's {best[0]:.5g} at "
+        f"{np.round(best[1] / 1e5, 4).tolist()} bar; {answer.confidence}"
+    )
 
 
 def main() -> None:
@@ -136,7 +142,7 @@ def main() -> None:
     parser.add_argument("--arm", action="append", choices=list(ARMS))
     parser.add_argument("--tasks", type=int, default=40, help="in all, on all arms")
     parser.add_argument("--compared", type=int, default=8, help="of these with IPOPT")
-    parser.add_argument("--starts", type=int, default=60, help="of IPOPT; a third if hanging")
+    parser.add_argument("--starts", type=int, default=60, help="of IPOPT")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--only", type=int, help="number of the one case to run, on one --arm")
     parser.add_argument("--meshes", type=Path, help="folder of the meshes, instead of a new one")
@@ -150,7 +156,6 @@ def main() -> None:
         for index in numbers:
             name, number = arms[index % len(arms)], index // len(arms)
             starts = given.starts if index < given.compared or given.only is not None else 0
-            starts = starts // 3 if name == "hanging" else starts
             words = run(name, number, given.seed, starts, tallies[name], folder)
             if words or given.only is not None:
                 case = random_case(name, given.seed, number, folder)

@@ -1,9 +1,12 @@
 """Many starts of IPOPT on a task with objects, at its own stations and with its own distances.
 
 The model's functions are stiffopt's (tested by themselves), its optimiser and distances are not
-used.  Each object and station is a row; where the body is between stations is seen only by
-the judge, so IPOPT's points count when that confirms them.  Half of the starts are random pressures
-within their limits, half random ones that keep clear and whose tips are not far from the target.
+used.  Each object and station is a row, and each ring one more, so that the arm passes through it.
+Half of the starts are random pressures within their limits, half random ones that keep clear and
+whose tips are not far from the target.  The tip is at the target first, by three equations, then
+where the multipliers point to on the ball of the tolerance: with the ball itself as a row, hardly a
+start in a hundred came to an end.  By what the judge finds an object nearer than its rows say, as
+between stations, more is asked of it, twice.
 """
 
 from collections.abc import Iterator
@@ -13,18 +16,20 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from scenes.judge import distances
+from scenes.judge import clearances, distances
 from scenes.scene_tasks import CLEARANCE, RADIUS, Case
 from stiffopt import EquilibriumError, Manipulator
 
 Vector = NDArray[np.float64]
 
 BAR = 1e5
-STATIONS = 33
+STATIONS, LINE = 33, 400  # of the rows, and of a centre line for the judge
+SAME = 1e-4  # bar, between two ends that are the same optimum
+MOST_MORE = 1e-3  # m that is asked beyond the clearance, at a time
 DRAWN, KEPT = 1500, 0.1  # random pressures, and the share of the clear ones that is not far
 OPTIONS = {
     "print_time": 0, "ipopt.print_level": 0, "ipopt.sb": "yes", "ipopt.tol": 1e-6,
-    "ipopt.max_iter": 80, "ipopt.hessian_approximation": "limited-memory",
+    "ipopt.max_iter": 50, "ipopt.hessian_approximation": "limited-memory",
     "ipopt.acceptable_tol": 1e-4, "ipopt.acceptable_iter": 5,
 }  # fmt: skip
 
@@ -38,24 +43,52 @@ class Ipopt:
         x = ca.MX.sym("x", robot.n_pressures)
         f, g = self._program(x)
         self._solver = ca.nlpsol("ipopt", "ipopt", {"x": x, "f": f, "g": g}, OPTIONS)
+        self._tolerance = case.task(with_scene=False).target.tolerance.position
 
     def ends(self, starts: int, rng: np.random.Generator) -> Iterator[tuple[float, Vector]]:
         """Stiffness and pressures (n,) in Pa where IPOPT ended, if its own rows hold there."""
         low, high = self._robot.pressure_min / BAR, self._robot.pressure_max / BAR
         clear = self._clear(rng)
-        bounds = {"lbx": low, "ubx": high, **self._program.bounds}
+        known: list[tuple[Vector, tuple[float, Vector] | None]] = []
         for number in range(starts):
-            start = rng.uniform(low, high)
+            x = rng.uniform(low, high)
             if number % 2 and len(clear):
-                start = clear[rng.integers(len(clear))] / BAR
-            try:
-                x = np.clip(self._solver(x0=start, **bounds)["x"].full()[:, 0], low, high)
-                _, rows = self._program.values(x)
-            except (EquilibriumError, RuntimeError):
+                x = clear[rng.integers(len(clear))] / BAR
+            self._program.place(self._case.position)
+            found = self._end(x, low, high)
+            if found is None:
                 continue
-            lower, upper = self._program.bounds["lbg"], self._program.bounds["ubg"]
-            if (rows >= lower - 1e-2).all() and (rows <= upper + 1e-3).all():
-                yield float(self._robot.stiffness(x * BAR, self._case.direction)), x * BAR
+            x, pull = found
+            same = [end for first, end in known if np.abs(x - first).max() < SAME]
+            end = same[0] if same else self._at_edge(x, pull, low, high)
+            known.append((x, end))
+            if end is not None:
+                yield end
+
+    def _at_edge(
+        self, x: Vector, pull: Vector, low: Vector, high: Vector
+    ) -> tuple[float, Vector] | None:
+        """From an end at the target to one on the edge of its tolerance, see above."""
+        for _ in range(2):
+            self._program.place(self._case.position + 0.99 * self._tolerance * pull, x * BAR)
+            found = self._end(x, low, high)
+            if found is None:
+                return None
+            x, pull = found
+        return float(self._robot.stiffness(x * BAR, self._case.direction)), x * BAR
+
+    def _end(self, x: Vector, low: Vector, high: Vector) -> tuple[Vector, Vector] | None:
+        """Where IPOPT ends, and to which side (3,) the tip is pulled."""
+        try:
+            found = self._solver(x0=x, lbx=low, ubx=high, lbg=0, ubg=self._program.upper)
+            x = np.clip(found["x"].full()[:, 0], low, high)
+            rows = self._program.values(x)[1]
+        except (EquilibriumError, RuntimeError):
+            return None
+        if not ((rows > -1e-3) & (rows < self._program.upper + 1e-3)).all():
+            return None
+        pull = found["lam_g"].full()[:3, 0]
+        return x, pull / max(float(np.linalg.norm(pull)), 1e-9)
 
     def _clear(self, rng: np.random.Generator) -> Vector:
         """Random pressures (k, n) in Pa at which the stations keep clear, near the target."""
@@ -79,15 +112,22 @@ class _Program(ca.Callback):
         super().__init__()
         self._robot, self._case = robot, case
         self._at = np.linspace(0, robot.length, STATIONS)[1:]
-        self._target = np.array(case.position)
-        self._tolerance = case.task(with_scene=False).target.tolerance.position
-        self.rows = 1 + len(case.objects) * len(self._at)
-        self.bounds = {
-            "lbg": np.append(-np.inf, np.zeros(self.rows - 1)),
-            "ubg": np.append(1.0, np.full(self.rows - 1, np.inf)),
-        }
-        self._last: tuple[bytes, tuple[Any, ...]] = (b"", ())
+        rings = sum("trocar" in item for item in case.objects)
+        self.rows = 3 + len(case.objects) * len(self._at) + rings
+        self.upper = np.where(np.arange(self.rows) < 3, 0.0, np.inf)
+        self.place(case.position)
         self.construct("program")
+
+    def place(self, target: Any, p: Vector | None = None) -> None:
+        """Have the tip at a place (3,) in m, and objects as far away as the judge sees them."""
+        self._target = np.array(target)
+        if p is None:
+            self._asked = np.full(len(self._case.objects), RADIUS + CLEARANCE)
+        else:
+            line = self._robot.backbone(p, LINE)[:, :3, 3]
+            lacking = CLEARANCE - np.array(clearances(self._case.objects, line, RADIUS, CLEARANCE))
+            self._asked += np.clip(lacking, 0, MOST_MORE)
+        self._last: tuple[bytes, tuple[Any, ...]] = (b"", ())
 
     def get_n_in(self) -> int:
         return 1
@@ -130,19 +170,25 @@ class _Program(ca.Callback):
         return self._last[1]
 
     def _computed(self, p: Vector) -> tuple[float, Vector, Vector, Vector]:
-        robot, direction = self._robot, self._case.direction
-        stiffness = float(robot.stiffness(p, direction))
-        slope = -robot.stiffness_gradient(p, direction) / stiffness * BAR
+        robot, direction = self._robot, np.array(self._case.direction)
+        h = 1e-3 * np.eye(len(p))  # bar
+        C = robot.compliance_between(
+            p + BAR * np.concatenate([0 * h[:1], h, -h]), *2 * [robot.length]
+        )
+        logs = np.log(np.einsum("i,kij,j->k", direction, C[:, :3, :3], direction))
+        slope = (logs[1 : len(p) + 1] - logs[len(p) + 1 :]) / 2e-3
         poses, J = robot.pose(p, self._at), robot.body_jacobian(p, self._at)
         moves = poses[:, :3, :3] @ J[:, :3] * BAR  # (m, 3, n)
         x = poses[:, :3, 3]
-        miss = (x[-1] - self._target) / self._tolerance
-        rows, slopes = [np.array([miss @ miss])], [2 * miss @ moves[-1:] / self._tolerance]
-        for item in self._case.objects:
+        rows, slopes = [(x[-1] - self._target) / 1e-3], [moves[-1] / 1e-3]
+        for item, asked in zip(self._case.objects, self._asked, strict=True):
             d, normals = self._distances(item, x)
-            rows.append((d - RADIUS - CLEARANCE) / 1e-3)
+            rows.append((d - asked) / 1e-3)
             slopes.append(np.einsum("mi,min->mn", normals, moves) / 1e-3)
-        return -np.log(stiffness), np.concatenate(rows), slope, np.vstack(slopes)
+            if "trocar" in item:
+                left, slope = _passing(item["trocar"], x, moves)
+                rows.append(np.array([left / 1e-3])), slopes.append(slope[None] / 1e-3)
+        return logs[0], np.concatenate(rows), slope, np.vstack(slopes)
 
     def _distances(self, item: dict[str, Any], x: Vector) -> tuple[Vector, Vector]:
         """Distances (m,) and their gradients (m, 3)."""
@@ -158,6 +204,25 @@ class _Program(ca.Callback):
             values = distances(item, (x + shifts[:, None]).reshape(-1, 3))
         values = values.reshape(7, -1)
         return values[0], (values[1:4] - values[4:]).T / (2 * h)
+
+
+def _passing(ring: dict[str, Any], x: Vector, moves: Vector) -> tuple[float, Vector]:
+    """What is left between a ring and the body where its centre line x (m, 3) crosses the plane.
+
+    Else it is that beside its tip.  With the derivatives (n,).
+    """
+    axis = np.array(ring["axis"])
+    height = (x - ring["centre"]) @ axis
+    crossing = np.flatnonzero((height[:-1] <= 0) != (height[1:] <= 0))
+    place, move = x[-1], moves[-1]
+    if len(crossing):
+        k = crossing[0]
+        share, way = height[k] / (height[k] - height[k + 1]), x[k + 1] - x[k]
+        place, move = x[k] + share * way, (1 - share) * moves[k] + share * moves[k + 1]
+        move = move - np.outer(way, axis @ move) / (way @ axis)
+    beside = place - ring["centre"]
+    length = max(float(np.linalg.norm(beside)), 1e-9)
+    return ring["radius"] - RADIUS - CLEARANCE - length, -beside @ move / length
 
 
 class _Slopes(ca.Callback):

@@ -54,7 +54,7 @@ class Case:
 
     def task(self, with_scene: bool = True, variant: int = 0) -> Task:
         """The task, as from a file; variants differ by nothing that matters, and share nothing."""
-        direction = tuple(x * (1 + 1e-12 * variant) for x in self.direction)
+        direction = tuple(x + 1e-9 * variant for x in self.direction)
         scene = Scene(clearance=CLEARANCE, objects=self.objects) if with_scene else None
         return Task(
             target=Target(position=self.position),

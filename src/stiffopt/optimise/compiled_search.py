@@ -110,7 +110,7 @@ class CompiledSearch:
         """Answer of compiled code where neither search nor descents to the target had one.
 
         The pose can be had, but no stiffness that is demanded; or descents start from the clear
-        sample nearest to the target, or from the clearest; or nothing is clear.
+        sample nearest to the target, or from the clearest ones; or nothing is clear.
         """
         fast = self.fast(task, None)
         if fast is None or task.scene is None:
@@ -127,11 +127,11 @@ class CompiledSearch:
         distances = self._robot.clearance(samples, task.scene)
         clear = distances >= task.scene.clearance
         far = solver.table.distances(program.terms, self._robot.length)[: len(samples)]
-        start = np.where(clear, far, np.inf).argmin() if clear.any() else distances.argmax()
-        found = self.nearest(task, samples[int(start)])
-        if found is None and not clear.any():
-            return self._clearest(task, samples, distances)
-        return found
+        if clear.any():
+            return self.nearest(task, samples[np.where(clear, far, np.inf).argmin()])
+        clearest = samples[np.argsort(-distances)[: OBSTACLES.starts]]
+        found = (self.nearest(task, start) for start in clearest)
+        return next(filter(None, found), None) or self._clearest(task, samples, distances)
 
     def _too_soft(
         self, task: Task, judgement: Judgement, answer: CompiledAnswer

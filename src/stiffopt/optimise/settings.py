@@ -143,6 +143,7 @@ class ObstacleSettings:
     turns, closer : without machine code, how often it is looked closer, and at how many stations.
     clearest : samples of which a clear one is sought to start from, where none near the target
         comes clear, and of which the clearest is shown where nothing is.
+    starts : of the clearest of them, from which descents start in turn where none is clear.
     allowed : by how much an answer may be nearer than the clearance, in m: the precision of least
         distances.
     """
@@ -154,6 +155,7 @@ class ObstacleSettings:
     turns: int = 5
     closer: int = 9
     clearest: int = 2048
+    starts: int = 8
     allowed: float = 1e-5
 
 

@@ -1,5 +1,7 @@
 """A box of any orientation."""
 
+from functools import cached_property
+
 import casadi as ca
 import numpy as np
 
@@ -37,7 +39,7 @@ class Box(Obstacle):
         """Centre, edges, axes one after another."""
         return [[*self.centre, *self.size, *self._axes.ravel(order="F").tolist()]]
 
-    @property
+    @cached_property
     def _axes(self) -> Array:
         return np.asarray(lie.rotation_from_quaternion(np.array(self.orientation)))
 

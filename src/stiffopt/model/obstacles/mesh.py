@@ -102,6 +102,10 @@ class Mesh(Obstacle):
         """The distances, a grid for each piece; made and kept in the cache folder."""
         return grids_about(self.surface, self.spacing)
 
+    @cached_property
+    def _axes(self) -> Array:
+        return np.asarray(lie.rotation_from_quaternion(np.array(self.orientation)))
+
     @staticmethod
     def formula(point: ca.SX, parameters: ca.SX) -> ca.SX:
         """Lower bound of the distance from the corners of the grid's cube.
@@ -127,8 +131,7 @@ class Mesh(Obstacle):
     @property
     def pieces(self) -> list[list[float]]:
         """Axes, centre, and of each grid origin, edge and numbers of cubes; corners are 0 here."""
-        axes = np.asarray(lie.rotation_from_quaternion(np.array(self.orientation)))
-        placed = [*axes.ravel(order="F").tolist(), *self.centre]
+        placed = [*self._axes.ravel(order="F").tolist(), *self.centre]
         return [
             [*placed, *grid.origin.tolist(), grid.spacing, *grid.cells, *[0.0] * 8]
             for grid in self.grids
@@ -136,8 +139,7 @@ class Mesh(Obstacle):
 
     def distance_of(self, point: Any) -> float:
         """Signed distance of one point (3,) from the triangles themselves, in m."""
-        axes = np.asarray(lie.rotation_from_quaternion(np.array(self.orientation)))
-        seen = (np.asarray(point, dtype=float) - np.array(self.centre)) @ axes
+        seen = (np.asarray(point, dtype=float) - np.array(self.centre)) @ self._axes
         return distance_of(self.surface, tuple(seen.tolist()))
 
     def check_against(self, robot: RobotDescription, clearance: float) -> None:
@@ -159,8 +161,7 @@ class Mesh(Obstacle):
 
     def outline(self, size: float) -> list[Array]:
         """Its triangles, (3, m, 3); see `Obstacle.outline`."""
-        axes = np.asarray(lie.rotation_from_quaternion(np.array(self.orientation)))
-        corners = self.surface.vertices @ axes.T + np.array(self.centre)
+        corners = self.surface.vertices @ self._axes.T + np.array(self.centre)
         triangles: Array = corners[self.surface.faces]  # (m, 3, 3)
         return [np.moveaxis(triangles, 2, 0)]
 

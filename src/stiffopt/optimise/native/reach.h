@@ -99,7 +99,9 @@ static int approach(Program *P, Point *p, int64_t most) {
     const Setup *s = P->setup;
     const ReachSettings *set = &s->reach;
     double weight[s->rows], lacks[s->rows], memory[s->rows * s->n], damping = set->damping;
-    row_weights(s, s->scale, weight);
+    double scale[s->balls]; /* what is left free does not pull */
+    for (int64_t k = 0; k < s->balls; k++) scale[k] = fmax(s->scale[k], P->radius[k]);
+    row_weights(s, scale, weight);
     if (!evaluate(P, p, 0)) return 0;
     if (p->reached) return 1;
     NEW_POINT(trial, s);
