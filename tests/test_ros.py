@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import shutil
 import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -839,6 +840,31 @@ def test_another_domain_hears_and_commands_nothing(robot: Manipulator) -> None:
         assert not reader.has_writer
         assert not vent.get_matched_subscriptions()
         other.close()
+
+
+ON_THIS_MACHINE = {  # what rmw_cyclonedds makes of "this machine only"
+    "humble": '<General><Interfaces><NetworkInterface address="127.0.0.1"/></Interfaces></General>',
+    "jazzy": """<General><AllowMulticast>false</AllowMulticast></General><Discovery>
+        <ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>32</MaxAutoParticipantIndex>
+        <Peers><Peer address="localhost"/></Peers></Discovery>""",
+}
+LISTENER = """
+import sys, ros_peer
+from stiffopt.ros.messages import String
+ros_peer.LOOPBACK = f"<CycloneDDS><Domain>{sys.argv[2]}</Domain></CycloneDDS>"
+peer = ros_peer.Peer(int(sys.argv[1]), alone=True)
+print(peer.reader("~/state", String).wait().data)
+"""
+
+
+@pytest.mark.parametrize("distro", ON_THIS_MACHINE)
+def test_nodes_that_keep_to_this_machine_find_it(distro: str, robot: Manipulator) -> None:
+    with graph(robot):
+        done = subprocess.run(
+            [sys.executable, "-c", LISTENER, str(own_domain()), ON_THIS_MACHINE[distro]],
+            cwd=Path(__file__).parent, capture_output=True, text=True, timeout=100, check=False,
+        )  # fmt: skip
+        assert done.stdout == "inactive\n", done.stderr
 
 
 @pytest.mark.parametrize("distro", ["humble", "jazzy"])

@@ -38,7 +38,13 @@ _LOOPBACK = "lo"
 _CONFIG = """\
 <CycloneDDS><Domain>
   <General><Interfaces><NetworkInterface name="{interface}" {more}/></Interfaces></General>
+  {discovery}
 </Domain></CycloneDDS>"""
+_LOCAL = """\
+<Discovery>
+  <ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>32</MaxAutoParticipantIndex>
+  <Peers><Peer address="localhost"/></Peers>
+</Discovery>"""
 _FOREVER = (1 << 63) - 1  # ns, which DDS takes as infinite
 _ANY = SampleState.Any | ViewState.Any | InstanceState.Any
 _BLOCKED = 20  # ms that a reader which does not acknowledge may keep a write waiting
@@ -226,10 +232,13 @@ class RosNode:
         self.names = names
         self._distro = distro
         place = network_interface(interface)
-        # DDS finds others by multicast, which Linux does not claim to have on loopback
-        more = 'multicast="true"' if place == _LOOPBACK else ""
+        # DDS finds others by multicast, which Linux does not claim to have on loopback; nodes of
+        # Jazzy that keep to this machine use none, and look for others at the ports of localhost
+        local = place == _LOOPBACK
+        more, discovery = ('multicast="true"', _LOCAL) if local else ("", "")
+        config = _CONFIG.format(interface=place, more=more, discovery=discovery)
         try:
-            self._domain = Domain(domain, _CONFIG.format(interface=place, more=more))
+            self._domain = Domain(domain, config)
             self._participant = DomainParticipant(domain, qos=Qos(Policy.Userdata(b"enclave=/;")))
         except DDSException as error:
             raise InputError(f"DDS cannot use the interface '{place}': {error}") from None
