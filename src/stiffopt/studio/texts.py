@@ -372,7 +372,9 @@ def rig_html(watch: RigWatch) -> str:
         description, measured, low, np.maximum(high, low + 1.0), state.saturated.tolist(),
         np.where(np.isfinite(state.commanded), state.commanded, 0.0), "commanded",
     )  # fmt: skip
-    return _padded(headline + said + _table(_rig_rows(state)) + bars + _events(watch.events))
+    return _padded(
+        headline + said + _table(_rig_rows(state)) + bars + _events(watch.events, state.time)
+    )
 
 
 def _rig_rows(state: Snapshot) -> Iterable[tuple[str, str]]:
@@ -396,8 +398,9 @@ def _rig_rows(state: Snapshot) -> Iterable[tuple[str, str]]:
         yield "alarm", f"<span style='color:#b35c00'>{escape(alarm.text)}</span>"
 
 
-def _events(events: Iterable[Event]) -> str:
+def _events(events: Iterable[Event], now: float) -> str:
     lines = "".join(
-        f"<div>{event.time:.1f} s: {escape(event.text)}</div>" for event in reversed([*events])
+        f"<div>{max(0.0, now - event.time):.0f} s ago: {escape(event.text)}</div>"
+        for event in reversed([*events])
     )
     return f"<div style='font-size:0.8em;color:#666;margin-top:6px'>{lines}</div>"
