@@ -28,7 +28,7 @@ _IN_PLANE = 1e-9  # m above a ring's plane that are none
 _SHARPENED = 1e-4  # m of arc length, over which a slope's change is measured
 _STEEPEST = 1.5  # change of an interpolated distance with the way
 _MORE_CURVED = 1.35  # than the curvature that coarse stations show
-_SPACING = 1 / 10  # of coarse stations, as a share of the arm's length
+_SPACING = 1 / 8  # of coarse stations, as a share of the arm's length
 _INSET = 1e-9  # m, by which a range ends before the next begins
 
 StationOf = Callable[[Array], tuple[Array, Array, Array]]

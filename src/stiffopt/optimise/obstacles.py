@@ -111,7 +111,7 @@ class ObstaclesInC:
 
 def _body_in_c(arm: Manipulator, rod: LoadedArm | None, groups: tuple[int, ...]) -> tuple[Any, ...]:
     """The arm's body, and what is known of its ranges: ends of segments, bounds and stations."""
-    ranges = Ranges.of(range_ends(arm.description, OBSTACLES.spacing))
+    ranges = Ranges.of(range_ends(arm.description))
     return ModelInC(arm, rod), np.array(groups, dtype=np.int64), ranges.bounds, ranges.counts
 
 
@@ -163,7 +163,7 @@ class Obstacles:
 
     def nearest(self, body: StationOf) -> list[Nearest]:
         """Where a body is nearest to the objects, a row each, by a few stations."""
-        ranges = range_ends(self.description, OBSTACLES.spacing)
+        ranges = range_ends(self.description)
         groups = [ranges[begin:end] for begin, end in pairwise((0, *self.range_groups))]
         return [
             nearest

@@ -136,7 +136,6 @@ class ObstacleSettings:
 
     Attributes
     ----------
-    spacing : of coarse stations, as a share of the arm's length.
     margin : width of a row's bound in m, the scale on which the method sees it.
     cutoff : distance beyond the clearance, in m, from which an object has no part in a step.
     touching : how near to the clearance an object counts as one that holds the arm back, in m.
@@ -148,7 +147,6 @@ class ObstacleSettings:
         distances.
     """
 
-    spacing: float = 1 / 8
     margin: float = 1e-3
     cutoff: float = 0.005
     touching: float = 2e-5

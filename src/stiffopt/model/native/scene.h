@@ -110,6 +110,10 @@ typedef struct {
     PieceBounds bounds;
 } NearestSearch;
 
+/* Not fmax and fmin, which are calls. */
+static double larger(double a, double b) { return a > b ? a : b; }
+static double smaller(double a, double b) { return a < b ? a : b; }
+
 static double scene_dot(const double *a, const double *b) {
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 }
@@ -201,9 +205,9 @@ static int survey(const CentreLine *line, double s0, double s1, Range *range) {
     range->speed = range->turn = 0;
     for (int64_t i = 0; i + 1 < n; i++, p++) {
         double step = p[1].s - p->s, half = scene_far(p[1].tangent, p->tangent) / 2;
-        double bent = half > 1e-6 ? asin(fmin(half, 1)) / fmin(half, 1) : 1; /* arc over chord */
-        range->speed = fmax(range->speed, bent * scene_far(p[1].position, p->position) / step);
-        range->turn = fmax(range->turn, 2 * half * bent / step);
+        double bent = half > 1e-6 ? asin(smaller(half, 1)) / smaller(half, 1) : 1; /* arc over chord */
+        range->speed = larger(range->speed, bent * scene_far(p[1].position, p->position) / step);
+        range->turn = larger(range->turn, 2 * half * bent / step);
     }
     return 1;
 }
@@ -214,7 +218,7 @@ static int counted_range(const CentreLine *line, const SceneObject *object, cons
     const BodyPoint *p = range->points;
     *counted = *range;
     if (p->s >= object->begin) return 1;
-    double s = fmin(object->begin, p[range->count - 1].s);
+    double s = smaller(object->begin, p[range->count - 1].s);
     counted->points = points, counted->count = 1;
     for (int64_t i = 0; i < range->count; i++)
         if (p[i].s > s) points[counted->count++] = p[i];
@@ -242,8 +246,8 @@ static int probe_at(NearestSearch *search, const BodyPoint *point, Probe *probe)
 
 static double to_beat(const NearestSearch *search) {
     const Precision *to = &search->to;
-    double least = fmin(search->best->distance, to->cutoff);
-    return least - fmax(to->error, to->share * (least - to->asked));
+    double least = smaller(search->best->distance, to->cutoff);
+    return least - larger(to->error, to->share * (least - to->asked));
 }
 
 /* By how much a distance changes with arc length at rest at most. */
@@ -256,7 +260,7 @@ static double steepness(const NearestSearch *search) {
 static double outside_spheres(double chord, double first, double second) {
     double x = (chord * chord + first * first - second * second) / (2 * chord);
     if (x <= 0) return first;
-    return x >= chord ? second : sqrt(fmax(first * first - x * x, 0));
+    return x >= chord ? second : sqrt(larger(first * first - x * x, 0));
 }
 
 /* Where the larger of two distances, each along a straight line, is least: of the one from a0 to
@@ -264,13 +268,13 @@ static double outside_spheres(double chord, double first, double second) {
 static double least_larger(double a0, double b0, double a1, double b1) {
     double crossing = a0 - a1 + b1 - b0;
     double there = crossing > 0 ? a0 + (b0 - a0) * (a0 - a1) / crossing : a0;
-    return fmin(fmin(a0, b1), there);
+    return smaller(smaller(a0, b1), there);
 }
 
 /* The same between two probes, of the pieces that have the largest distances at either. */
 static double least_of_pieces(const NearestSearch *search, const Probe *a, const Probe *b) {
     double of_b_at_a, of_a_at_b, unused[3];
-    if (a->piece == b->piece) return fmin(a->value, b->value);
+    if (a->piece == b->piece) return smaller(a->value, b->value);
     if (!piece_distance(search->object, b->piece, a->point->position, &of_b_at_a, unused) ||
         !piece_distance(search->object, a->piece, b->point->position, &of_a_at_b, unused))
         return -INFINITY;
@@ -292,19 +296,19 @@ static double least_between(const NearestSearch *search, const Probe *a, const P
     double least = (a->value + b->value - steepness(search) * h) / 2;
     double m = MORE_CURVED * range->speed * range->turn;
     if (least >= to_beat(search)) return least;
-    if (course == CONCAVE) return fmax(least, least_of_pieces(search, a, b) - m * h * h / 8);
+    if (course == CONCAVE) return larger(least, least_of_pieces(search, a, b) - m * h * h / 8);
     double first = a->value + a->point->radius, second = b->value + b->point->radius;
     if (course == ANY_COURSE && first > 0 && second > 0) {
         double chord = scene_far(a->point->position, b->point->position);
         double found = outside_spheres(chord, first, second) - m * h * h / 8;
-        least = fmax(least, found - fmax(a->point->radius, b->point->radius));
+        least = larger(least, found - larger(a->point->radius, b->point->radius));
     }
     if (course != CONVEX && h > FINE) return least;
     double down = a->slope - m * h / 2, up = b->slope + m * h / 2;
-    if (down >= 0) return fmax(least, a->value);
-    if (up <= 0) return fmax(least, b->value);
+    if (down >= 0) return larger(least, a->value);
+    if (up <= 0) return larger(least, b->value);
     double u = (b->value - a->value - up * h) / (down - up);
-    return fmax(least, a->value + down * fmin(fmax(u, 0), h));
+    return larger(least, a->value + down * smaller(larger(u, 0), h));
 }
 
 /* Look closer between two probes for as long as there may be something nearer. */
@@ -312,7 +316,7 @@ static int refine_between(NearestSearch *search, const Probe *a, const Probe *b)
     double h = b->point->s - a->point->s, share = 0.5;
     if (h < SHORTEST || least_between(search, a, b) >= to_beat(search)) return 1;
     if (a->slope < 0 && b->slope > 0)
-        share = fmin(fmax(a->slope / (a->slope - b->slope), 0.1), 0.9);
+        share = smaller(larger(a->slope / (a->slope - b->slope), 0.1), 0.9);
     BodyPoint middle;
     Probe probe;
     return body_point(search->line, a->point->s + share * h, &middle) &&
@@ -343,7 +347,7 @@ static int probe_beyond(NearestSearch *search, const Probe *from, BodyPoint *poi
     double low = range->points[0].s, high = range->points[range->count - 1].s;
     double step = from->slope > 0 ? -SHARPENED : SHARPENED;
     for (int turn = 0; turn < 3; turn++, step *= 4) {
-        double s = fmin(fmax(from->point->s + step, low), high);
+        double s = smaller(larger(from->point->s + step, low), high);
         if (!body_point(search->line, s, point) || !probe_at(search, point, probe)) return 0;
         if (from->slope * probe->slope < 0) return 1;
         if (s == low || s == high) return 0;
@@ -367,7 +371,7 @@ static int settle_at_minimum(NearestSearch *search) {
     for (int turn = 0; turn < MOST_TURNS; turn++) {
         double h = b->point->s - a->point->s;
         double meeting = (b->value - a->value - b->slope * h) / (a->slope - b->slope); /* of tangents */
-        double gap = fmin(a->value, b->value) - a->value - a->slope * meeting;
+        double gap = smaller(a->value, b->value) - a->value - a->slope * meeting;
         if (fabs(gap) < LEVEL + NOT_LEVEL * (best->distance - search->to.asked)) break;
         double way = turn % 2 ? meeting : h * a->slope / (a->slope - b->slope);
         BodyPoint *other = points + 2;
@@ -421,7 +425,7 @@ static int passes_between(const CentreLine *line, const SceneObject *o, const Bo
     for (int i = 0; i < 60 && s1 - s0 > SHORTEST; i++) {
         BodyPoint p;
         double share = low.height / (low.height - high.height);
-        share = i % 2 ? 0.5 : fmin(fmax(share, 0.01), 0.99);
+        share = i % 2 ? 0.5 : smaller(larger(share, 0.01), 0.99);
         if (!body_point(line, s0 + share * (s1 - s0), &p) || !passage_of(o, p.position, &middle))
             return 0;
         if ((middle.height <= 0) == (low.height <= 0)) s0 = p.s, low = middle;
