@@ -117,6 +117,18 @@ def test_table_says_what_a_limit_is_worth(write: Write) -> None:
     assert re.search(r"N/m per bar by which segment 2 channel \d max is raised", text)
 
 
+def test_no_vacuum_is_offered(write: Write) -> None:
+    both = TWO.replace("{direction: [1, 0, 0]}", "[{direction: [1, 0, 0]}, {direction: [0, 1, 0]}]")
+    task = stiffopt.load_task(write("task.yaml", both))
+    sensitivities = stiffopt.solve_pressure(stiffopt.load_robot("stiff-flop-2"), task).sensitivities
+    assert sensitivities is not None
+    lowest = {name: price for name, price in sensitivities.per_bound.items() if "min" in name}
+    assert max(lowest.values()) > 0
+    assert "lowered" not in run(write("vented.yaml", both)).stdout
+    above = run(write("above.yaml", both + "pressure: {min: 0.05 bar}\n")).stdout
+    assert "min is lowered" in " ".join(above.split())
+
+
 def test_table_says_why_a_gain_is_small(write: Write) -> None:
     exact = ONE.replace("-20 mm, 5 mm, free", "-18 mm, -3 mm, 92 mm").replace("0.5", "0.1")
     text = run(write("exact.yaml", exact)).stdout

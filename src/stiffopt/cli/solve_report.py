@@ -305,9 +305,10 @@ def _worth(solution: PressureSolution) -> Iterable[Line]:
         if price:
             tolerance = f"'{term.name}'" if term.is_inequality else f"{term.name} tolerance"
             offers.append((price / factor, f"{per} {what} {tolerance}"))
+    vented = _vented(solution)
     for name, value in sorted(given.per_bound.items(), key=lambda item: -item[1]):
         moved = "raised" if name.endswith("max") else "lowered"
-        if value:
+        if value and name not in vented:
             offers.append((pressure.to_si(value), f"{pressure} by which {name} is {moved}"))
     for name, price in given.per_clearance.items():
         if price:
@@ -316,6 +317,15 @@ def _worth(solution: PressureSolution) -> Iterable[Line]:
     for number, (value, per) in enumerate(offers):
         text = Text.assemble((unit.text(value, "+.3g"), "bold"), f" per {per}")
         yield "" if number else "worth", text
+
+
+def _vented(solution: PressureSolution) -> set[str]:
+    """Lower limits that no pressure source without vacuum goes below, as they are named."""
+    if solution.robot is None:
+        return set()
+    description = solution.robot.description
+    lower, _ = solution.task.pressure_bounds(description)
+    return {f"{description.channel_name(k)} min" for k, limit in enumerate(lower) if limit <= 0}
 
 
 def _front(solved: SolvedTask) -> RenderableType:
