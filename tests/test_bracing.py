@@ -374,3 +374,6 @@ def test_a_motion_goes_to_rest_and_then_into_contact(solution, approach):
             <= 2e5 * np.diff(found.times) * (1 + 1e-6)).all()  # fmt: skip
     with pytest.raises(InputError, match="the only goal of a motion"):
         stiffopt.plan_motion(ROBOT, TASK, start, slew=2e5)
+    given_up = stiffopt.plan_motion(ROBOT, start, TASK, slew=2e5, cancel=lambda: True)
+    assert given_up.status == "failed"
+    assert "cancelled" in given_up.message

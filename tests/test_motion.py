@@ -326,6 +326,12 @@ def test_no_way(two: Manipulator, compiled: Path) -> None:
         assert "no clear way was found" in motion.message
 
 
+def test_a_motion_that_nobody_wants_any_more(two: Manipulator) -> None:
+    motion = plan_motion(two, task_at(two, LEFT), RIGHT, cancel=lambda: True)
+    assert motion.status == "failed"
+    assert "cancelled" in motion.message
+
+
 def test_the_margin_of_a_calibrated_robot(two: Manipulator, monkeypatch: Any) -> None:
     from stiffopt.paths import motion_request
 
@@ -377,6 +383,7 @@ def test_times_are_the_least() -> None:
         ({"clearance": -1.0}, "clearance must be"),
         ({"scene": {"objects": []}}, "scene must be a Scene"),
         ({"timeout": -1}, "timeout must be"),
+        ({"cancel": 3}, "cancel must be"),
         ({"load": 3}, "load must be a Load"),
     ],
 )

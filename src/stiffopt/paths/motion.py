@@ -16,7 +16,7 @@ from stiffopt.model.compiled import Stopwatch
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.motion_clearance import MOTION_ERROR, ClearMotions
 from stiffopt.model.scene import Scene
-from stiffopt.model.stopping import giving_up
+from stiffopt.model.stopping import Cancel, giving_up
 from stiffopt.optimise.goal import StiffnessMeasure
 from stiffopt.optimise.solver import PressureSolver, solve_pressure
 from stiffopt.optimise.task import Load, Task
@@ -56,6 +56,7 @@ def plan_motion(
     load: Load | None = None,
     seed: int = 0,
     timeout: float | None = 10.0,
+    cancel: Cancel | None = None,
 ) -> PathSolution:
     """Find pressures over time from a start to a goal with the body clear of a scene all the way.
 
@@ -88,7 +89,10 @@ def plan_motion(
     seed : int
         Of the search.  The same gives the same motion, unless time ended the search.
     timeout : float, optional
-        Seconds after which to give up; what is compiled once for a kind of task does not count.
+        Seconds after which to give up; what is compiled once for a kind of task does not count,
+        nor the search for where to lean.
+    cancel : threading.Event or callable, optional
+        Give up as soon as it is set, or says true; it may be asked by another thread.
 
     Returns
     -------
@@ -111,7 +115,8 @@ def plan_motion(
             )
         task = goals[0] if scene is None else goals[0].model_copy(update={"scene": scene})
         options: dict[str, Any] = {"clearance": clearance, "load": load, "seed": seed}
-        return _leaning(robot, start, task, slew, options | {"timeout": timeout})
+        with giving_up(None, cancel):
+            return _leaning(robot, start, task, slew, options | {"timeout": timeout})
     watch = Stopwatch()
     request = MotionRequest.of(robot, start, goal, scene, clearance, slew, load, seed)
     timings: dict[str, float] = {}
@@ -120,7 +125,7 @@ def plan_motion(
             PressureSolver(request.bare, request.posed(end), seed=request.seed).compile()
     try:
         planner = _Planner(request, timings)
-        with giving_up(timeout):
+        with giving_up(timeout, cancel):
             way = planner.way()
         found = planner.described(way)
     except Unsolved as reason:
@@ -144,10 +149,13 @@ def _leaning(
         return down
     try:
         way = approach_to(robot, found, np.inf if down.slew is None else down.slew)
-    except Unsolved as reason:
+    except (Unsolved, StoppedError) as reason:
         own = {name: value for name, value in options.items() if name != "timeout"}
         request = MotionRequest.of(robot, start, rest, goal.scene, slew=slew, **own)
-        return request.without_answer(str(reason), "unreachable")
+        why = str(reason)
+        if isinstance(reason, Unsolved):
+            return request.without_answer(why, "unreachable")
+        return request.without_answer(why, "failed")
     unit = display_units().force
     leant = " and ".join(f"'{each.object}'" for each in found.contacts)
     return replace(
