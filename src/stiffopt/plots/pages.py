@@ -213,7 +213,7 @@ def _(solution: PathSolution) -> _Page:
         if solution.stiffness is None:
             return _in_space(lambda axes: draw_path(axes, solution))
         figure = style.new_figure(2.1 * _SIDE, _SIDE)
-        draw_path(style.add_space(figure, (0.0, 0.0, 0.5, 1.0)), solution)
+        draw_path(style.add_space(figure, (0.0, 0.0, 0.5, 1.0)), solution, labelled=False)
         axes = figure.add_axes((0.62, 0.15, 0.36, 0.7))
         draw_stiffness_along(axes, solution)
         style.tidy(axes)

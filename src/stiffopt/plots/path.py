@@ -169,6 +169,7 @@ def draw_path(
     path: Path | None = None,
     scene: Scene | None = None,
     view: View | None = None,
+    labelled: bool = True,
 ) -> list[Any]:
     """Draw the arm at some of the points, and the way of its tip.
 
@@ -183,6 +184,8 @@ def draw_path(
         What is around the arm.
     view : (elevation, azimuth), optional
         See `draw_arm`.
+    labelled : bool
+        Whether the least stiffness is written to where the tip has it.
 
     Returns
     -------
@@ -217,7 +220,8 @@ def draw_path(
         axes.plot(*tips[:, index, None], color=colour, linestyle="none", zorder=11, **look)
         drawing.add_line(colour, label, "none", **look)
         drawing.add_mark(tips[:, index])
-    _label_stiffness(drawing, solution, tips)
+    if labelled:
+        _label_stiffness(drawing, solution, tips)
     if scene is not None:
         drawing.draw_objects(scene)
     return drawing.finish(view)
