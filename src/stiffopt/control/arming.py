@@ -177,7 +177,7 @@ def _changed(
 
 
 def late_ticks(lateness: float, guard_timeout: float, load: float = 0.0) -> str:
-    """What to change where the guard may vent because the computer is busy; empty if it is not.
+    """Return advice where the computer is so busy that the guard may vent; else an empty text.
 
     Parameters
     ----------

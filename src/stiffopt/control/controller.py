@@ -421,7 +421,7 @@ class TipController:
         )  # fmt: skip
 
     def _is_known(self, now: float) -> bool:
-        """Whether the stiffness is known as well as adaptation will soon know it."""
+        """Whether no change of the model's stiffness by adaptation is due."""
         if not self._adapts:
             return True
         known, calm = self.replanner.known, self._tuning.adaptation.calm_time

@@ -1,4 +1,4 @@
-"""What searches find, judged by the model and put into words: the solutions of a solver."""
+"""Makes solutions of what searches find: judges it by the model and writes the messages."""
 
 from collections.abc import Callable, Iterable
 from typing import Any
@@ -89,7 +89,7 @@ class Answers:
         )
 
     def quantities(self, task: Task, judgement: Judgement) -> dict[str, Any]:
-        """What a solution takes from its judgement."""
+        """Return the fields of a solution that follow from its judgement."""
         return {
             "task": task,
             "robot": self.robot,
@@ -129,7 +129,7 @@ class Answers:
         return Explanation(message, tuple(active), freedom, sensitivities)
 
     def blocked_words(self, task: Task, touched: Iterable[str]) -> str:
-        """What a scene keeps the arm from, if the task is solved without it."""
+        """Name the objects in the way, if the task can be solved without its scene."""
         if task.scene is None:
             return ""
         coarse = diagnosis.coarse_meshes(self.robot, task.scene, touched)

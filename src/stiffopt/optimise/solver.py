@@ -201,7 +201,7 @@ class PressureSolver:
         """
         start = self._checked(guess)
         with giving_up(timeout, None):
-            calls = self._prepare_warm_calls()
+            calls = self._warm_calls or self._prepare_warm_calls()
             block = None if calls is None else calls.next_to(start, None, None, None)
             try:
                 found = self._solution_of(block) if block is not None else None
