@@ -1,8 +1,9 @@
-"""A bench of recordings: how well methods predict the tip in files that they were not fitted to.
+"""Compare how well methods, fitted to some recordings, predict the tip in other recordings.
 
-Splits are by file and stand in a bench file. Every method predicts the tip in the frame of the
-recordings, with a covariance from which the coverage of its 95 % regions follows. The baselines are
-maps of the pressures behind a lag: with more of the past they predict other manoeuvres worse.
+A bench file splits the recordings of each arm into training and test files. Every method predicts
+the tip in the frame of the recordings, and a covariance, from which the coverage of its 95 %
+regions follows. The baselines map lagged pressures to the tip: with more of the past as input,
+they predict other manoeuvres worse.
 """
 
 from __future__ import annotations
@@ -38,9 +39,9 @@ from stiffopt.schema import Items, Schema
 Array = NDArray[np.float64]
 Progress = Callable[[float, float, str], None]
 
-_LAG = 0.3  # s, of what baselines see
+_LAG = 0.3  # s, of the baselines' input
 _CHI_SQUARED = 7.814727903251179  # 95 % quantile, three degrees of freedom
-_COVERED_ROWS = 200  # of a file, at which the model's region is computed
+_COVERED_ROWS = 200  # rows of a file at which the model's region is computed
 
 
 class BenchArm(Schema):
@@ -48,10 +49,10 @@ class BenchArm(Schema):
 
     Attributes
     ----------
-    name : for people.
+    name : shown in reports.
     robot : a built-in robot, or a robot file relative to the bench file; where fits begin.
     train, test : logs, relative to the folder of the recordings.
-    sequence : whether the logs of `train` follow each other, and those of `test` do.
+    sequence : whether the logs of `train`, and those of `test`, were recorded without a break.
     """
 
     name: Annotated[str, Field(min_length=1)]
@@ -69,11 +70,11 @@ class BenchFile(Schema):
 
 @dataclass(frozen=True, eq=False)
 class BenchErrors:
-    """A file's tip, measured and predicted.
+    """Errors of a method on one file.
 
     Attributes
     ----------
-    errors : (N, 3), predicted less measured, in m.
+    errors : (N, 3), predicted minus measured tip, in m.
     covered : (M,), whether the measured tip lies in the 95 % region, at some of the rows.
     """
 
@@ -89,10 +90,10 @@ class BenchScore:
     ----------
     arm, method : their names.
     length : of the arm, in m.
-    train : mean error in what was fitted, in m.
-    test, p95 : mean error and its 95th percentile in what was not, in m; NaN without test files.
-    coverage : share of test rows whose tip lies in the method's 95 % region; NaN where unknown.
-    rows : of the test files that were compared.
+    train : mean error in the training files, in m.
+    test, p95 : mean and 95th percentile of the error in the test files, in m; NaN without any.
+    coverage : share of test rows whose tip lies in the method's 95 % region; NaN without any.
+    rows : number of compared rows of the test files.
     """
 
     arm: str
@@ -106,7 +107,7 @@ class BenchScore:
 
 
 def load_bench(path: str | None = None) -> tuple[BenchFile, Path]:
-    """Read a bench file, by default the one that comes with stiffopt; and its folder."""
+    """Read a bench file, by default stiffopt's own; return it and the base of its paths."""
     if path is not None:
         return read_file(path, "bench", BenchFile), Path(path).parent
     with as_file(files("stiffopt").joinpath("benches", "recordings.yaml")) as built_in:
@@ -124,17 +125,22 @@ def run_bench(
     seed: int = 0,
     progress: Progress = lambda done, total, text: None,
 ) -> Iterator[BenchScore]:
-    """Yield the score of each method on each arm whose files are in a folder.
+    """Yield the score of each method on each arm whose files are all in a folder.
 
     Parameters
     ----------
     folder : of the recordings.
     methods : names, see `METHODS`.
     bench, base : see `load_bench`.
-    rows : that are fitted, and most that are compared of each file.
-    full : let stiffopt compare its models, in place of one that it fits quickly.
+    rows : number of fitted rows, and largest number of compared rows of each file.
+    full : let stiffopt compare all its models; by default it fits one quickly.
     seed : of learnt methods.
-    progress : is told what is done, of how much, and in words.
+    progress : called with the work done, the total and a description.
+
+    Raises
+    ------
+    InputError
+        A method is unknown, or no arm has its files in the folder.
     """
     for name in methods:
         if name not in METHODS:
@@ -163,15 +169,15 @@ def run_bench(
 
 @dataclass(frozen=True, eq=False)
 class BenchTask:
-    """What a method is given.
+    """The input of a method: one arm with its logs.
 
     Attributes
     ----------
     arm : BenchArm
     robot : where fits begin.
     logs : by name.
-    settings : how logs are read, and of stiffopt's own fit.
-    rows : that are fitted, and most that are compared of each file.
+    settings : of reading logs, and of stiffopt's own fit.
+    rows : number of fitted rows, and largest number of compared rows of each file.
     seed : of random numbers.
     """
 
@@ -183,11 +189,14 @@ class BenchTask:
     seed: int
 
     def recordings(self, names: Sequence[str]) -> list[Recording]:
-        """Logs as stiffopt reads them: in the robot's order of channels, faults left out."""
+        """Return logs as stiffopt reads them: in the robot's order of channels, without faults."""
         return recordings_of(self.robot, [(name, self.logs[name]) for name in names], self.settings)
 
     def chosen(self, recording: Recording, most: int) -> tuple[Array, Array]:
-        """Pressures (N, n) behind a lag, and tips (N, 3) in m, of at most so many rows."""
+        """Return lagged pressures (N, n), as shares of the maximum, and tips (N, 3) in m.
+
+        Of at most `most` rows.
+        """
         rows = chosen_rows(recording, most)
         p = recording.pressures / np.max(self.robot.pressure_max)
         return lagged(recording.time, p, _LAG)[rows], recording.tracks[0].position[rows]
@@ -216,7 +225,7 @@ def _score(task: BenchTask, method: str, found: dict[str, BenchErrors]) -> Bench
 
 
 def stiffopt_method(task: BenchTask) -> dict[str, BenchErrors]:
-    """`stiffopt.calibrate`, and what `stiffopt.validate` says of the test files."""
+    """Fit with `stiffopt.calibrate`, and predict the test files with `stiffopt.validate`."""
     logs = [(name, task.logs[name]) for name in task.arm.train]
     result = calibrate(task.robot, logs, settings=task.settings)
     compared = [*result.calibrated]
@@ -232,7 +241,7 @@ def stiffopt_method(task: BenchTask) -> dict[str, BenchErrors]:
 
 
 def _of_model(found: Comparison, arm: Manipulator, axes: Array) -> BenchErrors:
-    """Errors, and coverage by the region about `tip_pose` moved to the prediction with history."""
+    """Return errors, and coverage by the region of `tip_pose`, moved to the prediction."""
     seen = np.flatnonzero(whole(found.measured))
     errors = (found.predicted - found.measured)[seen]
     some = np.unique(np.linspace(0, len(seen) - 1, min(len(seen), _COVERED_ROWS)).astype(int))
@@ -245,7 +254,7 @@ def _of_model(found: Comparison, arm: Manipulator, axes: Array) -> BenchErrors:
 
 
 def constant_curvature(task: BenchTask) -> dict[str, BenchErrors]:
-    """Arcs whose curvature and length are linear in pressure; gains and the base are fitted."""
+    """Fit arcs whose curvature and length are linear in pressure, with gains and base unknown."""
     from scipy.optimize import least_squares
     from scipy.spatial.transform import Rotation
 
@@ -296,7 +305,7 @@ def constant_curvature(task: BenchTask) -> dict[str, BenchErrors]:
 
 
 def _learnt(make: Callable[[int], Any]) -> Method:
-    """A method of a regressor of scikit-learn, made of a seed."""
+    """Return the method that uses a regressor of scikit-learn, made from a seed."""
 
     def method(task: BenchTask) -> dict[str, BenchErrors]:
         from sklearn.compose import TransformedTargetRegressor
@@ -318,9 +327,9 @@ def _learnt(make: Callable[[int], Any]) -> Method:
 def _regressed(
     task: BenchTask, fitted: Callable[[Array, Array], Callable[[Array], Array]]
 ) -> dict[str, BenchErrors]:
-    """Predictions of a map from features to tips; its region is the spread of what is left.
+    """Predict tips with a regression on features.
 
-    That is taken from each fifth of the training rows when the map is fitted to the others.
+    Its region is the spread of the residuals in five-fold cross-validation on the training rows.
     """
     each = task.rows // len(task.arm.train)
     rows = [task.chosen(one, each) for one in task.recordings(task.arm.train)]
@@ -378,6 +387,6 @@ METHODS: dict[str, Method] = {
     "gaussian-process": _learnt(_gaussian_process),
     "network": _learnt(_network),
 }
-"""Methods by name; another one is added by an entry here."""
+"""Methods by name; add an entry here to add a method."""
 LEARNT = {"polynomial", "gaussian-process", "network"}
-"""Those that need scikit-learn."""
+"""Methods that need scikit-learn."""

@@ -1,7 +1,7 @@
-"""Calibration: from recordings of an arm to a robot file that predicts it, with its covariance.
+"""Calibration: fit a robot file, with its covariance, to recordings of an arm.
 
-Models of growing complexity are fitted and compared by their errors in what was held back; the
-chosen one is then compared under the other strain laws, and fitted to all rows at the end.
+`calibrate` fits models of growing complexity to few rows and compares their errors on held-back
+data. It compares the best one under the other strain laws too, and fits the winner to more rows.
 """
 
 from __future__ import annotations
@@ -78,11 +78,11 @@ class CalibrationResult:
     nominal, calibrated : tuple of Comparison
         The logs with the predictions of the robot before and after.
     held_back : dict of str to Errors
-        Errors in logs (or parts of a log) when the others are fitted.
+        Errors on each held-back log, or part of the logs, when the rest is fitted.
     tables : tuple of StiffnessTable
         Measured stiffness that was fitted.
     remarks : tuple of str
-        What was found in the logs, and what to make of the result, one sentence each.
+        Findings in the logs and doubts about the result, one sentence each.
     """
 
     before: RobotDescription
@@ -114,32 +114,32 @@ def calibrate(
     Parameters
     ----------
     robot : str, path, RobotDescription or Manipulator
-        Where the fit begins; its tolerances say how far it may be expected to go.
+        Where the fit begins; its tolerances are the prior deviations of its numbers.
     logs : sequence of path, Log or (name, Log)
         In the order in which they were recorded.
     tables : sequence of path or StiffnessTable
         Measured stiffness, fitted together with the logs.
     settings : CalibrationSettings, optional
     progress : callable, optional
-        Is told what is done, of how much, and in words. If it raises `CancelledError`, the best
-        model so far becomes the error's `found`.
+        Called with the work done, the total and a description. It may raise `CancelledError`; the
+        error's `found` is then the best result so far.
 
     Returns
     -------
-    The result; `stiffopt.save_robot` writes its `robot` to a file, `stiffopt.load_robot` makes it a
-    `Manipulator`.
+    The result. `stiffopt.save_robot` writes its `robot` to a file; `stiffopt.load_robot` turns it
+    into a `Manipulator`.
 
     Raises
     ------
     InputError
-        There is nothing to fit, or a log is not usable; it names the log.
+        There is nothing to fit, or a log is not usable; the message names it.
     FileError
-        A file cannot be read or is wrong.
+        A file cannot be read or is invalid.
     EquilibriumError
-        An arm under gravity buckles on the way.
+        An arm under gravity buckles during the fit.
     CancelledError
-        From `progress`. Its `found` is the result with the best of the models that were fitted by
-        then, to `trial_rows` rows; None if there was none yet.
+        From `progress`. Its `found` is the result with the best model fitted so far, to
+        `trial_rows` rows; None if there is none yet.
     """
     description, settings = description_of(robot), settings or CalibrationSettings()
     if not logs and not tables:
@@ -154,7 +154,7 @@ def calibrate(
     teller = _Teller(progress, len(structures) + len(laws))
     recordings = recordings_of(description, logs, settings)
     setup = _put_right(Setup.of(description, recordings, read, settings), teller)
-    if not recordings:  # poses are taken to be as the robot file has them
+    if not recordings:  # tables alone: trust the robot file's poses
         teller.begin("fitting the stiffness")
         alone = ModelStructure(
             "stiffness", "stiffness alone", ("compensation.stiffness",), as_given=True
@@ -190,7 +190,10 @@ def _chosen(
     candidates: list[Candidate],
     teller: _Teller,
 ) -> Candidate:
-    """Fit structures, then the best of them under other laws; list them all, return the best."""
+    """Fit structures, then the best one under other strain laws; return the best candidate.
+
+    Every fitted candidate is appended to `candidates`.
+    """
     description, recordings = setup.description, setup.recordings
     first = near = _screened(setup, teller)
     for structure in structures:
@@ -204,7 +207,7 @@ def _chosen(
         leader = min(candidates, key=lambda each: each.score).fit
         near = {**near, **leader.problem.named(leader.x)}
     chosen = best(candidates)
-    if laws:  # the robot file's, unless another predicts clearly better
+    if laws:  # `best` prefers the robot file's law, which comes first
         near = chosen.fit.problem.named(chosen.fit.x)
         others = [chosen]
         for law in laws:
@@ -223,7 +226,7 @@ def _chosen(
 def _candidate(
     setup: Setup, structure: ModelStructure, near: Sequence[Mapping[str, float]], teller: _Teller
 ) -> Candidate:
-    """Fit a structure to few rows, and to what is left of them when parts are held back."""
+    """Fit a structure to few rows, and to their rest with each fold held back."""
     settings = setup.settings
     teller.begin(f"fitting {structure.words}")
     problem = setup.problem(structure, settings.trial_rows)
@@ -233,7 +236,7 @@ def _candidate(
 
 
 class _Teller:
-    """Progress of a calibration in phases, each of an unknown number of evaluations."""
+    """Reports progress in phases, each with an unknown number of evaluations."""
 
     def __init__(self, progress: Progress | None, fits: int) -> None:
         self._progress = progress
@@ -250,7 +253,7 @@ class _Teller:
 
     def __call__(self) -> None:
         if self._progress is not None:
-            # nears the end of the phase, however many there are
+            # approaches the end of the phase asymptotically
             share = 1 - 1 / (1 + self._evaluations / 60)
             done = min(self._phase - 1 + share, self._phases)
             self._progress(done, self._phases, self._words)
@@ -258,7 +261,7 @@ class _Teller:
 
 
 def _structures(name: str) -> list[ModelStructure]:
-    """Models of this name, or all of them where it is ``auto``."""
+    """Return the model structure of this name, or all for ``auto``."""
     known = {structure.name: structure for structure in STRUCTURES}
     if name == "auto":
         return list(STRUCTURES)
@@ -268,14 +271,14 @@ def _structures(name: str) -> list[ModelStructure]:
 
 
 def _is_worth_it(structure: ModelStructure, candidates: Sequence[Candidate]) -> bool:
-    """Whether one of those that a structure adds to is the best so far."""
+    """Whether one of the models that a structure extends is the best so far."""
     if not structure.after:
         return True
     return min(candidates, key=lambda each: each.score).structure.name in structure.after
 
 
 def _screened(setup: Setup, teller: _Teller) -> dict[str, float]:
-    """Coordinates by name near the best of several starts, from few rows."""
+    """Fit few rows from several starts; return the best coordinates by name."""
     teller.begin("looking for a start")
     problem = setup.problem(STRUCTURES[1], setup.settings.start_rows)
     tolerances = setup.tolerances
@@ -294,7 +297,7 @@ def _screened(setup: Setup, teller: _Teller) -> dict[str, float]:
 
 
 def _put_right(setup: Setup, teller: _Teller) -> Setup:
-    """The setup with what is wrong with all recordings put right, if the evidence is overwhelming.
+    """Return the setup with faults of the recordings corrected where the evidence is overwhelming.
 
     See `stiffopt.identify.detection`.
     """
@@ -317,7 +320,10 @@ def _put_right(setup: Setup, teller: _Teller) -> Setup:
 
 
 def _under(setup: Setup, hypothesis: Hypothesis, low: Array) -> Setup:
-    """The setup as it is if a hypothesis holds; the robot file keeps an order and a common turn."""
+    """Return the setup corrected as a hypothesis says.
+
+    The robot file stores an order of channels, and a turn of the axes if all logs share it.
+    """
     given = setup.description.recordings or Recordings()
     recordings = hypothesis.applied(setup.recordings, low)
     if hypothesis.kind == "channels":
@@ -336,10 +342,10 @@ def _under(setup: Setup, hypothesis: Hypothesis, low: Array) -> Setup:
 def _final(
     setup: Setup, structure: ModelStructure, near: Mapping[str, float], teller: _Teller
 ) -> Fit:
-    """Fit all that counts; with tables, both as soft as poses say and not softened by pressure.
+    """Fit a structure to all chosen rows; with tables, start with and without softening.
 
-    Poses alone do not tell whether pressure softens the arm or acts ever more strongly on it;
-    stiffness does, and the better of the two extremes is taken.
+    Poses alone cannot show whether pressure softens the arm or acts more strongly the higher it
+    is; measured stiffness can. The fit that matches the tables better is returned.
     """
     found = []
     for description in _softenings(setup):
@@ -351,13 +357,13 @@ def _final(
 
 
 def _misfit_of_tables(found: Fit) -> float:
-    """Sum of the squared residuals of the tables; what is compared does not move the poses."""
+    """Return the sum of the tables' squared residuals; the two fits hardly differ in poses."""
     tables = [found.problem.of_table(table, found.x)[0] for table in found.problem.tables]
     return float(sum((residuals**2).sum() for residuals in tables))
 
 
 def _softenings(setup: Setup) -> list[RobotDescription]:
-    """The robot as it is and, if there are tables, with the other extreme of softening."""
+    """Return the robot as it is and, if there are tables, also without softening."""
     description = setup.description
     slopes = [
         segment.compensation and segment.compensation.modulus_per_pressure
@@ -464,7 +470,7 @@ def _robot(setup: Setup, found: Fit, errors: ErrorModel | None) -> RobotDescript
 
 
 def _moved_along(at: float, before: RobotDescription, after: RobotDescription) -> float:
-    """Arc length in m of the point of the arm that was at another before lengths changed."""
+    """Return a point's new arc length in m after segments changed their lengths."""
     begin, moved = 0.0, 0.0
     for old, new in zip(before.segments, after.segments, strict=True):
         soft = min(max(at - begin, 0.0), old.length)
@@ -475,7 +481,7 @@ def _moved_along(at: float, before: RobotDescription, after: RobotDescription) -
 
 
 def _with_the_same_mass(robot: RobotDescription, before: RobotDescription) -> RobotDescription:
-    """The robot with the masses of the file that was fitted, whatever its lengths."""
+    """Return the robot with densities adapted so that segments keep their masses."""
     if not any(robot.gravity):
         return robot
     segments = []
@@ -500,9 +506,9 @@ def _check_usable(robot: RobotDescription) -> None:
 
 
 def _record(setup: Setup, found: Fit, errors: ErrorModel | None) -> Calibration:
-    """Return the covariance and the range of the calibration, for the robot file.
+    """Return the robot file's record of the calibration: covariance, pressure range and errors.
 
-    A fit to tables alone keeps what an earlier calibration knew of everything else.
+    A fit to tables alone keeps an earlier calibration's record of all other numbers.
     """
     from scipy.linalg import block_diag  # a large library; only fits need it
 
@@ -563,7 +569,7 @@ def _record(setup: Setup, found: Fit, errors: ErrorModel | None) -> Calibration:
 
 
 def _softening(setup: Setup, found: Fit) -> list[FittedParameter]:
-    """Softening, which poses alone cannot tell from pressure that acts ever more strongly."""
+    """Return the softening of each segment as not learnt; without tables, poses cannot show it."""
     if setup.tables:
         return []
     tolerance = setup.tolerances.softening
@@ -582,14 +588,14 @@ def _recorded(setup: Setup) -> Array:
 
 
 def _motion(twist: Array) -> Array:
-    """Transform (4, 4) of a twist (6,), (3,) without a turn, or of nothing."""
+    """Return the transform (4, 4) of a twist (6,), a translation (3,) or nothing (0,)."""
     full = np.zeros(6)
     full[: len(twist)] = twist
     return np.asarray(lie.exp(full))
 
 
 def _inverse_placement(transform: Array) -> Placement:
-    """Placement of the inverse of a transform (4, 4), with as many digits as a file needs."""
+    """Return the inverse of a transform (4, 4), rounded for a file."""
     found = Placement.of(np.asarray(np.linalg.inv(transform), dtype=float))
     return Placement(
         position=tuple(round(x, 8) for x in found.position),

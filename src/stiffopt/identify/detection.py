@@ -1,10 +1,10 @@
-"""What is wrong with how an arm was recorded, found by itself where the evidence is overwhelming.
+"""Detect errors in how an arm was recorded, and correct them if the evidence is overwhelming.
 
-Units of pressure and the clocks of pressures and tracker are found log by log. Axes of the tracker,
-the order of the channels and lines that are dead or shared are hypotheses about all logs: each is
-scored by how well the robot file's arm, softer or stiffer, scaled and moved a little, then follows
-the tip. (A fit would not tell: with enough numbers it follows a wrong recording too.) Where the
-recordings cannot tell, they stay as they are.
+Each log is checked for its units of pressure and for different clocks of pressures and tracker.
+Turned axes of the tracker, a wrong order of channels, and dead or shared lines are hypotheses about
+all logs. A hypothesis is scored by how well the robot file's arm then follows the tip, when it may
+be softer or stiffer, scaled and moved a little. (A fit cannot judge this: with enough numbers it
+also follows a wrong recording.) Where the evidence is not overwhelming, recordings stay unchanged.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ Array = NDArray[np.float64]
 
 
 def on_one_clock(recording: Recording, span: Array) -> Recording:
-    """Return a recording whose pressures and tip have one clock.
+    """Return the recording with its pressures shifted to the tracker's clock, if clocks differ.
 
-    The tip is regressed on the pressures and their products, behind a lag, at many shifts of time.
-    A shift is undone if it is none that an arm has, and leaves a small share of what the best of
-    those leaves that an arm may have.
+    The tip is regressed on the lagged pressures and their products at many time shifts. The best
+    shift is undone if an arm cannot have such a delay itself, and if its residual is a small share
+    of that at the best shift that an arm can have.
 
     Parameters
     ----------
@@ -78,7 +78,7 @@ def on_one_clock(recording: Recording, span: Array) -> Recording:
 
 
 def lagged(time: Array, pressures: Array, lag: float) -> Array:
-    """Pressures (N, n) behind a first-order lag, in s."""
+    """Return pressures (N, n) behind a first-order lag of `lag` s."""
     followed = pressures.copy()
     for i, share in enumerate(-np.expm1(-np.diff(time) / lag), start=1):
         followed[i] = followed[i - 1] + share * (pressures[i] - followed[i - 1])
@@ -86,7 +86,7 @@ def lagged(time: Array, pressures: Array, lag: float) -> Array:
 
 
 def _unexplained(pressures: Array, tip: Array) -> float:
-    """What a regression of positions (N, 3) on pressures (N, n) and their products misses, in m."""
+    """Return the RMS residual, in m, of positions (N, 3) regressed on quadratics of pressures."""
     n = pressures.shape[1]
     products = [pressures[:, i] * pressures[:, j] for i in range(n) for j in range(i, n)]
     known = np.column_stack([np.ones(len(tip)), pressures, *products])
@@ -99,14 +99,15 @@ def _unexplained(pressures: Array, tip: Array) -> float:
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """What may be wrong with recordings.
+    """A possible error in the recordings, and its correction.
 
     Attributes
     ----------
-    kind : see `Finding`; empty for "nothing".
-    words : what is wrong with a line.
-    sources : for each channel, counted from 0, that whose recorded pressure it has; -1 for none.
-    turns : for each recording the number of a rotation of the cube by which its axes are turned.
+    kind : see `Finding`; None for "no error".
+    words : the error of a line, in words.
+    sources : (n,), for each channel, the channel (from 0) whose column has its pressures; -1 for a
+        dead line.
+    turns : for each recording, the index in `CUBE_ROTATIONS` by which its axes are turned.
     """
 
     kind: Finding | None
@@ -115,7 +116,7 @@ class Hypothesis:
     turns: tuple[int, ...]
 
     def applied(self, recordings: Sequence[Recording], low: Array) -> list[Recording]:
-        """Recordings as they then are; `low` (n,) is the pressure of a dead line."""
+        """Return the corrected recordings; `low` (n,) is the pressure of a dead line."""
         found = []
         for each, turn in zip(recordings, self.turns, strict=True):
             pressures = _driven(each.pressures, self.sources, low)
@@ -125,11 +126,11 @@ class Hypothesis:
         return found
 
     def with_turns(self, turn: int) -> Hypothesis:
-        """The same with one turn of the axes for all recordings."""
+        """Return the hypothesis with the same turn of the axes for all recordings."""
         return replace(self, turns=(turn,) * len(self.turns))
 
     def told(self, description: RobotDescription, names: Sequence[str]) -> str:
-        """What is wrong and what is done about it, as the beginning of a sentence."""
+        """Describe the error, as the beginning of a sentence."""
         name = description.channel_name
         if self.kind == "channels":
             order = ", ".join(
@@ -153,7 +154,7 @@ class Hypothesis:
 
 
 def _driven(recorded: Array, sources: Sequence[int], low: Array) -> Array:
-    """Pressures (N, n) of the channels, see `Hypothesis`, from those that were recorded."""
+    """Return the channels' pressures (N, n) from the recorded ones, by `Hypothesis.sources`."""
     columns = [
         np.full(len(recorded), low[k]) if source < 0 else recorded[:, source]
         for k, source in enumerate(sources)
@@ -162,7 +163,7 @@ def _driven(recorded: Array, sources: Sequence[int], low: Array) -> Array:
 
 
 def _moved(recording: Recording, rotation: Array, shift: Array) -> Recording:
-    """A recording whose poses are turned (3, 3) about the origin of its frame, and shifted (3,)."""
+    """Rotate (3, 3) a recording's poses about the origin of its frame, and shift them (3,)."""
     tracks = tuple(
         Track(
             track.name,
@@ -175,13 +176,13 @@ def _moved(recording: Recording, rotation: Array, shift: Array) -> Recording:
 
 
 class Comparer:
-    """Scores hypotheses by the robot file's arm, whose softness and turn are not taken for known.
+    """Scores hypotheses by the robot file's arm, with free softness, scale and turn about z.
 
     Parameters
     ----------
     description : RobotDescription
-        Weight and history are left out.
-    base : pose (4, 4) of the base in the recordings' frame, as far as the robot file knows.
+        Its weight and history are ignored.
+    base : pose (4, 4) of the base in the recordings' frame, according to the robot file.
     stations : arc lengths in m of the tracks, the tip first.
     recordings : sequence of Recording
     """
@@ -215,7 +216,7 @@ class Comparer:
         self._kept: dict[tuple[int, ...], list[list[Array]]] = {}
 
     def score(self, hypothesis: Hypothesis) -> float:
-        """Distance in m between the tracks and the arm that is nearest to them."""
+        """Return the RMS distance in m between the tracks and the best matching arm."""
         measured = [
             self._in_base(each, CUBE_ROTATIONS[turn])
             for each, turn in zip(self._measured, hypothesis.turns, strict=True)
@@ -228,7 +229,7 @@ class Comparer:
         )
 
     def of_turns(self, sources: tuple[int, ...]) -> Array:
-        """Distances (logs, 24) of each recording in each of the rotations of its axes."""
+        """Return the RMS distance (logs, 24) of each recording under each rotation of its axes."""
         turned = [
             [self._in_base(m, rotation) for rotation in CUBE_ROTATIONS] for m in self._measured
         ]
@@ -245,7 +246,7 @@ class Comparer:
         return np.asarray(positions @ turn.T @ rotation.T + origin)
 
     def _predicted(self, sources: tuple[int, ...]) -> list[list[Array]]:
-        """Tracks of each recording, (N, k, 3), for each softness that the law allows."""
+        """Return predicted tracks (N, k, 3) of each recording, per softness that the law allows."""
         if sources not in self._kept:
             driven = [_driven(each, sources, self.low) for each in self._pressures]
             self._kept[sources] = [
@@ -262,7 +263,7 @@ class Comparer:
             return None
 
     def _square(self, measured: Array, predicted: Array) -> float:
-        """Mean square between tracks (N, k, 3) when the arm is scaled, turned and moved."""
+        """Return the mean square between tracks (N, k, 3) after scaling, turning and moving."""
         lateral = [
             (m[:, 0] + 1j * m[:, 1], q[:, 0] + 1j * q[:, 1])
             for m, q in zip(measured.swapaxes(0, 1), predicted.swapaxes(0, 1), strict=True)
@@ -284,14 +285,14 @@ class Comparer:
 
 
 def _factor(pairs: Sequence[tuple[NDArray[np.complex128], NDArray[np.complex128]]]) -> complex:
-    """The complex number that turns and scales the second of each pair into the first."""
+    """Return the complex factor that best turns and scales the second of each pair to the first."""
     over = sum(np.vdot(q - q.mean(), m - m.mean()) for m, q in pairs)
     under = sum(float(np.vdot(q - q.mean(), q - q.mean()).real) for _, q in pairs)
     return complex(over / under) if under > 0 else 1.0 + 0j
 
 
 def _slope(x: Array, y: Array) -> float:
-    """Slope of y over x, at least zero."""
+    """Return the regression slope of y over x, at least zero."""
     centred = x - x.mean()
     under = float(centred @ centred)
     return max(float(centred @ y) / under, 0.0) if under > 0 else 0.0
@@ -299,7 +300,7 @@ def _slope(x: Array, y: Array) -> float:
 
 @dataclass(frozen=True)
 class Found:
-    """The hypothesis that is told, with the scores in m of no hypothesis and of this one."""
+    """The accepted hypothesis, with the scores in m without it (`as_is`) and with it (`then`)."""
 
     hypothesis: Hypothesis
     as_is: float
@@ -309,9 +310,9 @@ class Found:
 def found_wrong(
     comparer: Comparer, description: RobotDescription, keep: Sequence[str]
 ) -> Found | None:
-    """What is wrong with the recordings of a comparer; None if nothing is, or it is not clear what.
+    """Return the error of a comparer's recordings; None if there is none or it is unclear which.
 
-    A hypothesis must leave a small share of the misfit, and clearly less than any other does.
+    A hypothesis must leave a small share of the misfit, and clearly less than any other kind.
     """
     nothing = comparer.nothing
     as_is = comparer.score(nothing)
@@ -336,12 +337,12 @@ def found_wrong(
 
 
 def _alike(one: Hypothesis, other: Hypothesis) -> bool:
-    """Whether two hypotheses are one, or orders that differ by a turn of the arm."""
+    """Whether two hypotheses are the same, or both orders (perhaps differing by a turn)."""
     return one is other or one.kind == other.kind == "channels"
 
 
 def _lines(description: RobotDescription, nothing: Hypothesis) -> Iterator[Hypothesis]:
-    """Lines that may be dead, or shared by two channels."""
+    """Yield hypotheses of a line that is dead, or shared by two channels."""
     name, order = description.channel_name, nothing.sources
     for k in order:
         for source in (-1, *(j for j in order if j != k)):
@@ -353,7 +354,7 @@ def _lines(description: RobotDescription, nothing: Hypothesis) -> Iterator[Hypot
 
 
 def _orders(description: RobotDescription, nothing: Hypothesis) -> Iterator[Hypothesis]:
-    """Orders of channels to try: all of few; of many, two exchanged, or whole segments."""
+    """Yield orders of channels: all if few; else with two channels or whole segments exchanged."""
     n = description.n_pressures
     if n <= DETECTION.few_channels:
         orders = set(permutations(range(n)))
@@ -371,9 +372,9 @@ def _exchanged(n: int, i: int, j: int) -> tuple[int, ...]:
 
 
 def _turns(scores: Array) -> tuple[int, ...]:
-    """The turn of each log by scores (logs, 24): none unless it explains a log overwhelmingly.
+    """Choose the turn of each log by scores (logs, 24); 0, none, without overwhelming evidence.
 
-    Of turns that explain it as well the one is taken that does so for most logs.
+    Among turns that explain a log about equally well, it takes the one that suits most logs.
     """
     clear = scores.min(axis=1) <= DETECTION.overwhelming * scores[:, 0]
     near = scores <= scores.min(axis=1, keepdims=True) / DETECTION.tie
@@ -385,7 +386,7 @@ def _turns(scores: Array) -> tuple[int, ...]:
 
 
 def _turn_text(rotation: Array) -> str:
-    """A rotation as the end of a sentence."""
+    """Describe a rotation, as the end of a sentence."""
     vector = np.asarray(lie.log(lie.transform(rotation, np.zeros(3))))[3:]
     angle = float(np.linalg.norm(vector))
     axis = ", ".join(f"{each + 0.0:.2g}" for each in np.round(vector / max(angle, 1e-9), 2))
@@ -398,9 +399,9 @@ def _turn_text(rotation: Array) -> str:
 def replaced(
     recording: Recording, measured: Array, predicted: Array, length: float
 ) -> tuple[Recording, str]:
-    """Move a recording as a whole to where a model that is known predicts its tip.
+    """Move a recording rigidly to where a calibrated model predicts its tip.
 
-    A quarter turn of the axes, if that is about as good as any motion.
+    Prefers a rotation of the cube without translation if it fits about as well.
 
     Parameters
     ----------
@@ -411,7 +412,7 @@ def replaced(
     Returns
     -------
     recording, words
-        The words say what was done, as the end of a sentence.
+        The words describe the motion, as the end of a sentence.
     """
     seen = whole(measured)
     x, y = measured[seen], predicted[seen]
@@ -423,7 +424,7 @@ def replaced(
     turned = x @ quarter.T
     centre = turned.mean(axis=0)
     spread = (y - y.mean(axis=0)).T @ (turned - centre)
-    weight = len(x) * (DETECTION.known_turn * length) ** 2  # turns that the tip does not tell: none
+    weight = len(x) * (DETECTION.known_turn * length) ** 2  # keeps undetermined turns at zero
     u, _, vt = np.linalg.svd(spread + weight * np.eye(3))
     rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt @ quarter
     shift = y.mean(axis=0) - rotation @ x.mean(axis=0)

@@ -1,11 +1,11 @@
-"""What a model cannot describe: a systematic error that rows at nearby pressures share.
+"""Systematic model error: the part of the residuals that rows at nearby pressures share.
 
-A thousand rows on one turn of a circle, and a thousand turns of it, tell the same of a model that
-is wrong there.  So the errors of each axis are taken for the sum of a smooth function of the
+Repeating the same circle does not reveal more about a model's systematic error: rows at nearby
+pressures share it.  So the error of each axis is modelled as the sum of a smooth function of the
 pressures, a Gaussian process (M. C. Kennedy and A. O'Hagan, Bayesian calibration of computer
-models, 2001), and of noise of each row: ``error = Z b + noise`` with coefficients b of variance
-one, about centres among the recorded pressures.  Whatever the numbers of the model, the best b is
-found along with the residuals; these are what it leaves, and b itself.
+models, 2001), and independent noise: ``error = Z b + noise``.  The coefficients b belong to centres
+among the recorded pressures and have variance one.  For any parameters of the model, the best b
+follows by linear least squares; the fit's residuals are then the remaining errors and b itself.
 """
 
 from __future__ import annotations
@@ -20,36 +20,43 @@ from stiffopt.identify.settings import FIT
 
 Array = NDArray[np.float64]
 
-_ROUNDING = 1e-6  # of a correlation, that keeps the centres' matrix regular
+_JITTER = 1e-6  # added to the diagonal of the centres' correlation, so that it stays regular
 
 
-def centres(points: Array, apart: float, most: int, chosen: Sequence[int] = (0,)) -> list[int]:
-    """Rows of points (M, k), each as far as can be from those before it, until all are near one.
+def centres(points: Array, spacing: float, limit: int, chosen: Sequence[int] = (0,)) -> list[int]:
+    """Choose points that spread over the set (farthest-point sampling).
+
+    Start from `chosen`. Add the point farthest from those chosen until every point lies within
+    `spacing` of one of them, or until `limit` are chosen.
 
     Parameters
     ----------
     points : (M, k)
-    apart : distance that counts as near.
-    most : of them.
+    spacing : in units of the points.
+    limit : largest number of points, those of `chosen` included.
     chosen : rows to begin with.
+
+    Returns
+    -------
+    Rows of `points`, in the order of their choice.
     """
-    found = list(chosen)
-    nearest = np.min([((points - points[row]) ** 2).sum(axis=1) for row in found], axis=0)
-    while len(found) < most and nearest.max() > apart**2:
-        found.append(int(nearest.argmax()))
-        nearest = np.minimum(nearest, ((points - points[found[-1]]) ** 2).sum(axis=1))
-    return found
+    rows = list(chosen)
+    nearest = np.min([((points - points[row]) ** 2).sum(axis=1) for row in rows], axis=0)
+    while len(rows) < limit and nearest.max() > spacing**2:
+        rows.append(int(nearest.argmax()))
+        nearest = np.minimum(nearest, ((points - points[rows[-1]]) ** 2).sum(axis=1))
+    return rows
 
 
 def smooth_functions(pressures: Array) -> Array:
-    """Functions (M, m) of recorded pressures (M, n); their products are correlations of rows.
+    """Return basis functions Z (M, m) at recorded pressures (M, n).
 
-    Rows at a distance r in pressure are correlated by ``exp(-r^2 / 2 l^2)``, where l is the share
-    `FitSettings.near` of the highest recorded pressure.
+    ``Z Z'`` approximates the correlation of the rows, which is ``exp(-r^2 / 2 l^2)`` for rows at a
+    distance r in pressure; l is the share `FitSettings.near` of the highest recorded pressure.
     """
     points = pressures / (FIT.near * (np.abs(pressures).max(initial=0.0) or 1.0))
     middle = points[centres(points, FIT.centres_apart, FIT.most_centres)]
-    root = np.linalg.cholesky(_correlation(middle, middle) + _ROUNDING * np.eye(len(middle)))
+    root = np.linalg.cholesky(_correlation(middle, middle) + _JITTER * np.eye(len(middle)))
     return np.asarray(np.linalg.solve(root, _correlation(middle, points)).T)
 
 
@@ -60,11 +67,11 @@ def _correlation(one: Array, other: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Systematic:
-    """Systematic errors of rows, in deviations of their noise.
+    """Splits errors of rows into a systematic part and the rest, in deviations of their noise.
 
     Attributes
     ----------
-    functions : Z (M, m), of coefficients that have the variance one.
+    functions : basis functions Z (M, m); their coefficients have variance one.
     """
 
     functions: Array
@@ -73,15 +80,15 @@ class Systematic:
 
     @classmethod
     def of(cls, functions: Array) -> Systematic:
-        """Of functions (M, m), zero in rows that do not count."""
+        """Factorise basis functions (M, m), which are zero in rows that do not count."""
         stacked = np.vstack([functions, np.eye(functions.shape[1])])
         orthogonal, triangle = np.linalg.qr(stacked)
         return cls(functions, orthogonal, triangle)
 
     def residuals(self, errors: Array) -> Array:
-        """What is left of errors (M, c), and the coefficients that took the rest: (M + m, c).
+        """Return ``errors - Z b`` for errors (M, c), then ``-b``, stacked: (M + m, c).
 
-        Their sum of squares is the least of ``|errors - Z b|^2 + |b|^2``, which is
+        b minimises ``|errors - Z b|^2 + |b|^2``. The minimum, the sum of the squared residuals, is
         ``errors' (1 + Z Z')^-1 errors``.
         """
         found = -self._orthogonal @ (self._orthogonal[: len(errors)].T @ errors)
@@ -89,6 +96,6 @@ class Systematic:
         return np.asarray(found)
 
     def part(self, errors: Array) -> Array:
-        """The systematic part (M, c) of errors (M, c)."""
+        """Return the systematic part ``Z b`` (M, c) of errors (M, c)."""
         taken = self._orthogonal[: len(errors)].T @ errors
         return np.asarray(self.functions @ np.linalg.solve(self._triangle, taken))

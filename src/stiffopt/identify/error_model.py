@@ -1,18 +1,20 @@
-"""How far a calibrated arm may be from its predictions, from what was held back.
+"""Estimate the prediction error of a calibrated arm from its errors on held-back data.
 
-The arm behaves as if the effective pressures of each segment were wrong by a discrepancy delta, a
+The arm is modelled as if the effective pressures of each segment were wrong by a discrepancy, a
 Gaussian process in that segment's pressures with covariance ``s^2 exp(-|p - p'| / l)`` for each
-channel.  It acts twice.  Rows near each other err alike, so that a fit to them is less certain
-than their number says: with the normal matrix N of the fit, its weighted slopes A (of all rows, by
-the unknowns) and the slopes J_p of positions by effective pressures, ::
+channel.  The discrepancy has two effects.  First, it correlates the errors of nearby rows, so that
+a fit is less certain than their number suggests.  With the covariance C of the fit without it, the
+gain N^-1 of the fit, its weighted slopes A (of all rows, by the unknowns), the slopes J_p of
+positions by effective pressures and the correlation K of the rows, ::
 
-    cov(x) = N^-1 + s^2 N^-1 (A' J_p) K (A' J_p)' N^-1.
+    cov(x) = C + s^2 N^-1 (A' J_p) K (A' J_p)' N^-1.
 
-And at a distance d from the nearest recorded pressure the discrepancy itself has the variance
+Second, it acts on predictions: at a distance d from the nearest recorded pressure its variance is
 ``s^2 (1 - exp(-2 d / l))``, that of the process given its value there.
 
-s, l, the residual and the tail of the errors are those that make what was held back most probable,
-with weak priors; a region of pressures that is alike counts once, however many rows lie in it.
+s, l, the residual and the tail of the errors maximise the probability of the held-back errors, with
+weak priors.  Rows are weighted so that many rows in one region of pressures count little more than
+one.
 """
 
 from __future__ import annotations
@@ -35,12 +37,12 @@ from stiffopt.model.calibration import ErrorModel, distances_from, growth
 Array = NDArray[np.float64]
 Rows = NDArray[np.bool_]
 
-_LEAST_FREEDOM = 4.0  # below it, a covariance says little about a t-distribution
+_LEAST_FREEDOM = 4.0  # of a t-distribution; below, its covariance says little
 
 
 @dataclass(frozen=True, eq=False)
 class HeldBack:
-    """Rows of all samples (M,) that were held back, the fit to the others, and its errors there."""
+    """A fold: the held-back rows (M,) of all samples, the fit to the others, its errors there."""
 
     rows: Rows
     fit: Fit
@@ -50,13 +52,13 @@ class HeldBack:
 def error_model(
     found: Fit, held_back: Mapping[str, HeldBack], recorded: Array | None = None
 ) -> ErrorModel:
-    """Fit the error model of a structure to what was held back from it.
+    """Fit the error model of a model structure to its errors on held-back data.
 
     Parameters
     ----------
     found : fit to all rows.
-    held_back : of the same problem, by what was held back; of nothing, what is expected stays.
-    recorded : all recorded pressures (N, n), in Pa; by default those of the rows that are fitted.
+    held_back : folds of the same problem, by name; without any, the priors' values result.
+    recorded : all recorded pressures (N, n), in Pa; by default those of the fitted rows.
     """
     pressures = commanded(found.problem.samples)
     reaches = np.array(ERRORS.reaches) * np.ptp(pressures, axis=0).max()
@@ -79,18 +81,21 @@ def error_model(
 
 
 def covariance_with(found: Fit, errors: ErrorModel) -> Array:
-    """Covariance (d, d) of a fit's scaled coordinates, with what the discrepancy adds."""
+    """Return the covariance (d, d) of a fit's scaled coordinates, discrepancy included."""
     added = _influence(found.problem, found.x, found.gain, np.array([errors.reach]))[0]
     return np.asarray(found.covariance + errors.discrepancy**2 * added)
 
 
 def commanded(samples: Sequence[Sample]) -> Array:
-    """Commanded pressures (M, n) of the rows of all samples, in Pa."""
+    """Return the commanded pressures (M, n), in Pa, of the rows of all samples."""
     return np.concatenate([each.recording.pressures[each.rows] for each in samples])
 
 
 def kept_unknowns(problem: CalibrationProblem) -> NDArray[np.intp]:
-    """Which unknowns a robot file keeps: of the equilibrium, the base and the tip's sensor."""
+    """Return the indices of the unknowns that a robot file stores with their covariance.
+
+    These are the numbers that affect the equilibrium, the base and the tip's sensor.
+    """
     base, sensors, _, _ = problem.unknowns.slices()
     parameters = [
         i
@@ -102,33 +107,34 @@ def kept_unknowns(problem: CalibrationProblem) -> NDArray[np.intp]:
 
 
 def representatives(channels: Sequence[int], pressures: Array) -> tuple[Array, float]:
-    """Rows (K, n) of pressures (N, n) that stand for all, and the largest distance from one.
+    """Return rows (K, n) that represent pressures (N, n), and the largest distance from one.
 
-    Of each segment's pressures always the farthest from those that were chosen comes next.
+    `centres` chooses them by each segment's pressures in turn.
     """
-    apart = ERRORS.spacing * float(np.ptp(pressures, axis=0).max())
-    chosen, most = [0], ERRORS.representatives
+    spacing = ERRORS.spacing * float(np.ptp(pressures, axis=0).max())
+    chosen, limit = [0], ERRORS.representatives
     for begin, end in pairwise(np.cumsum([0, *channels])):
-        chosen = centres(pressures[:, begin:end], apart, most, chosen)
-        most = len(chosen) + ERRORS.representatives
+        chosen = centres(pressures[:, begin:end], spacing, limit, chosen)
+        limit = len(chosen) + ERRORS.representatives
     kept = pressures[sorted(chosen)]
     return kept, float(distances_from(channels, pressures, kept).max())
 
 
-# -- the likelihood of what was held back ----------------------------------------------------
+# -- the likelihood of the held-back errors --------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
 class _Fold:
-    """Rows that were held back and seen, N in number.
+    """The N held-back rows of a fold in which the tip was measured.
 
     Attributes
     ----------
     errors : (N, 3), in the frame of the recordings, in m.
-    parameters : mean squares (N, 3, 3) that the parameters' errors cause without discrepancy.
-    through_fit, direct : what a discrepancy of 1 Pa^2 causes, through the fit and by itself, for
-        each reach (R, N, 3, 3).
-    weight : of a row: all of them count as the independent ones among them.
+    parameters : covariance (N, 3, 3) of the errors due to uncertain parameters, in m^2, without
+        discrepancy.
+    through_fit, direct : covariances (R, N, 3, 3) due to a discrepancy of variance 1 Pa^2, for each
+        reach: through its effect on the fit, and of the discrepancy itself.
+    weight : (R, N), of the rows, see `_weights`.
     """
 
     errors: Array
@@ -180,12 +186,16 @@ class _Fold:
 
 
 def _spread(slope: Array, covariance: Array) -> Array:
-    """Mean squares (N, 3, 3) of positions with slopes (N, 3, k) by what has a covariance (k, k)."""
+    """Propagate a covariance (k, k) through slopes (N, 3, k) to positions (N, 3, 3)."""
     return np.asarray(slope @ covariance @ np.swapaxes(slope, 1, 2))
 
 
 def _weights(pressures: Array, reach: float, independent: float) -> Array:
-    """Weights (N,) of rows at pressures (N, n): together as many as there are cells among them."""
+    """Return equal weights (N,) of rows at pressures (N, n).
+
+    Together they count as many rows as they occupy cells of the size `reach`, but at most as many
+    as are independent in time.
+    """
     cells = len(np.unique(np.round(pressures / reach), axis=0))
     most = len(pressures) / independent
     return np.full(
@@ -196,7 +206,7 @@ def _weights(pressures: Array, reach: float, independent: float) -> Array:
 def _most_probable(
     folds: Sequence[_Fold], index: int, found: Fit
 ) -> tuple[float, int, tuple[float, float, float]]:
-    """Misfit with the priors, the index of the reach, and discrepancy, residual and tail."""
+    """Find discrepancy, residual and tail at one reach; return misfit, index and these values."""
     from scipy.optimize import minimize  # a large library; only fits need it
 
     acting = found.predicted.per_pressure[0]
@@ -224,7 +234,7 @@ def _most_probable(
 
 
 def _influence(problem: CalibrationProblem, x: Array, gain: Array, reaches: Array) -> Array:
-    """Covariances (R, d, d) of scaled x that a discrepancy of 1 Pa^2 causes, for each reach."""
+    """Return covariances (R, d, d) of scaled x due to a discrepancy of 1 Pa^2, for each reach."""
     value, slope = problem.residuals(x)
     slope = slope / np.sqrt(1 + value**2 / FIT.loss_scale**2)[:, np.newaxis]
     predicted = problem.predict(x)
@@ -256,11 +266,14 @@ def _channels(found: Fit) -> list[int]:
     return [segment.n_channels for segment in found.problem.description.segments]
 
 
-# -- what unknown histories do ---------------------------------------------------------------
+# -- errors where the history is unknown -----------------------------------------------------
 
 
 def _unsettled(found: Fit) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Root mean squares (n,) of effective minus commanded pressures, held and moving; or none."""
+    """Return the RMS (n,) of effective minus commanded pressures in held and in moving rows.
+
+    Each is empty where there are too few rows.
+    """
     samples = found.problem.samples
     moves = np.concatenate([is_moving(each.recording.time, each.recording.pressures)[each.rows]
                             for each in samples])  # fmt: skip
@@ -276,7 +289,7 @@ def _unsettled(found: Fit) -> tuple[tuple[float, ...], tuple[float, ...]]:
 
 
 def is_moving(time: Array, pressures: Array) -> Rows:
-    """Rows (N,) at which pressures (N, n) have changed within the last `ERRORS.hold` seconds."""
+    """Return at which rows (N,) pressures (N, n) changed within the last `ERRORS.hold` seconds."""
     step = ERRORS.still * max(float(np.ptp(pressures, axis=0).max()), 1.0)
     before = np.searchsorted(time, time - ERRORS.hold)
     lowest, highest = pressures.copy(), pressures.copy()

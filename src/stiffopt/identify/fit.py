@@ -1,11 +1,11 @@
 """Robust nonlinear least squares with priors, and the covariance of the result.
 
-Residuals of real arms are not white noise: what a model cannot describe changes slowly, so that
-neighbouring rows err alike.  Where the model is wrong, all rows at nearby pressures err alike
-(`stiffopt.identify.discrepancy`).  Rows are weighted by the number of independent rows among them,
-from the autocorrelation of what is left, and that is divided by its own robust spread.  Only then
-do priors and covariance mean what they say: what a curve in pressure space cannot tell stays near
-the robot file, however often the curve was run.
+Residuals of real arms are not white noise.  Rows at nearby pressures share the model's systematic
+error (`stiffopt.identify.discrepancy`), and the remaining errors are correlated in time.  The fit
+therefore alternates with an estimate of the noise: it divides the remaining errors by their robust
+spread, and weights the rows by the number of independent ones among them, from the errors'
+autocorrelation.  Only then are priors and covariance meaningful: numbers that a recorded curve in
+pressure space does not determine stay near the robot file, however often the curve was repeated.
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """A minimum.
+    """The best minimum found, with its covariance.
 
     Attributes
     ----------
-    problem : with the noise and the weights that were used at last.
+    problem : with the noise and weights of the last round.
     x : scaled coordinates (d,).
     cost : half the sum of the squared residuals, with the loss and the prior.
-    covariance : of x, (d, d), by noise and prior: unknowns that nothing was learnt of have the
-        variance one.
+    covariance : of x, (d, d), from noise and prior; an unknown that the data do not determine keeps
+        the prior's variance of one.
     gain : inverse (d, d) of the normal matrix: x moves by ``gain @ slopes.T @ residuals``.
-    independent : how many rows are one independent one.
+    independent : number of rows per independent row.
     """
 
     problem: CalibrationProblem
@@ -54,7 +54,7 @@ class Fit:
 
     @property
     def predicted(self) -> Predicted:
-        """What it says of the rows of the samples."""
+        """The fitted model's predictions for the rows of the samples."""
         return self.problem.predict(self.x)
 
 
@@ -72,9 +72,9 @@ def fit(
     problem : CalibrationProblem
     starts : sequence of (d,)
         Scaled coordinates.
-    tell : is called at every evaluation of the problem, to show progress or to stop by raising.
-    rounds : how often the noise and the weights are made to fit the residuals.
-    most : evaluations of the problem from each start, and in each round.
+    tell : called at every evaluation of the problem, to show progress; it may raise to stop.
+    rounds : how often noise and weights are estimated anew and the fit is repeated.
+    most : largest number of evaluations of the problem from each start, and in each round.
     """
     different = {start.tobytes(): start for start in starts}.values()
     begun = [_minimum(problem, start, tell, most) for start in different]
@@ -89,7 +89,7 @@ def fit(
 def _minimum(
     problem: CalibrationProblem, start: Array, tell: Callable[[], None], most: int
 ) -> tuple[Array, float]:
-    """Scaled coordinates (d,) of a minimum near a start, and its cost."""
+    """Return scaled coordinates (d,) of a minimum near a start, and its cost."""
     from scipy.optimize import least_squares  # a large library; only fits need it
 
     memory: dict[bytes, tuple[Array, Array]] = {}
@@ -100,7 +100,7 @@ def _minimum(
             tell()
             memory.clear()
             value, slope = problem.residuals(x)
-            # a step to where the model fails is taken back; there must be slopes where it does not
+            # the solver takes back a step to where the model fails; elsewhere it needs slopes
             fails = not np.isfinite(value).all()
             if (fails and np.array_equal(x, inside)) or not (fails or np.isfinite(slope).all()):
                 raise InputError(
@@ -129,7 +129,7 @@ def _minimum(
 
 
 def _loss(n_prior: int) -> Callable[[Array], Array]:
-    """Soft L1 for the data, none for the prior: values, first and second derivatives."""
+    """Return the loss: soft L1 for the data, square for the prior, with two derivatives."""
 
     def loss(squared: Array) -> Array:
         z = squared / FIT.loss_scale**2
@@ -146,7 +146,7 @@ def _loss(n_prior: int) -> Callable[[Array], Array]:
 def _reweighted(
     problem: CalibrationProblem, x: Array, independent: float
 ) -> tuple[CalibrationProblem, float]:
-    """The problem with the noise and weights that fit its residuals, and rows per independent."""
+    """Return the problem with noise and weights estimated at x, and rows per independent row."""
     if not problem.samples:
         return problem, 1.0
     predicted = problem.predict(x)
@@ -162,7 +162,7 @@ def _reweighted(
 
 
 def _spread(errors: Array, least: float) -> float:
-    """Robust root mean square of errors (M, 3), each axis alike."""
+    """Return the robust root mean square, over all axes, of errors (M, 3); at least `least`."""
     known = errors[np.isfinite(errors).all(axis=1)]
     if not len(known):
         return least
@@ -172,14 +172,14 @@ def _spread(errors: Array, least: float) -> float:
 
 
 def _rows_per_independent(problem: CalibrationProblem, moves: Array) -> float:
-    """Integrated autocorrelation of the tip's errors (M, 3) along the rows, at least 1."""
+    """Return the integrated autocorrelation of the tip's errors (M, 3) along rows; at least 1."""
     starts = problem.starts
     longest = max(1, max(len(sample.rows) for sample in problem.samples) // 3)
     total: Array = np.zeros(longest)
     for begin, end in pairwise(starts):
         errors = moves[begin:end]
         known = np.where(np.isfinite(errors), errors, 0.0)
-        size = len(known) + longest  # so that nothing comes round
+        size = len(known) + longest  # zero padding, against circular correlation
         spectrum = np.abs(np.fft.rfft(known, size, axis=0)) ** 2
         products: Array = np.fft.irfft(spectrum, size, axis=0)
         total += np.asarray(products[:longest].sum(axis=1), dtype=float)
@@ -192,10 +192,11 @@ def _rows_per_independent(problem: CalibrationProblem, moves: Array) -> float:
 
 
 def _covariance(problem: CalibrationProblem, x: Array) -> tuple[Array, Array]:
-    """Covariance by noise and prior, with the weights of the loss, and the normal matrix's inverse.
+    """Return the covariance of x and the inverse of the normal matrix N, both loss-weighted.
 
-    The former is ``N^-1 (N - S'S) N^-1`` with the normal matrix N and the slopes S of what rows
-    share: how large that is, is told by what was held back (`stiffopt.identify.error_model`).
+    The covariance is ``N^-1 (N - S'S) N^-1`` with the slopes S of the systematic errors'
+    coefficients. It leaves out these errors: `stiffopt.identify.error_model` estimates their size
+    from held-back data.
     """
     value, slope = problem.residuals(x)
     slope = slope / np.sqrt(np.sqrt(1 + value**2 / FIT.loss_scale**2))[:, np.newaxis]

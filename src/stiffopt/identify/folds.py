@@ -1,8 +1,8 @@
-"""What is held back from a fit, so that models are compared by what they do not know.
+"""Cross-validation folds: the data held back from a fit, on which models are compared.
 
-Where there are logs enough, each in turn.  Else stretches of time, and regions of what the
-pressures and their history were, which says how a model extrapolates: the highest and the lowest
-pressures, thirds of the recorded pressures, and rising pressures.
+With enough logs, each log is a fold.  With fewer, the folds are stretches of time, and regions of
+pressure, which test how a model extrapolates: the highest and the lowest pressures, clusters of the
+recorded pressures, and rising pressures.
 """
 
 from __future__ import annotations
@@ -25,20 +25,30 @@ Rows = NDArray[np.bool_]
 
 
 def held_back(found: Fit, settle: float, tell: Callable[[], None]) -> dict[str, HeldBack]:
-    """Hold back logs, or stretches and regions of them, fit the rest, and predict these.
+    """Hold back each fold in turn, fit the other rows, and predict the fold.
 
     Parameters
     ----------
-    found : to all of them; the other fits begin there.
-    settle : of a log that begins in an unknown state this many s at its beginning still count, as
-        they would if it were predicted.
+    found : fit to all rows, at which the other fits begin.
+    settle : time in s. A held-back log whose initial state or zero is unknown keeps this much of
+        its beginning in the fit, since a prediction of it would also use that.
+    tell : called at every evaluation.
+
+    Returns
+    -------
+    Results by the names of the folds.
+
+    Raises
+    ------
+    InputError
+        No fold has a row to compare.
     """
     problem = found.problem
     parts = {}
     for name, away in folds(problem).items():
         kept = [_without_beginning(each, problem, i, settle) for i, each in enumerate(away)]
         if not any(each.any() for each in kept):
-            continue  # a log that ends before its beginning does
+            continue  # the log is shorter than its beginning
         rows = np.concatenate(kept)
         others = fit(problem.without(kept), [found.x], tell, rounds=0, most=CHOICE.evaluations)
         distances = np.linalg.norm(others.predicted.errors[0], axis=1)
@@ -53,7 +63,7 @@ def held_back(found: Fit, settle: float, tell: Callable[[], None]) -> dict[str, 
 
 
 def folds(problem: CalibrationProblem) -> dict[str, list[Rows]]:
-    """Rows of each sample that are held back together, by a name of them."""
+    """Return the folds by name, each as the held-back rows of every sample."""
     samples = problem.samples
     none = [np.zeros(len(each.rows), dtype=bool) for each in samples]
     if len(samples) >= CHOICE.logs:
@@ -89,12 +99,12 @@ def folds(problem: CalibrationProblem) -> dict[str, list[Rows]]:
 
 
 def is_region(name: str) -> bool:
-    """Whether a name of `folds` is that of a region of pressures, not of a stretch of time."""
+    """Whether a fold's name is that of a region of pressures, not of a log or stretch of time."""
     return "pressures" in name and not name.endswith((".csv", ".mcap"))
 
 
 def _nearest(pressures: Array) -> NDArray[np.intp]:
-    """To which of a few middles each row of pressures (M, n) is nearest (k-means)."""
+    """Return the cluster (k-means) of each row of pressures (M, n)."""
     middles = pressures[centres(pressures, 0.0, CHOICE.regions)]
     for _ in range(CHOICE.rounds):
         squared = ((pressures[:, np.newaxis] - middles[np.newaxis]) ** 2).sum(axis=2)

@@ -1,7 +1,7 @@
 """Effective pressures along a recording, with their derivatives by the numbers of the history.
 
-The operators are those of `stiffopt.model.history`.  Here they are run over a whole log at once,
-with derivatives by lag, dead time, shares and the state in which the log begins.
+The operators are those of `stiffopt.model.history`.  This module runs them over a whole log at
+once, with derivatives by lag, dead time, shares and the initial state.
 """
 
 from __future__ import annotations
@@ -21,25 +21,25 @@ from stiffopt.model.history import NO_HISTORY, History, part_of
 
 Array = NDArray[np.float64]
 
-_CHUNKS = (1, 8, 32, 128, 512, 2048)  # rows that may be run at once; fewer are filled up
-_MOST_FILLED = 0.25  # share of a chunk; rather than more, a smaller one is run
-_WORTH_FILLING = 128  # rows; machine code is quicker with them, though it always runs the most
-_WORTH_COMPILING = 100_000  # rows; compiling takes a second
+_CHUNKS = (1, 8, 32, 128, 512, 2048)  # rows per call; shorter blocks are padded
+_MOST_FILLED = 0.25  # largest padded share of a chunk; beyond it, a smaller chunk is run
+_WORTH_FILLING = 128  # rows from which machine code pays, though it always runs the largest chunk
+_WORTH_COMPILING = 100_000  # rows from which machine code pays; compiling takes a second
 _TIMES = 3  # lag, falling lag and dead time
 
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """State in which the c channels of a segment begin a log.
+    """Initial state of the c channels of a segment, with its derivatives.
 
     Attributes
     ----------
     states : of the operators (m, c).
-    per_side : their derivatives (s, m, c) by the sides of the channels, see `History.settled`; by
-        all together (s = 1) if no operator knows more than one channel.
+    per_side : derivatives (s, m, c) of the states by the sides of the channels, see
+        `History.settled`; s = 1, by all sides at once, if no operator couples channels, else s = c.
     before : pressures (c,) until the first row, in Pa.
-    per_time : derivatives (3, m, c) of the states by lag, falling lag and dead time, which a log
-        that went before leaves; None where there was none.
+    per_time : derivatives (3, m, c) of the states by lag, falling lag and dead time, carried over
+        from the previous log; None without one.
     """
 
     states: Array
@@ -49,13 +49,13 @@ class Start:
 
     @classmethod
     def from_rest(cls, history: History, pressures: Array) -> Start:
-        """After a rise from no pressure to these (c,)."""
+        """Return the state after a rise from zero to these pressures (c,)."""
         states = history.from_rest(pressures)
         return cls(states, np.zeros((_sides(history, len(pressures)), *states.shape)), pressures)
 
     @classmethod
     def settled(cls, history: History, pressures: Array, sides: Array) -> Start:
-        """Long at these pressures (c,), with each channel on a side (c,) of its plays."""
+        """Return the settled state at these pressures (c,), on given sides (c,) of the plays."""
         none, count = np.zeros_like(sides), len(sides)
         changes = np.eye(count) if _sides(history, count) > 1 else np.ones((1, count))
         per_side = np.stack([history.settled(none, change) for change in changes])
@@ -64,15 +64,15 @@ class Start:
 
 @dataclass(frozen=True, eq=False)
 class Effective:
-    """Effective pressures at some rows of a log.
+    """Effective pressures at selected rows of a log.
 
     Attributes
     ----------
     pressures : (M, c), in Pa.
-    per_number : their derivatives (M, c) by the numbers of the history, by their keys: ``lag``,
+    per_number : their derivatives (M, c) by each number of the history, by its key: ``lag``,
         ``lag_falling``, ``dead_time``, ``memory[0]``, ``play[0].share``, ``creep[0].share``, ...
-    per_side : their derivatives (M, c, c) by the sides on which the channels begin.
-    end : state in which another log of the sequence begins.
+    per_side : their derivatives (M, c, c) by the initial sides of the channels.
+    end : state in which the next log of the sequence begins.
     """
 
     pressures: Array
@@ -86,7 +86,7 @@ class Past:
 
     Parameters
     ----------
-    history : widths and times of its operators count; lag and shares are given for each run.
+    history : gives the operators' widths and times; each run supplies its own lag and shares.
     channels : number of channels c.
     """
 
@@ -103,23 +103,23 @@ class Past:
         start: Start,
         history: History,
     ) -> Effective:
-        """Run along a log.
+        """Return the effective pressures at the wanted rows of a log.
 
         Parameters
         ----------
         time : (N,)
             In s, increasing.
         pressures : (N, c)
-            Commanded, in Pa; they run evenly from row to row.
+            Commanded, in Pa; linear between rows.
         wanted : (M,)
             Rows whose effective pressures are returned, increasing.
         start : state before the first row.
-        history : with the values to use; its operators are those of this object.
+        history : the values to use; its operators must be those of this object.
         """
         delayed, slope = _delayed(time, pressures, start.before, history.dead_time)
         steps = np.diff(time, prepend=time[0] - np.median(np.diff(time)) if len(time) > 1 else 1.0)
         before = np.vstack([start.before, delayed[:-1]])
-        # a later command acts: d p(t - dead) / d dead = -p'
+        # a longer dead time delays the command: d p(t - dead) / d dead = -p'
         changes = np.vstack([np.zeros(self._channels), -slope[:-1]]), -slope
         run, lags = self._run(history), (history.lag, history.lag_falling)
         state = _carried(start)
@@ -167,7 +167,7 @@ class Past:
         return Effective(mixed(values), per_number, per_side, end)
 
     def _rested(self, end: Start, history: History) -> Start:
-        """State a while later, at the last pressures."""
+        """Return the state `FIT.between_logs` later, at the last pressures."""
         same, none = end.before[np.newaxis], np.zeros((1, self._channels))
         (state,) = self._run(history)(
             _carried(end), same, same, none, none, np.array([FIT.between_logs]),
@@ -176,7 +176,7 @@ class Past:
         return self._start(state, end.before)
 
     def _start(self, state: Array, before: Array) -> Start:
-        """Where another log begins, after a state of `_HistoryRun`."""
+        """Convert a state of `_HistoryRun` to the start of the next log."""
         states, *slopes = np.split(state, state.shape[1] // self._channels, axis=1)
         return Start(states, np.stack(slopes[_TIMES:]), before, np.stack(slopes[:_TIMES]))
 
@@ -188,22 +188,22 @@ class Past:
 
 
 def _sides(history: History, channels: int) -> int:
-    """How many derivatives tell what the sides of the channels do."""
+    """Return how many derivatives by sides to carry: one if no play couples channels, else c."""
     return 1 if all(play.of == "pressure" for play in history.play) else channels
 
 
 def _carried(start: Start) -> Array:
-    """State of `_HistoryRun` (m, (4 + s) c)."""
+    """Convert a start to a state (m, (4 + s) c) of `_HistoryRun`."""
     none = np.zeros((_TIMES, *start.states.shape))
     per_time = none if start.per_time is None else start.per_time
     return np.concatenate([start.states, *per_time, *start.per_side], axis=1)
 
 
 class _HistoryRun:
-    """The operators of several channels over many rows, with their derivatives carried along.
+    """Runs the operators of several channels over many rows, with their derivatives.
 
-    A state is (m, (4 + s) c): the operators of each channel, then their derivatives by lag, falling
-    lag, dead time and sides.
+    A state (m, (4 + s) c) holds the operators of each channel, then their derivatives by lag,
+    falling lag, dead time and sides.
     """
 
     def __init__(self, history: History, channels: int, lags: bool, falls: bool) -> None:
@@ -216,7 +216,7 @@ class _HistoryRun:
         self._interpreted_rows = 0
 
     def blocks(self, count: int) -> Iterator[slice]:
-        """Blocks of the rows of a log, each to be run at once."""
+        """Yield blocks of a log's rows, each to be run in one call."""
         begin = 0
         while begin < count:
             end = min(begin + self._at_once(count - begin), count)
@@ -224,7 +224,7 @@ class _HistoryRun:
             begin = end
 
     def _at_once(self, count: int) -> int:
-        """How many of the rows that are left to run at once, or more to run them all."""
+        """Return the chunk to run for `count` remaining rows; a larger one means padding."""
         if self._compiled is not None and count >= _WORTH_FILLING:
             return _CHUNKS[-1]
         enough = next((rows for rows in _CHUNKS if rows >= count), _CHUNKS[-1])
@@ -242,7 +242,7 @@ class _HistoryRun:
         steps: Array,
         lags: tuple[float, float],
     ) -> Array:
-        """States (N, m, (4 + s) c) after N steps; the pressures and their changes are (N, c)."""
+        """Return the states (N, m, (4 + s) c) after N steps; pressures and changes are (N, c)."""
         count = len(steps)
         size = self._at_once(count)
         given = np.broadcast_to(np.array(lags), (count, 2))
@@ -258,7 +258,7 @@ class _HistoryRun:
         return np.asarray(np.swapaxes(found[:, :count], 0, 1))
 
     def _function(self, rows: int) -> CompiledFunction | InterpretedFunction:
-        """A run of so many rows; the longest in machine code, once it pays to compile it."""
+        """Return the function that runs `rows` steps; the largest one compiled, once it pays."""
         if rows == _CHUNKS[-1] and self._compiled is not None:
             return self._compiled
         before = self._interpreted_rows
@@ -279,7 +279,7 @@ class _HistoryRun:
 
 
 def _columns(values: Array, count: int) -> Array:
-    """Rows (N, c) or (N,) as columns (c, count), the last one again and again to fill them up."""
+    """Transpose rows (N, c) or (N,) to columns (c, count), padded by repeating the last row."""
     rows = values.reshape(len(values), -1)
     filled = np.empty((count, rows.shape[1]))
     filled[: len(rows)] = rows
@@ -313,7 +313,7 @@ def _steps(history: History, channels: int, lags: bool, falls: bool) -> ca.Funct
 
 
 def _delayed(time: Array, pressures: Array, before: Array, dead_time: float) -> tuple[Array, Array]:
-    """Pressures (N, c) that were commanded a dead time earlier, and their slopes in time."""
+    """Return the pressures (N, c) commanded a dead time earlier, and their time derivatives."""
     if dead_time == 0:
         slope = np.zeros_like(pressures)
         if len(time) > 1:

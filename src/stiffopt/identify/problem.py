@@ -1,8 +1,9 @@
-"""The least-squares problem of a calibration: residuals of logs and tables, and their Jacobian.
+"""The least-squares problem of a calibration: residuals of logs and tables, with their Jacobian.
 
-A tracker's reading of a point of the arm follows from the commanded pressures in three steps, each
-with its derivatives: the history of every segment (`stiffopt.identify.past`), the equilibrium at
-the effective pressures (`stiffopt.model.parametric`) and the tracker (`stiffopt.identify.sensing`).
+Three steps, each with derivatives, predict a tracker's reading from the commanded pressures:
+the history of each segment gives the effective pressures (`stiffopt.identify.past`), the
+equilibrium there gives the arm's poses (`stiffopt.model.parametric`), and the measurement model
+gives the reading (`stiffopt.identify.sensing`).
 """
 
 from __future__ import annotations
@@ -37,9 +38,9 @@ Array = NDArray[np.float64]
 
 
 Begin = Literal["rest", "previous", "unknown"]
-"""State in which a log begins: after a rise from no pressure, as the last one ended, or unknown."""
+"""State at a log's beginning: after a rise from zero, as the previous log ended, or unknown."""
 Kind = Literal["position", "angle"]
-"""Of a residual."""
+"""Kind of a residual."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +50,7 @@ class Sample:
     Attributes
     ----------
     recording : Recording
-    rows : (M,), increasing.
+    rows : (M,), indices of rows, increasing.
     weight : factor (M,) on the residuals of each row.
     begin : state of the arm when the recording begins.
     """
@@ -66,10 +67,10 @@ class TrackedPoint:
 
     Attributes
     ----------
-    name : name of its track in the recordings.
+    name : of its track in the recordings.
     at : arc length at rest, in m; None is the tip.
-    sensor : pose (4, 4) of the sensor in the point's frame, where its unknown twist is zero.
-    turns : whether its orientation is compared too.
+    sensor : pose (4, 4) of the sensor in the point's frame if its unknown twist is zero.
+    turns : whether orientations are compared too.
     """
 
     name: str
@@ -80,15 +81,15 @@ class TrackedPoint:
 
 @dataclass(frozen=True)
 class Noise:
-    """Standard deviations of the residuals.
+    """Standard deviations of the errors.
 
     Attributes
     ----------
     position : of each axis of a row's position, in m.
-    angle : of a row's angle, in rad.
-    systematic : of the errors that rows at nearby pressures share, as a share of the arm's length;
-        of angles twice that in rad, as an arm that bends too far by a misses by a / 2 of its
-        length.
+    angle : of each axis of a row's rotation, in rad.
+    systematic : of the errors that rows at nearby pressures share, as a share of the arm's length.
+        For angles it is twice that number, in rad: an arm that bends too far by an angle a misses
+        the position by a / 2 of its length.
     """
 
     position: float
@@ -98,16 +99,15 @@ class Noise:
 
 @dataclass(frozen=True, eq=False)
 class Predicted:
-    """What the model predicts for the rows of all samples.
+    """The model's predictions for the rows of all samples; one array for each tracked point.
 
     Attributes
     ----------
-    effective : pressures (M, n) of the equilibria, in Pa.
-    poses : of each point in the base frame (M, 4, 4).
-    read : of each point, in the frame of the recordings.
-    errors : measured less read (M, 3), of each point; NaN where nothing was measured.
-    per_pressure : slopes (M, 3, n) of the positions that are read, of each point, by the effective
-        pressures, in m/Pa.
+    effective : effective pressures (M, n), in Pa; not by point.
+    poses : (M, 4, 4), in the base frame.
+    read : predicted readings, in the frame of the recordings.
+    errors : (M, 3), measured minus predicted position, in m; NaN where nothing was measured.
+    per_pressure : derivatives (M, 3, n) of the predicted positions by effective pressures, in m/Pa.
     """
 
     effective: Array
@@ -122,13 +122,13 @@ class CalibrationProblem:
 
     Parameters
     ----------
-    description : where all unknowns are zero.
-    unknowns : what may change.
+    description : the robot at which all unknowns are zero.
+    unknowns : numbers that the fit may change.
     samples : in the order in which they were recorded.
     points : the tip first.
-    base_in_tracker : pose (4, 4) of the base where its unknown twist is zero.
-    tables : fitted together with the samples.
-    noise : what the residuals are divided by.
+    base_in_tracker : pose (4, 4) of the base if its unknown twist is zero.
+    noise : standard deviations by which the errors are divided.
+    tables : measured stiffness, fitted together with the samples.
     """
 
     def __init__(
@@ -166,29 +166,29 @@ class CalibrationProblem:
 
     @property
     def starts(self) -> list[int]:
-        """Where each sample begins among the rows of all, and their end."""
+        """Index of each sample's first row among all rows, and the number of rows."""
         return [0, *np.cumsum([len(sample.rows) for sample in self.samples]).tolist()]
 
     def start(self, near: Mapping[str, float]) -> Array:
-        """Scaled coordinates (d,) of unknowns that are known by name, zero for the others."""
+        """Return scaled coordinates (d,) from values by name; zero for the other unknowns."""
         x = np.array([near.get(unknown.name, 0.0) for unknown in self.unknowns.all])
         return np.asarray(np.clip(x, self.low, self.high))
 
     def named(self, x: Array) -> dict[str, float]:
-        """Scaled coordinates (d,) by the names of their unknowns."""
+        """Return scaled coordinates (d,) by the names of their unknowns."""
         pairs = zip(self.unknowns.all, x, strict=True)
         return {unknown.name: float(value) for unknown, value in pairs}
 
     @property
     def n_shared(self) -> int:
-        """How many of the residuals, the last ones, are coefficients of errors that rows share."""
+        """How many of the residuals, at the end, are coefficients of systematic errors."""
         if not (self.noise.systematic and self.samples):
             return 0
         kinds = sum(1 + (rotation is not None) for _, rotation in self._measured)
         return int(3 * kinds * self._functions.shape[1])
 
     def without(self, held_back: Sequence[NDArray[np.bool_]]) -> CalibrationProblem:
-        """The same problem, in which some rows of its samples do not count."""
+        """Return the problem with zero weight for held-back rows (a mask for each sample)."""
         samples = [
             replace(each, weight=np.where(away, 0.0, each.weight))
             for each, away in zip(self.samples, held_back, strict=True)
@@ -196,7 +196,7 @@ class CalibrationProblem:
         return self.with_samples(samples, self.noise)
 
     def with_samples(self, samples: Sequence[Sample], noise: Noise) -> CalibrationProblem:
-        """The same problem with samples of other weights, and another noise."""
+        """Return the problem with the same samples in other weights, and with another noise."""
         other = copy(self)
         other.samples, other.noise = tuple(samples), noise
         other._weights = np.concatenate([sample.weight for sample in samples])
@@ -204,7 +204,7 @@ class CalibrationProblem:
         return other
 
     def robot(self, x: Array) -> RobotDescription:
-        """Robot with the parameters of scaled coordinates x (d,), to seven digits."""
+        """Return the robot at scaled coordinates x (d,), its numbers rounded to seven digits."""
         coordinates = x * self.scale
         return with_values(
             self.description,
@@ -215,10 +215,10 @@ class CalibrationProblem:
         )
 
     def residuals(self, x: Array) -> tuple[Array, Array]:
-        """Residuals (m,) of samples and tables at scaled coordinates, and their Jacobian (m, d).
+        """Return residuals (m,) of samples and tables at scaled coordinates, and Jacobian (m, d).
 
-        Rows without a measurement are zero.  The prior is not among them.  Of errors that rows
-        share, the rows have what is left, and how large these errors are comes last.
+        Rows without a measurement are zero.  The prior is not included.  Systematic errors are
+        subtracted from the rows; their coefficients come last.
         """
         predicted, slopes = self._predict(x)
         values: list[Array] = []
@@ -248,7 +248,7 @@ class CalibrationProblem:
         return np.concatenate(values), np.concatenate(jacobians) * self.scale
 
     def _of_parameters(self, x: Array) -> list[Array]:
-        """`_excess` and `_met_by_a_quick_push` at scaled coordinates (d,), each with its slopes."""
+        """Evaluate `_excess` and `_met_by_a_quick_push` at coordinates (d,), with Jacobians."""
         return self._parameter_function((x * self.scale)[: len(self._parameters)])
 
     @cached_property
@@ -261,11 +261,12 @@ class CalibrationProblem:
         return InterpretedFunction(dense(ca.Function("parameters", [coordinates], outputs)))
 
     def _met_by_a_quick_push(self, robot: RobotDescription, coordinates: ca.SX) -> ca.SX:
-        """Coordinates (k,) of the parameters as a quick push meets them.
+        """Return coordinates (k,) of the parameters that apply to a quick small push.
 
-        What the histories hold on to adds to the factor on the stiffness: a table is measured
-        with quick small pushes.  Under gravity that factor would move the arm too; there a table
-        is compared with the stiffness of equilibrium.
+        Stiffness tables are measured with such pushes, too quick for creep and too small to
+        overcome hysteresis, which makes the arm stiffer: the factor on the stiffness grows.  Under
+        gravity that factor would also move the arm, so there the table is compared with the
+        stiffness at equilibrium.
         """
         met = ca.SX(coordinates)
         for s, segment in enumerate(robot.segments):
@@ -275,18 +276,18 @@ class CalibrationProblem:
         return met
 
     def predict(self, x: Array) -> Predicted:
-        """What the model says at scaled coordinates (d,)."""
+        """Return the model's predictions at scaled coordinates (d,)."""
         return self._predict(x)[0]
 
     def with_slopes(self, x: Array) -> tuple[Predicted, Array]:
-        """`predict`, and slopes (M, 3, d) of the tip's position by scaled coordinates."""
+        """Return `predict` and derivatives (M, 3, d) of the tip's reading by scaled coordinates."""
         predicted, slopes = self._predict(x)
         return predicted, slopes[0][0] * self.scale
 
     def _divided(self, error: Array, slope: Array, kind: Kind) -> tuple[Array, Array]:
-        """Residuals (3 M + 3 m,) of errors (M, 3) of rows, and their slopes by coordinates.
+        """Return residuals (3 M + 3 m,) of errors (M, 3), and their derivatives by coordinates.
 
-        Of errors that rows share, what is left and the m coefficients of these.
+        They are the errors without their systematic part, then its m coefficients for each axis.
         """
         known = ~np.isnan(error.sum(axis=1))
         systematic, weight = self._systematic(known, kind)
@@ -298,7 +299,7 @@ class CalibrationProblem:
         return value.ravel(), slope.reshape(-1, self.size)
 
     def unshared(self, error: Array, kind: Kind) -> Array:
-        """Errors (M, 3) of rows less the part that rows at nearby pressures share."""
+        """Return errors (M, 3) minus the part that rows at nearby pressures share."""
         known = ~np.isnan(error.sum(axis=1))
         systematic, weight = self._systematic(known, kind)
         if systematic is None:
@@ -309,7 +310,7 @@ class CalibrationProblem:
         )
 
     def _systematic(self, known: NDArray[np.bool_], kind: Kind) -> tuple[Systematic | None, Array]:
-        """Systematic errors of the rows (M,) that are known, and the weights (M, 1) of all."""
+        """Return the systematic errors' model for known rows (M,), and all weights (M, 1)."""
         noise = self.noise
         own = noise.position if kind == "position" else noise.angle
         shared = noise.systematic * (self.description.length if kind == "position" else 2.0)
@@ -327,7 +328,7 @@ class CalibrationProblem:
         return smooth_functions(np.concatenate(rows))
 
     def _predict(self, x: Array) -> tuple[Predicted, list[tuple[Array, Array | None]]]:
-        """Prediction, and the slopes (M, 3, d) of each point's position and turn."""
+        """Return predictions, and derivatives (M, 3, d) of each point's position and turn."""
         coordinates = x * self.scale
         base, sensors, zeros, sides = self.unknowns.slices()
         effective, by_history = self._effective(coordinates, sides)
@@ -372,7 +373,7 @@ class CalibrationProblem:
         return predicted, slopes
 
     def _effective(self, coordinates: Array, sides: Sequence[slice]) -> tuple[Array, Array]:
-        """Effective pressures (M, n) of all samples and their slopes (M, n, d)."""
+        """Return effective pressures (M, n) of all samples, and derivatives (M, n, d)."""
         starts, n = self.starts, self.description.n_pressures
         effective = np.zeros((starts[-1], n))
         slopes = np.zeros((starts[-1], n, self.size))
@@ -388,7 +389,7 @@ class CalibrationProblem:
                 if each.key.startswith(prefix)
             ]
             end: Start | None = None
-            owner = slice(0, 0)  # the sides on which this and the logs before it depend
+            owner = slice(0, 0)  # the unknown sides on which this log depends, if any
             for i, sample in enumerate(self.samples):
                 pressures = sample.recording.pressures[:, channels]
                 before = sample.recording.before[channels]
@@ -415,7 +416,7 @@ class CalibrationProblem:
         return effective, slopes
 
     def _measurements(self, point: TrackedPoint) -> tuple[Array, Array | None]:
-        """Positions (M, 3) and rotations (M, 3, 3) of a point in the rows of all samples."""
+        """Return measured positions (M, 3) and rotations (M, 3, 3) of a point in all rows."""
         positions, rotations = [np.zeros((0, 3))], [np.zeros((0, 3, 3))]
         for sample in self.samples:
             track = sample.recording.track(point.name)
@@ -427,7 +428,7 @@ class CalibrationProblem:
         return np.concatenate(positions), np.concatenate(rotations) if point.turns else None
 
     def of_table(self, table: StiffnessTable, x: Array) -> tuple[Array, Array]:
-        """Residuals (r,) of a table over its sigmas, and their slopes (r, d)."""
+        """Return a table's residuals (r,), divided by its sigmas, and their derivatives (r, d)."""
         _, _, coordinates, by_history = self._of_parameters(x)
         value, slope = np.zeros(len(table)), np.zeros((len(table), self.size))
         known = np.isfinite(table.stiffness) & np.isfinite(table.sigma) & (table.sigma > 0)
@@ -445,11 +446,11 @@ class CalibrationProblem:
 
 
 def _excess(robot: RobotDescription) -> ca.SX:
-    """By how much a robot, in symbols, exceeds what is sensible, in deviations (n + s,).
+    """Return penalties (n + s,) on a symbolic robot outside sensible bounds, in deviations.
 
-    The shares of each channel's history may not add up to all of the pressure, and pressures within
-    the robot's limits may neither take nearly all of a segment's modulus nor, of an exponential
-    law, raise it so that more pressure would bend less.
+    There are two bounds. The shares of each channel's history may not add up to the whole pressure.
+    Pressures within the robot's limits may neither take nearly all of a segment's modulus nor, with
+    an exponential law, raise it so far that more pressure would bend the arm less.
     """
     limits = iter(np.maximum(np.abs(robot.pressure_min), np.abs(robot.pressure_max)).tolist())
     memory, modulus = [], []
@@ -464,7 +465,7 @@ def _excess(robot: RobotDescription) -> ca.SX:
             memory.append((history.memory_of(c) * shares - FIT.most_memory) / FIT.memory_slack)
             acting.append(corrections.gain[c] * next(limits) + ca.fabs(corrections.offset[c]))
         change = compensation.modulus_per_pressure * ca.norm_2(ca.vertcat(*acting))
-        change = change / segment.material.youngs_modulus  # of the modulus, relative, at the most
+        change = change / segment.material.youngs_modulus  # largest relative change of the modulus
         if compensation.modulus_law == "linear":
             excess = FIT.least_modulus - (1 + change)
         else:
@@ -474,5 +475,5 @@ def _excess(robot: RobotDescription) -> ca.SX:
 
 
 def _rounded(value: float) -> float:
-    """A value with as many digits as a robot file needs."""
+    """Round to the digits of a robot file."""
     return float(f"{value:.7g}")

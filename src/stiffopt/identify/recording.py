@@ -1,7 +1,7 @@
-"""From a log to a recording: checked, in one frame, without what was not measured.
+"""Turn a log into a `Recording`: check it, remove faulty readings, express poses in one frame.
 
-A log that cannot be one of the given arm in SI units, or from which nothing can be learnt, is
-refused. What is doubtful is told in remarks.
+`prepare` refuses a log that cannot come from the given arm in SI units, or that holds nothing to
+learn from. It reports doubtful findings as remarks.
 """
 
 from __future__ import annotations
@@ -42,13 +42,13 @@ _UNUSED = "these are not used"
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """A tracked point.
+    """Poses of a tracked point over time.
 
     Attributes
     ----------
     name : "tip" or a body's name.
-    position : (N, 3), in m, in the frame of the recording; NaN where not to be used.
-    rotation : (N, 3, 3), NaN where not to be used; None if no orientation was recorded.
+    position : (N, 3), in m, in the frame of the recording; NaN in rows that must not be used.
+    rotation : (N, 3, 3), NaN in rows that must not be used; None if no orientation was recorded.
     """
 
     name: str
@@ -58,17 +58,17 @@ class Track:
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """A log as a fit uses it.
+    """A log, checked and cleaned for a fit.
 
     Attributes
     ----------
     name : of the file.
     time : (N,), in s.
     pressures : (N, n), in Pa, in the order of the robot's channels; all finite.
-    before : (n,), pressures in the arm when the log begins, in Pa. A log may begin with a step:
-        commanded in its first row, where the measured pressure is still the old one.
+    before : (n,), pressures in the arm when the log begins, in Pa. They differ from the first row
+        if the log begins with a commanded step that the measured pressures have yet to follow.
     tracks : the tip first.
-    remarks : what was found and what was done about it, one sentence each.
+    remarks : findings and how each was handled, one sentence each.
     """
 
     name: str
@@ -79,7 +79,7 @@ class Recording:
     remarks: tuple[str, ...]
 
     def track(self, name: str) -> Track:
-        """Return the track of this name, which must be there."""
+        """Return the track of this name; raise `FileError` if there is none."""
         for track in self.tracks:
             if track.name == name:
                 return track
@@ -98,21 +98,21 @@ def prepare(
     pressures: Literal["commanded", "measured"] = "commanded",
     keep_units: bool = False,
 ) -> Recording:
-    """Check a log and take out of it what a fit can use.
+    """Check a log and extract the rows and readings that a fit can use.
 
     Parameters
     ----------
     log : in SI units.
     name : of the file, for messages.
-    description : the robot whose arm was recorded; its length and its limits say what is plausible.
-    channels : for each channel of the robot the log's column, from 1; None for the same order.
-    frame : body that does not move and in whose frame everything is expressed; None for the
-        tracker's. Where its orientation was not recorded, positions are counted from it along the
-        tracker's axes.
+    description : the robot whose arm was recorded; its length and limits decide what is plausible.
+    channels : the log's column, from 1, of each channel of the robot; None for the same order.
+    frame : a body at rest, in whose frame all poses are expressed; None for the tracker's frame.
+        If its orientation was not recorded, it is only the origin; the axes are the tracker's.
     bodies : further bodies to keep as tracks.
-    pressures : which ones; a missing one is as the last before it (commanded) or on the line
-        between its neighbours (measured).
-    keep_units : refuse pressures that look like another unit than Pa, even if it is clear which.
+    pressures : which to use. A missing commanded pressure repeats the last one; a missing measured
+        pressure is interpolated.
+    keep_units : refuse pressures in a unit other than Pa. By default they are converted if only
+        one unit is plausible.
 
     Raises
     ------
@@ -166,7 +166,7 @@ def prepare(
 
 
 def _columns(there: int, channels: Sequence[int] | None, wanted: int) -> list[int]:
-    """Return which column, from 0, each channel of the robot has."""
+    """Return the log's column, from 0, of each channel of the robot."""
     if channels is None:
         if there != wanted:
             raise InputError(
@@ -222,31 +222,34 @@ def _pressures(
 
 
 def _before(log: Log, columns: list[int], pressures: Array, description: RobotDescription) -> Array:
-    """Return pressures (n,) in the arm at the first row: measured, where they are far from it."""
+    """Return pressures (n,) in the arm at the first row.
+
+    These are the first pressures, except where the measured ones are still far from them.
+    """
     first: Array = pressures[0].copy()
     if log.measured is None:
         return first
     measured = log.measured[0, columns]
     span = np.subtract(description.pressure_max, description.pressure_min)
-    late = np.abs(measured - first) > PLAUSIBLE.late * span  # not where it is missing
+    late = np.abs(measured - first) > PLAUSIBLE.late * span  # False for a missing (NaN) reading
     first[late] = measured[late]
     return first
 
 
 def _stale(log: Log) -> Rows:
-    """Say which rows (N,) hold no new reading of any body."""
+    """Return which rows (N,) hold no new reading of any body."""
     everything = [Body(log.tip_position, log.tip_quaternion), *log.bodies.values()]
     tracked = [body.position for body in everything]
     tracked += [body.quaternion for body in everything if body.quaternion is not None]
     if len(tracked) == 1 or not len(log):
-        return np.zeros(len(log), dtype=bool)  # one point that rests repeats itself
+        return np.zeros(len(log), dtype=bool)  # a single point at rest repeats legitimately
     return repeats(tracked)
 
 
 def _reach(pressures: Array, description: RobotDescription) -> Array:
-    """How far (N,) the changes of pressure until then may have moved the tip altogether, in m.
+    """Return the longest way (N,), in m, that the pressures so far can have moved the tip.
 
-    The whole range of a channel moves it by no more than about the length of the arm.
+    A channel's whole range is taken to move the tip by at most the arm's length.
     """
     span = np.subtract(description.pressure_max, description.pressure_min)
     change = np.abs(np.diff(pressures, axis=0)) / span
@@ -334,7 +337,7 @@ def _in_frame(
 def _counted(
     rows: NDArray[np.bool_], time: Array, what: str, done: str | None = None
 ) -> tuple[str, ...]:
-    """Return a sentence on rows (N,), with their number and their first times; none if none."""
+    """Return a sentence with the number and first times of the rows (N,), or () for no rows."""
     at = np.flatnonzero(rows)
     if not len(at):
         return ()
@@ -379,9 +382,9 @@ def _mm(length: float) -> str:
 
 
 def _unit(pressures: Array, tip: Array, description: RobotDescription) -> str | None:
-    """Return the unit of pressures (N, n) that are too small for Pa; None where that is not clear.
+    """Return the unit of pressures (N, n) that are too small for Pa, or None if it is unclear.
 
-    In the right one the robot file's arm moves about as far as the tip did; units are far apart.
+    With the right unit, the robot file's arm moves about as far as the tip did.
     """
     limit = np.maximum(np.abs(description.pressure_min), np.abs(description.pressure_max))
     share = float(np.max(np.max(np.abs(pressures), axis=0) / limit))
@@ -405,7 +408,7 @@ def _unit(pressures: Array, tip: Array, description: RobotDescription) -> str | 
 
 
 def _check_pressures(name: str, pressures: Array, description: RobotDescription) -> tuple[str, ...]:
-    """Refuse pressures (N, n) that are not in Pa or never move, and remark on what is odd."""
+    """Refuse pressures (N, n) that are not in Pa or never change; return remarks on odd ones."""
     low, high = np.array(description.pressure_min), np.array(description.pressure_max)
     limit = np.maximum(np.abs(low), np.abs(high))
     share = float(np.max(np.max(np.abs(pressures), axis=0) / limit))
@@ -470,7 +473,10 @@ def _check_excitation(
 
 
 def _follows(causes: Array, position: Array) -> bool:
-    """Say whether positions (N, 3) depend on causes (N, m): rows may be far apart, but no noise."""
+    """Return whether a linear regression on causes (N, m) explains positions (N, 3).
+
+    Unlike the comparison with the neighbours, this works for rows that are far apart in time.
+    """
     known = np.column_stack([np.ones(len(causes)), causes])
     solution, _, rank, _ = np.linalg.lstsq(known, position, rcond=1e-6)
     freedom = max(len(position) - int(rank), 1)

@@ -1,4 +1,4 @@
-"""What calibration and validation return: errors of the tip, and fitted numbers with remarks."""
+"""Results of calibration and validation: errors of the tip, fitted numbers and remarks."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from stiffopt.model.parameters import Parameter
 Array = NDArray[np.float64]
 
 TIED = "hardly told apart"
-"""How the remark on two numbers begins that these data do not tell apart."""
+"""Beginning of the remark on two numbers that the data cannot distinguish."""
 _NORMAL = 1.959963984540054  # 97.5 % quantile
 _PLACED = {
     BASE: "the base tracked too, or touched with a pointer",
     SENSOR: "the tip's orientation recorded while it bends in all directions",
 }
-"""What recordings would tell where these are."""
+"""Experiments that would determine these frames."""
 
 
 @dataclass(frozen=True)
@@ -34,9 +34,9 @@ class Errors:
 
     Attributes
     ----------
-    n : number of rows that were compared.
-    mean, median, p95, max : of the distance between measured and predicted position, in m; NaN
-        where there is no row.
+    n : number of compared rows.
+    mean, median, p95, max : of the distance between measured and predicted position, in m; NaN if
+        n is 0.
     angle : mean angle between measured and predicted axis of the tip, in rad, or None where no
         orientation was recorded.
     """
@@ -50,7 +50,7 @@ class Errors:
 
     @classmethod
     def of(cls, distances: Array, angles: Array | None) -> Errors:
-        """Summarise distances (N,) in m and angles (N,) in rad; what is NaN is left out."""
+        """Summarise distances (N,) in m and angles (N,) in rad, ignoring NaN."""
         known = distances[np.isfinite(distances)]
         turned = None if angles is None else angles[np.isfinite(angles)]
         angle = float(turned.mean()) if turned is not None and len(turned) else None
@@ -75,17 +75,17 @@ class Comparison:
     name : of the log.
     time : (N,), in s.
     pressures : (N, n), commanded, in Pa.
-    effective : (N, n), for which the model's equilibrium was taken, in Pa.
+    effective : (N, n), effective pressures, at which the model predicts the tip, in Pa.
     measured, predicted : (N, 3), positions of the tip's sensor, in m; NaN where not measured.
-    angle : (N,), between the measured and the predicted axis of the tip, in rad; None where no
+    angle : (N,), between the measured and the predicted axis of the tip, in rad; None if no
         orientation was recorded.
-    inside : (N,), whether the calibration had seen such pressures; all true without one.
+    inside : (N,), whether the pressures lie within those of the calibration; all true without one.
     moving : (N,), whether the pressures were changing.
-    levels : (N,), probability of the smallest region about the prediction that holds the measured
-        tip; None where the robot file does not tell the errors of predictions.
-    unsettled_levels : (N,), the same about `Manipulator.tip_pose` at the commanded pressures, for
-        whoever does not know what was commanded before.
-    remarks : what was found in the log, one sentence each.
+    levels : (N,), probability of the smallest region about the prediction that contains the
+        measured tip; None if the robot file has no error model.
+    unsettled_levels : (N,), the same about `Manipulator.tip_pose` at the commanded pressures, which
+        ignores earlier commands.
+    remarks : findings in the log, one sentence each.
     """
 
     name: str
@@ -103,7 +103,7 @@ class Comparison:
 
     @property
     def distance(self) -> Array:
-        """Error (N,) of the position in m; NaN where it was not measured."""
+        """Error (N,) of the position in m; NaN where not measured."""
         return np.asarray(np.linalg.norm(self.measured - self.predicted, axis=1))
 
     @property
@@ -113,11 +113,11 @@ class Comparison:
 
     @property
     def outside(self) -> Errors:
-        """Errors of the rows whose pressures the calibration had not seen."""
+        """Errors of the rows whose pressures lie outside those of the calibration."""
         return self.rows(~self.inside).errors
 
     def rows(self, wanted: NDArray[np.bool_]) -> Comparison:
-        """Some rows (N,) of it."""
+        """Return the comparison of the wanted rows (N,) alone."""
         names = [each.name for each in fields(self) if each.name not in ("name", "remarks")]
         columns = {name: getattr(self, name) for name in names}
         kept = {name: column[wanted] for name, column in columns.items() if column is not None}
@@ -125,14 +125,14 @@ class Comparison:
 
 
 def together(comparisons: Sequence[Comparison]) -> Errors:
-    """Errors of the rows of all logs together."""
+    """Summarise the errors of the rows of all logs together."""
     distances = np.concatenate([np.zeros(0), *(each.distance for each in comparisons)])
     angles = [each.angle for each in comparisons if each.angle is not None]
     return Errors.of(distances, np.concatenate(angles) if angles else None)
 
 
 LEVELS = (0.5, 0.68, 0.9, 0.95, 0.99)
-"""Probabilities of the regions whose coverage is told."""
+"""Probabilities of the regions whose coverage is reported."""
 
 
 @dataclass(frozen=True)
@@ -155,13 +155,13 @@ class RegionCoverage:
 
 
 def coverage(comparisons: Sequence[Comparison]) -> dict[str, RegionCoverage]:
-    """RegionCoverage of the regions about predictions, over the rows of all logs together.
+    """Return the coverage of the regions about predictions, over the rows of all logs together.
 
     Returns
     -------
-    By what is known: ``with history``, and about `Manipulator.tip_pose` ``moving`` and ``settled``;
-    each also for rows ``inside`` and ``outside`` of what was recorded, as in ``settled, outside``.
-    Kinds without a row are left out.
+    Coverage by kind of prediction: ``with history``; and of `Manipulator.tip_pose`, ``moving`` and
+    ``settled``. Each also appears for the rows inside and outside the recorded pressures, as in
+    ``settled, outside``. Kinds without a row are left out.
     """
     found: dict[str, list[Array]] = {}
     for each in comparisons:
@@ -193,7 +193,7 @@ class FittedEstimate:
 
     Attributes
     ----------
-    name : what people call it.
+    name : in reports.
     key : its key in the robot file, or empty.
     unit : SI unit; empty for a plain number.
     before, value : before and after the fit, in SI; the motion of a frame is zero before.
@@ -242,7 +242,7 @@ def estimates(found: Fit) -> tuple[FittedEstimate, ...]:
 
 
 def doubts(found: Fit, listed: Sequence[FittedEstimate]) -> list[str]:
-    """Return a remark on each number that was not learnt, not told apart, or is far off."""
+    """Return remarks on numbers that were not learnt, cannot be distinguished, or are far off."""
     remarks = []
     unlearnt: dict[str, list[str]] = {}
     for estimate in listed:
@@ -276,7 +276,7 @@ def _experiment(estimate: FittedEstimate) -> str:
 
 
 def is_unfit(calibrated: Sequence[Comparison], length: float) -> bool:
-    """Whether a fit misses its own recordings by so much that it is of no use."""
+    """Whether a fit misses its own recordings by too much to be useful."""
     return bool(calibrated) and together(calibrated).mean > REPORT.unfit * length
 
 
@@ -303,7 +303,7 @@ def what_to_look_at(calibrated: Sequence[Comparison], length: float) -> str:
 
 
 def outliers(found: Fit) -> list[str]:
-    """Return a remark on each recording that has rows far from the model, which count less."""
+    """Return a remark on each recording with outlying rows, which the loss weights less."""
     remarks = []
     starts = found.problem.starts
     error = np.linalg.norm(found.predicted.errors[0], axis=1) if starts[-1] else np.zeros(0)

@@ -1,4 +1,4 @@
-"""Measurement model of a tracker: pose of a sensor on the arm, and its Jacobian by the frames."""
+"""Measurement model of a tracker: the pose of a sensor on the arm, with its Jacobian."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Readings:
-    """What a perfect tracker reads of a point in N rows.
+    """What an ideal tracker would measure of a point in N rows.
 
-    Derivatives are by the twist (6) of the point in its own axes, by the twist of the base in the
-    tracker's frame (in base axes), and by that of the sensor on the point (in the point's axes).
+    The 18 columns of the derivatives are three twists: of the point in its own axes, of the base in
+    the tracker's frame (in base axes), and of the sensor on the point (in the point's axes).
 
     Attributes
     ----------
     position : (N, 3), in m.
     per_twist : (N, 3, 18), of the position.
-    turn : (N, 3): the rotation from what was measured to what is read, as the sine of its angle
-        along its axis, in the axes of the sensor; None if no rotation was measured.
+    turn : (N, 3), rotation from the measured to the ideal orientation, as its axis times the sine
+        of its angle, in the axes of the sensor; None if no rotation was measured.
     turn_per_twist : (N, 3, 18).
     """
 
@@ -46,11 +46,11 @@ def readings(
     sensor_twist: Array,
     measured: Array | None,
 ) -> Readings:
-    """Read a point whose poses in the base frame are (N, 4, 4).
+    """Return an ideal tracker's readings of a point on the arm.
 
     Parameters
     ----------
-    point : (N, 4, 4)
+    point : (N, 4, 4), poses in the base frame.
     base_in_tracker, sensor_in_point : (4, 4)
     base_twist, sensor_twist : (6,)
         Move these frames: ``base_in_tracker exp(base_twist)``, ``exp(sensor_twist) sensor``.
@@ -73,7 +73,7 @@ def readings(
 
 
 def turned_by(turn: Array) -> Array:
-    """Angles (N,) in rad of `Readings.turn`, up to a quarter turn."""
+    """Return the angles (N,) of `Readings.turn` in rad, up to a quarter turn."""
     return np.asarray(np.arcsin(np.clip(np.linalg.norm(turn, axis=-1), 0.0, 1.0)))
 
 

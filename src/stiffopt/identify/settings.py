@@ -1,4 +1,4 @@
-"""Settings of a calibration: what users choose, and the tuning values behind each of its steps."""
+"""Settings of a calibration: the user's choices, and the tuning values of each of its steps."""
 
 from __future__ import annotations
 
@@ -12,27 +12,28 @@ from stiffopt.schema import Items, Schema
 from stiffopt.units import Duration
 
 Finding = Literal["units", "clock", "axes", "channels", "lines"]
-"""What is found by itself in recordings (`stiffopt.identify.detection`) unless it is to be kept."""
+"""Errors of recordings that are corrected automatically (`stiffopt.identify.detection`)."""
 
 
 @dataclass(frozen=True)
 class TrackerFaultSettings:
-    """Which readings of a tracker count as faults (`stiffopt.identify.tracker_faults`).
+    """Criteria for faulty readings of a tracker (`stiffopt.identify.tracker_faults`).
 
     Attributes
     ----------
     farthest : distance from the median position beyond which a reading is impossible, in lengths
         of the arm.
-    origin, origin_rows : a tracker may have been zeroed within this distance of the origin (lengths
-        of the arm); so many rows there say that positions of zero are readings.
-    jump_rows : number of rows that a jump may last.
-    jump_pause : longest time between the rows around a jump, in usual steps of time per row.
-    jump_factor : how many times the ordinary step a jump is.
+    origin, origin_rows : positions of exactly zero are true readings if at least `origin_rows`
+        other rows lie within `origin` (in lengths of the arm) of the origin; otherwise they mean
+        "missing".
+    jump_rows : largest number of rows in a jump.
+    jump_pause : longest time across a jump, in median time steps per row.
+    jump_factor : smallest jump, in usual steps at that time.
     jump_sigmas, jump_least : smallest jump, in deviations of the noise and in lengths of the arm;
-        a robust loss deals with smaller ones.
-    turn_agrees : angle by which rows that follow each other may differ at one place, in rad.
-    turn_moving : angle by which a body may turn while it moves by one length of the arm, in rad.
-    turn_rows : so many rows in a row are no chance, however they are turned.
+        the fit's robust loss handles smaller ones.
+    turn_agrees : largest angle between consecutive rows of a body at rest, in rad.
+    turn_moving : further angle by which a body may turn per arm's length of its motion, in rad.
+    turn_rows : a run of at least this many rows is kept although no rotation fits it.
     """
 
     farthest: float = 100.0
@@ -50,26 +51,27 @@ class TrackerFaultSettings:
 
 @dataclass(frozen=True)
 class PlausibilitySettings:
-    """When a log cannot be one of the given arm in SI units (`stiffopt.identify.recording`).
+    """Criteria for a log of the given arm in SI units (`stiffopt.identify.recording`).
 
     Attributes
     ----------
-    least_rows : number of usable rows that a recording needs.
-    tiny_pressure : share of the pressure limits that the highest pressure in Pa exceeds.
-    beyond, idle : shares of a channel's range: beyond its limits by so much is worth a remark;
-        a channel that moves by less is not used.
-    farthest, widest : in lengths of the arm: distance of the tip from the frame's body, and
-        range of the tip's positions, that would mean other units than m.
-    slow, slow_integers : median time between rows that would mean ms, in s; and the same where all
-        times are whole numbers.
-    late : share of a channel's range by which the first measured pressure differs from the
-        commanded one if the log begins with a step. Gauges are off by less.
-    frame_share, frame_moved, frame_turned : in so many of the rows the body that is the frame may
-        not have moved by more than this, in m and rad.
-    noise_factor, still : the tip moves if its positions vary by so many deviations of their noise,
-        and by so much of the arm's length.
-    unexplained : share of their spread that noisy positions keep after a regression on pressures.
-    times_shown : number of times that a remark names.
+    least_rows : smallest number of usable rows.
+    tiny_pressure : a highest pressure below this share of the limits is not in Pa.
+    beyond, idle : as shares of a channel's range: excess over its limits that deserves a remark,
+        and change of its pressure up to which nothing is learnt about it.
+    farthest, widest : distance of the tip from the frame's body, and range of the tip's positions,
+        beyond which positions are not in m; in lengths of the arm.
+    slow, slow_integers : median time between rows, in s, beyond which times look like ms; the
+        latter applies if all times are whole numbers.
+    late : a log begins with a step if the first measured pressure differs from the commanded one by
+        more than this share of the channel's range. Gauges are more accurate.
+    frame_share, frame_moved, frame_turned : in this share of the rows, the frame's body must stay
+        within these distances of its mean, in m and rad; else a remark says so.
+    noise_factor, still : the tip moves if the spread of its positions exceeds this multiple of
+        their noise, and this share of the arm's length.
+    unexplained : alternatively to the noise, it moves if a regression on pressures leaves less than
+        this share of the spread.
+    times_shown : how many times a remark lists.
     """
 
     least_rows: int = 20
@@ -96,14 +98,16 @@ class SamplingSettings:
 
     Attributes
     ----------
-    straight : share of the range of pressures: commands so near to a straight line are on it.
-    fine : of commands that change in every row, one is kept per so many s, as a lag can tell.
-    longest_gap : number of rows that are left out at once.
+    straight : rows whose commands are within this share of the pressure range of a straight line
+        are left out.
+    fine : where commands change in every row, one row is kept per this time in s, fine enough to
+        identify a lag.
+    longest_gap : largest number of rows left out at once.
     rest : share of the range of pressures below which an arm is at rest.
-    loaded_fit_rows, loaded_rows : most rows of an arm under gravity, whose every pose is an
-        equilibrium to be found, in a fit and in a comparison.
-    rows : most rows of a log in a comparison.
-    dead_time_step : slowest rows from which a dead time can be told from a lag, in s.
+    loaded_fit_rows, loaded_rows : largest numbers of rows in a fit and in a comparison of an arm
+        under gravity, each of whose poses needs a search for equilibrium.
+    rows : largest number of rows of a log in a comparison.
+    dead_time_step : longest time between rows, in s, that distinguishes a dead time from a lag.
     """
 
     straight: float = 1e-3
@@ -118,21 +122,21 @@ class SamplingSettings:
 
 @dataclass(frozen=True)
 class StartSettings:
-    """Where fits begin (`stiffopt.identify.structures`, `stiffopt.identify.calibration`).
+    """Initial values of fits (`stiffopt.identify.structures`, `stiffopt.identify.calibration`).
 
     Attributes
     ----------
     lag, dead_time : of a history that the robot file does not have, in s.
-    play_widths, elongation_width, play_share : of its plays, and of that of elongation; widths as
-        shares of the highest recorded pressure.
-    creep_times, creep_share : of its creep, in s.
-    bending_radius : least bending radius, in lengths of the segment.
-    dead_band : share of the highest recorded pressure.
-    turns, unknown_turn : turns of the base to begin with, in rad, where its tolerance is more than
-        the latter.
-    moduli : coordinates of the moduli to begin with, in prior deviations.
-    position_noise, angle_noise : what the first fit expects the model to miss, in lengths of the
-        arm and in rad.
+    play_widths, elongation_width, play_share : of its plays, the second for that of elongation;
+        widths as shares of the highest recorded pressure.
+    creep_times, creep_share : of its creep; times in s.
+    bending_radius : smallest bending radius, in lengths of the segment.
+    dead_band : as a share of the highest recorded pressure.
+    turns, unknown_turn : turns of the base from which fits start, in rad, if the tolerance of its
+        turn exceeds the latter.
+    moduli : coordinates of the moduli from which fits start, in prior deviations.
+    position_noise, angle_noise : expected model error in the first fit, in lengths of the arm and
+        in rad.
     """
 
     lag: float = 0.3
@@ -157,21 +161,22 @@ class FitSettings:
 
     Attributes
     ----------
-    loss_scale : residuals beyond so many deviations count less and less (soft L1).
-    rounds : number of fits, each with the spread of residuals that the one before left.
-    evaluations : most evaluations of the problem in each round.
+    loss_scale : deviations beyond which the loss grows only linearly (soft L1).
+    rounds : number of refits, each with the noise estimated from the fit before.
+    evaluations : largest number of evaluations of the problem in each round.
     tolerance : relative, of cost, step and gradient.
-    least_position, least_angle : smallest spread of residuals, in m and rad: logs have few digits.
+    least_position, least_angle : smallest spread of residuals, in m and rad; logs have few digits.
     most_memory, memory_slack : sum of the shares of a channel's history beyond which a penalty
         grows, and the excess that counts as one deviation.
     least_modulus, most_stiffening, modulus_slack : share of a segment's modulus that pressure must
-        leave; largest exponent by which an exponential law may raise it (at 1 more pressure bends
-        less); and the excess that counts as one deviation.
-    side : prior deviation of the side of its plays on which a channel begins, from -1 to 1.
-    between_logs : time at the last pressures between two logs of a sequence, in s.
+        leave; largest exponent by which an exponential law may raise it (at 1, more pressure bends
+        the arm less); and the excess of either that counts as one deviation.
+    side : prior deviation of a channel's initial state of hysteresis, from -1 to 1.
+    between_logs : assumed time at the last pressures between two logs of a sequence, in s.
     systematic : deviation of the errors that rows at nearby pressures share, in lengths of the arm.
-    near : what is near, as a share of the highest recorded pressure.
-    centres_apart, most_centres : of these errors, in units of what is near, and their number.
+    near : correlation length of these errors, as a share of the highest recorded pressure.
+    centres_apart, most_centres : spacing of their centres, in correlation lengths, and largest
+        number of centres.
     """
 
     loss_scale: float = 2.0
@@ -195,20 +200,19 @@ class FitSettings:
 
 @dataclass(frozen=True)
 class ChoiceSettings:
-    """How one of several models is chosen (`stiffopt.identify.structures`).
+    """Folds and the choice of a model (`stiffopt.identify.folds` and ``structures``).
 
     Attributes
     ----------
-    logs : as many logs or more are held back one by one; of fewer, parts are.
-    parts : number of these parts.
-    top : share of the rows, those with the highest pressures, that are held back too; and of those
-        with the lowest.
-    regions, rounds : number of regions of pressure that are held back, and of the steps that look
-        for them.
-    evaluations : most evaluations of a fit without what is held back, which begins near its end.
-    no_worse : relative error by which a simpler model may be worse.
-    held, held_still, held_for : creep can be told if pressures are held for this share of the time;
-        held is a change of less than this share of their range, for longer than so many s.
+    logs : smallest number of logs from which each log is a fold; with fewer, parts of logs are.
+    parts : number of folds in time.
+    top : share of the rows in the fold of the highest pressures, and in that of the lowest.
+    regions, rounds : number of clusters of pressure, and of the iterations that find them.
+    evaluations : largest number of evaluations of a fit without a fold, which begins near its end.
+    no_worse : relative increase of error that a simpler model may have.
+    held, held_still, held_for : creep can be identified if pressures are held for more than the
+        share `held` of the time; held means a change by less than the share `held_still` of their
+        range for more than `held_for` s.
     """
 
     logs: int = 3
@@ -229,22 +233,23 @@ class ErrorSettings:
 
     Attributes
     ----------
-    discrepancy, residual, tail : what is expected before anything was held back: error of the tip
-        far from what was recorded, in lengths of the arm; standard deviation of an axis in what is
-        held back, by that of the fit; degrees of freedom beyond four.
-    deviations : of their logarithms.
-    per_cell : rows that count in a cell of pressures that is as wide as the reach.
-    reaches, reach : distances over which the discrepancy may grow, and the expected one, as shares
-        of the range of recorded pressures.
-    gain : relative error of what pressures do in directions that were not recorded; no recording
-        tells it.
-    rows : most rows that tell what the discrepancy does to a fit.
-    representatives, spacing : most pressures of a segment that stand for all that were recorded;
-        and their distance, as a share of the range of pressures, at which they are enough.
-    hold, still : pressures are held if they have not changed for so many s by more than this share
-        of their range.
-    compared : most rows of a log whose regions are compared with the readings.
-    least_rows : of held, and of moving pressures that tell how far effective ones are from them.
+    discrepancy, residual, tail : prior means: tip error far from recorded pressures, in lengths of
+        the arm; standard deviation per axis on held-back rows, relative to that of the fit; degrees
+        of freedom beyond four.
+    deviations : prior standard deviations of their logarithms.
+    per_cell : number of rows that count in a cell of pressures as wide as the reach.
+    reaches, reach : candidates for the distance over which the discrepancy grows, and its prior
+        median, as shares of the range of recorded pressures.
+    gain : relative error of the effect of pressures in directions that were not recorded; no
+        recording can show it.
+    rows : largest number of rows in the estimate of the discrepancy's effect on a fit.
+    representatives, spacing : largest number of a segment's pressures kept to represent all
+        recorded ones, and the spacing, as a share of the pressure range, at which fewer suffice.
+    hold, still : pressures are held if they changed by less than the share `still` of their range
+        within the last `hold` s.
+    compared : largest number of rows of a log whose regions are compared with the readings.
+    least_rows : smallest number of held, or of moving, rows from which the difference of effective
+        from commanded pressures is estimated.
     """
 
     discrepancy: float = 0.1
@@ -266,13 +271,14 @@ class ErrorSettings:
 
 @dataclass(frozen=True)
 class SuggestionSettings:
-    """Poses that a calibration suggests to record next (`stiffopt.identify.suggestion`).
+    """Suggestion of poses to record next (`stiffopt.identify.suggestion`).
 
     Attributes
     ----------
-    poses : how many, unless somebody says.
-    candidates : from which they are chosen, besides those of one channel and of all.
-    levels : of these, as shares of the range of pressures.
+    poses : default number of poses.
+    candidates : number of candidates spread over the box of pressures; further ones pressurise one
+        channel, or all.
+    levels : pressures of those further ones, as shares of the range.
     """
 
     poses: int = 12
@@ -282,17 +288,17 @@ class SuggestionSettings:
 
 @dataclass(frozen=True)
 class ReportSettings:
-    """What is remarked on in the result (`stiffopt.identify.results`).
+    """Thresholds of the remarks on a result (`stiffopt.identify.results`).
 
     Attributes
     ----------
-    learnt : share of the prior's variance that the data must remove.
-    tied : correlation from which two numbers cannot be told apart.
-    far : distance from the robot file, in prior deviations.
-    tilt : of base or sensor that is doubted whatever the tolerance, in rad.
-    outlier : distance of a row from the model, in deviations.
-    unfit, alone : mean error in what was fitted, in lengths of the arm, above which a robot is
-        unfit; and how many times the median of all logs the error of one is that is to blame.
+    learnt : a number is not learnt if the data remove less than this share of its prior variance.
+    tied : correlation beyond which two numbers cannot be distinguished.
+    far : suspicious distance from the robot file, in prior deviations.
+    tilt : suspicious tilt of base or sensor, in rad, whatever the tolerance.
+    outlier : distance of an outlying row from the model, in deviations.
+    unfit, alone : mean error in the fitted logs, in lengths of the arm, beyond which a robot is
+        unfit; and multiple of the median log's error beyond which one log is singled out.
     correlation_digits : decimals of correlations in the robot file.
     """
 
@@ -308,28 +314,27 @@ class ReportSettings:
 
 @dataclass(frozen=True)
 class DetectionSettings:
-    """When a recording is taken to be other than it seems (`stiffopt.identify.detection`).
+    """Evidence needed to correct a recording (`stiffopt.identify.detection`).
 
     Attributes
     ----------
-    overwhelming : share of the misfit that the better hypothesis may leave.
-    tie : of two hypotheses neither is taken if the better leaves more than this share of what the
-        other does.
-    rows : of all recordings that are compared.
+    overwhelming : largest share of the misfit that an accepted hypothesis leaves.
+    tie : largest misfit of an accepted hypothesis, as a share of any rival's.
+    rows : number of compared rows of all recordings together.
     softness : factors on pressures, for arms softer or stiffer than the robot file says.
-    unknown_turn : tolerance of the base's turn from which the turn is not known, in rad.
-    few_channels : of how many channels all orders are tried.
-    off, frame : mean error of a log, in lengths of the arm, from which its frame may be another
-        than the one of the calibration; and the share of it that is left if it was.
-    known_turn : spread of the tip, in lengths of the arm, that tells a turn.
-    moved : how far the base may be from where the robot file has it, in lengths of the arm.
-    clock_rows : rows of a regression for the clocks.
-    clock_lag : of an arm, in s.
-    clock_usual : delay up to which it may be the arm's own, in s.
-    clock_most, clock_share : largest shift of time that is looked for, in s and as a share of the
-        log; clock_shifts : how many of them.
-    clock_overwhelming : as `overwhelming`, of the regression.
-    unit : factor within which the arm's motion must be what is expected with a unit of pressure.
+    unknown_turn : tolerance of the base's turn, in rad, beyond which the turn counts as unknown.
+    moved : largest distance of the base from its place in the robot file, in lengths of the arm.
+    few_channels : largest number of channels of which all orders are tried.
+    off, frame : mean error of a log, in lengths of the arm, beyond which its frame is suspected to
+        differ from the calibration's; and the share of it that a correction may leave.
+    known_turn : spread of the tip, in lengths of the arm, that determines a turn.
+    clock_rows : number of rows in the regression for the clocks.
+    clock_lag : lag of an arm, in s.
+    clock_usual : longest delay that the arm itself may have, in s.
+    clock_most, clock_share : largest time shift that is tried, in s and as a share of the log.
+    clock_shifts : number of shifts that are tried.
+    clock_overwhelming : as `overwhelming`, for the regression.
+    unit : largest factor between the arm's observed and expected motion with the right unit.
     """
 
     overwhelming: float = 0.5
@@ -369,29 +374,28 @@ class CalibrationSettings(Schema):
 
     Attributes
     ----------
-    structure : name of a model of `stiffopt.identify.structures.STRUCTURES`, or ``auto``: the one
-        that predicts held-back logs (of a single log, held-back parts) best; of those that are as
-        good, the simplest.
-    strain_law : ``auto``: the robot file's, unless another law of `stiffopt.model.laws` predicts
-        what is held back clearly better; or ``keep``.
-    sequence : whether the logs follow each other, so that each begins in the state in which the
-        one before it ended.
-    rezero : whether positions are counted anew in each log.
-    pressures : which of the recorded pressures the model is run with.
-    fixed : keys of parameters that stay as they are.
-    keep : what is taken as it was recorded: the ``units`` of pressures, the ``clock`` of pressures
-        and tracker, the ``axes`` of a log's frame, the order of the ``channels``, dead or shared
-        ``lines``. All else is put right where the evidence is overwhelming, and told.
-    settle : time at the beginning of a log that does not begin at rest, from which its state (and
-        its zero) is estimated where the log is only predicted, in s.
-    rows : number of rows that are fitted, of all logs together; chosen so as to cover them.
-    trial_rows : the same, while models are compared.
-    start_rows : the same, while a start is chosen among several.
-    compared_rows : the same, of each log, where the arm is under gravity and all is compared.
-    start_evaluations : most evaluations of the problem from each of several starts.
-    rounds : number of fits, each with the spread of residuals that the one before left.
-    holds_back : whether models are fitted without parts of the logs and compared by these; else
-        `structure` names one.
+    structure : name of a model of `stiffopt.identify.structures.STRUCTURES`, or ``auto`` for the
+        simplest of those that predict held-back logs (with few logs, held-back parts) best.
+    strain_law : ``auto`` for the robot file's, unless another law of `stiffopt.model.laws` predicts
+        held-back data clearly better; or ``keep``.
+    sequence : whether the logs were recorded without a break, so that each begins in the state in
+        which the previous one ended.
+    rezero : whether each log has its own zero of positions.
+    pressures : which of the recorded pressures drive the model.
+    fixed : keys of parameters that are not fitted.
+    keep : what to leave as recorded: the ``units`` of pressures, the ``clock`` of pressures and
+        tracker, the ``axes`` of a log's frame, the order of the ``channels``, dead or shared
+        ``lines``. Errors in the others are corrected, with a remark, if the evidence is
+        overwhelming.
+    settle : time in s at the beginning of a log from which its initial state (unless at rest) and
+        its zero are estimated if the log is only predicted.
+    rows : number of fitted rows of all logs together, spread evenly.
+    trial_rows : the same, for the comparison of models.
+    start_rows : the same, for the choice among several starts.
+    compared_rows : largest number of compared rows of each log, for an arm under gravity.
+    start_evaluations : largest number of evaluations of the problem from each start.
+    rounds : number of refits, each with the noise estimated from the fit before.
+    holds_back : whether to compare models on held-back data; if not, `structure` must name one.
     """
 
     structure: str = "auto"
@@ -412,11 +416,11 @@ class CalibrationSettings(Schema):
     holds_back: bool = True
 
     def quick(self, *, is_loaded: bool) -> CalibrationSettings:
-        """These settings for a first answer: one model, its law kept, nothing held back, few rows.
+        """Return settings for a quick first answer: one model, nothing held back, few rows.
 
         Parameters
         ----------
-        is_loaded : whether each pose is an equilibrium to be found, which takes longer.
+        is_loaded : whether the arm is under gravity, so that each pose takes longer.
         """
         structure = "hysteresis" if self.structure == "auto" else self.structure
         most = {"rows": 60, "start_rows": 40, "compared_rows": 60} if is_loaded else {

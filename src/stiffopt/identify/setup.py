@@ -1,4 +1,4 @@
-"""From a robot, logs and a model structure to the least-squares problem of a calibration."""
+"""Build the least-squares problem of a calibration from a robot, logs and a model structure."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ Array = NDArray[np.float64]
 Rows = NDArray[np.intp]
 
 NOISE = Noise(1e-3, np.radians(2.0))
-"""Of readings, in m and rad, for a robot that was not calibrated."""
+"""Assumed noise of readings for a robot that was not calibrated, in m and rad."""
 
 _Path = str | os.PathLike[str]
 RobotSource = _Path | RobotDescription | Arm
@@ -66,7 +66,7 @@ def tables_of(tables: Sequence[TableSource], description: RobotDescription) -> l
     Raises
     ------
     InputError
-        A table is of a robot with another number of channels.
+        A table does not have the robot's number of channels.
     """
     found = []
     for each in tables:
@@ -81,7 +81,7 @@ def tables_of(tables: Sequence[TableSource], description: RobotDescription) -> l
 
 
 def _named(logs: Sequence[LogSource]) -> list[tuple[str, Log]]:
-    """Logs with their names: those of the files, with their folders where files share a name."""
+    """Read logs and name them by their files, with the folder where files share a name."""
     if isinstance(logs, str):
         raise InputError("expected a list of logs, not one path")
     files = Counter(Path(log).name for log in logs if isinstance(log, str | os.PathLike))
@@ -103,7 +103,7 @@ def recordings_of(
     logs: Sequence[LogSource],
     settings: CalibrationSettings,
 ) -> list[Recording]:
-    """Return logs as recordings of this robot, read as its file and the settings say."""
+    """Read logs as recordings of this robot, as its file and the settings specify."""
     given = description.recordings or Recordings()
     found = [
         prepare(
@@ -126,7 +126,7 @@ def recordings_of(
 
 @dataclass(frozen=True, eq=False)
 class Setup:
-    """What stays the same while models are compared: the robot, the recordings and the settings.
+    """Everything that stays fixed while models are compared: robot, recordings and settings.
 
     Attributes
     ----------
@@ -134,9 +134,9 @@ class Setup:
     recordings : tuple of Recording
     tables : tuple of StiffnessTable
     settings : CalibrationSettings
-    base : pose (4, 4) of the base in the recordings' frame, as far as the robot file knows.
-    points : that are tracked.
-    found : what was wrong with the recordings altogether, and was put right, one sentence each.
+    base : pose (4, 4) of the base in the recordings' frame, according to the robot file.
+    points : the tracked points, the tip first.
+    found : faults of all recordings that were corrected, one sentence each.
     """
 
     description: RobotDescription
@@ -155,7 +155,7 @@ class Setup:
         tables: Sequence[StiffnessTable],
         settings: CalibrationSettings,
     ) -> Setup:
-        """Setup of a robot, with base and sensors where its file has them."""
+        """Create the setup of a robot, with base and sensors placed as its file says."""
         given = description.recordings or Recordings()
         places: dict[str, tuple[float | None, Placement]] = {
             "tip": (None, given.registration.tip_in_sensor)
@@ -193,13 +193,13 @@ class Setup:
 
     @property
     def is_fine(self) -> bool:
-        """Whether every log has rows so close that a dead time can be told from a lag."""
+        """Whether all logs are sampled finely enough to distinguish a dead time from a lag."""
         steps = [float(np.median(np.diff(recording.time))) for recording in self.recordings]
         return max(steps, default=0.0) <= 1.01 * SAMPLING.dead_time_step
 
     @property
     def tolerances(self) -> Tolerances:
-        """How well the robot file is known."""
+        """Prior uncertainty of the robot file's numbers."""
         return self.description.tolerances or Tolerances()
 
     @property
@@ -208,7 +208,7 @@ class Setup:
         return begins(self.recordings, self.span, self.settings.sequence)
 
     def samples(self, rows: int) -> list[Sample]:
-        """At most so many rows of all recordings, each with its share."""
+        """Return samples of the recordings, about `rows` rows in all, shared by their lengths."""
         if any(self.description.gravity):
             rows = min(rows, SAMPLING.loaded_fit_rows)
         total = sum(len(recording.time) for recording in self.recordings)
@@ -219,7 +219,7 @@ class Setup:
         return found
 
     def problem(self, structure: ModelStructure, rows: int) -> CalibrationProblem:
-        """The problem of fitting a structure to so many rows."""
+        """Return the problem of fitting a model structure to about `rows` rows."""
         description = structure.applied(self.description, self.seen, self.is_fine)
         samples = self.oriented(description, self.samples(rows))
         noise = Noise(START.position_noise * description.length, START.angle_noise)
@@ -247,7 +247,7 @@ class Setup:
     def beginnings(
         self, description: RobotDescription, samples: Sequence[Sample]
     ) -> tuple[Beginnings, Beginnings]:
-        """Unknown zero of each recording's positions, and unknown sides of the plays then."""
+        """Return each recording's unknown zero of positions and unknown initial sides of plays."""
         plays = any(segment.history and segment.history.play for segment in description.segments)
         zeros, sides = [], []
         for each in samples:
@@ -259,7 +259,10 @@ class Setup:
         return tuple(zeros), tuple(sides)
 
     def oriented(self, description: RobotDescription, samples: Sequence[Sample]) -> list[Sample]:
-        """Turn bodies whose markers look alike after quarter turns to what a model predicts."""
+        """Resolve the rotation of the cube that each track may share, by a model's prediction.
+
+        See `stiffopt.identify.tracker_faults`.
+        """
         if not any(point.turns for point in self.points):
             return list(samples)
         nothing: Beginnings = ((),)
@@ -283,7 +286,11 @@ class Setup:
         return found
 
     def _sensor(self, point: TrackedPoint) -> tuple[Unknown, ...]:
-        """Where a sensor is; of the tip's only if it tells turns, as moves and tilts trade off."""
+        """Return the unknown placement of a sensor.
+
+        That of the tip is fitted only if orientations were recorded: its position and the tilt of
+        the base have nearly the same effect.
+        """
         tolerances = self.tolerances
         if point.name == "tip":
             position, angle = tolerances.sensor_position, tolerances.sensor_angle
@@ -300,7 +307,7 @@ class Setup:
 
 
 def chosen_rows(recording: Recording, most: int) -> Rows:
-    """Rows (M,) to compare: at most so many of those in which the tip was seen, evenly spread."""
+    """Return at most `most` rows (M,) in which the tip was measured, evenly spread."""
     usable = np.flatnonzero(np.isfinite(recording.tracks[0].position).all(axis=1))
     if len(usable) <= most:
         return usable
@@ -309,12 +316,12 @@ def chosen_rows(recording: Recording, most: int) -> Rows:
 
 
 def thinned(recording: Recording, wanted: Rows, span: Array) -> tuple[Recording, Rows]:
-    """Leave out rows that are neither wanted nor needed for the course of the pressures.
+    """Remove rows that are neither wanted nor needed to interpolate the pressures.
 
     Returns
     -------
     recording, rows
-        The latter are where the wanted rows (M,) are now.
+        The shorter recording, and the indices in it of the wanted rows (M,).
     """
     count = len(recording.time)
     kept = np.zeros(count, dtype=bool)
@@ -322,7 +329,7 @@ def thinned(recording: Recording, wanted: Rows, span: Array) -> tuple[Recording,
     kept[0] = kept[-1] = True
     p = recording.pressures / span
     gap = SAMPLING.longest_gap
-    open_rows = np.ones(count, dtype=bool)  # not yet known to be on a line
+    open_rows = np.ones(count, dtype=bool)  # not yet known to lie on a straight line
     while gap > 1:
         begins = np.arange(0, count - 1, gap)
         ends = np.minimum(begins + gap, count - 1)
@@ -359,13 +366,13 @@ def thinned(recording: Recording, wanted: Rows, span: Array) -> tuple[Recording,
 
 
 def sampled(recording: Recording, rows: Rows, span: Array, begin: Begin) -> Sample:
-    """Sample of some rows (M,) of a recording, thinned elsewhere."""
+    """Return a sample of rows (M,) of a recording, thinned elsewhere."""
     smaller, places = thinned(recording, rows, span)
     return Sample(smaller, places, np.ones(len(places)), begin)
 
 
 def begins(recordings: Sequence[Recording], span: Array, sequence: bool) -> list[Begin]:
-    """Return the state in which each recording begins; in a sequence, as the one before ended."""
+    """Return the kind of state in which each recording begins."""
     found: list[Begin] = []
     for index, recording in enumerate(recordings):
         at_rest = bool((np.abs(recording.before) <= SAMPLING.rest * span).all())
@@ -377,7 +384,7 @@ def begins(recordings: Sequence[Recording], span: Array, sequence: bool) -> list
 
 
 def _turned(rotation: Array, rows: NDArray[np.intp], expected: Array) -> Array:
-    """The version of rotations (N, 3, 3) whose wanted rows are nearest to what is expected."""
+    """Return that of 24 versions of rotations (N, 3, 3) nearest to those expected in `rows`."""
     between = np.swapaxes(expected, 1, 2) @ rotation[rows]
     if not np.isfinite(between).all(axis=(1, 2)).any():
         return rotation

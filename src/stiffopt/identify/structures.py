@@ -1,4 +1,4 @@
-"""Models that calibration may choose from, and the choice of the one that predicts best.
+"""The model structures that calibration compares, and the choice of the one that predicts best.
 
 Models are compared by their errors in logs, or parts of logs, to which they were not fitted.
 """
@@ -28,18 +28,18 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class ModelStructure:
-    """A model that calibration may choose: what is fitted, and which history the segments have.
+    """A model that calibration may choose: the numbers it fits and the history of its segments.
 
     Attributes
     ----------
     name : for reports and the command line.
-    words : what the model has, in words.
-    shape : keys of a segment that are fitted to its equilibria, without indices.
-    lag, falling, play, elongation, memory, creep : whether the history has them; a lag comes with a
-        dead time where the logs are fine enough to tell the two apart, and elongation is play that
-        acts on it alone.
+    words : the model's description, for reports.
+    shape : keys of a segment, without indices, that are fitted and affect its equilibria.
+    lag, falling, play, elongation, memory, creep : which parts the history has. A lag comes with a
+        dead time if the logs are sampled finely enough to distinguish them; `elongation` is play
+        that acts on the mean pressure alone.
     strain_law : of all segments; empty for that of the robot file.
-    as_given : whether the history is that of the robot file.
+    as_given : whether to take the history from the robot file.
     after : names of simpler models; this one is tried only if one of them is the best so far.
     """
 
@@ -63,22 +63,22 @@ class ModelStructure:
 
         Parameters
         ----------
-        description : what it already has of the structure is where the fit begins.
+        description : parts of the structure that it already has keep their values.
         seen : highest recorded pressure, in Pa.
-        fine : whether the logs can tell a dead time from a lag.
+        fine : whether the logs can distinguish a dead time from a lag.
         """
         segments = tuple(self._segment(segment, seen, fine) for segment in description.segments)
         return description.model_copy(update={"segments": segments, "calibration": None})
 
     def is_possible(self, description: RobotDescription) -> bool:
-        """Whether the robot can have this structure: a dead band is for positive pressures."""
+        """Whether the robot can have this structure: a dead band needs pressures above zero."""
         return "corrections.dead_band" not in self.shape or min(description.pressure_min) >= 0
 
     def can_be_told(self, recordings: Sequence[Recording]) -> bool:
-        """Whether recordings can tell what the structure has, whatever its error on them.
+        """Whether the recordings can identify this structure.
 
-        Where pressures move evenly all the time, creep is taken for amplitude, and then predicts
-        other logs worse than no creep would.
+        Creep needs pressures that are held for a while. Where they always move, a fit confuses
+        creep with amplitude, and predicts other logs worse than without it.
         """
         return not self.creep or _held(recordings) > CHOICE.held
 
@@ -88,7 +88,7 @@ class ModelStructure:
             keys = law_class(self.strain_law).Keys
             update |= {"strain_law": self.strain_law, "law": keys() if keys is not None else None}
         given = segment.compensation or Compensation()
-        if not given.modulus_per_pressure:  # a robot file that softens says how
+        if not given.modulus_per_pressure:  # a robot file with softening also names its law
             given = given.model_copy(update={"modulus_law": "exponential"})
         if "compensation.bending_radius" in self.shape:
             radius = given.bending_radius or START.bending_radius * segment.length
@@ -207,13 +207,13 @@ def other_laws(description: RobotDescription) -> list[type[StrainLaw]]:
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A model that was fitted, and its errors in what was held back.
+    """A fitted model with its errors on held-back data.
 
     Attributes
     ----------
     structure : ModelStructure
     fit : to all rows of the trial.
-    held_back : what was held back, by what that was.
+    held_back : results of each fold, by its name.
     """
 
     structure: ModelStructure
@@ -222,21 +222,21 @@ class Candidate:
 
     @property
     def folds(self) -> dict[str, Errors]:
-        """Errors of what was held back, by what that was."""
+        """Errors of each fold, by its name."""
         return {name: each.errors for name, each in self.held_back.items()}
 
     @property
     def score(self) -> float:
-        """Mean error over what was held back, in m."""
+        """Mean error over the folds, in m."""
         return float(np.mean([errors.mean for errors in self.folds.values()]))
 
 
 def best(candidates: Sequence[Candidate]) -> Candidate:
-    """Return the simplest model of those that predict about as well as the best.
+    """Return the simplest model that predicts about as well as the best one.
 
-    About as well means within one standard error of the difference over what was held back, or
-    within the share `ChoiceSettings.no_worse`; of logs and stretches of them as well as of regions
-    of pressure, since errors of the latter are larger and vary more.
+    "About as well" means that the mean error is larger by at most one standard error of the
+    difference over the folds, or by the share `ChoiceSettings.no_worse`. This must hold for the
+    folds in time and, separately, for those in pressure, whose errors are larger and vary more.
 
     Parameters
     ----------
@@ -258,14 +258,14 @@ def _means(candidate: Candidate) -> Array:
 
 
 def _no_worse(means: Array, reference: Array) -> bool:
-    """Whether errors (k,) are about as small as others, as far as can be told."""
+    """Whether errors (k,) are not clearly larger than the reference (k,)."""
     worse = means - reference
     error = float(np.std(worse, ddof=1) / np.sqrt(len(worse))) if len(worse) > 1 else 0.0
     return bool(worse.mean() <= max(error, CHOICE.no_worse * reference.mean()))
 
 
 def _held(recordings: Sequence[Recording]) -> float:
-    """Share of the time in which no pressure had changed for a while."""
+    """Return the share of the time in which no pressure had changed for `CHOICE.held_for`."""
     held = total = 0.0
     for recording in recordings:
         range_of = np.ptp(recording.pressures, axis=0).max() or 1.0

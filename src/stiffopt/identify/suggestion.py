@@ -1,8 +1,8 @@
-"""Which poses to record next, so that a calibrated arm is known best over all its pressures.
+"""Suggest poses to record next, which reduce the calibrated model's uncertainty the most.
 
-Poses are chosen one after another from many candidates, each so that the mean variance of the tip
-over the arm's pressures becomes least (a greedy V-optimal design; Fedorov, Theory of Optimal
-Experiments, 1972).  The variance has the two parts that recordings can change:
+Poses are chosen one after another from many candidates, each to minimise the tip's mean variance
+over the arm's pressures (a greedy V-optimal design; Fedorov, Theory of Optimal Experiments, 1972).
+The variance has two parts that recordings can reduce:
 
 * the errors of the numbers with covariance C and slopes J of the tip, ``trace(J C J')``.  A pose
   with slopes J_c that is read with a covariance R leaves
@@ -33,13 +33,13 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Suggestion:
-    """Poses to record next.
+    """Poses to record next, with their expected benefit.
 
     Attributes
     ----------
     pressures : (m, n), in Pa, the most useful first.
-    before, after : standard deviation of the tip's position that recordings can change, root mean
-        square over the arm's pressures, in m: now, and expected with these poses.
+    before, after : the reducible part of the tip's standard deviation, root mean square over the
+        arm's pressures, in m: now, and expected after these poses are recorded.
     """
 
     pressures: Array
@@ -54,20 +54,20 @@ def suggest_poses(
     high: ArrayLike | None = None,
     is_allowed: Callable[[Array], bool] = lambda pressures: True,
 ) -> Suggestion:
-    """Suggest poses.
+    """Suggest poses to record next.
 
     Parameters
     ----------
     robot : calibrated.
-    count : of the poses.
+    count : number of poses.
     low, high : (n,)
         Limits of pressures in Pa; by default the robot's.
-    is_allowed : says whether pressures (n,) in Pa may be commanded.
+    is_allowed : returns whether pressures (n,), in Pa, may be commanded.
 
     Raises
     ------
     InputError
-        The robot's file does not tell its errors, or nothing is allowed.
+        The robot file has no error model, or too few candidates are allowed.
     """
     calibration = robot.calibration
     if calibration is None or calibration.errors is None:
@@ -84,7 +84,7 @@ def suggest_poses(
 
 
 def _candidates(low: Array, high: Array) -> Array:
-    """Pressures (N, n): each channel alone, all together, and spread evenly over the box."""
+    """Return pressures (N, n): each channel alone, all together, and a Halton set over the box."""
     from scipy.stats.qmc import Halton  # a large library; only fits need it
 
     base = np.clip(0.0, low, high)
@@ -95,7 +95,7 @@ def _candidates(low: Array, high: Array) -> Array:
 
 
 class _Design:
-    """What is known before and after poses are recorded; candidates stand for all pressures too."""
+    """The uncertainty as poses are added; the candidates also represent all the arm's pressures."""
 
     def __init__(
         self,
@@ -111,7 +111,7 @@ class _Design:
         _, self._slopes, self._acting = slopes.at(candidates)
         self._covariance = calibration.covariance
         self._mean = np.mean(np.swapaxes(self._slopes, 1, 2) @ self._slopes, axis=0)
-        # what a variance of a segment's effective pressures does to the tip, (N, segments)
+        # tip variance per variance of a segment's effective pressures, (N, segments)
         squares = (self._acting**2).sum(axis=1)
         ends = np.cumsum([0, *self._channels])
         self._weights = np.add.reduceat(squares, ends[:-1], axis=1)
@@ -125,7 +125,7 @@ class _Design:
         )
 
     def chosen(self, count: int) -> Suggestion:
-        """The best poses, one after another."""
+        """Choose poses greedily."""
         before, chosen = self._deviation(), list[int]()
         for _ in range(count):
             gains = self._gains()
@@ -135,25 +135,25 @@ class _Design:
         return Suggestion(self._candidates[chosen], before, self._deviation())
 
     def _variance(self, distances: Array) -> Array:
-        """Variance of a channel's discrepancy at distances from what was recorded, in Pa^2."""
+        """Return a channel's discrepancy variance in Pa^2 by distance from recorded pressures."""
         known = self._errors
         share = growth(distances, known.reach)
         return np.asarray(known.discrepancy**2 * share + (known.gain * distances) ** 2)
 
     def _reading(self, index: int) -> Array:
-        """Covariance (3, 3) of what a candidate's reading tells of the numbers, in m^2."""
+        """Return the covariance (3, 3), in m^2, of a candidate's reading given the parameters."""
         variance = np.repeat(self._errors.discrepancy**2, self._acting.shape[2])
         own = self._acting[index]
         return np.asarray(self._errors.residual**2 * np.eye(3) + (own * variance) @ own.T)
 
     def _seen(self, index: int) -> tuple[Array, Array]:
-        """A candidate's slopes times covariance (3, k), and the inverse of its reading's (3, 3)."""
+        """Return J C (3, k) of a candidate, and the inverse covariance (3, 3) of its reading."""
         slope = self._slopes[index]
         seen = slope @ self._covariance
         return seen, np.linalg.inv(seen @ slope.T + self._reading(index))
 
     def _gains(self) -> Array:
-        """By how much each candidate would lower the mean variance (N,), in m^2."""
+        """Return by how much each candidate (N,) would lower the mean variance, in m^2."""
         now = self._variance(self._distances)
         found = np.zeros(len(self._candidates))
         for index in range(len(self._candidates)):
@@ -164,12 +164,12 @@ class _Design:
         return found
 
     def _record(self, index: int) -> None:
-        """Take a candidate as recorded."""
+        """Update the uncertainty as if a candidate had been recorded."""
         seen, inverse = self._seen(index)
         self._covariance = self._covariance - seen.T @ inverse @ seen
         self._distances = np.minimum(self._distances, self._between[index])
 
     def _deviation(self) -> float:
-        """Root mean square (over all pressures) of the tip's standard deviation, in m."""
+        """Return the tip's standard deviation in m, root mean square over all pressures."""
         discrepancy = np.mean((self._weights * self._variance(self._distances)).sum(axis=1))
         return float(np.sqrt(np.trace(self._mean @ self._covariance) + discrepancy))

@@ -1,4 +1,4 @@
-"""Readings of a tracker that cannot be right: gaps, repeats, jumps and flipped orientations.
+"""Find a tracker's faulty readings: gaps, repeats, jumps and flipped orientations.
 
 A tracker may lose a body for some rows, repeat its last reading, or report a body elsewhere for a
 moment. Where the markers of a body look alike after quarter turns, it may also report the body
@@ -30,7 +30,7 @@ _CHUNK = 1 << 16  # rows whose flips are looked for at a time, to save memory
 
 
 def whole(values: Array) -> Rows:
-    """Say in which rows (N,) of (N, m) no number is missing; fast where there are few columns."""
+    """Return which rows (N,) of (N, m) have no missing number; fast if m is small."""
     return np.asarray(np.isfinite(np.einsum("ij->i", values)))
 
 
@@ -40,7 +40,7 @@ def norms(values: Array) -> Array:
 
 
 def repeats(tracked: Sequence[Array]) -> Rows:
-    """Say in which rows (N,) all arrays (N, m) repeat the row before, number for number."""
+    """Return in which rows (N,) all arrays (N, m) repeat the row before exactly."""
     same = np.ones(len(tracked[0]) - 1, dtype=bool)
     known = np.zeros_like(same)
     for values in tracked:
@@ -52,7 +52,7 @@ def repeats(tracked: Sequence[Array]) -> Rows:
 
 
 def dropouts(position: Array, length: float) -> Rows:
-    """Say which positions (N, 3) are zeros that stand for none, or farther than any arm gets.
+    """Return which positions (N, 3) are zeros that mean "missing", or impossibly far away.
 
     Parameters
     ----------
@@ -78,18 +78,18 @@ def roughness(time: Array, position: Array) -> Array:
 
 
 def jumps(time: Array, position: Array, reach: Array, length: float) -> Rows:
-    """Say in which rows (N,) a position is away for a moment from where the body was.
+    """Return in which rows (N,) a position jumps away for a moment and comes back.
 
-    It must be away from the straight lines that the rows before, the rows after and both of them
-    together lay through it, by several ordinary steps of that time of the recording, and by more
-    than the pressures may have moved it. So the answer to a step of pressure is none, and the
-    first and the last row never are.
+    A jump lies off three straight lines: those extrapolated from the rows before and from the rows
+    after, and that between them. It is several times the usual step at that time, and more than
+    the pressures can have moved the tip. So neither the response to a step of pressure nor the
+    first or last row counts as a jump.
 
     Parameters
     ----------
     time : (N,), in s.
-    position : (N, 3), in m; NaN where it is not to be used.
-    reach : (N,), how far changes of pressure until then may have moved the tip altogether, in m.
+    position : (N, 3), in m; NaN in rows that must not be used.
+    reach : (N,), longest way in m that the pressures so far can have moved the tip; increasing.
     length : of the arm, in m.
     """
     bad = np.zeros(len(time), dtype=bool)
@@ -116,7 +116,7 @@ def jumps(time: Array, position: Array, reach: Array, length: float) -> Rows:
 def _away(
     time: Array, position: Array, reach: Array, count: int, least: float, pause: float
 ) -> NDArray[np.int_]:
-    """Return the first row of each run of `count` rows that is away from both its neighbours."""
+    """Return the first row of each run of `count` rows that jumps away from both neighbours."""
     last = len(time) - 1
     step = norms(np.diff(position, axis=0))
     some = 1 - 1 / TRACKER.jump_factor  # of `least`: no run that is found starts or ends with less
@@ -148,7 +148,7 @@ def _away(
 
 
 def _slope(time: Array, position: Array, a: NDArray[np.int_], b: NDArray[np.int_]) -> Array:
-    """Velocities (K, 3) between rows; none where they are the same row."""
+    """Velocities (K, 3) between rows a and b; zero where they are the same row."""
     between = time[b] - time[a]
     safe = np.where(between > 0, between, 1.0)
     return np.asarray((position[b] - position[a]) / safe[:, None])
@@ -181,9 +181,9 @@ class Unflipped:
 
     Attributes
     ----------
-    quaternion : (N, 4); NaN where there is none to be used.
-    flips : rows in which the reported orientation jumps, counted from 0.
-    stray : rows (N,) that agree with none of their neighbours, however they are turned.
+    quaternion : (N, 4); NaN in rows that must not be used.
+    flips : indices of the rows at which the reported orientation jumps.
+    stray : (N,), rows that agree with no neighbour under any of the 24 rotations.
     """
 
     quaternion: Array
@@ -192,11 +192,11 @@ class Unflipped:
 
 
 def unflipped(quaternion: Array, position: Array, length: float) -> Unflipped:
-    """Undo jumps about a body's own axes.
+    """Undo flips of orientation about a body's own axes.
 
-    Each row is turned so that it is nearest to the one before; no row is turned as far as the
-    body's motion may explain the difference. Of the 24 results the one is taken that changes the
-    fewest rows. Some rows between two jumps to which no turn fits are strays.
+    Each row gets the rotation of the cube that brings it nearest to the row before, unless the
+    body's motion can explain the difference. One rotation common to all rows stays undetermined;
+    the result is the one that changes the fewest rows. Short runs that no rotation fits are strays.
 
     Parameters
     ----------
@@ -227,7 +227,7 @@ def unflipped(quaternion: Array, position: Array, length: float) -> Unflipped:
 
 
 def aligned(track_rotation: Array, reference: Array) -> Array:
-    """Return the one of the 24 versions of a whole track that is nearest to a reference.
+    """Return that one of a track's 24 versions ``track_rotation @ g`` nearest to a reference.
 
     Parameters
     ----------
@@ -246,7 +246,7 @@ def aligned(track_rotation: Array, reference: Array) -> Array:
 
 
 def unit_quaternions(quaternion: Array) -> Array:
-    """Return quaternions (N, 4) at length 1; NaN where they are missing or none, such as zeros."""
+    """Normalise quaternions (N, 4); NaN where missing or far from unit length, such as zeros."""
     size = norms(quaternion)
     with np.errstate(invalid="ignore"):
         size = np.where((size > 0.5) & (size < 2.0), size, np.nan)
@@ -254,7 +254,7 @@ def unit_quaternions(quaternion: Array) -> Array:
 
 
 def rotations(quaternion: Array) -> Array:
-    """Return rotations (N, 3, 3) of unit quaternions (N, 4)."""
+    """Return rotation matrices (N, 3, 3) of unit quaternions (N, 4)."""
     w, x, y, z = quaternion.T
     xx, yy, zz = 2 * x * x, 2 * y * y, 2 * z * z
     xy, xz, yz, wx, wy, wz = 2 * x * y, 2 * x * z, 2 * y * z, 2 * w * x, 2 * w * y, 2 * w * z
@@ -273,7 +273,7 @@ def mean_rotation(rotation: Array) -> Array:
 
 
 def _allowance(before: Array, after: Array, length: float) -> Array:
-    """Angle (N,) in rad by which bodies may have turned that have moved from here to there."""
+    """Return the angles (N,), in rad, that bodies can have turned while moving between rows."""
     way = norms(after - before)
     return np.asarray(TRACKER.turn_agrees + TRACKER.turn_moving * np.nan_to_num(way) / length)
 
@@ -281,7 +281,10 @@ def _allowance(before: Array, after: Array, length: float) -> Array:
 def _links(
     before: Array, after: Array, allowed: Array
 ) -> tuple[NDArray[np.int_], NDArray[np.bool_]]:
-    """Return which turn (N,) of `after` is nearest to `before`, and where even that is too far."""
+    """Return which rotation (N,) of the cube brings `after` nearest to `before`.
+
+    The second result is true where even then the angle exceeds the allowed one.
+    """
     turn = np.zeros(len(before), dtype=int)
     off = np.zeros(len(before), dtype=bool)
     alike = np.cos(np.minimum(allowed, np.pi) / 2)
@@ -289,7 +292,7 @@ def _links(
     for start in range(0, len(jump), _CHUNK):
         part = jump[start : start + _CHUNK]
         between = _product(before[part] * [1, -1, -1, -1], after[part])
-        # the real part of `between g` says how far `after g` is like `before`
+        # the real part of `between g` is cos(angle / 2) between `after g` and `before`
         like = np.abs(between @ (CUBE * [1, -1, -1, -1]).T)  # (chunk, 24)
         turn[part] = np.argmax(like, axis=1)
         off[part] = np.max(like, axis=1) < alike[part]
@@ -297,7 +300,7 @@ def _links(
 
 
 def _alone(q: Array, p: Array, length: float) -> NDArray[np.bool_]:
-    """Say which rows (N,) fit neither neighbour, though these fit each other."""
+    """Return which rows (N,) fit neither neighbour although the neighbours fit each other."""
     _, off = _links(q[:-1], q[1:], _allowance(p[:-1], p[1:], length))
     alone = np.zeros(len(q), dtype=bool)
     between = np.flatnonzero(off[:-1] & off[1:]) + 1
@@ -308,7 +311,7 @@ def _alone(q: Array, p: Array, length: float) -> NDArray[np.bool_]:
 
 
 def _accumulated(turn: NDArray[np.int_]) -> NDArray[np.int_]:
-    """Versions (N + 1,) of rows, of which the first is as it is, by the turns (N,) between them."""
+    """Accumulate rotations (N,) between rows into versions (N + 1,); the first row is unchanged."""
     version = np.zeros(len(turn) + 1, dtype=int)
     changes = np.flatnonzero(turn).tolist()
     now = 0
@@ -321,7 +324,7 @@ def _accumulated(turn: NDArray[np.int_]) -> NDArray[np.int_]:
 def _join(
     q: Array, p: Array, version: NDArray[np.int_], bounds: NDArray[np.int_], length: float
 ) -> NDArray[np.bool_]:
-    """Turn each piece of a track as a whole to fit its neighbour, from the longest one outwards.
+    """Rotate each piece of a track as a whole to fit its neighbour, from the longest outwards.
 
     It changes `version` and returns the rows of short pieces that fit nowhere.
     """

@@ -1,7 +1,7 @@
 """The unknowns of a calibration: numbers of the robot, poses of the tracker, states of the arm.
 
-Every unknown has a coordinate that is zero at the value of the robot file, and a prior standard
-deviation.  The fit works in *scaled* coordinates, in which that deviation is one.
+Each unknown has a coordinate, which is zero at the robot file's value, and a prior standard
+deviation.  The fit works in *scaled* coordinates: coordinates divided by that deviation.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ class Unknown:
 
     Attributes
     ----------
-    name : what people call it.
+    name : in reports.
     unit : SI unit of its coordinate; empty for a ratio or a plain number.
     deviation : prior standard deviation of its coordinate.
     low, high : bounds of its coordinate.
-    parameter : the number of the robot file that it is, or None.
+    parameter : the robot file's number that it stands for, or None.
     """
 
     name: str
@@ -55,9 +55,9 @@ class Unknowns:
     parameters : numbers of the robot file: of the equilibrium, then of the histories.
     base : twist of the base in the tracker's frame, six or none.
     sensors : twists of the sensors, for each tracked point.
-    zeros : shift of each recording's positions, three each or none.
-    sides : for each recording that begins in an unknown state, the side of its plays on which each
-        channel begins.
+    zeros : offset of each recording's positions, three each or none.
+    sides : for each recording that begins in an unknown state, each channel's initial state of
+        hysteresis, see `side_unknowns`; else none.
     """
 
     parameters: tuple[Unknown, ...]
@@ -68,12 +68,12 @@ class Unknowns:
 
     @property
     def all(self) -> tuple[Unknown, ...]:
-        """All of them, in order."""
+        """All unknowns, in order."""
         groups = (self.parameters, self.base, *self.sensors, *self.zeros, *self.sides)
         return tuple(unknown for group in groups for unknown in group)
 
     def slices(self) -> tuple[slice, list[slice], list[slice], list[slice]]:
-        """Where the base's, the sensors', the zeros' and the sides' are among all."""
+        """Slices of `all`: the base's, and those of each sensor, each zero and each side."""
         begin = len(self.parameters)
         found: list[slice] = []
         for group in (self.base, *self.sensors, *self.zeros, *self.sides):
@@ -86,15 +86,15 @@ class Unknowns:
 def shape_unknowns(
     description: RobotDescription, names: Sequence[str], tolerances: Tolerances
 ) -> list[Unknown]:
-    """Unknowns of the equilibrium of all segments.
+    """Return the unknowns of all segments that affect their equilibrium.
 
     Parameters
     ----------
     description : the robot from which the fit begins.
-    names : keys of a segment without indices, such as ``corrections.gain``. Of the material and the
-        compensation those count that the segment's strain law lets be fitted; the law's own numbers
-        come after them.
-    tolerances : how well the robot file is known.
+    names : keys of a segment without indices, such as ``corrections.gain``. Keys of the material
+        and the compensation are skipped unless the segment's strain law can fit them. The law's own
+        fitted numbers are appended.
+    tolerances : prior uncertainty of the robot file's numbers.
     """
     found = []
     for s, segment in enumerate(description.segments):
@@ -111,7 +111,7 @@ def shape_unknowns(
 
 
 def history_unknowns(description: RobotDescription, tolerances: Tolerances) -> list[Unknown]:
-    """Unknowns of the histories that a description has."""
+    """Return the unknowns of the histories that the segments have."""
     found = []
     for s, segment in enumerate(description.segments):
         history = segment.history
@@ -141,7 +141,10 @@ def _of_parameter(
 
 
 def placement_unknowns(name: str, position: Array, angle: Array, turns: bool) -> list[Unknown]:
-    """Unknown twist of a frame from deviations (3,), in m and rad; moves alone if not `turns`."""
+    """Return the unknown twist of a frame; only its translation unless `turns`.
+
+    `position` and `angle` are the prior standard deviations (3,), in m and rad.
+    """
     moves = [
         Unknown(f"{name}, {axis}", "m", float(d)) for axis, d in zip(_AXES, position, strict=True)
     ]
@@ -154,7 +157,7 @@ def placement_unknowns(name: str, position: Array, angle: Array, turns: bool) ->
 
 
 def side_unknowns(description: RobotDescription, name: str) -> list[Unknown]:
-    """On which side of its plays each channel begins, from -1 after a rise to 1 after a fall."""
+    """Return each channel's unknown initial hysteresis: -1 after a rise, 1 after a fall."""
     return [
         Unknown(
             f"{description.channel_name(c)} at the beginning of {name}", "", FIT.side, -1.0, 1.0
@@ -164,5 +167,5 @@ def side_unknowns(description: RobotDescription, name: str) -> list[Unknown]:
 
 
 def zero_unknowns(name: str, tolerances: Tolerances) -> list[Unknown]:
-    """By how much the positions of a recording are shifted."""
+    """Return the unknown offset of a recording's positions."""
     return [Unknown(f"zero of {name}, {axis}", "m", tolerances.zero) for axis in _AXES]

@@ -1,4 +1,4 @@
-"""Validation: how well a robot file predicts logs and measured stiffness."""
+"""Validation: compare a robot file's predictions with logs and measured stiffness."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def validate(
     settings: CalibrationSettings | None = None,
     progress: Callable[[float, float, str], None] | None = None,
 ) -> tuple[Comparison, ...]:
-    """Run a robot along recordings and compare; nothing of the robot is fitted.
+    """Predict recordings with a robot as it is, and compare.
 
     Parameters
     ----------
@@ -53,16 +53,16 @@ def validate(
     logs : sequence of path, Log or (name, Log)
         In the order in which they were recorded.
     settings : CalibrationSettings, optional
-        How logs are read; what is fitted has no effect here.
+        How logs are read; settings of the fit have no effect.
     progress : callable, optional
-        Is told what is done, of how much, and in words.
+        Called with the work done, the total and a description.
 
     Raises
     ------
     InputError
-        A log is not usable; it names the log.
+        A log is not usable; the message names it.
     FileError
-        A file cannot be read or is wrong.
+        A file cannot be read or is invalid.
     """
     description, settings = description_of(robot), settings or CalibrationSettings()
     if progress is not None:
@@ -78,7 +78,7 @@ def validate(
 
 
 def _with_frames_found(setup: Setup, found: tuple[Comparison, ...]) -> tuple[Comparison, ...]:
-    """Comparisons with each log moved as a whole that is far off only because of its frame."""
+    """Return comparisons in which logs that are off only by their frame are moved to fit."""
     recordings = list(setup.recordings)
     length, words = setup.description.length, [""] * len(recordings)
     for i, each in enumerate(found):
@@ -106,13 +106,13 @@ def compare(
     known: Mapping[str, float] | None = None,
     tell: Callable[[], None] = lambda: None,
 ) -> tuple[Comparison, ...]:
-    """Run the robot of a setup along its recordings.
+    """Predict the recordings of a setup and compare.
 
     Parameters
     ----------
     setup : Setup
-    known : scaled coordinates of zeros and states by name, where a fit has found them already.
-    tell : is called at every evaluation.
+    known : scaled coordinates of zeros and initial states by name, as far as a fit has found them.
+    tell : called at every evaluation.
     """
     description, recordings = setup.description, setup.recordings
     most = setup.settings.compared_rows if any(description.gravity) else SAMPLING.rows
@@ -137,7 +137,7 @@ def compare(
 def _beginnings(
     setup: Setup, samples: Sequence[Sample], known: Mapping[str, float], tell: Callable[[], None]
 ) -> tuple[Unknowns, Array]:
-    """Zeros and states of the recordings, as known or as estimated from their beginnings."""
+    """Return zeros and initial states, known or estimated from the logs' beginnings."""
     all_zeros, all_sides = setup.beginnings(setup.description, samples)
     sensors: Beginnings = ((),) * len(setup.points)
     found_zeros, found_sides = [np.zeros(0)], [np.zeros(0)]
@@ -166,7 +166,7 @@ def _beginnings(
 
 
 def _noise(description: RobotDescription) -> Noise:
-    """Noise of readings about the prediction, as the calibration left it."""
+    """Return the spread of readings about the prediction that the calibration found."""
     known = description.calibration
     if known is None or not known.position_residual:
         return NOISE
@@ -181,7 +181,7 @@ def _comparison(
     predicted: Predicted,
     own: slice,
 ) -> Comparison:
-    """A recording's rows, which are some of those of a sample, and what was predicted for them."""
+    """Compare rows of a recording with their predictions, the rows `own` of all samples."""
     description, tip = setup.description, setup.points[0]
     angle = None
     track = sample.recording.track(tip.name)
@@ -217,9 +217,9 @@ def _comparison(
 def _levels(
     setup: Setup, pressures: Array, effective: Array, errors: Array, moving: NDArray[np.bool_]
 ) -> tuple[Array, Array] | None:
-    """Probabilities (N,) of the regions that hold the measured tip, with and without its history.
+    """Return the levels (N,) of the regions that contain the measured tip, see `Comparison`.
 
-    `errors` (N, 3) are those of the prediction with its history, in the frame of the recordings.
+    `errors` (N, 3) are those of the prediction with history, in the frame of the recordings.
     """
     calibration = setup.description.calibration
     if calibration is None or calibration.errors is None:
@@ -253,8 +253,8 @@ class StiffnessComparison:
     boundary : ``free``, ``guided`` or ``clamped``.
     measured : in N/m.
     sigma : its standard uncertainty, in N/m.
-    before, after : predictions of the robot file before and after calibration, in N/m; None where
-        the model has no equilibrium.
+    before, after : predictions before and after calibration, in N/m; None where the model has no
+        equilibrium.
     """
 
     pressures: tuple[float, ...]
@@ -269,7 +269,7 @@ class StiffnessComparison:
 def compare_stiffness(
     tables: Sequence[StiffnessTable], before: RobotDescription, after: RobotDescription
 ) -> list[StiffnessComparison]:
-    """Compare all rows of tables in which a stiffness was measured."""
+    """Compare each measured stiffness of the tables with the predictions of two robots."""
     arms = [Manipulator(before), Manipulator(after)]
     found = []
     for table in tables:
