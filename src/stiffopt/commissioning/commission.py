@@ -1,4 +1,4 @@
-"""Commission a rig: move it, explain what was seen, and put it on record."""
+"""Commission a rig: move it, compare its responses with the model, and write the record."""
 
 from __future__ import annotations
 
@@ -35,19 +35,21 @@ from stiffopt.commissioning.responses import Responses, responses_of
 from stiffopt.experiments.folder import Progress
 from stiffopt.rig.interface import Rig
 
-_DIGITS = 6  # significant ones, of what is written
+_DIGITS = 6  # significant digits in the record
 
 
 @dataclass(frozen=True, eq=False)
 class Commissioning:
-    """A commissioning and what it found.
+    """The result of a commissioning.
 
     Attributes
     ----------
-    expected, readings, responses, explanation : what the model expects, all that was seen, what
-        was made of it, and the causes that explain it.
-    findings : what does not fit first.
-    quick : whether no step was held for long.
+    expected : the model's predictions.
+    readings : all measurements.
+    responses : their evaluation, step by step.
+    explanation : the wiring and the causes that explain the responses best.
+    findings : those that prevent arming first.
+    quick : whether the steps were held only briefly.
     """
 
     expected: ExpectedSteps
@@ -74,7 +76,7 @@ def commission(
     progress: Progress = lambda done, total, text: None,
     check: Callable[[], None] = lambda: None,
 ) -> Commissioning:
-    """Move the channels of a rig one by one and find what does not fit its files.
+    """Move the channels of a rig one by one and find where the rig deviates from its files.
 
     Parameters
     ----------
@@ -87,16 +89,16 @@ def commission(
     rate : float
         Rate of the commands, in Hz.
     quick : bool
-        Under a minute for six channels; slow leaks are not seen then.
+        Hold the steps only briefly: under a minute for six channels, but slow leaks go unnoticed.
     frequency : float, optional
-        Of the tip's swing by the model, in Hz; None: it has none.
+        Of the tip's swing according to the model, in Hz; None if the model predicts none.
     progress, check : callable
         As in `stiffopt.experiments.poses.run_poses`.
 
     Raises
     ------
     DangerError
-        The tip moves as none should; whoever has opened the rig closes it, which vents.
+        The tip moves as no sound arm can; the caller must close the rig, which vents it.
     DeviceError
         A device fails.
     """
@@ -114,7 +116,7 @@ def evaluate(
     quick: bool = False,
     frequency: float | None = None,
 ) -> Commissioning:
-    """Find what does not fit in what was seen; see `commission`."""
+    """Evaluate the readings of a commissioning; see `commission`."""
     responses = responses_of(readings)
     explainer = Explainer(expected, responses)
     best = explainer.best()
@@ -126,7 +128,7 @@ def evaluate(
 
 
 def record_of(rig: Rig, found: Commissioning, log: str | None = None) -> CommissioningRecord:
-    """Return the record of a commissioning; `log` is the file of its recording."""
+    """Return the record of a commissioning; `log` is the path of its recording."""
     seen = found.responses
     orientation = found.readings.quaternion
     if orientation is not None:
@@ -163,7 +165,7 @@ def record_of(rig: Rig, found: Commissioning, log: str | None = None) -> Commiss
 
 
 def stopped_record(rig: Rig, reason: str, *, quick: bool) -> CommissioningRecord:
-    """Return the record of a commissioning that danger or a fault ended."""
+    """Return the record of a commissioning that a danger or a fault ended."""
     finding = RecordedFinding(text=f"commissioning was stopped: {reason}", fits=False)
     return CommissioningRecord(**_heading(rig, quick), fits=False, findings=(finding,))
 
@@ -199,7 +201,7 @@ def _channel(found: Commissioning, k: int) -> RecordedChannel:
 
 
 def _numbers(found: Commissioning) -> tuple[RecordedNumber, ...]:
-    """All numbers of the set-up that were estimated, with their deviations."""
+    """Return all estimated numbers of the set-up, with their standard deviations."""
     robot, e = found.expected.description, found.explanation
     names: list[tuple[str, str]] = [("", "")] * len(e.values)
     for part, name, unit in (

@@ -1,4 +1,4 @@
-"""The corrected rig file: what the findings say to change, as data of a rig file."""
+"""Correct a rig file by a commissioning's findings."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ from stiffopt.units import format_quantity
 Array = NDArray[np.float64]
 
 _INPUTS = ("reading", "input")
-"""Keys of a channel in a rig file that say where its gauge is read."""
+"""Keys of a channel in a rig file that name its gauge's input."""
 
 
 def corrections(
     rig: Rig, path: str, best: SetupExplanation, seen: Responses, findings: Sequence[Finding]
 ) -> tuple[dict[str, Any], list[str]]:
-    """Return the data of a corrected rig file, and the keys that were changed.
+    """Return the data of a corrected rig file, and the changed keys.
 
-    Only what does not fit is changed, and only where the rig file has a key for it.
+    Only keys of findings that do not fit are changed.
     """
     data = copy.deepcopy(read_document(path).data)
     wrong = {finding.cause for finding in findings if not finding.fits}
@@ -66,7 +66,7 @@ def corrections(
 
 
 def check_place(out: str | os.PathLike[str], path: str) -> None:
-    """Refuse a place for the corrected file from which the files that it names are not found."""
+    """Raise `FileError` unless `out` is in the folder of `path`, as its relative paths need."""
     if Path(out).resolve().parent != Path(path).resolve().parent:
         raise FileError(out, f"expected a place beside {path}: it names files relative to itself")
 
@@ -79,7 +79,7 @@ def write_corrected(
     Raises
     ------
     FileError
-        It is in another folder, from which the files that it names are not found, or it is wrong.
+        It is in another folder, where its relative paths would be wrong, or it is invalid.
     """
     check_place(out, path)
     comment = [
@@ -91,10 +91,10 @@ def write_corrected(
 
 
 def _rewired(data: dict[str, Any], best: SetupExplanation, seen: Responses) -> list[Any] | None:
-    """Channels of the supply in the order in which they drive the arm's; None: not by the file.
+    """Return the supply's channels in the order in which they drive the arm's channels.
 
-    Where the gauges follow their own commands, a channel's output and input have to go elsewhere
-    together; where they follow as the tip does, only the outputs are crossed.
+    If a gauge follows its own channel's command, the channel's output and input move together;
+    else only the outputs are crossed. None if the rig file cannot express the wiring.
     """
     channels = data.get("supply", {}).get("channels")
     sources = [source[0] if len(source) == 1 else None for source in best.wiring]
@@ -103,7 +103,7 @@ def _rewired(data: dict[str, Any], best: SetupExplanation, seen: Responses) -> l
     ):
         return None
     rewired = copy.deepcopy(channels)
-    own = [not seen.gauge[k, k] < 0.5 for k in range(len(sources))]  # NaN counts as its own
+    own = [not seen.gauge[k, k] < 0.5 for k in range(len(sources))]  # true for NaN
     for k, target in enumerate(sources):
         assert target is not None
         rewired[target] = copy.deepcopy(channels[k])
@@ -114,7 +114,7 @@ def _rewired(data: dict[str, Any], best: SetupExplanation, seen: Responses) -> l
 
 
 def _registered(rig: Rig, best: SetupExplanation, wrong: set[str]) -> Registration | None:
-    """The rig file's registration, corrected by what is wrong with frame and sensor."""
+    """Return the rig file's registration, corrected by the errors of frame and sensor."""
     if rig.tracker is None or rig.settings is None:
         return None
     frame, sensor = np.eye(4), np.eye(4)
@@ -141,7 +141,7 @@ def _registered(rig: Rig, best: SetupExplanation, wrong: set[str]) -> Registrati
 
 
 def _written(placement: Placement) -> dict[str, Any]:
-    """A placement as a rig file has it, rounded to what can be known."""
+    """Return a placement in the form of a rig file, rounded."""
     position = [format_quantity(round(x, 6) + 0.0, "m", "mm") for x in placement.position]
     q = np.round(placement.orientation, 6)
     return {"position": position, "orientation": (q / np.linalg.norm(q)).tolist()}

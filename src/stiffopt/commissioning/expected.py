@@ -1,4 +1,4 @@
-"""What the model expects of small steps from rest, and what its numbers change about that."""
+"""Predict the tip's response to small steps from rest, and its sensitivity to model parameters."""
 
 from __future__ import annotations
 
@@ -21,31 +21,33 @@ from stiffopt.rig.interface import PressureLimits
 
 Array = NDArray[np.float64]
 Source = tuple[int, ...]
-"""Channels (from 0) whose chambers a line fills: one, none, or two that share it."""
+"""Channels (from 0) whose chambers one line fills: one, none, or two that share it."""
 
-_CANTILEVER = 3 / 8  # of a beam's weight has the effect of a weight at its end
+_CANTILEVER = 3 / 8  # share of a beam's weight that, at its end, bends it as far as the whole
 
 
 @dataclass(frozen=True, eq=False)
 class ExpectedSteps:
-    """Poses of the tip at rest and after steps of each channel, and of each pair of channels.
+    """Predicted poses of the tip at rest, and after steps of each channel and pair of channels.
 
-    All in the base's axes and in SI. The numbers of the arm that may be off are, in this order, the
-    force on the tip (3), and as coordinates (see `Parameter`) lengths and moduli of the segments
-    and gains of the channels, k together.
+    All in the base's axes and in SI. The k uncertain numbers of the arm are, in this order, the
+    force on the tip (3), the lengths and the moduli of the segments, and the gains of the channels;
+    all but the force as coordinates (see `Parameter`).
 
     Attributes
     ----------
+    description : the robot.
     size : of the steps, in Pa.
     rest : pose of the tip (4, 4).
     rest_slope : twist (6, k) of the tip at rest per number, in the base's axes.
-    sources : channels of each row of the following.
+    sources : the channels of each of the N steps; the first has none.
     shift, turn : displacement and rotation vector (N, 3) of the tip from rest.
-    shift_slope, turn_slope : what the numbers change about them (N, 3, k).
-    lever : change (N, 3, 3) of the tip's axes: what a sensor's offset adds to the displacement.
+    shift_slope, turn_slope : derivatives (N, 3, k) of these by the numbers.
+    lever : (N, 3, 3), change of the tip's axes; times the sensor's offset on the tip, it is the
+        displacement that this offset adds.
     tilt_force : lateral force on the tip that bends the arm as far as a tilt of the base by 1 rad.
     compliance : displacement of the tip per lateral force.
-    believed : standard deviations (k,) of the numbers.
+    believed : prior standard deviations (k,) of the numbers.
     """
 
     description: RobotDescription
@@ -69,16 +71,16 @@ class ExpectedSteps:
 
     @property
     def farthest(self) -> float:
-        """The most that the tip moves by a step of one channel or of two, in m."""
+        """Largest displacement of the tip in a step of one or two channels, in m."""
         return float(np.linalg.norm(self.shift, axis=1).max())
 
     def row(self, source: Source) -> int:
-        """Row of the steps of these channels."""
+        """Return the row of the step of these channels."""
         return self.sources.index(source)
 
 
 def expected_steps(description: RobotDescription, limits: PressureLimits) -> ExpectedSteps:
-    """Choose the size of the steps and compute what they do.
+    """Choose the size of the steps and predict their effect.
 
     Raises
     ------
@@ -112,7 +114,7 @@ def expected_steps(description: RobotDescription, limits: PressureLimits) -> Exp
     per_force = turned @ body[:, :3] @ rotation[0].T  # (6, 3), base axes
     relative = rotation @ rotation[0].T
     weight, compliance = _tip_weight(description), float(np.trace(per_force[:2, :2])) / 2
-    still = np.zeros((len(poses), 3, 3))  # what a force changes about steps is left out
+    still = np.zeros((len(poses), 3, 3))  # neglects the effect of a force on the steps
     return ExpectedSteps(
         description=description,
         size=size,
@@ -136,19 +138,19 @@ def expected_steps(description: RobotDescription, limits: PressureLimits) -> Exp
 
 
 def _size(arm: ParametricArm, as_drawn: Array, zero: Array, limits: PressureLimits) -> float:
-    """Size of the steps, in Pa: what moves the tip enough by the channel that moves it most."""
+    """Return the step, in Pa, at which the most effective channel moves the tip far enough."""
     room = float((limits.high - zero).min())
-    most = PROCEDURE.share * room
-    if not most > 0:
+    largest = PROCEDURE.share * room
+    if not largest > 0:
         raise InputError("the limits leave no pressure for a step; raise safety.max_pressure")
-    tried = zero + np.vstack([np.zeros_like(zero), most * np.eye(len(zero))])
+    tried = zero + np.vstack([np.zeros_like(zero), largest * np.eye(len(zero))])
     tips = arm.poses(tried, as_drawn).transforms[:, :3, 3]
     farthest = float(np.linalg.norm(tips[1:] - tips[0], axis=1).max())
-    return float(min(most, most * PROCEDURE.motion / max(farthest, 1e-9)))
+    return float(min(largest, largest * PROCEDURE.motion / max(farthest, 1e-9)))
 
 
 def _acting_share(description: RobotDescription) -> Array:
-    """Share (n,) of a step's pressure that acts at its end: play and creep take the rest."""
+    """Return the share (n,) of a step that is effective at its end, after play and creep."""
     places = [(s, c) for s in description.segments for c in range(s.n_channels)]
     if not any(segment.history for segment, _ in places):
         return np.ones(len(places))
@@ -158,7 +160,7 @@ def _acting_share(description: RobotDescription) -> Array:
 
 
 def _tip_weight(description: RobotDescription) -> float:
-    """Weight at the tip, in N, that gravity's sideways part moves the tip by as the whole arm's."""
+    """Return the weight at the tip, in N, that under a tilt moves it as far as the arm's weight."""
     mass = description.tip_mass
     for segment in description.segments:
         density = segment.material.density or 0.0
@@ -167,7 +169,7 @@ def _tip_weight(description: RobotDescription) -> float:
 
 
 def _believed(description: RobotDescription, parameters: Sequence[Parameter]) -> Array:
-    """Standard deviations of the parameters: those of a calibration, if it knows better."""
+    """Return prior standard deviations of the parameters; smaller ones after a calibration."""
     usual = {"length": BELIEF.length, "youngs_modulus": BELIEF.modulus, "gain": BELIEF.gain}
     fitted = {} if description.calibration is None else {
         each.key: each.deviation for each in description.calibration.parameters
@@ -180,7 +182,7 @@ def _believed(description: RobotDescription, parameters: Sequence[Parameter]) ->
 
 
 def rotation_vectors(rotations: Array) -> Array:
-    """Rotation vectors (..., 3) of one or N rotations (..., 3, 3) by less than a half turn."""
+    """Return rotation vectors (..., 3) of rotations (..., 3, 3) by less than a half turn."""
     from scipy.spatial.transform import Rotation
 
     return np.asarray(Rotation.from_matrix(rotations).as_rotvec())

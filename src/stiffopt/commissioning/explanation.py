@@ -1,17 +1,18 @@
-"""Which causes explain what the tip did: a Bayesian comparison of small and large deviations.
+"""Find the causes that explain the tip's responses, by Bayesian comparison of hypotheses.
 
-With F = (R, t) the error of the tracker's frame in the base, s and S the error of the sensor's
-place and axes on the tip, and a the numbers of the arm that may be off (`ExpectedSteps`), a tracker
-sees the tip at rest, and its displacement d and rotation vector w in step k, at::
+Let (R, t) be the error of the tracker's frame in the base, s and S the errors of the sensor's
+position and axes on the tip, and a the uncertain numbers of the arm (`ExpectedSteps`). A tracker
+then measures the tip at rest at position p with axes T, and in step k the displacement d_k and the
+rotation vector w_k::
 
     p = R (p_0 + P_0 a + R_0 s) + t          T = R exp(W_0 a) R_0 S
     d_k = R (D_k + D'_k a + L_k s)           w_k = R (W_k + W'_k a)
 
-Everything is believed to be small (`Belief`); that is the ordinary state of a set-up. A *cause* is
-one thing that may be off by much: its prior is wide, in its directions alone. Of the wiring there
-are as many hypotheses as there are arrangements. Each hypothesis has an evidence by Laplace's
-approximation at its most probable values, which Gauss-Newton finds; causes are taken one by one as
-long as the evidence grows clearly.
+In a sound set-up all these unknowns are small; their priors are narrow (`Belief`). A *cause* is one
+possible large error: it widens the prior in its own directions. A hypothesis combines an
+arrangement of the tubes (the wiring) with some causes. Gauss-Newton finds its most probable values,
+and Laplace's approximation there gives its evidence. Causes are added one by one as long as the
+evidence grows clearly.
 """
 
 from __future__ import annotations
@@ -30,18 +31,18 @@ from stiffopt.commissioning.settings import BELIEF, LIMITS
 
 Array = NDArray[np.float64]
 Wiring = tuple[Source, ...]
-"""For each command line the channels whose chambers it fills."""
+"""For each command line, the channels whose chambers it fills."""
 
 TURN, MOVE, SENSOR, SENSOR_TURN = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
-FORCE, NUMBERS = slice(12, 15), 15  # where the force on the tip stands, and what follows
+FORCE, NUMBERS = slice(12, 15), 15  # the force on the tip; the arm's other numbers follow it
 
-_ROUNDS = 3  # of Gauss-Newton
-_MOST_CAUSES = 4
-_SHORTLIST = 3  # arrangements that are explained with further causes
-_PLAUSIBLE = 30.0  # log evidence that further causes may gain for an arrangement
-_KEPT = 8  # arrangements that are looked at closely
-_FEW = 6  # channels of which all orders are tried
-_WIDE = {
+_ITERATIONS = 3  # of Gauss-Newton
+_MAX_CAUSES = 4
+_SHORTLIST = 3  # wirings to which causes are added
+_PLAUSIBLE = 30.0  # log evidence that causes may gain for a wiring
+_KEPT = 8  # wirings, nearest by displacement, whose evidence is computed
+_FEW = 6  # largest number of channels of which all orders are tried
+_WIDE = {  # prior standard deviations of a cause, in rad, m, or relative
     "turn": 1.0,
     "turn about z": 2.0,
     "move": 0.05,
@@ -53,14 +54,14 @@ _WIDE = {
 
 @dataclass(frozen=True, eq=False)
 class Cause:
-    """One thing that may be off by much.
+    """One possible large error of the set-up.
 
     Attributes
     ----------
     name : see `causes_of`.
-    directions : (k, d) in the space of all unknowns; each column is one standard deviation.
-    about : index of the segment or channel, from 0, or -1.
-    prior : logarithm of how likely it is before anything is seen, compared with the others.
+    directions : (k, d), in the space of all unknowns; each column is one prior standard deviation.
+    about : index of the segment or channel concerned, from 0; -1 for the whole set-up.
+    prior : logarithm of its prior probability, relative to other causes.
     """
 
     name: str
@@ -71,14 +72,14 @@ class Cause:
 
 @dataclass(frozen=True, eq=False)
 class SetupExplanation:
-    """What a hypothesis makes of the responses.
+    """A hypothesis with its most probable values and its evidence.
 
     Attributes
     ----------
     wiring, causes : the hypothesis.
-    evidence : logarithm of its probability, but for a constant that all share.
-    values, covariance : of the unknowns (k,) and (k, k); the first three are a rotation vector.
-    missed : displacements (n, 3) that are left unexplained, in m.
+    evidence : logarithm of its probability, up to a constant that all hypotheses share.
+    values, covariance : of the unknowns, (k,) and (k, k); the first three are a rotation vector.
+    missed : unexplained displacements (n, 3), in m.
     """
 
     wiring: Wiring
@@ -90,7 +91,7 @@ class SetupExplanation:
 
 
 def causes_of(expected: ExpectedSteps) -> list[Cause]:
-    """Return all causes: of tracker frame, sensor, load, and of the arm's numbers."""
+    """Return all causes: errors of tracker frame and sensor, a load, and errors of the arm."""
     size = NUMBERS - 3 + len(expected.believed)
     segments, n = expected.description.n_segments, expected.n
 
@@ -124,13 +125,12 @@ def causes_of(expected: ExpectedSteps) -> list[Cause]:
 
 
 class Explainer:
-    """Compares hypotheses about one set of responses.
+    """Compares hypotheses about the responses to one step of each line.
 
     Parameters
     ----------
     expected : ExpectedSteps
     responses : Responses
-        Of one step of each line.
     """
 
     def __init__(self, expected: ExpectedSteps, responses: Responses) -> None:
@@ -149,8 +149,8 @@ class Explainer:
         self._turn_noise = np.ones(expected.n)
         if responses.turn is not None:
             angle = np.linalg.norm(responses.turn, axis=1)
-            most = float(np.linalg.norm(expected.turn, axis=1).max())
-            floor = max(float(angle.max()), 0.3 * most)
+            largest = float(np.linalg.norm(expected.turn, axis=1).max())
+            floor = max(float(angle.max()), 0.3 * largest)
             self._turn_noise = np.sqrt(
                 responses.turn_noise**2
                 + (b.model_share * angle) ** 2
@@ -161,7 +161,7 @@ class Explainer:
     # -- search ---------------------------------------------------------------------------------
 
     def best(self) -> SetupExplanation:
-        """The most probable explanation: the wiring, and the causes that are clear."""
+        """Return the most probable explanation: a wiring and the causes that are clear."""
         found = sorted(self._arranged, key=lambda each: -each.evidence)
         near = [each for each in found if each.evidence > found[0].evidence - _PLAUSIBLE]
         wirings = list(dict.fromkeys(each.wiring for each in near))[:_SHORTLIST]
@@ -169,7 +169,7 @@ class Explainer:
 
     @cached_property
     def _arranged(self) -> list[SetupExplanation]:
-        """Explanations by the wiring, and a turn of the frame, alone."""
+        """Explanations by the wiring alone, or with a turn of the frame."""
         plain = [self.explain(self.ordinary, each) for each in ((), self.causes[1:2])]
         likely = [(self.ordinary, True), *self._likely_wirings()]
         turned = self.causes[:1]
@@ -177,7 +177,7 @@ class Explainer:
 
     def _with_causes(self, wiring: Wiring) -> SetupExplanation:
         best = self.explain(wiring)
-        while len(best.causes) < _MOST_CAUSES:
+        while len(best.causes) < _MAX_CAUSES:
             more = [
                 self.explain(best.wiring, (*best.causes, cause))
                 for cause in self.causes
@@ -190,24 +190,27 @@ class Explainer:
         return best
 
     def rivals(self, best: SetupExplanation, cause: Cause) -> list[tuple[Cause, SetupExplanation]]:
-        """Causes that do as well in the place of one, the best first; it is among them."""
+        """Return causes that explain about as much in place of one, which is among them.
+
+        The best comes first.
+        """
         others = tuple(each for each in best.causes if each is not cause)
-        told = {(each.name, each.about) for each in best.causes}
+        used = {(each.name, each.about) for each in best.causes}
         found = [
             (each, best if each is cause else self.explain(best.wiring, (*others, each)))
             for each in self.causes
-            if each is cause or (each.name, each.about) not in told
+            if each is cause or (each.name, each.about) not in used
         ]
-        # what is likely beforehand is left aside: what was seen has to tell them apart
-        least = max(
+        # without priors: only the measurements may rule out a rival
+        threshold = max(
             best.evidence - cause.prior - LIMITS.same,
             self.explain(best.wiring, others).evidence,
         )
-        near = [p for p in found if p[0] is cause or p[1].evidence - p[0].prior > least]
+        near = [p for p in found if p[0] is cause or p[1].evidence - p[0].prior > threshold]
         return sorted(near, key=lambda pair: -pair[1].evidence)
 
     def wiring_rivals(self, best: SetupExplanation) -> list[SetupExplanation]:
-        """Explanations by another wiring, or by none and a turn, that do as well as the best."""
+        """Return the explanations with another wiring that are about as probable as the best."""
         found = list(self._arranged)
         if best.causes:
             found += [self.explain(each, best.causes) for each in {f.wiring for f in found}]
@@ -219,7 +222,7 @@ class Explainer:
         return sorted(near.values(), key=lambda each: -each.evidence)
 
     def _likely_wirings(self) -> Iterator[tuple[Wiring, bool]]:
-        """Arrangements that come nearest to the displacements, and whether a turn helped."""
+        """Yield wirings that match the displacements best, and whether with a turn of the frame."""
         candidates = [each for each in set(self._wirings()) if each != self.ordinary]
         rows = np.array([[self._expected.row(s) for s in each] for each in candidates])
         expected, seen = self._expected.shift[rows], self._seen.shift  # (M, n, 3), (n, 3)
@@ -240,7 +243,10 @@ class Explainer:
                 yield candidates[index], is_turned
 
     def _wirings(self) -> Iterator[Wiring]:
-        """Orders of the tubes, of few channels all, else exchanges; dead and shared lines."""
+        """Yield possible wirings: other orders of the tubes, dead lines and shared lines.
+
+        All orders if there are few channels; else two channels or whole segments exchanged.
+        """
         n, plain = self._expected.n, self.ordinary
         orders: set[tuple[int, ...]] = set()
         if n <= _FEW:
@@ -268,7 +274,7 @@ class Explainer:
     # -- one hypothesis -------------------------------------------------------------------------
 
     def explain(self, wiring: Wiring, causes: Sequence[Cause] = ()) -> SetupExplanation:
-        """Most probable values of the unknowns under a hypothesis, and its evidence."""
+        """Find the most probable values of the unknowns under a hypothesis, and its evidence."""
         prior = np.diag(self._believed**2)
         for cause in causes:
             prior = prior + cause.directions @ cause.directions.T
@@ -277,7 +283,7 @@ class Explainer:
         values = np.zeros(len(self._believed))
         if any(cause.name.startswith("frame") and cause.name != "frame moved" for cause in causes):
             values[TURN] = self._first_turn(rows)
-        for _ in range(_ROUNDS):
+        for _ in range(_ITERATIONS):
             misses, slopes = self._misses(rows, values)
             precision = slopes.T @ slopes + weight
             step: Array = np.asarray(
@@ -296,16 +302,16 @@ class Explainer:
         return SetupExplanation(wiring, tuple(causes), evidence, values, covariance, missed)
 
     def _first_turn(self, rows: Sequence[int]) -> Array:
-        """Rotation vector that takes the expected displacements to those that were seen."""
+        """Return the rotation vector that best turns the expected to the seen displacements."""
         expected, seen = self._expected.shift[rows], self._seen.shift
-        if self._seen.turn is not None:  # rotations of a lever of 0.1 m count as much
+        if self._seen.turn is not None:  # weight rotations as displacements of a 0.1 m lever
             expected = np.vstack([expected, 0.1 * self._expected.turn[rows]])
             seen = np.vstack([seen, 0.1 * self._seen.turn])
         u, _, vt = np.linalg.svd(seen.T @ expected)
         return rotation_vectors(u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt)
 
     def _misses(self, rows: Sequence[int], values: Array) -> tuple[Array, Array]:
-        """What is seen less what is expected, over its deviation, and slopes of the latter."""
+        """Return seen minus expected, in deviations, and the expected values' derivatives."""
         e, seen = self._expected, self._seen
         turn, numbers, sensor = _rotation(values[TURN]), values[FORCE.start :], values[SENSOR]
         shift = (e.shift[rows] + e.shift_slope[rows] @ numbers + e.lever[rows] @ sensor) @ turn.T
@@ -347,7 +353,7 @@ def _with(wiring: Wiring, changes: dict[int, Source]) -> Wiring:
 
 
 def _log_prior(wiring: Wiring) -> float:
-    """Logarithm of how likely an arrangement is."""
+    """Return the log prior of a wiring."""
     odd = [source for k, source in enumerate(wiring) if source != (k,)]
     lines = [source for source in odd if len(source) != 1]
     moved = len(odd) - len(lines)
@@ -356,7 +362,7 @@ def _log_prior(wiring: Wiring) -> float:
 
 
 def _hats(vectors: Array) -> Array:
-    """Matrices (N, 3, 3) of the cross products with vectors (N, 3)."""
+    """Return the cross-product matrices (N, 3, 3) of vectors (N, 3)."""
     found = np.zeros((len(vectors), 3, 3))
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
         found[:, i, j], found[:, j, i] = -vectors[:, k], vectors[:, k]

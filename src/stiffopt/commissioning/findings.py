@@ -1,4 +1,4 @@
-"""What was found, in words: what is wrong with a rig, how sure that is, and what to change."""
+"""Describe a commissioning's findings: what is wrong, how certain it is, and what to change."""
 
 from __future__ import annotations
 
@@ -49,12 +49,12 @@ _TELLS = {
     "modulus from gain",
     "gain": "put another gauge on that channel's tube",
 }
-_WORST = 3.0  # standard deviations, that a number must be away from what the files say
+_WORST = 3.0  # standard deviations from the files' value from which a number does not fit
 
 
 @dataclass(frozen=True)
 class Finding:
-    """Something that was found; see `stiffopt.commissioning.record.RecordedFinding`.
+    """A finding; see `stiffopt.commissioning.record.RecordedFinding` for the other fields.
 
     Attributes
     ----------
@@ -76,14 +76,14 @@ def findings_of(
     best: SetupExplanation,
     frequency: float | None = None,
 ) -> list[Finding]:
-    """Return all findings, what does not fit first.
+    """Return all findings; those that prevent arming come first.
 
     Parameters
     ----------
     rig : Rig
-        Its settings are what the findings are compared with.
-    expected, seen, explainer, best : what the model expects, what was seen, and what explains it.
-    frequency : of the swing by the model, in Hz; None: it has none.
+        Its settings are compared with the measurements.
+    expected, seen, explainer, best : prediction, measurement and its explanation.
+    frequency : of the swing according to the model, in Hz; None if the model predicts none.
     """
     control = ControlSettings() if rig.settings is None else rig.settings.control
     found = [
@@ -134,7 +134,7 @@ def _wiring(
 
 
 def wiring_words(wiring: Wiring) -> str:
-    """What is wrong with the tubes; empty for nothing."""
+    """Describe what is wrong with the tubes; empty if nothing is."""
     dead = [k + 1 for k, source in enumerate(wiring) if source == ()]
     shared = sorted({source for source in wiring if len(source) > 1})
     moved = {k: s[0] for k, s in enumerate(wiring) if len(s) == 1 and s[0] != k}
@@ -192,7 +192,7 @@ def _causes(
 
 
 def _are_one(cause: Cause, other: Cause) -> bool:
-    """Whether both say that the whole arm, or the same segment, responds otherwise."""
+    """Whether both causes mean a different response of the whole arm."""
     names = {cause.name, other.name}
     return cause.about == other.about < 0 and names <= {"gain", "response"}
 
@@ -200,7 +200,7 @@ def _are_one(cause: Cause, other: Cause) -> bool:
 def cause_size(
     cause: Cause, expected: ExpectedSteps, explanation: SetupExplanation
 ) -> tuple[float, float]:
-    """How large a cause is, in units of what no longer fits, and the deviation of that."""
+    """Return the size of a cause, relative to its limit of fitting, and its deviation."""
     v, deviation = explanation.values, np.sqrt(np.diag(explanation.covariance))
 
     def of(part: slice, limit: float) -> tuple[float, float]:
@@ -226,7 +226,7 @@ def cause_size(
 
 
 def _channels(cause: Cause, expected: ExpectedSteps) -> list[int]:
-    """Channels (from 0) that a cause about the arm's numbers concerns."""
+    """Return the channels (from 0) that a cause about the arm concerns."""
     if cause.about < 0:
         return list(range(expected.n))
     if cause.name == "gain":
@@ -237,7 +237,7 @@ def _channels(cause: Cause, expected: ExpectedSteps) -> list[int]:
 
 
 def _ratio(cause: Cause, expected: ExpectedSteps, e: SetupExplanation) -> float:
-    """How far the channels that a cause concerns move the tip, over what the model expects."""
+    """Return the ratio of displacement to the model's, over the channels that a cause concerns."""
     rows = [expected.row((k,)) for k in _channels(cause, expected)]
     expected_way = expected.shift[rows]
     way = expected_way + expected.shift_slope[rows] @ e.values[FORCE.start :]
@@ -246,7 +246,7 @@ def _ratio(cause: Cause, expected: ExpectedSteps, e: SetupExplanation) -> float:
 
 
 def _number(cause: Cause, expected: ExpectedSteps, e: SetupExplanation) -> tuple[float, float]:
-    """Relative change of a length, or of a response, to first order, and its deviation."""
+    """Return the relative change of a length or response, to first order, and its deviation."""
     segments, weights = expected.description.n_segments, np.zeros(len(e.values))
     channels = _channels(cause, expected)
     chosen = range(segments) if cause.about < 0 else [cause.about]
@@ -261,7 +261,7 @@ def _number(cause: Cause, expected: ExpectedSteps, e: SetupExplanation) -> tuple
 
 
 def cause_words(cause: Cause, expected: ExpectedSteps, e: SetupExplanation) -> str:
-    """What is wrong if a cause is, with its number."""
+    """Describe a cause, with its size."""
     v, deviation = e.values, np.sqrt(np.diag(e.covariance))
 
     def turned(part: slice, sign: float) -> str:
@@ -303,7 +303,7 @@ def cause_words(cause: Cause, expected: ExpectedSteps, e: SetupExplanation) -> s
     if cause.name == "length":
         return f"{about} is {100 * value:+.1f} +- {100 * spread:.1f} % longer than its file says"
     moves = f"{about} moves the tip {factor:.2f} times as far as modelled"
-    share = max(1 + value, 0.01)  # of the modelled response, in which the estimate is linear
+    share = max(1 + value, 0.01)  # of the modelled response; the estimate is linear in it
     if cause.name == "gain" and cause.about >= 0:
         return f"{moves}: gain {share:.2f} +- {spread:.2f}"
     return (
@@ -332,7 +332,7 @@ def _about(cause: Cause, expected: ExpectedSteps) -> str:
 
 
 def _axis(axis: Array) -> str:
-    """An axis by its name, with its sign, or as a vector."""
+    """Name an axis with its sign, or write it as a vector."""
     main = int(np.argmax(np.abs(axis)))
     if abs(axis[main]) > 0.96:
         return f"{'-' if axis[main] < 0 else ''}{_AXES[main]}"
@@ -411,7 +411,7 @@ def _gauges(rig: Rig, seen: Responses, wiring: Wiring) -> Iterator[Finding]:
 
 
 def measured_channels(rig: Rig) -> list[bool]:
-    """Whether each channel has a gauge, by the rig file."""
+    """Return whether each channel has a gauge, according to the rig file."""
     n = rig.supply.n
     if rig.settings is None:
         return [False] * n

@@ -1,7 +1,7 @@
-"""Moves an arm that nobody knows yet: one channel after the other, by small steps, from rest.
+"""Move an arm that was never commissioned: one channel after another, by small steps from rest.
 
-The steps go through the conductor, so through the safety gate. They end at the first sign of
-danger: whoever opened the rig closes it, which vents.
+All commands pass the conductor and thus the safety gate. At the first sign of danger the procedure
+raises `DangerError`; the caller then closes the rig, which vents it.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ LOG = "commissioning"
 
 
 class DangerError(DeviceError):
-    """The arm did what no arm of this kind should do; it must be vented."""
+    """The arm moved as no sound arm can; it must be vented."""
 
 
 @dataclass(frozen=True)
 class ChannelStep:
-    """When a channel (from 0) had its first part, its step, its release, and the end; in s."""
+    """Times, in s, of a channel's (from 0) first part of the step, full step, release and end."""
 
     channel: int
     first: float
@@ -44,14 +44,14 @@ class ChannelStep:
 
 @dataclass(frozen=True, eq=False)
 class StepReadings:
-    """All that was seen during the steps, in SI; times are those of the rig's clock.
+    """All measurements during the steps, in SI; times are those of the rig's clock.
 
     Attributes
     ----------
-    time, position, quaternion, age : of the tracker's frames (N,), (N, 3), (N, 4), (N,); the last
-        is the time from capture to arrival. NaN where the tip was not seen.
-    tick, commanded, measured : (M,), (M, n), (M, n).
-    rest : begin and end of the rest.
+    time, position, quaternion, age : of the tracker's frames, (N,), (N, 3), (N, 4), (N,). `age` is
+        the time from capture to arrival. NaN where the tip was not seen.
+    tick, commanded, measured : times (M,), and pressures (M, n).
+    rest : begin and end of the rest before the steps.
     steps : one for each channel.
     size : of the steps, in Pa.
     """
@@ -70,7 +70,7 @@ class StepReadings:
 
 @dataclass
 class _StepWatch:
-    """Keeps all that is seen, and ends the steps when the tip does what it must not."""
+    """Collects all measurements; raises `DangerError` when the tip jumps or moves too far."""
 
     conductor: Conductor
     safety: Safety
@@ -111,7 +111,7 @@ class _StepWatch:
             )
 
     def settle(self, begin: float) -> None:
-        """Take the tip's place at rest for the origin of its motion."""
+        """Set the origin of the motion to the tip's position at rest; check that it is at rest."""
         seen = np.array([f.position for f in self.frames if f.visible and f.time >= begin])
         if len(seen) < 10:
             raise DangerError(
@@ -137,27 +137,27 @@ def run_steps(
     progress: Progress = lambda done, total, text: None,
     check: Callable[[], None] = lambda: None,
 ) -> StepReadings:
-    """Move the channels one after another, and return what was seen.
+    """Move the channels one after another, and return all measurements.
 
     Parameters
     ----------
     rig : Rig
         Open.
     expected : ExpectedSteps
-        What the model expects; it says how large the steps are.
+        The model's predictions; they contain the size of the steps.
     folder : Path
         Gets the recording (log v1, CSV and MCAP).
     rate : float
         Rate of the commands, in Hz.
     quick : bool
-        Whether no step is held long, so that slow leaks are not seen.
+        Whether to hold the steps only briefly; slow leaks then go unnoticed.
     progress, check : callable
         As in `stiffopt.experiments.poses.run_poses`.
 
     Raises
     ------
     DangerError
-        The tip moves as none should.
+        The tip moves as no sound arm can.
     DeviceError
         A device fails.
     """
@@ -167,7 +167,7 @@ def run_steps(
     zero = limits.clamp(np.clip(0.0, limits.low, limits.high))
     conductor.start()
     conductor.watch = watch
-    most = PROCEDURE.danger * expected.farthest + PROCEDURE.slack
+    limit = PROCEDURE.danger * expected.farthest + PROCEDURE.slack
     steps: list[ChannelStep] = []
     with recorded(conductor, folder, LOG, {"experiment": LOG}):
         begin = conductor.clock.now()
@@ -185,7 +185,7 @@ def run_steps(
             ):
                 times.append(conductor.clock.now())
                 p[channel] = zero[channel] + share * expected.size
-                watch.allowed = max(share, PROCEDURE.first) * most if share else most
+                watch.allowed = max(share, PROCEDURE.first) * limit if share else limit
                 _hold(conductor, p, hold)
             first, up, down = times
             steps.append(ChannelStep(channel, first, up, down, conductor.clock.now()))
@@ -208,7 +208,7 @@ def _readings(
     if turns:
         quaternion = np.array([nothing if f.quaternion is None else f.quaternion for f in frames])
         first = next(each for each in quaternion if np.isfinite(each).all())
-        quaternion *= np.where(quaternion @ first < 0, -1.0, 1.0)[:, np.newaxis]  # one sign
+        quaternion *= np.where(quaternion @ first < 0, -1.0, 1.0)[:, np.newaxis]
     return StepReadings(
         time=np.array([frame.time for frame in frames]),
         position=np.array([frame.position for frame in frames]),

@@ -1,7 +1,7 @@
-"""The record of a commissioning, ``format: stiffopt-commissioning/1``: what was found, and when.
+"""The record of a commissioning, ``format: stiffopt-commissioning/1``.
 
-The daemon checks itself against it before it arms: is it recent, of this rig and this robot file,
-did all fit, and is the vented arm still as it was then?
+Before it arms, the daemon checks that the record is recent, that it belongs to this rig and this
+robot file, that the rig fitted, and that the vented arm is still where it was.
 """
 
 from __future__ import annotations
@@ -40,14 +40,14 @@ def _date(value: Any) -> str:
 
 
 class RecordedFinding(Schema):
-    """Something that was found.
+    """One finding.
 
     Attributes
     ----------
-    text : what, as a sentence.
+    text : as a sentence.
     fits : whether the rig may be armed nevertheless.
-    advice : what to do about it, or what would tell its causes apart; may be absent.
-    keys : of the rig file, that it concerns.
+    advice : what to do about it, or how to distinguish its possible causes; may be empty.
+    keys : keys of the rig file that it concerns.
     """
 
     text: Text
@@ -57,12 +57,12 @@ class RecordedFinding(Schema):
 
 
 class RecordedNumber(Schema):
-    """A number of the set-up: how far it is from what the files say, in SI.
+    """A number of the set-up: its deviation from the files, in SI.
 
     Attributes
     ----------
-    name, unit : what it is; the unit is empty for a relative number.
-    value, deviation : the most probable one, and its standard deviation.
+    name, unit : the unit is empty for a relative number.
+    value, deviation : the most probable value and its standard deviation.
     """
 
     name: Text
@@ -72,17 +72,17 @@ class RecordedNumber(Schema):
 
 
 class RecordedChannel(Schema):
-    """How the arm answered to the step of one channel; what was not measured is absent.
+    """The arm's response to the step of one channel; fields that were not measured are absent.
 
     Attributes
     ----------
     drives : channels (from 1) whose chambers it seems to fill.
-    displacement, expected : of the tip in the base frame, measured and modelled.
-    deviation : of each component that was measured.
-    gauge : rise of its gauge over the step.
+    displacement, expected : of the tip in the base frame, measured and predicted.
+    deviation : standard deviation of each measured component.
+    gauge : rise of its gauge, as a share of the step.
     gauge_offset, gauge_noise : of its gauge at rest.
     dead_time, lag_up, lag_down, rate_up, rate_down : of its regulator.
-    drift : share of the displacement that was lost while the pressure was held.
+    drift : share of the displacement that the tip lost while the pressure was held.
     """
 
     drives: Items[Count] = ()
@@ -101,15 +101,15 @@ class RecordedChannel(Schema):
 
 
 class RecordedTracker(Schema):
-    """What the tracker said of the vented arm.
+    """The tracker's readings of the vented arm, and its quality.
 
     Attributes
     ----------
-    position, orientation : of the tip in the base frame; no orientation: it was not tracked.
-    noise, angular_noise : standard deviation of a sample, each axis.
+    position, orientation : of the tip in the base frame; orientation is absent if not tracked.
+    noise, angular_noise : standard deviation of a sample in each axis.
     rate : samples per second.
-    latency : usual age of a sample on arrival.
-    tip_delay : by which the tip follows the gauges, by the tracker's times; absent without gauges.
+    latency : median age of a sample on arrival.
+    tip_delay : of the tip behind the gauges, by the tracker's times; absent without gauges.
     missing : share of the samples that did not see the tip.
     """
 
@@ -128,7 +128,7 @@ class RecordedSwing(Schema):
 
     Attributes
     ----------
-    frequency, damping : of it; the damping is a share of critical damping.
+    frequency, damping : the damping is a share of critical damping.
     frequency_deviation, damping_deviation : standard deviations of these.
     amplitude : the largest, just after a step.
     """
@@ -141,21 +141,21 @@ class RecordedSwing(Schema):
 
 
 class CommissioningRecord(Schema):
-    """What a commissioning found.
+    """The record of a commissioning.
 
     Attributes
     ----------
     date : when it ended, with the time zone.
     rig, robot : their names.
-    rig_hash, robot_hash : of what matters of their files, see `fingerprints`.
-    quick : whether no step was held for long.
+    rig_hash, robot_hash : see `fingerprints`.
+    quick : whether the steps were held only briefly.
     fits : whether the rig may be armed.
-    findings : what is wrong or worth knowing, the worst first.
-    step : size of the steps; absent where danger ended them.
-    tracker, channels, swing : what was measured.
-    numbers : of the set-up, with their deviations.
-    unexplained : root mean square of the displacements that nothing explains.
-    log : file of the recording, relative to this one.
+    findings : those that prevent arming first.
+    step : size of the steps; absent if danger ended them.
+    tracker, channels, swing : measurements.
+    numbers : estimated numbers of the set-up.
+    unexplained : root mean square of the unexplained displacements.
+    log : path of the recording, relative to this file.
     """
 
     date: Annotated[str, BeforeValidator(_date)]
@@ -175,28 +175,28 @@ class CommissioningRecord(Schema):
     log: str | None = None
 
     def age(self, now: datetime | None = None) -> float:
-        """Seconds since it was made."""
+        """Return the seconds since the commissioning ended."""
         return ((now or datetime.now(UTC)) - datetime.fromisoformat(self.date)).total_seconds()
 
 
 def load_record(path: str | os.PathLike[str]) -> CommissioningRecord:
-    """Read a record; `FileError` with the line and the key of the first mistake."""
+    """Read a record; raise `FileError` with line and key of the first mistake."""
     return read_file(path, KIND, CommissioningRecord)
 
 
 def save_record(path: str | os.PathLike[str], record: CommissioningRecord) -> None:
-    """Write a record, whole or not at all."""
+    """Write a record atomically."""
     save_file(path, KIND, record, ("Written by 'stiffopt commission'; the daemon reads it.",))
 
 
 def fingerprints(robot: RobotDescription, rig: Any) -> tuple[str, str]:
-    """Hashes of a rig and its robot: they change with supply, tracker, registration and robot.
+    """Return hashes of a rig (its supply, tracker and registration) and of its robot.
 
     Parameters
     ----------
     robot : RobotDescription
     rig : RigDescription
-        Or None, for a rig that was not made from a file.
+        None for a rig that was not made from a file.
     """
     parts = None if rig is None else [_content(rig.supply), _content(rig.tracker)]
     return _hash(parts), _hash(_content(robot))
@@ -211,15 +211,15 @@ def _hash(content: Any) -> str:
 
 
 def is_record_of(record: CommissioningRecord, robot: RobotDescription, rig: Any) -> bool:
-    """Whether a record is of this very robot, supply, tracker and registration."""
+    """Whether a record belongs to exactly this robot, supply, tracker and registration."""
     return (record.rig_hash, record.robot_hash) == fingerprints(robot, rig)
 
 
 def commissioned_control(rig: Any, robot: RobotDescription) -> ControlSettings:
-    """Return the settings of a rig's control loop, with the swing that commissioning found.
+    """Return a rig's control settings, with frequency and damping of the swing from its record.
 
-    What the rig file itself says of the swing stays, and so does all if there is no record of this
-    very rig that fits.
+    Values given in the rig file take precedence. Without a record of exactly this rig that fits,
+    the settings are unchanged.
 
     Parameters
     ----------
@@ -232,7 +232,7 @@ def commissioned_control(rig: Any, robot: RobotDescription) -> ControlSettings:
         return control
     try:
         record = load_record(path)
-    except InputError:  # of which the check before arming tells
+    except InputError:  # the check before arming reports it
         return control
     if record.swing is None or not record.fits or not is_record_of(record, robot, rig):
         return control
@@ -244,7 +244,7 @@ def commissioned_control(rig: Any, robot: RobotDescription) -> ControlSettings:
 def problems_of_record(
     record: CommissioningRecord, robot: RobotDescription, rig: Any, max_age: float
 ) -> Iterator[str]:
-    """Yield why a record does not permit to arm a rig; max_age is in s."""
+    """Yield the reasons why a record does not permit arming a rig; `max_age` is in s."""
     rig_hash, robot_hash = fingerprints(robot, rig)
     if record.robot_hash != robot_hash:
         yield f"its record is of another robot file ('{record.robot}')"

@@ -1,4 +1,4 @@
-"""What was seen at rest and in each step: poses, gauges, lags, swings and noise."""
+"""Evaluate the readings at rest and in each step: poses, gauges, lags, swing and noise."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from stiffopt.commissioning.timing import Delays, Swing, delays_of, fit_swing, s
 
 Array = NDArray[np.float64]
 
-_BEGIN = 0.25  # s after a step, until regulators have followed
+_BEGIN = 0.25  # s after a step, in which the regulators still follow
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,20 +23,21 @@ class Responses:
     Attributes
     ----------
     rest_position, rest_rotation : of the tip at rest (3,), and (3, 3) or None.
-    rest_noise : deviation of `rest_position`.
-    shift, turn : displacement and rotation vector (n, 3) by each step; no `turn`: None.
-    shift_noise, turn_noise : deviations (n,) of each axis by the tracker's noise.
-    drift : share (n,) of the displacement by which the tip comes back during the hold; NaN where
-        it was not held for long.
-    noise, angular_noise : of a sample of the tracker at rest, each axis.
+    rest_noise : standard deviation of `rest_position` in each axis.
+    shift, turn : displacement and rotation vector (n, 3) in each step; `turn` is None without
+        orientations.
+    shift_noise, turn_noise : their standard deviations (n,) in each axis due to tracker noise.
+    drift : share (n,) of the displacement that the tip lost during the hold; NaN after short holds.
+    noise, angular_noise : standard deviation of the tracker's samples at rest in each axis.
     rate, latency, missing : of the tracker: samples per s, median age on arrival in s, share of
         the samples in which the tip was not seen.
-    gauge_offset, gauge_noise : of each gauge at rest (n,), in Pa; NaN where none reads.
-    gauge : (n, n): by how much gauge j rises when channel k is commanded, over the step.
-    gauge_deviation : of each of these.
+    gauge_offset, gauge_noise : mean and standard deviation of each gauge at rest (n,), in Pa; NaN
+        for a gauge without readings.
+    gauge : (n, n), rise of gauge j (column) in the step of channel k (row), as a share of the step.
+    gauge_deviation : standard deviation of these.
     size : of the steps, in Pa.
     delays : of the regulators, by channel.
-    tip_delay : by which the tip follows the gauges later than they and the arm explain, in s.
+    tip_delay : of the tip behind the gauges, beyond that of the arm's dynamics, in s.
     swing : of the tip, or None.
     """
 
@@ -64,7 +65,7 @@ class Responses:
 
 
 def responses_of(readings: StepReadings) -> Responses:
-    """Evaluate what was seen."""
+    """Evaluate all readings of a commissioning."""
     r = readings
     seen = np.isfinite(r.position).all(axis=1)
     resting = seen & (r.time >= r.rest[0]) & (r.time <= r.rest[1])
@@ -116,19 +117,19 @@ def responses_of(readings: StepReadings) -> Responses:
 
 
 def _still(time: Array, values: Array) -> tuple[Array, float]:
-    """Mean (3,) of what hardly moves, and the deviation of a sample in each axis."""
+    """Return the mean (3,) of readings at rest, and their deviation about a linear drift."""
     slopes = np.polyfit(time - time.mean(), values, 1)[0]
     rest = values - values.mean(axis=0) - np.outer(time - time.mean(), slopes)
     return values.mean(axis=0), float(np.sqrt(np.mean(rest**2)))
 
 
 def _holds(r: StepReadings) -> list[tuple[float, float]]:
-    """Begin and end of all times in which a step or its release was held."""
+    """Return begin and end of each step's hold, and of the rest after it."""
     return [each for step in r.steps for each in ((step.up, step.down), (step.down, step.end))]
 
 
 def _window(r: StepReadings, values: Array, begin: float, end: float) -> tuple[Array, Array]:
-    """Times (m,) since a step, and what was seen (m, c) from when its regulator had followed."""
+    """Return times (m,) since a step, and values (m, c), from when its regulator had followed."""
     rows = (r.time > begin + _BEGIN) & (r.time <= end) & np.isfinite(values).all(axis=1)
     return r.time[rows] - begin, values[rows]
 
@@ -136,7 +137,7 @@ def _window(r: StepReadings, values: Array, begin: float, end: float) -> tuple[A
 def _response(
     r: StepReadings, values: Array, step: ChannelStep, swing: Swing | None
 ) -> tuple[Array, float, int]:
-    """What a step changes (c,), the share of it that comes back in a long hold, and the rows."""
+    """Return the change (c,) by a step, the share lost in a long hold, and the number of rows."""
     since = r.steps[r.steps.index(step) - 1].down if step.channel else r.rest[0] - _BEGIN
     before = settled(*_window(r, values, since, step.first), swing, last=1.5)
     after = settled(*_window(r, values, step.down, step.end), swing, last=1.5)
@@ -152,7 +153,7 @@ def _response(
 
 
 def _gauges(r: StepReadings) -> tuple[Array, Array, Array, float]:
-    """Offsets (n,) and noise (n,) of the gauges, their rise (n, n) in each step, its deviation."""
+    """Return `gauge_offset`, `gauge_noise`, `gauge` and `gauge_deviation` of `Responses`."""
     resting = (r.tick >= r.rest[0]) & (r.tick <= r.rest[1])
     offset, noise = r.measured[resting].mean(axis=0), r.measured[resting].std(axis=0)
     rises, least = [], np.inf
@@ -166,7 +167,7 @@ def _gauges(r: StepReadings) -> tuple[Array, Array, Array, float]:
 
 
 def _rotations(quaternions: Array) -> Array:
-    """Rotations (N, 3, 3) of quaternions (N, 4), w first."""
+    """Return rotations (N, 3, 3) of quaternions (N, 4), w first."""
     from scipy.spatial.transform import Rotation
 
     return np.asarray(Rotation.from_quat(quaternions, scalar_first=True).as_matrix())

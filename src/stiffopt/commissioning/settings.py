@@ -1,4 +1,4 @@
-"""The numbers behind a commissioning: how the arm is moved, what is believed, what does not fit."""
+"""Tuning of a commissioning: the procedure, the priors, and the limits of what fits."""
 
 from __future__ import annotations
 
@@ -13,15 +13,16 @@ class ProcedureTuning:
 
     Attributes
     ----------
-    motion : that the model expects of the channel that moves the tip farthest, in m.
-    share : of a channel's range, that no step exceeds.
-    first : share of the step that comes first, so that danger shows early.
-    rest, first_hold, up, down : times of the rest, of that first part, of the step and of the rest
-        after it, in s.
-    long, long_down : of step and rest in a full commissioning, in which leaks and creep show, in s.
-    danger, slack : the arm is vented where the tip moves by so many times the most that is expected
-        of any channel or pair, and by `slack` in m more.
-    restless : motion of the vented arm, in m, that ends it before it begins.
+    motion : predicted displacement of the tip by the most effective channel, in m.
+    share : largest step, as a share of a channel's range.
+    first : share of the step that is commanded first, to reveal danger early.
+    rest, first_hold, up, down : duration of the initial rest, of the first part of a step, of a
+        step and of the rest after it, in s.
+    long, long_down : duration of a step and of the rest after it in a full commissioning, which
+        reveals leaks and creep, in s.
+    danger, slack : the arm is vented if the tip moves farther than `danger` times the largest
+        prediction for any channel or pair, plus `slack` in m.
+    restless : largest motion of the vented arm, in m, with which the steps may begin.
     """
 
     motion: float = 4e-3
@@ -40,19 +41,19 @@ class ProcedureTuning:
 
 @dataclass(frozen=True)
 class Belief:
-    """What is believed of a set-up before it is seen: standard deviations, in SI.
+    """Priors of a sound set-up: standard deviations, in SI.
 
     Attributes
     ----------
     tilt, turn : of the tracker's frame about the base's x and y, and about its z.
     move : of the tracker's frame.
     sensor, sensor_angle : of the sensor on the tip.
-    base_tilt : of the base against gravity; with the load that has the same effect.
-    sag : displacement of the tip at rest that an unknown load or the arm's own shape causes.
-    length, modulus, gain : of segments and channels, relative; a calibration knows better.
-    model_share, model_floor : of a step's displacement, and of the largest of all, by which the
-        model may miss it beyond all that.
-    rest_position, rest_angle : the same, at rest.
+    base_tilt : of the base against gravity; covers a load of the same effect.
+    sag : displacement of the tip at rest due to an unknown load or the arm's own shape.
+    length, modulus, gain : of segments and channels, relative; less after a calibration.
+    model_share, model_floor : remaining model error, as a share of the step's own displacement and
+        of the largest of all steps.
+    rest_position, rest_angle : remaining model error at rest.
     """
 
     tilt: float = float(np.radians(0.5))
@@ -73,25 +74,26 @@ class Belief:
 
 @dataclass(frozen=True)
 class Limits:
-    """From where on a set-up does not fit, and how clear it must be; in SI.
+    """Limits beyond which a set-up does not fit, and the evidence needed to say so; in SI.
 
     Attributes
     ----------
-    clear : gain in log evidence from which a cause is told.
-    same : causes whose log evidence is so near to the best one's cannot be told apart.
+    clear : smallest gain in log evidence of a cause that is reported.
+    same : causes whose log evidence differs by less cannot be distinguished.
     swapped, lines : log prior of tubes in another order, and of dead or shared ones.
     tilt, turn, move, sensor, sensor_angle : of tracker frame and sensor, as in `Belief`.
-    bend : of the tip at rest, by load or tilt of the base.
-    length, gain, soft, weak : relative, of segments and channels; factors of response.
+    bend : displacement of the tip at rest due to a load or a tilt of the base.
+    length, gain, soft, weak : relative error of a length and of a channel's gain; largest and
+        smallest response of the arm or a segment, as a factor on the model's.
     dead : share of the expected response below which a channel or gauge is dead.
-    gauge, gauge_least : share of a step, and pressure, by which a reading may be off.
-    unexplained : share of a step's displacement that nothing explains.
-    noise : factor on the noise that the rig file has.
-    latency : of the tracker, in s, above what the rig file has.
-    tip_delay : by which the tip may follow the gauges, in s, by the tracker's own times.
-    slower : time by which the regulators may be slower than the rig file has it, in s.
-    frequency : factor between the swing's frequency and the modelled one.
-    drift : share of its displacement that the tip may come back while a pressure is held.
+    gauge, gauge_least : error of a gauge, as a share of a step and in Pa.
+    unexplained : unexplained share of a step's displacement.
+    noise : factor on the tracker's noise in the rig file.
+    latency : excess over the tracker's latency in the rig file, in s.
+    tip_delay : of the tip behind the gauges, by the tracker's own times, in s.
+    slower : excess of the regulators' delay over that in the rig file, in s.
+    frequency : factor between measured and modelled frequency of the swing.
+    drift : share of its displacement that the tip may lose while a pressure is held.
     """
 
     clear: float = 0.5

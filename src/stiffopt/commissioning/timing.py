@@ -1,4 +1,4 @@
-"""When things happen after a step: dead time and lag of the regulators, swings of the tip."""
+"""Estimate dynamics after steps: regulators' dead time and lag, the tip's swing and delay."""
 
 from __future__ import annotations
 
@@ -12,27 +12,27 @@ from stiffopt.commissioning.procedure import StepReadings
 
 Array = NDArray[np.float64]
 
-_CREEP = 1.5  # s, of the slow part of a response
-_FREQUENCIES = np.geomspace(0.4, 12.0, 70)  # Hz, of the search's beginnings
+_CREEP = 1.5  # s, time constant of creep
+_FREQUENCIES = np.geomspace(0.4, 12.0, 70)  # Hz, initial values of the search, as the next three
 _DAMPINGS = (0.02, 0.1)
 _LAGS = (0.01, 0.03, 0.06, 0.12, 0.25, 0.5, 1.0)  # s
 _DEAD_TIMES = (0.0, 0.02, 0.06, 0.15, 0.3)  # s
-_LOOK = 1.5  # s after a step, in which a regulator is looked at
-_FINE = 0.005  # s, at which the tip's delay is looked for
+_LOOK = 1.5  # s after a step, used for the regulator's and the tip's delay
+_FINE = 0.005  # s, resolution of the tip's delay
 _TIP_DELAYS = np.arange(-0.05, 0.6, _FINE)  # s
 _RISE = (0.1, 0.9)  # shares of a step between which its rate is taken
 
 
 @dataclass(frozen=True)
 class Swing:
-    """A damped swing that all steps excite.
+    """The damped swing of the tip that the steps excite.
 
     Attributes
     ----------
     frequency : in Hz.
     damping : share of critical damping.
     amplitude : the largest, just after a step, in m.
-    frequency_deviation, damping_deviation : of these.
+    frequency_deviation, damping_deviation : standard deviations of these.
     """
 
     frequency: float
@@ -44,7 +44,7 @@ class Swing:
 
 @dataclass(frozen=True, eq=False)
 class Delays:
-    """Of the regulators, by their gauges: (n,) each, NaN where nothing was measured.
+    """Delays of the regulators by their gauges, (n,) each; NaN without a measurement.
 
     Attributes
     ----------
@@ -62,11 +62,11 @@ class Delays:
 # -- swings ----------------------------------------------------------------------------------------
 
 
-_SWINGS_FOR = (3.5, 1.2)  # s after a step in which a swing is looked for
+_SWINGS_FOR = (3.5, 1.2)  # s after a step; windows in which a swing is sought
 
 
 def _shapes(time: Array, frequency: float, damping: float) -> Array:
-    """Basis (m, 4): a constant, creep, and a damped swing."""
+    """Return basis functions (m, 4): a constant, creep, and two of a damped swing."""
     omega = 2 * np.pi * frequency
     decay, damped = np.exp(-damping * omega * time), omega * np.sqrt(1 - damping**2)
     return np.stack(
@@ -76,7 +76,7 @@ def _shapes(time: Array, frequency: float, damping: float) -> Array:
 
 
 def fit_swing(windows: Sequence[tuple[Array, Array]], noise: float) -> Swing | None:
-    """Fit one damped swing to what follows each step.
+    """Fit one damped swing to the motions after all steps.
 
     Parameters
     ----------
@@ -85,7 +85,7 @@ def fit_swing(windows: Sequence[tuple[Array, Array]], noise: float) -> Swing | N
 
     Returns
     -------
-    None where no swing stands out of the noise, neither for long nor just after the steps.
+    None if no swing stands out from the noise, in neither a long nor a short window.
     """
     for duration in _SWINGS_FOR:
         used = [(t[t < duration], x[t < duration]) for t, x in windows]
@@ -95,7 +95,7 @@ def fit_swing(windows: Sequence[tuple[Array, Array]], noise: float) -> Swing | N
 
 
 def _fit_swing(used: Sequence[tuple[Array, Array]], noise: float) -> Swing | None:
-    """Fit one damped swing to windows; None where it does not stand out of the noise."""
+    """Fit one damped swing to windows; return None if it does not stand out from the noise."""
     if not used:
         return None
 
@@ -139,7 +139,7 @@ def _fit_swing(used: Sequence[tuple[Array, Array]], noise: float) -> Swing | Non
 
 
 def settled(time: Array, values: Array, swing: Swing | None, *, last: float) -> Array:
-    """Mean (c,) of values (m, c) in the last seconds of a window, without the swing."""
+    """Return the mean (c,) of values (m, c) in the `last` s of a window, without the swing."""
     rows = time > time[-1] - last
     if swing is None or rows.sum() < 12:
         return np.asarray(values[rows].mean(axis=0))
@@ -151,7 +151,7 @@ def settled(time: Array, values: Array, swing: Swing | None, *, last: float) -> 
 
 
 def delays_of(readings: StepReadings) -> Delays:
-    """Fit a dead time and a lag to how the gauge of each channel follows its command."""
+    """Fit a dead time and a lag to the response of each channel's gauge to its command."""
     r = readings
     found = []
     for step in r.steps:
@@ -169,7 +169,7 @@ def delays_of(readings: StepReadings) -> Delays:
 
 
 def _delay(r: StepReadings, channel: int, begin: float, end: float) -> tuple[float, float, float]:
-    """Dead time and lag, in s, and rate, in Pa/s, of a channel after a step."""
+    """Return dead time and lag, in s, and rate, in Pa/s, of a channel after a step."""
     rows = (r.tick > begin - 0.1) & (r.tick <= end)
     time, y = r.tick[rows], r.measured[rows, channel]
     known = np.isfinite(y)
@@ -197,7 +197,7 @@ def _delay(r: StepReadings, channel: int, begin: float, end: float) -> tuple[flo
 
 
 def _followed(time: Array, command: Array, lag: float) -> Array:
-    """Pressure (m,) behind a lag, of commands that hold from each moment to the next."""
+    """Return pressures (m,) behind a lag in s; each command holds until the next."""
     if lag == 0:
         return command
     found = command.copy()
@@ -210,15 +210,15 @@ def _followed(time: Array, command: Array, lag: float) -> Array:
 
 
 def tip_delay(readings: StepReadings, shift: Array, swing: Swing | None) -> float:
-    """How much later than its gauge the tip moves after a step, by the tracker's times, in s.
+    """Estimate the delay in s of the tip behind the gauges, by the tracker's times.
 
-    The tip is a sum of the pressure, its creep and, of an arm that swings, the response of a damped
-    oscillator to it, all later by the same time. NaN without gauges.
+    The tip's motion is regressed on the measured pressure, its creep and, if the arm swings, the
+    response of a damped oscillator to it, all delayed by the same time. NaN without gauges.
 
     Parameters
     ----------
     readings : StepReadings
-    shift : displacements (n, 3) by the steps.
+    shift : displacements (n, 3) in the steps, in m.
     swing : of the tip, or None.
     """
     r, total = readings, np.zeros(len(_TIP_DELAYS))
@@ -246,7 +246,7 @@ def tip_delay(readings: StepReadings, shift: Array, swing: Swing | None) -> floa
 
 
 def _oscillator(driven: Array, swing: Swing) -> Array:
-    """Response (m,) of a damped oscillator at rest to what drives it, in steps of `_FINE`."""
+    """Return the response (m,) of a damped oscillator to an input, in steps of `_FINE`."""
     omega, damping = 2 * np.pi * swing.frequency, swing.damping
     found, speed = np.full_like(driven, driven[0]), 0.0
     for i in range(1, len(driven)):
