@@ -1,1 +1,1 @@
-"""Paths that the tip follows, and motions from one configuration to another."""
+"""Plan paths that the tip follows, and motions from one configuration to another."""

@@ -1,8 +1,8 @@
-"""Candidates: local optima at each point of a path, as many of its branches as are seen.
+"""Find candidates: local optima of the stiffness at each point of a path.
 
-At some points (knots) local optima are looked for from samples near the target; each is followed
-from point to point, forwards and backwards.  A branch ends where its optimum vanishes: the search
-next to it then leads to another branch, or to none.
+At some points (knots), local searches start from samples near the target.  Each optimum is followed
+from point to point, forwards and backwards, which traces a branch.  A branch ends where its optimum
+vanishes: the local search then finds another branch, or nothing.
 """
 
 import itertools
@@ -19,13 +19,13 @@ Vector = NDArray[np.float64]
 
 
 def candidates(tasks: PathTasks) -> tuple[list[list[PathCandidate]], int]:
-    """Distinct candidates at each point, the best first, and how many starts were tried."""
+    """Return distinct candidates at each point, the best first, and the number of starts."""
     count = len(tasks)
     n_knots = CANDIDATES.knots if tasks.is_compiled else CANDIDATES.general_knots
     knots = np.unique(np.linspace(0, count - 1, min(count, n_knots)).round().astype(int)).tolist()
     at_knots, starts = _at_knots(tasks, knots)
     found: list[list[PathCandidate]] = []
-    new: list[list[PathCandidate]] = []  # those that did not come from the point before
+    new: list[list[PathCandidate]] = []  # not reached from the point before
     live: list[PathCandidate] = []
     for index in range(count):
         came = _next_to(tasks, index, live)
@@ -45,7 +45,7 @@ def _is_one_of(candidate: PathCandidate, some: Iterable[PathCandidate]) -> bool:
 
 
 def distinct(tasks: PathTasks, some: Iterable[PathCandidate]) -> list[PathCandidate]:
-    """Those of some candidates that are unlike each other, the first of each; the best first."""
+    """Return candidates without near duplicates, the best first, at most `kept` of them."""
     kept: list[PathCandidate] = []
     tolerance = CANDIDATES.same * tasks.unit
     for each in some:
@@ -56,11 +56,11 @@ def distinct(tasks: PathTasks, some: Iterable[PathCandidate]) -> list[PathCandid
 
 
 def lanes(tasks: PathTasks) -> list[list[PathCandidate]]:
-    """Further candidates at each point of a free arm: any pressures that solve the task there.
+    """Return further candidates at each point of a free arm, which need not be optimal.
 
-    Some are spread over all that reach the target at a few points, and follow the path from there
-    with as little change as possible, from one mark to the next.  A way from branch to branch
-    leads over them where the direct one does not stay on the path.
+    At a few points, configurations are spread over all that reach the target.  From there they
+    follow the path, from mark to mark, with as little change as possible.  They connect branches
+    where the direct crossing would leave the path.
     """
     count = len(tasks)
     if tasks.robot.is_loaded:
@@ -94,9 +94,9 @@ def lanes(tasks: PathTasks) -> list[list[PathCandidate]]:
 
 
 def _spread(tasks: PathTasks, live: Vector, new: Vector) -> Vector:
-    """Pressures (k, n) that differ, and new ones that are far from all of them, the furthest first.
+    """Return at most `LANES.kept` distinct pressures (k, n): of `live`, then of `new`.
 
-    There are at most `LANES.kept` then.
+    New ones are farther from all others, and the farthest come first.
     """
     x = np.vstack([live, new]) / tasks.unit
     distance = np.full(len(x), np.inf)
@@ -113,7 +113,7 @@ def _spread(tasks: PathTasks, live: Vector, new: Vector) -> Vector:
 
 
 def _at_knots(tasks: PathTasks, knots: Sequence[int]) -> tuple[dict[int, list[PathCandidate]], int]:
-    """Candidates at some points, from samples near their targets."""
+    """Return candidates at the knots, found from samples near their targets."""
     starts = CANDIDATES.starts_loaded if tasks.robot.is_loaded else CANDIDATES.starts
     if not tasks.is_compiled:
         starts = CANDIDATES.general_starts
@@ -136,7 +136,7 @@ def _at_knots(tasks: PathTasks, knots: Sequence[int]) -> tuple[dict[int, list[Pa
 
 
 def _next_to(tasks: PathTasks, index: int, some: Sequence[PathCandidate]) -> list[PathCandidate]:
-    """Candidates at a point, next to those at its neighbour."""
+    """Return candidates at a point, found from those at its neighbour."""
     checkpoint()
     questions = [Local(index, each.pressures, tasks.lower, tasks.upper) for each in some]
     return [answer for answer in tasks.locals(questions) if answer is not None]

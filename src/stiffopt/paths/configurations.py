@@ -1,4 +1,4 @@
-"""Where a motion may end: pressures as they are given, or configurations that solve a task."""
+"""The ends of a motion: given pressures, or configurations that solve a task."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from stiffopt.optimise.task import Task
 Vector = NDArray[np.float64]
 End = ArrayLike | Task
 
-_LOCAL = 3  # searches from random guesses, for other local optima
-_NEAR = 8  # searches for the best answer near a random guess
-_NEARNESS = 0.4  # of a channel's range, about such a guess
-_ALIKE = 0.02  # of the ranges, by which configurations differ that count as one
+_LOCAL = 3  # number of searches from random guesses, for other local optima
+_NEAR = 8  # number of searches for the best answer near a random guess
+_NEARNESS = 0.4  # half width of the box about such a guess, as a share of a channel's range
+_ALIKE = 0.02  # of the ranges; configurations that differ by less count as one
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Configuration:
     Attributes
     ----------
     pressures : (n,), in Pa.
-    worth : its stiffness as a share of the best known for its task; 1 where nothing is maximised.
+    worth : its stiffness as a share of the best known for its task; 1 if nothing is maximised.
     """
 
     pressures: Vector
@@ -45,7 +45,7 @@ class Unsolved(Exception):  # noqa: N818
 
 
 def several(goal: End | Sequence[End]) -> list[End]:
-    """The goals, of one or of several."""
+    """Return a list of goals, from one goal or several."""
     if isinstance(goal, Task):
         return [goal]
     if isinstance(goal, np.ndarray):
@@ -61,7 +61,7 @@ def several(goal: End | Sequence[End]) -> list[End]:
 
 
 def checked_pressures(name: str, robot: Manipulator, pressures: ArrayLike) -> Vector:
-    """Pressures (n,) within the robot's limits."""
+    """Return pressures (n,), or raise `InputError` if they are outside the robot's limits."""
     p = checked_vector(f"the {name}'s pressures", pressures, robot.n_pressures)
     low, high = robot.pressure_min, robot.pressure_max
     for index in np.flatnonzero((p < low) | (p > high)):
@@ -74,23 +74,24 @@ def checked_pressures(name: str, robot: Manipulator, pressures: ArrayLike) -> Ve
 
 
 class TaskConfigurations:
-    """The configurations that solve a task, as far as they are looked for.
+    """Finds configurations that solve a task.
 
     Parameters
     ----------
     name : of the end, for messages.
     robot : without the task's load.
     task : with the scene and the clearance of the motion.
+    seed : of the searches.
 
     Attributes
     ----------
-    best : the optimum.
-    limits : of the pressures, two (n,).
+    best : the stiffest configuration.
+    limits : lower and upper limits of the pressures, (n,) each.
 
     Raises
     ------
     Unsolved
-        There are none.
+        The task has no solution.
     StoppedError
         The solver failed, or the time is over.
     """
@@ -108,7 +109,7 @@ class TaskConfigurations:
         self._most = min(solution.stiffnesses[: self._maximised], default=None)
 
     def others(self, start: Vector) -> list[Configuration]:
-        """More of them, near the start of a motion and near random guesses."""
+        """Search further configurations, near the start of a motion and near random guesses."""
         low, high = self.limits
         span = high - low
         rng = np.random.default_rng(self._seed)
@@ -133,5 +134,5 @@ class TaskConfigurations:
 
 
 def maximised(task: Task) -> tuple[StiffnessMeasure, ...]:
-    """The directional stiffnesses that a task maximises."""
+    """Return the directional stiffnesses that a task maximises."""
     return task.stiffness.maximise if task.stiffness is not None else ()

@@ -1,4 +1,4 @@
-"""Lines in space by their arc length, and the points of a path on one."""
+"""Curves in space, parametrised by arc length, and the points of a path."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from stiffopt.optimise.target import Target
 
 Vector = NDArray[np.float64]
 
-_SAMPLES = 20_000  # of a spline, for its arc length
-_STRAIGHT = 1e-6  # sine of the angle between two chords up to which three points are on one line
-_ALONG_Z = 1e-6  # sine of a tangent's angle to the base's z axis below which x stands in for it
+_SAMPLES = 20_000  # of a spline, to integrate its arc length
+_STRAIGHT = 1e-6  # sine of the angle between two chords up to which three points are collinear
+_ALONG_Z = 1e-6  # sine of a tangent's angle to the base's z axis below which x replaces z
 
 
 class Curve(ABC):
-    """A line in space, by its arc length from its start.
+    """A curve in space, parametrised by the arc length from its start.
 
     Attributes
     ----------
@@ -31,25 +31,25 @@ class Curve(ABC):
 
     @abstractmethod
     def at(self, lengths: ArrayLike) -> Vector:
-        """Positions (..., 3) in m at arc lengths (...) in m."""
+        """Return positions (..., 3) in m at arc lengths (...) in m."""
 
     @abstractmethod
     def tangents(self, lengths: ArrayLike) -> Vector:
-        """Unit vectors (..., 3) along it there; zero on a polyline that never leaves its start."""
+        """Return unit tangents (..., 3) at arc lengths (...); zero if the curve is a point."""
 
 
 class Polyline(Curve):
     """Straight lines from point to point.
 
-    At a point its tangent halves the angle between the two lines, or is that of the second where
-    it turns right back.
+    At a point, the tangent bisects the directions of the two lines; if the line turns straight
+    back, it is that of the second. Between points, tangents are interpolated.
 
     Parameters
     ----------
     points : (k, 3)
-        In m; some may be the same.
+        In m; some may coincide.
     closed : bool
-        Whether it ends where it begins, and goes on there.
+        Whether it ends where it begins.
     """
 
     def __init__(self, points: Vector, closed: bool = False) -> None:
@@ -78,16 +78,16 @@ class Polyline(Curve):
 
 
 class ArcCurve(Curve):
-    """A part of a circle, or all of it.
+    """An arc of a circle, or a whole circle.
 
     Parameters
     ----------
     centre, start : (3,)
         In m.
     axis : (3,)
-        Unit vector across its plane, about which it turns to the left.
+        Unit normal of its plane; the arc turns about it by the right-hand rule.
     angle : float
-        By which it turns, in rad.
+        Angle of the arc, in rad.
     """
 
     def __init__(self, centre: Vector, start: Vector, axis: Vector, angle: float) -> None:
@@ -108,17 +108,16 @@ class ArcCurve(Curve):
 
 
 class SplineCurve(Curve):
-    """The cubic spline through points, in the lengths of the chords between them.
+    """The cubic spline through points, parametrised by chord lengths.
 
-    Its arc length is integrated by Simpson's rule between many points.
+    Simpson's rule on a fine grid gives the arc length.
 
     Parameters
     ----------
     points : (k, 3)
-        In m, k >= 2, no two in a row the same.
+        In m, k >= 2, neighbours distinct.
     closed : bool
-        Whether the last point is the first, and the spline is periodic; else it is straight at both
-        ends (natural).
+        Whether the last point equals the first and the spline is periodic; else it is natural.
     """
 
     def __init__(self, points: Vector, closed: bool = False) -> None:
@@ -152,10 +151,10 @@ class SplineCurve(Curve):
 
 
 def arc_through(start: Vector, via: Vector, end: Vector) -> ArcCurve | None:
-    """Return the arc from a point over a second to a third one; None if they are on one line.
+    """Return the arc from `start` through `via` to `end`; None if they are collinear.
 
     Its centre is ``start + (|u|^2 v x n + |v|^2 n x u) / (2 |n|^2)`` with ``u = via - start``,
-    ``v = end - start`` and ``n = u x v``, about which it turns.
+    ``v = end - start`` and the axis ``n = u x v``.
     """
     u, v = via - start, end - start
     normal = np.cross(u, v)
@@ -172,8 +171,8 @@ def arc_through(start: Vector, via: Vector, end: Vector) -> ArcCurve | None:
 def path_axes(tangents: Vector) -> Vector:
     """Return the axes of a path in the base frame.
 
-    x is along the tangent, z is the base's z axis made perpendicular to it (where the tangent is
-    along that, the base's x axis), and y = z x x.
+    x is the tangent, z is the base's z axis made perpendicular to it (the base's x axis where the
+    tangent is along z), and y is the cross product of z and x.
 
     Parameters
     ----------
@@ -194,12 +193,12 @@ def path_axes(tangents: Vector) -> Vector:
 
 @dataclass(frozen=True, eq=False)
 class PathPoints:
-    """The points of a path, and the line that they are on.
+    """The points of a path, and its curve.
 
     Attributes
     ----------
     targets : tuple of Target (N,)
-        What is asked at each point; all of the same parts.
+        All prescribe the same components of the pose.
     goals : tuple of StiffnessGoal or None (N,)
         With directions in base or tip axes.
     positions : ndarray (N, 3)
@@ -209,9 +208,9 @@ class PathPoints:
     lengths : ndarray (N,)
         Arc length from the first point, in m.
     times : ndarray (N,) or None
-        In s, from 0; None where the rates decide.
+        In s, from 0; None if the rates decide.
     curve : Curve
-        The line, for what is between the points.
+        The curve through the points.
     """
 
     targets: tuple[Target, ...]
@@ -226,17 +225,17 @@ class PathPoints:
         return len(self.targets)
 
     def at(self, length: ArrayLike) -> Vector:
-        """Position (..., 3) in m of the line at an arc length (...) in m."""
+        """Return positions (..., 3) on the curve, in m, at arc lengths (...) in m."""
         return self.curve.at(length)
 
 
 def _interpolated(lengths: ArrayLike, knots: Vector, rows: Vector) -> Vector:
-    """Rows (k, 3) at knots (k,), interpolated linearly at arc lengths (...)."""
+    """Interpolate rows (k, 3) at knots (k,) linearly at arc lengths (...)."""
     x = np.asarray(lengths, float)
     return np.stack([np.interp(x, knots, column) for column in rows.T], axis=-1)
 
 
 def _unit(vectors: Vector) -> Vector:
-    """Vectors (..., 3) at length 1; zeros stay zeros."""
+    """Normalise vectors (..., 3); zeros stay zeros."""
     sizes = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return vectors / np.where(sizes > 0, sizes, 1.0)

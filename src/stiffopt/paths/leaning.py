@@ -1,8 +1,8 @@
-"""The way into contact: from rest, where the arm is clear of all objects, to a braced equilibrium.
+"""Plan the motion into contact: from rest, clear of all objects, to a braced equilibrium.
 
-All pressures grow together, which is the approach by which equilibria in contact are defined
-(`Manipulator.contact_equilibrium`). The equilibria along the way are followed one from the other,
-so that the motion ends in the wanted one or is refused. Played backwards it lets go.
+All pressures grow in proportion, as in the definition of equilibria in contact
+(`Manipulator.contact_equilibrium`). Each equilibrium along the way is found from the one before. If
+they do not end in the wanted one, the motion is refused. Played backwards, it releases the contact.
 """
 
 from __future__ import annotations
@@ -27,25 +27,25 @@ from stiffopt.paths.configurations import Unsolved
 
 Vector = NDArray[np.float64]
 
-SPEED = 0.02  # m/s, of any part of the body
-FORCE_RATE = 0.1  # N/s, at which the force of a contact grows
-_STATES = 61  # of the way that are looked at
+SPEED = 0.02  # m/s, largest, of any part of the body
+FORCE_RATE = 0.1  # N/s, largest change of a contact's force
+_STATES = 61  # equilibria along the way
 _STATIONS = 41  # of the body
-_SAME = 2e-4  # m, between tips of one equilibrium that was reached on two ways
-_PUSH = 2e-3  # N, of the differences by which forces change with a push at the tip
-_FORGIVEN = 1e-4  # m, by which the body may be nearer to other objects than the clearance
+_SAME = 2e-4  # m; tips that are nearer belong to the same equilibrium
+_PUSH = 2e-3  # N, step of finite differences by a push at the tip
+_FORGIVEN = 1e-4  # m, tolerated lack of clearance from other objects
 
 
 class Hold(NamedTuple):
-    """What the contacts of a braced equilibrium hold, k of them, linear about it.
+    """The k contacts of a braced equilibrium, linearised about it.
 
     Attributes
     ----------
     forces : along the normals (k,), in N.
-    per_pressure : their change with the pressures (k, n), in N/Pa.
-    per_push : their change with a force at the tip (k, 3), in base axes.
-    directions : unit vectors (m, 3), base axes, in which the tip may be pushed.
-    slips : push in each of them by which a contact slips (m,), in N; infinite where none does.
+    per_pressure : their derivatives by pressures (k, n), in N/Pa.
+    per_push : their derivatives by a force at the tip (k, 3), in base axes.
+    directions : unit vectors (m, 3), base axes, of pushes at the tip.
+    slips : push (m,) in each direction at which a contact slips, in N; infinite if none does.
     """
 
     forces: Vector
@@ -62,12 +62,12 @@ class BraceApproach:
     Attributes
     ----------
     times : (k,), in s.
-    pressures : (k, n), in Pa: from none, in proportion.
+    pressures : (k, n), in Pa, growing in proportion from zero.
     tips : of the equilibria on the way, with their Jacobians and compliances.
-    forces : greatest force of a contact (k,), in N.
+    forces : largest force of a contact (k,), in N.
     contacts : at the end.
-    hold : what they hold.
-    free_tip : where the tip would be at the end without contact (3,), in m.
+    hold : their forces and limits at the end.
+    free_tip : position (3,), in m, of the tip at the end pressures without contact.
     """
 
     times: Vector
@@ -82,21 +82,21 @@ class BraceApproach:
 def approach_to(
     robot: Manipulator, solution: PressureSolution, slew: Vector | float = np.inf
 ) -> BraceApproach:
-    """The motion from rest to a braced answer.
+    """Return the motion from rest to a braced solution.
 
     Parameters
     ----------
     robot : Manipulator
     solution : PressureSolution
-        Of a task with a brace, which leans on something.
+        Of a task with a brace; it leans on an object.
     slew : float or (n,)
-        Greatest rates of change, in Pa/s.
+        Largest rates of change, in Pa/s.
 
     Raises
     ------
     Unsolved
-        The way ends in another equilibrium, or presses an object with more than its greatest
-        force, or the body comes too near to another object on it.
+        The way is lost or ends in another equilibrium, presses an object with more than its
+        largest force, or brings the body too near to another object.
     """
     task, p = solution.task, solution.pressures
     assert task.brace is not None
@@ -163,7 +163,7 @@ def _largest(eq: ContactEquilibrium) -> float:
 
 
 def _check_clear(robot: Manipulator, others: Scene, lines: Vector, at: Vector) -> None:
-    """Refuse a way (k, stations, 3) on which the body comes too near to other objects."""
+    """Raise `Unsolved` if on the way (k, stations, 3) the body comes too near to other objects."""
     radii = robot.body_radius(np.zeros(robot.n_pressures), at)
     for item in measured_scene(others, robot.description).items:
         gaps = item.distances(lines.reshape(-1, 3)).values.reshape(lines.shape[:2]) - radii

@@ -1,4 +1,4 @@
-"""`plan_motion`: from one configuration to another, the whole body clear of a scene all the way."""
+"""`plan_motion`: plan a motion between configurations with the whole body clear of a scene."""
 
 from __future__ import annotations
 
@@ -60,51 +60,51 @@ def plan_motion(
 ) -> PathSolution:
     """Find pressures over time from a start to a goal with the body clear of a scene all the way.
 
-    Ways are straight in the space of pressures where that is clear, else found by two trees that
-    grow towards each other (RRTConnect of OMPL); then they are shortened, rounded and timed.  Each
-    piece of what is returned was judged as a whole, not only at points of it (see
-    `stiffopt.model.motion_clearance`): pressures that are interpolated linearly keep the clearance
-    to 0.03 mm.
+    The planner tries the straight way in the space of pressures.  If it is not clear, two trees
+    grow towards each other (RRTConnect of OMPL), and their way is shortened and rounded.  Clearance
+    is checked continuously along each piece, not only at points (see
+    `stiffopt.model.motion_clearance`): linearly interpolated pressures keep it to 0.03 mm.
 
     Parameters
     ----------
     robot : Manipulator
     start : (n,) or Task
-        Pressures in Pa, or a task, whose solution is meant.
+        Pressures in Pa, or a task, which stands for its solution.
     goal : (n,) or Task, or several of them
-        A task means all configurations that solve it: the stiffest, and others.  The stiffest to
-        which the straight way is clear is taken; if there is none, whichever the trees reach.
-        Where that one is softer than 0.95 of the best that is known, as many motions again are
-        tried to reach one that is not.  A single task with a brace that does better to lean: the
-        motion goes to rest first, and from there into contact (`stiffopt.paths.leaning`).
+        A task stands for all configurations that solve it: the stiffest and others.  The motion
+        goes to the stiffest with a clear straight way; if there is none, to whichever the trees
+        reach.  If that one has less than 0.95 of the best known stiffness, the search goes on, for
+        about as long again, towards one that has more.  For a single task with a brace whose answer
+        leans, the motion goes to rest first, and from there into contact
+        (`stiffopt.paths.leaning`).
     scene : Scene, optional
-        Instead of that of the tasks.  Without any, the way is straight.
+        Replaces that of the tasks.  Without any, the way is straight.
     clearance : float, optional
-        To be kept by the body, in m; that of the scene if absent.  A calibrated robot's body keeps
-        as much more as the calibration leaves unknown of the tip (`Manipulator.tip_uncertainty`).
+        Required of the body, in m; by default that of the scene.  For a calibrated robot, the
+        uncertainty of the tip is added (`Manipulator.tip_uncertainty`).
     slew : float or (n,), optional
-        Greatest rates of change in Pa/s; the robot's own hold too, and one of both must be known.
+        Largest rates of change in Pa/s, besides the robot's own; one of the two must be known.
     load : Load, optional
-        At the tip all the way, instead of that of the tasks.
+        At the tip all the way; replaces that of the tasks.
     seed : int
-        Of the search.  The same gives the same motion, unless time ended the search.
+        Of the search.  The same seed gives the same motion, unless time ended the search.
     timeout : float, optional
-        Seconds after which to give up; what is compiled once for a kind of task does not count,
-        nor the search for where to lean.
+        Seconds after which to give up; compiling a kind of task once does not count, nor does the
+        search for where to lean.
     cancel : threading.Event or callable, optional
-        Give up as soon as it is set, or says true; it may be asked by another thread.
+        The search gives up once it is set, or returns true; another thread may call it.
 
     Returns
     -------
     PathSolution
-        "unreachable" where no way was found; the message says what is blocked.
+        With status "unreachable" if no way was found; the message says what blocks it.
 
     Raises
     ------
     InputError
-        An argument is wrong; pressures are outside of the robot's limits; tasks differ in load.
+        An argument is invalid, pressures are outside the robot's limits, or tasks differ in load.
     MissingExtraError
-        The straight way is not clear, and OMPL is not installed.
+        A search is needed, and OMPL is not installed.
     """
     goals = several(goal)
     if any(isinstance(each, Task) and each.brace is not None for each in (start, *goals)):
@@ -139,7 +139,7 @@ def plan_motion(
 def _leaning(
     robot: Manipulator, start: End, goal: Task, slew: Any, options: dict[str, Any]
 ) -> PathSolution:
-    """A motion to a task with a brace: to rest, clear of its scene, and from there into contact."""
+    """Plan a motion to a task with a brace: to rest, clear of the scene, then into contact."""
     found = solve_pressure(robot, goal)
     if found.pressures is None or not found.contacts:  # it keeps clear, or there is no answer
         return plan_motion(robot, start, goal.unbraced, slew=slew, **options)
@@ -196,14 +196,14 @@ class _Planner:
         return found.clear
 
     def is_still_clear(self, rows: Vector) -> bool:
-        """The same, but nothing is clear any more when the time is over."""
+        """Whether the way is clear; false once the time is over."""
         try:
             return self.is_clear(rows)
         except StoppedError:
             return False
 
     def way(self) -> Vector:
-        """A way (k, n) in pressures, or raise `Unsolved` with what is in the way."""
+        """Return a way (k, n) in pressures, or raise `Unsolved` with the reason."""
         begin = perf_counter()
         start = self._start()
         tasks, goals = self._first_goals()
@@ -234,7 +234,7 @@ class _Planner:
         return given
 
     def _first_goals(self) -> tuple[list[TaskConfigurations], list[Configuration]]:
-        """The tasks among the goals that can be solved, and the best of each goal."""
+        """Return the solvable tasks among the goals, and the best configuration of each goal."""
         request = self.request
         tasks, goals, refused = [], [], []
         for number, goal in enumerate(request.goals, start=1):
@@ -260,7 +260,7 @@ class _Planner:
             raise Unsolved(f"{name}: {self._in_the_way(p)}")
 
     def _in_the_way(self, p: Vector) -> str:
-        """Which object is the nearest at pressures, and how it is."""
+        """Describe the nearest object at pressures (n,) and the missing clearance."""
         request = self.request
         assert request.scene is not None
         near = request.robot.clearances(p, request.scene)
@@ -282,7 +282,7 @@ class _Planner:
     def _straight(
         self, start: Vector, goals: list[Configuration]
     ) -> tuple[Vector | None, Configuration | None]:
-        """The straight way to the best goal of those to which it is clear."""
+        """Return the straight way to the best goal for which it is clear."""
         for goal in sorted(goals, key=lambda each: -each.worth):
             way = np.stack([start, goal.pressures])
             if self.is_clear(way):
@@ -292,7 +292,7 @@ class _Planner:
     def _search(
         self, start: Vector, goals: list[Configuration], tasks: list[TaskConfigurations]
     ) -> tuple[Vector, Configuration]:
-        """A way around; see `plan_motion` for which goal."""
+        """Search a way around obstacles; `plan_motion` says to which goal."""
         begin = perf_counter()
         assert self.motions is not None  # or the straight way was clear
         weights = self.motions.bounds.speeds.max(axis=0)[self.motions.piece_of]
@@ -316,7 +316,7 @@ class _Planner:
     def _stiffer(
         self, search: TreeSearch, way: Vector, end: Configuration, stiff: list[Configuration]
     ) -> tuple[Vector, Configuration]:
-        """On to one of the stiff goals, if that is soon found."""
+        """Extend the way to one of the stiff goals, if a short search finds how."""
         further, goal = self._straight(end.pressures, stiff)
         if further is not None and goal is not None:
             return np.concatenate([way, further[1:]]), goal
@@ -329,7 +329,10 @@ class _Planner:
     def _limits(
         self, start: Vector, goals: list[Configuration], tasks: list[TaskConfigurations]
     ) -> tuple[Vector, Vector]:
-        """Limits of the way: those of the tasks, if all goals are tasks, but all ends within."""
+        """Return limits of the way that include its ends.
+
+        They are those of the tasks if all goals are tasks, else the robot's.
+        """
         robot = self.request.robot
         if len(tasks) == len(self.request.goals):
             low = np.min([task.limits[0] for task in tasks], axis=0)
@@ -349,7 +352,7 @@ class _Planner:
     # -- the answer -------------------------------------------------------------------------
 
     def described(self, way: Vector) -> PathSolution:
-        """The motion with its times and all that the model says of it."""
+        """Return the motion along a way, timed and evaluated by the model."""
         begin = perf_counter()
         request = self.request
         robot = request.robot
@@ -395,7 +398,7 @@ class _Planner:
 
 
 def timed(way: Vector, rates: Vector) -> tuple[Vector, Vector]:
-    """Points (N, n) on the way, divided evenly in time, and their times (N,), as soon as can be."""
+    """Return points (N, n) along a way at the highest speed within the rates, and times (N,)."""
     if len(way) < 2 or not np.ptp(way, axis=0).any():
         return way[:1], np.zeros(1)
     least = np.maximum(least_times(way, rates), _LEAST_STEP)
@@ -415,11 +418,11 @@ def _all(goals: Sequence[Configuration]) -> Vector:
 
 
 def _nearest(goals: Sequence[Configuration], p: Vector) -> Configuration:
-    """The goal at pressures (n,), but for rounding."""
+    """Return the goal nearest to pressures (n,)."""
     return min(goals, key=lambda goal: float(np.abs(goal.pressures - p).max()))
 
 
 def _measures(goals: Sequence[Vector | Task]) -> tuple[StiffnessMeasure, ...]:
-    """What the first task among the goals maximises."""
+    """Return the stiffnesses maximised by the first goal that maximises any."""
     tasks = (goal for goal in goals if isinstance(goal, Task))
     return next((found for found in map(maximised, tasks) if found), ())

@@ -1,4 +1,4 @@
-"""Files with a motion, as ``--out`` of `stiffopt path` and `stiffopt plan` writes them."""
+"""Read motions from files that ``--out`` of `stiffopt path` and `stiffopt plan` wrote."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ Vector = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class MotionTable:
-    """Pressures over time.
+    """A motion: pressures over time.
 
     Attributes
     ----------
-    file : where they come from.
-    times : (N,) in s, increasing.
-    pressures : (N, n) in Pa; between two times they change linearly.
-    tips : (N, 3) in m: where the tip is then, in the base frame.
+    file : from which it was read.
+    times : (N,), in s, increasing.
+    pressures : (N, n), in Pa; linear between two times.
+    tips : (N, 3), positions of the tip in the base frame, in m.
     """
 
     file: str
@@ -40,14 +40,14 @@ class MotionTable:
     tips: Vector
 
     def trajectory(self, ranges: Vector, begin: float) -> Trajectory:
-        """What a control loop follows.
+        """Return the trajectory for a control loop.
 
         Parameters
         ----------
         ranges : (n,)
-            Of the pressures, in Pa; see `trajectory_through`.
+            Ranges of the pressures, in Pa; see `trajectory_through`.
         begin :
-            When to be at the first point, in s.
+            Time of the first point, in s.
 
         Raises
         ------
@@ -66,7 +66,7 @@ def read_motion(file: str | os.PathLike[str], description: RobotDescription) -> 
     Raises
     ------
     FileError
-        It cannot be read, is no motion or no whole one, or is of another robot.
+        The file cannot be read, holds no complete motion, or one of another robot.
     """
     name = os.fspath(file)
     if name.lower().endswith(".csv"):

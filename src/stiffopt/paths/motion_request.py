@@ -1,4 +1,4 @@
-"""`MotionRequest`: what is asked of a motion, checked."""
+"""`MotionRequest`: the checked arguments of `plan_motion`."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from stiffopt.paths.solution import PathSolution, Status
 
 Vector = NDArray[np.float64]
 
-_MARGIN_SAMPLES = 12  # pressures at which a calibration is asked for the error
+_MARGIN_SAMPLES = 12  # pressures at which the calibrated uncertainty is evaluated
 
 
 @dataclass(frozen=True)
 class MotionRequest:
-    """What is asked of a motion, checked.
+    """The checked arguments of `plan_motion`.
 
     Attributes
     ----------
-    bare, robot : without and with the load of the motion.
-    margin : of the asked clearance, for what a calibration leaves unknown; None: nothing is known.
+    bare, robot : the robot without and with the load of the motion.
+    margin : clearance added for the calibrated uncertainty, in m; None without a calibration.
     """
 
     bare: Manipulator
@@ -91,18 +91,18 @@ class MotionRequest:
 
     @property
     def asked(self) -> float:
-        """Clearance that is kept by the model's body, in m."""
+        """Clearance required of the model's body, in m, margin included."""
         return self.clearance + (self.margin or 0.0)
 
     def posed(self, task: Task) -> Task:
-        """A task with the load, the scene and the clearance of the motion."""
+        """Return a task with the load, the scene and the clearance of the motion."""
         scene = self.scene
         if scene is not None:
             scene = scene.model_copy(update={"clearance": self.asked})
         return task.model_copy(update={"load": self.load, "press": None, "scene": scene})
 
     def without_answer(self, message: str, status: Status) -> PathSolution:
-        """Solution with nothing but its message."""
+        """Return a solution with a message alone."""
         n = self.robot.n_pressures
         return PathSolution(
             status, message, self.robot, np.empty(0), np.empty((0, n)), np.empty((0, 4, 4)),
@@ -111,7 +111,7 @@ class MotionRequest:
 
 
 def _load_of(tasks: list[Task], load: Load | None) -> Load | None:
-    """The load of the whole motion."""
+    """Return the load of the whole motion; refuse tasks that differ in it."""
     if load is not None:
         if not isinstance(load, Load):
             raise InputError(f"load must be a Load; got {shown(load)}")
@@ -129,7 +129,7 @@ def _checked_clearance(clearance: float) -> float:
 
 
 def _rates(robot: Manipulator, slew: float | ArrayLike | None) -> Vector:
-    """Greatest rates (n,) of the pressures."""
+    """Return the largest rates (n,) of the pressures, in Pa/s."""
     own = None
     if slew is not None:
         try:
@@ -151,7 +151,7 @@ def _rates(robot: Manipulator, slew: float | ArrayLike | None) -> Vector:
 
 
 def _margin(robot: Manipulator) -> float | None:
-    """What a calibration leaves unknown of the tip, in m; the largest over the pressures."""
+    """Return the largest calibrated uncertainty of the tip over sampled pressures, in m."""
     if robot.description.calibration is None:
         return None
 

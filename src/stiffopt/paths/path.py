@@ -1,6 +1,6 @@
-"""`Path`: where the tip goes, how fast, how stiff; the schema of the path file and a class in code.
+"""`Path`: a tip path with its timing and stiffness goal; also the schema of path files.
 
-Everything is in SI. Built in code::
+All values are in SI. Example::
 
     Path(
         path={"line": {"from": (-0.03, -0.02, 0.19), "to": (-0.03, 0.02, 0.19)}},
@@ -46,19 +46,19 @@ from stiffopt.units import Duration, Length, Pressure, Speed
 Vector = NDArray[np.float64]
 
 MAX_POINTS = 5_000
-"""Of a path."""
-_LONGEST = 86_400.0  # s, of a path
-_ROUNDING = 1e-9  # of lengths, relative
+"""Largest number of points of a path."""
+_LONGEST = 86_400.0  # s, longest duration of a path
+_ROUNDING = 1e-9  # relative tolerance of lengths
 
 
 class PathTiming(Schema):
-    """When the tip is at each point; one of these.
+    """The timing of a path; exactly one of these.
 
     Attributes
     ----------
     speed : along the path, in m/s.
     times : at each point, in s; the first is 0.
-    fastest : as soon as the rates of the pressures allow.
+    fastest : as fast as the rates of the pressures allow.
     """
 
     speed: Annotated[Speed, Field(gt=0)] | None = None
@@ -72,12 +72,12 @@ class PathTiming(Schema):
 
 
 class PathMeasure(StiffnessMeasure):
-    """A stiffness along a path.
+    """A stiffness that is maximised along a path.
 
     Attributes
     ----------
-    frame : axes of `direction`: of the base, of the tip, or of the path, see `path_axes`.
-    over : what is maximised of it: its worst value on the path, or its mean.
+    frame : axes of `direction`: those of the base, of the tip, or of the path, see `path_axes`.
+    over : whether to maximise its worst value on the path or its mean.
     """
 
     frame: Literal["base", "tip", "path"] = "base"  # type: ignore[assignment]
@@ -89,18 +89,18 @@ class PathStiffness(Schema):
 
     Attributes
     ----------
-    maximise : at each point the smallest of these counts.
+    maximise : the smallest of these counts at each point.
     """
 
     maximise: OneOrMore[PathMeasure]
 
     @property
     def over(self) -> Literal["worst", "mean"]:
-        """What is maximised: the worst value on the path, or the mean."""
+        """Whether the worst value on the path is maximised, or the mean."""
         return self.maximise[0].over
 
     def goals(self, tangents: Vector) -> tuple[StiffnessGoal, ...]:
-        """Return the goal at each point of a path, whose tangents (N, 3) are given."""
+        """Return the goal at each point of a path with tangents (N, 3)."""
         plain = [
             StiffnessMeasure(
                 direction=m.direction, kind=m.kind, boundary=m.boundary,
@@ -148,7 +148,7 @@ class PathPressure(PressureRange):
 
     Attributes
     ----------
-    slew : greatest rate of change, in Pa/s, or None for the robot's.
+    slew : largest rate of change, in Pa/s; None for the robot's.
     """
 
     slew: PerChannelRate | None = None
@@ -158,25 +158,25 @@ class PathPressure(PressureRange):
 
 
 class Path(ForRobot):
-    """Where an arm's tip goes, how fast and how stiff.
+    """A path of an arm's tip, with timing, tolerances and stiffness goal.
 
     Attributes
     ----------
     robot : name of a built-in robot, or path of a robot file relative to the path file; in code it
         may be left out.
-    path : the line that the tip follows.
-    pointing, orientation : of the tip on all of it, as in a `Target`, or None.
-    count : number of points, both ends counted; in files and as argument ``points``.
-    spacing : largest distance between neighbouring points, in m; either of the two, but for points
-        that are given one by one, of which it is only checked.
-    timing : when the tip is where; None for a CSV file that says it.
+    path : the curve that the tip follows.
+    pointing, orientation : of the tip all along the path, as in a `Target`, or None.
+    count : number of points, both ends included; in files and as argument ``points``.
+    spacing : largest distance between neighbouring points, in m; given instead of `count`. For
+        points that are listed one by one, it is only checked.
+    timing : None for a CSV file with times.
     tolerance : largest errors at each point.
-    stiffness : what is maximised, or None: the least pressures.
-    start, end : pressures there, or None where they are free.
-    closed : whether the path and its pressures end as they begin; of a circle by default.
+    stiffness : stiffness to maximise; None for the least pressures.
+    start, end : pressures at the ends; None where they are free.
+    closed : whether the path and its pressures end as they begin; by default true for a circle.
     load : load at the tip, or None.
     pressure : limits and rates that tighten the robot's.
-    scene : what is around the arm, or None.
+    scene : the objects around the arm, or None.
     source : the file that the path was read from, or None.
     """
 
@@ -206,7 +206,7 @@ class Path(ForRobot):
     __str__ = __repr__
 
     def points(self) -> PathPoints:
-        """Return the points of the path with what is asked at each of them."""
+        """Return the points of the path, with target and stiffness goal of each."""
         curve = self._curve()
         lengths = self._lengths(curve)
         tangents = curve.tangents(lengths)
@@ -227,7 +227,7 @@ class Path(ForRobot):
         )
 
     def task(self, target: Target, goal: StiffnessGoal | None) -> Task:
-        """Return the task that one point of the path is, without its neighbours."""
+        """Return the task of a single point of the path."""
         return Task(
             robot=self.robot, target=target, stiffness=goal, load=self.load, scene=self.scene,
             pressure=PressureRange(min=self.pressure.min, max=self.pressure.max),
@@ -297,7 +297,7 @@ class Path(ForRobot):
         return np.linspace(0.0, curve.length, max(math.ceil(steps) + 1, least))
 
     def _check_listed(self, curve: Polyline) -> None:
-        """Refuse points that are too many, or too far apart."""
+        """Refuse too many listed points, or points too far apart."""
         count = len(curve.knots)
         if self.count is not None:
             raise BadKeyError("points", f"cannot be chosen: path.{self.path.kind} is the points")
@@ -360,7 +360,7 @@ class Path(ForRobot):
         return tuple(first.model_copy(update=change) for change in changes)
 
     def _with_own(self, target: Target, own: Mapping[str, Any]) -> Target:
-        """Return a target of the list with the tolerance and the angular part of the path."""
+        """Return a listed target with the path's tolerance and pointing or orientation."""
         update: dict[str, Any] = {}
         if "tolerance" not in target.model_fields_set:
             update["tolerance"] = self.tolerance
@@ -371,7 +371,7 @@ class Path(ForRobot):
         return target.model_copy(update=update)
 
     def _refuse_own(self, where: str) -> None:
-        """Refuse an angular part beside one of the points."""
+        """Refuse the path's pointing or orientation where the points have their own."""
         for key in ("pointing", "orientation"):
             if getattr(self, key) is not None:
                 raise BadKeyError(key, f"is told by {where} too; remove one of them")

@@ -1,4 +1,7 @@
-"""The tasks at the points of a path, which differ in target and direction alone."""
+"""The tasks at the points of a path, solved and evaluated together.
+
+They differ only in target and stiffness direction.
+"""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -34,8 +37,8 @@ class PathCandidate(NamedTuple):
     pressures : ndarray (n,)
         In Pa.
     value : float
-        Logarithm of the (smallest) stiffness that is maximised; without any, the negative of the
-        mean square pressure.
+        Logarithm of the smallest stiffness that is maximised; if none is, the negative mean square
+        of the relative pressures.
     """
 
     pressures: Vector
@@ -43,7 +46,7 @@ class PathCandidate(NamedTuple):
 
 
 class Local(NamedTuple):
-    """A question for the local optimum at a point, next to a guess and within limits, in Pa."""
+    """A local search at a point, from a guess and within limits, in Pa."""
 
     point: int
     guess: Vector
@@ -59,7 +62,7 @@ class Slopes(NamedTuple):
     residuals, jacobians : ndarray (k, m), (k, m, n)
         Of the terms.
     costs, gradients : ndarray (k, t), (k, t, n)
-        Of what is minimised, the largest first of all: negative logarithms of stiffnesses.
+        Negative logarithms of the stiffnesses; the largest of each point is minimised.
     """
 
     residuals: Vector
@@ -69,7 +72,7 @@ class Slopes(NamedTuple):
 
 
 class PathTasks:
-    """Tasks (at least one) that have the load, the scene and the limits of the first.
+    """The tasks of a path (at least one), with the same load, scene and limits.
 
     Attributes
     ----------
@@ -78,7 +81,7 @@ class PathTasks:
     lower, upper, unit : ndarray (n,)
         Limits, and ranges of the channels, in Pa.
     is_compiled : bool
-        Whether there is machine code for them.
+        Whether they are solved by machine code.
     """
 
     def __init__(self, robot: Manipulator, tasks: Sequence[Task], seed: int) -> None:
@@ -106,14 +109,14 @@ class PathTasks:
 
     @cached_property
     def _parameters(self) -> Vector:
-        """Of the functions at each point."""
+        """Parameters of the compiled functions at each point."""
         return np.array([self.robot.parameters(each.parameters) for each in self.programs])
 
     def __len__(self) -> int:
         return len(self.tasks)
 
     def near(self, index: int, count: int) -> Vector:
-        """Sampled pressures (count, n) whose tips are nearest to the target at a point."""
+        """Return the sampled pressures (count, n) whose tips are nearest to a point's target."""
         table = self._prepared.samples
         distances = table.distances(self.programs[index].terms, self.robot.length)
         near: Vector = table.pressures[table.nearest_first(distances, count)]
@@ -135,7 +138,7 @@ class PathTasks:
         return [PathCandidate(p, value) if value > -np.inf else None for p, value in pairs]
 
     def bests(self, indices: Sequence[int]) -> list[PathCandidate | None]:
-        """Best local optima that a global search finds."""
+        """Return the best candidate that a global search finds at each point, or None."""
         if self._fast is None:
             return [None for _ in indices]
         rows = np.stack([self._row(index) for index in indices])
@@ -143,7 +146,7 @@ class PathTasks:
         return [self._accepted(i, answer) for i, answer in zip(indices, answers, strict=True)]
 
     def _row(self, index: int) -> Vector:
-        """Numbers of the task at a point."""
+        """Return the numbers of a point's task, as machine code expects them."""
         if index not in self._rows:
             assert self._fast is not None
             solver, program = self._fast[0], self.programs[index]
@@ -161,13 +164,13 @@ class PathTasks:
         return PathCandidate(answer.pressures, self.value(index, judgement, answer.pressures))
 
     def value(self, index: int, judgement: Judgement, pressures: Vector) -> float:
-        """What `PathCandidate.value` is at judged pressures."""
+        """Return `PathCandidate.value` of judged pressures."""
         if self.programs[index].measures:
             return float(np.log(min(judgement.stiffnesses)))
         return -float(np.mean((pressures / self.programs[index].reference) ** 2))
 
     def _general(self, question: Local) -> PathCandidate | None:
-        """The same without machine code."""
+        """Search a local optimum without machine code."""
         index = question.point
         problem = PressureProblem(self.robot, self._without_load[index])
         problem.lower, problem.upper = question.lower / self.unit, question.upper / self.unit
@@ -187,9 +190,9 @@ class PathTasks:
     # -- evaluation -------------------------------------------------------------------------
 
     def brought(self, indices: NDArray[np.intp], pressures: Vector) -> tuple[Vector, Mask]:
-        """Pressures (k, n) of a free arm brought to targets near by, each to that of a point.
+        """Move pressures (k, n) of a free arm to nearby targets, each to that of its point.
 
-        Those that arrive, and which (k,) these are.
+        Returns those that arrive, and a mask (k,) of which these are.
         """
         lower, upper = self.lower / self.unit, self.upper / self.unit
         bounding = PressureProblem(self.robot, self._without_load[0]).terms_bounding
@@ -214,7 +217,7 @@ class PathTasks:
         return x[is_at] * self.unit, is_at
 
     def assessed(self, indices: NDArray[np.intp], pressures: Vector) -> list[list[PathCandidate]]:
-        """Candidates at each point, of pressures (k, n) at targets, where the body is clear."""
+        """Return candidates at each point, from pressures (k, n) on target with a clear body."""
         found: list[list[PathCandidate]] = [[] for _ in range(len(self))]
         scene = self.tasks[0].scene
         if scene is not None and len(pressures):
@@ -228,7 +231,7 @@ class PathTasks:
         return found
 
     def judged(self, pressures: Vector) -> list[Judgement | None]:
-        """Judgement by the model of pressures (N, n), one of each point; None: no equilibrium."""
+        """Judge pressures (N, n), one row for each point; None where there is no equilibrium."""
         if self._fast is None:
             return [self.judged_at(index, p) for index, p in enumerate(pressures)]
         solver = self._fast[0]
@@ -241,21 +244,21 @@ class PathTasks:
         return found
 
     def judged_at(self, index: int, pressures: Vector) -> Judgement | None:
-        """The same of one point."""
+        """Judge pressures (n,) at one point; None if there is no equilibrium."""
         try:
             return judge(self.robot, self._without_load[index], pressures)
         except EquilibriumError:
             return None
 
     def candidate(self, index: int, pressures: Vector) -> PathCandidate | None:
-        """The candidate that pressures (n,) are at a point, if they solve its task."""
+        """Return pressures (n,) as a candidate at a point, or None if they miss its task."""
         judgement = self.judged_at(index, pressures)
         if judgement is None or not judgement.holds:
             return None
         return PathCandidate(pressures, self.value(index, judgement, pressures))
 
     def slopes(self, indices: Sequence[int], pressures: Vector) -> Slopes | None:
-        """The tasks at some points, linearised at pressures (k, n); None where one has none."""
+        """Linearise the tasks at some points about pressures (k, n); None without equilibrium."""
         if self.robot.is_loaded:
             parts = [self._loaded(i, p) for i, p in zip(indices, pressures, strict=True)]
             known = [part for part in parts if part is not None]
@@ -273,7 +276,7 @@ class PathTasks:
         )
 
     def _loaded(self, index: int, pressures: Vector) -> tuple[Vector, ...] | None:
-        """`Slopes` at one point of a loaded arm, which stands up from rest; None if it falls."""
+        """Return `Slopes` at one point of a loaded arm; None if it has no equilibrium."""
         program = self.programs[index]
         if self._fast is not None:
             parameters = self.robot.parameters(program.parameters)

@@ -1,4 +1,4 @@
-"""How fast pressures may change, and how long it takes them to get from one point to the next."""
+"""Limits on the rates of pressures, and the step sizes and times that follow from them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Vector = NDArray[np.float64]
 def slew_limits(
     description: RobotDescription, path_slew: float | tuple[float, ...] | None = None
 ) -> Vector | None:
-    """Return the greatest rate of change of each channel.
+    """Return the largest rate of change of each channel.
 
     Parameters
     ----------
@@ -25,7 +25,7 @@ def slew_limits(
     Returns
     -------
     (n,) array or None
-        The smaller of the robot's and the path's, in Pa/s; None if neither says one.
+        The smaller of the robot's and the path's, in Pa/s; None if neither gives one.
     """
     known = [rates for rates in (description.pressure_slew, path_slew) if rates is not None]
     if not known:
@@ -43,7 +43,7 @@ def least_times(pressures: ArrayLike, slew: ArrayLike) -> Vector:
     pressures : (N, n)
         In Pa.
     slew : (n,)
-        Greatest rates, in Pa/s.
+        Largest rates, in Pa/s.
 
     Returns
     -------
@@ -56,7 +56,7 @@ def least_times(pressures: ArrayLike, slew: ArrayLike) -> Vector:
 
 
 def step_limits(times: ArrayLike, slew: ArrayLike) -> Vector:
-    """Return by how much each pressure may change between one time and the next.
+    """Return the largest change of each pressure between consecutive times.
 
     Parameters
     ----------

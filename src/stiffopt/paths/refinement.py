@@ -1,7 +1,7 @@
-"""Joint optimisation of neighbouring points of a path that the rates hold back.
+"""Optimise neighbouring points of a path together where the rates of the pressures bind.
 
-Where no rate binds, each point is at an optimum of its own and nothing can be gained.  Elsewhere
-the pressures x of a window of points are optimised together, by sequential convex programming::
+Where no rate binds, each point is already at its own optimum.  Elsewhere the pressures x of a
+window of points are optimised together, by sequential convex programming::
 
     minimise    max_i e_i + w mean_i e_i                (over the mean: the mean alone)
     subject to  c_i(x_i) <= e_i                         c: logarithms of stiffness, negative
@@ -36,7 +36,7 @@ Entries = tuple[NDArray[Any], NDArray[Any], NDArray[Any]]
 def refined(
     tasks: PathTasks, pressures: Vector, steps: Vector, over: str, fixed: Sequence[int] = ()
 ) -> Vector:
-    """Pressures (N, n) that are better where the rates hold them back.
+    """Return pressures (N, n) that are better where the rates bind.
 
     Parameters
     ----------
@@ -46,7 +46,7 @@ def refined(
     steps : (N - 1, n)
         Largest changes from point to point, in Pa.
     over : "worst" or "mean"
-    fixed : indices of points that stay as they are.
+    fixed : indices of points that must not change.
     """
     for window in _windows(pressures, steps):
         pressures = _Window(tasks, pressures, steps, over, window, set(fixed)).optimised()
@@ -54,7 +54,7 @@ def refined(
 
 
 def _windows(pressures: Vector, steps: Vector) -> list[range]:
-    """Points on both sides of steps that are near the rates, those that overlap together."""
+    """Return windows of points about steps that are near the rates; overlapping ones are joined."""
     near = (np.abs(np.diff(pressures, axis=0)) > REFINEMENT.near * steps).any(axis=1)
     found: list[range] = []
     for index in np.flatnonzero(near).tolist():
@@ -69,7 +69,7 @@ def _windows(pressures: Vector, steps: Vector) -> list[range]:
 
 @dataclass
 class _State:
-    """The points of a window at some pressures.
+    """A window at some pressures, with its linearisation.
 
     Attributes
     ----------
@@ -77,8 +77,8 @@ class _State:
         As shares of the ranges.
     slopes : Slopes
     near, near_slopes : ndarray (k, b), (k, b, n)
-        What one-sided constraints lack, to be at most 0, and their derivatives.
-    merit, excess : what is minimised, and the sum of what constraints lack.
+        Values of one-sided constraints, which must be at most 0, and their derivatives.
+    merit, excess : the merit function, and the sum of the constraints' violations.
     """
 
     x: Vector
@@ -90,7 +90,7 @@ class _State:
 
 
 class _Step(NamedTuple):
-    """Step d (k, n), multipliers of costs (k, t) and residuals (k, m), and the promised gain."""
+    """A step d (k, n), multipliers of costs (k, t) and residuals (k, m), and the predicted gain."""
 
     d: Vector
     weights: Vector
@@ -99,7 +99,7 @@ class _Step(NamedTuple):
 
 
 class _Window:
-    """Some neighbouring points; all others stay as they are."""
+    """Optimises a window of neighbouring points; all others are fixed."""
 
     def __init__(
         self,
@@ -132,7 +132,7 @@ class _Window:
         self._price = REFINEMENT.price
 
     def optimised(self) -> Vector:
-        """All pressures (N, n), those of the window as good as they become."""
+        """Return all pressures (N, n), with those of the window optimised."""
         state = self._state(self._x[self._free.start : self._free.stop])
         if state is None:
             return self._pressures
@@ -167,14 +167,14 @@ class _Window:
 
     @property
     def _weight(self) -> float:
-        """First guess of the multiplier of a cost."""
+        """Initial multiplier of a cost."""
         return (1.0 + REFINEMENT.mean) / len(self._free)
 
     # -- evaluation -----------------------------------------------------------------------------
 
     @staticmethod
     def _bent(state: _State, trial: _State, d: Vector) -> _State:
-        """A state whose linear constraints are true after a step d (second-order correction)."""
+        """Return a state with linear constraints exact at a step d (second-order correction)."""
         bend = np.einsum("kmn,kn->km", state.slopes.jacobians, d)
         residuals = trial.slopes.residuals - bend
         near = trial.near - np.einsum("kbn,kn->kb", state.near_slopes, d)
@@ -198,7 +198,7 @@ class _Window:
         return _State(x, slopes, near, near_slopes, merit + self._price * excess, excess)
 
     def _near(self, slopes: Slopes, pressures: Vector) -> tuple[Vector, Vector]:
-        """Inequalities of terms and clearance of objects, each at most 0, over their scales."""
+        """Return scaled inequalities of terms and clearances, each to be at most 0."""
         k, n = pressures.shape
         values: list[Vector] = []
         derivatives: list[Vector] = []
@@ -216,7 +216,7 @@ class _Window:
         return np.stack(values, axis=1), np.stack(derivatives, axis=1)
 
     def _curvature(self, state: _State, weights: Vector, pulls: Vector) -> Vector:
-        """Convex parts (k, n, n) of the second derivatives of the Lagrangian."""
+        """Return the convex part (k, n, n) of the Lagrangian's second derivatives."""
         k, n = state.x.shape
         h = REFINEMENT.difference
 
@@ -246,7 +246,7 @@ class _Window:
     # -- the convex program ---------------------------------------------------------------------
 
     def _step(self, state: _State, curvature: Vector, radius: float) -> _Step | None:
-        """The step that solves the convex program; None where that fails."""
+        """Solve the convex program for a step; None if that fails."""
         k, n = state.x.shape
         costs = state.slopes.costs
         worst = self._over == "worst"
@@ -323,7 +323,7 @@ class _Window:
         return _Step(d, weights, pulls, state.merit - hoped)
 
     def _add_rates(self, rows: "_Rows", x: Vector) -> None:
-        """Steps between points of the window, and to their neighbours outside."""
+        """Add the rates between points of the window, and to the neighbours outside."""
         k, n = x.shape
         first, last = self._free.start, self._free.stop - 1
         steps = self._steps[first:last]
@@ -350,7 +350,7 @@ class _Window:
                 )
 
     def _add_ball(self, rows: "_Rows", state: _State, ball: Constraint, slack: int) -> None:
-        """Cones ``(radius + slack, r + J d)`` of one constraint, over its scale."""
+        """Add the scaled cones ``(radius + slack, r + J d)`` of one constraint."""
         k, n = state.x.shape
         width = 1 + ball.end - ball.first
         own = slice(ball.first, ball.end)
@@ -372,7 +372,7 @@ class _Window:
 
 
 class _Rows:
-    """Rows of ``A x + s = b``, collected."""
+    """Collects rows of ``A x + s = b``."""
 
     def __init__(self, size: int) -> None:
         self._size, self.count = size, 0
@@ -386,12 +386,12 @@ class _Rows:
         self.count += len(bounds)
 
     def matrix(self) -> tuple[sparse.csc_matrix, Vector]:
-        """A and b."""
+        """Return A and b."""
         row, column, value = (np.concatenate(each) for each in zip(*self._entries, strict=True))
         A = sparse.csc_matrix((value, (row, column)), shape=(self.count, self._size))
         return A, np.concatenate(self._bounds)
 
 
 def _columns(points: NDArray[np.intp], n: int) -> NDArray[np.intp]:
-    """Columns of the variables of some points, n for each."""
+    """Return the columns of the variables of some points, n for each."""
     return (points[:, np.newaxis] * n + np.arange(n)).ravel()

@@ -1,9 +1,10 @@
-"""The best sequence of candidates, one at each point, whose steps keep the rates.
+"""Find the best sequence of candidates, one at each point of a path, within the rates.
 
-Candidates whose step is within the rates may follow each other.  Between others there are
-crossings: some steps in which the pressures go from one to the other at full rate while the tip
-stays on the path.  How stiff the arm is on a crossing is computed only for those that a best
-sequence would use; until then a crossing counts as good as its ends.
+Candidates at consecutive points are linked if the rates allow the step.  A crossing links
+candidates several points apart: the pressures go from one to the other at full rate while the tip
+stays on the path.  Dynamic programming finds the best sequence.  The stiffness along a crossing is
+expensive; it is computed only if a best sequence would use the crossing, and until then estimated
+from its ends.
 """
 
 import math
@@ -25,7 +26,7 @@ _NONE = np.zeros(0, dtype=np.intp)
 
 @dataclass
 class Route:
-    """Candidates in order, one at each point.
+    """A sequence of candidates, one at each point.
 
     Attributes
     ----------
@@ -37,13 +38,13 @@ class Route:
     crossings: int
 
     def value(self, over: str) -> float:
-        """Its worst value, or its mean."""
+        """Return the worst value of the sequence, or the mean."""
         values = [each.value for each in self.candidates]
         return float(min(values) if over == "worst" else np.mean(values))
 
 
 class _Sequence(NamedTuple):
-    """The first candidate, numbers of links in order, worst value (where it counts) and mean."""
+    """A sequence: its first candidate, its links in order, worst value (if it counts) and mean."""
 
     first: int
     links: list[int]
@@ -53,16 +54,16 @@ class _Sequence(NamedTuple):
 
 @dataclass
 class _Links:
-    """Ways from a candidate to one of a later point, in the order of where they end.
+    """Links from a candidate to one at a later point, sorted by their ends.
 
-    Candidates are counted through all points.  A link is a step to the next point or a crossing.
+    Candidates are numbered through all points.  A link is a step to the next point or a crossing.
 
     Attributes
     ----------
     origin, goal : candidates at both ends.
-    worst, total : values between; until a crossing is computed they are guessed.
-    known : whether they are computed.
-    between : the candidates between, of crossings that were computed.
+    worst, total : smallest value and sum of values in between; estimates until `known`.
+    known : whether these are computed.
+    between : the candidates along each computed crossing, by the link's number.
     """
 
     origin: Indices
@@ -74,12 +75,12 @@ class _Links:
 
     @classmethod
     def steps(cls, origin: Indices, goal: Indices) -> "_Links":
-        """Steps, with nothing between."""
+        """Return links to the next point, with nothing in between."""
         count = len(goal)
         return cls(origin, goal, np.full(count, np.inf), np.zeros(count), np.ones(count, bool))
 
     def with_crossings(self, others: "_Links") -> "_Links":
-        """These steps, and crossings that are not computed yet."""
+        """Return these links and crossings together."""
         order = np.argsort(np.concatenate([self.goal, others.goal]), kind="stable")
         return _Links(
             np.concatenate([self.origin, others.origin])[order],
@@ -90,7 +91,7 @@ class _Links:
         )
 
     def sorted_by_point(self, first: Indices) -> list[tuple[slice, Indices, Indices]]:
-        """For each point: its links, where each goal's begin among them, and the goals."""
+        """Return, for each point, its links, the first link of each goal, and the goals."""
         bounds = np.searchsorted(self.goal, first)
         heads = np.flatnonzero(np.diff(self.goal, prepend=-1))
         runs = np.searchsorted(heads, bounds)
@@ -102,7 +103,7 @@ class _Links:
 
 
 class RouteSearch:
-    """Search for the best sequence.
+    """Searches for the best sequence of candidates.
 
     Parameters
     ----------
@@ -112,7 +113,7 @@ class RouteSearch:
     steps : (N - 1, n)
         Largest changes of pressure from point to point, in Pa.
     over : "worst" or "mean"
-        Which value along the path counts.
+        Which value along the path to maximise.
     lanes : list of list of PathCandidate, optional
         Further candidates at each point.
     is_closed : whether sequences end with the pressures with which they begin.
@@ -151,10 +152,10 @@ class RouteSearch:
     def best(
         self, rounds: int = ROUTE.rounds, *, share: float | None = None, any_will_do: bool = False
     ) -> Route | None:
-        """The best sequence, or any; None if there is none.
+        """Return the best sequence, or any if `any_will_do`; None if there is none.
 
-        Crossings are computed in so many rounds, until one is about as good as can be, or has this
-        share of what the points alone could have.
+        Crossings are computed in at most `rounds` rounds, until a sequence is about as good as
+        possible, or has the given share of the single points' stiffness.
         """
         hope = self._hope()
         best = self._best_of_ends(0, hope, share, any_will_do)
@@ -195,7 +196,7 @@ class RouteSearch:
         return known
 
     def _hold(self, end: int | None) -> None:
-        """Have sequences begin and end with one candidate of the first point, or with any."""
+        """Restrict sequences to begin and end with one candidate of the first point; None: any."""
         self._usable = self._values
         if end is not None:
             self._usable = self._values.copy()
@@ -204,7 +205,7 @@ class RouteSearch:
                 self._usable[first + end] = self._values[first + end]
 
     def _is_enough(self, known: _Sequence, hoped: _Sequence, share: float | None) -> bool:
-        """Whether a sequence has a share of what is hoped for; without any, almost all of it."""
+        """Whether a sequence has the given share (by default nearly all) of the hoped stiffness."""
         over = self._over == "worst"
         gain = hoped.worst - known.worst if over else hoped.mean - known.mean
         if share is not None:
@@ -213,19 +214,19 @@ class RouteSearch:
         return gain < ROUTE.hardly and (not over or on_average < ROUTE.hardly_on_average)
 
     def _hope(self) -> _Sequence:
-        """What no sequence can be better than."""
+        """Return an upper bound of all sequences."""
         best = np.maximum.reduceat(self._values, self._first[:-1])
         return _Sequence(0, [], float(best.min()), float(best.mean()))
 
     def comes_up_to(self, route: Route | None, share: float) -> bool:
-        """Whether a sequence has this share of what the points alone could have."""
+        """Whether a sequence has this share of the upper bound, the single points' stiffness."""
         hope = self._hope()
         best = hope.worst if self._over == "worst" else hope.mean
         return route is not None and route.value(self._over) > best + np.log(share)
 
     @property
     def furthest(self) -> int:
-        """The last point that a sequence comes to."""
+        """The last point that a sequence reaches."""
         reached = np.isfinite(self._reached(-np.inf, bottleneck=True, computed=True))
         return int(self._point[reached].max(initial=0))
 
@@ -237,7 +238,7 @@ class RouteSearch:
         self._starts = np.searchsorted(links.goal, np.arange(len(self._values) + 1))
 
     def _sequence(self, *, computed: bool = False) -> _Sequence | None:
-        """The best sequence, maybe of computed links alone; None without any."""
+        """Return the best sequence, of computed links alone if asked; None if there is none."""
         if self._over == "mean":
             return self._traced(-np.inf, computed=computed)
         worst = self._reached(-np.inf, bottleneck=True, computed=computed)
@@ -255,7 +256,10 @@ class RouteSearch:
         return np.where(usable, links.worst if bottleneck else links.total, -np.inf)
 
     def _reached(self, least: float, *, bottleneck: bool, computed: bool = False) -> Vector:
-        """To each candidate the best worst value, or sum of values that are at least `least`."""
+        """Return for each candidate the best sequence to it: its worst value, or its sum.
+
+        All values of a sequence are at least `least`.
+        """
         price = self._prices(least, bottleneck=bottleneck, computed=computed)
         join = np.minimum if bottleneck else np.add
         own = np.where(self._usable >= least, self._usable, -np.inf)
@@ -268,7 +272,7 @@ class RouteSearch:
         return found
 
     def _traced(self, least: float, *, computed: bool = False) -> _Sequence | None:
-        """The sequence with the best sum of values, all at least `least`."""
+        """Return the sequence with the largest sum of values that are all at least `least`."""
         price = self._prices(least, bottleneck=False, computed=computed)
         reached = self._reached(least, bottleneck=False, computed=computed)
         at = int(self._first[-2] + reached[self._first[-2] :].argmax())
@@ -295,7 +299,7 @@ class RouteSearch:
     # -- steps and crossings ----------------------------------------------------------------------
 
     def _all_steps(self) -> _Links:
-        """Steps from point to point that keep the rates."""
+        """Return the steps from point to point that the rates allow."""
         origins, goals = [_NONE], [_NONE]
         first = self._first.tolist()
         for a, b, c, step in zip(first[:-2], first[1:-1], first[2:], self._steps, strict=True):
@@ -306,7 +310,7 @@ class RouteSearch:
         return _Links.steps(np.concatenate(origins), np.concatenate(goals))
 
     def _add_crossings(self) -> None:
-        """Crossings from some points, where candidates are too far apart for a step."""
+        """Add crossings from some points between candidates that are too far apart for a step."""
         count = len(self._first) - 1
         reach = np.concatenate([np.zeros((1, len(self._tasks.unit))), self._steps.cumsum(axis=0)])
         widest = np.ptp(self._pressures, axis=0)
@@ -329,19 +333,22 @@ class RouteSearch:
     def _pairs(
         self, begin: int, origin: Indices, lengths: Indices, limits: Vector, every: int
     ) -> tuple[Indices, Indices]:
-        """Ends of crossings of some lengths, which come every so many points, and limits."""
+        """Choose crossings from candidates of one point; return their origins and goals.
+
+        `lengths` are in points, spaced by `every`; `limits` are the changes that they allow.
+        """
         goal = np.flatnonzero(np.isin(self._point, begin + lengths))
         at = (self._point[goal] - begin - 2) // every
         length, limit = lengths[at], limits[at]
         before, after = [_NONE], [_NONE]
         for is_lane in (False, True):
             own = origin[self._is_lane[origin] == is_lane]
-            # an end is a local optimum, but where every point counts
+            # crossings end at local optima, unless the mean counts
             others = np.flatnonzero(~self._is_lane[goal] | (not is_lane or self._over == "mean"))
             if not len(own) or not len(others):
                 continue
             apart = np.abs(self._pressures[own][:, np.newaxis] - self._pressures[goal[others]])
-            # steps, if all of them are as large
+            # number of steps needed, if all allow the same change
             needed = (apart / limit[others]).max(axis=2) * length[others]
             for more in ROUTE.lengths:
                 wanted = np.ceil(more * np.maximum(needed, 1.0))
@@ -355,7 +362,7 @@ class RouteSearch:
         return np.concatenate(before), np.concatenate(after)
 
     def _guessed(self, origin: Indices, goal: Indices) -> _Links:
-        """Crossings from candidates to candidates, as good as their ends."""
+        """Return crossings with values estimated from their ends."""
         values = self._values
         between = self._point[goal] - self._point[origin] - 1
         worst = np.minimum(values[origin], values[goal]) - ROUTE.price
@@ -363,7 +370,7 @@ class RouteSearch:
         return _Links(origin, goal, worst, total, np.zeros(len(goal), dtype=bool))
 
     def _compute(self, number: int) -> None:
-        """Follow a crossing; it counts as impossible where that fails."""
+        """Compute the values along a crossing; minus infinity if it cannot be followed."""
         links = self._links
         origin, goal = links.origin[number], links.goal[number]
         begin, end = int(self._point[origin]), int(self._point[goal])
@@ -381,10 +388,10 @@ class RouteSearch:
 def crossed(
     tasks: PathTasks, begin: int, start: Vector, goal: Vector, steps: Vector
 ) -> list[PathCandidate] | None:
-    """Candidates at the points between point `begin`, at pressures `start`, and the goal.
+    """Return candidates at the points between point `begin`, at pressures `start`, and the goal.
 
-    At each point the stiffest pressures are taken from which the goal is still within reach of
-    the steps (k, n) that are left.  None where the tip cannot stay on the path on the way.
+    At each point these are the stiffest pressures from which the goal is still within reach of the
+    remaining steps; `steps` (k, n) are the largest.  None if the tip cannot stay on the path.
     """
     found: list[PathCandidate] = []
     here = start

@@ -5,15 +5,16 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class CandidateSettings:
-    """Local optima at the points of a path (`stiffopt.paths.candidates`).
+    """Search for local optima at the points of a path (`stiffopt.paths.candidates`).
 
     Attributes
     ----------
-    knots : points at which new local optima are looked for.
-    starts, starts_loaded : samples near the target that are tried at each of them.
-    kept : most candidates at a point, the best ones.
-    same : candidates are the same that differ in no channel by more than this share of its range.
-    general_knots, general_starts, general_kept : where there is no machine code.
+    knots : number of points at which new local optima are sought.
+    starts, starts_loaded : number of samples near the target from which each search starts, for a
+        free and for a loaded arm.
+    kept : largest number of candidates at a point.
+    same : candidates that differ by less than this share of the range in all channels count as one.
+    general_knots, general_starts, general_kept : the same without machine code.
     """
 
     knots: int = 24
@@ -32,13 +33,13 @@ class LaneSettings:
 
     Attributes
     ----------
-    knots : points at which they are spread over all that reach the target.
-    starts : samples that are brought to the target at each of them.
-    kept : most of them that are followed, in either direction.
-    marks : points from one to the next of which they are followed.
-    iterations : to bring them to a target.
-    apart : least distance of a new one from the others, as a share of a channel's range.
-    alike : where they are nearer to each other than this, one is enough.
+    knots : number of points at which new configurations are spread over all that reach the target.
+    starts : number of samples that are brought to the target at each knot.
+    kept : largest number of configurations that are followed in either direction.
+    marks : number of points along the path at which they are followed, one after another.
+    iterations : largest number, to bring configurations to a target.
+    apart : smallest distance of a new one from the others, as a share of a channel's range.
+    alike : distance below which one of two followed configurations is dropped.
     """
 
     knots: int = 8
@@ -56,16 +57,17 @@ class RouteSettings:
 
     Attributes
     ----------
-    crossings : points of a path at which a crossing to another branch may begin.
-    ends : points at which crossings from one of them may end, about.
-    lengths : of a crossing, times the least number of steps that the rates allow.
-    nearest : candidates to which crossings lead from another, for each length.
-    rounds, first_rounds : in which crossings are computed; and before anything else is tried.
-    price : by which a crossing counts as worse than it is: small, so that none is idle.
+    crossings : number of points of a path at which a crossing to another branch may begin.
+    ends : approximate number of points at which crossings from one of them may end.
+    lengths : of a crossing, relative to the smallest number of steps that the rates allow.
+    nearest : number of candidates to which crossings lead from another, for each length.
+    rounds, first_rounds : largest number of rounds in which crossings are computed; and the same
+        before further configurations are added.
+    price : small penalty on a crossing, which prevents useless ones.
     within : share of a rate that crossings use.
-    hardly : gain of the logarithm of stiffness for which no crossing is computed; and of its mean
-    hardly_on_average : where the worst is maximised.
-    enough : share of what the points alone could have, from which on nothing else is tried.
+    hardly : gain in the logarithm of stiffness for which no crossing is computed.
+    hardly_on_average : the same for the mean, where the worst value is maximised.
+    enough : share of the single points' stiffness from which the search stops.
     """
 
     crossings: int = 40
@@ -87,16 +89,16 @@ class RefinementSettings:
 
     Attributes
     ----------
-    near : share of a rate from which on it counts as holding back.
-    margin : points on either side of those that a rate holds back.
-    iterations : at most.
-    radius : of the trust region, as a share of a channel's range.
-    last_radius : at which the method ends.
-    last_gain : of the objective, below which it ends.
-    price : of what a constraint lacks, as a share of the arm's length or in rad.
-    aside : of obstacles, more than the clearance that is asked, in m.
+    near : share of a rate from which on the rate counts as binding.
+    margin : number of points added on either side of those where a rate binds.
+    iterations : largest number.
+    radius : initial radius of the trust region, as a share of a channel's range.
+    last_radius : radius below which the method stops.
+    last_gain : gain in the objective below which the method stops.
+    price : penalty per violation of a constraint, as a share of the arm's length or in rad.
+    aside : clearance kept beyond the required one, in m.
     mean : weight of the mean stiffness where the worst is maximised.
-    difference : of pressures, for second derivatives.
+    difference : step of finite differences for second derivatives, as a share of a channel's range.
     inside : share of the tolerances and rates that is used, so that rounding stays within them.
     """
 
@@ -119,14 +121,13 @@ class RateSettings:
 
     Attributes
     ----------
-    rounding : relative excess over a rate that is rounding.
-    largest_step : of a channel between two points, as a share of its range, where no rate or no
-        time says more.
-    slowest : times slower that a path is tried that is too fast.
-    clearance_between : by how much the body may be nearer between two points before the message
-        says so, in m.
-    few_points : up to which a path does not wait for machine code.
-    least_time : between two points, in s.
+    rounding : relative excess over a rate that counts as rounding.
+    largest_step : of a channel between two points, as a share of its range, if rates or times are
+        unknown.
+    slowest : largest factor by which a path that is too fast is slowed down.
+    clearance_between : loss of clearance between two points that a message reports, in m.
+    few_points : largest number of points for which the solver does not wait for machine code.
+    least_time : shortest time between two points, in s.
     """
 
     rounding: float = 1e-9

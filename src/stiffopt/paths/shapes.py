@@ -1,4 +1,4 @@
-"""Where a path goes: the part ``path`` of a path file, and the curve that it is."""
+"""Shapes of paths: the key ``path`` of a path file, and the curve that it describes."""
 
 from __future__ import annotations
 
@@ -29,21 +29,21 @@ from stiffopt.schema import BadKeyError, Items, Schema
 
 Vector = NDArray[np.float64]
 
-_OFF_CIRCLE = 1e-5  # m, that the start of a circle may be off it: a rounded coordinate
-_APART = 1e-9  # m, from which two ends of a closed path are not the same point
-_FARTHEST = 1e3  # m, of a coordinate
+_OFF_CIRCLE = 1e-5  # m, tolerated distance of a circle's start from the circle, for rounding
+_APART = 1e-9  # m, distance from which the ends of a closed path count as different points
+_FARTHEST = 1e3  # m, largest coordinate
 _COLUMNS = ("time_s", "x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")
 
 
 class _Formula(Schema):
-    """A curve that a few numbers say."""
+    """A curve given by a few numbers."""
 
     model_config = ConfigDict(populate_by_name=True)
 
     @property
     @abstractmethod
     def curve(self) -> Curve:
-        """The line in space; `BadKeyError` if there is none."""
+        """The curve in space; raises `BadKeyError` if there is none."""
 
     @model_validator(mode="after")
     def _check(self) -> _Formula:
@@ -71,7 +71,7 @@ class PathLine(_Formula):
 
 
 class PathArc(_Formula):
-    """An arc of a circle from a point over a second one to a third one.
+    """An arc of a circle from one point through a second to a third.
 
     Attributes
     ----------
@@ -94,12 +94,12 @@ class PathArc(_Formula):
 
 
 class PathCircle(_Formula):
-    """A whole circle; it turns to the left about its normal.
+    """A whole circle, followed about its normal by the right-hand rule.
 
     Attributes
     ----------
     centre : in m.
-    normal : unit vector across its plane.
+    normal : unit normal of its plane.
     radius : in m.
     start : the point at which it begins and ends, in m.
     """
@@ -135,7 +135,7 @@ Rows = tuple[tuple[float, ...], ...]
 
 
 class PointTable(NamedTuple):
-    """What a CSV file says: positions (N, 3), and quaternions (N, 4) and times (N,) or None."""
+    """A CSV file's positions (N, 3), and its quaternions (N, 4) and times (N,), or None."""
 
     positions: Rows
     orientations: Rows | None
@@ -143,16 +143,16 @@ class PointTable(NamedTuple):
 
 
 class PathShape(Schema):
-    """Where a path goes; one of these.
+    """The shape of a path; exactly one of these.
 
     Attributes
     ----------
     line, arc, circle : see `PathLine`, `PathArc`, `PathCircle`.
     spline : points in m, at least two; the cubic spline through them.
-    through : targets, which are the points of the path; all of the same parts, the whole position
-        among them.
-    csv : file whose rows are the points, with the columns ``x_m``, ``y_m``, ``z_m`` and maybe
-        ``time_s`` and ``qw``, ``qx``, ``qy``, ``qz``; in files relative to these.
+    through : targets, which are the points of the path. All prescribe the same components of the
+        pose, among them the whole position.
+    csv : file whose rows are the points, with the columns ``x_m``, ``y_m``, ``z_m`` and optionally
+        ``time_s`` and ``qw``, ``qx``, ``qy``, ``qz``; in a path file relative to it.
     """
 
     line: PathLine | None = None
@@ -164,21 +164,21 @@ class PathShape(Schema):
 
     @property
     def kind(self) -> str:
-        """The key that is given."""
+        """The given key."""
         return next(key for key, value in self if value is not None)
 
     @property
     def is_listed(self) -> bool:
-        """Whether the points are given one by one."""
+        """Whether the points are listed one by one."""
         return self.kind in ("through", "csv")
 
     @cached_property
     def table(self) -> PointTable | None:
-        """What the CSV file says, if there is one."""
+        """The contents of the CSV file, or None."""
         return None if self.csv is None else _read_points(self.csv)
 
     def curve(self, closed: bool) -> Curve:
-        """Return the line in space that it is, or goes through; `BadKeyError` if there is none."""
+        """Return the curve; raise `BadKeyError` if there is none."""
         shape = self.line or self.arc or self.circle
         if shape is not None:
             if closed and self.circle is None:
@@ -199,7 +199,7 @@ class PathShape(Schema):
 
     @staticmethod
     def _knots(spline: tuple[tuple[float, float, float], ...], closed: bool) -> Vector:
-        """Points (k, 3) of a spline; a closed one leads back to the first."""
+        """Return the points (k, 3) of a spline; a closed one ends at the first."""
         if len(spline) < 2:
             raise BadKeyError("spline", f"expected at least 2 points, not {len(spline)}")
         points = np.array(spline)
@@ -214,7 +214,7 @@ class PathShape(Schema):
         return points
 
     def _positions(self) -> Vector:
-        """Positions (N, 3) of points that are given one by one."""
+        """Return the positions (N, 3) of listed points."""
         if self.table is not None:
             return np.array(self.table.positions)
 
@@ -308,7 +308,7 @@ def _check_columns(file: FilePath, columns: tuple[str, ...]) -> None:
 
 
 def fault_of_times(times: Vector) -> tuple[int, str] | None:
-    """Return the index of the first time that is wrong, and what is; None if all are right."""
+    """Return the index of the first invalid time and the fault; None if all are valid."""
     if times[0] != 0:
         return 0, f"begins at {times[0]:g} s; expected 0 s"
     for index in np.flatnonzero(np.diff(times) <= 0).tolist():
@@ -327,5 +327,5 @@ def check_one_key(schema: Schema) -> None:
 
 
 def mm_text(length: float) -> str:
-    """Return a length in m for people."""
+    """Return a length in m as text in mm."""
     return f"{length * 1e3:.6g} mm"

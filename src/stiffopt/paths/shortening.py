@@ -1,4 +1,4 @@
-"""Ways in the space of pressures made shorter and rounder; each change is judged."""
+"""Shorten and round ways in the space of pressures; every change is checked for clearance."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ from stiffopt.paths.tree_search import IsClear
 
 Vector = NDArray[np.float64]
 
-_SHORTCUTS = 60  # tried, at most
-_IN_VAIN = 12  # shortcuts in a row that are not clear or bring nothing
-_GAIN = 1e-3  # of the length, that a shortcut saves at least
-_REACHES = (0.5, 0.25, 0.12, 0.05)  # of a corner, as shares of the shorter edge
-_CHORDS = 8  # of a rounded corner
-_FLAT = 0.999  # cosine, above which a corner is none
+_SHORTCUTS = 60  # largest number tried
+_IN_VAIN = 12  # consecutive failed shortcuts after which to stop
+_GAIN = 1e-3  # smallest saving of a shortcut, as a share of the length
+_REACHES = (0.5, 0.25, 0.12, 0.05)  # extents of a rounded corner, as shares of the shorter edge
+_CHORDS = 8  # in a rounded corner
+_FLAT = 0.999  # cosine above which a corner counts as straight
 
 
 def shortened(way: Vector, is_clear: IsClear, scale: Vector, seed: int) -> Vector:
-    """A shorter way (k, n), by dropping corners and by shortcuts between random points.
+    """Return a shorter way (k, n), by skipping corners and by random shortcuts.
 
     Parameters
     ----------
     way : (m, n), in Pa.
-    is_clear : judges motions.
-    scale : (n,), pressures that count as equally long.
+    is_clear : checks motions.
+    scale : (n,), divisors of the channels in a length.
     seed : of the shortcuts.
     """
     way = _without_corners(way, is_clear)
@@ -47,7 +47,7 @@ def shortened(way: Vector, is_clear: IsClear, scale: Vector, seed: int) -> Vecto
 
 
 def _without_corners(way: Vector, is_clear: IsClear) -> Vector:
-    """From each point go on to the last one that can be seen from there."""
+    """Skip corners: connect each point with the last one to which the straight way is clear."""
     kept, here = [0], 0
     while here < len(way) - 1:
         ahead = len(way) - 1
@@ -60,7 +60,7 @@ def _without_corners(way: Vector, is_clear: IsClear) -> Vector:
 
 
 def _marks(way: Vector, scale: Vector) -> Vector:
-    """Lengths (m,) from the start."""
+    """Return the length (m,) from the start to each point."""
     steps = np.linalg.norm(np.diff(way, axis=0) / scale, axis=1)
     return np.concatenate([[0.0], np.cumsum(steps)])
 
@@ -70,9 +70,9 @@ def _at(way: Vector, marks: Vector, length: float) -> Vector:
 
 
 def rounded(way: Vector, is_clear: IsClear, scale: Vector) -> Vector:
-    """The way with its corners replaced by parabolas in chords, as wide as they are clear.
+    """Replace corners by parabolic arcs (in chords), the widest that are clear.
 
-    Where all corners are as wide as can be it is a quadratic B-spline about the way's corners.
+    If all corners can be as wide as possible, the result is a quadratic B-spline.
     """
     lengths = np.diff(_marks(way, scale))
     parts = [way[:1]]

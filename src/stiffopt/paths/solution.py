@@ -1,4 +1,4 @@
-"""The answer to a path or a motion: pressures over time, judged by the model alone."""
+"""`PathSolution`: the solution of a path or motion, pressures over time."""
 
 from dataclasses import dataclass, field
 from typing import Literal
@@ -19,41 +19,41 @@ Status = Literal["solved", "unreachable", "failed"]
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PathSolution(ShownInNotebook):
-    """Pressures over time; between two times they are interpolated linearly.
+    """Pressures over time, linear between two times.
 
-    Errors, stiffness and clearance are computed from the model at `pressures`.
+    Errors, stiffness and clearance are recomputed from the model at `pressures`.
 
     Attributes
     ----------
     status : {"solved", "unreachable", "failed"}
-        "unreachable": no pressures do all that was asked; the nearest path that can be followed is
-        given, if there is one.  "failed": there is no answer, and all arrays are empty or None.
+        "unreachable": no pressures meet all requirements; the solution is the nearest path that can
+        be followed, if there is one.  "failed": no solution; all arrays are empty or None.
     message : str
-        One or two sentences for people.
+        One or two sentences for the user.
     robot : Manipulator
-        The arm, which carries the load of the path.
+        With the load of the path.
     times : ndarray (N,)
         In s, from 0.
     pressures : ndarray (N, n)
         In Pa.
     tip_poses : ndarray (N, 4, 4)
     slew : ndarray (n,) or None
-        The rates of change that were kept, in Pa/s; None where none is known.
+        Largest rates of change that were allowed, in Pa/s; None if none is known.
     stiffness : ndarray (N,) or None
-        The stiffness that is maximised, in `stiffness_unit`; of several the smallest.
+        The smallest of the stiffnesses that are maximised, in `stiffness_unit`.
     stiffness_unit : str or None
     alone : ndarray (N,) or None
-        What each point alone could have: its best stiffness without rates and neighbours.
+        Best stiffness of each single point, without rates and neighbours.
     position_errors, angle_errors : ndarray (N,) or None
         In m and rad; None where not asked for.
     clearance : ndarray (N,) or None
-        Least distance between body and scene, in m; None without a scene.
+        Smallest distance between body and scene, in m; None without a scene.
     first_failure : int or None
-        Index of the first point that the arm cannot have as it was asked for.
+        Index of the first point whose requirements cannot be met.
     confidence : str
-        How sure the search is, in words.
+        How thorough the search was, in words.
     timings : dict of str to float
-        Seconds.
+        In s.
     """
 
     status: Status
@@ -75,7 +75,7 @@ class PathSolution(ShownInNotebook):
 
     @property
     def found(self) -> bool:
-        """Whether every point holds what was asked of it, and every step its rates."""
+        """Whether every point meets its requirements, and every step the rates."""
         return self.status == "solved"
 
     @property
@@ -87,24 +87,24 @@ class PathSolution(ShownInNotebook):
 
     @property
     def worst(self) -> float | None:
-        """Least stiffness along the path, in `stiffness_unit`."""
+        """Smallest stiffness along the path, in `stiffness_unit`."""
         index = self.worst_index
         return None if self.stiffness is None or index is None else float(self.stiffness[index])
 
     def trajectory(self, begin: float = 0.0) -> Trajectory:
-        """What a `ControlLoop` follows: the pressures, and the tip positions that they give.
+        """Return the trajectory for a `ControlLoop`: pressures and the resulting tip positions.
 
-        Points that are too many or too close are left out; see `trajectory_through`.
+        Superfluous points are left out if there are too many; see `trajectory_through`.
 
         Parameters
         ----------
         begin :
-            When to be at the first point, in s, for an arm that has to go there.
+            Time of the first point, in s; it leaves the arm time to go there.
 
         Raises
         ------
         InputError
-            There are no pressures, or too many points that cannot be left out.
+            There are no pressures, or too many points remain.
         """
         if not len(self.times):
             raise InputError(f"there is nothing to follow: {self.message}")

@@ -1,4 +1,4 @@
-"""`solve_path`: the stiffest pressures with which the tip follows a path within the rates."""
+"""`solve_path`: find the stiffest pressures with which the tip follows a path within the rates."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -37,9 +37,9 @@ def solve_path(
     """Find pressures over time with which the tip follows a path, as stiff as possible.
 
     Every point is within its tolerance, the body keeps the clearance of the scene, and no
-    pressure changes faster than the rates of robot and path allow.  At each point several local
-    optima are found; a search over their sequences chooses where to change from one to another,
-    and then points that the rates hold back are optimised together.
+    pressure changes faster than the rates of robot and path allow.  The solver finds several local
+    optima at each point, searches for the best sequence of them (`stiffopt.paths.route`), and then
+    optimises neighbouring points together where rates bind (`stiffopt.paths.refinement`).
 
     Parameters
     ----------
@@ -48,14 +48,14 @@ def solve_path(
     seed : int
         Of the searches.  The same seed gives the same answer.
     timeout, cancel : optional
-        As for `PressureSolver.solve`; the status is "failed" where they end it.
+        As for `PressureSolver.solve`; the status is then "failed".
 
     Raises
     ------
     InputError
-        If the path does not suit the robot: limits, scene, or pressures at its ends that are not
-        at the first or the last point.  Nothing is raised for a path that cannot be followed:
-        the solution says where and why, and holds the nearest path that can.
+        The path does not suit the robot: its limits, its scene, or given pressures at an end that
+        do not reach the end point.  A path that cannot be followed raises nothing: the solution
+        says where and why, and holds the nearest path that can be followed.
     """
     if not isinstance(robot, Manipulator):
         raise InputError(f"robot must be a Manipulator, see load_robot; got {shown(robot)}")
@@ -105,10 +105,10 @@ class _PathSolver:
         except EquilibriumError as error:
             return self._failed(str(error))
 
-    # -- ends and points that cannot be had ----------------------------------------------------
+    # -- ends and unreachable points -----------------------------------------------------------
 
     def _check_ends(self, tasks: PathTasks) -> None:
-        """Refuse pressures at an end of the path that do not bring the tip there."""
+        """Refuse given pressures at an end of the path that do not solve its task."""
         for key, index, pressures in (
             ("start", 0, self._ends[0]),
             ("end", len(self._tasks) - 1, self._ends[1]),
@@ -143,7 +143,7 @@ class _PathSolver:
     def _with_reachable(
         self, tasks: PathTasks, layers: list[list[PathCandidate]]
     ) -> tuple[PathTasks, list[list[PathCandidate]]]:
-        """Tasks and candidates with, for points out of reach, the nearest that can be had."""
+        """Return tasks and candidates in which unreachable points are moved to the nearest pose."""
         moved = list(self._tasks)
         closest: dict[int, Vector] = {}
         for index, layer in enumerate(layers):
@@ -166,7 +166,7 @@ class _PathSolver:
         nearest = PathTasks(self._robot, moved, self._seed)
         found, _ = candidates(nearest)
         for index, layer in enumerate(found):
-            if not layer:  # just at the border of what can be reached
+            if not layer:  # on the border of the reachable workspace
                 found[index] = list(layers[index])
                 own = nearest.candidate(index, closest[index]) if index in closest else None
                 found[index] += [] if own is None else [own]
@@ -213,7 +213,7 @@ class _PathSolver:
         return solution
 
     def _steps(self, tasks: PathTasks, times: Vector | None) -> Vector:
-        """Largest changes (N - 1, n) of the pressures from point to point."""
+        """Return the largest changes (N - 1, n) of the pressures from point to point."""
         if times is None or self._slew is None:
             return np.tile(RATES.largest_step * tasks.unit, (len(tasks) - 1, 1))
         return step_limits(times, self._slew)
@@ -226,7 +226,7 @@ class _PathSolver:
         *,
         any_will_do: bool = False,
     ) -> Route | None:
-        """The best sequence, over further configurations where the local optima are not enough."""
+        """Return the best sequence, with further configurations if local optima do not suffice."""
         if not all(layers):
             return None
         closed = self._path.closed
@@ -242,7 +242,7 @@ class _PathSolver:
         return max(known, key=lambda each: each.value(self._over), default=None)
 
     def _further(self, tasks: PathTasks) -> list[list[PathCandidate]]:
-        """Further candidates, but where the pressures are given."""
+        """Return further candidates, none where the pressures are given."""
         if self._lanes is None:
             self._lanes = lanes(tasks)
             for index, end in ((0, self._ends[0]), (-1, self._ends[1])):
@@ -253,7 +253,7 @@ class _PathSolver:
     def _slower(
         self, tasks: PathTasks, layers: list[list[PathCandidate]], steps: Vector
     ) -> tuple[float, Route | None]:
-        """By how much slower the path can be followed, to a few per cent, and how."""
+        """Find the smallest slow-down, to 5 %, with which the path can be followed, and how."""
         factor, route = 1.0, None
         while route is None and factor < RATES.slowest:
             factor *= 2
@@ -271,7 +271,7 @@ class _PathSolver:
         return factor, route
 
     def _fastest(self, pressures: Vector) -> Vector:
-        """Times (N,) at which the points come as soon as the rates allow."""
+        """Return the earliest times (N,) of the points that the rates allow."""
         if self._slew is None:
             raise self._path.error_at(
                 "timing.fastest", "needs to know the rates; give pressure.slew here or in the robot"
@@ -284,7 +284,7 @@ class _PathSolver:
     def _judged(
         self, tasks: PathTasks, pressures: Vector, times: Vector, alone: Vector
     ) -> PathSolution:
-        """The solution at pressures (N, n), judged by the model against the tasks of the path."""
+        """Return the solution at pressures (N, n), judged by the model against the path's tasks."""
         judgements = tasks.judged(pressures)
         known = [j for j in judgements if j is not None]
         if len(known) < len(judgements):
@@ -327,7 +327,7 @@ class _PathSolver:
         return replace(solution, message=self._notes(solution))
 
     def _notes(self, solution: PathSolution) -> str:
-        """What the user should know of a path that can be followed."""
+        """Return remarks for the user on a path that can be followed."""
         notes: list[str] = []
         if self._slew is None:
             notes.append("No rate of change is known, of the robot or of the path; none was kept.")
@@ -369,7 +369,7 @@ class _PathSolver:
         )
 
     def _binding(self, solution: PathSolution) -> str:
-        """The channel whose rate is used most where the path is slowed down."""
+        """Name the channel that uses most of its rate."""
         if self._slew is None:
             return ""
         rates = np.abs(np.diff(solution.pressures, axis=0)) / np.diff(solution.times)[:, np.newaxis]
@@ -382,7 +382,7 @@ class _PathSolver:
     def _without_route(
         self, tasks: PathTasks, layers: Sequence[Sequence[PathCandidate]], steps: Vector
     ) -> PathSolution:
-        """The answer where no sequence of pressures is continuous, however slow."""
+        """Return the answer when there is no sequence of pressures without a jump."""
         empty = next((i for i, layer in enumerate(layers) if not layer), None)
         if self._unreachable is not None:
             point, why = self._unreachable
@@ -418,7 +418,7 @@ class _PathSolver:
 
 
 def _at_tip(task: Task, solution: PressureSolution) -> Task:
-    """The task with the tip's pose of a solution as its target."""
+    """Return the task with a solution's tip pose as its target."""
     assert solution.tip_position is not None
     assert solution.tip_pose is not None
     target = task.target

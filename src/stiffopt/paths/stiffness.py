@@ -1,4 +1,4 @@
-"""Stiffness of many configurations of an arm, free or loaded, at the cost of their shapes."""
+"""Compute tip stiffness at many pressures at once, for a free or loaded arm."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Vector = NDArray[np.float64]
 
 
 def least_stiffness(robot: Manipulator, p: Vector, measures: Sequence[StiffnessMeasure]) -> Vector:
-    """The smallest of several stiffnesses of the tip (N,) at pressures (N, n)."""
+    """Return the smallest (N,) of several stiffnesses of the tip at pressures (N, n)."""
     C = robot.compliance_between(p, robot.length, robot.length)
     R = robot.pose(p, robot.length)[:, :3, :3]
     found: Vector = np.min([_stiffness(C, R, each) for each in measures], axis=0)
@@ -22,7 +22,7 @@ def least_stiffness(robot: Manipulator, p: Vector, measures: Sequence[StiffnessM
 
 
 def _stiffness(C: Vector, R: Vector, measure: StiffnessMeasure) -> Vector:
-    """One stiffness (N,) of compliances (N, 6, 6) in base axes; see `Manipulator.stiffness`."""
+    """Return a stiffness (N,) from compliances (N, 6, 6) and rotations of the tip, base axes."""
     d = np.broadcast_to(np.array(measure.direction), (len(C), 3))
     if measure.frame == "tip":
         d = (R @ d[..., None])[..., 0]

@@ -1,4 +1,4 @@
-"""`Trajectory`: targets over time, with or without pressures, as they are given to a controller."""
+"""`Trajectory`: targets over time, with or without pressures, as a controller accepts them."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from stiffopt.schema import Items, Schema
 from stiffopt.units import Duration, Pressure
 
 MAX_WAYPOINTS = 2_000
-"""Of a trajectory; its splines are made between two ticks of the control loop."""
-_LONGEST = 86_400.0  # s, of a trajectory
+"""Largest number in a trajectory: its splines are built between two ticks of the control loop."""
+_LONGEST = 86_400.0  # s, longest duration of a trajectory
 CLOSEST = 1e-3
-"""Between waypoints, in s."""
-_ROUNDING = 1e-6  # of that
-_ON_THE_LINE = 1e-3  # of the range of a pressure
+"""Shortest time between waypoints, in s."""
+_ROUNDING = 1e-6  # relative tolerance of that time
+_ON_THE_LINE = 1e-3  # of a pressure's range; points nearer to a straight line may be left out
 
 
 class Waypoint(Schema):
-    """A target and when to be there.
+    """A target with its time.
 
     Attributes
     ----------
     time : since the beginning of the trajectory, in s; at most a day.
     target : the pose.
-    pressures : the posture in which it is to be there, one for each channel, in Pa; None: the
+    pressures : the posture in which to reach it, one for each channel, in Pa; None for the
         stiffest.
     """
 
@@ -42,12 +42,12 @@ class Waypoint(Schema):
 class Trajectory(Schema):
     """Waypoints through which the tip passes.
 
-    Without pressures it passes them smoothly, and the controller chooses the posture. With
-    pressures the posture goes on straight lines from one waypoint's to the next.
+    Without pressures, the tip passes them smoothly and the controller chooses the posture. With
+    pressures, the posture is interpolated linearly between waypoints.
 
     Attributes
     ----------
-    waypoints : in order of time, at least 1 ms apart, the first at 0 or 1 ms later; all
+    waypoints : in order of time, at least 1 ms apart, the first at 0 or at least 1 ms later. All
         prescribe the same components of the pose, and all have pressures or none has.
     """
 
@@ -73,7 +73,7 @@ class Trajectory(Schema):
 
     @property
     def pressures(self) -> NDArray[np.float64] | None:
-        """Those of all waypoints (k, n), in Pa; None where they have none."""
+        """Pressures of all waypoints (k, n), in Pa; None if they have none."""
         if self.waypoints[0].pressures is None:
             return None
         return np.array([waypoint.pressures for waypoint in self.waypoints])
@@ -86,11 +86,10 @@ def trajectory_through(
     ranges: NDArray[np.float64],
     begin: float = 0.0,
 ) -> Trajectory:
-    """Return a trajectory of pressures and of the tip positions that they give.
+    """Return a trajectory from pressures and the resulting tip positions.
 
-    Of more points than a trajectory may have waypoints, or of points that follow each other
-    sooner than these may, those are left out that lie on the straight lines between the others,
-    to a thousandth of the range of each pressure.
+    If there are more points than a trajectory may have, or points closer in time, those are left
+    out whose pressures linear interpolation reproduces to a thousandth of their range.
 
     Parameters
     ----------
@@ -101,14 +100,14 @@ def trajectory_through(
     tips : (N, 3)
         In m, in the base frame.
     ranges : (n,)
-        Of the pressures, in Pa.
+        Ranges of the pressures, in Pa.
     begin :
-        When to be at the first point, in s, for an arm that has to go there.
+        Time of the first point, in s; it leaves the arm time to go there.
 
     Raises
     ------
     InputError
-        There are too many points that cannot be left out.
+        Too many points remain.
     """
     kept = np.arange(len(times))
     if len(kept) > MAX_WAYPOINTS or (np.diff(times) < CLOSEST).any():
@@ -126,7 +125,7 @@ def trajectory_through(
 
 
 def check_times(times: list[float]) -> None:
-    """Refuse times that are out of range, not ascending or too close."""
+    """Raise `InputError` for times that are out of range, not ascending or too close."""
     if not times:
         raise InputError("has no waypoints")
     for time in (times[0], times[-1]):
@@ -149,11 +148,10 @@ def check_times(times: list[float]) -> None:
 def without_straight(
     times: NDArray[np.float64], values: NDArray[np.float64], tolerance: float
 ) -> NDArray[np.intp]:
-    """Indices (k,) of those of N points that make up the same line in time, to a tolerance.
+    """Return indices (k,) of the points needed to interpolate values (N, n) linearly in time (N,).
 
-    The first and the last are among them; the others are those farthest from the line through the
-    ones before (Ramer, Douglas and Peucker), in any of the values (N, n), which are interpolated
-    in time (N,).
+    The first and the last point are kept; then, wherever the error exceeds the tolerance in any
+    value, the point with the largest error (the algorithm of Ramer, Douglas and Peucker).
     """
     kept, open_ = {0, len(times) - 1}, [(0, len(times) - 1)]
     while open_:
@@ -173,7 +171,7 @@ def without_straight(
 
 
 def _check_counts(pressures: list[tuple[float, ...] | None]) -> None:
-    """Refuse waypoints of which some have pressures, or have more of them than others."""
+    """Refuse waypoints that differ in their number of pressures, or in whether they have any."""
     counts = [None if each is None else len(each) for each in pressures]
     for number, count in enumerate(counts, start=1):
         if count == counts[0]:

@@ -1,7 +1,7 @@
-"""A way between pressures by OMPL: two trees that grow towards each other (RRTConnect).
+"""Search a way in the space of pressures with OMPL's RRTConnect, two trees that grow together.
 
-Motions are judged whole, by a function that is given: no resolution is set.  Distances in the
-space of pressures are ways of the body at most, so that channels count by how far they move it.
+A given function checks each straight motion as a whole, so no resolution needs to be set.  Each
+channel is weighted by how far it moves the body: distances bound the body's displacement.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from stiffopt.model.stopping import checkpoint
 
 Vector = NDArray[np.float64]
 IsClear = Callable[[Vector], bool]
-"""From rows of pressures (N, n) to whether the way along them is clear."""
+"""Returns whether the way along rows of pressures (N, n) is clear."""
 
 _RANGE = 0.3  # longest branch, as a share of the space's diagonal
 
@@ -28,10 +28,10 @@ class TreeSearch:
 
     Parameters
     ----------
-    is_clear : judges motions.
+    is_clear : checks motions.
     low, high : limits of the pressures, (n,).
-    weights : way of the body per pressure, (n,).
-    seed : the same gives the same ways, unless time ends the search.
+    weights : (n,), bound on the body's displacement per pressure, in m/Pa.
+    seed : the same seed gives the same ways, unless time ends the search.
 
     Raises
     ------
@@ -49,16 +49,17 @@ class TreeSearch:
         self.tried = 0
 
     def way(self, start: Vector, goals: Vector, most: float) -> tuple[Vector | None, Vector | None]:
-        """A way (k, n) from the start to one of the goals (N, n), or None; tried `most` motions.
+        """Search a way (k, n) from the start to one of the goals (N, n).
 
-        And, where there is none, how far the tree from the start came (n,), if that is known.
+        The search ends after `most` checked motions in all. Without a way it returns None, and, if
+        known, the pressures (n,) that the tree from the start reached.
         """
         from ompl import base, geometric, util
 
         if not len(self._free):
             return None, None
         with _quiet(util):
-            util.RNG.setSeed(self._seed + 1)  # zero is no seed there
+            util.RNG.setSeed(self._seed + 1)  # OMPL refuses a seed of zero
             space = base.RealVectorStateSpace(len(self._free))
             bounds = base.RealVectorBounds(len(self._free))
             for index, channel in enumerate(self._free):
@@ -98,7 +99,7 @@ class TreeSearch:
             return None, path[-1]
 
     def _validator(self, base: Any, info: Any, start: Vector) -> Any:
-        """OMPL's judge of motions between two states."""
+        """Return the check of a motion between two states, as OMPL expects it."""
         search, count = self, len(self._free)
         rows, weights = np.stack([start, start]), self._weights
         all_move = count == len(start)
