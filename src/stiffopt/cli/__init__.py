@@ -1,6 +1,7 @@
-"""The command line: options, progress, printing, files and exit codes of every command.
+"""The command line.
 
-The module of a command (`solve`, `map`, `calibrate`) has its options and its help. It imports no
-numerics, so that `--help` is fast; the modules that begin with its name (`solve_run`, `map_report`)
-are imported when the command runs.
+The module named like a command (`solve`, `map`, `calibrate`) defines its options and help. It
+imports no numerics, so that `--help` is fast. The modules that begin with its name (`solve_run`,
+`map_report`) do the work; they are imported when the command runs. Progress, printing, output
+files and exit codes are shared.
 """

@@ -1,4 +1,4 @@
-"""The files of one command, answered one after the other; a wrong one does not stop the others."""
+"""Answer the files of one command in turn; an invalid one does not stop the others."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ AnswerT = TypeVar("AnswerT")
 
 @dataclass
 class Batch(ABC, Generic[AnswerT]):
-    """The files of one command and what has come of them.
+    """The files of one command and their answers.
 
-    `rows` are those of the summary, `codes` the exit codes of the files; `writes_files` says
-    whether answers go into files too, so that work goes on where nobody reads stdout.
+    `rows` are those of the summary, `codes` the exit codes of the files. `writes_files` says
+    whether answers also go into files; if so, the work goes on when nobody reads stdout.
     """
 
     as_json: bool
@@ -34,11 +34,11 @@ class Batch(ABC, Generic[AnswerT]):
 
     @abstractmethod
     def answer(self, file: str) -> AnswerT:
-        """Answer one file; raise `StiffoptError` if it is wrong."""
+        """Answer one file; raise `StiffoptError` if it is invalid."""
 
     @abstractmethod
     def take(self, answer: AnswerT, seconds: float) -> None:
-        """Print an answer that took this time, and note its exit code."""
+        """Print an answer, which took `seconds`, and add its exit code."""
 
     @abstractmethod
     def draw(self, answer: AnswerT, picture: str) -> None:
@@ -46,12 +46,12 @@ class Batch(ABC, Generic[AnswerT]):
 
     @abstractmethod
     def is_drawable(self, answer: AnswerT) -> bool:
-        """Whether there is something to draw."""
+        """Whether an answer can be drawn."""
 
     def answer_all(
         self, files: Sequence[str], pictures: Sequence[str | None], check: Callable[[], None]
     ) -> None:
-        """Answer files in turn, and draw the answers that have a picture's name."""
+        """Answer files in turn, and draw each answer for which a picture is named."""
         for number, (file, picture) in enumerate(zip(files, pictures, strict=True)):
             with ProgressBar(quiet=self.quiet) as bar:
                 if len(files) > 1:
@@ -63,7 +63,7 @@ class Batch(ABC, Generic[AnswerT]):
     def _answer(
         self, file: str, picture: str | None, check: Callable[[], None], bar: ProgressBar
     ) -> None:
-        """Answer one file, or report what is wrong with it."""
+        """Answer one file, or report its error."""
         begin = perf_counter()
         try:
             try:
@@ -76,7 +76,7 @@ class Batch(ABC, Generic[AnswerT]):
             self.refuse(file, str(error))
         except OSError:
             raise
-        except Exception as error:  # a mistake of ours must not leave the other files unanswered
+        except Exception as error:  # a bug must not leave the other files unanswered
             check()
             self.refuse(file, f"{file}: {_bug(error)}", exits.FAILED)
         else:
@@ -86,7 +86,7 @@ class Batch(ABC, Generic[AnswerT]):
                 self._draw(file, answer, picture, bar)
 
     def _draw(self, file: str, answer: AnswerT, picture: str, bar: ProgressBar) -> None:
-        """Draw an answer; where that fails it is still reported."""
+        """Draw an answer, or report why that fails."""
         try:
             bar.report(0, None, f"{file}: drawing")
             try:
@@ -105,7 +105,7 @@ class Batch(ABC, Generic[AnswerT]):
         self.rows.append((file, "bad input" if code == exits.BAD_INPUT else "failed"))
 
     def print(self, printing: Callable[[], None]) -> None:
-        """Print; where nobody reads any more, go on only if there are files to write."""
+        """Print; once nobody reads stdout, go on only if there are files to write."""
         if self.stdout_is_closed:
             return
         try:
@@ -116,14 +116,14 @@ class Batch(ABC, Generic[AnswerT]):
             self.stdout_is_closed = True
 
     def summarise(self, *headings: str) -> None:
-        """Print one line a file under some headings, where there are several files."""
+        """Print a line for each file under some headings, if there are several files."""
         if len(self.rows) > 1 and not self.as_json and not self.quiet:
             from stiffopt.cli.tables import summary  # which needs rich
 
             self.print(lambda: show(summary(self.rows, headings)))
 
     def write(self, writing: Callable[[], None]) -> None:
-        """Write a file with the answers, or report why that cannot be done."""
+        """Write a file with the answers, or report why that fails."""
         try:
             writing()
         except StiffoptError as error:
@@ -137,7 +137,7 @@ class Batch(ABC, Generic[AnswerT]):
 
 
 def _bug(error: Exception) -> str:
-    """Put a mistake of ours into one sentence that says where it is."""
+    """Describe a bug in one sentence, with its place."""
     frames = extract_tb(error.__traceback__)
     where = f" in {frames[-1].name}, line {frames[-1].lineno}" if frames else ""
     return f"this should not happen: {type(error).__name__}{where}: {error}; please report it"

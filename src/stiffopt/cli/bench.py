@@ -1,4 +1,4 @@
-"""The command `stiffopt bench recordings`: how well methods predict recordings of real arms."""
+"""The command `stiffopt bench recordings`: compare methods on recordings of real arms."""
 
 from __future__ import annotations
 
@@ -61,18 +61,18 @@ def recordings(
         str | None,
         typer.Option(
             metavar="LIST",
-            help="Of stiffopt, constant-curvature, polynomial, gaussian-process, network; by "
+            help="Any of stiffopt, constant-curvature, polynomial, gaussian-process, network; by "
             "default all. The last three need scikit-learn.",
         ),
     ] = None,
     rows: Annotated[
         int,
-        typer.Option(metavar="N", min=50, max=10_000, help="That are fitted; by default 400."),
+        typer.Option(metavar="N", min=50, max=10_000, help="Fitted rows; by default 400."),
     ] = 400,
     full: Annotated[
         bool, typer.Option("--full", help="stiffopt compares its models, which takes minutes.")
     ] = False,
-    seed: Annotated[int, typer.Option(metavar="N", min=0, help="Of the network; 0.")] = 0,
+    seed: Annotated[int, typer.Option(metavar="N", min=0, help="Seed of the learnt methods.")] = 0,
     units: Units = None,
     as_json: Json = False,
     quiet: Quiet = False,

@@ -1,4 +1,4 @@
-"""The commands `stiffopt calibrate` and `stiffopt validate`: their options and their help."""
+"""Options and help of the commands `stiffopt calibrate` and `stiffopt validate`."""
 
 from typing import Annotated
 
@@ -166,7 +166,10 @@ def calibrate(
     rows: Annotated[
         int | None,
         typer.Option(
-            metavar="N", min=50, max=100_000, help="Of all logs that are fitted; by default 2000."
+            metavar="N",
+            min=50,
+            max=100_000,
+            help="Number of fitted rows of all logs together; by default 2000.",
         ),
     ] = None,
     suggest: Annotated[

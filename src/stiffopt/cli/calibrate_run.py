@@ -1,6 +1,6 @@
 """Run `stiffopt calibrate` and `stiffopt validate`: read recordings, fit or compare, report.
 
-What cannot be read or does not fit the robot raises `InputError` before anything is fitted.
+Input that cannot be read or does not suit the robot raises `InputError` before the fit.
 """
 
 from __future__ import annotations
@@ -149,7 +149,7 @@ def run_calibrate(
 
 @dataclass(frozen=True, eq=False)
 class _RigLimits:
-    """Limits of the pressures that a rig accepts."""
+    """The pressures that a rig accepts."""
 
     low: NDArray[np.float64]
     high: NDArray[np.float64]
@@ -170,7 +170,7 @@ class _RigLimits:
 
 
 def _record(suggestion: Suggestion | None, path: str | None) -> dict[str, Any]:
-    """Suggested poses for JSON, in SI units; nothing where none were asked for."""
+    """Return suggested poses for JSON, in SI units; empty without a suggestion."""
     if suggestion is None:
         return {}
     return {
@@ -213,7 +213,7 @@ def run_validate(
 
 @dataclass(frozen=True)
 class RecordingOptions:
-    """Options of both commands: which robot, which recordings of it, and how they are read."""
+    """Options of both commands: robot, recordings, and how to read them."""
 
     robot: str
     logs: tuple[str, ...]
@@ -225,7 +225,7 @@ class RecordingOptions:
     keep: tuple[str, ...] = ()
 
     def settings(self, **others: Any) -> CalibrationSettings:
-        """Return the settings of a calibration: of these options, and others."""
+        """Return the settings of a calibration from these options and others."""
         quantities.choice("--pressures", self.pressures, ("commanded", "measured"))
         for each in self.keep:
             quantities.choice("--keep", each, get_args(Finding))
@@ -234,7 +234,7 @@ class RecordingOptions:
         return CalibrationSettings(**given, **others)
 
     def description(self) -> RobotDescription:
-        """Return the robot, with the channels and the frame of the options in its recordings."""
+        """Return the robot, with the options' channels and frame for its recordings."""
         robot = load_description(self.robot)
         change: dict[str, Any] = {}
         if self.channels is not None:
@@ -267,7 +267,7 @@ class RecordingOptions:
 
 
 def log_names(paths: Sequence[str]) -> list[str]:
-    """Return a name for each file: its own, with as many folders as tell it from the others."""
+    """Return a name for each file: its own, with as many folders as make it unique."""
     parts = [Path(path).resolve().parts for path in paths]
     for i, each in enumerate(parts):
         if each in parts[:i]:
@@ -298,7 +298,7 @@ def read_tables(paths: Sequence[str], robot: RobotDescription) -> list[Stiffness
 
 
 def fixed_keys(given: Sequence[str], robot: RobotDescription) -> tuple[str, ...]:
-    """Return the parameters that --fix names: by whole keys, without an index, or by their ends."""
+    """Return the parameters that --fix names by keys, keys without indices, or ends of keys."""
     known = _fitted_keys(robot)
     found: list[str] = []
     for text in given:
@@ -320,7 +320,7 @@ def fixed_keys(given: Sequence[str], robot: RobotDescription) -> tuple[str, ...]
 
 
 def _fitted_keys(robot: RobotDescription) -> list[str]:
-    """Keys of all parameters that some model fits."""
+    """Return the keys of all parameters that any model fits."""
     tolerances = robot.tolerances or Tolerances()
     keys: dict[str, None] = {}
     for structure in STRUCTURES:
@@ -384,7 +384,7 @@ def _origin(
     *,
     is_interrupted: bool,
 ) -> list[str]:
-    """The comment at the top of the robot file: the data and options that it came from."""
+    """Return the comment at the top of the robot file: the data and options of the fit."""
     lines = [f"Calibrated by stiffopt {stiffopt.__version__} from {Path(recordings.robot).name}."]
     names = [each.name for each in result.calibrated]
     if names:

@@ -1,6 +1,6 @@
-"""Results of a calibration and of a validation: for the terminal, as a page with figures, as JSON.
+"""Report calibrations and validations: on the terminal, as a page with figures, and as JSON.
 
-The tables of the terminal and of the page are the same.
+Terminal and page show the same tables.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from stiffopt.model.parameters import Parameter
 from stiffopt.plots import calibration as plots
 from stiffopt.plots.wording import vector_text
 
-_MOST_REMARKS = 8  # of the logs, at the terminal; the page has all
+_MOST_REMARKS = 8  # on the terminal; the page has all
 _MOST_STIFFNESSES = 30
 _MOST_PAIRS = 3
 _MOST_DRAWN = 60  # measured stiffnesses
@@ -235,7 +235,7 @@ def _remarks(page: MarkdownPage, remarks: Sequence[str]) -> None:
 
 
 def errors_before_and_after(result: CalibrationResult) -> TextTable:
-    """Errors of the tip in each log, before and after calibration."""
+    """Return the errors of the tip in each log, before and after calibration."""
     units = display_units()
     turns = any(each.angle is not None for each in (*result.nominal, *result.calibrated))
     heading = ("log", "before", "95 %", "after", "95 %", "max", "%", *(("axis",) * turns))
@@ -262,7 +262,7 @@ def errors_before_and_after(result: CalibrationResult) -> TextTable:
 
 
 def errors_of_logs(robot: RobotDescription, found: Sequence[Comparison]) -> TextTable:
-    """Errors of the tip in each log, and the share of rows outside the range that was seen."""
+    """Return the errors of the tip in each log, and the share of rows outside the calibration."""
     units = display_units()
     turns = any(each.angle is not None for each in found)
     known = robot.calibration is not None
@@ -291,7 +291,7 @@ def errors_of_logs(robot: RobotDescription, found: Sequence[Comparison]) -> Text
 
 
 def coverage_table(found: Sequence[Comparison]) -> TextTable:
-    """Share of the measured tips within the regions about the predictions."""
+    """Return the share of measured tips within the regions about the predictions."""
     rows = tuple(
         (kind, f"{each.n}", *(_percent(share) for share in each.shares))
         for kind, each in coverage(found).items()
@@ -307,7 +307,7 @@ def coverage_table(found: Sequence[Comparison]) -> TextTable:
 
 
 def range_remarks(robot: RobotDescription, found: Sequence[Comparison]) -> list[str]:
-    """Return sentences on the logs whose pressures the calibration had not seen."""
+    """Return remarks on logs whose pressures lie outside those of the calibration."""
     if robot.calibration is None:
         return [
             f"the robot '{robot.name}' was not calibrated: there is no recorded range that these "
@@ -331,7 +331,7 @@ def range_remarks(robot: RobotDescription, found: Sequence[Comparison]) -> list[
 
 
 def _beyond(robot: RobotDescription, found: Comparison) -> str:
-    """Which channel exceeds the recorded range most, and by how much, in parentheses."""
+    """Name the channel that exceeds the recorded range most, and the excess, in parentheses."""
     calibration = robot.calibration
     if calibration is None or not calibration.pressure_max:
         return ""
@@ -352,7 +352,7 @@ def _beyond(robot: RobotDescription, found: Comparison) -> str:
 
 
 def models_compared(result: CalibrationResult) -> TextTable:
-    """Models that were compared, by their errors in what each was not fitted to."""
+    """Return the compared models with their errors on held-back data."""
     chosen = result.structure.name
     rows = []
     for each in result.candidates:
@@ -376,7 +376,7 @@ def models_compared(result: CalibrationResult) -> TextTable:
 
 
 def errors_held_back(result: CalibrationResult) -> TextTable:
-    """Errors in what the chosen model was not fitted to."""
+    """Return the errors of the chosen model on held-back data."""
     return TextTable(
         "Error of the tip in what was held back (the others are fitted)",
         ("held back", f"mean {display_units().length}", "95 %", "max"),
@@ -391,9 +391,9 @@ def errors_held_back(result: CalibrationResult) -> TextTable:
 
 
 def fitted_numbers(result: CalibrationResult, *, beginnings: bool) -> list[TextTable]:
-    """The fitted numbers with their 95 % intervals, a table for each segment.
+    """Return the fitted numbers with their 95 % intervals, in a table for each segment.
 
-    With `beginnings` also the state and the origin with which each log begins.
+    With `beginnings`, also the initial state and the zero of each log.
     """
     groups: dict[str, list[tuple[str, ...]]] = {}
     for each in result.estimates:
@@ -407,7 +407,7 @@ def fitted_numbers(result: CalibrationResult, *, beginnings: bool) -> list[TextT
 
 
 def _place(estimate: FittedEstimate) -> tuple[str, str]:
-    """The title of the table in which a number stands, and its name there."""
+    """Return the title of a number's table, and its name there."""
     if not estimate.key:
         begins = estimate.name.startswith("zero of ") or " at the beginning of " in estimate.name
         words = estimate.name.replace(f"{BASE},", "base,").replace(f"{SENSOR},", "sensor,")
@@ -431,7 +431,7 @@ def _number_row(estimate: FittedEstimate, words: str) -> tuple[str, ...]:
 
 
 def _unit(estimate: FittedEstimate) -> DisplayUnit:
-    """The unit of a fitted number: moduli are in kPa, whatever pressures are shown in."""
+    """Return the display unit of a fitted number; always kPa for moduli."""
     if estimate.key.endswith(".share"):
         return DisplayUnit("%", 100.0)
     return {
@@ -443,7 +443,7 @@ def _unit(estimate: FittedEstimate) -> DisplayUnit:
 
 
 def _plain(value: float, places: int) -> str:
-    """A number as it stands in a file, without zeros at its end."""
+    """Format a number as in a file, without trailing zeros."""
     return f"{round(value, max(places, 3)) + 0.0:.8g}"
 
 
@@ -451,7 +451,7 @@ def _plain(value: float, places: int) -> str:
 
 
 def stiffnesses_compared(rows: Sequence[StiffnessComparison]) -> TextTable:
-    """Stiffness, measured and predicted."""
+    """Return a table of measured and predicted stiffness."""
     unit, pressure = display_units().stiffness, display_units().pressure
 
     def text(value: float | None) -> str:
@@ -485,12 +485,12 @@ def _length(value: float) -> str:
 
 
 def _decimals(value: float, places: int) -> str:
-    """A number with so many decimals; a dash where there is none, and no minus before zero."""
+    """Format a number with decimals; a dash for NaN, and no minus before zero."""
     return f"{round(value, places) + 0.0:.{places}f}" if isfinite(value) else "-"
 
 
 def _two(value: float) -> str:
-    """A number with two significant figures, and no power of ten before a million."""
+    """Format a number with two significant figures, without an exponent below a million."""
     return f"{float(f'{value:.2g}'):g}"
 
 

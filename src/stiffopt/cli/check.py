@@ -1,4 +1,4 @@
-"""The command `stiffopt check`: its options and its help."""
+"""Options and help of the command `stiffopt check`."""
 
 from typing import Annotated
 

@@ -1,4 +1,4 @@
-"""The checks of `stiffopt check`, one for each kind of file."""
+"""Check files for `stiffopt check`, each by its kind."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def _record(mistake: FileError) -> dict[str, Any]:
 
 
 def check_file(path: str) -> tuple[str, list[FileError]]:
-    """Return the kind of a file, empty if nobody knows, and its mistakes."""
+    """Return the kind of a file, empty if unknown, and its mistakes."""
     kind = ""
     try:
         kind = _kind_of(path)
@@ -61,7 +61,7 @@ def check_file(path: str) -> tuple[str, list[FileError]]:
 
 def _kind_of(path: str) -> str:
     """Return the kind of a file by its ending, and of a YAML file by its format."""
-    if _is_pipe(path):  # it can be read once, and is waited for until somebody writes
+    if _is_pipe(path):  # reading would block, and works only once
         raise FileError(path, "is a pipe; expected a file")
     ending = Path(path).suffix.lower()
     if ending in (".csv", ".mcap"):
@@ -116,7 +116,7 @@ def _check_path(path: str) -> None:
 
 
 def _check_with_robot(wanted: Any) -> None:
-    """Check what a task and a path ask for against their robot."""
+    """Check the limits and the scene of a task or path against its robot."""
     robot = wanted.resolve_robot()
     wanted.pressure_bounds(robot)
     wanted.check_scene(robot)

@@ -1,4 +1,4 @@
-"""The command `stiffopt commission`: its options and its help."""
+"""Options and help of the command `stiffopt commission`."""
 
 from typing import Annotated
 

@@ -1,4 +1,4 @@
-"""Reports of a commissioning: for the terminal, as a Markdown page with its figure, as JSON."""
+"""Report a commissioning: on the terminal, as a Markdown page with its figure, and as JSON."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ FIGURE = "commissioning.png"
 
 @dataclass(frozen=True)
 class CommissioningReport:
-    """What a commissioning found: a title, a verdict, findings, labelled lines, and a table."""
+    """The content of the report, for the terminal and for the page."""
 
     title: str
     verdict: str
@@ -48,7 +48,7 @@ class CommissioningReport:
         return Group(*blocks, labelled(lines), Text(""), self.table.renderable())
 
     def write(self, folder: Path, found: Commissioning | None) -> None:
-        """Write the report as a page into a folder, with a figure if there is what to draw."""
+        """Write the report as a page into a folder, with a figure of `found` if given."""
         page = MarkdownPage(folder, self.title)
         page.text(f"{self.verdict}.")
         if self.findings:
@@ -81,7 +81,7 @@ def report(
     changed: Sequence[str],
     out: str | None,
 ) -> CommissioningReport:
-    """Return the report of a commissioning; `changed` are keys that a corrected file changes."""
+    """Return the report; `changed` are the keys that the corrected rig file changes."""
     corrected = ""
     if changed:
         where = f"{out} has it" if out else f"--out FILE.yaml writes it, beside {rig_file}"

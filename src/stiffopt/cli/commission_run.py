@@ -33,7 +33,7 @@ def run(
     as_json: bool,
     quiet: bool,
 ) -> int:
-    """Commission the rig of a file and return the exit code; `fast` holds no step for long."""
+    """Commission the rig of a file and return the exit code; `fast` shortens the steps."""
     if plot:
         from stiffopt.plots import require_matplotlib
 
@@ -63,14 +63,14 @@ def run(
 
 
 def _check_record(path: str) -> None:
-    """Refuse a record that could not be written, before the arm moves."""
+    """Raise `FileError` before the arm moves if the record could not be written."""
     folder = Path(path).resolve().parent
     if not os.access(folder, os.W_OK):
         raise FileError(path, f"the record cannot be written: {folder} is no folder to write to")
 
 
 def _made(folder: Path) -> Path:
-    """Make a new folder; an empty one will do."""
+    """Make a folder; it may exist if it is empty."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         if any(folder.iterdir()):
@@ -102,7 +102,7 @@ def _moved(
 
 
 def _frequency(expected: ExpectedSteps) -> float:
-    """Frequency of the first bending mode by the model, in Hz."""
+    """Return the model's frequency of the first bending mode, in Hz."""
     from math import pi
 
     from stiffopt.control.vibration import BendingMode
@@ -122,7 +122,7 @@ def _reported(
     as_json: bool,
     quiet: bool,
 ) -> int:
-    """Write the record, the page and the corrected rig file; say what was found."""
+    """Write the record, the page and the corrected rig file; print the findings."""
     record = record_of(rig, found, f"{LOG}.csv")
     save_record(folder / RECORD, record)
     path = rig.settings.commissioning.record

@@ -1,7 +1,7 @@
-"""Printing: answers to stdout; errors, notes and progress to stderr.
+"""Print answers to stdout; errors, notes and progress to stderr.
 
-Brackets in what is printed are no markup of rich, for a path may hold some. rich is imported when
-something is shown: JSON and help do without it.
+The markup of rich is off, since paths may contain brackets. rich is imported only when something
+is shown: JSON and help do not need it.
 """
 
 from __future__ import annotations
@@ -23,20 +23,20 @@ if TYPE_CHECKING:
     from rich.progress import Progress
 
 
-_FILE_WIDTH = 80  # columns of what does not go to a terminal
-_REFRESH = 0.1  # s, between two changes of a progress bar
-_FIRST_LINE, _LONGEST_SILENCE = 2.0, 30.0  # s, of progress without a terminal
+_FILE_WIDTH = 80  # columns of output that does not go to a terminal
+_REFRESH = 0.1  # s, between updates of a progress bar
+_FIRST_LINE, _LONGEST_SILENCE = 2.0, 30.0  # s, timing of progress lines without a terminal
 
 
 class Closed(Exception):  # noqa: N818 - no error: `head`, for example, reads a few lines
-    """The program that read stdout has closed it."""
+    """The reader of stdout has closed it."""
 
 
 def console_on(*, stderr: bool = False) -> Console:
-    """Console on stdout or stderr that takes text as it is.
+    """Return a console on stdout or stderr that prints text literally.
 
-    What does not go to a terminal is 80 columns wide, or `COLUMNS`: rich would take the width of
-    the terminal that the command was started from, and a file would look different each time.
+    Without a terminal it is 80 columns wide, or `COLUMNS`. rich would take the width of the
+    terminal from which the command was started, so that files would differ.
     """
     from rich.console import Console
 
@@ -55,14 +55,14 @@ def show(renderable: RenderableType) -> None:
 
 
 def write_line(text: str) -> None:
-    """Print a line to stdout as it is, whatever its width; raise `Closed` if nobody reads it."""
-    if sys.stdout is None:  # the program was started without one
+    """Print a line to stdout without wrapping; raise `Closed` if the reader is gone."""
+    if sys.stdout is None:  # the program was started without stdout
         return
     try:
         sys.stdout.write(f"{text}\n")
         sys.stdout.flush()
     except BrokenPipeError:
-        # what is buffered, and what the interpreter flushes as it ends, must go somewhere
+        # the interpreter flushes the buffer at its end, which must not fail
         null = os.open(os.devnull, os.O_WRONLY)
         os.dup2(null, sys.stdout.fileno())
         raise Closed from None
@@ -96,7 +96,7 @@ def report_error(message: str, *, label: str = "error: ") -> None:
 
 
 def report_note(message: str) -> None:
-    """Print what a user may want to know but need not act on to stderr."""
+    """Print a note to stderr: information on which the user need not act."""
     report_error(message, label="note: ")
 
 
@@ -123,15 +123,15 @@ def showing_slow_warnings(show: Callable[[str], object]) -> Iterator[None]:
 
 
 def warnings_as_notes(*, quiet: bool) -> AbstractContextManager[None]:
-    """Context in which such a warning is shown as a note, or not at all."""
+    """Context in which these warnings are shown as notes, or not at all if `quiet`."""
     return showing_slow_warnings(lambda text: None if quiet else report_note(text))
 
 
 class ProgressBar:
-    """Says what is being done, how much of it is done and how long the rest takes.
+    """Shows the current work, its progress and the remaining time on stderr, as a context.
 
-    It is a context: from the first report to its end a bar is shown on stderr. Where that is no
-    terminal, lines are printed: the first after two seconds, then ever more seldom.
+    A bar is shown from the first report to the end of the context. Without a terminal, lines are
+    printed instead: the first after two seconds, then less and less often.
     """
 
     def __init__(self, *, quiet: bool, clock: Callable[[], float] = monotonic) -> None:
@@ -152,7 +152,7 @@ class ProgressBar:
         self.hide()
 
     def report(self, done: float, total: float | None, text: str) -> None:
-        """Show how far the work is; `total` is None where nobody knows."""
+        """Show the progress; `total` is None if unknown."""
         if not self._wanted:
             return
         if self._lines is not None:
@@ -180,7 +180,7 @@ class ProgressBar:
 
 
 class _ProgressLines:
-    """Progress where there is no terminal: lines with an estimate, ever more seldom."""
+    """Prints progress lines with an estimate, less and less often, where there is no terminal."""
 
     def __init__(self, clock: Callable[[], float]) -> None:
         self._clock = clock
@@ -188,7 +188,7 @@ class _ProgressLines:
         self._next = _FIRST_LINE
 
     def report(self, done: float, total: float | None, text: str) -> None:
-        """Print a line if it is time for one."""
+        """Print a line if one is due."""
         gone = self._clock() - self._begin
         if gone < self._next:
             return

@@ -1,4 +1,4 @@
-"""An arm that leans on objects, as text for the terminal and as JSON."""
+"""Report the equilibrium of an arm that leans on objects: on the terminal and as JSON."""
 
 from typing import Any
 
@@ -17,7 +17,7 @@ _AXES = dict(zip("xyz", np.eye(3), strict=True))
 
 
 def record(robot: Manipulator, found: ContactEquilibrium) -> dict[str, Any]:
-    """Return what there is to say about an equilibrium, for JSON, in SI units."""
+    """Return an equilibrium for JSON, in SI units."""
     return {
         "robot": robot.description.name,
         "pressures_pa": found.pressures,

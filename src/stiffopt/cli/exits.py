@@ -1,4 +1,4 @@
-"""How a command ends: exit codes, errors, Ctrl-C and other signals."""
+"""The end of a command: exit codes, errors, Ctrl-C and other signals."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ FAILED = 4
 FAULT = 5
 """The rig failed; it was vented."""
 MISFIT = 6
-"""The rig does not fit its files; what to change was told."""
+"""The rig does not fit its files; the report says what to change."""
 INTERRUPTED = 130
 """Ctrl-C."""
 CLOSED_PIPE = 141
-"""The program that read the output has closed it; a shell's code for the signal SIGPIPE."""
+"""The reader of the output closed it; the shell's code for the signal SIGPIPE."""
 
 OF_STATUS = {"solved": SOLVED, "unreachable": UNREACHABLE, "failed": FAILED}
 ENDING_SIGNALS = tuple(
@@ -36,28 +36,28 @@ ENDING_SIGNALS = tuple(
 """Signals that ask a program to end."""
 
 _MOST_SERIOUS_FIRST = (BAD_INPUT, FAILED, UNREACHABLE)
-_REPEAT = 0.02  # s, between two repetitions of an interrupt
+_REPEAT = 0.02  # s, period at which an interrupt is repeated
 
 Handler = Callable[[int, FrameType | None], None]
 Progress = Callable[[float, float, str], None]
-"""Takes how much is done, of how much, and what is being done."""
+"""Called with the work done, the total and a description."""
 P = ParamSpec("P")
 
 
 class RigFaultError(StiffoptError):
-    """The rig failed while a command used it; it was vented, or the message says otherwise."""
+    """The rig failed while a command used it; it was vented unless the message says otherwise."""
 
 
 def most_serious(codes: Iterable[int]) -> int:
-    """Return the exit code of several files: 2 if one has it, else 4, 3 or 0 in this order."""
+    """Return the most serious exit code: 2, then 4, 3 and 0."""
     seen = set(codes)
     return next((code for code in _MOST_SERIOUS_FIRST if code in seen), SOLVED)
 
 
 def with_exit_code(command: Callable[P, int | None]) -> Callable[P, None]:
-    """Let a command of typer end with an exit code, and report the error that ends it.
+    """Make a typer command exit with the code that it returns (None is 0).
 
-    The code is the one that the command returns (None is 0), or the one of the error.
+    An error is reported and gives its own code.
     """
 
     @wraps(command)
@@ -76,9 +76,9 @@ def with_exit_code(command: Callable[P, int | None]) -> Callable[P, None]:
 
 @contextmanager
 def handled(handlers: Mapping[int, Handler]) -> Iterator[None]:
-    """Context with handlers for signals by their numbers; without effect outside the main thread.
+    """Context that handles signals, by their numbers; it has no effect outside the main thread.
 
-    A signal that was ignored stays ignored: the program runs under nohup.
+    A signal that was ignored stays ignored, as under nohup.
     """
     before: dict[int, Any] = {}
     if threading.current_thread() is threading.main_thread():
@@ -93,11 +93,11 @@ def handled(handlers: Mapping[int, Handler]) -> Iterator[None]:
 
 @contextmanager
 def interruptible() -> Iterator[Callable[[], None]]:
-    """Context in which Ctrl-C raises KeyboardInterrupt for certain.
+    """Context in which Ctrl-C reliably raises KeyboardInterrupt.
 
-    CasADi clears Python errors while it converts its arguments, a KeyboardInterrupt among them: the
-    work would go on, or fail for a value that is missing. So the interrupt is repeated until the
-    context is left. The function that it gives raises KeyboardInterrupt if Ctrl-C was pressed.
+    CasADi clears Python errors, also a KeyboardInterrupt, while it converts arguments: the work
+    would go on, or fail because a value is missing. So the interrupt is repeated until the context
+    is left. The context yields a function that raises KeyboardInterrupt if Ctrl-C was pressed.
     """
     is_pressed, over = False, threading.Event()
 
@@ -128,7 +128,7 @@ def interruptible() -> Iterator[Callable[[], None]]:
 
 @contextmanager
 def interruptible_work(*, quiet: bool) -> Iterator[Progress]:
-    """Context of work that Ctrl-C ends, with warnings as notes; gives a function for progress."""
+    """Context of work that Ctrl-C ends, with warnings as notes; yields a progress function."""
     with (
         interruptible() as check,
         ProgressBar(quiet=quiet) as bar,
@@ -144,10 +144,10 @@ def interruptible_work(*, quiet: bool) -> Iterator[Progress]:
 
 @contextmanager
 def stoppable_work(*, quiet: bool) -> Iterator[Progress]:
-    """Context of work that keeps what it has at the first Ctrl-C, and that a second one ends.
+    """Context of work that keeps its results at the first Ctrl-C; a second one ends it.
 
-    The function for progress raises `CancelledError` once after the first. Work that has nothing
-    to keep lets it pass, and ends as interrupted.
+    It yields a progress function, which raises `CancelledError` once after the first Ctrl-C. Work
+    without results lets the error pass, and ends as interrupted.
     """
     interrupt, is_told = InterruptBetweenSteps(), False
     with interrupt.handled(), ProgressBar(quiet=quiet) as bar, warnings_as_notes(quiet=quiet):
@@ -167,10 +167,10 @@ def stoppable_work(*, quiet: bool) -> Iterator[Progress]:
 
 
 class InterruptBetweenSteps:
-    """Turns signals into one KeyboardInterrupt between two steps of the work.
+    """Turns signals into a KeyboardInterrupt between two steps of the work.
 
-    The first signal is raised by `check`, which the work calls at each step; a second one at once.
-    After `hold` none is raised, so that a rig can be vented and closed.
+    After the first signal, `check`, which the work calls at each step, raises it; a second signal
+    raises it at once. After `hold` nothing is raised, so that a rig can be vented and closed.
     """
 
     def __init__(self, signals: Iterable[int] = ENDING_SIGNALS) -> None:
@@ -185,21 +185,21 @@ class InterruptBetweenSteps:
 
     @property
     def pressed(self) -> bool:
-        """Whether one of the signals has come."""
+        """Whether a signal was received."""
         return self._pressed
 
     def check(self) -> None:
-        """Raise KeyboardInterrupt if a signal has come."""
+        """Raise KeyboardInterrupt if a signal was received."""
         if self._pressed:
             raise KeyboardInterrupt
 
     def hold(self) -> None:
-        """From now on raise nothing when a signal comes."""
+        """Raise nothing from now on."""
         self._held = True
 
     @contextmanager
     def at_once(self) -> Iterator[None]:
-        """Context in which a signal is raised at once, while a person is asked for something."""
+        """Context in which a signal interrupts at once, while a person is asked for something."""
         self.check()
         self._at_once = True
         try:

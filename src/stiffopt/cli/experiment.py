@@ -1,4 +1,4 @@
-"""The commands `stiffopt experiment ...`: their options and their help."""
+"""Options and help of the commands `stiffopt experiment ...`."""
 
 from typing import Annotated
 
@@ -92,7 +92,7 @@ def kinematics(
     ] = None,
     period: Annotated[
         str | None,
-        typer.Option(metavar="TIME", help="Of a tooth, up and down; by default 40 s / 9."),
+        typer.Option(metavar="TIME", help="Period of a tooth, up and down; by default 40 s / 9."),
     ] = None,
     repetitions: Repetitions = None,
     poses: Annotated[
@@ -152,22 +152,23 @@ def stiffness(
     pressures: Annotated[
         str | None,
         typer.Option(
-            metavar="LIST", help="Of the channel: '0:1.5:0.25 bar' (the default) or '0,0.5,1 bar'."
+            metavar="LIST",
+            help="Pressures of the channel: '0:1.5:0.25 bar' (the default) or '0,0.5,1 bar'.",
         ),
     ] = None,
     channel: Annotated[
         int | None,
-        typer.Option(metavar="N", min=1, help="The one that is pressurised; by default 1."),
+        typer.Option(metavar="N", min=1, help="The channel to pressurise; by default 1."),
     ] = None,
     directions: Annotated[
         str | None,
         typer.Option(
             metavar="LIST",
-            help="Along which the probe pushes, of x, y, z, -x, -y, -z; by default x,y,-z.",
+            help="Directions of the probe, of x, y, z, -x, -y, -z; by default x,y,-z.",
         ),
     ] = None,
     displacement: Annotated[
-        str | None, typer.Option(metavar="LENGTH", help="Of the tip; by default 3 mm.")
+        str | None, typer.Option(metavar="LENGTH", help="Displacement of the tip; by default 3 mm.")
     ] = None,
     force: Annotated[
         str | None,
@@ -177,7 +178,7 @@ def stiffness(
         ),
     ] = None,
     steps: Annotated[
-        int | None, typer.Option(metavar="N", min=2, max=1000, help="Each way; by default 5.")
+        int | None, typer.Option(metavar="N", min=2, max=1000, help="Steps each way; by default 5.")
     ] = None,
     repetitions: Repetitions = None,
     settle: Annotated[

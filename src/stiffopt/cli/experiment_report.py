@@ -1,4 +1,4 @@
-"""Reports of experiments: for the terminal, as a Markdown page, and as JSON."""
+"""Report experiments: on the terminal, as a Markdown page, and as JSON."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,7 +26,7 @@ from stiffopt.rig.settings import Published
 
 @dataclass(frozen=True)
 class ExperimentReport:
-    """What an experiment found: a title, labelled lines, and tables; one beside the published."""
+    """The content of a report; the table `published` compares with published results."""
 
     title: str
     lines: tuple[tuple[str, str], ...]
@@ -58,7 +58,7 @@ def kinematics_report(
     model: Manipulator,
     published: Published | None = None,
 ) -> ExperimentReport:
-    """Return the report of a kinematics experiment, and of its combined poses if there are any."""
+    """Return the report of a kinematics experiment, with its combined poses if it has any."""
     found: list[KinematicsResult | CoverageResult] = [result]
     length, pressure = display_units().length, display_units().pressure
     peaks = ", ".join(pressure.number(p, "g") for p in settings.pressures)
@@ -115,7 +115,7 @@ def kinematics_report(
 
 
 def _errors_beside(result: KinematicsResult, published: Published) -> TextTable | None:
-    """Errors along each axis, next to the published ones."""
+    """Return the errors along each axis beside the published ones."""
     if published.tip_error is None:
         return None
     length = display_units().length
@@ -183,7 +183,7 @@ def kinematics_record(
 def stiffness_report(
     result: StiffnessResult, model: Manipulator, published: StiffnessTable | None = None
 ) -> ExperimentReport:
-    """Return the report of a stiffness experiment, beside a table that was published of the arm."""
+    """Return the report of a stiffness experiment, compared with a published table if given."""
     settings = result.settings
     names = [direction_name(direction) for direction in settings.directions]
     unit, pressure_unit = display_units().stiffness, display_units().pressure
@@ -215,7 +215,7 @@ def stiffness_report(
 
 
 def _stiffness_beside(result: StiffnessResult, published: StiffnessTable) -> TextTable | None:
-    """Stiffness that was measured and modelled beside what was published."""
+    """Return measured and modelled stiffness beside the published one."""
     rows = []
     units = display_units()
     spread = published.others.get("repeatability_n_per_m", published.sigma)

@@ -68,7 +68,7 @@ class _Plan:
 
     @property
     def is_complete(self) -> bool:
-        """Whether nothing is left to do."""
+        """Whether every part of the experiment is recorded."""
         if isinstance(self.settings, KinematicsSettings):
             return not (
                 missing_repetitions(self.folder, self.settings)
@@ -89,9 +89,9 @@ def run(
     as_json: bool = False,
     quiet: bool,
 ) -> None:
-    """Do an experiment, or go on with one; report and draw.
+    """Do an experiment, or resume one; report and draw.
 
-    `given` are the options that are settings of the experiment, None where an option is absent.
+    `given` are the options that are settings of the experiment; absent options are None.
     """
     if plot:
         from stiffopt.plots import require_matplotlib
@@ -122,7 +122,7 @@ def run(
 
 
 def run_poses_file(file: str, *, out: str | None, quiet: bool) -> None:
-    """Go through the poses of a file on the rig that it names, and record it."""
+    """Hold the poses of a file on the rig that it names, and record them."""
     require_package("foxglove-sdk", "log", "foxglove")
     settings = load_poses(file)
     with interruptible(), warnings_as_notes(quiet=quiet):
@@ -196,7 +196,7 @@ def _planned(
 
 
 def _published(rig: Rig, path: str) -> tuple[Published | None, StiffnessTable | None]:
-    """What a rig file says was published of its arm, with the table of stiffness that it names."""
+    """Return the published results that a rig file names, and their table of stiffness."""
     published = None if rig.settings is None else rig.settings.published
     if published is None or published.stiffness is None:
         return published, None
@@ -204,7 +204,7 @@ def _published(rig: Rig, path: str) -> tuple[Published | None, StiffnessTable | 
 
 
 def _old_settings(experiment: str, folder: Path, given: Mapping[str, Any]) -> Settings:
-    """Settings of an experiment that is resumed."""
+    """Return the settings of an experiment that is resumed."""
     if given:
         raise InputError(
             f"--{next(iter(given))} cannot be changed when an experiment is resumed; "
@@ -213,7 +213,7 @@ def _old_settings(experiment: str, folder: Path, given: Mapping[str, Any]) -> Se
     if experiment == "stiffness":
         return open_folder(folder, StiffnessSettings)
     settings = open_folder(folder, KinematicsSettings)
-    # an old folder that does not mention combined poses has none
+    # a folder of an older version that does not mention combined poses has none
     begun_with = settings.poses if "poses" in settings.model_fields_set else 0
     return settings.model_copy(update={"poses": begun_with})
 

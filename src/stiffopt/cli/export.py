@@ -51,7 +51,7 @@ Pressures = Annotated[
     str,
     typer.Option(
         metavar="LIST",
-        help="Of all channels, proximal segment first: '0.2, 0, 0.3 bar'.",
+        help="Pressures of all channels, proximal segment first: '0.2, 0, 0.3 bar'.",
     ),
 ]
 
@@ -77,7 +77,8 @@ def export_mjcf(
     damping: Annotated[
         float | None,
         typer.Option(
-            metavar="SHARE", help="Of critical damping, of the slowest swing; by default 0.05."
+            metavar="SHARE",
+            help="Damping of the slowest mode, as a share of critical; by default 0.05.",
         ),
     ] = None,
     quiet: Quiet = False,

@@ -1,4 +1,4 @@
-"""The commands `stiffopt init ...`: their options, their questions and their help."""
+"""Options and help of the commands `stiffopt init ...`."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def _file(kind: str) -> Any:
 
 
 def _write(kind: str, path: str, answers: dict[str, Any], yes: bool, force: bool) -> int:
-    """Ask for what was not given, and write the file."""
+    """Ask for answers that were not given, and write the file."""
     from stiffopt.cli.init_files import (
         write_first_file,
     )  # here, so that --help waits for no numerics
@@ -61,13 +61,14 @@ def init_robot(
         int | None, typer.Option(metavar="N", min=1, max=6, help="Segments in series, all alike.")
     ] = None,
     length: Annotated[
-        str | None, typer.Option(metavar="LENGTH", help="Of a segment at rest.")
+        str | None, typer.Option(metavar="LENGTH", help="Length of a segment at rest.")
     ] = None,
     outer_radius: Annotated[
-        str | None, typer.Option(metavar="LENGTH", help="Of the silicone cylinder.")
+        str | None, typer.Option(metavar="LENGTH", help="Radius of the silicone cylinder.")
     ] = None,
     inner_radius: Annotated[
-        str | None, typer.Option(metavar="LENGTH", help="Of its central channel; 0 mm for none.")
+        str | None,
+        typer.Option(metavar="LENGTH", help="Radius of its central channel; 0 mm for none."),
     ] = None,
     chambers: Annotated[
         int | None, typer.Option(metavar="N", min=3, help="Chambers around a segment.")
@@ -76,16 +77,18 @@ def init_robot(
         int | None, typer.Option(metavar="N", min=3, help="Regulators that feed a segment.")
     ] = None,
     chamber_radius: Annotated[
-        str | None, typer.Option(metavar="LENGTH", help="Of a chamber's round section.")
+        str | None, typer.Option(metavar="LENGTH", help="Radius of a chamber.")
     ] = None,
     chamber_offset: Annotated[
-        str | None, typer.Option(metavar="LENGTH", help="From the arm's axis to a chamber's.")
+        str | None,
+        typer.Option(metavar="LENGTH", help="Distance of a chamber's axis from the arm's."),
     ] = None,
     modulus: Annotated[
         str | None, typer.Option(metavar="PRESSURE", help="Young's modulus of the silicone.")
     ] = None,
     max_pressure: Annotated[
-        str | None, typer.Option(metavar="PRESSURE", help="That the arm bears, gauge.")
+        str | None,
+        typer.Option(metavar="PRESSURE", help="Highest gauge pressure that the arm bears."),
     ] = None,
     mounting: Annotated[
         str | None,
@@ -120,10 +123,10 @@ def init_task(
     robot: Robot = None,
     position: Annotated[
         str | None,
-        typer.Option(metavar="'X, Y, Z'", help="Where the tip shall be; an axis may be free."),
+        typer.Option(metavar="'X, Y, Z'", help="Target of the tip; an axis may be free."),
     ] = None,
     direction: Annotated[
-        str | None, typer.Option(metavar="'X, Y, Z'", help="In which it shall be stiff.")
+        str | None, typer.Option(metavar="'X, Y, Z'", help="Direction in which to be stiff.")
     ] = None,
     yes: Yes = False,
     force: Force = False,
@@ -144,11 +147,9 @@ def init_path(
     end: Annotated[
         str | None, typer.Option("--to", metavar="'X, Y, Z'", help="End of the line.")
     ] = None,
-    speed: Annotated[
-        str | None, typer.Option(metavar="SPEED", help="At which the tip follows it.")
-    ] = None,
+    speed: Annotated[str | None, typer.Option(metavar="SPEED", help="Speed of the tip.")] = None,
     direction: Annotated[
-        str | None, typer.Option(metavar="'X, Y, Z'", help="In which it shall be stiff.")
+        str | None, typer.Option(metavar="'X, Y, Z'", help="Direction in which to be stiff.")
     ] = None,
     yes: Yes = False,
     force: Force = False,
@@ -164,7 +165,8 @@ def init_scene(
     file: Annotated[str, _file("scene")] = "my-scene.yaml",
     robot: Robot = None,
     clearance: Annotated[
-        str | None, typer.Option(metavar="LENGTH", help="That the whole arm keeps from objects.")
+        str | None,
+        typer.Option(metavar="LENGTH", help="Distance that the whole arm keeps from objects."),
     ] = None,
     yes: Yes = False,
     force: Force = False,

@@ -1,4 +1,4 @@
-"""The texts that `stiffopt init` writes: minimal files with comments, and what to do next."""
+"""Write the minimal, commented files of `stiffopt init`, and print what to do next."""
 
 from __future__ import annotations
 
@@ -41,13 +41,13 @@ _KEYS = {
     "speed": "timing.speed",
     "clearance": "clearance",
 }
-"""Names of options, and how the keys end at which their values stand."""
+"""Names of options, and the ends of the keys at which their values stand in the file."""
 
 
 def write_first_file(
     kind: str, path: str, given: Mapping[str, Any], ask: Ask | None, *, force: bool
 ) -> None:
-    """Write a minimal file of a kind and say what to do next.
+    """Write a minimal file of a kind, and print what to do next.
 
     Parameters
     ----------
@@ -56,14 +56,14 @@ def write_first_file(
     path :
         Of the file, which must not exist unless `force`.
     given :
-        Answers by the names of the options; None: it is asked for.
+        Answers by the names of the options; None for those to ask for.
     ask :
-        How to ask; None: nobody can be asked, and each answer is the default.
+        Function that asks a question; None to take the defaults.
 
     Raises
     ------
     InputError
-        An answer is wrong; nothing was written.
+        An answer is invalid; nothing was written.
     """
     check_ending(path, (".yaml", ".yml"))
     check_writable(path)
@@ -85,7 +85,7 @@ def write_first_file(
 
 
 class _Robot(NamedTuple):
-    """A robot: for a command line, in a file, and its model."""
+    """A robot: its name for a command line, its name for a file, and its model."""
 
     typed: str
     written: str
@@ -93,13 +93,13 @@ class _Robot(NamedTuple):
 
 
 class _Answers:
-    """Answers to questions: those that were given as options, and those that are asked for."""
+    """Answers to questions, given as options or asked for."""
 
     def __init__(self, given: Mapping[str, Any], ask: Ask | None, folder: Path) -> None:
         self._given, self._ask, self._folder = given, ask, folder
 
     def option_of(self, key: str) -> str:
-        """Return the option from which the value of a key came; empty: from none."""
+        """Return the option that gave the value of a key; empty if none did."""
         name = next((name for name, end in _KEYS.items() if key.endswith(end)), "")
         return _option(name) if self._given.get(name) is not None else ""
 
@@ -110,7 +110,7 @@ class _Answers:
         default: object,
         check: Callable[[str], str] = lambda text: text,
     ) -> str:
-        """Return an answer as text, after a check that returns it, or raises `InputError`."""
+        """Return an answer as text; `check` returns it or raises `InputError`."""
         given = self._given.get(name)
         if given is not None or self._ask is None:
             return check(str(default if given is None else given))
@@ -133,7 +133,7 @@ class _Answers:
         return self.text(name, question, default, check)
 
     def count(self, name: str, question: str, default: int) -> int:
-        """Return a number of things."""
+        """Return a positive whole number."""
 
         def check(text: str) -> str:
             if not text.isdecimal() or int(text) < 1:
@@ -170,7 +170,7 @@ class _Answers:
         return self.text(name, question, default, check)
 
     def position(self, name: str, question: str, default: str, *, free: bool = False) -> str:
-        """Return three lengths, of which some may be free."""
+        """Return three lengths; axes may be `free` if allowed."""
 
         def check(text: str) -> str:
             parts = [part.strip() for part in text.strip("[] ").split(",")]
@@ -200,7 +200,7 @@ class _Answers:
 
 
 def _scalar(text: str) -> str:
-    """Return text on one line as a YAML file says it, in quotes where YAML needs them."""
+    """Return text as a YAML scalar on one line, quoted where needed."""
     folded = to_yaml({"text": text}).removeprefix("text: ")
     return " ".join(line.strip() for line in folded.splitlines())
 
@@ -210,8 +210,8 @@ def _option(name: str) -> str:
 
 
 def _write_checked(path: str, text: str, answers: _Answers) -> None:
-    """Write a file after a check of its text; what was there stays if that is wrong."""
-    folder = Path(path).absolute().parent  # where the files that it names are looked for
+    """Check a text and write it to a file; an existing file stays if the text is invalid."""
+    folder = Path(path).absolute().parent  # the draft's relative paths must resolve as the file's
     handle, draft = tempfile.mkstemp(dir=folder, prefix=".", suffix=".yaml")
     try:
         with open(handle, "wb") as stream:

@@ -21,7 +21,7 @@ from stiffopt.errors import InputError
 if TYPE_CHECKING:
     from stiffopt.lab.virtual import VirtualLab
 
-_TICK = 0.2  # s, between two checks of whether the arm still moves
+_TICK = 0.2  # s, period of checks whether the simulation still runs
 
 LAB_HELP = """\
 Start a simulated arm in real time behind the protocols of a rig file's devices.
@@ -77,7 +77,7 @@ def lab(
     ] = False,
 ) -> int:
     """Run the virtual lab."""
-    # here, so that --help waits for no numerics; without numba there is no lab
+    # here, so that --help waits for no numerics; the lab needs numba
     from stiffopt.files import file_text, save_file
     from stiffopt.lab.virtual import VirtualLab
     from stiffopt.model.robot_files import load_description, robot_path
@@ -108,7 +108,7 @@ def lab(
 
 
 def _serve(lab: VirtualLab, ended: threading.Event, *, quiet: bool) -> None:
-    """Carry out what is typed until the lab is ended or the arm cannot be followed."""
+    """Carry out typed commands until the lab ends or the simulation fails."""
     lines: queue.SimpleQueue[str] = queue.SimpleQueue()
     threading.Thread(target=_listen, args=(lines,), daemon=True).start()
     while not ended.is_set() and lab.bench.failure is None:
@@ -128,7 +128,7 @@ def _serve(lab: VirtualLab, ended: threading.Event, *, quiet: bool) -> None:
 
 
 def _listen(lines: queue.SimpleQueue[str]) -> None:
-    """Pass on what is typed; in the background of a terminal, or without one, that is nothing."""
+    """Queue typed lines; there are none in the background of a terminal or without one."""
     if sys.stdin is None:
         return
     with suppress(OSError, ValueError):
@@ -138,7 +138,7 @@ def _listen(lines: queue.SimpleQueue[str]) -> None:
 
 
 def _obey(lab: VirtualLab, words: list[str]) -> str:
-    """Carry out a command and return what to say about it."""
+    """Carry out a command and return its answer."""
     if words[0] == "fault" and len(words) in (3, 4):
         channel = None if len(words) == 3 else _channel(words[3])
         lab.world.inject(words[1], words[2], channel)
@@ -179,14 +179,14 @@ def _direction(words: list[str]) -> list[float]:
 
 @contextmanager
 def _until_signal() -> Iterator[threading.Event]:
-    """Give an event that Ctrl-C and SIGTERM set."""
+    """Context with an event that Ctrl-C and SIGTERM set."""
     ended = threading.Event()
 
     def end(number: int, frame: Any) -> None:
         ended.set()
 
     handlers: dict[int, Any] = {signal.SIGINT: end, signal.SIGTERM: end}
-    if hasattr(signal, "SIGTTIN"):  # to read a terminal from the background would stop the lab
+    if hasattr(signal, "SIGTTIN"):  # reading the terminal from the background would stop the lab
         handlers[signal.SIGTTIN] = signal.SIG_IGN
     before = {number: signal.signal(number, handler) for number, handler in handlers.items()}
     try:

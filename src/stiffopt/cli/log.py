@@ -24,11 +24,11 @@ Exit codes:
 EXPORT_HELP = """\
 Write a recording as CSV (log v1), from which 'stiffopt calibrate' can calibrate, or as a bag.
 
-In CSV each row is a frame of the tracker, at the time at which it was captured, with the pressures
-that were commanded and measured then; nothing that was estimated. Rows without a tip are from times
-in which the tracker saw nothing that can be believed. A bag (--bag, rosbag2 with MCAP) has what
-'stiffopt ros' publishes, and needs the extra 'ros'. RUN is a recording (.mcap), whole or cut short;
-of CSV also one of an experiment.
+In CSV each row is a frame of the tracker, at the time at which it was captured, with the commanded
+and measured pressures of that moment; nothing is estimated. Rows without a tip are from times in
+which the tracker gave no credible reading. A bag (--bag, rosbag2 with MCAP) has what 'stiffopt ros'
+publishes, and needs the extra 'ros'. RUN is a recording (.mcap), whole or cut short; for CSV it may
+also be one of an experiment.
 """
 
 _EXPORT_EPILOG = f"""\
@@ -42,8 +42,8 @@ Examples:
 PLOT_HELP = """\
 Draw a run on a page: target and tip, error, pressures, stiffness, states, alarms and events.
 
-Errors are told apart on the way to a target, and at it: from when the tip first is within 1 mm and
-1 deg.
+Errors on the way to a target and errors at it are reported separately: the tip is at the target
+once it has come within 1 mm and 1 deg.
 
 RUN is a recording (.mcap) of 'stiffopt run', whole or cut short.
 """

@@ -1,4 +1,4 @@
-"""The two programs: `stiffopt` with its commands, and `solve-pressure`, its command `solve`."""
+"""Entry points of the two programs: `stiffopt`, and `solve-pressure`, its command `solve`."""
 
 import gc
 import os
@@ -136,9 +136,9 @@ def solve_pressure_main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(application: typer.Typer, name: str, arguments: Sequence[str] | None) -> int:
     for stream in (sys.stdout, sys.stderr):
-        if hasattr(stream, "reconfigure"):  # a character that the terminal lacks is no error
+        if hasattr(stream, "reconfigure"):  # escape characters that the terminal lacks
             stream.reconfigure(errors="backslashreplace")
-    # Before NumPy is imported: the matrices are small, a second thread would only spin.
+    # Before NumPy is imported: matrices are small, and a second thread would only spin.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     given = sys.argv[1:] if arguments is None else list(arguments)
     try:
@@ -154,6 +154,6 @@ def _run(application: typer.Typer, name: str, arguments: Sequence[str] | None) -
         report_error(f"cannot write the answer: {error.strerror or error}")
         return BAD_INPUT
     finally:
-        if arguments is None:  # the process ends here; without this the collector runs for 40 ms
+        if arguments is None:  # the process ends here; saves 40 ms of garbage collection
             gc.freeze()
     return 0

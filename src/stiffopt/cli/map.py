@@ -1,4 +1,4 @@
-"""The commands `stiffopt map workspace` and `stiffopt map arm`: options, help, order of work."""
+"""The commands `stiffopt map workspace`, `map contact` and `map arm`: options, help and work."""
 
 import signal
 from time import perf_counter
@@ -92,11 +92,14 @@ def workspace(
     ] = "translation",
     boundary: BoundaryOption = "free",
     frame: FrameOption = "base",
-    seed: Annotated[int, typer.Option(metavar="N", min=0, help="Of the quasi-random samples.")] = 0,
+    seed: Annotated[
+        int, typer.Option(metavar="N", min=0, help="Seed of the quasi-random samples.")
+    ] = 0,
     scene: Annotated[
         str | None,
         typer.Option(
-            metavar="FILE", help="Leave out samples that are nearer to its objects than it says."
+            metavar="FILE",
+            help="A scene file; samples without its clearance are left out.",
         ),
     ] = None,
     scheduler: Annotated[
@@ -104,7 +107,7 @@ def workspace(
         typer.Option(metavar="ADDRESS", help="Have the workers of this Dask scheduler do it."),
     ] = None,
     timeout: Annotated[
-        str | None, typer.Option(metavar="TIME", help="After which to stop, as by Ctrl-C.")
+        str | None, typer.Option(metavar="TIME", help="Stop after this time, as by Ctrl-C.")
     ] = None,
     plot: Annotated[
         str | None,
@@ -206,7 +209,8 @@ def contact(
     pressures: Annotated[
         str,
         typer.Option(
-            metavar="LIST", help="Of all channels, proximal segment first: '0.2, 0, 0.3 bar'."
+            metavar="LIST",
+            help="Pressures of all channels, proximal segment first: '0.2, 0, 0.3 bar'.",
         ),
     ],
     plot: Annotated[
@@ -273,11 +277,11 @@ def arm(
         str | None,
         typer.Option(
             metavar="LIST",
-            help="To which: '0,0.5,1 bar' or '0:1.5:0.5 bar'; by default seven up to the limit.",
+            help="Pressures, '0,0.5,1 bar' or '0:1.5:0.5 bar'; by default seven up to the limit.",
         ),
     ] = None,
     points: Annotated[
-        int | None, typer.Option(metavar="N", min=2, help="Along the arm; by default 25.")
+        int | None, typer.Option(metavar="N", min=2, help="Points along the arm; by default 25.")
     ] = None,
     over: Annotated[
         str | None,
@@ -285,7 +289,9 @@ def arm(
     ] = None,
     levels: Annotated[
         int | None,
-        typer.Option(metavar="K", min=2, help="With --over: of each channel; by default 31."),
+        typer.Option(
+            metavar="K", min=2, help="With --over: levels of each channel; by default 31."
+        ),
     ] = None,
     boundary: BoundaryOption = "free",
     frame: FrameOption = "base",

@@ -1,4 +1,4 @@
-"""Maps as text for the terminal, as JSON and as CSV."""
+"""Report maps: on the terminal, as JSON and as CSV."""
 
 import csv
 import io

@@ -1,4 +1,4 @@
-"""Options that several commands share, and how commands are grouped."""
+"""Options that several commands share, and the application to which commands are added."""
 
 from typing import Annotated, Any
 
@@ -12,14 +12,14 @@ from stiffopt.errors import InputError
 def command_group(**settings: Any) -> typer.Typer:
     """Return an application to which commands are added.
 
-    Its help has no rich markup: a path may hold brackets, and help is read in pipes too.
+    Its help has no rich markup: paths may contain brackets, and help may be piped.
     """
     always = {"pretty_exceptions_enable": False, "rich_markup_mode": None}
     return typer.Typer(**{"add_completion": False, **always, **settings})
 
 
 def print_version(wanted: bool) -> None:
-    """Print the version and exit, if that is wanted."""
+    """Print the version and exit, if wanted."""
     if wanted:
         from stiffopt import __version__
 
@@ -28,7 +28,7 @@ def print_version(wanted: bool) -> None:
 
 
 def show_in_units(text: str | None) -> str | None:
-    """Show tables, figures and messages in the units that an option, or the environment, names."""
+    """Choose the units of tables, figures and messages by an option or the environment."""
     from stiffopt.display import choose_units, display_units  # here: --help waits for no numbers
 
     try:
@@ -62,7 +62,8 @@ Units = Annotated[
         "--units",
         metavar="UNITS",
         callback=show_in_units,
-        help="Of what is shown, such as 'mm, kPa, N/mm', as STIFFOPT_UNITS too; JSON stays SI.",
+        help="Units of tables, figures and messages, such as 'mm, kPa, N/mm'; also by the variable "
+        "STIFFOPT_UNITS. JSON stays SI.",
     ),
 ]
 BoundaryOption = Annotated[
@@ -75,6 +76,6 @@ ViewOption = Annotated[
     str | None,
     typer.Option(
         metavar="ANGLES",
-        help="From where --plot looks: elevation and azimuth about z from x, '20 deg, -60 deg'.",
+        help="Viewpoint of --plot: elevation, and azimuth about z from x, '20 deg, -60 deg'.",
     ),
 ]

@@ -1,6 +1,6 @@
-"""Files and folders that commands write: checked before long work, written whole or not at all.
+"""Check the paths of output files and folders before long work.
 
-Each check raises `FileError` if something cannot be written.
+Each check raises `FileError` if the path cannot be written.
 """
 
 import os
@@ -45,7 +45,7 @@ def check_new_folder(path: str) -> None:
 
 @contextmanager
 def new_folder(path: str | None) -> Iterator[Path | None]:
-    """Context with a folder that gets its name at the end, and is removed if something fails."""
+    """Context with a folder that is renamed to `path` at the end, or removed on failure."""
     if path is None:
         yield None
         return

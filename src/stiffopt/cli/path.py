@@ -1,4 +1,4 @@
-"""The command `stiffopt path`: its options and its help."""
+"""Options and help of the command `stiffopt path`."""
 
 from typing import Annotated
 
@@ -71,7 +71,7 @@ def path(
     seed: Annotated[
         int,
         typer.Option(
-            metavar="N", min=0, help="Of the global search: the same seed, the same answer."
+            metavar="N", min=0, help="Seed of the global search; the same gives the same answer."
         ),
     ] = 0,
     units: Units = None,

@@ -1,4 +1,4 @@
-"""The solution of a path as data: a line of JSON, rows of CSV, or an entry of a result file."""
+"""Convert the solution of a path to data: JSON, CSV, or an entry of a result file."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from stiffopt.paths.solution import PathSolution, Vector
 from stiffopt.units import unit_suffix
 
 _ERROR = "position_error_m"
-"""A column that no log has, by which a solution is known."""
+"""A column that no log has; it identifies a solution."""
 
 
 class SolvedPath(NamedTuple):
@@ -28,13 +28,13 @@ class SolvedPath(NamedTuple):
 
 
 def rate_margins(solution: PathSolution) -> Vector | None:
-    """Return how much of its rate is left to the fastest channel on the way to each point.
+    """Return the unused share of the rate of the fastest channel on the way to each point.
 
     Returns
     -------
     (N,) array or None
         1 where nothing moves (and at the first point), 0 at the limit, negative beyond it; None
-        where no rates are known.
+        if no rates are known.
     """
     if solution.slew is None or not len(solution.times):
         return None
@@ -48,7 +48,7 @@ def json_record(solved: SolvedPath) -> dict[str, Any]:
 
 
 def solution_values(solution: PathSolution) -> dict[str, Any]:
-    """Return what a solution says, in SI units."""
+    """Return the values of a solution, in SI units."""
     return {
         "status": solution.status,
         "found": solution.found,
@@ -71,7 +71,7 @@ def solution_values(solution: PathSolution) -> dict[str, Any]:
 
 
 def csv_text(solution: PathSolution) -> str:
-    """Return a solution as CSV in SI units, one row a point; what there is none of is left out."""
+    """Return a solution as CSV in SI units, a row for each point, without absent quantities."""
     channels = range(solution.pressures.shape[1]) if len(solution.times) else ()
     stiffness = f"stiffness{unit_suffix(solution.stiffness_unit or '')}"
     missing = np.full(len(solution.times), np.nan)
@@ -91,7 +91,7 @@ def csv_text(solution: PathSolution) -> str:
 
 
 def is_result_csv(file: FilePath) -> bool:
-    """Whether a file is what `csv_text` makes."""
+    """Whether a file was written by `csv_text`."""
     return _ERROR.encode() in read_bytes(file).partition(b"\n")[0].split(b",")
 
 
@@ -101,7 +101,7 @@ def result_record(solved: SolvedPath) -> dict[str, Any]:
 
 
 def solution_quantities(solution: PathSolution) -> dict[str, Any]:
-    """Return what a solution says as text: numbers of seven digits with their units."""
+    """Return the values of a solution as text with units, to seven digits."""
     description = solution.robot.description
     unit = solution.stiffness_unit or ""
     channels = range(solution.pressures.shape[1]) if len(solution.times) else ()
@@ -133,7 +133,7 @@ def solution_quantities(solution: PathSolution) -> dict[str, Any]:
 
 
 def _quantities(values: Vector | None, unit: str, per_si: float = 1.0) -> list[str | None] | None:
-    """Return quantities as text in a unit, of which one in SI is `per_si`; None: no number."""
+    """Return quantities as text in a unit; an SI unit has `per_si` of it. None: no number."""
     if values is None:
         return None
     return [

@@ -1,4 +1,4 @@
-"""Solved paths as text for the terminal: a block for each path, with a table of some points."""
+"""Report solved paths on the terminal: a block for each path, with a table of some points."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from stiffopt.model.scene import Scene
 from stiffopt.paths.solution import PathSolution
 from stiffopt.plots.wording import stiffness_text
 
-_ROWS = 10  # of the table, about
+_ROWS = 10  # approximate number in the table
 
 
 def block(solved: SolvedPath) -> RenderableType:
@@ -31,7 +31,7 @@ def block(solved: SolvedPath) -> RenderableType:
 
 
 def summary_row(solved: SolvedPath, seconds: float) -> tuple[str, ...]:
-    """Return the line of the summary for a path that took this time altogether."""
+    """Return the path's line of the summary; it took `seconds` in all."""
     solution = solved.solution
     worst = "" if solution.worst is None else _stiffness(solution.worst, solution)
     last = f"{solution.times[-1]:.4g}" if len(solution.times) else ""
@@ -65,7 +65,7 @@ def _lines(solved: SolvedPath) -> Iterable[tuple[str, RenderableType]]:
 
 
 def _stiffness_lines(solved: SolvedPath) -> Iterable[tuple[str, RenderableType]]:
-    """The worst stiffness and the mean; what is maximised is marked."""
+    """Yield the worst stiffness and the mean; the maximised one is marked."""
     path, solution = solved.path, solved.solution
     index = solution.worst_index
     if solution.stiffness is None or index is None or path.stiffness is None:
@@ -87,7 +87,7 @@ def _stiffness_lines(solved: SolvedPath) -> Iterable[tuple[str, RenderableType]]
 
 
 def rate_lines(solution: PathSolution) -> Iterable[tuple[str, RenderableType]]:
-    """Where the pressures are nearest to their rates."""
+    """Yield where the pressures are nearest to their rates."""
     margins = rate_margins(solution)
     if margins is None or solution.slew is None:
         yield "rates", Text("not known: neither robot nor path says a slew")
@@ -112,7 +112,7 @@ def rate_lines(solution: PathSolution) -> Iterable[tuple[str, RenderableType]]:
 def clearance_lines(
     solution: PathSolution, scene: Scene | None
 ) -> Iterable[tuple[str, RenderableType]]:
-    """Where the body is nearest to the scene."""
+    """Yield where the body is nearest to the scene."""
     if solution.clearance is None or scene is None:
         return
     index, unit = int(np.argmin(solution.clearance)), display_units().length
@@ -126,7 +126,7 @@ def clearance_lines(
 
 
 def points_table(solution: PathSolution) -> RenderableType:
-    """Every so many points, and those that matter."""
+    """Return a table of evenly spaced points and of the notable ones."""
     count = len(solution.times)
     marks: dict[int, str] = {}
     if solution.worst_index is not None:
@@ -146,7 +146,7 @@ def points_table(solution: PathSolution) -> RenderableType:
 
 
 def _columns(solution: PathSolution) -> dict[str, list[str]]:
-    """Headings and cells of what there is, a cell for each point."""
+    """Return the available columns: heading, and a cell for each point."""
     margins = rate_margins(solution)
     alone = solution.alone
     share = None if solution.stiffness is None or alone is None else solution.stiffness / alone
@@ -173,7 +173,7 @@ def _columns(solution: PathSolution) -> dict[str, list[str]]:
 
 
 def _explained(table: Table, solution: PathSolution) -> RenderableType:
-    """Add below the table what its headings mean."""
+    """Explain the headings below the table."""
     notes = []
     if solution.alone is not None:
         notes.append("of alone: share of what the point could have by itself")

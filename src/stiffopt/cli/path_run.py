@@ -1,4 +1,4 @@
-"""What `stiffopt path` does: solve path files in turn; print, write and draw the solutions."""
+"""Run `stiffopt path`: solve path files in turn; print, write and draw the solutions."""
 
 from __future__ import annotations
 
@@ -107,12 +107,12 @@ class PathBatch(Batch[SolvedPath]):
 
 
 def is_csv(out: str) -> bool:
-    """Say whether the name of a file ends as that of a CSV file."""
+    """Return whether a file name ends in .csv."""
     return out.lower().endswith(".csv")
 
 
 def check_csv(out: str, files: Sequence[str]) -> None:
-    """Check the paths of CSV files: only what an earlier command wrote is overwritten."""
+    """Check the paths of CSV files: only the output of an earlier command is overwritten."""
     for name in map(FilePath, names_for_each(out, files)):
         check_writable(str(name))
         if name.is_file() and name.stat().st_size and not path_records.is_result_csv(name):

@@ -1,4 +1,4 @@
-"""The command `stiffopt plan`: its options and its help."""
+"""Options and help of the command `stiffopt plan`."""
 
 from typing import Annotated
 
@@ -53,13 +53,13 @@ def plan(
     ] = None,
     clearance: Annotated[
         str | None,
-        typer.Option(metavar="LENGTH", help="Asked of the body, instead of the scene's: '2 mm'."),
+        typer.Option(metavar="LENGTH", help="Required clearance, replaces the scene's: '2 mm'."),
     ] = None,
     slew: Annotated[
         str | None,
         typer.Option(
             metavar="RATES",
-            help="One rate or one per channel, such as '2 bar/s'; the robot's hold too.",
+            help="Largest rates, one or one per channel, such as '2 bar/s'; besides the robot's.",
         ),
     ] = None,
     as_json: Json = False,
@@ -77,9 +77,11 @@ def plan(
     view: ViewOption = None,
     seed: Annotated[
         int,
-        typer.Option(metavar="N", min=0, help="Of the search: the same seed, the same motion."),
+        typer.Option(
+            metavar="N", min=0, help="Seed of the search; the same gives the same motion."
+        ),
     ] = 0,
-    timeout: Annotated[str, typer.Option(metavar="TIME", help="After which to give up.")] = "10 s",
+    timeout: Annotated[str, typer.Option(metavar="TIME", help="Give up after this time.")] = "10 s",
     units: Units = None,
     quiet: Quiet = False,
 ) -> int:

@@ -1,4 +1,4 @@
-"""What `stiffopt plan` does: plan a motion; print, write and draw it."""
+"""Run `stiffopt plan`: plan a motion; print, write and draw it."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class PlanCommand:
-    """The options of `stiffopt plan` that say what is planned."""
+    """The options of `stiffopt plan` that define the motion."""
 
     robot: str | None
     start: str
@@ -72,7 +72,7 @@ class PlanCommand:
         return self._write(scene, solution, out, plot, angles) or exits.OF_STATUS[solution.status]
 
     def _plan(self) -> tuple[Scene | None, PathSolution]:
-        """The scene that is kept clear of, and the motion."""
+        """Return the scene and the motion."""
         given = [load_task(text) if _is_file(text) else text for text in (self.start, *self.goals)]
         tasks = [each for each in given if isinstance(each, Task)]
         robot = self._robot(tasks)
@@ -138,7 +138,7 @@ class PlanCommand:
         return code
 
     def _report(self, scene: Scene | None, solution: PathSolution) -> RenderableType:
-        """The motion as text."""
+        """Return the report for the terminal."""
         from rich.console import Group
 
         from stiffopt.cli.path_report import points_table
@@ -172,7 +172,7 @@ class PlanCommand:
 
 
 def _is_file(text: str) -> bool:
-    """Whether an end of a motion is a task file; else it is pressures."""
+    """Whether an end of a motion is a task file rather than pressures."""
     return text.lower().endswith((".yaml", ".yml")) or FilePath(text).is_file()
 
 

@@ -1,4 +1,4 @@
-"""Reads the values of options: quantities with units, lists of them, directions, channels.
+"""Read the values of options: quantities with units, lists of them, directions, channels.
 
 Each function raises `InputError`, which names the option, if it cannot read the text.
 """
@@ -13,7 +13,7 @@ _LIST = re.compile(r"\s*([-+0-9.,:eE\s]*[0-9.])\s*([A-Za-z].*?)\s*")
 _NUMBER = re.compile(r"[-+0-9.eE]+")
 _LAST_UNIT = re.compile(r"[-+0-9.eE]+\s*([A-Za-z].*)")
 _AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
-_MOST = 1000  # values of a range
+_MAX_VALUES = 1000  # of a range
 
 
 def quantity(option: str, text: str, unit: str, what: str) -> float:
@@ -52,8 +52,10 @@ def pressures(option: str, text: str) -> tuple[float, ...]:
     if step <= 0 or end < start:
         raise InputError(f"{option}: a range goes up, in steps above 0; {example}")
     count = int((end - start) / step * (1 + 1e-9)) + 1
-    if count > _MOST:
-        raise InputError(f"{option}: these are {count} pressures; at most {_MOST} are allowed")
+    if count > _MAX_VALUES:
+        raise InputError(
+            f"{option}: these are {count} pressures; at most {_MAX_VALUES} are allowed"
+        )
     return tuple(round(start + step * k, 6) for k in range(count))
 
 
@@ -72,7 +74,7 @@ def view(text: str | None) -> tuple[float, ...] | None:
     Raises
     ------
     InputError
-        If it is not two angles, or no view of an arm.
+        The text is not two angles, or the elevation exceeds 90 deg.
     """
     if text is None:
         return None

@@ -1,4 +1,4 @@
-"""What commands do with a rig: find it, open it, work on it, and vent it whatever happens."""
+"""Open a rig for a command, work on it, and vent it whatever happens."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ T = TypeVar("T")
 
 
 class RigStoppedError(RigFaultError):
-    """Something went wrong after the rig was opened."""
+    """The work failed after the rig was opened."""
 
 
 def rig_of(path: str) -> tuple[Rig, str, float, str]:
-    """The rig of a file, its name, its rate and its log folder."""
+    """Return the rig of a file, its name, its rate in Hz and its log folder."""
     from stiffopt.rig.config import load_rig_description
     from stiffopt.safety.rigs import open_rig
 
@@ -28,7 +28,7 @@ def rig_of(path: str) -> tuple[Rig, str, float, str]:
 
 
 def new_name(experiment: str, rig: str) -> str:
-    """Name of the folder of a new experiment: that of the rig, and the time."""
+    """Return a name for the folder of a new experiment, with the rig's name and the time."""
     stamp = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
     safe = re.sub(r"[^\w.-]+", "-", rig).strip("-.") or "rig"
     return f"{experiment}_{safe}_{stamp}"
@@ -44,7 +44,7 @@ def open_rig_for(rig: Rig, undo: Callable[[], None]) -> None:
 
 
 def on_rig(rig: Rig, work: Callable[[], T], interrupt: InterruptBetweenSteps) -> T:
-    """Work, and vent and close the rig whatever happens."""
+    """Run `work`, then vent and close the rig whatever happens; return the result of `work`."""
     failure: BaseException | None = None
     try:
         done = work()

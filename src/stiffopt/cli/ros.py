@@ -1,4 +1,4 @@
-"""The command `stiffopt ros`: its options and its help."""
+"""Options and help of the command `stiffopt ros`."""
 
 from typing import Annotated
 
@@ -36,17 +36,19 @@ def ros(
     rig: RigArgument,
     distro: Annotated[
         str | None,
-        typer.Option(metavar="NAME", help="humble or jazzy: by whose layout nodes are listed."),
+        typer.Option(metavar="NAME", help="humble or jazzy: the distribution of ROS on the graph."),
     ] = None,
     domain: Annotated[
         int | None,
-        typer.Option(metavar="ID", min=0, max=232, help="Of DDS; else ROS_DOMAIN_ID, else 0."),
+        typer.Option(metavar="ID", min=0, max=232, help="DDS domain; else ROS_DOMAIN_ID, else 0."),
     ] = None,
-    namespace: Annotated[str | None, typer.Option(metavar="NAMESPACE", help="Of the node.")] = None,
-    node: Annotated[str | None, typer.Option(metavar="NAME", help="Of the node.")] = None,
+    namespace: Annotated[
+        str | None, typer.Option(metavar="NAMESPACE", help="Namespace of the node.")
+    ] = None,
+    node: Annotated[str | None, typer.Option(metavar="NAME", help="Name of the node.")] = None,
     remap: Annotated[
         list[str] | None,
-        typer.Option("--remap", "-r", metavar="FROM:=TO", help="Another name; may be repeated."),
+        typer.Option("--remap", "-r", metavar="FROM:=TO", help="Rename a topic; may be repeated."),
     ] = None,
     token_file: Annotated[
         str | None,

@@ -1,4 +1,4 @@
-"""The work of `stiffopt ros`: find or start the daemon, and run the node until a signal."""
+"""Run `stiffopt ros`: find or start the daemon, and run the node until a signal."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ from stiffopt.rig.config import RigDescription, load_rig_description
 from stiffopt.rig.settings import RosSettings
 
 _START = 600.0  # s; a first start compiles the model
-_TELL = 10.0  # s after which a note says that the daemon is still starting; then ever more seldom
-_LATE = 30.0  # s, beyond the ramp, in which a daemon has ended
+_TELL = 10.0  # s until a note says that the daemon is still starting; later ones come less often
+_LATE = 30.0  # s that a daemon may take to end, beyond the ramp
 _LOOPBACK = (None, "lo")
 
 
 def run(rig: str, given: Mapping[str, Any], remap: Sequence[str], token_file: str | None) -> int:
-    """Run the node of a rig; return the exit code. `given` are options in place of `ros:`."""
+    """Run the node of a rig; return the exit code. `given` are options that override `ros:`."""
     require_package("cyclonedds", "ros")
     from stiffopt.ros.bridge import NAMES, Bridge
     from stiffopt.ros.names import NodeNames, remap_rules
@@ -67,7 +67,7 @@ def run(rig: str, given: Mapping[str, Any], remap: Sequence[str], token_file: st
                 bridge = Bridge(rig, description, robot, url, token, node, report_note)
                 with closing(bridge):
                     _tell(names, domain, settings)
-                    # a daemon of ours is shown, and vents for whoever asks, until it has ended
+                    # a daemon started here stays visible, and can be vented, until it has ended
                     bridge.run(daemon.left)
         except ServiceError as error:
             if not over.is_set():
@@ -81,7 +81,7 @@ def run(rig: str, given: Mapping[str, Any], remap: Sequence[str], token_file: st
 def _settings(
     settings: RosSettings, given: Mapping[str, Any], rules: Mapping[str, str]
 ) -> RosSettings:
-    """Return the rig file's settings, with options in their place."""
+    """Return the rig file's settings, overridden by options."""
     options = {key: value for key, value in given.items() if value is not None}
     changes = {**settings.model_dump(), **options, "remap": {**settings.remap, **rules}}
     try:
@@ -109,17 +109,17 @@ def _tell(names: Any, domain: int, settings: RosSettings) -> None:
 
 
 class _Daemon:
-    """The daemon of a rig: one that runs already, or one that is started and ended here."""
+    """The daemon of a rig: one that already runs, or one that is started and ended here."""
 
     def __init__(self, rig: str, description: RigDescription, token_file: str | None) -> None:
         self._rig, self._description, self._token_file = rig, description, token_file
         self._process: subprocess.Popen[str] | None = None
-        self._asked = False  # to end
+        self._asked = False  # whether it was asked to end
         self.left = threading.Event()
-        """Set when a daemon that others have started is to be left."""
+        """Set to disconnect from a daemon that others have started."""
 
     def find(self, over: threading.Event) -> tuple[str, str]:
-        """Return the URL and the token of the daemon, which is started if none runs.
+        """Return the URL and the token of the daemon; start one if none runs.
 
         Raises
         ------
@@ -144,7 +144,7 @@ class _Daemon:
         return True
 
     def _token(self, file: str | None) -> str:
-        """Return the token, without which not even venting would be possible."""
+        """Return the token; without it, not even venting would be possible."""
         description = self._description
         secret = Secret(description.service, description.log.folder, description.name)
         place = file or secret.path
@@ -160,7 +160,7 @@ class _Daemon:
             ) from None
 
     def _start(self, over: threading.Event) -> tuple[str, str]:
-        """Start a daemon, in a session of its own, so that Ctrl-C reaches it through here alone."""
+        """Start a daemon in its own session, so that Ctrl-C reaches it only through here."""
         report_note(f"no daemon of {self._description.name} runs: one is started")
         command = [sys.executable, "-m", "stiffopt", "run", self._rig, "--json-lines"]
         self._process = subprocess.Popen(
@@ -183,7 +183,7 @@ class _Daemon:
         return started["url"], self._token(started.get("token_file"))
 
     def _listen(self, started: dict[str, Any], there: threading.Event) -> None:
-        """Pass on what the daemon says, and note where it is."""
+        """Forward the daemon's messages, and store its address."""
         assert self._process is not None
         assert self._process.stdout is not None
         for line in self._process.stdout:
@@ -197,9 +197,9 @@ class _Daemon:
                         there.set()
 
     def begin_end(self) -> None:
-        """Let the daemon end if it was started here, and leave it if not; this does not wait.
+        """Ask the daemon to end if it was started here, else disconnect; does not wait.
 
-        To be asked to end twice, it vents at once.
+        Asked a second time, the daemon vents at once.
         """
         if self._process is None:
             self.left.set()

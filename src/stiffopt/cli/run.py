@@ -1,4 +1,4 @@
-"""The command `stiffopt run`: its options and help."""
+"""Options and help of the command `stiffopt run`."""
 
 import sys
 from typing import Annotated

@@ -1,4 +1,4 @@
-"""Runs the daemon in the foreground: starts it, shows its state, ends it on a signal.
+"""Run the daemon in the foreground: start it, show its state, end it on a signal.
 
 It ends in bounded time, even if the terminal or a thread hangs.
 """
@@ -29,10 +29,10 @@ from stiffopt.rig.config import load_rig_description
 if TYPE_CHECKING:
     from stiffopt.daemon.daemon import Daemon
 
-_CHECK = 0.2  # s, between two checks of whether the end has begun
-_LOOK = 0.05  # s, between two checks of whether it is over
-_LAST_OUTPUT = 1.0  # s, for what is shown at the end
-_FLUSH = 0.3  # s
+_CHECK = 0.2  # s, period of checks whether the end has begun
+_LOOK = 0.05  # s, period of checks whether it is over
+_LAST_OUTPUT = 1.0  # s, time limit of the last output
+_FLUSH = 0.3  # s, time limit of flushing
 _LATE = "error: the daemon did not end in time and is left as it is; its guard vents"
 _log = logging.getLogger(__name__)
 
@@ -51,8 +51,8 @@ def run(
 ) -> int:
     """Run the daemon of a rig until it is ended; return the exit code.
 
-    `rig`, `task` and `play` are paths of files, `duration` is text with a unit, `service` says
-    whether ports are opened, `plot` is the path of a figure of the run, `style` is ``live``,
+    `rig`, `task` and `play` are paths of files, `duration` is text with a unit. `service` says
+    whether to open ports, `plot` is the path of a figure of the run, and `style` is ``live``,
     ``plain`` or ``json``.
     """
     if task is not None and not arm:
@@ -73,7 +73,7 @@ def run(
     seconds = float("inf") if duration is None else quantity("--duration", duration, "s", "time")
     if not seconds > 0:
         raise InputError("--duration: expected a time above 0 s")
-    load_rig_description(rig)  # its mistakes are told before anything is loaded
+    load_rig_description(rig)  # reports its mistakes before anything else is loaded
     with _Signals().handled() as signals:
         from stiffopt.daemon.daemon import TIMES, Daemon
 
@@ -145,7 +145,7 @@ def _verdict(daemon: Daemon, watch: _Watch, state: State, refused: str) -> int:
 
 
 def _draw(recording: str | None, path: str) -> None:
-    """Draw a run that has ended; what fails there is reported and changes nothing else."""
+    """Draw a run that has ended, or report why that fails."""
     try:
         from stiffopt.daemon.run_log import read_run
         from stiffopt.plots import save_figure
@@ -160,7 +160,7 @@ def _draw(recording: str | None, path: str) -> None:
 
 
 class _Watch:
-    """Waits while a daemon runs and while it ends, and shows its state."""
+    """Shows the state of a daemon while it runs and while it ends."""
 
     def __init__(
         self, daemon: Daemon, display: LiveStatus | Lines, signals: _Signals, screen: Screen
@@ -171,11 +171,11 @@ class _Watch:
         self._ending = False
 
     def is_ending(self) -> bool:
-        """Whether the end has begun, or was asked for."""
+        """Whether the end has begun or was requested."""
         return self._ending or self.signals.count > 0
 
     def say(self, kind: str, text: str) -> None:
-        """Show something that is no event of the loop."""
+        """Show a message that is not an event of the loop."""
         self._screen.post(lambda: self._display.say(kind, text))
 
     def say_slow(self, text: str) -> None:
@@ -187,16 +187,16 @@ class _Watch:
         self._screen.post(lambda: report_error(text))
 
     def begin(self) -> None:
-        """Show what was started."""
+        """Show the daemon that was started."""
         self._screen.post(lambda: self._display.begin(self._daemon))
 
     def show(self) -> None:
-        """Show what is new, unless the last update still waits to be shown."""
+        """Show an update, unless the last one is still waiting."""
         if not self._screen.is_behind:
             self._screen.post(self._update)
 
     def end(self) -> None:
-        """Show the last state, and then no more."""
+        """Show the last state, then end the display."""
         self._screen.post(self._update)
         self._screen.post(self._display.end)
 
@@ -205,9 +205,9 @@ class _Watch:
         self._display.update(self._daemon.loop.snapshot(), events)
 
     def go_on(self, end: float, *, unattended: bool) -> None:
-        """Show until a signal comes, the time `end` has come, or control has ended.
+        """Show updates until a signal, the time `end`, or the end of control.
 
-        A fault ends it too if it is `unattended`, as no client can reset it then.
+        If `unattended`, a fault also ends it, since no client can reset the fault.
         """
         while not (self.signals.count or self._daemon.ended or time.monotonic() > end):
             self.show()
@@ -216,7 +216,7 @@ class _Watch:
             self.signals.wait(self._display.period)
 
     def wind_up(self) -> None:
-        """Show how the pressures are let down; another signal lets them out at once."""
+        """Let the pressures down and show it; another signal vents at once."""
         from stiffopt.daemon.daemon import TIMES
 
         self._ending = True
@@ -232,16 +232,16 @@ class _Watch:
 
 
 class _Signals:
-    """Counts the signals that ask the program to end, without interrupting it."""
+    """Counts signals to end the program, without interrupting it."""
 
     def __init__(self) -> None:
         self.count = 0
         self._interrupt = False
-        self._news: SimpleQueue[None] = SimpleQueue()  # an Event's lock is not for handlers
+        self._news: SimpleQueue[None] = SimpleQueue()  # an Event is not safe in a signal handler
 
     @contextmanager
     def handled(self) -> Iterator[_Signals]:
-        """Context in which they are counted."""
+        """Context in which signals are counted."""
         with handled(dict.fromkeys(ENDING_SIGNALS, self._handle)):
             yield self
 
@@ -257,7 +257,7 @@ class _Signals:
             self._interrupt = False
 
     def wait(self, seconds: float) -> None:
-        """Let some time pass, until the next signal at most."""
+        """Wait for some time, or until the next signal."""
         with suppress(Empty):
             self._news.get(timeout=seconds)
 
@@ -278,7 +278,7 @@ def _display(style: str, daemon: Daemon) -> LiveStatus | Lines:
 
 
 class Screen:
-    """Prints from a thread of its own, since writing to a terminal may block."""
+    """Prints from its own thread, since writing to a terminal may block."""
 
     def __init__(self) -> None:
         self._waiting: SimpleQueue[Callable[[], object] | None] = SimpleQueue()
@@ -291,11 +291,11 @@ class Screen:
         return not self._waiting.empty()
 
     def post(self, show: Callable[[], object]) -> None:
-        """Have something shown; this waits for nothing."""
+        """Queue a function that shows something; does not block."""
         self._waiting.put(show)
 
     def finish(self, seconds: float) -> bool:
-        """Show what waits and then nothing more; return whether that is done in time."""
+        """Show everything queued, then end; return whether that finished in time."""
         self._waiting.put(None)
         self._thread.join(seconds)
         return not self._thread.is_alive()
@@ -309,9 +309,9 @@ class Screen:
 
 
 class Backstop:
-    """A watchdog that ends the process some seconds after `has_begun` says that the end has begun.
+    """A watchdog, as a context, that ends the process if its end takes too long.
 
-    It does nothing if the context is left before.
+    It acts `seconds` after `has_begun` first returns true, unless the context was left before.
     """
 
     def __init__(self, seconds: float, has_begun: Callable[[], bool]) -> None:
@@ -336,7 +336,7 @@ class Backstop:
 
 
 def leave(code: int) -> None:
-    """End this process at once, without waiting for any thread; what was printed is flushed."""
+    """Flush the output and end this process at once, without waiting for any thread."""
     ends_within(_FLUSH, call_in_thread("flush", _flush))
     os._exit(code)
 

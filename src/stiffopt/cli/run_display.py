@@ -1,4 +1,4 @@
-"""Shows a run: as a live status on a terminal, or as lines, in JSON for programs."""
+"""Show a run: as a live status on a terminal, or as lines of text or JSON."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from stiffopt.safety.messages import json_line
 if TYPE_CHECKING:
     from stiffopt.daemon.daemon import Daemon
 
-_LONGEST = 500  # characters of a text: a pipe takes 4096 bytes at once or not at all
+_LONGEST = 500  # characters of a text, since a pipe takes up to 4096 bytes atomically
 _COLOURS = {
     State.UNCONFIGURED: "bold white",
     State.INACTIVE: "bold cyan",
@@ -44,7 +44,7 @@ _LEVELS = {Severity.INFO: "dim", Severity.WARNING: "yellow", Severity.ERROR: "bo
 _BAR = 24  # characters of a pressure's bar
 _EVENTS = 6
 _UNKNOWN = "-"
-_DECIMALS = {"m": 1, "rad": 1}  # of a vector, in the usual units
+_DECIMALS = {"m": 1, "rad": 1}  # of vectors, in the usual display units
 
 
 def write_at_once(stream: TextIO, line: str) -> None:
@@ -61,15 +61,16 @@ def write_at_once(stream: TextIO, line: str) -> None:
 class Lines:
     """Writes a line to stdout for each event and each change of state.
 
-    Writing never waits and never fails: a line is left out if its reader has stopped or is gone,
-    for the arm is more important.
+    Writing never blocks and never fails: a line is dropped if its reader is slow or gone, since the
+    arm is more important.
 
     Parameters
     ----------
     as_json :
-        As an object with ``time`` (of day, UTC), ``level``, ``kind`` and ``text``; else for people.
+        Whether lines are JSON objects with ``time`` (of day, UTC), ``level``, ``kind`` and
+        ``text``, rather than text for people.
     now :
-        Time on the rig's clock, in s.
+        Returns the time on the rig's clock, in s.
     """
 
     period = 0.05  # s, between two updates
@@ -83,7 +84,7 @@ class Lines:
         self._line(self._now(), str(severity), kind, text)
 
     def begin(self, daemon: Daemon) -> None:
-        """Write where the daemon is reached and what it records."""
+        """Write the daemon's addresses and the path of its recording."""
         found: dict[str, Any] = {
             "url": daemon.url,
             "token_file": None if daemon.token_file is None else str(daemon.token_file),
@@ -95,7 +96,7 @@ class Lines:
         self._line(self._now(), "info", "started", f"runs; {words or 'no ports'}", **known)
 
     def update(self, now: Snapshot, events: list[Event]) -> None:
-        """Write the new events, and the state if it has changed."""
+        """Write new events, and the state if it has changed."""
         for event in events:
             self._line(event.time, str(event.severity), event.kind, event.text)
         shown = [entry for entry in entries(type(now)) if entry.shown.line]
@@ -124,8 +125,8 @@ class Lines:
 class LiveStatus:
     """Shows the state of the loop in one place of the terminal.
 
-    A terminal that is gone or fails is no reason to end: nothing is shown then. `name` is that of
-    the rig, `channels` are those of its channels (n,).
+    If the terminal fails, nothing is shown and the run goes on. `name` is the rig's, `channels` are
+    the names of its n channels.
     """
 
     period = 0.25  # s, between two updates
@@ -144,18 +145,18 @@ class LiveStatus:
         self._works = True
 
     def say(self, kind: str, text: str, severity: Severity = Severity.INFO) -> None:
-        """Show something as an event of this moment."""
+        """Show a message as an event of this moment."""
         self._events.append(Event(time.monotonic(), kind, text, severity))
         if not self._live.is_started:
             self._attempt(lambda: self._live.console.print(Text(text, _LEVELS[severity])))
 
     def begin(self, daemon: Daemon) -> None:
-        """Start to show, with the addresses of a daemon."""
+        """Start the display, with the addresses of a daemon."""
         self._daemon = daemon
         self._attempt(self._live.start)
 
     def update(self, now: Snapshot, events: list[Event]) -> None:
-        """Show the state, and events with the last ones before them."""
+        """Show the state, and the last events."""
         self._events.extend(events)
         if self._before is not None and now.time > self._before[0]:
             self._rate = (now.timing.ticks - self._before[1]) / (now.time - self._before[0])
@@ -167,7 +168,7 @@ class LiveStatus:
         self._attempt(lambda: self._live.update(shown, refresh=True))
 
     def end(self) -> None:
-        """Leave the last status where it is."""
+        """End the display; the last status stays visible."""
         self._attempt(self._live.stop)
 
     def _attempt(self, show: Callable[[], object]) -> None:
@@ -191,8 +192,8 @@ def status(
 ) -> RenderableType:
     """Return the state of the loop for the terminal.
 
-    `name` is that of the rig, `channels` are those of its channels (n,), `rate` is the loop's in
-    Hz, NaN where unknown; the addresses and files of the daemon come last.
+    `name` is the rig's, `channels` are the names of its n channels, `rate` is the loop's in Hz, NaN
+    if unknown. The addresses and files of the daemon come last.
     """
     armed = now.state in (State.ACTIVE, State.HOLDING)
     rows: list[tuple[str, RenderableType]] = [*_stiffness(now)] if armed else []
@@ -219,7 +220,7 @@ def _headline(now: Snapshot, name: str) -> Text:
 
 
 def _fields(now: Snapshot, armed: bool) -> list[tuple[str, RenderableType]]:
-    """Return the rows of the fields whose definitions name one; those of one name are joined."""
+    """Return the rows that the fields' definitions name; fields of one row are joined."""
     rows: dict[str, list[str]] = {}
     for entry in entries(type(now)):
         value = getattr(now, entry.name)
@@ -231,7 +232,7 @@ def _fields(now: Snapshot, armed: bool) -> list[tuple[str, RenderableType]]:
 
 
 def _shown(value: Any, entry: Entry) -> str:
-    """Return a value in the unit in which it is shown."""
+    """Return a value as text in its display unit."""
     if entry.kind not in (Kind.NUMBERS, Kind.NUMBER):
         return printable(str(value))
     si = entry.shown.unit if isinstance(entry.shown.unit, str) else entry.shown.unit[0]
@@ -305,7 +306,7 @@ def _loop(now: Snapshot, rate: float) -> list[tuple[str, RenderableType]]:
 
 
 def _percentile(lateness: tuple[tuple[float, ...], tuple[int, ...]], share: float) -> str:
-    """Return the edge of the histogram below which a share of all ticks began."""
+    """Return the edge of the lateness histogram below which a share of all ticks lies."""
     edges, counts = lateness
     so_far = list(accumulate(counts))
     if not so_far or not so_far[-1]:

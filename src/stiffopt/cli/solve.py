@@ -1,4 +1,4 @@
-"""The command `solve-pressure`, also `stiffopt solve`: its options and its help."""
+"""Options and help of the command `solve-pressure`, also `stiffopt solve`."""
 
 from typing import Annotated
 
@@ -81,7 +81,7 @@ def solve(
     seed: Annotated[
         int,
         typer.Option(
-            metavar="N", min=0, help="Of the global search: the same seed, the same answer."
+            metavar="N", min=0, help="Seed of the global search; the same gives the same answer."
         ),
     ] = 0,
     units: Units = None,

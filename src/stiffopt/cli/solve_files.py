@@ -1,6 +1,6 @@
-"""Files of `solve`: task files that are read, result files and figures that are written.
+"""Find the task files of `solve`, and write its result files and figures.
 
-A path that cannot be used raises `FileError`.
+An unusable path raises `FileError`.
 """
 
 import os
@@ -19,7 +19,7 @@ _YAML = (".yaml", ".yml")
 
 
 class TaskFiles(NamedTuple):
-    """Paths of task files in the order of work, and notes and errors about what holds no task."""
+    """Paths of task files in the order of work, and notes and errors about other files."""
 
     paths: list[str]
     skipped: list[str]
@@ -29,9 +29,9 @@ class TaskFiles(NamedTuple):
 def find_tasks(named: Iterable[str]) -> TaskFiles:
     """Replace each folder by the task files in it, sorted by name; subfolders are left alone.
 
-    A file in a folder is left out, with a note, only if its `format` says that it is something
-    else, a robot file for example.  One that cannot be read or has no `format` may be a task file
-    with a mistake in it, and is kept.
+    A file in a folder is skipped, with a note, only if its `format` is of another kind, such as a
+    robot file.  A file that cannot be read, or has no `format`, may be a task file with a mistake,
+    and is kept.
     """
     found = TaskFiles([], [], [])
     for name in named:
@@ -67,7 +67,7 @@ def _in_folder(folder: str) -> tuple[list[str], list[str]]:
 
 
 def _other_kind(path: str) -> str | None:
-    """Return the kind of a stiffopt file that is no task file, None for all else."""
+    """Return the kind of a stiffopt file that is not a task file, None for all others."""
     try:
         given = read_document(Path(path)).data.get("format")
     except FileError:
@@ -95,7 +95,7 @@ def check_result_file(path: str, tasks: Sequence[str], result: str = RESULT_FORM
 
 
 def _begins(path: str, result: str) -> bool:
-    """Whether a file may be overwritten: it begins as a result file does, or is empty."""
+    """Whether a file may be overwritten: it begins like a result file, or is empty."""
     kind = result.partition("/")[0]
     try:
         with open(path, "rb") as stream:
@@ -116,7 +116,7 @@ def picture_names(plot: str | None, tasks: Sequence[str]) -> tuple[str | None, .
 
 
 def names_for_each(path: str, tasks: Sequence[str]) -> tuple[str, ...]:
-    """Return the file for each task: of one task FILE itself, of several FILE-<task>."""
+    """Return the file for each task: FILE for a single task, FILE-<task> for several."""
     if len(tasks) == 1:
         return (path,)
     stem, ending = os.path.splitext(path)

@@ -1,4 +1,4 @@
-"""A solved task as data: a line of JSON in SI units, or an entry of a result file with units."""
+"""Convert a solved task to data: JSON in SI units, or an entry of a result file with units."""
 
 import math
 from dataclasses import asdict
@@ -16,7 +16,7 @@ from stiffopt.units import format_quantity
 Record = dict[str, Any]
 
 _WRITTEN = {"m": "mm", "rad": "deg"}
-"""Units of errors in result files, whatever people read."""
+"""Units of errors in result files, whatever units are displayed."""
 
 _BLOCKS = {
     "translation_per_force": (slice(0, 3), slice(0, 3), "m/N"),
@@ -28,7 +28,7 @@ _BLOCKS = {
 
 
 def priced(solution: PressureSolution) -> Sensitivities | None:
-    """Return the sensitivities if they are prices in stiffness, else None."""
+    """Return a solution's sensitivities if their objective is a stiffness, else None."""
     given = solution.sensitivities
     if given is None or not solution.found or given.objective_unit not in ("N/m", "N*m/rad"):
         return None
@@ -36,7 +36,7 @@ def priced(solution: PressureSolution) -> Sensitivities | None:
 
 
 def _relaxed(term: Term) -> str:
-    """Name of the tolerance or margin of a term, whose price is reported."""
+    """Return the name under which the price of a term's tolerance or margin is reported."""
     return f"{term.name}_{'margin' if term.is_inequality else 'tolerance'}"
 
 
@@ -95,7 +95,7 @@ def _clearance(solution: PressureSolution) -> Record:
 
 
 def _brace(solution: PressureSolution) -> Record:
-    """Where an arm leans, what that gives, and what it holds."""
+    """Return the contacts of a braced arm, its stiffness without them, and what they hold."""
     if solution.task.brace is None:
         return {}
     return {
@@ -110,7 +110,7 @@ def _brace(solution: PressureSolution) -> Record:
 
 
 def contact_record(contact: Contact) -> Record:
-    """A contact for JSON, in SI units."""
+    """Return a contact for JSON, in SI units."""
     return {
         "object": contact.object,
         "at_m": contact.at,
@@ -121,7 +121,7 @@ def contact_record(contact: Contact) -> Record:
 
 
 def loss_record(loss: ContactLoss) -> Record:
-    """The push by which a contact is lost for JSON, in SI units; null where none is."""
+    """Return the push that loses a contact for JSON, in SI units; null where none does."""
     return {
         "force_n": loss.force if math.isfinite(loss.force) else None,
         "object": loss.object,
@@ -278,7 +278,7 @@ def _compliance(solution: PressureSolution) -> Record | None:
 
 
 def _worth(solution: PressureSolution) -> Record | None:
-    """What relaxing limits and tolerances is worth."""
+    """Return the stiffness gained by relaxing limits and tolerances."""
     given = priced(solution)
     if given is None:
         return None

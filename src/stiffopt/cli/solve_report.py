@@ -1,4 +1,4 @@
-"""Solved tasks as text for the terminal: a block for each task, and a summary of several."""
+"""Report solved tasks on the terminal: a block for each task, and a summary of several."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -35,7 +35,7 @@ _PARTS = {
 }
 
 SMALL_GAIN = 0.01
-"""Gain over plain pressures below which the table says why."""
+"""Gain over the plain solution below which the report explains why it is small."""
 
 Vector = NDArray[Any]
 Line = tuple[str, RenderableType]
@@ -81,7 +81,7 @@ def _robot(solved: SolvedTask) -> str:
 
 
 def _pressures(solved: SolvedTask, pressures: Vector) -> RenderableType:
-    """Pressures, a row for each segment; those at a limit say so."""
+    """Return a table of pressures, a row for each segment, with marks at limits."""
     description, unit = solved.robot.description, display_units().pressure
     table = Table.grid(padding=(0, 2), pad_edge=False)
     widest = max(segment.n_channels for segment in description.segments)
@@ -111,7 +111,7 @@ def _tip(solution: PressureSolution, pose: Vector) -> Iterable[Line]:
 
 
 def _press(solution: PressureSolution, pose: Vector) -> Iterable[Line]:
-    """The force of a press, and how well the arm feels it."""
+    """Yield the force of a press, and how well the arm can measure it."""
     press, compliance = solution.task.press, solution.compliance
     if press is None or compliance is None:
         return
@@ -125,7 +125,7 @@ def _press(solution: PressureSolution, pose: Vector) -> Iterable[Line]:
 
 
 def _brace(solution: PressureSolution) -> Iterable[Line]:
-    """Where the arm leans, how stiff it would be free, what the contacts hold and what limits."""
+    """Yield the contacts, the stiffness without them, what they hold, and the active limits."""
     if not solution.contacts:
         return
     units = display_units()
@@ -160,7 +160,7 @@ def _brace(solution: PressureSolution) -> Iterable[Line]:
 
 
 def _clearance(solution: PressureSolution) -> Iterable[Line]:
-    """How near the body is to the scene."""
+    """Yield the clearance of the body from the scene."""
     scene, distance = solution.task.scene, solution.clearance
     if scene is None or distance is None:
         return
@@ -180,7 +180,7 @@ def _clearance(solution: PressureSolution) -> Iterable[Line]:
 
 
 def _error(term: Term, value: float) -> Text:
-    """By how much a term of the target is missed, or by which margin it holds."""
+    """Return the error of a term of the target, or the margin of an inequality."""
     if term.is_inequality:
         return Text(term.words(value), "bold" if term.holds(value) else "bold yellow")
     unit = display_units().of_si(term.unit)
@@ -194,7 +194,7 @@ def _error(term: Term, value: float) -> Text:
 
 
 def _uncertainty(solved: SolvedTask) -> Iterable[Line]:
-    """How well the tip's position is known from the calibration."""
+    """Yield the uncertainty of the tip's position from the calibration."""
     known = solved.uncertainty
     if known is None:
         return
@@ -242,7 +242,7 @@ def _stiffnesses(solved: SolvedTask) -> Iterable[Line]:
 
 
 def _small_gain(solved: SolvedTask) -> Iterable[Line]:
-    """Why an answer is hardly stiffer than plain pressures, where it is not."""
+    """Explain why an answer is hardly stiffer than the plain solution, if it is not."""
     solution = solved.solution
     goal, value = solution.task.stiffness, least_maximised(solution)
     if goal is None or value is None or not solved.plain:
@@ -279,7 +279,7 @@ def _stiffness(
 
 
 def _condition(measure: StiffnessMeasure) -> str:
-    """What the task says that the value must be."""
+    """Return the task's condition on the value, or nothing."""
     value, tolerance = (getattr(measure, key, None) for key in ("value", "tolerance"))
     if value is None:
         return ""
@@ -290,13 +290,13 @@ def _condition(measure: StiffnessMeasure) -> str:
 
 
 def _worth(solution: PressureSolution) -> Iterable[Line]:
-    """What relaxing limits and tolerances would buy."""
+    """Yield the stiffness gained by relaxing limits and tolerances."""
     given = priced(solution)
     if given is None:
         return
     units = display_units()
     unit, pressure, length = units.of_si(given.objective_unit), units.pressure, units.length
-    offers = []  # in SI for one of a unit
+    offers = []  # gain in SI per display unit
     for term in solution.task.target.terms:
         price = given.per_tolerance.get(term.name)
         factor, unit_of_term = term.shown(1.0)
@@ -320,7 +320,7 @@ def _worth(solution: PressureSolution) -> Iterable[Line]:
 
 
 def _vented(solution: PressureSolution) -> set[str]:
-    """Lower limits that no pressure source without vacuum goes below, as they are named."""
+    """Return the names of lower limits that a supply without vacuum cannot go below."""
     if solution.robot is None:
         return set()
     description = solution.robot.description
@@ -362,7 +362,7 @@ def _errors(solution: PressureSolution) -> list[str]:
 
 
 def _list(solved: SolvedTask, solution: PressureSolution) -> str:
-    """All pressures on one line, segments apart."""
+    """Return all pressures on one line, separated by segment."""
     values = [] if solution.pressures is None else list(solution.pressures)
     groups, unit = [], display_units().pressure
     for segment in solved.robot.description.segments:
@@ -372,7 +372,7 @@ def _list(solved: SolvedTask, solution: PressureSolution) -> str:
 
 
 def summary_row(solved: SolvedTask, seconds: float) -> tuple[str, ...]:
-    """Return the line of the summary for a task that took this time altogether."""
+    """Return the task's line of the summary; it took `seconds` in all."""
     solution = solved.solution
     position, angle = solution.position_error, solution.angle_error
     units, stiffness = display_units(), solution.stiffness

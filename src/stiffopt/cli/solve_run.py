@@ -1,6 +1,6 @@
-"""What `solve` does: solve one task file after the other; print, write and draw the solutions.
+"""Run `solve`: solve task files in turn; print, write and draw the solutions.
 
-The tables need rich, so their module is imported where one is printed.
+The module of the tables needs rich, and is imported only when one is printed.
 """
 
 from __future__ import annotations

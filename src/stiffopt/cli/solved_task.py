@@ -1,4 +1,4 @@
-"""A solved task: its solution with everything else that is printed, written and drawn."""
+"""Solve a task file: the solution with everything else that is printed, written and drawn."""
 
 from dataclasses import dataclass, replace
 
@@ -21,13 +21,12 @@ class SolvedTask:
     file : the task file as the user named it.
     robot : the arm under the task's load.
     solution : of the task.
-    plain : the task's stiffnesses at pressures that reach the target and ignore stiffness; empty
-        if there are none.
-    uncertainty : how well the tip is known there, or None for a robot without calibration.
+    plain : the task's stiffnesses at the plain solution, which ignores stiffness; empty if unknown.
+    uncertainty : of the tip; None for a robot without calibration.
     intervals : 95 % intervals of the task's stiffnesses, None for those that are not along a
-        direction; empty where there is no `uncertainty`.
+        direction; empty without `uncertainty`.
     front : the trade-off between tip error and stiffness; None without --pareto or if it failed.
-    no_front : why there is no trade-off although --pareto was given; else empty.
+    no_front : why --pareto failed; else empty.
     """
 
     file: str
@@ -41,12 +40,12 @@ class SolvedTask:
 
 
 def solve_file(file: str, *, seed: int, pareto: int | None) -> SolvedTask:
-    """Solve a task file; with `pareto` also a trade-off of so many points.
+    """Solve a task file; with `pareto`, also a trade-off with that number of points.
 
     Raises
     ------
     InputError
-        The task file or its robot is wrong; the message names the file.
+        The task file or its robot is invalid; the message names the file.
     """
     task = load_task(file)
     try:
@@ -73,7 +72,7 @@ def solve_file(file: str, *, seed: int, pareto: int | None) -> SolvedTask:
 
 def _with_uncertainty(answer: SolvedTask) -> SolvedTask:
     pressures = answer.solution.pressures
-    leans = answer.solution.contacts  # the uncertainty is that of a free arm
+    leans = answer.solution.contacts  # the uncertainty is known only for a free arm
     if answer.robot.description.calibration is None or pressures is None or leans:
         return answer
     try:
@@ -85,13 +84,13 @@ def _with_uncertainty(answer: SolvedTask) -> SolvedTask:
             else None
             for m in measures
         )
-    except EquilibriumError:  # hardly an equilibrium: nothing is known of its errors
+    except EquilibriumError:  # near a limit of stability, its errors are unknown
         return answer
     return replace(answer, uncertainty=uncertainty, intervals=intervals)
 
 
 def _plain(solver: PressureSolver, solution: PressureSolution) -> tuple[float, ...]:
-    """The task's stiffnesses at pressures that were found without regard to stiffness."""
+    """Return the task's stiffnesses at the plain solution, which ignores stiffness."""
     if not solution.found or not solution.stiffnesses:
         return ()
     try:

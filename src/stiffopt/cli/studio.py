@@ -1,4 +1,4 @@
-"""The command `stiffopt studio`: its options and its help."""
+"""Options and help of the command `stiffopt studio`."""
 
 from typing import Annotated
 
@@ -52,10 +52,13 @@ def studio(
     ] = None,
     units: Units = None,
     host: Annotated[
-        str, typer.Option(metavar="HOST", help="Where to listen; other machines reach others.")
+        str,
+        typer.Option(
+            metavar="HOST", help="Address to listen on; the default admits only this machine."
+        ),
     ] = "127.0.0.1",
     port: Annotated[
-        int, typer.Option(metavar="PORT", min=0, max=65535, help="0 is any free one.")
+        int, typer.Option(metavar="PORT", min=0, max=65535, help="Port; 0 takes any free one.")
     ] = 0,
     no_browser: Annotated[
         bool, typer.Option("--no-browser", help="Only print the address.")

@@ -1,4 +1,4 @@
-"""What `stiffopt studio` does: open the page, and wait until it is ended."""
+"""Run `stiffopt studio`: open the page, and wait until a signal ends it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from stiffopt.cli.exits import ENDING_SIGNALS, handled
 from stiffopt.daemon.secret import is_loopback
 from stiffopt.errors import require_package
 
-_TOKEN = "STIFFOPT_TOKEN"  # which `stiffopt.Client` reads too
+_TOKEN = "STIFFOPT_TOKEN"  # `stiffopt.Client` reads it too
 
 
 def run(

@@ -1,4 +1,4 @@
-"""Tables of text, for the terminal and for a Markdown page."""
+"""Text tables for the terminal and for Markdown pages."""
 
 from __future__ import annotations
 
@@ -23,11 +23,10 @@ STATUS_COLOURS = {"solved": "green", "unreachable": "yellow", "failed": "red", "
 
 @dataclass(frozen=True)
 class TextTable:
-    """A table of text with a title above it, if it is not empty, and a remark below it.
+    """A table of text with an optional title above it and a remark below it.
 
-    The first column holds words, as do those whose headings are in `words`; the others hold
-    numbers, which are aligned to the right and never broken. The remark says what headings or
-    numbers mean.
+    The first column, and those whose headings are in `words`, contain words. The others contain
+    numbers, aligned to the right and never wrapped. The remark explains headings or numbers.
     """
 
     title: str
@@ -37,7 +36,7 @@ class TextTable:
     words: tuple[str, ...] = ()
 
     def holds_words(self, column: int) -> bool:
-        """Whether a column holds words rather than numbers."""
+        """Whether a column contains words rather than numbers."""
         return column == 0 or self.heading[column] in self.words
 
     def renderable(self) -> RenderableType:
@@ -59,7 +58,7 @@ class TextTable:
 
 
 def number_table(*headings: str) -> Table:
-    """Return an empty table without lines; the first column is words, the others are numbers."""
+    """Return an empty table without lines: a column of words, then columns of numbers."""
     table = Table(box=None, padding=(0, 1), pad_edge=False, header_style="bold")
     for number, heading in enumerate(headings):
         table.add_column(heading, justify="right" if number else "left", no_wrap=True)
@@ -67,7 +66,7 @@ def number_table(*headings: str) -> Table:
 
 
 def labelled(lines: Iterable[tuple[str, RenderableType]]) -> Table:
-    """Return lines with a label each."""
+    """Return a grid of lines with their labels."""
     grid = Table.grid(padding=(0, 2), pad_edge=False)
     grid.add_column(no_wrap=True, style="dim")
     grid.add_column(overflow="fold")
@@ -77,9 +76,9 @@ def labelled(lines: Iterable[tuple[str, RenderableType]]) -> Table:
 
 
 def summary(rows: Sequence[tuple[str, ...]], headings: Sequence[str]) -> RenderableType:
-    """Return one line for each file, and how many have which status.
+    """Return one line for each file, and the number of files with each status.
 
-    The first column is the file, the second its status; of a bad one there is no more.
+    The first column is the file, the second its status; a file with bad input has no others.
     """
     names = [os.path.basename(file) for file, *_ in rows]
     if len(set(names)) < len(rows):
@@ -96,12 +95,12 @@ def summary(rows: Sequence[tuple[str, ...]], headings: Sequence[str]) -> Rendera
 
 
 def title(text: str) -> Text:
-    """Return the title of all that is printed."""
+    """Return the title of a report."""
     return Text(printable(text), "bold")
 
 
 class MarkdownPage:
-    """A page that grows, and the folder in which it is written with its figures."""
+    """A Markdown page under construction, and the folder for it and its figures."""
 
     def __init__(self, folder: Path, title: str) -> None:
         self._folder = folder
@@ -112,11 +111,11 @@ class MarkdownPage:
         self._lines += [f"## {text}", ""]
 
     def text(self, text: str) -> None:
-        """Add a paragraph, which may hold Markdown."""
+        """Add a paragraph, which may contain Markdown."""
         self._lines += [text, ""]
 
     def bullets(self, items: Sequence[str]) -> None:
-        """Add a list of plain text; what stands between backticks is code."""
+        """Add a list of plain text; text between backticks is code."""
         self._lines += [*(f"- {_escaped(item)}" for item in items), ""]
 
     def table(self, table: TextTable) -> None:
@@ -142,7 +141,7 @@ class MarkdownPage:
 
 
 def _escaped(text: str) -> str:
-    """Text that Markdown leaves as it is; what is between backticks, it does anyway."""
+    """Escape Markdown outside of backticks."""
     parts = text.split("`")
     parts[::2] = [
         part.replace("*", r"\*").replace("_", r"\_").replace("<", "&lt;") for part in parts[::2]
@@ -155,7 +154,7 @@ def _cell(text: str) -> str:
 
 
 def block_title(name: str, status: str, timings: Mapping[str, float]) -> Text:
-    """Return the first line of a report: what was solved, how that ended, and the time it took."""
+    """Return the first line of a report: name, status and time."""
     seconds = f"  {timings.get('total', 0.0):.2f} s"
     if "compilation" in timings:
         seconds += f", after compiling once for {timings['compilation']:.0f} s"

@@ -1,4 +1,4 @@
-"""The command `stiffopt vent`: let the pressure out of a rig, also while a program commands it."""
+"""The command `stiffopt vent`: vent a rig, even while a program commands it."""
 
 from typing import Annotated
 
@@ -12,10 +12,10 @@ from stiffopt.errors import DeviceError, StiffoptError
 VENT_HELP = """\
 Let all pressure out of the arm of RIG at once.
 
-If a program commands it, its guard vents and takes no command until somebody arms again. If none
-does, the supply is vented directly. A guard that does not answer is ended first. This needs no
-network, no token and no control interface; it works for the user who started that program, and for
-root.
+If a program commands it, that program's guard vents and accepts no command until somebody arms
+again. If none does, the supply is vented directly. A guard that does not answer is ended first.
+This needs no network, no token and no control interface. It works for the user who started the
+program, and for root.
 """
 
 VENT_EPILOG = """\
