@@ -1,8 +1,8 @@
-"""Figures: of solutions, paths, maps, experiments, calibrations and runs.
+"""Draw figures of solutions, paths, maps, experiments, calibrations and runs.
 
-They need matplotlib, which the extra ``plot`` brings; it is imported when something is drawn, not
-before. Without it every function that makes a figure raises `MissingExtraError`. Functions whose
-names begin with ``draw_`` draw into axes that the caller gives.
+They need matplotlib, from the extra ``plot``, which is imported only when something is drawn.
+Without it, every function that makes a figure raises `MissingExtraError`. Functions whose names
+begin with ``draw_`` draw into axes that the caller provides.
 """
 
 from stiffopt.plots.arm import draw_arm

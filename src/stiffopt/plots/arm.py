@@ -1,7 +1,4 @@
-"""An arm in axes in 3-D, in the unit in which lengths are shown.
-
-Its base, its tube, the scene around it, labels and the view.
-"""
+"""Draw an arm in 3-D axes: base, tube, scene, labels and view, in the display unit of lengths."""
 
 from __future__ import annotations
 
@@ -22,11 +19,11 @@ from stiffopt.plots.view import View, ViewAngles, fill_panel
 Vector = NDArray[np.float64]
 
 TUBE_STATIONS = 24
-"""Stations of the tube, per segment."""
-_SPOKES = 28  # of the tube, around
-_ALONG = 24  # points of an arrow that no text should lie on
-_SMALL = 4.0  # inches, of a panel
-_LEAST_SIDES = (0.5, 0.3, 0.5)  # of the box, as shares of its longest
+"""Number of stations of the tube, per segment."""
+_SPOKES = 28  # points around the tube
+_ALONG = 24  # points along an arrow, which labels avoid
+_SMALL = 4.0  # inches, width below which a panel counts as small
+_LEAST_SIDES = (0.5, 0.3, 0.5)  # smallest sides of the box, as shares of the longest
 
 
 def draw_arm(
@@ -37,7 +34,7 @@ def draw_arm(
     scene: Scene | None = None,
     view: View | None = None,
 ) -> list[Any]:
-    """Draw an arm in space, in the unit in which lengths are shown.
+    """Draw an arm in space, in the display unit of lengths.
 
     Parameters
     ----------
@@ -48,11 +45,11 @@ def draw_arm(
     pressures : (n,)
         In Pa.
     scene : Scene, optional
-        What is around it.
+        The objects around it.
     view : (elevation, azimuth), optional
-        From where to look: the angle of the eye above the horizontal, and about the z axis of the
-        base from its x axis; in rad, or as text with a unit: ``("20 deg", "-60 deg")``. By default
-        x points to the right, and z up or, of an arm that hangs, down.
+        The viewpoint: the angle of the eye above the horizontal, and about the z axis of the base
+        from its x axis; in rad, or as text with a unit: ``("20 deg", "-60 deg")``. By default x
+        points to the right, and z up or, for a hanging arm, down.
 
     Returns
     -------
@@ -62,7 +59,7 @@ def draw_arm(
     Raises
     ------
     InputError
-        If the pressures are not those of such an arm, or the view cannot be had.
+        The pressures do not suit the arm, or the view is invalid.
     """
     drawing = ArmDrawing(axes, robot)
     drawing.draw_base()
@@ -74,7 +71,7 @@ def draw_arm(
 
 
 class Label(NamedTuple):
-    """A text for a point (3,) of the axes."""
+    """A text beside a point (3,) of the axes."""
 
     point: Vector
     text: str
@@ -83,15 +80,15 @@ class Label(NamedTuple):
 
 @dataclass
 class ArmDrawing:
-    """Axes in 3-D and what has been drawn in them, in the unit of lengths.
+    """3-D axes and their contents, in the display unit of lengths.
 
     Attributes
     ----------
     axes :
     robot : Manipulator
-    corners : points (k, 3) that the figure has to show.
-    covered : points (k, 3), close together, on which no text should lie.
-    marks : points (3,) with a marker, on which none should lie either.
+    corners : points (k, 3) that must be visible.
+    covered : points (k, 3), close together, which labels avoid.
+    marks : points (3,) with a marker, which labels avoid too.
     labels : texts beside points, the most important first.
     handles : for a legend.
     """
@@ -115,7 +112,7 @@ class ArmDrawing:
         return display_units().length
 
     def draw_base(self) -> None:
-        """Base plate: a disc on which the arm stands."""
+        """Draw the base plate, a disc."""
         radius = self.unit.of(1.7 * self.robot.description.segments[0].outer_radius)
         angle, share = np.meshgrid(np.linspace(0, 2 * np.pi, 49), [0.0, 1.0])
         x, y = radius * share * np.cos(angle), radius * share * np.sin(angle)
@@ -127,9 +124,9 @@ class ArmDrawing:
     def draw_tube(
         self, pressures: Vector, shade: float = 0.38, poses: Vector | None = None
     ) -> None:
-        """Tube with each segment in its colour, its backbone, and a ring at each end.
+        """Draw the tube with each segment in its colour, its backbone, and a ring at each end.
 
-        The poses (segments, k, 4, 4) are those at the pressures unless they are given.
+        Poses (segments, k, 4, 4), if given, replace those at the pressures.
         """
         description = self.robot.description
         poses = segment_poses(self.robot, pressures, TUBE_STATIONS) if poses is None else poses
@@ -157,7 +154,7 @@ class ArmDrawing:
             self.add_patch(style.segment_colour(number), f"segment {number + 1}")
 
     def draw_objects(self, scene: Scene) -> None:
-        """What is around the arm."""
+        """Draw the objects around the arm."""
         seen, middles = draw_objects(self.axes, scene, self.size, np.vstack(self.corners))
         self.corners.append(seen)
         for item, middle in zip(scene.objects, middles, strict=True):
@@ -169,7 +166,7 @@ class ArmDrawing:
     def draw_arrow(
         self, start: Vector, vector: Vector, colour: str, zorder: int, linestyle: str = "-"
     ) -> None:
-        """Draw a shaft with a cone as its head, to the scale of the figure."""
+        """Draw a shaft with a conical head, in the units of the axes."""
         end = start + vector
         self.axes.plot(
             *np.stack([start, start + 0.82 * vector]).T, color=colour, linewidth=2.0,
@@ -196,16 +193,16 @@ class ArmDrawing:
         self.handles.append(Line2D([], [], label=label, **look))
 
     def add_label(self, point: Vector, text: str, colour: str) -> None:
-        """Ask for a text beside a point of the axes; those that are asked for first come first."""
+        """Request a text beside a point of the axes; earlier requests take precedence."""
         self.labels.append(Label(np.asarray(point), text, colour))
 
     def add_body(self, points: Vector) -> None:
-        """Show points (k, 3) of the axes, on which no text should lie."""
+        """Make points (k, 3) visible, and let labels avoid them."""
         self.corners.append(points)
         self.covered.append(points)
 
     def add_mark(self, point: Vector) -> None:
-        """Show a point of the axes with a marker."""
+        """Make a point with a marker visible, and let labels avoid it."""
         self.corners.append(point[None])
         self.marks.append(point)
 
@@ -232,9 +229,9 @@ class ArmDrawing:
             self.axes.set(**{f"{name}lim": (start, start + side)})
             self.axes.set(**{f"{name}label": f"{name} ({self.unit})"})
             axis = getattr(self.axes, f"{name}axis")
-            prune = None if name == "z" else "both"  # two axes meet in a corner
+            prune = None if name == "z" else "both"  # numbers of two axes would meet in a corner
             most = max(3, round(7 * side / sides.max()))
-            if name == "y" and width < _SMALL:  # it is seen nearly end on
+            if name == "y" and width < _SMALL:  # the axis is seen nearly end on
                 most = 1
             axis.set_major_locator(MaxNLocator(most, prune=prune, min_n_ticks=min(2, most)))
             axis.labelpad = 8 if name == "z" else -2
@@ -250,7 +247,7 @@ class ArmDrawing:
 
 
 def _cone(point: Vector, way: Vector, length: float) -> Vector:
-    """Surface (3, 2, k) of a cone that ends in a point."""
+    """Return the surface (3, 2, k) of a cone with its apex at a point."""
     aside = np.eye(3)[np.abs(way).argmin()]
     across = np.cross(way, aside)
     across /= np.linalg.norm(across)

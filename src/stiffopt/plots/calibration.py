@@ -1,4 +1,4 @@
-"""Figures of a calibration and of a validation: errors, paths, models, stiffness."""
+"""Draw figures of calibrations and validations: errors, paths, models, stiffness."""
 
 from __future__ import annotations
 
@@ -36,23 +36,23 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-_MOST = 8  # logs in a figure; of more, those with the largest errors
-_MOST_PATHS = 4  # where each takes much room
+_MOST = 8  # logs in a figure: those with the largest errors
+_MOST_PATHS = 4  # logs in a figure of paths
 _DRAWN = 3000  # points of a line
-_SCATTERED = 1200  # points of a log in a cloud
+_SCATTERED = 1200  # points of a log in a scatter plot
 _OUTSIDE = "#f2a541"
 _HEAD = 1.08  # inches
 _FOOT = 0.58
 _GAP = 0.45
 _ROW = 1.35
 _LINE = 0.2  # of a legend
-_LEGEND = 75  # characters beside each other in a legend
-_FEW = 30  # different pressures
-_ASIDE = 0.015  # of their range: by how much logs of a few pressures stand side by side
-_PAUSE_STEPS = 5.0  # median steps of time that are a pause in a recording, if they are also ...
-_PAUSE = 1.0  # ... so many seconds
-_LEAST_RANGE = 1e-3  # m, of an axis of the tip
-_FLAT = 0.25  # an axis shows at least this share of what the widest of x, y and z does
+_LEGEND = 75  # characters in a line of a legend
+_FEW = 30  # distinct pressures up to which logs are drawn side by side
+_ASIDE = 0.015  # distance of logs side by side, as a share of the pressures' range
+_PAUSE_STEPS = 5.0  # a pause in a recording exceeds this many median time steps, ...
+_PAUSE = 1.0  # ... and this many seconds
+_LEAST_RANGE = 1e-3  # m, smallest range of an axis of the tip
+_FLAT = 0.25  # smallest range of an axis, as a share of the widest of x, y and z
 
 
 # -- over time ------------------------------------------------------------------------------------
@@ -63,7 +63,7 @@ def plot_errors_over_time(
 ) -> Figure:
     """Draw the error of the tip over time, a panel for each log.
 
-    `before` may hold the same logs, compared with the robot file as it was before.
+    `before` may contain the same logs, compared with the robot file before calibration.
     """
     shown = _worst(found)
     figure, panels = _rows(len(shown), _ROW if len(shown) > 2 else 2 * _ROW)
@@ -157,7 +157,8 @@ def plot_errors_over_pressure(
 ) -> Figure:
     """Draw the error of the tip over the pressure of each channel, a row for each segment.
 
-    Last in a row is the norm of the segment's pressures; what the calibration has seen is shaded.
+    The last panel of a row is over the norm of the segment's pressures. The range of the
+    calibration is shaded.
     """
     last = max(segment.n_channels for segment in robot.segments)
     length, pressure = display_units().length, display_units().pressure
@@ -217,7 +218,7 @@ def _draw_clouds(
 ) -> bool:
     """Draw the errors of logs over pressures in Pa, and shade limits.
 
-    Logs of a few pressures are moved apart so that they do not hide each other; return whether.
+    Logs with only a few distinct pressures are drawn side by side; returns whether they were.
     """
     length, pressure = display_units().length, display_units().pressure
     every = np.concatenate(pressures)
@@ -241,7 +242,7 @@ def _draw_clouds(
 
 
 def plot_models(candidates: Sequence[Candidate], chosen: str, *, title: str = "models") -> Figure:
-    """Draw the error of each model in what was held back."""
+    """Draw the error of each model on held-back data."""
     figure, panels = stacked_panels(
         [0.5 * len(candidates)], left=1.76, right=2.86, head=1.13, foot=0.62
     )
@@ -271,7 +272,7 @@ def plot_models(candidates: Sequence[Candidate], chosen: str, *, title: str = "m
 
 
 def plot_stiffnesses(rows: Sequence[StiffnessComparison], *, title: str = "stiffness") -> Figure:
-    """Draw measured stiffnesses with their 95 % intervals, and what the robot says of them."""
+    """Draw measured stiffnesses with their 95 % intervals, and the robot's predictions."""
     figure, panels = stacked_panels([0.27 * len(rows)], left=2.64, right=2.2, head=1.13, foot=0.62)
     axes = panels[0, 0]
     places = np.arange(len(rows))
@@ -319,14 +320,14 @@ def _label(row: StiffnessComparison) -> str:
 
 
 def _rows(rows: int, height: float, *, columns: int = 1, **settings: Any) -> tuple[Figure, Any]:
-    """Figure with rows of panels of one height in inches, and the panels (rows, columns)."""
+    """Return a figure with rows of panels of one height in inches, and its panels."""
     gap = _GAP * (1.25 if columns > 1 and "sharey" not in settings else 1.0)
     settings = {"head": _HEAD, "foot": _FOOT, "gap": gap, **settings}
     return stacked_panels([height] * rows, columns=columns, **settings)
 
 
 def _worst(found: Sequence[Comparison], most: int = _MOST) -> list[int]:
-    """Indices of the logs that are drawn, in their order."""
+    """Return the indices of the logs with the largest errors, in order."""
     if len(found) <= most:
         return list(range(len(found)))
     errors = np.nan_to_num(np.array([each.errors.p95 for each in found]))
@@ -351,14 +352,14 @@ def _panel_title(axes: Any, found: Comparison) -> None:
 
 
 def _line(axes: Any, time: Array, values: Array, colour: str, width: float, label: str) -> None:
-    """Draw a line that breaks at pauses, and whose peaks stay however long it is."""
+    """Draw a line that breaks at pauses; thinning keeps its peaks."""
     time, values = thinned(time, values, _DRAWN)
     line = _path(time, np.stack([time, values], axis=1))
     axes.plot(line[:, 0], line[:, 1], color=colour, linewidth=width, label=label)
 
 
 def _path(time: Array, values: Array) -> Array:
-    """Points (N, k) of a line without missing ones; NaN where they are missing for long."""
+    """Return points (N, k) of a line without missing ones; NaN at pauses."""
     known = np.isfinite(values).all(axis=1)
     t, points = time[known], values[known]
     if len(t) < 3:
@@ -373,7 +374,7 @@ def _evenly(count: int, most: int) -> NDArray[np.intp]:
 
 
 def _shade_outside(axes: Any, found: Comparison) -> None:
-    """Mark the times at which pressures were outside what the calibration has seen."""
+    """Mark the times at which pressures were outside those of the calibration."""
     if found.inside.all():
         return
     axes.fill_between(
@@ -391,7 +392,7 @@ def _limit_decades(axes: Any, found: Sequence[Comparison], before: Sequence[Comp
 
 
 def _room(axes: Any, values: Array, least: float) -> None:
-    """Leave some room about values, and show at least so much of the axis."""
+    """Set the limits of the axis around values, with a margin and at least a range of `least`."""
     known = values[np.isfinite(values)]
     if len(known):
         middle, half = (known.max() + known.min()) / 2, (known.max() - known.min()) / 2
@@ -400,7 +401,7 @@ def _room(axes: Any, values: Array, least: float) -> None:
 
 
 def _key(figure: Figure, axes: Any, found: Sequence[Comparison]) -> None:
-    """Legend of the lines, and of the shade where there is some, at the top."""
+    """Add a legend of the lines, and of the shading if there is any, at the top."""
     handles, labels = axes.get_legend_handles_labels()
     if any(not each.inside.all() for each in found):
         from matplotlib.patches import Patch

@@ -1,4 +1,4 @@
-"""The page of a commissioning: responses against the model, steps over time, noise, findings."""
+"""Draw a commissioning: responses against the model, steps over time, noise, findings."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ from stiffopt.plots.style import (
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_BEFORE = 0.4  # s before a step that is drawn
-_LINE = 0.2  # inches, of the findings
+_BEFORE = 0.4  # s that are drawn before a step
+_LINE = 0.2  # inches, height of a line of findings
 _CHARACTERS = 135
 
 
 def plot_commissioning(
     found: Commissioning, *, title: str = "commissioning", findings: Sequence[str] = ()
 ) -> Figure:
-    """Draw what a commissioning saw, with what was found, one sentence each."""
+    """Draw the measurements of a commissioning, with its findings as sentences."""
     lines = [line for text in findings for line in wrap(f"-  {text}", _CHARACTERS)]
     height = 9.6 + _LINE * len(lines)
     figure = new_figure(11, height)
@@ -63,7 +63,7 @@ def plot_commissioning(
 
 
 def _draw_responses(axes: Any, found: Commissioning) -> None:
-    """Displacements by each channel, in the plane across the arm."""
+    """Draw the displacement by each channel, in the plane across the arm."""
     unit, e = display_units().length, found.expected
     for k, moved in enumerate(found.responses.shift):
         expected = e.shift[e.row((k,))]
@@ -79,7 +79,7 @@ def _draw_responses(axes: Any, found: Commissioning) -> None:
 
 
 def _draw_steps(axes: Any, found: Commissioning) -> None:
-    """Motion along what each step settles at, over time."""
+    """Draw the motion in each step along its final displacement, over time."""
     unit, r = display_units().length, found.readings
     for step, moved in zip(r.steps, found.responses.shift, strict=True):
         rows = (r.time > step.up - _BEFORE) & (r.time < min(step.down, step.up + 4.0))
@@ -93,7 +93,7 @@ def _draw_steps(axes: Any, found: Commissioning) -> None:
 
 
 def _draw_gauges(axes: Any, found: Commissioning) -> None:
-    """Gauge of each channel beside its command, over time."""
+    """Draw the gauge of each channel and its command, over time."""
     unit, r = display_units().pressure, found.readings
     for step in r.steps:
         rows = (r.tick > step.up - _BEFORE) & (r.tick < min(step.down, step.up + 1.5))
@@ -107,7 +107,7 @@ def _draw_gauges(axes: Any, found: Commissioning) -> None:
 
 
 def _draw_noise(axes: Any, found: Commissioning) -> None:
-    """Tip at rest over time, each axis about its mean."""
+    """Draw the tip at rest over time, each axis about its mean."""
     unit, r = display_units().length, found.readings
     rows = (r.time >= r.rest[0]) & (r.time <= r.rest[1])
     for axis, letter in enumerate("xyz"):

@@ -1,4 +1,4 @@
-"""Figure of an arm that leans on objects: its shape, the free one, and the contact forces."""
+"""Draw an arm that leans on objects: its shape, the free arm, and the contact forces."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def draw_contact(
     *,
     view: View | None = None,
 ) -> list[Any]:
-    """Draw the same into axes in 3-D; see `draw_arm` for these, and for what is returned."""
+    """Draw the same into 3-D axes; see `draw_arm` for the axes and the returned handles."""
     drawing = ArmDrawing(axes, robot)
     drawing.draw_base()
     draw_leaning_tube(drawing, equilibrium)
@@ -64,14 +64,14 @@ def draw_contact(
 
 
 def draw_leaning_tube(drawing: ArmDrawing, equilibrium: ContactEquilibrium) -> None:
-    """The arm at an equilibrium in contact."""
+    """Draw the arm at an equilibrium in contact."""
     stations = segment_stations(drawing.robot, TUBE_STATIONS)
     poses = equilibrium.poses(stations.ravel()).reshape(*stations.shape, 4, 4)
     drawing.draw_tube(equilibrium.pressures, poses=poses)
 
 
 def draw_forces(drawing: ArmDrawing, equilibrium: ContactEquilibrium) -> None:
-    """The contact forces on the arm as arrows."""
+    """Draw the contact forces on the arm as arrows."""
     unit = drawing.unit
     largest = max((np.linalg.norm(each.force) for each in equilibrium.contacts), default=1.0)
     for each in equilibrium.contacts:

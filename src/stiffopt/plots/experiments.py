@@ -1,4 +1,4 @@
-"""Figures of the experiments: the tip against the model, combined poses, stiffness."""
+"""Draw figures of the experiments: the tip against the model, combined poses, stiffness."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _BAND = 0.55  # opacity
-_BAND_EDGE = 4.0  # points: a thin band must be seen beside the line
+_BAND_EDGE = 4.0  # points, so that a thin band is visible beside the line
 
 
 def plot_kinematics(
@@ -38,7 +38,7 @@ def plot_kinematics(
 ) -> Figure:
     """Draw pressures, the tip against the model, and the error, over time.
 
-    `published` is an error along each axis, in m, that lines in the last panel show.
+    Lines in the last panel show `published`, an error along each axis, in m.
     """
     figure, grid = stacked_panels(
         (1.95, 1.95, 1.95, 1.95, 2.15), left=0.93, right=1.98, gap=0.28, sharex=True
@@ -59,7 +59,7 @@ def plot_kinematics(
 
 
 def _error_text(result: KinematicsResult | CoverageResult) -> str:
-    """Mean, 95th percentile and largest error, each also in per cent of the arm's length."""
+    """Return mean, 95th percentile and largest error, also in per cent of the arm's length."""
     unit = display_units().length
     mean, p95, worst = (
         f"{unit.text(error, '.2f')} ({error / result.length * 100:.1f} %{of})"
@@ -120,7 +120,7 @@ def _draw_error(axes: Any, result: KinematicsResult, published: float | None) ->
 
 
 def plot_coverage(result: CoverageResult, *, title: str = "combined poses") -> Figure:
-    """Draw the pressures of each combined pose, and how far the model's tip is off there."""
+    """Draw the pressures of each combined pose, and the error of the model's tip there."""
     (count, n), units = result.pressures.shape, display_units()
     height = 4.6 + 0.32 * n
     figure = new_figure(11, height)
@@ -165,7 +165,7 @@ def plot_coverage(result: CoverageResult, *, title: str = "combined poses") -> F
 def plot_stiffness(
     result: StiffnessResult, *, title: str = "stiffness", published: StiffnessTable | None = None
 ) -> Figure:
-    """Draw stiffness over pressure: measured, modelled and published, a panel a direction."""
+    """Draw measured, modelled and published stiffness over pressure, a panel per direction."""
     directions = result.settings.directions
     columns = min(len(directions), 3)
     rows = -(-len(directions) // columns)

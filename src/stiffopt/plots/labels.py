@@ -1,4 +1,4 @@
-"""Short texts in a picture of an arm, placed where they cover nothing."""
+"""Place labels in a picture of an arm where they cover nothing."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ if TYPE_CHECKING:
 Vector = NDArray[np.float64]
 
 _SIZE = 8.5  # points, of letters
-_CELL = 3  # pixels, of the map of what is covered
-_WAYS = 24  # directions in which a place is looked for
-_DISTANCES = (7.0, 12.0, 19.0, 28.0, 40.0, 55.0, 75.0, 100.0)  # points, from what is labelled
-_LINED_FROM = 15.0  # points: further away a line leads to the text
-_GAP = 2.0  # points, around a text
-_NUMBERS = 10.0  # points, of the numbers at an axis within the box
-_MARK = 8.0  # points, around the target
-_COVERS, _COVERS_TEXT, _OUTSIDE, _FAR = 60.0, 120.0, 40.0, 0.05  # costs, the last per point
-_CUT = 500.0  # what leaves the axes
+_CELL = 3  # pixels, size of a cell in the map of covered area
+_WAYS = 24  # number of directions that are tried
+_DISTANCES = (7.0, 12.0, 19.0, 28.0, 40.0, 55.0, 75.0, 100.0)  # points, that are tried
+_LINED_FROM = 15.0  # points; from this distance a line leads to the text
+_GAP = 2.0  # points, margin around a text
+_NUMBERS = 10.0  # points, width of the numbers at an axis within the box
+_MARK = 8.0  # points, margin around a marker
+_COVERS, _COVERS_TEXT, _OUTSIDE, _FAR = 60.0, 120.0, 40.0, 0.05  # costs; the last per point
+_CUT = 500.0  # cost of a text that leaves the axes
 
 
 class PlacedLabel(Annotation):
@@ -42,12 +42,12 @@ class PlacedLabel(Annotation):
         self.point = label.point
 
     def follow(self) -> None:
-        """Go to where the point is in the picture."""
+        """Move to the point's place in the picture."""
         x, y = projected(self.axes, self.point[None])
         self.xy = (float(x[0]), float(y[0]))
 
     def move(self, offset: Vector, *, with_line: bool) -> None:
-        """Put the middle of the text this far from its point (2,), in points."""
+        """Put the middle of the text at an offset (2,) from its point, in points."""
         self.set_position((float(offset[0]), float(offset[1])))
         if self.arrow_patch is not None:
             self.arrow_patch.set_visible(with_line)
@@ -59,7 +59,7 @@ class PlacedLabel(Annotation):
 
 
 def place_labels(axes: Any, labels: Sequence[Label], covered: Vector, marks: Vector) -> None:
-    """Put texts into axes in 3-D, whose limits and view are set.
+    """Place texts in 3-D axes whose limits and view are set.
 
     Parameters
     ----------
@@ -67,9 +67,9 @@ def place_labels(axes: Any, labels: Sequence[Label], covered: Vector, marks: Vec
     labels : sequence of Label
         The most important first.
     covered : (k, 3)
-        Points of the axes, close together, of what no text should lie on.
+        Points of the axes, close together, which texts avoid.
     marks : (j, 3)
-        Points with a marker.
+        Points with a marker, which texts avoid with a margin.
     """
     if not labels:
         return
@@ -85,7 +85,7 @@ def place_labels(axes: Any, labels: Sequence[Label], covered: Vector, marks: Vec
 
 
 class _TextPlace(NamedTuple):
-    """A place for a text: what it costs, how far away it is, in points, and its middle."""
+    """A place for a text: its cost, its distance in points, and its middle in pixels."""
 
     cost: float
     distance: float
@@ -93,7 +93,7 @@ class _TextPlace(NamedTuple):
 
 
 class _CoveredCells:
-    """What is covered in axes, in cells of a few pixels."""
+    """A map of the covered area of axes, in cells of a few pixels."""
 
     def __init__(self, axes: Any) -> None:
         self.axes = axes
@@ -106,12 +106,12 @@ class _CoveredCells:
         self.low, self.high = corners.min(axis=0) + edge, corners.max(axis=0) - edge
 
     def at(self, points: Vector) -> Vector:
-        """Where points (k, 3) are, in pixels (k, 2) from the lower left corner of the axes."""
+        """Return points (k, 3) in pixels (k, 2) from the lower left corner of the axes."""
         plane = projected(self.axes, np.atleast_2d(points)).T
         return np.asarray(self.axes.transData.transform(plane) - self.start)
 
     def cover(self, points: Vector, radius: float) -> None:
-        """Note that squares around points (k, 3) are covered; the radius is in points."""
+        """Mark squares around points (k, 3) as covered; the radius is in points."""
         reach = round(radius * self.pixels / _CELL) + 1
         most = np.array(self.cells.shape) - 1
         cells = (self.at(points) // _CELL).astype(int)
@@ -120,7 +120,7 @@ class _CoveredCells:
             self.cells[at[:, 0], at[:, 1]] = 1.0
 
     def put(self, label: PlacedLabel) -> None:
-        """Put a label to the best place near its point, and note that this is covered."""
+        """Put a label at the best place near its point, and mark that place as covered."""
         box = label.get_window_extent()
         half = np.array([box.width, box.height]) / 2 + _GAP * self.pixels
         anchor = self.at(label.point)[0]
@@ -136,7 +136,7 @@ class _CoveredCells:
         self._of(best.middle - half, best.middle + half)[:] = _COVERS_TEXT / _COVERS
 
     def _place(self, anchor: Vector, way: Vector, distance: float, half: Vector) -> _TextPlace:
-        """A place in a direction (2,) from an anchor, for a text with a frame of this size."""
+        """Rate a place in a direction (2,) from an anchor; `half` (2,) is half the text's size."""
         edge = 1 / max(np.abs(way) / half)  # from the middle of the text to its frame
         middle = anchor + way * (distance * self.pixels + edge)
         low, high = middle - half, middle + half
@@ -150,7 +150,7 @@ class _CoveredCells:
         return _TextPlace(cost, distance, middle)
 
     def _of(self, low: Vector, high: Vector) -> Vector:
-        """The cells of a box in pixels, those at the edge of the axes if it is outside."""
+        """Return the cells of a box in pixels; cells at the edge for a box outside the axes."""
         most = np.array(self.cells.shape)
         first = np.clip((low // _CELL).astype(int), 0, most - 1)
         last = np.clip((high // _CELL).astype(int) + 1, first + 1, most)

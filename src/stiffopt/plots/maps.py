@@ -1,4 +1,4 @@
-"""Figures of maps: of a workspace, of stiffness along an arm (the paper's figure 6), of the tip."""
+"""Draw maps: of a workspace, of stiffness along an arm (the paper's figure 6), and of the tip."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ if TYPE_CHECKING:
 
 Vector = NDArray[np.float64]
 
-_ENOUGH = 10  # samples in a cell for its ratio of stiffnesses to be shown; fewer say little of it
+_ENOUGH = 10  # samples in a cell from which its ratio of stiffnesses is shown
 _UNKNOWN = "#d5d9dd"
 _BEST, _CHOICE = "viridis", "YlOrRd"  # colours of stiffness, and of its ratio
-_ROW, _HEAD, _FOOT = 2.75, 1.55, 0.95  # inches: a direction, above and below all
+_ROW, _HEAD, _FOOT = 2.75, 1.55, 0.95  # inches: a row, the head and the foot
 
 
 # -- workspaces -----------------------------------------------------------------------------------
@@ -40,15 +40,15 @@ _ROW, _HEAD, _FOOT = 2.75, 1.55, 0.95  # inches: a direction, above and below al
 def plot_workspace(found: WorkspaceMap, *, title: str | None = None) -> Figure:
     """Draw sections through a workspace, a row for each direction.
 
-    On the left the greatest stiffness that the tip can have at a place, on the right the ratio of
-    the greatest to the least: how much pressures can change it there. The upright section holds the
-    arm at rest, the level one is where the workspace is widest.
+    On the left is the largest stiffness that the tip can have at a place; on the right is the ratio
+    of the largest to the smallest, which shows how much pressures can change it there. The upright
+    section contains the arm at rest; the level one is where the workspace is widest.
     The title is by default the name of the robot.
 
     Raises
     ------
     InputError
-        If no tip was found anywhere.
+        The map has no cell with a sample.
     """
     if not len(found.table):
         raise InputError("there is nothing to draw: no sample has a stable equilibrium")
@@ -82,7 +82,7 @@ def plot_workspace(found: WorkspaceMap, *, title: str | None = None) -> Figure:
 
 
 class _Section:
-    """A layer of cells, seen along one axis."""
+    """A layer of a workspace's cells, seen along one axis."""
 
     def __init__(self, found: WorkspaceMap, normal: int, layer: int) -> None:
         across, up = (axis for axis in range(3) if axis != normal)
@@ -100,29 +100,29 @@ class _Section:
 
     @classmethod
     def upright(cls, found: WorkspaceMap) -> _Section:
-        """The plane y = 0, or if nothing was reached there the plane with the most cells."""
+        """Return the plane y = 0, or the plane with the most cells if none was reached there."""
         layers = found.cells[:, 1]
         return cls(found, 1, 0 if (layers == 0).any() else _fullest(layers))
 
     @classmethod
     def level(cls, found: WorkspaceMap) -> _Section:
-        """The height at which most cells are reached."""
+        """Return the height with the most cells."""
         return cls(found, 2, _fullest(found.cells[:, 2]))
 
     @property
     def name(self) -> str:
-        """Where the section is."""
+        """The position of the section, in words."""
         return f"at {'xyz'[self.normal]} = {display_units().length.text(self.place, 'g')}"
 
     def image(self, values: Vector) -> Vector:
-        """Values (M,) of cells as an image, row by row from below."""
+        """Return values (M,) of cells as an image, row by row from below."""
         picture = np.full(self._shape, np.nan)
         picture[tuple(self._at.T)] = values[self.rows]
         return picture.T
 
     @property
     def extent(self) -> tuple[float, float, float, float]:
-        """Edges left, right, bottom, top in the unit of lengths."""
+        """Edges left, right, bottom, top in the display unit of lengths."""
         size = display_units().length.of(self._size)
         low = (self._first - 0.5) * size
         high = low + np.array(self._shape) * size
@@ -137,7 +137,7 @@ def _fullest(layers: NDArray[np.int64]) -> int:
 def _draw_sections(
     panels: Sequence[Any], sections: Sequence[_Section], values: Vector, colours: str
 ) -> Any:
-    """Draw the same quantity in both sections, in the same colours; return what has them."""
+    """Draw a quantity in both sections with the same colours; return the coloured artist."""
     from matplotlib.colors import ListedColormap, LogNorm
 
     seen = np.concatenate([values[section.rows] for section in sections])
@@ -158,7 +158,7 @@ def _draw_sections(
 
 
 def _frame(axes: Any, section: _Section, other: _Section) -> None:
-    """Axes in the unit of lengths, the arm at rest, and where the other section cuts this one."""
+    """Set up axes; draw the arm at rest and the line where the other section cuts this one."""
     left, right, bottom, top = section.extent
     unit = display_units().length
     if section.normal == 1:
@@ -210,7 +210,7 @@ def _write_head(figure: Figure, found: WorkspaceMap, title: str, height: float) 
 
 
 def _write_foot(figure: Figure) -> None:
-    """Explain what lines and colours mean."""
+    """Write the legend of lines and colours."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
@@ -281,7 +281,7 @@ def _draw_shapes(axes: Any, found: ArmMap, row: int, colours: list[Any]) -> None
 
 
 def _bending_plane(shapes: Vector) -> Vector:
-    """Unit vector (2,) in the plane x-y along which the tip moves most; x if it hardly moves."""
+    """Return the unit vector (2,) in the x-y plane along which the tip moves most, x by default."""
     tips = shapes[:, -1, :2] - shapes[0, -1, :2]
     farthest: Vector = tips[np.argmax(np.linalg.norm(tips, axis=1))]
     size = float(np.linalg.norm(farthest))
@@ -376,7 +376,7 @@ def _colours(count: int) -> list[Any]:
 
 
 def _pressure_bar(figure: Figure, axes: Any, pressures: Vector) -> None:
-    """Show which colour is which pressure."""
+    """Add a colour bar of the pressures."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import BoundaryNorm, ListedColormap
 

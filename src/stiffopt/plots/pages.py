@@ -1,6 +1,6 @@
-"""What notebooks show of a robot, a task, a path and their answers: a figure and a small table.
+"""Render robots, tasks, paths and solutions for notebooks: a figure and a small table.
 
-`stiffopt.notebook` asks for these pages.
+`stiffopt.notebook` uses these pages.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ from stiffopt.plots.wording import stiffness_text
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_LONGEST = 2.0  # s, for what a page computes
-_SIDE = 3.4  # inches, of the panel of an arm
+_LONGEST = 2.0  # s, time limit of a page
+_SIDE = 3.4  # inches, side of the panel of an arm
 _DPI = 80
 _CELL = "text-align:left;vertical-align:top;padding:1px 10px 1px 0"
 
@@ -43,7 +43,7 @@ Row = tuple[str, str]
 
 
 class _Page(NamedTuple):
-    """A title, a status, rows of a table, and what draws the figure."""
+    """A title, a status, rows of a table, and a function that draws the figure."""
 
     title: str
     status: str
@@ -52,16 +52,16 @@ class _Page(NamedTuple):
 
 
 def page(shown: object) -> str:
-    """Return HTML of an object: its table and its figure, as far as they are had at once.
+    """Return HTML of an object: its table and its figure, as far as the time limit allows.
 
     Raises
     ------
     TypeError
-        If there is no page for such an object.
+        There is no page for this type.
     """
     made, rows, picture = _page_of(shown), "", ""
     with suppress(ImportError):
-        import_module("matplotlib.figure")  # before the time that a page may take begins
+        import_module("matplotlib.figure")  # not counted in the time limit
     with suppress(StiffoptError), compiling_nothing(), giving_up(_LONGEST):
         for row in made.rows:
             rows += _row(row)
@@ -95,7 +95,7 @@ def _page_of(shown: object) -> _Page:
     raise TypeError(f"there is no page for a {type(shown).__name__}")
 
 
-# -- robots and what is asked of them -------------------------------------------------------------
+# -- robots, tasks and paths ----------------------------------------------------------------------
 
 
 @_page_of.register
@@ -189,7 +189,7 @@ def _(solution: PressureSolution) -> _Page:
 def _answer_rows(solution: PressureSolution) -> Iterable[Row]:
     if solution.pressures is not None and solution.tip_position is not None:
         yield from _quantity_rows(solution, solution.pressures, solution.tip_position)
-    if solution.message:  # last: what it says of an answer may take long
+    if solution.message:  # last, since computing the message may take long
         yield "note", solution.message
 
 
@@ -238,7 +238,7 @@ def _points_rows(solution: PathSolution) -> Iterable[Row]:
 
 
 def _in_space(draw: Callable[[Any], object]) -> Figure:
-    """Draw into a figure of one panel in 3-D."""
+    """Draw into a figure with one 3-D panel."""
     figure = style.new_figure(_SIDE, _SIDE)
     draw(style.add_space(figure, (0.0, 0.0, 1.0, 1.0)))
     return figure

@@ -1,4 +1,4 @@
-"""Figure of a solved path: the arm along it, its stiffness and its pressures over time.
+"""Draw a solved path: the arm along it, its stiffness and its pressures over time.
 
 Each panel is a function that draws into axes of the caller.
 """
@@ -49,7 +49,7 @@ def plot_path(
     Raises
     ------
     InputError
-        If the solution has no points, as the solver failed, or the view cannot be had.
+        The solution has no points, or the view is invalid.
     MissingExtraError
         If matplotlib is not installed.
     """
@@ -80,7 +80,7 @@ def plot_motion(
     ----------
     solution : PathSolution
     scene : Scene, optional
-        That was kept clear of.
+        The scene that the motion keeps clear of.
     title : str, optional
         By default the name of the robot.
     view : (elevation, azimuth), optional
@@ -89,7 +89,7 @@ def plot_motion(
     Raises
     ------
     InputError
-        If the solution has no points, or the view cannot be had.
+        The solution has no points, or the view is invalid.
     MissingExtraError
         If matplotlib is not installed.
     """
@@ -171,7 +171,7 @@ def draw_path(
     view: View | None = None,
     labelled: bool = True,
 ) -> list[Any]:
-    """Draw the arm at some of the points, and the way of its tip.
+    """Draw the arm at some of the points, and the path of its tip.
 
     Parameters
     ----------
@@ -179,13 +179,13 @@ def draw_path(
         In 3-D, as for `draw_arm`.
     solution : PathSolution
     path : Path, optional
-        That was asked for, to be drawn beside the one that is followed.
+        The requested path, to draw beside the followed one.
     scene : Scene, optional
-        What is around the arm.
+        The objects around the arm.
     view : (elevation, azimuth), optional
         See `draw_arm`.
     labelled : bool
-        Whether the least stiffness is written to where the tip has it.
+        Whether to label the point of least stiffness.
 
     Returns
     -------
@@ -195,7 +195,7 @@ def draw_path(
     Raises
     ------
     InputError
-        If the solution has no points, or the view cannot be had.
+        The solution has no points, or the view is invalid.
     """
     _require_points(solution)
     drawing = ArmDrawing(axes, solution.robot)
@@ -230,7 +230,7 @@ def draw_path(
 def draw_asked_path(
     axes: Any, robot: Manipulator, path: Path, *, view: View | None = None
 ) -> list[Any]:
-    """Draw a path that is asked for, and the arm at its least pressures.
+    """Draw a requested path, and the arm at its lowest pressures.
 
     Parameters
     ----------
@@ -249,7 +249,7 @@ def draw_asked_path(
     Raises
     ------
     InputError
-        If the view cannot be had.
+        The view is invalid.
     """
     drawing = ArmDrawing(axes, robot)
     drawing.draw_base()
@@ -269,14 +269,14 @@ def _draw_asked(drawing: ArmDrawing, path: Path) -> None:
 
 
 def _label_stiffness(drawing: ArmDrawing, solution: PathSolution, tips: Vector) -> None:
-    """Write the least stiffness to where the tip has it."""
+    """Label the point of least stiffness."""
     if solution.worst is not None:
         text = f"least stiff:\n{stiffness_text(solution.worst, solution.stiffness_unit)}"
         drawing.add_label(tips[:, solution.worst_index], text, style.LEAST_STIFF_TEXT)
 
 
 def draw_stiffness_along(axes: Any, solution: PathSolution) -> None:
-    """Draw stiffness over time, and what each point alone could have.
+    """Draw stiffness over time, and the best stiffness of each single point.
 
     Parameters
     ----------
@@ -287,7 +287,7 @@ def draw_stiffness_along(axes: Any, solution: PathSolution) -> None:
     Raises
     ------
     InputError
-        If the solution has no stiffness: its path maximises none, or it has no points.
+        The solution has no stiffness: its path maximises none, or it has no points.
     """
     index = solution.worst_index
     if solution.stiffness is None or index is None:
@@ -313,7 +313,7 @@ def draw_stiffness_along(axes: Any, solution: PathSolution) -> None:
 
 
 def draw_clearance_along(axes: Any, solution: PathSolution, required: float | None = None) -> None:
-    """Draw clearance over time against what is required.
+    """Draw clearance over time, and the required clearance.
 
     Parameters
     ----------
@@ -326,7 +326,7 @@ def draw_clearance_along(axes: Any, solution: PathSolution, required: float | No
     Raises
     ------
     InputError
-        If the solution has no clearance: there is no scene, or it has no points.
+        The solution has no clearance: there is no scene, or it has no points.
     """
     if solution.clearance is None or not len(solution.times):
         raise InputError("there is nothing to draw: the solution has no clearance")
@@ -354,12 +354,12 @@ def draw_pressures_along(
     segment : int
         From 1, at the base.
     limits : ((n,), (n,)), optional
-        The least and the largest pressures of all channels in Pa; by default the robot's.
+        Lower and upper limits of all channels in Pa; by default the robot's.
 
     Raises
     ------
     InputError
-        If the solution has no points, or the arm no such segment.
+        The solution has no points, or the arm has no such segment.
     """
     _require_points(solution)
     segments = solution.robot.description.segments
@@ -388,7 +388,7 @@ def draw_pressures_along(
 
 
 def _mark_fast_steps(axes: Any, times: Vector, values: Vector, fast: Any) -> None:
-    """Mark the steps (N - 1, k) of pressures (N, k) in which they change at their full rate."""
+    """Mark the steps, given by `fast` (N - 1, k), in which pressures (N, k) change at full rate."""
     from matplotlib.collections import LineCollection
 
     lines = np.stack([np.broadcast_to(times[:, None], values.shape), values], axis=-1)  # (N, k, 2)
@@ -402,7 +402,7 @@ def _mark_fast_steps(axes: Any, times: Vector, values: Vector, fast: Any) -> Non
 
 
 def _fast_steps(solution: PathSolution) -> Any:
-    """Which channels (N - 1, n) change at their full rate in which step."""
+    """Return which channels change at their full rate in each step, (N - 1, n)."""
     steps = np.abs(np.diff(solution.pressures, axis=0))
     if solution.slew is None:
         return np.zeros(steps.shape, dtype=bool)

@@ -1,4 +1,4 @@
-"""Figure of a closed-loop run: tip, error, force, pressures, stiffness, states and events."""
+"""Draw a closed-loop run: tip, error, force, pressures, stiffness, states and events."""
 
 from __future__ import annotations
 
@@ -36,13 +36,13 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 _WIDE = 11.5  # inches
-_HEAD = 1.82  # title and four lines
+_HEAD = 1.82  # inches, title and four lines
 _PANEL, _GAP, _ROW, _LINE = 1.35, 0.16, 0.24, 0.2
 _FOOT = 0.62
 _MOST_EVENTS = 14  # in the list
-_FLOOR = 1e-5  # m; errors below are drawn there
+_FLOOR = 1e-5  # m; smaller errors are drawn here
 _SMALLEST_RANGE = 2e-3  # m, of an axis of the tip
-_BELOW_ZERO = 3e3  # Pa, that an axis of pressures shows
+_BELOW_ZERO = 3e3  # Pa, shown below zero on axes of pressure
 _STATES = {
     "unconfigured": "#c9cdd2",
     "inactive": "#c9cdd2",
@@ -52,15 +52,15 @@ _STATES = {
 }
 _SEVERITIES = {"info": "#4e79a7", "warning": "#e0a100", "error": "#b00020"}
 _ALARM = "#e07b39"
-_MOST_ALARMS = 6  # kinds that have a row
-_HALF = 0.36  # of a row, that a band fills to each side
+_MOST_ALARMS = 6  # kinds of alarms that have a row
+_HALF = 0.36  # half width of a band, as a share of a row
 _LONGEST = 20  # letters of a name
 _LETTER_WIDTH = 0.0095  # of the panel's width
-_APART = 0.012  # of the panel's width, between two numbers of events
+_APART = 0.012  # of the panel's width; smallest distance between two numbers of events
 
 
 def plot_run(run: RecordedRun, *, title: str | None = None) -> Figure:
-    """Draw a run of at least one tick; the title is by default the name of the rig."""
+    """Draw a run with at least one tick; the title is by default the name of the rig."""
     listed = _listed(run.events)
     stiff = bool(np.isfinite(run.stiffness).any())
     angles = bool(np.isfinite(run.angle_error).any())
@@ -121,7 +121,7 @@ def _draw_tip(axes: Any, run: RecordedRun, axis: int) -> None:
         )  # fmt: skip
     low, high = axes.get_ylim()
     least = unit.of(_SMALLEST_RANGE)
-    if high - low < least:  # noise is not to look like motion
+    if high - low < least:  # else noise would look like motion
         middle = (low + high) / 2
         axes.set_ylim(middle - least / 2, middle + least / 2)
     axes.set_ylabel(f"tip {'xyz'[axis]} ({unit})")
@@ -159,7 +159,7 @@ def _draw_angle(axes: Any, run: RecordedRun) -> None:
 
 
 def _draw_force(axes: Any, run: RecordedRun) -> None:
-    """Draw the force that is felt: of a press along its direction, else its size."""
+    """Draw the estimated force: its component along a press, else its magnitude."""
     unit, force = display_units().force, run.wrench[:, :3]
     size = np.linalg.norm(force, axis=1)
     felt = np.where(np.isfinite(run.press_force), run.press_force, size)
@@ -227,7 +227,7 @@ def _draw_stiffness(axes: Any, run: RecordedRun) -> None:
 
 
 def _shade(panels: Any, run: RecordedRun) -> None:
-    """Shade the times at which the loop was not active, in the colours of its states."""
+    """Shade the times at which the loop was not active, in the colour of its state."""
     for span in run.states:
         if span.kind in _STATES and span.kind != "active":
             for axes in panels:
@@ -253,7 +253,7 @@ def _list_events(figure: Any, listed: list[Event], below: float) -> None:
 
 
 def _listed(events: tuple[Event, ...]) -> list[Event]:
-    """The events that are listed in words: the gravest where there are too many."""
+    """Return the events to list in words: the most severe if there are too many."""
 
     def rank(index: int) -> tuple[int, int]:
         event = events[index]
@@ -275,7 +275,7 @@ def _what(run: RecordedRun) -> str:
 
 
 def error_lines(run: RecordedRun, stages: RunStages | None = None) -> list[str]:
-    """Return in words how far the tip was from its targets, on its way to them and at them."""
+    """Describe the tip's errors, on the way to its targets and at them."""
     approach, hold = stages or RunStages.of(run)
     units = display_units()
     if not (approach | hold).any():
@@ -305,7 +305,7 @@ def _errors_text(run: RecordedRun, ticks: NDArray[np.bool_]) -> str:
 
 
 def _stiffness_line(run: RecordedRun, stages: RunStages) -> list[str]:
-    """Median stiffness while the loop had a target."""
+    """Describe the median stiffness while the loop had a target."""
     share = (run.stiffness / run.best_stiffness)[stages.approach | stages.hold]
     if not np.isfinite(share).any():
         return []
@@ -316,7 +316,7 @@ def _stiffness_line(run: RecordedRun, stages: RunStages) -> list[str]:
 
 
 def _draw_timeline(axes: Any, run: RecordedRun, listed: list[Event]) -> None:
-    """Draw bands for states and alarms, and marks for events; those that are listed by number."""
+    """Draw bands for states and alarms, and marks for events, with numbers for listed ones."""
     kinds = _alarm_kinds(run)
     labels = ["state", *kinds, *(["events"] if run.events else [])]
     width = max(float(run.time[-1] - run.time[0]), 1e-3)
@@ -358,7 +358,7 @@ def _draw_events(axes: Any, run: RecordedRun, listed: list[Event], row: int, wid
 
 
 def _alarm_kinds(run: RecordedRun) -> list[str]:
-    """The kinds of alarms that have a row: those that stood longest."""
+    """Return the kinds of alarms that have a row: those that lasted longest."""
     stood: dict[str, float] = {}
     for span in run.alarms:
         stood[span.kind] = stood.get(span.kind, 0.0) + span.end - span.begin

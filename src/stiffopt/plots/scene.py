@@ -1,4 +1,4 @@
-"""The objects of a scene in axes in 3-D."""
+"""Draw the objects of a scene in 3-D axes."""
 
 from __future__ import annotations
 
@@ -18,25 +18,25 @@ _SHADE = 0.45
 
 
 def draw_objects(axes: Any, scene: Scene, size: float, seen: Vector) -> tuple[Vector, list[Vector]]:
-    """Draw a scene's objects, in the unit in which lengths are shown.
+    """Draw a scene's objects, in the display unit of lengths.
 
     Parameters
     ----------
     axes :
         In 3-D.
     scene :
-        What is around the arm.
+        The objects around the arm.
     size :
-        Length of the arm, in that unit: what has no end is cut off at about it.
+        Length of the arm, in that unit; unbounded objects are cut off at about it.
     seen : (k, 3)
-        What the figure shows anyway, in that unit.
+        Points that the figure shows anyway, in that unit.
 
     Returns
     -------
     near : (j, 3)
-        Points that the figure should show too: those of objects that are not far from the rest.
+        Points that the figure should show too: those of objects near the others.
     middles : list of (3,)
-        For each object a point where its name belongs.
+        For each object, a point for its name.
     """
     near, middles, unit = [seen], [], display_units().length
     low, high = seen.min(axis=0) - 0.6 * size, seen.max(axis=0) + 0.6 * size

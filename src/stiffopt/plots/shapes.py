@@ -1,4 +1,4 @@
-"""Shapes that are drawn: stations along the segments, objects of a scene, and the ellipsoid."""
+"""Shapes to draw: poses along the segments, meshes of objects, and the stiffness ellipsoid."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Vector = NDArray[np.float64]
 
 
 def segment_poses(robot: Manipulator, pressures: ArrayLike, count: int) -> Vector:
-    """Poses (segments, count, 4, 4) along each segment with its connector, ends included.
+    """Return poses (segments, count, 4, 4) along each segment with its connector, ends included.
 
     Parameters
     ----------
@@ -23,7 +23,7 @@ def segment_poses(robot: Manipulator, pressures: ArrayLike, count: int) -> Vecto
     pressures : (n,)
         In Pa.
     count : int
-        Stations of each segment, 2 or more.
+        Number of stations of each segment, at least 2.
     """
     stations = segment_stations(robot, count).ravel()
     poses = np.concatenate([np.eye(4)[None], robot.pose(pressures, stations[1:])])
@@ -31,7 +31,7 @@ def segment_poses(robot: Manipulator, pressures: ArrayLike, count: int) -> Vecto
 
 
 def segment_stations(robot: Manipulator, count: int) -> Vector:
-    """Arc lengths (segments, count) along each segment with its connector, ends included, in m."""
+    """Return arc lengths (segments, count), in m, along each segment with its connector."""
     return robot.kept(("segment stations", count), lambda: _stations(robot, count))
 
 
@@ -43,7 +43,7 @@ def _stations(robot: Manipulator, count: int) -> Vector:
 
 
 def surface_mesh(shape: Obstacle, length: float) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
-    """Return vertices and triangles of a shape, cut off at about a length where it has no end."""
+    """Return vertices and triangles of a shape; an unbounded one is cut off at about a length."""
     vertices, faces, begin = [], [], 0
     for surface in shape.outline(length):
         rows, columns = surface.shape[1:]
@@ -62,13 +62,13 @@ def surface_mesh(shape: Obstacle, length: float) -> tuple[NDArray[np.float32], N
 class StiffnessEllipsoid(NamedTuple):
     """The ellipsoid of forces f with ``f'C_vv f = 1``, in base axes.
 
-    The square of a radius is the free stiffness along it: the square root keeps the thin ones
+    The square of a semi-axis is the free stiffness along it; the square root keeps thin ellipsoids
     visible.
 
     Attributes
     ----------
-    stiffnesses : (3,), of its axes, in N/m, increasing.
-    axes : (3, 3), right-handed, in the columns.
+    stiffnesses : (3,), along its axes, in N/m, increasing.
+    axes : (3, 3), the columns, right-handed.
     """
 
     stiffnesses: Vector
@@ -76,12 +76,12 @@ class StiffnessEllipsoid(NamedTuple):
 
     @classmethod
     def of(cls, compliance: ArrayLike, rotation: ArrayLike) -> StiffnessEllipsoid:
-        """That of a tip with a compliance (6, 6) in tip axes, turned by a rotation (3, 3)."""
+        """Return the ellipsoid of a tip with compliance (6, 6) in tip axes, and rotation (3, 3)."""
         linear, turn = np.asarray(compliance)[:3, :3], np.asarray(rotation)
         stiffness = turn @ np.linalg.inv((linear + linear.T) / 2) @ turn.T
         values, axes = np.linalg.eigh(stiffness)
         return cls(np.abs(values), axes * np.sign(np.linalg.det(axes)))
 
     def radii(self, largest: float) -> Vector:
-        """Semi-axes (3,), the largest of this length."""
+        """Return the semi-axes (3,), scaled to a largest one."""
         return np.asarray(largest * np.sqrt(self.stiffnesses / self.stiffnesses.max()))

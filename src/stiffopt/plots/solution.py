@@ -1,4 +1,4 @@
-"""Figures of a solution: the arm with its pressures, and the trade-off against tip error."""
+"""Draw a solution: the arm with its pressures, and the trade-off against tip error."""
 
 from __future__ import annotations
 
@@ -38,11 +38,11 @@ if TYPE_CHECKING:
 
 Vector = NDArray[np.float64]
 
-_MOST_LABELS = 15  # pressures with a number on their bar
-_NEAR_BOUND = 0.06  # of all pressures: from there a number stands above the limit
-_BOLD_NUMBER = 3.4  # times the size of its letters: the width of "1.234"
-_ELLIPSOID_SHARE = 0.22  # of the arm's length: its largest semi-axis
-_ARROW_SHARE = 0.22
+_MOST_LABELS = 15  # largest number of pressures with a number on their bar
+_NEAR_BOUND = 0.06  # of the axis; a bar nearer to its limit has its number above the limit
+_BOLD_NUMBER = 3.4  # width of "1.234", in font sizes
+_ELLIPSOID_SHARE = 0.22  # largest semi-axis, as a share of the arm's length
+_ARROW_SHARE = 0.22  # length of an arrow, likewise
 
 
 def plot_solution(
@@ -55,28 +55,28 @@ def plot_solution(
     scene: Scene | None = None,
     view: View | None = None,
 ) -> Figure:
-    """Draw an answer: the arm in space, and its pressures against their limits.
+    """Draw a solution: the arm in space, and its pressures against their limits.
 
     Parameters
     ----------
     robot : Manipulator
-        The arm; the load of the solution's task is put on it.
+        The arm; the load of the solution's task is applied to it.
     solution : PressureSolution
     front : sequence of PressureSolution, optional
         A trade-off to draw beside it, as `stiffopt.pareto_front` returns it.
     plain : float, optional
-        First stiffness of a stiffness-blind solution, to compare with.
+        First stiffness of the plain solution, which ignores stiffness, for comparison.
     title : str, optional
         By default the name of the task's file.
     scene : Scene, optional
-        What is around the arm, by default that of the task.
+        The objects around the arm; by default those of the task.
     view : (elevation, azimuth), optional
         From where to look at the arm, in rad or as text with a unit; see `draw_arm`.
 
     Raises
     ------
     InputError
-        If the solution has no pressures, as the solver failed, or the view cannot be had.
+        The solution has no pressures, or the view is invalid.
     MissingExtraError
         If matplotlib is not installed.
     """
@@ -155,7 +155,7 @@ def _key_numbers(solution: PressureSolution, plain: float | None) -> str:
 
 
 def draw_pressures(axes: Any, robot: Manipulator, solution: PressureSolution) -> None:
-    """Draw bars of the pressures against the limits that hold; those at a limit stand out.
+    """Draw the pressures as bars with their limits; those at a limit are highlighted.
 
     Parameters
     ----------
@@ -167,7 +167,7 @@ def draw_pressures(axes: Any, robot: Manipulator, solution: PressureSolution) ->
     Raises
     ------
     InputError
-        If the solution has no pressures.
+        The solution has no pressures.
     """
     _require_pressures(solution)
     description, unit = robot.description, display_units().pressure
@@ -207,7 +207,7 @@ def draw_pressures(axes: Any, robot: Manipulator, solution: PressureSolution) ->
 def draw_pareto(
     axes: Any, front: Sequence[PressureSolution], *, plain: float | None = None
 ) -> None:
-    """Draw stiffness against tip error, each point the stiffest at its error.
+    """Draw the trade-off of stiffness against tip error.
 
     Parameters
     ----------
@@ -249,7 +249,7 @@ def draw_pareto(
 
 
 def _places(robot: Manipulator) -> Any:
-    """Where the bars stand: a gap between segments."""
+    """Return the positions of the bars, with a gap between segments."""
     places, place = [], 0.0
     for segment in robot.description.segments:
         for _ in range(segment.n_channels):
@@ -299,17 +299,17 @@ def draw_solution(
     scene: Scene | None = None,
     view: View | None = None,
 ) -> list[Any]:
-    """Draw an answer in space: the arm, its stiffness and what was asked of it.
+    """Draw a solution in space: the arm, its stiffness and its task.
 
     Parameters
     ----------
     axes :
         In 3-D, as for `draw_arm`.
     robot : Manipulator
-        The arm; the load of the solution's task is put on it.
+        The arm; the load of the solution's task is applied to it.
     solution : PressureSolution
     scene : Scene, optional
-        What is around the arm, by default that of the task.
+        The objects around the arm; by default those of the task.
     view : (elevation, azimuth), optional
         See `draw_arm`.
 
@@ -321,7 +321,7 @@ def draw_solution(
     Raises
     ------
     InputError
-        If the solution has no pressures, or the view cannot be had.
+        The solution has no pressures, or the view is invalid.
     """
     _require_pressures(solution)
     arm = _loaded(robot, solution.task)
@@ -347,14 +347,14 @@ def draw_solution(
 
 
 def draw_task(axes: Any, robot: Manipulator, task: Task, *, view: View | None = None) -> list[Any]:
-    """Draw a task in space: the arm at its least pressures, and what is asked of it.
+    """Draw a task in space: the arm at its lowest pressures, and the task's target and goals.
 
     Parameters
     ----------
     axes :
         In 3-D, as for `draw_arm`.
     robot : Manipulator
-        The arm; the load of the task is put on it.
+        The arm; the load of the task is applied to it.
     task : Task
     view : (elevation, azimuth), optional
         See `draw_arm`.
@@ -367,7 +367,7 @@ def draw_task(axes: Any, robot: Manipulator, task: Task, *, view: View | None = 
     Raises
     ------
     InputError
-        If the view cannot be had.
+        The view is invalid.
     """
     arm = _loaded(robot, task)
     start = arm.pressure_min
@@ -395,7 +395,7 @@ def _require_pressures(solution: PressureSolution) -> None:
 
 @dataclass
 class _Drawing(ArmDrawing):
-    """The arm at a solution's pressures, and what was asked of it."""
+    """Draws the arm at a solution's pressures, its stiffness and its task."""
 
     solution: PressureSolution
 
@@ -412,7 +412,7 @@ class _Drawing(ArmDrawing):
     # -- stiffness --------------------------------------------------------------------------
 
     def draw_ellipsoid(self) -> None:
-        """The stiffness ellipsoid with its axes; see `StiffnessEllipsoid`."""
+        """Draw the stiffness ellipsoid with its axes; see `StiffnessEllipsoid`."""
         values, ways = found = StiffnessEllipsoid.of(
             np.asarray(self.solution.compliance), self.rotation
         )
@@ -438,7 +438,7 @@ class _Drawing(ArmDrawing):
         )
 
     def draw_free_ellipsoid(self) -> None:
-        """That of the answer that keeps clear of all objects, to the same scale, as an outline."""
+        """Draw the outline of the ellipsoid of the arm clear of objects, to the same scale."""
         free = self.solution.free
         if free is None or not free.found:
             return
@@ -460,7 +460,7 @@ class _Drawing(ArmDrawing):
         self.add_line(style.DARK, f"ellipsoid clear of objects:\n{listed} {unit}", ":")
 
     def draw_directions(self) -> None:
-        """An arrow along each direction whose stiffness the task names."""
+        """Draw an arrow along each direction whose stiffness the task names."""
         pairs = zip_longest(self.solution.task.measures, self.solution.stiffnesses)
         for number, (measure, value) in enumerate(pairs):
             if not isinstance(measure, StiffnessMeasure):
@@ -478,7 +478,7 @@ class _Drawing(ArmDrawing):
     # -- target and loads -------------------------------------------------------------------
 
     def draw_target(self) -> None:
-        """Target position, a line along each axis that is free; target pointing or orientation."""
+        """Draw the target position, a line along each free axis, and pointing or orientation."""
         target = self.solution.task.target
         point = self.tip.copy()
         if target.position is not None:
@@ -527,7 +527,7 @@ class _Drawing(ArmDrawing):
         self.add_line("#555555", "orientation of the tip")
 
     def draw_loads(self) -> None:
-        """The force at the tip and the pull of gravity."""
+        """Draw the force at the tip and the direction of gravity."""
         task = self.solution.task
         load, name = task.tip_load, "load" if task.press is None else "reaction of the press"
         if load is not None and any(load.force):

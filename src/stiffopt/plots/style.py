@@ -1,6 +1,6 @@
-"""What all figures share: colours, panels, titles, legends, logarithmic scales, and saving.
+"""Style of all figures: colours, panels, titles, legends, logarithmic scales, and saving.
 
-matplotlib is imported when something is drawn, not before.
+matplotlib is imported only when something is drawn.
 """
 
 from __future__ import annotations
@@ -29,28 +29,28 @@ MEASURED = "#2f6db3"
 MODEL = "#d62728"
 TARGET = "#d62728"
 BEFORE = "#9aa3ab"
-"""Of a robot file before it was calibrated."""
+"""Robot file before calibration."""
 AXES = ("#2f6db3", "#2a8a57", "#c99a0b")
-"""Of x, y and z."""
+"""Axes x, y and z."""
 CHANNELS = ("#2f6db3", "#c2571a", "#2a8a57", "#8e5bb5", "#c99a0b", "#4aa7b5", "#b5547a", "#6b7a3a",
             "#7d5a4a")  # fmt: skip
-"""Of channels, or logs, in turn."""
+"""Channels, or logs, in turn."""
 SEGMENTS = ("#7fa8c9", "#a9c47f", "#c9a27f", "#a58fc4", "#7fc4b8")
-"""Of segments in turn."""
+"""Segments in turn."""
 DIRECTIONS = ("#c2571a", "#8c2d04", "#e0a100", "#b5547a")
-"""Of the stiffnesses that a task names, in turn."""
+"""Stiffnesses that a task names, in turn."""
 FORCE = "#8c564b"
 ELLIPSOID = "#6a3d9a"
 AT_LIMIT = "#f28e2b"
 LEAST_STIFF_TEXT = "#b35c00"
 WITHIN_LIMITS = "#4e79a7"
 RANGE = "#e9ecef"
-"""Of what is allowed, or was recorded."""
+"""Allowed or recorded range."""
 BOUND = "#9aa3ab"
 LOAD = "#111111"
 OBSTACLE = "#8a6d5c"
 ARM = "#39424b"
-"""Of the arm in outline."""
+"""Outline of the arm."""
 STATUS = {"solved": "#2a7f3f", "unreachable": "#b35c00", "failed": "#b00020"}
 GREY = "#8a8f96"
 DARK = "#333333"
@@ -76,17 +76,11 @@ def channel_colour(channel: int) -> str:
 
 _WIDE = 11.0  # inches
 _DPI = 130
-_LONGEST_NOTE = 160  # characters of a message that fit
+_LONGEST_NOTE = 160  # characters of a message
 
 
 def require_matplotlib() -> None:
-    """Say how to get matplotlib if it is missing.
-
-    Raises
-    ------
-    MissingExtraError
-        If it is not installed.
-    """
+    """Raise `MissingExtraError`, which says how to install matplotlib, if it is missing."""
     require_package("matplotlib", "plot")
 
 
@@ -105,7 +99,7 @@ def new_figure(width: float, height: float, **settings: Any) -> Figure:
 
 
 def add_space(figure: Figure, place: tuple[float, float, float, float]) -> Any:
-    """Return new axes in 3-D, in the right of a place of a figure: left, bottom, width, height."""
+    """Add 3-D axes at the right of a place of a figure: left, bottom, width, height."""
     return figure.add_axes(place, projection="3d", computed_zorder=False, anchor="E")
 
 
@@ -119,7 +113,7 @@ def stacked_panels(
     Parameters
     ----------
     heights : of the rows.
-    columns : how many panels stand in a row.
+    columns : number of panels in a row.
     wide, left, right, head, foot, gap : width of the figure, its margins on the four sides, and
         the space between two rows; like `heights` in inches.
     between : space between two columns, as a share of a panel's width.
@@ -141,12 +135,12 @@ def stacked_panels(
 
 
 def save_figure(figure: Figure, path: str | os.PathLike[str]) -> None:
-    """Write a figure in the format that the path's ending names; whole or not at all.
+    """Write a figure atomically, in the format of the path's ending.
 
     Raises
     ------
     FileError
-        If it cannot be written.
+        The file cannot be written.
     """
     buffer = BytesIO()
     try:
@@ -160,12 +154,12 @@ def save_figure(figure: Figure, path: str | os.PathLike[str]) -> None:
 
 
 def literal(text: str) -> str:
-    """Return text that matplotlib does not take for mathematics."""
+    """Escape text so that matplotlib does not typeset it as mathematics."""
     return printable(text).replace("$", r"\$")
 
 
 def draw_head(figure: Figure, title: str, *lines: str) -> None:
-    """Write a title at the top of a figure, and lines with the numbers that matter below it."""
+    """Write a title at the top of a figure, and lines with key numbers below it."""
     height = figure.get_figheight()
     figure.text(0.025, 1 - 0.34 / height, literal(title), fontsize=15, weight="bold", va="center")
     for number, line in enumerate(lines):
@@ -174,7 +168,7 @@ def draw_head(figure: Figure, title: str, *lines: str) -> None:
 
 
 def draw_outcome(figure: Figure, title: str, numbers: str, status: str, message: str) -> None:
-    """Write the head of a solution's figure: title, numbers, message, and its status beside it."""
+    """Write the head of a solution's figure: title, key numbers, message and status."""
     draw_head(
         figure, title, numbers, shorten(printable(message), _LONGEST_NOTE, placeholder=" ...")
     )
@@ -193,7 +187,7 @@ def legend_beside(axes: Any, **settings: Any) -> None:
 
 
 def legend_in_corner(axes: Any, handles: Sequence[Any]) -> None:
-    """Put a legend into the upper left corner of the place of axes in 3-D, and these beside it."""
+    """Put a legend into the upper left corner of 3-D axes, and move their box to the right."""
     from stiffopt.plots.view import move_to_the_right
 
     move_to_the_right(axes)
@@ -216,7 +210,7 @@ def legend_on_top(
 
 
 def tidy(axes: Any) -> None:
-    """Leave out the frame's upper and right side; small numbers."""
+    """Remove the frame's upper and right side, and make the numbers smaller."""
     axes.spines[["top", "right"]].set_visible(False)
     axes.tick_params(labelsize=9)
 
@@ -236,7 +230,7 @@ _STEPS = (
 
 
 def round_steps(low: float, high: float, most: int = 8) -> Array:
-    """Round numbers between two positive ones, evenly spread on a logarithmic scale."""
+    """Return at most about `most` round numbers between two, evenly spread on a log scale."""
     decades = range(int(np.floor(np.log10(low))), int(np.ceil(np.log10(high))) + 1)
     found: list[float] = []
     for steps in _STEPS:
@@ -264,7 +258,7 @@ def label_logarithmic(axis: Any, low: float, high: float, most: int = 8) -> None
 
 
 def thinned(time: Array, values: Array, most: int = 4000) -> tuple[Array, Array]:
-    """Return a line with at most about so many points that shows the same extremes."""
+    """Return a line with at most about `most` points that shows the same extremes."""
     count = len(time)
     size = -(-2 * count // most)
     if size <= 2:

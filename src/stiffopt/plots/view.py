@@ -1,4 +1,4 @@
-"""From where an arm in axes in 3-D is looked at, and how it comes to fill them."""
+"""The viewpoint of 3-D axes with an arm, and their scale."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ View = Sequence[float | str]
 
 _ELEVATION = radians(14.0)
 _AZIMUTH = radians(-66.0)  # x to the right, y away from the eye
-_ASIDE, _BELOW, _ABOVE = 40.0, 37.0, 4.0  # points, for the numbers at the axes
+_ASIDE, _BELOW, _ABOVE = 40.0, 37.0, 4.0  # points, margins for the numbers at the axes
 
 
 class ViewAngles(NamedTuple):
@@ -38,12 +38,12 @@ class ViewAngles(NamedTuple):
 
     @classmethod
     def of(cls, robot: Manipulator, view: View | None = None) -> ViewAngles:
-        """The view that is asked for, or the one of all figures: x to the right.
+        """Return the requested view, or the default one, with x to the right.
 
         Raises
         ------
         InputError
-            If the view is not two angles, or its elevation above 90 deg.
+            The view is not two angles, or its elevation exceeds 90 deg.
         """
         hangs = robot.description.gravity[2] > 0
         if view is None:
@@ -59,7 +59,7 @@ class ViewAngles(NamedTuple):
         return cls(elevation, azimuth, hangs)
 
     def set(self, axes: Any) -> None:
-        """Look at axes like this."""
+        """Set the view of axes."""
         axes.view_init(
             elev=degrees(-self.elevation if self.hangs else self.elevation),
             azim=degrees(self.azimuth),
@@ -74,9 +74,9 @@ def _angle(angle: float | str) -> float:
 
 
 def fill_panel(axes: Any) -> None:
-    """Make the box of axes in 3-D, whose limits and view are set, as large as they allow.
+    """Make the box of 3-D axes, whose limits and view are set, as large as possible.
 
-    matplotlib leaves so much room around it that no view cuts off a corner.
+    By default, matplotlib leaves enough room for any view.
     """
     x, y = projected(axes, box_corners(axes))
     axes.apply_aspect()
@@ -91,9 +91,9 @@ def fill_panel(axes: Any) -> None:
 
 
 def move_to_the_right(axes: Any) -> None:
-    """Move the box of axes in 3-D from their middle to their right, where a legend is at the left.
+    """Move the box of 3-D axes from the middle to the right, to make room for a legend.
 
-    `fill_panel` has set their limits.
+    `fill_panel` must have set their limits.
     """
     x, _ = projected(axes, box_corners(axes))
     left, right = axes.viewLim.intervalx
@@ -104,13 +104,13 @@ def move_to_the_right(axes: Any) -> None:
 
 
 def box_corners(axes: Any) -> Vector:
-    """Corners (8, 3) of the box of axes in 3-D."""
+    """Return the corners (8, 3) of the box of 3-D axes."""
     limits = axes.get_xlim(), axes.get_ylim(), axes.get_zlim()
     return np.stack(np.meshgrid(*limits, indexing="ij"), axis=-1).reshape(8, 3)
 
 
 def projected(axes: Any, points: Vector) -> Vector:
-    """Points (k, 3) in the plane of the picture (2, k), in data units of that plane."""
+    """Project points (k, 3) to the picture (2, k), in data units of its plane."""
     from mpl_toolkits.mplot3d import proj3d
 
     return np.asarray(proj3d.proj_transform(*points.T, axes.get_proj())[:2])

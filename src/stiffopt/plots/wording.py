@@ -1,4 +1,4 @@
-"""Numbers, units and stiffness measures in words, the same in figures and in tables."""
+"""Format numbers, units and stiffness measures, the same in figures and in tables."""
 
 from collections.abc import Iterable
 
@@ -10,48 +10,48 @@ from stiffopt.optimise.solution import PressureSolution
 
 
 def least_maximised(solution: PressureSolution) -> float | None:
-    """Return the smallest of the stiffnesses that a task maximises: what its trade-off is about."""
+    """Return the smallest of the stiffnesses that a task maximises, or None."""
     goal = solution.task.stiffness
     count = len(goal.maximise) if goal is not None else 0
     return min(solution.stiffnesses[:count], default=None)
 
 
 def limit_of(solution: PressureSolution, channel: str) -> str:
-    """Return at which limit a channel is: ``min``, ``max`` or, at none, an empty text."""
+    """Return the limit at which a channel is: ``min``, ``max`` or an empty text."""
     sides = (s for s in ("min", "max") if f"{channel} {s}" in solution.active_bounds)
     return next(sides, "")
 
 
 def unit_text(unit: str | None) -> str:
-    """Return the unit in which values of an SI unit are shown."""
+    """Return the name of the display unit for an SI unit."""
     return display_units().of_si(unit).name
 
 
 def stiffness_text(value: float, unit: str | None) -> str:
-    """Return a stiffness, in its SI unit, as people read it: with four significant figures."""
+    """Format a stiffness, given in an SI unit, in its display unit with four figures."""
     return display_units().of_si(unit).text(value, FIGURES)
 
 
 def gain_text(value: float, plain: float) -> str:
-    """Return by how many per cent a value is above a plain one."""
+    """Format the excess of a value over a plain one in per cent."""
     return f"{(value / plain - 1) * 100:+.0f} %".replace("-0 %", "+0 %")
 
 
 def vector_text(values: Iterable[float], unit: DisplayUnit = PLAIN) -> str:
-    """Return a vector as numbers of a unit, with at most three decimals of the usual one."""
+    """Format a vector in a unit, with at most three decimals (more for larger units)."""
     digits = 3 + unit.more_decimals
     return f"({', '.join(f'{round(unit.of(float(x)), digits) + 0.0:g}' for x in values)})"
 
 
 def short_direction(measure: StiffnessMeasure) -> str:
-    """Return along or about which direction a stiffness is meant, as short as can be."""
+    """Describe the direction of a stiffness briefly."""
     way = "along" if measure.kind == "translation" else "about"
     tip = "the tip's " if measure.frame == "tip" else ""
     return f"{way} {tip}{direction_name(measure.direction)}"
 
 
 def direction_text(measure: Measure) -> str:
-    """Return along or about what a stiffness is meant, or what else it is of."""
+    """Describe the direction of a stiffness, or another measure in its own words."""
     if not isinstance(measure, StiffnessMeasure):
         return measure.words()
     way = "along" if measure.kind == "translation" else "about"
