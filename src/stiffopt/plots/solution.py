@@ -108,7 +108,7 @@ def plot_pareto(
     front : sequence of PressureSolution
         As `stiffopt.pareto_front` returns it.
     plain : float, optional
-        First stiffness of a stiffness-blind solution, to compare with.
+        First stiffness of the plain solution, which ignores stiffness, for comparison.
     title : str, optional
 
     Raises
@@ -216,7 +216,7 @@ def draw_pareto(
     front : sequence of PressureSolution
         As `stiffopt.pareto_front` returns it.
     plain : float, optional
-        First stiffness of a stiffness-blind solution, to compare with.
+        First stiffness of the plain solution, which ignores stiffness, for comparison.
     """
     axes.set_title("stiffness gained by a larger tip error", fontsize=11, loc="left")
     tidy(axes)

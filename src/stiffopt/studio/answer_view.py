@@ -1,4 +1,4 @@
-"""What the studio draws of an answer: the arm, its stiffness, its loads, and what it misses."""
+"""Draw a solution in the studio: the arm, its stiffness, its loads, and the missed target."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _ELLIPSOID_SHARE = 0.22
 
 
 class AnswerView:
-    """Draws answers of one arm.
+    """Draws the solutions of one arm.
 
     Parameters
     ----------
@@ -29,7 +29,7 @@ class AnswerView:
     description :
         The robot.
     is_preview :
-        Whether the arm is drawn as a ghost, before another one.
+        Whether to draw the arm translucently, as a preview over another one.
     """
 
     def __init__(self, server: Any, description: RobotDescription, *, is_preview: bool) -> None:
@@ -61,19 +61,19 @@ class AnswerView:
 
     @property
     def arm_end(self) -> Vector:
-        """Where the arm that is drawn ends (3,), in m."""
+        """Position of the drawn arm's end (3,), in m."""
         return self._arm.end
 
     def show(self, answer: StudioAnswer, target: Vector, *, with_plain: bool) -> None:
-        """Draw an answer.
+        """Draw a solution.
 
         Parameters
         ----------
         answer : StudioAnswer
         target : (3,)
-            Where the target is, in m.
+            Position of the target, in m.
         with_plain :
-            Whether the arm is drawn with plain pressures too.
+            Whether to draw the plain solution too.
         """
         leaning = answer.solution.equilibrium
         self._arm.show(answer.robot, answer.pressures, leaning)
@@ -85,7 +85,7 @@ class AnswerView:
         self._show_load(answer)
 
     def direction_end(self, answer: StudioAnswer) -> Vector | None:
-        """Where the arrow of the first direction ends (3,), in m; None: there is none."""
+        """Return the end (3,), in m, of the first direction's arrow, or None."""
         ways = _directions(answer)
         if not ways or answer.solution.stiffness is None:
             return None
@@ -107,7 +107,7 @@ class AnswerView:
         self._ellipsoid.visible = True
 
     def _show_directions(self, answer: StudioAnswer) -> None:
-        """Arrows along what is maximised, and the value at the first."""
+        """Draw arrows along the stiffnesses' directions, and the value at the first."""
         tip, ways = _pose(answer)[:3, 3], _directions(answer)
         reach = _ARROW_SHARE * self._length
         draw(self._arrows, _arrows([(tip, tip + reach * way) for way in ways]))
@@ -118,12 +118,12 @@ class AnswerView:
             place(self._label, tip + 1.25 * reach * ways[0])
 
     def _show_miss(self, answer: StudioAnswer, target: Vector) -> None:
-        """The way from the tip to a target that it does not reach."""
+        """Draw an arrow from the tip to a target that it does not reach."""
         far = (answer.solution.position_error or 0.0) > 0.004 * self._length
         draw(self._miss, _arrows([(_pose(answer)[:3, 3], target)] if far else []))
 
     def _show_load(self, answer: StudioAnswer) -> None:
-        """The force at the tip."""
+        """Draw the force at the tip."""
         load, forces, pose = answer.design.task.tip_load, [], _pose(answer)
         if load is not None and any(load.force):
             force = np.array(load.force)
@@ -139,7 +139,7 @@ def _pose(answer: StudioAnswer) -> Vector:
 
 
 def _directions(answer: StudioAnswer) -> list[Vector]:
-    """Unit vectors of what is maximised, in base axes."""
+    """Return the directions of the task's stiffnesses as unit vectors, in base axes."""
     rotation = _pose(answer)[:3, :3]
     return [
         rotation @ each.direction if each.frame == "tip" else np.array(each.direction)

@@ -1,4 +1,4 @@
-"""A workspace map as a cloud of points, coloured by stiffness."""
+"""Convert a workspace map to a cloud of points, coloured by stiffness."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from stiffopt.errors import InputError
 from stiffopt.model.description import RobotDescription
 from stiffopt.workspace.map import WorkspaceMap
 
-_MOST = 30_000  # points that are sent to the browser
+_MAX_POINTS = 30_000  # sent to the browser
 _SCALE = np.array([(68, 1, 84), (59, 82, 139), (33, 145, 140), (94, 201, 98), (253, 231, 37)])
 
 
 class StiffnessCloud(NamedTuple):
-    """The cells of a map in one direction.
+    """The cells of a map with their stiffness in one direction.
 
     Attributes
     ----------
     points : (m, 3), centres of cells in m.
     colours : (m, 3), from violet (soft) to yellow (stiff).
-    legend : what the colours mean.
+    legend : meaning of the colours, in words.
     size : of a point, in m.
     """
 
@@ -34,11 +34,11 @@ class StiffnessCloud(NamedTuple):
 
     @classmethod
     def of(cls, found: WorkspaceMap, direction: int, cut: float = -np.inf) -> StiffnessCloud:
-        """The stiffest that each cell beyond y = `cut` (m) has in a direction, counted from 0."""
+        """Return the largest stiffness of cells beyond y = `cut` (m), in a direction (from 0)."""
         best = found.best[direction]
         low, high = np.log(np.nanpercentile(best, (2, 98)))
         kept = np.flatnonzero(np.isfinite(best) & (found.centres[:, 1] >= cut))
-        kept = kept[:: max(1, -(-len(kept) // _MOST))]
+        kept = kept[:: max(1, -(-len(kept) // _MAX_POINTS))]
         values = best[kept]
         if not len(values):
             raise InputError("the map has no cells to show there")
@@ -57,7 +57,7 @@ class StiffnessCloud(NamedTuple):
 
 
 def check_map(found: WorkspaceMap, description: RobotDescription) -> None:
-    """Raise `InputError` unless a map is of a robot of these segments."""
+    """Raise `InputError` unless a map's robot has the same segments."""
     if found.plan.robot.description.segments != description.segments:
         raise InputError(
             f"--map: the map is of '{found.plan.robot.description.name}', which is another arm "

@@ -1,4 +1,4 @@
-"""Answers side by side in the studio, and copies of the design."""
+"""Compare solutions side by side in the studio, and copy the design."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from stiffopt.studio.workbench import Workbench
 
 
 class CompareView:
-    """Draws the answers that were kept, with inputs that keep and clear them.
+    """Draws the kept solutions, with inputs that keep and clear them.
 
     Parameters
     ----------
     server : viser.ViserServer
     bench : Workbench
     redraw :
-        Is called when the arm with plain pressures is to appear or to go.
+        Called when the plain solution is switched on or off.
     """
 
     def __init__(self, server: Any, bench: Workbench, redraw: Callable[[], None]) -> None:
@@ -38,11 +38,11 @@ class CompareView:
 
     @property
     def with_plain(self) -> bool:
-        """Whether the arm is to be drawn with plain pressures too."""
+        """Whether to draw the plain solution too."""
         return bool(self._with_plain.value)
 
     def show(self) -> None:
-        """Compare the answers that were kept with the one now."""
+        """Compare the kept solutions with the present one."""
         if self._bench.kept:
             self._table.content = texts.compared_html(self._bench, KEPT)
 
@@ -67,14 +67,14 @@ class CompareView:
 
 
 class CopyView:
-    """Shows the design as files and as Python, to be copied.
+    """Shows the design as files and as Python, for copying.
 
     Parameters
     ----------
     gui :
         Of viser.
     design :
-        Returns the design now.
+        Returns the present design.
     """
 
     def __init__(self, gui: Any, design: Callable[[], Design]) -> None:

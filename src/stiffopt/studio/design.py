@@ -1,6 +1,6 @@
-"""What is designed in the studio: a robot and a task, and each way to change them.
+"""The design that the studio edits: a robot and a task, with every possible change.
 
-A `Design` is immutable: a change returns another one, or raises `InputError` as a file would.
+A `Design` is immutable: a change returns a new one, or raises `InputError` like an invalid file.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from stiffopt.optimise.term import Tolerance
 from stiffopt.schema import Schema
 
 Angular = Literal["any", "pointing", "orientation"]
-"""What a target asks of the tip's direction."""
+"""The part of the tip's orientation that a target prescribes."""
 SchemaT = TypeVar("SchemaT", bound=Schema)
 
-_BENT = 0.4  # of the range of the first channel of each segment, for the task of a bare robot
+_BENT = 0.4  # share of the range of each segment's first channel, in the first task of a robot
 
 
 def _rounded(values: ArrayLike) -> tuple[float, ...]:
@@ -37,7 +37,7 @@ def _rounded(values: ArrayLike) -> tuple[float, ...]:
 
 
 def changed(schema: SchemaT, **update: Any) -> SchemaT:
-    """Return a description with other values, checked as a new one is."""
+    """Return a copy of a description with other values, validated anew."""
     given = {name: getattr(schema, name) for name in type(schema).model_fields}  # no cached values
     return type(schema)(**{**given, **update})
 
@@ -48,10 +48,10 @@ class Design:
 
     Attributes
     ----------
-    description : the robot as it is now.
-    task : what is asked of it.
-    robot : name or path of the robot that it began with, as a file anywhere names it.
-    original : that robot.
+    description : the present robot.
+    task : the task on it.
+    robot : name or absolute path of the original robot.
+    original : the robot before any change.
     """
 
     description: RobotDescription
@@ -61,14 +61,14 @@ class Design:
 
     @classmethod
     def of_robot(cls, name_or_path: str | os.PathLike[str]) -> Design:
-        """A robot with a task that it can do, see `of_description`."""
+        """Return a robot with a first task, see `of_description`."""
         return cls.of_description(
             load_description(name_or_path), robot_path(os.fspath(name_or_path), "")
         )
 
     @classmethod
     def of_description(cls, description: RobotDescription, name: str) -> Design:
-        """A robot and its name, with a task: its tip, bent by a few channels, stiff along x."""
+        """Return a robot with a first task: hold its tip where it bends a little, stiff along x."""
         robot = load_robot(description)
         low, high = robot.pressure_min, robot.pressure_max
         pressures, channel = low.copy(), 0
@@ -84,21 +84,21 @@ class Design:
 
     @classmethod
     def of_task(cls, task: Task) -> Design:
-        """A task with the robot that it names."""
+        """Return a task with the robot that it names."""
         description = task.resolve_robot()
         folder = Path("") if task.source is None else task.source.parent
         return cls(description, task, robot_path(task.robot or "", folder), description)
 
     @property
     def has_own_robot(self) -> bool:
-        """Whether the robot is no longer the one that it began with."""
+        """Whether the robot was changed."""
         return self.description != self.original
 
     # -- the target -------------------------------------------------------------------------
 
     @property
     def angular(self) -> Angular:
-        """What the target asks of the tip's direction."""
+        """The part of the tip's orientation that the target prescribes."""
         target = self.task.target
         if target.orientation is not None:
             return "orientation"
@@ -106,18 +106,18 @@ class Design:
 
     @property
     def free(self) -> tuple[bool, bool, bool]:
-        """Which axes of the position are free."""
+        """Whether each axis of the position is free."""
         x, y, z = self.task.target.position or (None, None, None)
         return (x is None, y is None, z is None)
 
     def with_target(self, **parts: Any) -> Design:
-        """Another target: `position`, `pointing`, `orientation` or `tolerance` of it."""
+        """Change `position`, `pointing`, `orientation` or `tolerance` of the target."""
         return self.with_task(target=changed(self.task.target, **parts))
 
     def at_pose(self, position: ArrayLike, quaternion: ArrayLike) -> Design:
-        """The target at a pose (w first) as far as it asks for one: free axes stay free.
+        """Move the target to a pose (quaternion w first); free axes stay free.
 
-        It is rounded to what a hand can place: 0.01 mm, and 1e-4 of a direction.
+        It is rounded to 0.01 mm and, in directions, to 1e-4.
         """
         parts: dict[str, Any] = {}
         if not all(self.free):
@@ -131,7 +131,7 @@ class Design:
         return self.with_target(**parts)
 
     def with_free(self, free: Sequence[bool], tip: ArrayLike) -> Design:
-        """Other free axes; one that is no longer free is asked to be where the tip is."""
+        """Choose the free axes; one that becomes prescribed takes the tip's coordinate."""
         old = self.task.target.position or (None, None, None)
         pairs = zip(free, old, np.asarray(tip).tolist(), strict=True)
         position = tuple(
@@ -141,7 +141,7 @@ class Design:
         return self.with_target(position=None if all(free) else position)
 
     def with_angular(self, angular: Angular, quaternion: ArrayLike) -> Design:
-        """Ask for another part of the tip's direction: as a quaternion (w first) has it."""
+        """Prescribe another part of the tip's orientation, taken from a quaternion (w first)."""
         parts: dict[str, Any] = {"pointing": None, "orientation": None}
         rotation = np.asarray(lie.rotation_from_quaternion(np.asarray(quaternion)))
         if angular == "pointing":
@@ -151,42 +151,42 @@ class Design:
         return self.with_target(**parts)
 
     def with_tolerance(self, position: float, angle: float) -> Design:
-        """Other tolerances, in m and rad."""
+        """Change the tolerances, in m and rad."""
         return self.with_target(tolerance=Tolerance(position=position, angle=angle))
 
     # -- stiffness, loads and limits ----------------------------------------------------------
 
     @property
     def measure(self) -> StiffnessMeasure | None:
-        """The one stiffness along a direction that is maximised, if that is the goal."""
+        """The stiffness that is maximised, if it is the only goal and has a direction."""
         goal = self.task.stiffness
         if goal is None or len(goal.maximise) != 1 or goal.at_least or goal.match is not None:
             return None
         return goal.maximise[0]
 
     def with_measure(self, **parts: Any) -> Design:
-        """Maximise a stiffness: that of now, with another direction, kind, frame or boundary."""
+        """Maximise the present stiffness with another direction, kind, frame or boundary."""
         given = self.measure or StiffnessMeasure(direction=(1.0, 0.0, 0.0))
         return self.with_task(stiffness=StiffnessGoal(maximise=changed(given, **parts)))
 
     def with_least_pressure(self) -> Design:
-        """Ask for no stiffness, but for the least pressure."""
+        """Minimise the pressures instead of maximising a stiffness."""
         return self.with_task(stiffness=None)
 
     def with_force(self, force: Sequence[float]) -> Design:
-        """Another force at the tip, in N, that keeps its frame; none if it is zero."""
+        """Change the force at the tip, in N, in its present frame; zero removes it."""
         given = self.task.load or Load()
         load = changed(given, force=tuple(map(float, force)))
         return self.with_task(load=load if any((*load.force, *load.moment)) else None)
 
     def with_highest(self, pressure: float) -> Design:
-        """Another limit for all channels, in Pa; the robot's own if it is not below that."""
+        """Change the highest pressure of all channels, in Pa; at most the robot's own."""
         highest = max(self.description.pressure_max)
         limit = None if pressure >= highest * (1 - 1e-9) else float(pressure)
         return self.with_task(pressure=PressureRange(min=self.task.pressure.min, max=limit))
 
     def with_gravity(self, gravity: Sequence[float], tip_mass: float) -> Design:
-        """Other gravity, in m/s^2, and another mass at the tip, in kg."""
+        """Change gravity, in m/s^2, and the mass at the tip, in kg."""
         description = changed(
             self.description, gravity=tuple(map(float, gravity)), tip_mass=float(tip_mass)
         )
@@ -196,11 +196,11 @@ class Design:
 
     @property
     def objects(self) -> tuple[SceneObject, ...]:
-        """What is around the arm."""
+        """The objects around the arm."""
         return () if self.task.scene is None else self.task.scene.objects
 
     def with_objects(self, objects: Sequence[SceneObject]) -> Design:
-        """Other objects around the arm, or none; refused where they leave it no place."""
+        """Change the objects around the arm; raise `InputError` if they leave it no room."""
         if not objects:
             return self.with_task(scene=None)
         clearance = 0.0 if self.task.scene is None else self.task.scene.clearance
@@ -209,7 +209,7 @@ class Design:
         return self.with_task(scene=scene)
 
     def with_clearance(self, clearance: float) -> Design:
-        """Another distance, in m, that is kept from all objects."""
+        """Change the clearance from all objects, in m."""
         if self.task.scene is None:
             return self
         scene = Scene(clearance=clearance, objects=self.objects)
@@ -217,5 +217,5 @@ class Design:
         return self.with_task(scene=scene)
 
     def with_task(self, **parts: Any) -> Design:
-        """Other parts of the task."""
+        """Change parts of the task."""
         return replace(self, task=changed(self.task, **parts))

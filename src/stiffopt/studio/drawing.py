@@ -1,4 +1,4 @@
-"""What all views draw in space: arms, arrows and lines, changed in place."""
+"""Draw arms, arrows and lines in viser's scene, and change them in place."""
 
 from __future__ import annotations
 
@@ -17,30 +17,30 @@ Vector = NDArray[np.float64]
 Floats = NDArray[np.float32]
 
 _STATIONS = 16  # of the tube, per segment
-_SPOKES = 20  # of the tube, around
-_SOLID = 0.72  # opacity, through which the ellipsoid is seen
-_GHOST = 1.04  # times the radius, so that a ghost is seen about an arm in the same place
+_SPOKES = 20  # points around the tube
+_SOLID = 0.72  # opacity of an arm, which shows the ellipsoid inside
+_GHOST = 1.04  # radius of a translucent arm, relative to a solid one in the same place
 _ANGLES = np.linspace(0, 2 * np.pi, _SPOKES, endpoint=False)
 KEPT = ("#8e5bb5", "#2a8a57", "#c99a0b", "#b5547a", "#4aa7b5", "#6b7a3a")
-"""Colours of answers that were kept, in turn."""
+"""Colours of kept solutions, in turn."""
 NOWHERE = np.zeros((1, 2, 3), dtype=np.float32)
-"""A line or an arrow that is not to be seen."""
+"""An invisible line or arrow."""
 
 
 def rgb(colour: str) -> tuple[int, int, int]:
-    """Return a colour such as ``#2f6db3`` as viser takes it."""
+    """Convert a colour such as ``#2f6db3`` to viser's form."""
     return (int(colour[1:3], 16), int(colour[3:5], 16), int(colour[5:7], 16))
 
 
 def tube_vertices(poses: Vector, radius: float) -> Floats:
-    """Points of a tube about poses (k, 4, 4): a ring about each, then the middle of the last."""
+    """Return the vertices of a tube: a ring about each pose (k, 4, 4), and the last centre."""
     ring = radius * np.stack([np.cos(_ANGLES), np.sin(_ANGLES)])  # (2, spokes)
     points = poses[:, None, :3, 3] + np.einsum("kij,js->ksi", poses[:, :3, :2], ring)
     return np.concatenate([points.reshape(-1, 3), poses[-1:, :3, 3]]).astype(np.float32)
 
 
 def tube_faces(rings: int) -> NDArray[np.uint32]:
-    """Triangles of the points of `tube_vertices`, with a lid on the last ring."""
+    """Return the triangles of `tube_vertices`, with a lid on the last ring."""
     spoke = np.arange(_SPOKES)
     after = (spoke + 1) % _SPOKES
     side = np.stack([
@@ -62,9 +62,9 @@ class ArmTube:
     name :
         Of the node in the scene tree.
     description :
-        The robot, at whose `n_segments` the number of tubes is fixed.
+        The robot, which fixes the number of tubes.
     colour, opacity :
-        Instead of the colours of segments, for an arm that is compared with.
+        Replace the colours of segments, for an arm shown for comparison.
     """
 
     def __init__(
@@ -95,7 +95,7 @@ class ArmTube:
         pressures: ArrayLike,
         equilibrium: ContactEquilibrium | None = None,
     ) -> None:
-        """Draw it at pressures (n,) in Pa; or as it leans on objects there."""
+        """Draw the arm at pressures (n,) in Pa, or at an equilibrium on which it leans."""
         if equilibrium is None:
             poses = segment_poses(robot, pressures, _STATIONS)
         else:
@@ -108,7 +108,7 @@ class ArmTube:
 
     @property
     def visible(self) -> bool:
-        """Whether it is seen."""
+        """Whether the arm is visible."""
         return bool(self._meshes[0].visible)
 
     @visible.setter
@@ -119,17 +119,17 @@ class ArmTube:
 
     @property
     def end(self) -> Vector:
-        """Middle of the lid of its tip (3,), in m."""
+        """Centre of the tip's lid (3,), in m."""
         return np.asarray(self._meshes[-1].vertices[-1], dtype=np.float64)
 
     def remove(self) -> None:
-        """Take it away for good."""
+        """Remove the arm from the scene."""
         for mesh in self._meshes:
             mesh.remove()
 
 
 def add_surroundings(server: Any, description: RobotDescription) -> None:
-    """Draw the base and the floor, and look at the arm from the side; what hangs is drawn so."""
+    """Draw base and floor, and look at the arm from the side; a hanging arm hangs."""
     length = description.length
     hangs = description.gravity[2] > 0
     up = -1.0 if hangs else 1.0
@@ -145,27 +145,27 @@ def add_surroundings(server: Any, description: RobotDescription) -> None:
         position=(0.0, 0.0, -0.011 * length),
     )  # fmt: skip
     camera = server.initial_camera
-    middle = np.array([0.28, 0.1 * up, 0.55]) * length  # x to the right; beside the panel
+    middle = np.array([0.28, 0.1 * up, 0.55]) * length  # x to the right, clear of the panel
     camera.position = tuple(middle + np.array([0.62, -0.95 * up, 0.32 * up]) * length)
     camera.look_at = tuple(middle)
     camera.up = (0.0, 0.0, up)
 
 
 def draw(handle: Any, points: ArrayLike) -> None:
-    """Draw other arrows or lines, (k, 2, 3), if they are not there already."""
+    """Replace arrows or lines, (k, 2, 3), if they changed."""
     if not np.array_equal(handle.points, points):
         handle.points = points
 
 
 def place(handle: Any, position: ArrayLike) -> None:
-    """Move a node, if it is not there already."""
+    """Move a node if its position changed."""
     point = np.asarray(position, dtype=float)
     if not np.array_equal(np.asarray(handle.position), point):
         handle.position = point
 
 
 def turn(handle: Any, quaternion: ArrayLike) -> None:
-    """Turn a node to a quaternion (w first), if it is not turned so already."""
+    """Turn a node to a quaternion (w first) if it changed."""
     wanted = np.asarray(quaternion, dtype=float)
     if not np.array_equal(np.asarray(handle.wxyz), wanted):
         handle.wxyz = wanted

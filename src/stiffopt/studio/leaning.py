@@ -1,7 +1,8 @@
-"""An arm that leans on what the studio shows around it, at pressures that are held.
+"""An arm that leans on the studio's objects at held pressures.
 
-While an object is dragged, the pressures stay and the arm gives way to it: equilibrium, contact
-forces and braced stiffness follow the object, where a task would move the arm out of its way.
+While an object is dragged, the pressures are constant and the arm yields to it: equilibrium,
+contact forces and braced stiffness follow the object. (With a task, the solver would move the arm
+out of its way.)
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from stiffopt.plots.shapes import StiffnessEllipsoid
 from stiffopt.studio.design import Design
 from stiffopt.studio.drawing import NOWHERE, ArmTube, Vector, draw, place, rgb, turn
 
-_LARGEST_PUSH = 1.0  # N, within which it is said what lets a contact go
+_LARGEST_PUSH = 1.0  # N, up to which the loss of a contact is sought
 _ARROW_SHARE, _ELLIPSOID_SHARE = 0.25, 0.22  # of the arm's length
 
 
@@ -36,9 +37,9 @@ class Leaning:
 
     Attributes
     ----------
-    design : the scene, and the stiffness that is looked at.
+    design : contains the scene and the stiffness to show.
     robot : the arm, with the task's load.
-    equilibrium : where it comes to rest.
+    equilibrium : with contacts.
     """
 
     design: Design
@@ -48,7 +49,7 @@ class Leaning:
 
     @classmethod
     def of(cls, design: Design, robot: Manipulator, pressures: Vector) -> Leaning:
-        """Lean an arm on the objects that allow it, as if they were pushed against it.
+        """Find the equilibrium of an arm against objects that allow contact, pushed against it.
 
         Raises
         ------
@@ -69,13 +70,13 @@ class Leaning:
 
     @property
     def measure(self) -> StiffnessMeasure | None:
-        """The first stiffness of the task that has a direction."""
+        """The task's first stiffness with a direction, or None."""
         found = (each for each in self.design.task.measures if isinstance(each, StiffnessMeasure))
         return next(found, None)
 
     @cached_property
     def stiffness(self) -> tuple[float, float] | None:
-        """That stiffness of the free arm at these pressures, and of the arm that leans."""
+        """The measure's value for the free arm at these pressures, and for the leaning arm."""
         m = self.measure
         if m is None:
             return None
@@ -84,7 +85,7 @@ class Leaning:
         return float(free), self.equilibrium.stiffness(*parts)
 
     def pushes(self) -> tuple[ContactLoss, ContactLoss] | None:
-        """Return the pushes along and against the direction that let the first contact go."""
+        """Return the pushes along and against the direction that lose the first contact."""
         m = self.measure
         if m is None or m.kind != "translation" or not self.equilibrium.contacts:
             return None
@@ -98,7 +99,7 @@ class Leaning:
 
 
 def contact_rows(contacts: Iterable[Contact]) -> Iterable[tuple[str, str]]:
-    """Yield what the panel says of contacts, as names and plain text."""
+    """Yield the panel's rows on contacts, as names and plain text."""
     units = display_units()
     for each in contacts:
         force = float(np.linalg.norm(each.force))
@@ -112,7 +113,7 @@ def contact_rows(contacts: Iterable[Contact]) -> Iterable[tuple[str, str]]:
 
 
 def leaning_rows(leaning: Leaning) -> Iterable[tuple[str, str]]:
-    """Yield what the panel says of an arm that leans, as names and plain text."""
+    """Yield the panel's rows on a leaning arm, as names and plain text."""
     units = display_units()
     if leaning.stiffness is not None and leaning.measure is not None:
         free, braced = leaning.stiffness
@@ -138,7 +139,7 @@ def _loss_text(loss: ContactLoss) -> str:
 
 
 def force_arrows(equilibrium: ContactEquilibrium | None, length: float) -> Any:
-    """Arrows (k, 2, 3) of the forces on an arm of a length; they end where it is touched."""
+    """Return arrows (k, 2, 3) of the contact forces on an arm; they end at the contacts."""
     contacts = () if equilibrium is None else equilibrium.contacts
     largest = max((np.linalg.norm(each.force) for each in contacts), default=1.0)
     ends = [
@@ -149,7 +150,7 @@ def force_arrows(equilibrium: ContactEquilibrium | None, length: float) -> Any:
 
 
 class LeaningView:
-    """Draws an arm that leans: its shape, the forces on it, and its braced stiffness.
+    """Draws a leaning arm: its shape, the forces on it, and its braced stiffness.
 
     Parameters
     ----------
@@ -173,16 +174,16 @@ class LeaningView:
 
     @property
     def visible(self) -> bool:
-        """Whether it is seen."""
+        """Whether the leaning arm is visible."""
         return self._arm.visible
 
     @property
     def arm_end(self) -> Vector:
-        """Where the arm that is drawn ends (3,), in m."""
+        """Position of the drawn arm's end (3,), in m."""
         return self._arm.end
 
     def show(self, leaning: Leaning | None) -> None:
-        """Draw an arm that leans; None: take it away."""
+        """Draw a leaning arm; None hides it."""
         if leaning is None:
             self._arm.visible = self._ellipsoid.visible = False
             draw(self._forces, NOWHERE)
@@ -193,7 +194,7 @@ class LeaningView:
         draw(self._forces, force_arrows(found, self._length))
 
     def _show_ellipsoids(self, leaning: Leaning) -> None:
-        """The braced one, to the scale of the free arm's, which is drawn with the answer."""
+        """Draw the braced ellipsoid, to the scale of the free arm's, which `AnswerView` draws."""
         pose = leaning.equilibrium.tip_pose
         braced = StiffnessEllipsoid.of(leaning.equilibrium.tip_compliance, pose[:3, :3])
         p = leaning.equilibrium.pressures

@@ -1,4 +1,4 @@
-"""A workspace map in the studio: a cloud of cells, coloured by the stiffness that they allow."""
+"""Show a workspace map in the studio, as a cloud of cells coloured by stiffness."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ _NO_MAP = "do not show"
 
 
 class MapView:
-    """Draws a map, with inputs for what is shown of it.
+    """Draws a map, with inputs that choose the direction and the cut.
 
     Parameters
     ----------
     server : viser.ViserServer
     found : WorkspaceMap
-        Of the arm that is drawn.
+        Of the drawn arm.
     """
 
     def __init__(self, server: Any, found: WorkspaceMap) -> None:

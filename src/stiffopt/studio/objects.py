@@ -1,4 +1,4 @@
-"""Objects of a scene as the studio changes them: made, moved, given another size, and saved."""
+"""Create, move, resize and save the objects of a scene for the studio."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _PLACES = ("centre", "start", "end", "point")  # fields of a shape that are poin
 
 
 def new_object(kind: str, others: Sequence[SceneObject], length: float) -> SceneObject:
-    """Return an object of a kind beside an arm of a length, with a name that no other has."""
+    """Return a new object of a kind beside an arm of a length, with a unique name."""
     names = {each.name for each in others}
     name = next(f"{kind} {k}" for k in count(1) if f"{kind} {k}" not in names)
     size = round(0.06 * length, 3)
@@ -42,13 +42,13 @@ def new_object(kind: str, others: Sequence[SceneObject], length: float) -> Scene
 
 
 def place_of(shape: Obstacle) -> Vector:
-    """Return the point (3,) at which a shape is held, in m."""
+    """Return the point (3,) of a shape at which its handle is, in m."""
     points = [getattr(shape, key) for key in _PLACES if hasattr(shape, key)]
     return np.asarray(np.mean(points or [shape.points[0]], axis=0))  # type: ignore[attr-defined]
 
 
 def moved(item: SceneObject, place: ArrayLike) -> SceneObject:
-    """Return an object that is held at another point (3,), in m, to 0.1 mm."""
+    """Return an object moved so that its handle is at a point (3,), in m, to 0.1 mm."""
     way = np.asarray(place) - place_of(item.shape)
     parts: dict[str, Any] = {
         key: _point(np.add(getattr(item.shape, key), way))
@@ -61,7 +61,7 @@ def moved(item: SceneObject, place: ArrayLike) -> SceneObject:
 
 
 def size_of(shape: Obstacle) -> float | None:
-    """Return the radius of a shape, or the longest edge of a box, in m; None if it has none."""
+    """Return the radius of a shape or the longest edge of a box, in m; None if it has neither."""
     size = getattr(shape, "size", None)
     return getattr(shape, "radius", None) if size is None else max(size)
 
@@ -75,13 +75,13 @@ def resized(item: SceneObject, size: float) -> SceneObject:
 
 
 def leant_on(item: SceneObject, *, allowed: bool) -> SceneObject:
-    """Return an object that the arm may lean on, or may not."""
+    """Return an object that allows or forbids contact."""
     contact = item.contact or AllowedContact()
     return changed(item, contact=changed(contact, allowed=allowed))
 
 
 def replaced(objects: Sequence[SceneObject], item: SceneObject) -> tuple[SceneObject, ...]:
-    """Return objects with another one in the place of that with its name."""
+    """Return objects in which an item replaces that with its name."""
     return tuple(item if each.name == item.name else each for each in objects)
 
 
@@ -91,7 +91,7 @@ def save_scene(path: str | os.PathLike[str], scene: Scene) -> None:
     Raises
     ------
     FileError
-        The file is none, or cannot be written.
+        The file exists and is not a scene file, or cannot be written.
     """
     if Path(path).suffix.lower() not in (".yaml", ".yml"):
         raise FileError(path, "is no name of a scene file; expected one that ends in .yaml")

@@ -1,4 +1,4 @@
-"""Opens the studio: a page with the view of a file."""
+"""Open the studio: a page with the view of a file."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from stiffopt.workspace.mapping import open_workspace_map
 
 
 class OpenStudio:
-    """A page with the view of a file; `close` ends both.
+    """An open page with its view.
 
     Attributes
     ----------
     page : StudioPage
-    view : what draws on it.
+    view : draws on the page.
     """
 
     def __init__(self, page: StudioPage, view: Any) -> None:
@@ -52,27 +52,27 @@ def open_studio(
     host: str = "127.0.0.1",
     port: int = 0,
 ) -> OpenStudio:
-    """Show a file on a page, and return when it can be opened.
+    """Show a file on a page; return when a browser can open it.
 
     Parameters
     ----------
     file :
         A built-in robot, or a file of a kind that the studio shows.
     robot :
-        For a file that names none, by default `stiffopt.studio.sources.ROBOT`.
+        For a file that names none; by default `stiffopt.studio.sources.ROBOT`.
     map_file :
         A workspace map to show with a robot, a task or a scene.
     token :
-        For a rig: that of its daemon, or the file that it is in; without it the rig is only read.
+        For a rig: its daemon's token, or the file with it; without it the rig is only shown.
     host, port :
-        Where to listen, see `StudioPage`.
+        Address to listen on, see `StudioPage`.
 
     Raises
     ------
     InputError
-        The file is wrong or of another kind, or the address cannot be listened on.
+        The file is invalid or of another kind, or the address cannot be listened on.
     MissingExtraError
-        viser, or what reads the file, is not installed.
+        viser, or a package that reads the file, is not installed.
     """
     kind = kind_of(file)
     if map_file is not None and kind not in ("robot", "task", "scene"):
@@ -92,7 +92,7 @@ def open_studio(
 
 
 def _open_rig(file: str, token: str | os.PathLike[str] | None, host: str, port: int) -> OpenStudio:
-    """Show a rig; what commands it is for this machine alone."""
+    """Show a rig; with a token, only this machine may connect."""
     if token is not None and not is_loopback(host):
         raise InputError(
             f"--host: other machines can reach {host}; a studio that commands a rig listens on "

@@ -1,15 +1,15 @@
-"""The studio's server: viser, behind a check of who asks.
+"""The studio's server: viser, behind an authentication of every request.
 
-viser answers whoever reaches its port: it looks neither at the headers Host and Origin nor for any
-secret, so that any web page in a browser on this machine could open its WebSocket. Here every
-request, for the page, its parts and the WebSocket, is checked first:
+viser answers any client that reaches its port: it checks neither the headers Host and Origin nor a
+secret, so that any web page in a browser on this machine could open its WebSocket. Therefore every
+request, for the page, its parts and the WebSocket, is checked first for
 
-- Host and Origin by the daemon's rules (`stiffopt.daemon.place`);
-- the key: drawn at each start and part of the address that the command prints. The first request
-  trades it for a cookie, so that it does not stay in the address bar.
+- Host and Origin, by the daemon's rules (`stiffopt.daemon.place`);
+- the key, which is drawn at each start and is part of the address that the command prints. The
+  first request exchanges it for a cookie, so that it does not stay in the address bar.
 
-viser has no place for such a check, so its call of `websockets` is given one while it starts.
-Afterwards the studio tries its own port without the key, and does not go on if that is answered.
+viser has no hook for such a check, so one is patched into its call of `websockets` while it starts.
+Afterwards the studio sends requests without the key to its own port, and stops if one is answered.
 """
 
 from __future__ import annotations
@@ -45,17 +45,17 @@ _HARMLESS = {
     "Referrer-Policy": "no-referrer",
     "Content-Security-Policy": "frame-ancestors 'none'",
 }
-_TRY = 5.0  # s
+_TRY = 5.0  # s, time limit of that test
 _starting = threading.Lock()
 
 
 class KeyCheck:
-    """Lets those requests pass that come from this studio's page and show its key.
+    """Accepts only requests from this studio's page with its key.
 
     Parameters
     ----------
     hosts :
-        Names under which the studio may be asked for, beside addresses and localhost.
+        Accepted host names, besides addresses and localhost.
     """
 
     def __init__(self, hosts: tuple[str, ...] = ()) -> None:
@@ -64,7 +64,7 @@ class KeyCheck:
         self._hosts = hosts
 
     def __call__(self, path: str, headers: Headers) -> Response | None:
-        """Return the answer to a request that does not pass; None: it does."""
+        """Return the answer to a request that is refused or redirected; None to accept it."""
         try:
             hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
             check_place(hosts, origins, self._hosts, "studio", "the name given with --host")
@@ -103,7 +103,7 @@ def _answer(
 
 
 class _PrivateServer(viser.ViserServer):
-    """A server that is never published on the network by a click in its page."""
+    """A server without viser's function to share it publicly."""
 
     def request_share_url(self, verbose: bool = True) -> str | None:
         """Do nothing: viser would tunnel the page to a public address."""
@@ -111,12 +111,12 @@ class _PrivateServer(viser.ViserServer):
 
 
 class StudioPage:
-    """A viser server that only the studio's user reaches.
+    """A viser server that only the studio's user can use.
 
     Parameters
     ----------
     host, port :
-        Where to listen; port 0 is any free one.
+        Address to listen on; port 0 takes any free one.
     label :
         Title of the panel.
 
@@ -129,7 +129,7 @@ class StudioPage:
     InputError
         The address cannot be listened on.
     ServiceError
-        The check does not work with the viser that is installed.
+        The check does not work with the installed version of viser.
     """
 
     def __init__(self, host: str = "127.0.0.1", port: int = 0, label: str = "stiffopt") -> None:
@@ -180,7 +180,7 @@ class StudioPage:
 
 @contextmanager
 def _checked(check: KeyCheck) -> Iterator[None]:
-    """Let each request to the servers that `websockets` starts here be checked first."""
+    """Context in which servers that `websockets` starts check each request."""
     serve = asyncio_server.serve
 
     def serve_checked(*arguments: Any, process_request: Any = None, **options: Any) -> Any:
@@ -201,7 +201,7 @@ def _checked(check: KeyCheck) -> Iterator[None]:
 
 
 def _free_port(host: str, port: int) -> int:
-    """Return the port, or any free one for 0: viser would take the next one where it is in use."""
+    """Return the port, or a free one for 0; raise if it is in use (viser would take the next)."""
     try:
         found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
         family, kind, protocol, _, address = found[0]

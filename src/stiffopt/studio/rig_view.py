@@ -1,4 +1,4 @@
-"""The view of a rig: its arm as it is now, and with the token a preview and what commands it."""
+"""The view of a rig: its arm as it is now and, with the token, a preview and controls."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from stiffopt.studio.rig_watch import RigWatch
 from stiffopt.studio.task_view import TaskView
 from stiffopt.studio.workbench import Workbench
 
-_PERIOD = 0.1  # s, between two looks at the daemon
+_PERIOD = 0.1  # s, polling period of the daemon
 
 
 class RigView:
-    """Draws a daemon's arm. With the token there is a preview to drag, and *go* sends its task.
+    """Draws a daemon's arm; with the token, also a preview to drag, whose task *go* sends.
 
     Parameters
     ----------
@@ -31,7 +31,7 @@ class RigView:
         self.server, self.watch = server, watch
         description = watch.design.description
         self._robot = Manipulator(description)
-        watch.poll()  # so that a preview begins where the arm is
+        watch.poll()  # a preview begins where the arm is
         self.bench = Workbench(watch.present_design(self._robot))
         self._preview = TaskView(server, self.bench, is_preview=True) if watch.may_command else None
         if self._preview is None:
@@ -50,7 +50,7 @@ class RigView:
         self._thread.start()
 
     def close(self) -> None:
-        """Look no longer; control is given back."""
+        """Stop watching, and release control."""
         self._over.set()
         self._thread.join()
         if self._preview is not None:

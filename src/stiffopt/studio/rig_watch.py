@@ -1,10 +1,10 @@
-"""A rig as the studio sees it: its daemon's state and events, and what is asked of it.
+"""A rig for the studio: its daemon's state and events, and commands to it.
 
-Nothing is commanded but by `stiffopt.Client`, with its token and its lease. Only venting has a
-second way: if the daemon does not answer, the guard is asked, as ``stiffopt vent`` does.
+All commands go through `stiffopt.Client`, with its token and its lease. Only venting has a second
+way: if the daemon does not answer, the guard vents, as with ``stiffopt vent``.
 
-Control is renewed by `RigWatch.poll`, as long as somebody looks: when no browser is connected, or
-the studio hangs, the daemon hears nothing, takes control back and holds the arm.
+`RigWatch.poll` renews control while a browser is connected. If none is, or if the studio hangs, the
+daemon misses the heartbeat, takes control back and holds the arm.
 """
 
 from __future__ import annotations
@@ -33,22 +33,22 @@ from stiffopt.studio.workbench import Workbench
 Vector = NDArray[np.float64]
 
 NAME = "studio"
-"""That other clients see."""
-_EVENTS = 6  # that are shown
-_QUICK = 2.0  # s after which the daemon does not answer; the guard is asked to vent then
+"""Name of this client that others see."""
+_EVENTS = 6  # number shown
+_QUICK = 2.0  # s, time limit of the daemon's answers; then the guard is asked to vent
 
 
 class RigWatch:
-    """A running daemon, read and, with its token, commanded.
+    """Reads a running daemon and, with its token, commands it.
 
     Parameters
     ----------
     file :
         The rig file.
     token :
-        The token or its file; None: only read.
+        The token or its file; None to read only.
     is_watched :
-        Says whether somebody looks; else control is not renewed.
+        Returns whether a browser is connected; if not, control is not renewed.
 
     Attributes
     ----------
@@ -56,7 +56,7 @@ class RigWatch:
     state : the latest state, or None.
     events : the latest events, the newest last.
     trouble : why there is no state, or an empty text.
-    said : what became of the last command.
+    said : outcome of the last command.
     """
 
     def __init__(
@@ -76,7 +76,7 @@ class RigWatch:
         )
         url = daemon_url(rig.service)
         self.may_command = token is not None
-        given = "" if token is None else token  # empty: nor that of the environment
+        given = "" if token is None else token  # empty: not even that of the environment
         self._client = Client(url, given, name=NAME, heartbeat="manual")
         self._quick = Client(url, given, name=NAME, heartbeat="manual", timeout=_QUICK)
         self.state: Snapshot | None = None
@@ -84,10 +84,10 @@ class RigWatch:
         self.trouble, self.said = "asking the daemon ...", ""
         self._next = 0
         self._is_known = False
-        self._lock = threading.Lock()  # one command at a time; venting waits for none
+        self._lock = threading.Lock()  # one command at a time, except for venting
 
     def close(self) -> None:
-        """Give control back, if the studio has it; the arm goes on with what it does."""
+        """Release control if the studio has it; the arm continues its task."""
         for client in (self._client, self._quick):
             with suppress(StiffoptError):
                 client.close()
@@ -98,15 +98,15 @@ class RigWatch:
         return self._client.in_control
 
     def present_design(self, robot: Manipulator) -> Design:
-        """The rig's design with the target that it has now, or where the model has its tip.
+        """Return the rig's design with its present target, else with the tip's present position.
 
-        That is the design with its usual target where the daemon has not answered yet.
+        Before the daemon's first answer, it has the default target.
         """
         state = self.state
         position = None if state is None else state.target_position
         if state is not None and (position is None or not np.isfinite(position).any()):
             pressures = state.pressures
-            with suppress(StiffoptError):  # an arm that has no equilibrium there
+            with suppress(StiffoptError):  # the model may have no equilibrium there
                 position = None if pressures is None else robot.tip_pose(pressures)[:3, 3]
         if position is None or not np.isfinite(position).any():
             return self.design
@@ -114,7 +114,7 @@ class RigWatch:
         return self.design.with_target(position=tuple(axes))
 
     def poll(self) -> None:
-        """Read the state and what has happened; keep control while somebody looks."""
+        """Read state and events; renew control while a browser is connected."""
         try:
             if not self._is_known:
                 self._check_robot()
@@ -142,15 +142,15 @@ class RigWatch:
         self._do("you have control", self._client.take_control)
 
     def release(self) -> None:
-        """Give control back; the arm goes on with what it does."""
+        """Release control; the arm continues its task."""
         self._do("control is given back", self._client.release)
 
     def arm(self) -> None:
-        """Check everything and steer from now on."""
+        """Arm: check everything and start control."""
         self._do("armed", self._client.arm)
 
     def hold(self) -> None:
-        """Keep the pressures as they are."""
+        """Hold the present pressures."""
         self._do("held", lambda: self._client.hold("asked for in the studio"))
 
     def disarm(self) -> None:
@@ -162,7 +162,7 @@ class RigWatch:
         self._do("reset", self._client.reset)
 
     def go(self, bench: Workbench) -> None:
-        """Pursue the task of the preview, if its answer is there and holds."""
+        """Send the task of the preview, if it has a valid solution."""
         answer, design = bench.answer, bench.design
         if design.has_own_robot:
             self.said = "not sent: gravity or tip mass of the preview are not those of the rig"
@@ -175,7 +175,7 @@ class RigWatch:
             self._do("going to the target", lambda: self._client.set_task(task))
 
     def vent(self) -> None:
-        """Let all pressure out at once: by the daemon, and by the guard if that does not answer."""
+        """Vent at once through the daemon, or through the guard if the daemon does not answer."""
         if not self.may_command:
             self.said = "venting needs the token; 'stiffopt vent RIG' needs none"
             return

@@ -1,4 +1,4 @@
-"""The view of a scene: its objects, the handle of the one that is chosen, and their inputs."""
+"""The view of a scene: its objects, the handle of the chosen one, and their inputs."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ class SceneView:
     ----------
     server : viser.ViserServer
     design :
-        Returns what is shown now.
+        Returns the present design.
     change :
-        Takes a kind and a change of the design.
+        Called with the kind of a change and a function that changes the design.
     hold :
-        Takes whether the pressures are held, so that the arm leans on objects.
+        Called with whether to hold the pressures, so that the arm leans on objects.
     """
 
     def __init__(
@@ -55,7 +55,7 @@ class SceneView:
 
     @property
     def handle_position(self) -> Vector:
-        """Where the handle of the chosen object is (3,), in m."""
+        """Position of the chosen object's handle (3,), in m."""
         return np.asarray(self._handle.position)
 
     def add_inputs(self, gui: Any) -> None:
@@ -86,7 +86,7 @@ class SceneView:
         save.on_click(self._saved)
         self._said = gui.add_html("")
 
-    # -- what is done in the browser ----------------------------------------------------------
+    # -- events of the browser ----------------------------------------------------------------
 
     async def _moved(self, event: Any) -> None:
         self.is_held = event.phase != "end"
@@ -150,7 +150,7 @@ class SceneView:
     # -- drawing ------------------------------------------------------------------------------
 
     def show(self) -> None:
-        """Draw the objects of the design; only what has changed is sent."""
+        """Draw the objects of the design; only changes are sent."""
         design = self._design()
         names = tuple(each.name for each in design.objects)
         for gone in [name for name in self._drawn if name not in names]:

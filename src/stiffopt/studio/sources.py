@@ -1,4 +1,4 @@
-"""What a file is, and the model that shows it: a design or a timeline."""
+"""Determine the kind of a file, and load it as a design or a timeline."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ from stiffopt.studio.design import Design
 from stiffopt.studio.timeline import Timeline
 
 ROBOT = "stiff-flop-2"
-"""The robot where none is named."""
+"""The default robot."""
 _KINDS = ("robot", "task", "scene", "path", "rig")
-_MOTION = "position_error_m"  # a column that logs have not
+_MOTION = "position_error_m"  # a column that logs do not have
 
 
 def kind_of(file: str) -> str:
-    """Return what a file is, by its ending and its ``format``; a built-in name is a robot.
+    """Return the kind of a file by its ending and its ``format``; a built-in name is a robot.
 
     Raises
     ------
     FileError
-        It cannot be read, or is nothing that the studio shows.
+        The file cannot be read, or the studio does not show its kind.
     """
     if file in builtin_robots():
         return "robot"
@@ -50,7 +50,7 @@ def kind_of(file: str) -> str:
 
 
 def design_of(file: str, robot: str | None = None) -> Design:
-    """Return what is designed of a robot, a task or a scene file."""
+    """Return the design of a robot, a task or a scene file."""
     kind = kind_of(file)
     if kind == "task":
         return Design.of_task(load_task(file))
@@ -62,7 +62,7 @@ def design_of(file: str, robot: str | None = None) -> Design:
 
 
 def timeline_of(file: str, robot: str | None = None) -> Timeline:
-    """Return what is played of a path file, a motion or a recording."""
+    """Return the timeline of a path file, which is solved, a motion or a recording."""
     if kind_of(file) == "path":
         path = load_path(file)
         return Timeline.of_path(path, solve_path(load_robot(path.resolve_robot()), path))
@@ -80,7 +80,7 @@ def timeline_of(file: str, robot: str | None = None) -> Timeline:
 
 
 def _robot_of(text: str) -> RobotDescription:
-    """The robot whose file a recording has kept."""
+    """Return the robot whose file is stored in a recording."""
     with tempfile.TemporaryDirectory() as folder:
         path = FilePath(folder) / "robot.yaml"
         write_whole(path, text.encode())

@@ -1,6 +1,6 @@
-"""The inputs of the panel that set a task: its target, its stiffness, its loads and limits.
+"""The panel's inputs of a task: its target, its stiffness, its loads and limits.
 
-Each shows a design, and turns what is done in the browser into a change of it.
+Each input shows a design, and converts events of the browser to changes of it.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from stiffopt.studio.design import Angular, Design
 from stiffopt.studio.drawing import Vector
 
 On = Callable[[str, Callable[[Design, Any], Design]], Callable[[Any], None]]
-"""Takes the kind of a change and what it does with an input's value; returns viser's callback."""
+"""Takes the kind of a change and a function of design and input; returns viser's callback."""
 
 _GRAM, _MILLINEWTON = DisplayUnit("g", 1e3), DisplayUnit("mN", 1e3)
 _MOST_FORCE = 0.2  # N
@@ -47,7 +47,7 @@ class TargetInputs:
     tip :
         Pose (4, 4) of the tip now.
     turned :
-        Quaternion (w first) to which the handle of the target is turned.
+        Quaternion (w first) of the target's handle.
     """
 
     def __init__(
@@ -91,7 +91,7 @@ class TargetInputs:
 
 
 class StiffnessInputs:
-    """Inputs of what is maximised.
+    """Inputs of the stiffness goal.
 
     Parameters
     ----------
@@ -100,7 +100,7 @@ class StiffnessInputs:
     on :
         Forwards changes.
     design :
-        That the view begins with: its goal can be had again.
+        The initial design, whose goal can be chosen again.
     """
 
     def __init__(self, gui: Any, on: On, design: Design) -> None:
@@ -152,7 +152,7 @@ class LoadInputs:
     on :
         Forwards changes.
     design :
-        That the view begins with: its gravity can be had again.
+        The initial design, whose gravity can be chosen again.
     """
 
     def __init__(self, gui: Any, on: On, design: Design) -> None:
@@ -203,12 +203,12 @@ def add_slider(
 
 
 def show_on_slider(slider: Any, unit: DisplayUnit, value: float) -> None:
-    """Show an SI value on a slider, at its end if it is beyond that."""
+    """Show an SI value on a slider, clipped to its range."""
     show_value(slider, min(slider.max, max(slider.min, _rounded(unit.of(value)))))
 
 
 def show_value(handle: Any, value: Any) -> None:
-    """Show a value in an input of the panel, unless it is shown already."""
+    """Show a value in an input of the panel if it changed."""
     if handle.value != value:
         handle.value = value
 

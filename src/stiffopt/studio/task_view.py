@@ -28,16 +28,16 @@ _PREVIEW = "Preview (violet): the arm does not move until you send it."
 
 
 class TaskView:
-    """Draws a workbench, and forwards what is done in the browser to it.
+    """Draws a workbench, and forwards events of the browser to it.
 
     Parameters
     ----------
     server : viser.ViserServer
     bench : Workbench
     found : WorkspaceMap, optional
-        To show as a cloud; of the same arm.
+        A map of the same arm, to show as a cloud.
     is_preview : bool
-        Whether the arm is drawn as a ghost, before another one.
+        Whether to draw the arm translucently, as a preview over another one.
     """
 
     def __init__(
@@ -62,30 +62,30 @@ class TaskView:
         self.worker.request()
 
     def close(self) -> None:
-        """End the thread that searches."""
+        """End the thread of the solver."""
         self.worker.close()
 
     @property
     def target_position(self) -> Vector:
-        """Where the handle of the target is (3,), in m."""
+        """Position of the target's handle (3,), in m."""
         return np.array(self._target.position)
 
     @property
     def direction_position(self) -> Vector:
-        """Where the handle of the direction is (3,), in m."""
+        """Position of the direction's handle (3,), in m."""
         return np.asarray(self._pull.position)
 
     @property
     def object_position(self) -> Vector:
-        """Where the handle of the chosen object of the scene is (3,), in m."""
+        """Position of the handle of the scene's chosen object (3,), in m."""
         return self._scene.handle_position
 
     @property
     def arm_end(self) -> Vector:
-        """Where the arm that is drawn ends (3,), in m."""
+        """Position of the drawn arm's end (3,), in m."""
         return (self._leaning if self._leaning.visible else self._drawn).arm_end
 
-    # -- what is there ------------------------------------------------------------------------
+    # -- handles and panel --------------------------------------------------------------------
 
     def _add_handles(self) -> None:
         scene, length = self.server.scene, self._length
@@ -130,13 +130,13 @@ class TaskView:
             self._copies = CopyView(gui, lambda: self.bench.design)
         self.tabs = tabs
 
-    # -- what is done in the browser ----------------------------------------------------------
+    # -- events of the browser ----------------------------------------------------------------
 
     def _on(self, kind: str, change: Callable[[Design, Any], Design]) -> Callable[[Any], None]:
-        """Return what forwards an input of the panel as a change."""
+        """Return the callback of an input of the panel, which forwards a change."""
 
         def changed(event: Any) -> None:
-            if event.client is not None:  # else it was set here
+            if event.client is not None:  # else the program itself set the value
                 self._change(kind, lambda design: change(design, event.target.value))
 
         return changed
@@ -170,7 +170,7 @@ class TaskView:
         self._change("direction", lambda design: design.with_measure(direction=direction))
 
     def _note_drag(self, event: Any) -> None:
-        """Remember which handle is held, so that it is not moved under the hand."""
+        """Remember the dragged handle, which must not be moved meanwhile."""
         self._dragged = None if event.phase == "end" else event.target
         if event.phase == "end":
             self.bench.end_step()
@@ -213,7 +213,7 @@ class TaskView:
     # -- drawing ------------------------------------------------------------------------------
 
     def _show_design(self) -> None:
-        """Draw what is asked for: the target, and the inputs of the panel."""
+        """Draw the design: the target, and the inputs of the panel."""
         design = self.bench.design
         with self.server.atomic():
             if self._dragged is not self._target:
@@ -238,7 +238,7 @@ class TaskView:
         self._target.disable_rotations = design.angular == "any"
 
     def _show_answer(self) -> None:
-        """Draw the answer: the arm, its stiffness, what it misses, and the panel."""
+        """Draw the solution: the arm, its stiffness, a missed target, and the panel."""
         answer = self.bench.answer
         if answer is None:
             return
@@ -260,7 +260,7 @@ class TaskView:
         self._words.content = texts.answer_html(self.bench)
 
     def _tip_pose(self) -> Vector:
-        """Pose (4, 4) of the tip of the answer; of the straight arm where there is none."""
+        """Return the pose (4, 4) of the solution's tip; without one, that of the straight arm."""
         answer = self.bench.answer
         if answer is None or answer.solution.tip_pose is None:
             pose = np.eye(4)
@@ -270,7 +270,7 @@ class TaskView:
 
 
 def _pointing_quaternion(direction: Vector) -> Vector:
-    """The least rotation (w first) of the z axis into a unit vector."""
+    """Return the smallest rotation (w first) from the z axis to a unit vector."""
     half = np.array([1.0 + direction[2], -direction[1], direction[0], 0.0])
     length = np.linalg.norm(half)
     return np.array([0.0, 1.0, 0.0, 0.0]) if length < 1e-9 else half / length

@@ -1,6 +1,6 @@
-"""What the studio's panel says, as HTML, and what is copied from it, as files and as Python.
+"""Contents of the studio's panel, as HTML, and of its copies, as files and as Python.
 
-Names and messages may come from files of others: all of them are escaped here.
+Names and messages may come from untrusted files, so all of them are escaped here.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ from stiffopt.studio.workbench import StudioAnswer, Workbench
 
 STATUS_WORDS = {"solved": "solved", "unreachable": "out of reach", "failed": "no answer"}
 ROBOT_FILE = "my-arm.yaml"
-"""Under which a changed robot is to be saved, so that a copied task finds it."""
+"""File name of a changed robot, which a copied task refers to."""
 _BEST = "best that was found everywhere"
 _LOCAL = "next to the previous one; the best is searched for when you pause"
 _SEARCHING = "searching; the first task of a kind compiles its solver, which takes a while ..."
 _LEANING = "Pressures held (blue: the arm as it leans). Drag an object; untick 'lean' to go on."
-_AT_LIMIT = 1e-3  # of the range, within which a pressure counts as at its limit
+_AT_LIMIT = 1e-3  # distance from a limit, as a share of the range, that counts as at it
 _COPY = "navigator.clipboard.writeText(this.nextElementSibling.value)"
 
 
@@ -43,14 +43,14 @@ _COPY = "navigator.clipboard.writeText(this.nextElementSibling.value)"
 
 
 def answer_html(bench: Workbench) -> str:
-    """Return the answer as the panel shows it: status, numbers and pressures."""
+    """Return the panel's view of the solution: status, numbers and pressures."""
     answer = bench.answer
     if bench.leaning is not None:
         return _padded(_headline("", _LEANING) + _table(_leaning_rows(bench.leaning)))
     if answer is None:
         return _padded(_headline("failed" if bench.trouble else "", bench.trouble or _SEARCHING))
     solution = answer.solution
-    is_told = answer.is_best or not solution.found  # what it says of an answer takes a while
+    is_told = answer.is_best or not solution.found  # the message of a solution takes a while
     message = bench.trouble or (solution.message if is_told else "")
     status = "failed" if bench.trouble else solution.status
     return _padded(
@@ -104,7 +104,7 @@ def _rows(answer: StudioAnswer) -> Iterable[tuple[str, str]]:
     if solution.contacts and solution.stiffness_free is not None:
         unit = units.of_si(solution.stiffness_unit)
         yield "clear of all", unit.text(solution.stiffness_free, FIGURES)
-    if solution.task.scene is not None:  # exact, of the whole body: too slow for a drag
+    if solution.task.scene is not None:  # the exact clearance is too slow during a drag
         clear = solution.clearance if answer.is_best else None
         yield (
             "clearance",
@@ -117,7 +117,7 @@ def _rows(answer: StudioAnswer) -> Iterable[tuple[str, str]]:
 
 
 def _limits_text(answer: StudioAnswer) -> str:
-    """Return which channels are at which limits, by segments."""
+    """Describe which channels are at which limits, by segment."""
     parts, begin = [], 0
     for number, segment in enumerate(answer.robot.description.segments, start=1):
         for side, name in ((-1, "min"), (1, "max")):
@@ -130,7 +130,7 @@ def _limits_text(answer: StudioAnswer) -> str:
 
 
 def position_text(position: ArrayLike) -> str:
-    """Return a position in the unit of lengths, to a tenth of a millimetre or about that."""
+    """Format a position in the display unit of lengths, to about 0.1 mm."""
     unit = display_units().length
     numbers = (unit.number(float(x), ".1f") for x in np.asarray(position))
     return f"({', '.join(numbers)})"
@@ -170,9 +170,9 @@ def pressures_html(
     pressures, low, high : (n,)
         In Pa.
     at_limit : (n,)
-        Which bars stand out.
+        Which bars to highlight.
     marks : (n,), optional
-        In Pa, called `mark` in the legend.
+        In Pa, named `mark` in the legend.
     """
     p, low, high = (np.asarray(each, dtype=float) for each in (pressures, low, high))
     top, bottom = max(high.max(), p.max()), min(low.min(), 0.0)
@@ -217,7 +217,7 @@ def _line(left: str, colour: str, width: int) -> str:
 
 
 def note_html(text: str) -> str:
-    """Return a sentence as the panel shows it below an input."""
+    """Return a note below an input of the panel."""
     return _padded(f"<div style='font-size:0.85em'>{escape(text)}</div>")
 
 
@@ -225,7 +225,7 @@ def note_html(text: str) -> str:
 
 
 def compared_html(bench: Workbench, colours: Sequence[str]) -> str:
-    """Return a table of the answer now and of those that were kept, each with its colour."""
+    """Return a table of the present and the kept solutions, each with its colour."""
     now = [] if bench.answer is None else [(style.DARK, "now", bench.answer)]
     kept = [(colours[k % len(colours)], str(k + 1), answer) for k, answer in enumerate(bench.kept)]
     if not kept:
@@ -263,7 +263,7 @@ def _pressures_text(pressures: ArrayLike) -> str:
 
 
 def task_text(design: Design) -> str:
-    """Return the design's task file; its robot is that of `robot_text` where that is needed."""
+    """Return the design's task file; it names `ROBOT_FILE` if the robot was changed."""
     robot = ROBOT_FILE if design.has_own_robot else design.robot
     return file_text("task", design.task.model_copy(update={"robot": robot}))
 
@@ -298,7 +298,7 @@ def python_text(design: Design) -> str:
 
 
 def _literal(value: Any) -> str:
-    """Return plain data as Python, on several lines where they are long."""
+    """Return plain data as Python source, on several lines if long."""
     return pformat(_plain(value), width=88, sort_dicts=False).replace("\n", "\n    ")
 
 
@@ -324,7 +324,7 @@ def copy_html(title: str, text: str) -> str:
 
 
 def moment_html(timeline: Timeline, time: float) -> str:
-    """Return one moment of a timeline as the panel shows it."""
+    """Return the panel's view of one moment of a timeline."""
     moment, length = timeline.at(time), display_units().length
     description = timeline.robot.description
     tip = timeline.robot.tip_pose(moment.pressures)[:3, 3]
@@ -348,12 +348,12 @@ def moment_html(timeline: Timeline, time: float) -> str:
 # -- rigs -----------------------------------------------------------------------------------------
 
 BALLS = {"estimated": style.DARK, "seen": style.MEASURED, "target": style.TARGET}
-"""Balls of a rig's view, and their colours."""
+"""Colours of the balls in a rig's view."""
 _STATES = {"active": "#2a7f3f", "holding": "#b35c00", "fault": "#b00020"}
 
 
 def rig_html(watch: RigWatch) -> str:
-    """Return the state of a rig as the panel shows it."""
+    """Return the panel's view of a rig's state."""
     said = f"<div style='font-size:0.85em;color:#666'>{escape(watch.said)}</div>"
     if not watch.may_command:
         said = "<div style='font-size:0.85em;color:#666'>read only: no token was given</div>"

@@ -1,4 +1,4 @@
-"""Pressures over time as the studio plays them: of a path, a motion or a recording."""
+"""Pressures over time for the studio to play: of a path, a motion or a recording."""
 
 from __future__ import annotations
 
@@ -47,13 +47,13 @@ class TimelineChart(NamedTuple):
 
 
 class TimelineMoment(NamedTuple):
-    """What is shown of one moment.
+    """The state at one moment of a timeline.
 
     Attributes
     ----------
-    row : the last one until then.
-    pressures : (n,) in Pa, interpolated.
-    seen : (3,) where the tip was seen last, in m, or None.
+    row : index of the last row until then.
+    pressures : (n,), in Pa, interpolated.
+    seen : (3,), last measured position of the tip, in m, or None.
     """
 
     row: int
@@ -63,19 +63,19 @@ class TimelineMoment(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Timeline:
-    """Pressures over time with what belongs to them.
+    """Pressures over time, with charts, positions and events.
 
     Attributes
     ----------
     robot : the arm, with the load of the path.
-    times : (N,) in s, from 0, increasing.
-    pressures : (N, n) in Pa, without gaps.
-    charts : what is drawn over time.
-    headline : status and what there is to say, for people.
-    asked : (N, 3) positions that are asked for, in m, or None.
-    seen : (N, 3) positions at which the tip was seen, NaN where it was not, or None.
-    events : times and texts of what happened.
-    scene : what is around the arm, or None.
+    times : (N,), in s, from 0, increasing.
+    pressures : (N, n), in Pa, without gaps.
+    charts : quantities to draw over time.
+    headline : status and message, for the user.
+    asked : (N, 3), target positions, in m, or None.
+    seen : (N, 3), measured positions of the tip, in m, NaN where it was not seen; or None.
+    events : times and texts.
+    scene : the objects around the arm, or None.
     """
 
     robot: Manipulator
@@ -94,7 +94,7 @@ class Timeline:
         return float(self.times[-1])
 
     def at(self, time: float) -> TimelineMoment:
-        """What is shown at a time in s."""
+        """Return the state at a time in s."""
         index = int(np.clip(np.searchsorted(self.times, time, side="right") - 1, 0, None))
         after = min(index + 1, len(self.times) - 1)
         begin, end = self.times[index], self.times[after]
@@ -107,19 +107,19 @@ class Timeline:
         return TimelineMoment(index, pressures, seen)
 
     def events_until(self, time: float, count: int = 4) -> tuple[tuple[float, str], ...]:
-        """The last events until a time, the newest first."""
+        """Return the last events until a time, the newest first."""
         return tuple([event for event in self.events if event[0] <= time][-count:][::-1])
 
     def shown_rows(self) -> NDArray[np.int_]:
-        """The rows that a chart shows: all, or some hundreds of them."""
+        """Return the rows that a chart shows: all, or some hundreds of them."""
         count = min(len(self.times), _SHOWN)
         return np.unique(np.linspace(0, len(self.times) - 1, count).astype(int))
 
-    # -- what is played -----------------------------------------------------------------------
+    # -- sources ------------------------------------------------------------------------------
 
     @classmethod
     def of_path(cls, path: Path, solution: PathSolution) -> Timeline:
-        """A path that was solved.
+        """Return the timeline of a solved path.
 
         Raises
         ------
@@ -154,7 +154,7 @@ class Timeline:
 
     @classmethod
     def of_motion(cls, file: str | os.PathLike[str], description: RobotDescription) -> Timeline:
-        """What `stiffopt path` or `stiffopt plan` has written as CSV."""
+        """Return the timeline of a CSV file that `stiffopt path` or `stiffopt plan` wrote."""
         motion, table = read_motion(file, description), read_table(file)
         charts = [
             TimelineChart(name.replace("_", " "), ("",), table[name][:, None])
@@ -174,7 +174,7 @@ class Timeline:
         description: RobotDescription,
         events: Sequence[tuple[float, str]] = (),
     ) -> Timeline:
-        """A recording; the robot's `recordings` say which columns and frames are meant."""
+        """Return the timeline of a recording, read as the robot's `recordings` say."""
         given, columns = description.recordings, list(range(description.n_pressures))
         if given is not None and given.channels:
             columns = [column - 1 for column in given.channels]
@@ -213,7 +213,7 @@ class Timeline:
     def of_run(
         cls, file: str | os.PathLike[str], run: RecordedRun, description: RobotDescription
     ) -> Timeline:
-        """A recording of the daemon, with its events."""
+        """Return the timeline of a daemon's recording, with its events."""
         events = [(event.time, event.text) for event in run.events]
         return cls.of_log(file, log_of_run(run), description, events)
 
@@ -226,7 +226,7 @@ def _check_rows(file: str | os.PathLike[str], times: Vector, pressures: Vector) 
 
 
 def _pressure_charts(description: RobotDescription, pressures: Vector) -> tuple[TimelineChart, ...]:
-    """A chart of the pressures of each segment."""
+    """Return a chart of the pressures of each segment."""
     charts, begin, unit = [], 0, display_units().pressure
     for number, segment in enumerate(description.segments):
         mine = slice(begin, begin + segment.n_channels)

@@ -1,4 +1,4 @@
-"""The view of a timeline: the arm plays, beside charts of its stiffness and its pressures."""
+"""The view of a timeline: play the arm's motion beside charts of stiffness and pressures."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from stiffopt.studio import texts
 from stiffopt.studio.drawing import ArmTube, add_surroundings, place, rgb
 from stiffopt.studio.timeline import Timeline, TimelineChart
 
-_FRAME = 0.05  # s
-_CHARTS = 0.25  # s, between two marks of the moment in the charts
+_FRAME = 0.05  # s, period of the animation
+_CHARTS = 0.25  # s, period at which the charts' marks move
 _SPEEDS = {"1/4": 0.25, "as it is": 1.0, "4 times": 4.0, "20 times": 20.0}
 
 
@@ -48,7 +48,7 @@ class TimelineView:
 
     @property
     def time(self) -> float:
-        """The moment that is shown, in s."""
+        """The shown moment, in s."""
         return float(self._slider.value)
 
     def _add_scene(self) -> None:
@@ -100,14 +100,14 @@ class TimelineView:
             )
         series.append({"label": "now", "stroke": style.DARK, "width": 0,
                        "points": {"show": True, "size": 9, "fill": style.DARK}})  # fmt: skip
-        hidden = np.full(len(rows), low - 1e3 * (high - low))  # below what the chart shows
+        hidden = np.full(len(rows), low - 1e3 * (high - low))  # below the chart's range
         handle = gui.add_uplot(
             (*data, hidden), tuple(series), title=chart.title, height=150,
             scales={"x": {"time": False}, "y": {"range": (low, high)}}, legend={"show": False},
         )  # fmt: skip
         return handle, (*data, hidden)
 
-    # -- what is done in the browser ----------------------------------------------------------
+    # -- events of the browser ----------------------------------------------------------------
 
     def _pressed(self, _: Any) -> None:
         if self._wanted.is_set():
@@ -161,7 +161,7 @@ class TimelineView:
 
 
 def _without_gaps(values: Any) -> Any:
-    """Return values (N,) with those that are missing between the others; 0 if all are."""
+    """Interpolate missing values in (N,); 0 if all are missing."""
     known = np.isfinite(values)
     if not known.any():
         return np.zeros(len(values))

@@ -1,7 +1,7 @@
-"""The answers of a design: quick ones while it is changed, the best one when it rests.
+"""Solve a design: quickly while it is being changed, and fully when it rests.
 
-`Workbench` holds what is shown; it can be used without any view. `NewestWins` is the thread that
-asks it, so that no event of a browser waits for a search.
+`Workbench` contains the design with its solutions; it works without any view. `NewestWins` is the
+thread that calls it, so that no event of a browser waits for a search.
 """
 
 from __future__ import annotations
@@ -28,22 +28,22 @@ from stiffopt.studio.leaning import Leaning
 QUICK = 0.03
 """Seconds after which a quick search gives up."""
 REST = 0.25
-"""Seconds without a change after which the best answer is searched for."""
-_BETTER = 1e-3  # relative, of a stiffness, for which an arm at rest may jump to another answer
-_CHEAP = 5e-3  # s that plain pressures may take while the arm is dragged
+"""Seconds without a change after which the full search starts."""
+_BETTER = 1e-3  # relative gain of stiffness for which an arm at rest may jump to another solution
+_CHEAP = 5e-3  # s that the plain solution may take during a drag
 _STEPS = 200  # that can be undone
 
 
 @dataclass(frozen=True, eq=False)
 class StudioAnswer:
-    """The answer to a design.
+    """The solution of a design.
 
     Attributes
     ----------
-    design : what it answers.
-    solution : the pressures, and what the model says of them.
-    plain : the same pose with the least pressure, or None where that is not known.
-    is_best : whether it was searched for everywhere, and not only next to the previous one.
+    design : the design that it solves.
+    solution : with pressures.
+    plain : the plain solution, with the least pressures for the same pose; None if unknown.
+    is_best : whether it comes from the global search, not only from one near the previous one.
     """
 
     design: Design
@@ -53,7 +53,7 @@ class StudioAnswer:
 
     @property
     def pressures(self) -> NDArray[np.float64]:
-        """In Pa (n,); of a search that failed there is no answer."""
+        """Pressures (n,), in Pa."""
         assert self.solution.pressures is not None
         return self.solution.pressures
 
@@ -65,7 +65,7 @@ class StudioAnswer:
 
     @cached_property
     def at_limit(self) -> NDArray[np.int_]:
-        """At which limit each pressure (n,) is: -1 at the lowest, 1 at the highest, else 0."""
+        """Limit at which each pressure is (n,): -1 at the lowest, 1 at the highest, else 0."""
         found = np.zeros(len(self.pressures), dtype=int)
         for channel, side in active_bounds(self.robot, self.design.task, self.pressures).values():
             found[channel] = side
@@ -73,7 +73,7 @@ class StudioAnswer:
 
     @property
     def plain_stiffness(self) -> float | None:
-        """What the plain pressures have of the first stiffness that the task names."""
+        """The task's first stiffness at the plain solution, or None."""
         measures = self.design.task.measures
         if self.plain is None or self.plain.pressures is None or not measures:
             return None
@@ -83,17 +83,17 @@ class StudioAnswer:
 
 
 class Workbench:
-    """A design, its history, its answer, and the answers that were kept.
+    """A design with its history, its solution, and kept solutions.
 
-    Any thread may change the design; one thread asks for answers.
+    Any thread may change the design; a single thread requests solutions.
 
     Attributes
     ----------
-    design : what is shown now.
-    answer : the newest answer, which may be to an earlier design, or None.
-    kept : answers to compare with.
-    leaning : the arm as it leans on objects at held pressures, or None.
-    trouble : why there is no answer to the design, or an empty text.
+    design : the present design.
+    answer : the newest solution, perhaps of an earlier design, or None.
+    kept : solutions to compare with.
+    leaning : the arm leaning on objects at held pressures, or None.
+    trouble : why the design has no solution, or an empty text.
     """
 
     def __init__(self, design: Design) -> None:
@@ -110,14 +110,14 @@ class Workbench:
         self._lock = threading.RLock()
 
     def change(self, kind: str, change: Callable[[Design], Design]) -> bool:
-        """Change the design; changes of one kind that follow each other are one step to undo.
+        """Change the design; consecutive changes of one kind are a single step to undo.
 
         Returns False, and leaves the design as it is, if nothing changes.
 
         Raises
         ------
         InputError
-            The change makes no sense; the design is as it was.
+            The change is invalid; the design stays as it was.
         """
         with self._lock:
             new = change(self.design)
@@ -130,7 +130,7 @@ class Workbench:
             return True
 
     def end_step(self) -> None:
-        """The next change is a step of its own to undo."""
+        """End the step to undo; the next change begins a new one."""
         with self._lock:
             self._step = ""
 
@@ -143,7 +143,7 @@ class Workbench:
             return True
 
     def keep(self) -> bool:
-        """Keep the answer to compare others with it; return False if there is none."""
+        """Keep the solution for comparison; return False if there is none or it is kept already."""
         if self.answer is None or any(self.answer is each for each in self.kept):
             return False
         self.kept.append(self.answer)
@@ -152,12 +152,12 @@ class Workbench:
     # -- leaning ------------------------------------------------------------------------------
 
     def hold(self, *, held: bool) -> None:
-        """Hold the pressures of the answer, so that the arm leans on objects; or no longer.
+        """Hold the solution's pressures, so that the arm leans on objects; or stop holding them.
 
         Raises
         ------
         InputError
-            There is no answer.
+            There is no solution.
         """
         if held and self.answer is None:
             raise InputError("there are no pressures to hold yet")
@@ -174,7 +174,7 @@ class Workbench:
     # -- answers ------------------------------------------------------------------------------
 
     def answer_quickly(self, cancel: Cancel) -> bool:
-        """Look next to the previous answer; return whether there is an answer now."""
+        """Search near the previous solution; return whether there is a new one."""
         design, before, held = self.design, self.answer, self._held
         if held is not None:
             return self._lean(design, held)
@@ -194,7 +194,7 @@ class Workbench:
         return True
 
     def answer_best(self, cancel: Cancel) -> bool:
-        """Search everywhere; return whether there is another answer now."""
+        """Search globally; return whether there is a new solution."""
         design, before = self.design, self.answer
         if self._held is not None:
             return False
@@ -210,7 +210,7 @@ class Workbench:
         return True
 
     def _solver(self, design: Design) -> PressureSolver:
-        """A solver on the robot of before, if it is the same: what was prepared for it is kept."""
+        """Return a solver; it reuses the robot, with its caches, if that did not change."""
         if self._robot is None or self._robot.description != design.description:
             self._robot = Manipulator(design.description)
         return PressureSolver(self._robot, design.task)
@@ -235,13 +235,13 @@ def _is_better(solution: PressureSolution, before: StudioAnswer) -> bool:
 
 
 class NewestWins:
-    """A thread that answers the newest of many requests, first quickly, at rest in full.
+    """A thread that serves the newest of many requests: first quickly, then, at rest, fully.
 
     Parameters
     ----------
     quickly, fully :
-        What it calls, with a function that says whether a newer request has come: after a request,
-        and when none has come for `REST` seconds after that.
+        Called after a request, and once no request has come for `REST` seconds. Their argument is
+        a function that returns whether a newer request has come.
 
     Attributes
     ----------
@@ -260,13 +260,13 @@ class NewestWins:
         self._thread.start()
 
     def request(self) -> None:
-        """Ask for an answer; returns at once."""
+        """Request a solution; returns at once."""
         if not self._wanted.is_set():
             self._since = perf_counter()
         self._wanted.set()
 
     def close(self) -> None:
-        """End; what is being searched for is given up."""
+        """Cancel the search and end the thread."""
         self._is_over = True
         self._wanted.set()
         self._thread.join()
