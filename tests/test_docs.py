@@ -240,6 +240,15 @@ def headings(page: Path) -> set[str]:
     return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
 
 
+def test_the_map_names_every_package() -> None:
+    page = (ROOT / "docs" / "map.md").read_text(encoding="utf-8")
+    names = {
+        path.name for path in (ROOT / "src" / "stiffopt").glob("[!_]*") if path.name != "py.typed"
+    }
+    missing = {name for name in names if f"`{name}`" not in page}
+    assert not missing, f"docs/map.md does not name {sorted(missing)}"
+
+
 def test_the_site_has_a_place_for_every_page(monkeypatch: pytest.MonkeyPatch) -> None:
     """The configuration loads, and each page stands in the table of contents once."""
     docs = ROOT / "docs"
