@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-_CHUNK = 16  # poses that a thread takes at a time
+_CHUNK = 64  # poses that a thread takes at a time
 _DEGREE = 22  # of polynomials along a range, which are exact to a nanometre
 _STEP = 10.0  # Pa, of differences of radii
 

@@ -92,7 +92,10 @@ def c_code(function: ca.Function) -> str:
     """One C file with a dense function ``NAME`` and its ``NAME_rows``."""
     generator = ca.CodeGenerator(f"{function.name()}.c", {"with_header": False})
     generator.add(function)
-    return str(generator.dump()) + _rows_code(function.name(), Signature.of(function))
+    text = str(generator.dump()).replace(
+        "\ncasadi_real casadi_", "\nstatic inline casadi_real casadi_"
+    )
+    return text + _rows_code(function.name(), Signature.of(function))
 
 
 def header(signatures: dict[str, Signature]) -> str:

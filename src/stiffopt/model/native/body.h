@@ -37,7 +37,7 @@ typedef struct {
     const void *rod;         /* Rod, of an arm under loads */
 } BodyModel;
 
-typedef struct {
+typedef struct { /* as `along` gives it, up to the tangent */
     double position[3];
     double axes[9];    /* of the section, by columns */
     double tangent[3]; /* of unit length */
@@ -51,7 +51,8 @@ static double in_piece(const BodyModel *model, double s, Station *station) {
     while (piece < model->pieces - 1 && s > model->ends[piece]) piece++;
     double start = piece ? model->ends[piece - 1] : 0;
     station->piece = piece;
-    return fmin(fmax(s, start), model->ends[piece]) - start;
+    double end = model->ends[piece];
+    return (s < start ? start : s > end ? end : s) - start;
 }
 
 /* The radius of a station and, unless slopes is NULL, its changes by pressures. */

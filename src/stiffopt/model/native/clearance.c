@@ -1,4 +1,7 @@
 /* The clearance of an arm to a scene, for rows of pressures, with all that body.c has. */
+#if defined(__GNUC__) && !defined(STIFFOPT_LOADED)
+#pragma GCC optimize("O2") /* small functions, called often; the results are the same */
+#endif
 #include "body.c"
 #include "scene.h"
 

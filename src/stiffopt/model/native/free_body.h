@@ -44,17 +44,11 @@ static int prepare_body(const Work *work, Body *b, const double *pressures, cons
 static int find_station(const Work *work, const Body *b, double s, Station *station,
                         double *moves) {
     const BodyModel *m = b->model;
-    double pose[15], local = in_piece(m, s, station);
+    double local = in_piece(m, s, station);
     work->arg[0] = b->start + 12 * station->piece;
     work->arg[1] = b->strain + m->strains * station->piece, work->arg[2] = &local;
-    work->res[0] = pose, work->res[1] = moves;
-    if (moves ? moving_along(work->arg, work->res, work->iw, work->w, 0)
-              : along(work->arg, work->res, work->iw, work->w, 0))
-        return 0;
-    memcpy(station->position, pose, sizeof station->position);
-    memcpy(station->axes, pose + 3, sizeof station->axes);
-    memcpy(station->tangent, pose + 12, sizeof station->tangent);
-    return 1;
+    work->res[0] = (double *)station, work->res[1] = moves;
+    return !(moves ? moving_along : along)(work->arg, work->res, work->iw, work->w, 0);
 }
 
 static int station_at(const Work *work, const Body *b, double s, Station *station) {

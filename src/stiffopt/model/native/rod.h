@@ -4,8 +4,8 @@
  * equations and their derivatives are generated (`stiffopt.model.rod`); here are the steps of
  * Cooper and Verner's Runge-Kutta method of order eight and what is carried along them:
  *
- *   newton_step    changes per turn of the tip, and the defects of the lifted Newton method,
- *   is_stable      changes per turn of and moment at the tip (Jacobi's condition),
+ *   newton_step    changes per turn of the tip, and the defects of the lifted Newton method; with
+ *                  those per moment at the tip whether it is stable (Jacobi's condition),
  *   linearise      changes per turn, added wrench and pressures: pose, Jacobian and compliance,
  *   add_curvature  adjoint of a change: derivatives of the compliance by the pressures.
  *
@@ -97,6 +97,22 @@ static const Row TABLE[STAGES] = {
 static const double WEIGHT[STAGES] = {1. / 20, 0, 0, 0, 0, 0, 0,
                                       49. / 180, 16. / 45, 49. / 180, 1. / 20};
 #undef S
+
+/* A method of integration: rows, and weights of their slopes. */
+typedef struct {
+    int stages;
+    const Row *row;
+    const double *weight;
+} Method;
+
+static const Method EIGHTH_ORDER = {STAGES, TABLE, WEIGHT};
+
+/* Runge and Kutta's of order four, for Newton's first steps, which are larger than its errors. */
+static const Method FOURTH_ORDER = {
+    4,
+    (const Row[4]){{0, 0, {0}, {0}}, {1. / 2, 1, {0}, {1. / 2}}, {1. / 2, 1, {1}, {1. / 2}},
+                   {1, 1, {2}, {1}}},
+    (const double[4]){1. / 6, 1. / 3, 1. / 3, 1. / 6}};
 
 /* -- generated functions, by kind of section ------------------------------------------------ */
 
@@ -268,8 +284,9 @@ ROD_INLINE void combine(int64_t numbers, const double *restrict from, int count,
 
 /* One step; with `rows` 12 position too, and without `da` no directions then.  The last `own`
  * directions are the section's own pressures. */
-ROD_INLINE int rod_step(const Work *work, const RodPiece *piece, const double *a, const double *da,
-                        const double *weight, int rows, int64_t own, Carried *c) {
+ROD_INLINE int rod_step(const Work *work, const Method *method, const RodPiece *piece,
+                        const double *a, const double *da, const double *weight, int rows,
+                        int64_t own, Carried *c) {
     double h = piece->length;
     int64_t D = c->directions;
     double slope[STAGES][12], G[12 * 7], Gn[12 * 3], Gp[12 * (piece->channels + 1)];
@@ -280,8 +297,8 @@ ROD_INLINE int rod_step(const Work *work, const RodPiece *piece, const double *a
         note(block, D, c->y, c->r, c->Y, c->X);
         block += block_size(c->noted), c->notes = next_note(c->notes, c->noted);
     }
-    for (int i = 0; i < STAGES; i++) {
-        const Row *row = &TABLE[i];
+    for (int i = 0; i < method->stages; i++) {
+        const Row *row = method->row + i;
         for (int j = 0; j < row->count; j++) {
             share[j] = h * row->a[j];
             slopes[j] = slope[row->from[j]], changes[j] = change[row->from[j]];
@@ -302,7 +319,7 @@ ROD_INLINE int rod_step(const Work *work, const RodPiece *piece, const double *a
             : da == NULL ? section_slope(work, piece->kind)
                          : section_linear(work, piece->kind))
             return 0;
-        double by = h * WEIGHT[i];
+        double by = h * method->weight[i];
         change_slopes(rows, G, Gn, Gp, own, c, Y, change[i], moved, by);
         if (rows == 8 || by == 0) continue;
         for (int j = 0; j < 4; j++) c->r[j] += by * slope[i][8 + j];
@@ -312,9 +329,9 @@ ROD_INLINE int rod_step(const Work *work, const RodPiece *piece, const double *a
         }
     }
     int count = 0;
-    for (int i = 0; i < STAGES; i++) {
-        if (WEIGHT[i] == 0) continue;
-        share[count] = h * WEIGHT[i], slopes[count] = slope[i], changes[count++] = change[i];
+    for (int i = 0; i < method->stages; i++) {
+        if (method->weight[i] == 0) continue;
+        share[count] = h * method->weight[i], slopes[count] = slope[i], changes[count++] = change[i];
     }
     combine(8, c->y, count, share, slopes, y);
     combine(8 * D, c->Y, count, share, changes, Y);
@@ -324,20 +341,20 @@ ROD_INLINE int rod_step(const Work *work, const RodPiece *piece, const double *a
     return 1;
 }
 
-ROD_CLONES static int lean_step(const Work *work, const RodPiece *piece, const double *a,
-                                const double *weight, Carried *c) {
-    return rod_step(work, piece, a, NULL, weight, 8, 0, c);
+ROD_CLONES static int lean_step(const Work *work, const Method *method, const RodPiece *piece,
+                                const double *a, const double *weight, Carried *c) {
+    return rod_step(work, method, piece, a, NULL, weight, 8, 0, c);
 }
 
 ROD_CLONES static int long_step(const Work *work, const RodPiece *piece, const double *a,
                                 const double *da, const double *weight, int64_t own, Carried *c) {
-    return rod_step(work, piece, a, da, weight, 12, own, c);
+    return rod_step(work, &EIGHTH_ORDER, piece, a, da, weight, 12, own, c);
 }
 
 /* A step of the shape alone. */
 static int plain_step(const Work *work, const RodPiece *piece, const double *a,
                       const double *weight, Carried *c) {
-    return rod_step(work, piece, a, NULL, weight, 12, 0, c);
+    return rod_step(work, &EIGHTH_ORDER, piece, a, NULL, weight, 12, 0, c);
 }
 
 /* A rigid stretch moves the force that is carried. */
@@ -399,68 +416,6 @@ static void weight_of(const RodPiece *piece, const Condition *at, double *weight
 
 /* -- equilibrium ---------------------------------------------------------------------------- */
 
-/* One step of the lifted Newton method (`stiffopt.model.equilibrium`) on a state, in place; the
- * largest turn of the tip or a state in rad, or NaN. */
-static double newton_step(const Work *work, const Rod *rod, const Condition *at, const double *a,
-                          double *state) {
-    double *q = state + rod->n, *states = q + 4, *lifted = states;
-    double Y[4 * 8], dn[9], R[9], changes[rod->steps * 4 * 8 + 1], *met = changes;
-    Carried c = {.directions = 4, .Y = Y};
-    if (!start_at_tip(work, rod, at, q, dn, R, &c)) return NAN;
-    for (int64_t k = 0; k < rod->pieces; k++) {
-        const RodPiece *piece = rod->piece + k;
-        if (piece->kind < 0) {
-            if (!rigid_stretch(work, piece, 8, &c)) return NAN;
-            continue;
-        }
-        double weight[3];
-        weight_of(piece, at, weight);
-        for (int64_t i = 0; i < piece->steps; i++, lifted += 7, met += 32) {
-            if (!lean_step(work, piece, a + piece->parts, weight, &c)) return NAN;
-            for (int j = 0; j < 7; j++) Y[24 + j] += c.y[j] - lifted[j], c.y[j] = lifted[j];
-            memcpy(met, Y, sizeof Y);
-        }
-    }
-    double per_turn[9], inverse[9], turn[3];
-    for (int i = 0; i < 3; i++)
-        for (int j = 0; j < 3; j++) per_turn[3 * i + j] = Y[8 * j + 1 + i];
-    if (!invert_3x3(per_turn, inverse)) return NAN;
-    for (int i = 0; i < 3; i++) {
-        turn[i] = 0;
-        for (int j = 0; j < 3; j++) turn[i] -= inverse[3 * i + j] * (c.y[1 + j] + Y[24 + 1 + j]);
-    }
-    double most = sqrt(turn[0] * turn[0] + turn[1] * turn[1] + turn[2] * turn[2]);
-    for (int64_t k = 0; k < rod->steps; k++, states += 7) {
-        const double *by = changes + 32 * k;
-        double square = 0;
-        for (int j = 0; j < 7; j++) {
-            double move = by[24 + j];
-            for (int t = 0; t < 3; t++) move += by[8 * t + j] * turn[t];
-            states[j] += move;
-            if (j < 4) square += move * move;
-        }
-        if (!(2 * sqrt(square) <= most)) most = 2 * sqrt(square);
-    }
-    turn_quaternion(q, turn);
-    return most;
-}
-
-/* Newton's method from a nearby state, as `Equilibrium.correct`; the state is spoilt by failure. */
-static int correct(const Work *work, const Rod *rod, const Condition *at, const double *a,
-                   double *state) {
-    double before = 1;
-    for (int i = 0; i < 12; i++) {
-        double size = newton_step(work, rod, at, a, state);
-        if (!(size <= (i < 2 ? before : 0.5 * before))) return 0;
-        if (size < 1e-6) {
-            memcpy(state, at->pressures, (size_t)rod->n * sizeof(double));
-            return 1;
-        }
-        before = size;
-    }
-    return 0;
-}
-
 /* Whether a symmetric matrix (3, 3) is positive definite. */
 static int is_positive(const double *A) {
     double minor = A[0] * A[4] - A[1] * A[3];
@@ -491,51 +446,110 @@ static int turns_back(const double *A) {
     return -p / 2 - sqrt(square) <= 0;
 }
 
-/* Whether an equilibrium is stable, as `Equilibrium.is_stable`. */
-static int is_stable(const Work *work, const Rod *rod, const Condition *at, const double *a,
-                     const double *state) {
-    double Y[6 * 8], dn[9], R[9], turned[9];
-    Carried c = {.directions = 6, .Y = Y};
-    int conservative = 1;
-    for (int i = 3; i < 12; i++) conservative = conservative && at->load[i] == 0;
-    if (!start_at_tip(work, rod, at, state + rod->n, dn, R, &c)) return 0;
+/* Whether the changes of a state y per turn of the tip (3) and per moment at it (3) are those of a
+ * stable arm from there on, as `Equilibrium.is_stable`; R of the tip is given by columns. */
+static int is_stable_to(const double *y, const double *by_turn, const double *by_moment,
+                        const double *R, int conservative) {
+    double per_turn[9], per_moment[9], inverse[9], here[9], turned[9], block[9], symmetric[9];
+    turns_between(y, by_turn, 3, per_turn);
+    turns_between(y, by_moment, 3, per_moment);
+    if (!invert_3x3(per_turn, inverse)) return 0;
+    if (!conservative) return 1;
     for (int i = 0; i < 3; i++)
-        for (int j = 0; j < 3; j++) turned[3 * i + j] = R[3 * j + i]; /* R by columns: to rows */
-    for (int i = 0; i < 3; i++) Y[8 * (3 + i) + 4 + i] = 1;
+        for (int j = 0; j < 3; j++) turned[3 * i + j] = R[3 * j + i];
+    multiply_3x3(inverse, per_moment, here);
+    multiply_3x3(here, turned, block);
+    for (int s = 0; s < 3; s++)
+        for (int t = 0; t < 3; t++)
+            symmetric[3 * s + t] = -(block[3 * s + t] + block[3 * t + s]) / 2;
+    return is_positive(symmetric);
+}
+
+/* One step of the lifted Newton method (`stiffopt.model.equilibrium`) on a state, in place; the
+ * largest turn of the tip or a state in rad, or NaN. And, unless stable is NULL, whether the state
+ * was stable, if it was an equilibrium. */
+static double newton_step(const Work *work, const Rod *rod, const Condition *at, const double *a,
+                          const Method *method, double *state, int *stable) {
+    double *q = state + rod->n, *states = q + 4, *lifted = states;
+    double Y[7 * 8], dn[9], R[9], changes[rod->steps * 4 * 8 + 1], *met = changes;
+    Carried c = {.directions = stable ? 7 : 4, .Y = Y};
+    int conservative = 1;
+    if (stable) *stable = 1;
+    for (int i = 3; i < 12; i++) conservative = conservative && at->load[i] == 0;
+    if (!start_at_tip(work, rod, at, q, dn, R, &c)) return NAN;
+    for (int i = 0; stable && i < 3; i++) Y[8 * (4 + i) + 4 + i] = 1;
     for (int64_t k = 0; k < rod->pieces; k++) {
         const RodPiece *piece = rod->piece + k;
         if (piece->kind < 0) {
-            if (!rigid_stretch(work, piece, 8, &c)) return 0;
+            if (!rigid_stretch(work, piece, 8, &c)) return NAN;
             continue;
         }
         double weight[3];
         weight_of(piece, at, weight);
-        for (int64_t i = 0; i < piece->steps; i++) {
-            if (!lean_step(work, piece, a + piece->parts, weight, &c)) return 0;
-            double per_turn[9], per_moment[9], inverse[9], here[9], block[9];
-            turns_between(c.y, Y, 3, per_turn);
-            turns_between(c.y, Y + 24, 3, per_moment);
-            if (!invert_3x3(per_turn, inverse)) return 0;
-            if (!conservative) continue;
-            multiply_3x3(inverse, per_moment, here);
-            multiply_3x3(here, turned, block);
-            double symmetric[9];
-            for (int s = 0; s < 3; s++)
-                for (int t = 0; t < 3; t++)
-                    symmetric[3 * s + t] = -(block[3 * s + t] + block[3 * t + s]) / 2;
-            if (!is_positive(symmetric)) return 0;
+        for (int64_t i = 0; i < piece->steps; i++, lifted += 7, met += 32) {
+            if (!lean_step(work, method, piece, a + piece->parts, weight, &c)) return NAN;
+            for (int j = 0; j < 7; j++) Y[24 + j] += c.y[j] - lifted[j], c.y[j] = lifted[j];
+            memcpy(met, Y, 32 * sizeof(double));
+            if (stable) *stable = *stable && is_stable_to(c.y, Y, Y + 32, R, conservative);
         }
     }
-    if (conservative) return 1;
-    double per_turn[9], base_turn[9];
-    turns_between(c.y, Y, 3, per_turn);
+    if (stable && !conservative) {
+        double per_turn[9], base_turn[9];
+        turns_between(c.y, Y, 3, per_turn);
+        multiply_3x3(per_turn, R, base_turn);
+        for (int i = 0; i < 9; i++) *stable = *stable && isfinite(base_turn[i]);
+        *stable = *stable && !turns_back(base_turn);
+    }
+    double per_turn[9], inverse[9], turn[3];
     for (int i = 0; i < 3; i++)
-        for (int j = 0; j < 3; j++) turned[3 * i + j] = R[3 * i + j]; /* its transpose */
-    multiply_3x3(per_turn, turned, base_turn);
-    for (int i = 0; i < 9; i++)
-        if (!isfinite(base_turn[i])) return 0;
-    return !turns_back(base_turn);
+        for (int j = 0; j < 3; j++) per_turn[3 * i + j] = Y[8 * j + 1 + i];
+    if (!invert_3x3(per_turn, inverse)) return NAN;
+    for (int i = 0; i < 3; i++) {
+        turn[i] = 0;
+        for (int j = 0; j < 3; j++) turn[i] -= inverse[3 * i + j] * (c.y[1 + j] + Y[24 + 1 + j]);
+    }
+    double most = sqrt(turn[0] * turn[0] + turn[1] * turn[1] + turn[2] * turn[2]);
+    for (int64_t k = 0; k < rod->steps; k++, states += 7) {
+        const double *by = changes + 32 * k;
+        double square = 0;
+        for (int j = 0; j < 7; j++) {
+            double move = by[24 + j];
+            for (int t = 0; t < 3; t++) move += by[8 * t + j] * turn[t];
+            states[j] += move;
+            if (j < 4) square += move * move;
+        }
+        if (!(2 * sqrt(square) <= most)) most = 2 * sqrt(square);
+    }
+    turn_quaternion(q, turn);
+    return most;
 }
+
+#define QUADRATIC 1e-6 /* rad, after a step of which 1e-12 is left, convergence being quadratic */
+#define NEARLY 1e-3    /* rad, after a step of which the next is likely to be the last */
+#define ROUGHLY 0.03   /* rad, after a step of which errors of coarse ones do not count */
+
+/* Newton's method from a nearby state, or one far away, as `Equilibrium.correct`, to a stable
+ * equilibrium if `stable` is not 0; the state is spoilt by failure. */
+static int correct(const Work *work, const Rod *rod, const Condition *at, const double *a, int far,
+                   int stable, double *state) {
+    double before = 1, noise = QUADRATIC;
+    for (int i = 0; i < 12; i++) {
+        int coarse = before > ROUGHLY && (i > 0 || far), judged = stable && before <= NEARLY;
+        int holds = 1;
+        double size = newton_step(work, rod, at, a, coarse ? &FOURTH_ORDER : &EIGHTH_ORDER, state,
+                                  judged ? &holds : NULL);
+        if (!(size <= fmax(i < 2 ? before : 0.5 * before, noise))) return 0;
+        if (size < QUADRATIC && !coarse && judged == stable) {
+            memcpy(state, at->pressures, (size_t)rod->n * sizeof(double));
+            return holds;
+        }
+        before = size, noise = coarse ? ROUGHLY : QUADRATIC;
+    }
+    return 0;
+}
+
+#define SHORTEST_FROM_REST 1e-3
+#define SHORTEST_NEARBY 0.1
 
 /* Equilibrium reached continuously from one condition to another, as `Equilibrium.follow`; the
  * state is the last one that was found, and the share of the way that it is at is returned. */
@@ -555,8 +569,8 @@ static double follow(const Work *work, const Rod *rod, const Condition *start, c
         for (int i = 0; i < 3; i++)
             at.gravity[i] = (1 - to) * start->gravity[i] + to * end->gravity[i];
         memcpy(trial, state, sizeof trial);
-        if (sections_at(work, rod, &at, a, da) && correct(work, rod, &at, a, trial) &&
-            (!stable || is_stable(work, rod, &at, a, trial))) {
+        if (sections_at(work, rod, &at, a, da) &&
+            correct(work, rod, &at, a, shortest < SHORTEST_NEARBY, stable, trial)) {
             memcpy(state, trial, sizeof trial);
             share = to;
             if (!halved) step *= 2;
@@ -568,9 +582,6 @@ static double follow(const Work *work, const Rod *rod, const Condition *start, c
     }
     return 1;
 }
-
-#define SHORTEST_FROM_REST 1e-3
-#define SHORTEST_NEARBY 0.1
 
 /* The unpressurised arm under its weight; 0 where it falls over. */
 static int hang(const Work *work, const Rod *rod, double *state) {

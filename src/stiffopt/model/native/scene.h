@@ -170,6 +170,7 @@ static double steepest(const SceneObject *o) { return o->cell ? STEEPEST : 1; }
  * cannot have the largest distance are passed over. */
 static int object_distance(const SceneObject *o, PieceBounds *bounds, const double *point,
                            double *distance, double *normal, int64_t *nearest) {
+    if (o->pieces == 1) return *nearest = 0, piece_distance(o, 0, point, distance, normal);
     double way = steepest(o) * scene_far(point, bounds->point), value, gradient[3];
     int64_t first = bounds->nearest;
     *distance = -INFINITY;
