@@ -6,6 +6,7 @@ Distances are measured once more, with formulas in NumPy on many stations of the
 from __future__ import annotations
 
 import json
+import subprocess
 import sys
 from importlib.util import find_spec
 from itertools import pairwise
@@ -439,6 +440,22 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     scene.write_text(SCENE % "70")
     assert planned(*given) == 3
     assert "too near 'table'" in " ".join(capsys.readouterr().out.split())
+
+
+@needs_ompl
+def test_the_program_ends_without_a_word_of_ompl() -> None:
+    code = """
+import numpy as np
+from stiffopt.cli.main import main
+from stiffopt.paths.tree_search import TreeSearch
+zero, one = np.zeros(1), np.ones(1)
+TreeSearch(lambda _: True, zero, one, one, 0).way(zero, one[None], 9)
+main()
+"""
+    ended = subprocess.run(
+        [sys.executable, "-c", code, "--version"], capture_output=True, text=True, timeout=60
+    )
+    assert (ended.returncode, ended.stderr) == (0, "")
 
 
 @pytest.mark.parametrize(

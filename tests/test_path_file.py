@@ -325,6 +325,11 @@ CIRCLE = (
         (3, LINE + SPEED + "closed: true\n", "path.line: has two ends; only a circle, a spline"),
         (3, POINTS % "" + "timing: {fastest: true}\nclosed: true\n",
          "path.through: ends 9 mm from where it begins; a closed path ends there again"),
+        (5, "path: {through: [{position: [0 m, 0 m, 1 m], pointing: [0, 0, 1]}, {position: "
+         "[1 m, 0 m, 1 m], pointing: [0, 0, 1]}, {position: "
+         "[0 m, 0 m, 1 m], pointing: [0, 1, 1]}]}\n"
+         "timing: {fastest: true}\nclosed: true\n",
+         "closed: cannot be: the last point has another pointing than the first"),
         (7, LINE + SPEED + "pointing: [0, 0, 1]\norientation: [1, 0, 0, 0]\n",
          "orientation: cannot be combined with pointing"),
         (6, LINE + SPEED + "stiffness: {maximise: {direction: [1, 0, 0], frame: trail}}\n",

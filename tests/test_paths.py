@@ -166,7 +166,7 @@ def test_as_fast_as_the_rates_allow(robot, compiled):
 
 
 def test_a_speed_that_no_rate_allows_names_the_rate_and_what_can_be_followed(robot, compiled):
-    path = path_of(timing={"speed": 10.0})
+    path = path_of(timing={"speed": 1e4})
     solution = solve_path(robot, path)
     assert solution.status == "unreachable"
     assert "too fast for the rates" in solution.message
@@ -191,6 +191,11 @@ def test_pressures_at_the_start_that_are_elsewhere_are_refused(robot):
     path = path_of(points=3, start={"pressures": (0.0,) * 6})
     with pytest.raises(InputError, match=r"start\.pressures.* mm off that point"):
         solve_path(robot, path)
+
+
+def test_rates_that_are_too_few_are_refused(robot):
+    with pytest.raises(InputError, match=r"pressure\.slew: has 2 values; expected one value or"):
+        solve_path(robot, path_of(pressure={"slew": (1e5, 1e5)}))
 
 
 def test_objects_on_the_path_are_named_with_the_nearest_path(robot, compiled):

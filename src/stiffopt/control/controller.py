@@ -389,7 +389,7 @@ class TipController:
         """Whether the reference is at rest, at pressures (n,)."""
         n, tuning = len(pressures), self._tuning.reference
         off = float(np.abs(self._reference.path[:n] - pressures).max())
-        return off < tuning.there and bool(
+        return off <= tuning.there and bool(
             np.abs(self._reference.motion[1, :n]).max() <= tuning.at_rest
         )
 
@@ -464,14 +464,11 @@ class TipController:
 
     def _has_arrived(self) -> bool:
         """Whether the reference rests on the plan."""
-        reference, plan = self._reference, self.replanner.plan
-        if plan is None:
+        plan = self.replanner.plan
+        if plan is None or not self._is_near(plan.pressures):
             return False
-        n, tuning = len(plan.pressures), self._tuning.reference
-        for place in (reference.path, reference.goal):
-            if np.abs(place[:n] - plan.pressures).max() > tuning.there:
-                return False
-        return bool(np.abs(reference.motion[1, :n]).max() <= tuning.at_rest)
+        off = np.abs(self._reference.goal[: len(plan.pressures)] - plan.pressures)
+        return bool(off.max() <= self._tuning.reference.there)
 
     def _set_reference_rate(self) -> None:
         tuning, rate = self._tuning.reference, self._tuning.reference.rigid_rate

@@ -216,8 +216,11 @@ class Path(ForRobot):
         times = self._times(lengths)
         if times is not None and not times[-1] <= _LONGEST:
             raise BadKeyError("timing", f"takes {times[-1]:.3g} s; expected a day at most")
+        targets = self._targets(positions)
+        if self.closed:
+            _check_ends(targets[0], targets[-1])
         return PathPoints(
-            targets=self._targets(positions),
+            targets=targets,
             goals=self._goals(tangents),
             positions=positions,
             tangents=tangents,
@@ -406,6 +409,19 @@ class Path(ForRobot):
             )
         self.points()
         return self
+
+
+def _check_ends(first: Target, last: Target) -> None:
+    """Refuse a closed path that ends in another direction than it begins."""
+    for key in ("pointing", "orientation"):
+        before, after = getattr(first, key), getattr(last, key)
+        if before is None or after is None:
+            continue
+        cosine = float(np.dot(before, after))
+        if (cosine if key == "pointing" else abs(cosine)) < 1 - _ROUNDING:  # q and -q are the same
+            raise BadKeyError(
+                "closed", f"cannot be: the last point has another {key} than the first"
+            )
 
 
 def load_path(path: str | os.PathLike[str]) -> Path:

@@ -124,7 +124,6 @@ class RateSettings:
     rounding : relative excess over a rate that counts as rounding.
     largest_step : of a channel between two points, as a share of its range, if rates or times are
         unknown.
-    slowest : largest factor by which a path that is too fast is slowed down.
     clearance_between : loss of clearance between two points that a message reports, in m.
     few_points : largest number of points for which the solver does not wait for machine code.
     least_time : shortest time between two points, in s.
@@ -132,7 +131,6 @@ class RateSettings:
 
     rounding: float = 1e-9
     largest_step: float = 0.1
-    slowest: float = 64.0
     clearance_between: float = 5e-5
     few_points: int = 5
     least_time: float = 1e-3

@@ -78,8 +78,8 @@ class _PathSolver:
             path.task(target, goal)
             for target, goal in zip(self._points.targets, self._points.goals, strict=True)
         ]
-        self._slew = slew_limits(robot.description, path.pressure.slew)
         self._ends = path.end_pressures(robot.description)
+        self._slew = slew_limits(robot.description, path.pressure.slew)
         self._over = "mean" if path.stiffness is None else path.stiffness.over
         self._unreachable: tuple[int, str] | None = None  # the first point, and why
         self._lanes: list[list[PathCandidate]] | None = None
@@ -255,10 +255,10 @@ class _PathSolver:
     ) -> tuple[float, Route | None]:
         """Find the smallest slow-down, to 5 %, with which the path can be followed, and how."""
         factor, route = 1.0, None
-        while route is None and factor < RATES.slowest:
-            factor *= 2
+        while route is None and (steps * factor < tasks.unit).any():
+            factor *= 8
             route = self._best_route(tasks, layers, steps * factor, any_will_do=True)
-        low = factor / 2
+        low = factor / 8
         while route is not None and factor / low > 1.05:
             middle = (low * factor) ** 0.5
             quicker = self._best_route(tasks, layers, steps * middle, any_will_do=True)
@@ -314,7 +314,7 @@ class _PathSolver:
         if self._unreachable is not None:
             index, why = self._unreachable
             message = (
-                f"{self._cannot_be_reached(index, why)}.  "
+                f"{self._cannot_be_reached(index, why)}. "
                 "The nearest path that can be followed is given."
             )
             return replace(solution, status="unreachable", message=message, first_failure=index)
@@ -360,13 +360,11 @@ class _PathSolver:
         message = (
             f"The path is too fast for the rates: beyond point {index + 1} of {len(self._tasks)} "
             f"({along} along it) no pressures keep them"
-            f"{self._binding(solution)}.  It can be followed {slowed:.3g} times slower, as given."
+            f"{self._binding(solution)}. It can be followed {slowed:.3g} times slower, as given."
         )
         if solution.status != "solved":
             return solution
-        return replace(
-            solution, status="unreachable", message=message.replace("  ", " "), first_failure=index
-        )
+        return replace(solution, status="unreachable", message=message, first_failure=index)
 
     def _binding(self, solution: PathSolution) -> str:
         """Name the channel that uses most of its rate."""
