@@ -1,23 +1,23 @@
-"""The arm's numbers, adapted to where its tip is seen at rest.
+"""Adaptation of the model's numbers to where the tip is seen at rest.
 
-What a robot file says of moduli, gains and weights is known within a deviation: that of its
-calibration, with all correlations, or else that of its `tolerances`. The coordinates z of these
-numbers (`stiffopt.model.parameters`), of a mass at the tip that the file does not have, and of the
-twists of base and sensor in the tracker's frame have the prior N(0, P0). A *window* is the tip at
-rest at some effective pressures p, averaged::
+A robot file knows moduli, gains and weights within a deviation: that of its calibration, with all
+correlations, or that of its `tolerances`. Coordinates z (`stiffopt.model.parameters`) describe
+these numbers, a mass at the tip that the file does not have, and the twists of base and sensor in
+the tracker's frame. Their prior is N(0, P0). A *window* is the average of the tip at rest at some
+effective pressures p::
 
     y = s(p, z) + e,      e ~ N(0, R),      R_ij = sigma_i sigma_j exp(-|p_i - p_j|^2 / 2 l^2)
 
-e is the discrepancy of the model, which postures near each other share: a thousand windows of one
-posture tell no more than one. The estimate is the most likely z, by Gauss-Newton::
+e is the discrepancy of the model. Postures near each other share it, so a thousand windows of one
+posture give no more information than one. The estimate is the most likely z, by Gauss-Newton::
 
     z = K (y - s(p, z0) + S z0),   K = P0 S' (S P0 S' + R)^-1,   P = P0 - K S P0,   S = ds/dz
 
-Windows age: sigma grows, and an arm that shows nothing new returns to its prior. z stays within
-three prior deviations in each coordinate.
+Windows age: sigma grows, so without new windows the estimate returns towards its prior. Each
+coordinate stays within three prior deviations.
 
-Of these, moduli, the mass and, where the robot file has gains, the gains are *applied*: they
-replace the numbers of the model that plans and controls. All else is left to the tip's offset.
+Only moduli, the mass and, if the robot file has gains, the gains are *applied*: they replace the
+numbers of the model that plans and controls. The tip's offset accounts for the rest.
 """
 
 from __future__ import annotations
@@ -57,81 +57,80 @@ class Window:
     time: float  # at its end, in s
     pressures: Array  # effective (n,), in Pa
     position: Array  # (3,), in m
-    rotation: Array | None  # (3, 3); None where the tracker measures none
+    rotation: Array | None  # (3, 3); None if the tracker measures none
 
 
 @dataclass(frozen=True, eq=False)
 class Adapted:
-    """Numbers of an arm as adapted."""
+    """A model with adapted numbers."""
 
-    description: RobotDescription  # with those that are applied
-    applied: Array  # their coordinates (k,), zero for all others
+    description: RobotDescription  # with the applied numbers
+    applied: Array  # their coordinates (k,); zero for numbers that are not applied
 
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """What is known of an arm's numbers."""
+    """The estimated numbers of an arm."""
 
     numbers: tuple[AdaptedNumber, ...]
-    proposal: Adapted | None  # to go on with; None: the present arm will do
+    proposal: Adapted | None  # to use from now on; None: the present model will do
 
 
 class Learning:
-    """What the planner learns of the arm, beside its plans.
+    """What the planner's process learns of the arm besides its plans.
 
-    It takes half a second for the first windows, and tens of milliseconds for later ones. The arm
-    is at rest then.
+    The first windows take half a second, later ones tens of milliseconds; the arm is at rest then.
 
     Parameters
     ----------
     description :
-        The arm as its file has it.
+        The arm as its file describes it.
     tuning :
-        Of the adaptation.
+        Tuning of the adaptation.
     """
 
     def __init__(self, description: RobotDescription, tuning: AdaptationTuning) -> None:
         self._description, self._tuning = description, tuning
         self._adaptation: Adaptation | None = None
-        self._seen: tuple[tuple[Window, ...], Adapted | None] = (), None
+        self._last: tuple[tuple[Window, ...], Adapted | None] = (), None  # of `estimate`
         self._deviation = math.nan
-        self._measured: tuple[DirectionalMeasure, Array] | None = None  # and pressures (n,)
-        self._before: Array | None = None  # pressures of the plan before
+        self._deviation_of: tuple[DirectionalMeasure, Array] | None = None  # and pressures (n,)
+        self._last_plan: Array | None = None  # pressures (n,)
 
     def estimate(
         self, windows: tuple[Window, ...], adapted: Adapted | None, tip: TipModel
     ) -> Estimate | None:
-        """Return what is new of the arm's numbers; None if nothing is.
+        """Return the estimate of the arm's numbers; None if there is no news.
 
         `adapted` is the present arm, and `tip` its model.
         """
-        before, self._seen = self._seen, (windows, adapted)
+        before, self._last = self._last, (windows, adapted)
         if not windows or (windows is before[0] and adapted is before[1]):
             return None
         if self._adaptation is None:
             self._adaptation = Adaptation(self._description, self._tuning)
         adaptation = self._adaptation
         if windows is not before[0]:
-            self._measured = None
-            with suppress(StiffoptError, LinAlgError):  # of numbers with which no arm stands
+            self._deviation_of = None
+            with suppress(StiffoptError, LinAlgError):  # numbers without an equilibrium
                 adaptation.take(windows, tip)
         applied = adaptation.none_applied if adapted is None else adapted.applied
         return Estimate(adaptation.report(), adaptation.step_from(applied))
 
     def deviation(self, pressures: Array, measure: DirectionalMeasure) -> float:
-        """Relative deviation of a stiffness at a plan's pressures (n,); NaN if it is not known.
+        """Return the relative deviation of a stiffness at a plan's pressures (n,); NaN if unknown.
 
-        It is computed anew where the arm rests elsewhere.
+        It is computed again when plans rest at other pressures.
         """
-        before, self._before = self._before, pressures
+        before, self._last_plan = self._last_plan, pressures
         if self._adaptation is None or before is None:
             return self._deviation
         if np.abs(pressures - before).max() > self._tuning.at_rest:
             return self._deviation
-        last = self._measured
+        last = self._deviation_of
         far = math.inf if last is None else float(np.linalg.norm(last[1] - pressures))
         if last is None or last[0] != measure or far > self._tuning.elsewhere:
-            self._measured, self._deviation = (measure, pressures), math.nan
+            self._deviation_of, self._deviation = (measure, pressures), math.nan
             with suppress(StiffoptError):
                 self._deviation = self._adaptation.deviation(pressures, measure)
         return self._deviation
@@ -143,7 +142,7 @@ class Adaptation:
     Parameters
     ----------
     description :
-        The arm as its file has it.
+        The arm as its file describes it.
     tuning :
         Bounds, discrepancy and pace.
     """
@@ -167,12 +166,12 @@ class Adaptation:
         self.none_applied: Array = np.zeros(len(self._prior))
 
     def take(self, windows: Sequence[Window], tip: TipModel) -> None:
-        """Estimate anew from all windows; `tip` is the present model, for its compliance.
+        """Update the estimate from all windows; `tip` is the present model, for its compliance.
 
         Raises
         ------
         StiffoptError
-            The arm has no equilibrium with the numbers that were tried.
+            If the arm has no equilibrium with numbers that the search tried.
         """
         z, prior = self.estimate, self._prior
         for _ in range(self._tuning.iterations):
@@ -185,13 +184,14 @@ class Adaptation:
         self.estimate, self.covariance = z, prior - gain @ S @ prior
 
     def _bounded(self, z: Array) -> Array:
-        most = self._tuning.bound * np.sqrt(np.diag(self._prior))
-        return np.asarray(np.clip(z, -most, most))
+        limit = self._tuning.bound * np.sqrt(np.diag(self._prior))
+        return np.asarray(np.clip(z, -limit, limit))
 
     def step_from(self, applied: Array) -> Adapted | None:
         """Return the arm with numbers nearer to the estimate; None if they are near enough.
 
-        A step is limited, so that the model changes slowly. `applied` are the present coordinates.
+        The step is limited, so that the model changes slowly. `applied` are the present coordinates
+        (k,).
         """
         deviations = np.sqrt(np.diag(self._prior))
         change = np.where(self._applies, self.estimate - applied, 0.0)
@@ -202,12 +202,12 @@ class Adaptation:
         try:
             description = self._with(after)
             TipModel(Manipulator(description)).at(np.zeros(description.n_pressures))
-        except StiffoptError:  # such an arm falls over, or breaks its strain law
+        except StiffoptError:  # such an arm has no equilibrium, or breaks its strain law
             return None
         return Adapted(description, after)
 
     def _with(self, z: Array) -> RobotDescription:
-        """The arm with the applied ones of coordinates (k,)."""
+        """Return the arm with those of the coordinates (k,) that are applied."""
         own = self._description
         values = {
             parameter: float(parameter.at(parameter.value(own), z[index]))
@@ -218,7 +218,7 @@ class Adaptation:
         return with_values(own, values).model_copy(update={"tip_mass": max(float(mass), 0.0)})
 
     def report(self) -> tuple[AdaptedNumber, ...]:
-        """What the numbers are, with their deviations."""
+        """Return the estimated numbers with their deviations."""
         deviations = np.sqrt(np.maximum(np.diag(self.covariance), 0.0)).tolist()
         found = []
         for index, parameter in enumerate(self._parameters):
@@ -235,7 +235,7 @@ class Adaptation:
         return tuple(found)
 
     def deviation(self, pressures: Array, measure: DirectionalMeasure) -> float:
-        """Relative standard deviation of a stiffness at pressures (n,) with the numbers applied."""
+        """Return the relative standard deviation of the stiffness at pressures (n,)."""
         k, _, slopes = self._arm.stiffnesses(
             pressures[None], self.estimate[: len(self._parameters)], measure
         )
@@ -247,10 +247,10 @@ class Adaptation:
     def _linearised(
         self, windows: Sequence[Window], z: Array, tip: TipModel
     ) -> tuple[Array, Array]:
-        """Errors (6 w,) of the model at coordinates (k,), NaN if unknown, and slopes (6 w, k).
+        """Return errors (6 w,) of the model at coordinates (k,) and their slopes (6 w, k).
 
-        Of each window they are those of the position, in m, and of the orientation, a rotation
-        vector in base axes.
+        Each of the w windows has errors of position, in m, and of orientation, as a rotation vector
+        in base axes; NaN if not measured.
         """
         count = len(self._parameters)
         if self._has_mass:
@@ -280,7 +280,7 @@ class Adaptation:
         return np.concatenate(errors) - S[:, len(z) - self._frames :] @ frames, S
 
     def _noise(self, windows: Sequence[Window]) -> Array:
-        """Covariance (6 w, 6 w) of the discrepancies, which grow with displacement and age."""
+        """Return the covariance (6 w, 6 w) of discrepancies; it grows with displacement and age."""
         t = self._tuning
         p = np.array([window.pressures for window in windows])
         rest = np.array([0.0, 0.0, self._description.length])
@@ -302,9 +302,9 @@ class Adaptation:
 
 
 def _prior(description: RobotDescription, tuning: AdaptationTuning) -> tuple[list[str], Array, int]:
-    """Keys of the numbers, covariance (k, k) of all coordinates, and how many are of frames.
+    """Return keys of the numbers, prior covariance (k, k), and the number of frames' coordinates.
 
-    The coordinates are those of the numbers, the mass where there is gravity, and the frames.
+    The coordinates are those of the numbers, of the mass if there is gravity, and of the frames.
     """
     mass = [tuning.mass**2] if any(description.gravity) else []
     known, tolerances = description.calibration, description.tolerances or Tolerances()
@@ -333,7 +333,7 @@ def _prior(description: RobotDescription, tuning: AdaptationTuning) -> tuple[lis
 
 
 def _frames(tolerances: Tolerances) -> list[float]:
-    """Variances (6,) of the twist of the base in the tracker's frame."""
+    """Return the variances (6,) of the twist of the base in the tracker's frame."""
     position, tilt = tolerances.base_position**2, tolerances.base_tilt**2
     return [position, position, position, tilt, tilt, tolerances.base_turn**2]
 
@@ -349,7 +349,7 @@ def _made(description: str, keys: tuple[str, ...]) -> ParametricArm:
 
 
 def _cross(v: Array) -> Array:
-    """Matrix (3, 3) of the cross product with a vector (3,)."""
+    """Return the matrix (3, 3) of the cross product with a vector (3,)."""
     x, y, z = v
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 

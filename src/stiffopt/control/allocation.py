@@ -1,20 +1,20 @@
 """The quadratic program that turns the feedback law into pressures, solved in every tick.
 
 The tip is to move by v relative to the reference, with pressures p as near to the reference's r as
-that permits::
+possible::
 
     minimise   |W (J (p - r) - v)|^2 + epsilon |p - r|^2
     such that  low <= p <= high,   |p - last| <= slew,   |G (p - last)| <= speed
 
 ``p = last`` is feasible as long as the last pressures are within their limits, which they are. So
 there is always a solution, though OSQP gives up on one in a thousand of the hardest problems. All
-inputs and outputs are checked for being finite and within bounds, because solvers' flags are not
+inputs and outputs are checked to be finite and within bounds, because solvers' flags are not
 reliable: OSQP answers 2e9 to a contradiction, and NaN for ever after one NaN; DAQP may return NaN
 with a flag of success.
 
-The slew also limits the reference (as a whole, so that its path stays straight) and the gate (each
-channel, by the time since the last command). Here it is a bound of the program, which so finds the
-best pressures that the gate will pass on unchanged; a test holds it to that.
+The reference and the gate limit the slew too: the reference as a whole, so that its path stays
+straight, the gate each channel, by the time since the last command. Here it is a bound of the
+program, which thus finds the best pressures that the gate passes unchanged; a test checks that.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ from stiffopt.control.tuning import FeedbackTuning
 Array = NDArray[np.float64]
 
 _BAR = 1e5
-_SLACK = 1e-4  # bar; a pressure that is nearer to a limit is at it
-_BOUND_ERROR = 1e-3  # bar; a solution that violates its bounds by more is none
+_SLACK = 1e-4  # bar; a pressure within this of a limit counts as being at it
+_BOUND_ERROR = 1e-3  # bar; a solution that violates its bounds by more is rejected
 
 
 class QuadraticSolver(ABC):
@@ -47,7 +47,7 @@ class QuadraticSolver(ABC):
 
     @abstractmethod
     def solve(self, H: Array, f: Array, A: Array, lower: Array, upper: Array) -> Array | None:
-        """Return x (n,), not checked; None without a solution."""
+        """Return x (n,), not checked; None if the solver finds none."""
 
 
 class DaqpSolver(QuadraticSolver):
@@ -63,7 +63,7 @@ class DaqpSolver(QuadraticSolver):
 
 
 class OsqpSolver(QuadraticSolver):
-    """OSQP: an operator-splitting method, with a workspace that persists."""
+    """OSQP: an operator-splitting method, with a persistent workspace."""
 
     def __init__(self, n: int, m: int) -> None:
         self._n, self._m = n, m
@@ -80,7 +80,7 @@ class OsqpSolver(QuadraticSolver):
         P = sparse.csc_matrix(np.triu(np.ones((n, n))))
         rows = np.vstack([np.eye(n), np.ones((m, n))])
         self._A = sparse.csc_matrix(rows)
-        # where the entries of A are, by column, below those of the unit matrix
+        # indices of A's entries in the data, column by column, below those of the unit matrix
         self._values = self._A.data.copy()
         self._places = (np.arange(m) + 1 + np.arange(n)[:, None] * (m + 1)).ravel()
         P.data[:] = np.eye(n)[self._upper]
@@ -109,9 +109,9 @@ SOLVERS: dict[str, type[QuadraticSolver]] = {"daqp": DaqpSolver, "osqp": OsqpSol
 class Allocation:
     """The quadratic program of an arm with n channels.
 
-    The feedback law has J, v and G, the tuning W and epsilon. Commands stay between `low` and
-    `high` (n,), in Pa, and change by `step` (n,) at most from tick to tick; the tip moves by
-    `tip_step` at most along each axis, in m.
+    The feedback law gives J, v and G, the tuning W and epsilon. Commands stay between `low` and
+    `high` (n,), in Pa, and change by at most `step` (n,) from tick to tick; the tip moves by at
+    most `tip_step` along each axis, in m.
     """
 
     def __init__(
@@ -132,7 +132,7 @@ class Allocation:
         self.limit(low, high)
 
     def limit(self, low: Array, high: Array) -> None:
-        """Permit these pressures (n,) from now on, in Pa."""
+        """Change the limits of the pressures (n,), in Pa."""
         self._low, self._high = low / _BAR, high / _BAR
 
     def solve(
@@ -142,8 +142,8 @@ class Allocation:
 
         Returns
         -------
-        Pressures (n,) in Pa, None without a usable solution; the channels (n,) at a limit; and the
-        residual of the task's rows, in m.
+        Pressures (n,) in Pa, None without a usable solution; flags (n,) of the channels at a limit;
+        and the residual of the task's rows, in m.
         """
         H, f, G, lower, upper, finite, J, v = self._program(
             *inputs, reference, last, self._low, self._high
@@ -156,16 +156,16 @@ class Allocation:
         p, held, residual, violation = self._solution(
             change, lower, upper, J, v, reference, last, self._low, self._high
         )
-        if not violation[0] <= _BOUND_ERROR**2:  # nor if it is NaN
+        if not violation[0] <= _BOUND_ERROR**2:  # NaN is rejected too
             return None, self._none_held, math.nan
         return p, held > 0, float(residual[0])
 
 
 def _program(law: TrackingRows, step: Array, tip_step: float, weight: float) -> Formula:
-    """The program in terms of the change of pressures; in bar, and scaled.
+    """Return the formula of the program for the change of pressures; in bar, and scaled.
 
     Outputs: H (n, n), f (n,), G (3, n), the bounds (n + 3,), a number that is finite only if all
-    inputs are (what is not finite in H makes f so), and J and v.
+    inputs are (an entry of H that is not finite makes f so too), J and v.
     """
     J, v, n = law.rows, law.values, len(step)
     reference, last = ca.SX.sym("reference", n), ca.SX.sym("last", n)
@@ -174,10 +174,10 @@ def _program(law: TrackingRows, step: Array, tip_step: float, weight: float) -> 
     before, reach = last / _BAR, ca.DM(step)
     H = scaled.T @ scaled + ca.SX.eye(n)
     f = scaled.T @ (v / -weight) - H @ (reference / _BAR - before)
-    # where a limit was tightened below the last pressures: down as fast as the slew allows
+    # a limit may be below the last pressures: go down as fast as the slew allows
     upper = ca.fmax(ca.fmin(high - before, reach), -reach)
     lower = ca.fmin(ca.fmax(low - before, -reach), upper)
-    # the tip may be faster by what such a limit forces upon it
+    # the tip may be faster by what such a limit requires
     forced = ca.fmax(ca.fmax(-upper, lower), 0)
     displacement = max(tip_step, 1e-9) + ca.fabs(G) @ forced
     finite = ca.sumsqr(f) + ca.sumsqr(G)
@@ -187,10 +187,10 @@ def _program(law: TrackingRows, step: Array, tip_step: float, weight: float) -> 
 
 
 def _solution(law: TrackingRows) -> Formula:
-    """What a change of the pressures (n,), in bar, amounts to.
+    """Return the formula that evaluates a change of the pressures (n,), in bar.
 
     Outputs: pressures (n,) in Pa, 1 for channels at a limit (n,), the residual of the task's rows
-    in m, and the square of how far the change is beyond its bounds, in bar^2.
+    in m, and the square of the violation of the change's bounds, in bar^2.
     """
     t, n = law.rows.shape
     change = ca.SX.sym("change", n)

@@ -23,13 +23,13 @@ from stiffopt.rig.settings import CommissioningSettings
 from stiffopt.safety.gate import Outlet
 from stiffopt.safety.monitors import PressureMonitor
 
-_BUSY = 1.0  # load of a processor from which on it keeps a program waiting
+_BUSY = 1.0  # load of a processor above which programs wait
 
-# how far a vented arm may be from how it was commissioned
-_MOVED = 0.04  # of its length; hysteresis and creep leave about half of that
-_NOISIER, _LEAST_NOISE = 2.5, 2e-5  # factor on the tracker's noise, and the least of it, in m
-_LATER = 0.05  # s
-_GAUGE = 0.3  # of `Safety.max_pressure_error`
+# limits of how a vented arm may differ from when it was commissioned
+_MAX_MOVED = 0.04  # share of its length; hysteresis and creep take about half of that
+_NOISE_FACTOR, _MIN_NOISE = 2.5, 2e-5  # growth of the tracker's noise; lower bound of it, in m
+_MAX_DELAY = 0.05  # s, growth of the age of samples
+_MAX_GAUGE_CHANGE = 0.3  # share of `Safety.max_pressure_error`
 
 
 def check_rig(rig: Rig, outlet: Outlet, controller: Controller) -> Iterator[str]:
@@ -78,7 +78,7 @@ def check_vented_arm(
 ) -> Iterator[str]:
     """Yield the problems of a vented arm's measurements; each begins with the name of its check.
 
-    `max_offset` of the tip is a share of the arm's length.
+    `max_offset` is the greatest offset of the tip, as a share of the arm's length.
     """
     trouble = pressures.implausible(now, reading)
     if trouble is not None:
@@ -99,7 +99,7 @@ def check_vented_arm(
     if modelled is None:
         modelled = status.tip_position - status.disturbance
     off = float(np.linalg.norm(tracker.position - modelled))
-    if not off <= max_offset * rig.robot.length:  # NaN is too far as well
+    if not off <= max_offset * rig.robot.length:  # NaN fails too
         seen, model = (", ".join(f"{1e3 * x:.1f}" for x in p) for p in (tracker.position, modelled))
         yield (
             f"calibration: the vented tip is seen at ({seen}) mm, {1e3 * off:.0f} mm from where "
@@ -111,7 +111,7 @@ def check_vented_arm(
 def check_commissioned(
     rig: Rig, gauges: GaugeWatch, tracker: TrackerWatch, reading: PressureReading
 ) -> Iterator[str]:
-    """Yield why the record of its commissioning, or its gauges, do not permit to arm a vented arm.
+    """Yield reasons against arming from the gauges and the record of the commissioning.
 
     A rig that was not made from a rig file is not checked.
     """
@@ -145,21 +145,21 @@ def check_commissioned(
 def _changed(
     record: CommissioningRecord, rig: Rig, tracker: TrackerWatch, reading: PressureReading
 ) -> Iterator[str]:
-    """Yield how a vented arm differs from what it was when it was commissioned."""
+    """Yield how a vented arm differs from when it was commissioned."""
     then = record.tracker
     if then is None or not tracker.samples:
         return
     off = float(np.linalg.norm(tracker.position - then.position))
-    if off > _MOVED * rig.robot.length:
+    if off > _MAX_MOVED * rig.robot.length:
         yield (
             f"the vented tip is {1e3 * off:.1f} mm from where it was: a push, a load, a slipped "
             "sensor or a moved tracker; look at the arm"
         )
-    if tracker.noise > _NOISIER * max(then.noise, _LEAST_NOISE):
+    if tracker.noise > _NOISE_FACTOR * max(then.noise, _MIN_NOISE):
         yield (
             f"the tracker's noise is {1e3 * tracker.noise:.3f} mm and was {1e3 * then.noise:.3f} mm"
         )
-    if tracker.usual[1] > then.latency + _LATER:
+    if tracker.usual[1] > then.latency + _MAX_DELAY:
         yield (
             f"the tracker's samples are {1e3 * tracker.usual[1]:.0f} ms old when they come and "
             f"were {1e3 * then.latency:.0f} ms old"
@@ -169,7 +169,7 @@ def _changed(
         if channel.gauge_offset is None:
             continue
         moved = abs(reading.pressures[k] - channel.gauge_offset)
-        if moved > _GAUGE * tolerance[k] + 6 * (channel.gauge_noise or 0.0):
+        if moved > _MAX_GAUGE_CHANGE * tolerance[k] + 6 * (channel.gauge_noise or 0.0):
             yield (
                 f"the gauge of channel {k + 1} reads {reading.pressures[k] * 1e-5:.3f} bar of the "
                 f"vented arm and read {channel.gauge_offset * 1e-5:.3f} bar"
@@ -177,17 +177,17 @@ def _changed(
 
 
 def late_ticks(lateness: float, guard_timeout: float, load: float = 0.0) -> str:
-    """Return advice where the computer is so busy that the guard may vent; else an empty text.
+    """Return advice if the computer is so busy that the guard may vent; otherwise an empty text.
 
     Parameters
     ----------
     lateness :
-        How late ticks began in the last half minute, in s. By half of the guard's patience within
-        that time, they may exceed it within minutes.
+        How late ticks began in the last half minute, in s. If that is half of the guard's timeout,
+        it may exceed the timeout within minutes.
     guard_timeout :
-        The guard's patience, in s.
+        The guard's timeout, in s.
     load :
-        Processes that want to run, over the processors that they have.
+        Number of processes that want to run per processor.
     """
     half = 0.5 * guard_timeout
     if lateness < half and load < _BUSY:

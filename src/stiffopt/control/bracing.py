@@ -1,17 +1,17 @@
-"""`Bracing`: an arm goes to rest, leans on objects of the scene from there, holds, and lets go.
+"""`Bracing`: a brace under way. The arm goes to rest, leans on objects, holds, and lets go.
 
-Where it leans is planned (`stiffopt.paths.leaning`). All pressures then grow together, as fast as
-the approach says, so that the arm comes into contact slowly and at the wanted equilibrium. Going
-back on the same way lets go of the objects.
+`stiffopt.paths.leaning` plans the approach. From rest, all pressures grow together at its pace, so
+that the arm comes into contact slowly and at the planned equilibrium. The same way back releases
+the contacts.
 
-While the arm is held, its tip is seen at y and the braced model has it at s. Of y - s, what changes
-slowly is the model's error and creep, b. The rest is the work of a push F at the tip, which is
-taken for the one that is most likely: with the compliance C of the braced tip, the deviation sigma
-of y - s - b and that of the pushes, f,
+While the brace is held, the tracker measures the tip at y and the braced model predicts s. The slow
+part of y - s is the error b of the model and creep. The rest is the effect of a push F at the tip,
+of which the most likely one is taken. With the compliance C of the braced tip and the deviations
+sigma of y - s - b and f of pushes,
 
     F = C (C C + (sigma / f)^2)^-1 (y - s - b).
 
-Contacts hold as long as the model's do under this push.
+The contacts count as held as long as the model's contacts hold under this push.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ Array = NDArray[np.float64]
 
 
 class BracePhase(StrEnum):
-    """Where a brace is."""
+    """The phase of a brace."""
 
     PLANNING = "planning"
     TO_REST = "going to rest"
@@ -45,23 +45,23 @@ class BracePhase(StrEnum):
 
 
 class Bracing:
-    """A brace under way: pressures for each moment, and whether the contacts hold.
+    """A brace under way: its pressures over time, and whether the contacts hold.
 
     Parameters
     ----------
     task :
-        What is wanted.
+        The task with the brace.
     tuning :
         Times and limits.
 
     Attributes
     ----------
-    phase : where it is.
-    next : what takes its place when the arm has let go; None: it stays at rest.
-    force : smallest normal force of the contacts, as it is estimated, in N; NaN without contact.
-    margin : further push at the tip by which a contact is lost, in N; NaN while nothing pushes.
-    push : at the tip, as it is estimated (3,), base axes, in N; zero while nothing is felt.
-    displacement : of the tip by it (3,), in m.
+    phase : the present phase.
+    next : task to pursue after the release; None: the arm stays at rest.
+    force : smallest normal force of the contacts, as estimated, in N; NaN without contact.
+    margin : further push at the tip that would break a contact, in N; NaN while nothing pushes.
+    push : estimated push at the tip (3,), base axes, in N; zero while none is felt.
+    displacement : of the tip by the push (3,), in m.
     covariance : of the push (3, 3), in N^2.
     """
 
@@ -73,23 +73,23 @@ class Bracing:
         self.push, self.displacement = np.zeros(3), np.zeros(3)
         self.covariance: Array = tuning.usual_push**2 * np.eye(3)
         self._error: Array | None = None  # b (3,)
-        self._residual: Array = np.zeros(3)  # y - s, without swings
-        self._held = self._pushed = 0.0  # for how long, in s
+        self._residual: Array = np.zeros(3)  # y - s, smoothed over vibrations
+        self._held = self._pushed = 0.0  # durations, in s
         self.approach: BraceApproach | None = None
         self._start: Array = np.zeros(0)  # pressures (n,) from which the arm goes to rest
-        self._left = 1.0  # share of them
-        self._time = 0.0  # on the way of the approach, in s
+        self._left = 1.0  # share of `_start` that is left
+        self._time = 0.0  # along the approach, in s
         self._waited = 0.0  # at its end, in s
-        self._change: Array = np.zeros(0)  # of the planned pressures (n,), to be at the target
-        self._free = 0  # samples in a row at which the tip is rather where a free arm has it
+        self._change: Array = np.zeros(0)  # of the planned pressures (n,), to correct the tip
+        self._free = 0  # successive samples at which the tip is nearer to a free arm's
         self._slips = False
-        self._lost = 0  # looks in a row at which the model's contacts do not hold
-        self._looked = 0.0  # since it was looked what the contacts hold, in s
+        self._lost = 0  # successive checks at which the model's contacts do not hold
+        self._unchecked = 0.0  # time since the last such check, in s
         self._why = ""
-        self._told: list[Notice] = []
+        self._notices: list[Notice] = []
 
     def at(self, now: float) -> Target:
-        """Return the target, at any time."""
+        """Return the target, which is constant."""
         return self.task.target
 
     @property
@@ -110,14 +110,14 @@ class Bracing:
         return found
 
     def begin(self, approach: BraceApproach, pressures: Array) -> None:
-        """Go to rest from pressures (n,), and lean then."""
+        """Go from pressures (n,) to rest, then along the approach."""
         self.approach, self._start = approach, pressures
         self._left = float(bool(np.abs(pressures).max() > self._tuning.at_rest))
         self._change = np.zeros_like(pressures)
         self.phase = BracePhase.TO_REST
 
     def release(self, then: Task | None = None, why: str = "") -> None:
-        """Let go, and pursue something else afterwards."""
+        """Release the contacts, then pursue the task `then`; `why` is the reason for a failure."""
         self.next = then or self.next
         if self.phase in (BracePhase.APPROACHING, BracePhase.HELD):
             self.phase, self._why = BracePhase.RELEASING, why
@@ -126,14 +126,14 @@ class Bracing:
             text = "goes back on the way that it came"
             if why:
                 text = f"{why}; the arm {text}, and stays at rest until there is a new task"
-                self._tell("brace-lost", text, Severity.ERROR)
+                self._notify("brace-lost", text, Severity.ERROR)
             else:
-                self._tell("release", f"the arm lets go: it {text}")
+                self._notify("release", f"the arm lets go: it {text}")
         elif self.phase is not BracePhase.RELEASING:
             self.phase = BracePhase.RELEASED
 
     def advance(self, elapsed: float, is_there: bool) -> None:
-        """Go on by a tick of so many seconds; `is_there`: the reference has come to `pressures`."""
+        """Advance by a tick, in s; `is_there`: whether the reference has reached `pressures`."""
         t, approach = self._tuning, self.approach
         if approach is None:
             return
@@ -147,7 +147,7 @@ class Bracing:
             self._waited = self._waited + elapsed if done else 0.0
             if self._waited >= t.settle:
                 self.phase = BracePhase.HELD
-                self._tell("braced", self._words(approach))
+                self._notify("braced", self._words(approach))
         elif self.phase is BracePhase.RELEASING:
             self._time = max(0.0, self._time - elapsed)
             if not self._time and is_there:
@@ -162,26 +162,25 @@ class Bracing:
         return f"the arm leans on {' and '.join(where)}"
 
     def look(self, elapsed: float, seen: Array, tip: TipAt, pressures: Array) -> None:
-        """Look whether the contacts hold, at a sample of the tracker.
+        """Check at a sample of the tracker whether the contacts hold.
 
-        A tip that is nearer to where the free arm would have it is in contact no more, whatever
-        pushes it.
+        If the tip is nearer to its place on a free arm, the contact is lost, whatever pushes it.
 
         Parameters
         ----------
         elapsed :
-            Since the last sample, in s.
+            Time since the last sample, in s.
         seen :
-            Position (3,) of the tip, in m.
+            Measured position (3,) of the tip, in m.
         tip :
-            Of the braced arm at the present pressures.
+            Model of the braced tip at the present pressures.
         pressures :
-            Effective ones (n,), in Pa.
+            Effective pressures (n,), in Pa.
         """
         t = self._tuning
         if self.phase is not BracePhase.HELD or self.approach is None:
             return
-        if float(np.abs(pressures - self.pressures).max()) > t.off_plan:  # they are let down
+        if float(np.abs(pressures - self.pressures).max()) > t.off_plan:  # being let down
             return
         residual = seen - tip.pose[:3, 3]
         if self._error is None:
@@ -190,9 +189,9 @@ class Bracing:
             residual - self._residual
         )
         residual = self._residual
-        apart = self.approach.free_tip - self.approach.tips[-1].pose[:3, 3]
-        distance = float(np.linalg.norm(apart))
-        share = float(residual @ apart) / max(distance, 1e-9) ** 2
+        to_free = self.approach.free_tip - self.approach.tips[-1].pose[:3, 3]
+        distance = float(np.linalg.norm(to_free))
+        share = float(residual @ to_free) / max(distance, 1e-9) ** 2
         is_free = distance > t.told_apart and share > t.free_share
         self._free = self._free + 1 if is_free else 0
         if self._free >= t.samples:
@@ -214,58 +213,58 @@ class Bracing:
         self.push = C @ np.linalg.solve(C @ C + doubt * np.eye(3), off)
         self.covariance[:] = np.linalg.inv(C @ C / t.deviation**2 + np.eye(3) / t.usual_push**2)
         self.displacement = off
-        self._looked += elapsed
-        if self._looked >= t.every:
-            self._looked = 0.0
+        self._unchecked += elapsed
+        if self._unchecked >= t.every:
+            self._unchecked = 0.0
             self._judge(self._forces(pressures))
 
     def _forces(self, pressures: Array) -> Array:
-        """Normal forces (k,) of the contacts at pressures (n,), without a push."""
+        """Return normal forces (k,) of the contacts at pressures (n,), without a push."""
         assert self.approach is not None
         hold, planned = self.approach.hold, self.approach.pressures[-1]
         found: Array = hold.forces + hold.per_pressure @ (pressures - planned)
         return found
 
     def _judge(self, before: Array) -> None:
-        """Judge whether contacts with normal forces (k,) hold the estimated push."""
+        """Judge whether the contacts hold the estimated push; `before`: normal forces (k,)."""
         assert self.approach is not None
         assert self.task.brace is not None
         hold, size = self.approach.hold, float(np.linalg.norm(self.push))
         change = hold.per_push @ self.push
         forces = before + change
-        least = int(forces.argmin())
+        weakest = int(forces.argmin())
         falls = change < 0
         left = size * float(np.min(forces[falls] / -change[falls], initial=math.inf))
         slip = float(hold.slips[int(np.argmax(hold.directions @ self.push))]) - size
         sticks = self.task.brace.contacts == "sticking"
-        self.force = float(forces[least])
+        self.force = float(forces[weakest])
         self.margin = max(min(left, slip) if sticks else left, 0.0)
         how = "lifts off" if self.force <= 0 else "slips" if sticks and slip <= 0 else ""
         self._lost = self._lost + 1 if how else 0
-        where = f"on '{self.approach.contacts[least].object}'"
+        where = f"on '{self.approach.contacts[weakest].object}'"
         words = f"under a push of {1e3 * size:.0f} mN"
         if self._lost >= self._tuning.looks:
             self.release(why=f"the contact {where} {how} {words}")
         elif slip <= 0 and not self._slips:
-            self._tell("brace-slips", f"the contact {where} slips {words}", Severity.WARNING)
+            self._notify("brace-slips", f"the contact {where} slips {words}", Severity.WARNING)
         self._slips = slip <= 0
 
-    def _tell(self, kind: str, text: str, severity: Severity = Severity.INFO) -> None:
-        self._told.append(Notice(kind, text, severity))
+    def _notify(self, kind: str, text: str, severity: Severity = Severity.INFO) -> None:
+        self._notices.append(Notice(kind, text, severity))
 
     def correct(self, elapsed: float, error: Array, jacobian: Array) -> None:
-        """Bring the braced tip to its target, slowly, with contact forces that stay as they are.
+        """Move the braced tip slowly to its target, with constant contact forces.
 
         Parameters
         ----------
         elapsed :
-            In s.
+            Time since the last call, in s.
         error :
-            Of the tip (3,), in m, zero in components that the target leaves open.
+            Of the tip (3,), in m; zero in components that the target leaves open.
         jacobian :
             Of the braced tip's position, base axes (3, n), in m/Pa.
         """
-        if self.displacement.any() or self.approach is None:  # a push is not made up for
+        if self.displacement.any() or self.approach is None:  # a push is not compensated
             return
         t = self._tuning
         rows = np.vstack([jacobian, t.force_weight * self.approach.hold.per_pressure])
@@ -275,8 +274,8 @@ class Bracing:
         self._change = np.clip(self._change + step, -t.most_change, t.most_change)
 
     def notices(self) -> tuple[Notice, ...]:
-        """Return what has happened since the last call, and what is wrong."""
-        told, self._told = tuple(self._told), []
+        """Return events since the last call, and alarms."""
+        found, self._notices = tuple(self._notices), []
         if self._why and self.phase in (BracePhase.RELEASING, BracePhase.RELEASED):
-            told = (*told, Notice("brace-lost", self._why, Severity.ERROR, standing=True))
-        return told
+            found = (*found, Notice("brace-lost", self._why, Severity.ERROR, standing=True))
+        return found

@@ -1,13 +1,13 @@
-"""What each channel can have, where its regulator does not follow: shortfalls and lost channels.
+"""Channels that do not follow their commands: shortfalls, and limited, stuck or removed channels.
 
 A channel that stays below its command by s has a leak, which its regulator may be able to feed, or
-no more pressure. Its command is raised by s, slowly, up to `most`, a share of what the pressure
-monitor tolerates. If it is still short by more, it is *limited*: the plan gets what the channel has
-as its upper bound, and the command stays just above that, where more pressure shows as soon as it
-is there. If a limited channel does not follow its command down either, it is *stuck*: the plan gets
-its pressure as a fixed value, and the command stays just below it. What the pressure monitor makes
-a fault remains one: none of these commands is above the limits, nor farther from what is read than
-it tolerates.
+no more pressure. Its command is raised by s, slowly, up to `_most`, a share of the pressure
+monitor's tolerance. If the channel is still short by more, it is *limited*: its present pressure
+becomes the plan's upper bound, and the command stays just above it, where more pressure shows as
+soon as there is some. If a limited channel does not follow its command down either, it is *stuck*:
+the plan takes its pressure as fixed, and the command stays just below it. Faults of the pressure
+monitor remain faults: none of these commands exceeds the limits, nor differs from the reading by
+more than the monitor tolerates.
 
 A channel that was *taken out* by request is let down and stays without pressure.
 """
@@ -31,24 +31,24 @@ Flags = NDArray[np.bool_]
 
 
 class Channels:
-    """Finds channels that do not follow their commands, and says what is left of them.
+    """Finds channels that do not follow their commands, and their available pressures.
 
     Parameters
     ----------
     limits :
-        Of the commands.
+        Limits of the commands.
     slew :
         Greatest rate of change (n,), in Pa/s.
     tolerance :
-        Of the pressure monitor (n,), in Pa.
+        Tolerance of the pressure monitor (n,), in Pa.
     tuning :
-        Of the regulators.
+        Tuning of the regulators.
 
     Attributes
     ----------
-    limited, stuck, out : channels (n,) that have no more pressure; that keep theirs; that were
-        taken out by request.
-    shortfall : pressures (n,) relative to commands, in Pa, positive where they are less.
+    limited, stuck, out : flags (n,) of channels that have no more pressure, that keep their
+        pressure, and that were taken out by request.
+    shortfall : commands minus settled pressures (n,), in Pa.
     """
 
     def __init__(
@@ -65,20 +65,20 @@ class Channels:
         self.begin()
 
     def begin(self) -> None:
-        """Start anew with a vented arm; what was taken out stays so."""
+        """Restart with a vented arm; channels that were taken out stay out."""
         n = self._limits.n
         self.limited: Flags = np.zeros(n, dtype=bool)
         self.stuck: Flags = np.zeros(n, dtype=bool)
         self.shortfall: Array = np.zeros(n)
-        self._allowed: Array = self._least.copy()  # to be made up for, in Pa
+        self._allowed: Array = self._least.copy()  # shortfall to compensate, in Pa
         self._has: Array = np.zeros(n)  # pressure of a limited or stuck channel, in Pa
-        self._for: Array = np.zeros((2, n))  # s for which short, and for which above
-        self._read: Array = np.zeros(n)  # without noise
+        self._for: Array = np.zeros((2, n))  # durations of being short, and too high, in s
+        self._read: Array = np.zeros(n)  # smoothed readings, in Pa
         self._ceiling: Array = np.where(self.out, self._empty, self._limits.high)
-        self._quiet = True  # whether no channel is or was short
+        self._quiet = True  # whether no channel is short, or was until now
 
     def take_out(self, channels: Iterable[int]) -> None:
-        """Do without these channels, counted from 0, from now on, and without no others."""
+        """Take exactly these channels, counted from 0, out of use."""
         chosen, n = set(channels), self._limits.n
         if wrong := sorted(c for c in chosen if not 0 <= c < n):
             raise InputError(f"there is no channel {wrong[0] + 1}; this arm has {n}")
@@ -92,14 +92,14 @@ class Channels:
 
     @property
     def lost(self) -> Flags:
-        """Channels (n,) that the plan does without, or with less than they should have."""
+        """Channels (n,) that the plan does without, or uses below their usual limit."""
         return self.limited | self.stuck | self.out
 
     def update(self, elapsed: float, command: Array, reading: Array, offset: Array) -> None:
-        """Look at commands and readings (n,), in Pa; NaN: not measured.
+        """Take in commands and readings (n,), in Pa; NaN: not measured.
 
-        `offset` (n,) are settled pressures relative to commands, `elapsed` is the time since the
-        last look, in s.
+        `offset` (n,) are settled pressures relative to commands, in Pa; `elapsed` is the time since
+        the last call, in s.
         """
         self.shortfall = -offset
         share = -math.expm1(-elapsed / self._tuning.reading_time)
@@ -141,7 +141,7 @@ class Channels:
         self.stuck = (self.stuck | stuck) & self.limited
 
     def compensated(self, offset: Array) -> Array:
-        """The part of settled pressures relative to commands (n,) that commands make up for."""
+        """Return the part of `offset` (n,), see `update`, that commands compensate, in Pa."""
         if self._quiet:
             most = above = self._least
         else:
@@ -151,7 +151,7 @@ class Channels:
         return part
 
     def available(self) -> tuple[Array, Array]:
-        """Lowest and highest pressures (n,) that channels can settle at, in Pa."""
+        """Return the lowest and highest pressures (n,) at which channels can settle, in Pa."""
         low, high = self._limits.low, self._limits.high
         if self._quiet and not self._any_out:
             return low, high
@@ -161,7 +161,10 @@ class Channels:
         return low, high
 
     def commands(self, path: Array, low: Array, high: Array) -> tuple[Array, Array]:
-        """Lowest and highest commands (n,) on the way along a path (n,), within others, in Pa."""
+        """Return the lowest and highest commands (n,) at a path's pressures (n,), in Pa.
+
+        They stay within `low` and `high` (n,).
+        """
         if not self._quiet and self.limited.any():
             above, below = self._has + self._most, self._read - self._below
             pressed = path > self._has - self._tuning.follows
@@ -176,7 +179,7 @@ class Channels:
         return low, high
 
     def notices(self) -> Iterator[Notice]:
-        """Say which channels are not what they should be."""
+        """Yield alarms about lost and leaking channels."""
         if not (self._quiet and not self._any_out) and self.lost.any():
             each = ", ".join(self._words(int(c)) for c in np.flatnonzero(self.lost))
             yield Notice("lost-channel", f"{each}; the plan goes on with the others", standing=True)

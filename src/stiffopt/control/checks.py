@@ -1,7 +1,7 @@
 """Checks of requests before they reach the control thread.
 
-They apply to all requests: of a program in Python, a client of the daemon or the command line. The
-`InputError` of a refusal names the key and, for a pressure, the channel; nothing has changed then.
+They apply to all requests: from Python, a client of the daemon or the command line. A refusal is an
+`InputError` that names the key and, for a pressure, the channel; it changes nothing.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ from stiffopt.schema import Schema
 Array = NDArray[np.float64]
 ModelT = TypeVar("ModelT", bound=Schema)
 
-_NOT_CONTENT = frozenset({"source"})  # the file that a description was read from
-_ROUNDING = 1e-6  # of a rate
-_LISTED = 5  # keys that an error names
+_IGNORED_FIELDS = frozenset({"source"})  # the file that a description was read from
+_ROUNDING = 1e-6  # relative, of a rate
+_MAX_LISTED = 5  # keys that an error names
 
 
 @contextmanager
 def refusing(what: str) -> Iterator[None]:
-    """Context that checks or prepares a thing; any error in it becomes an `InputError`.
+    """Turn any error in the body into an `InputError`: a refusal, after which nothing has changed.
 
-    Such a refusal means that nothing has changed.
+    `what` names the request in the message.
     """
     try:
         yield
@@ -51,23 +51,23 @@ def refusing(what: str) -> Iterator[None]:
 
 
 def check_task(task: Task, limits: PressureLimits) -> None:
-    """Refuse a task that is not valid or needs pressures beyond the limits."""
+    """Refuse a task that is invalid or needs pressures beyond the limits."""
     with refusing("task"):
         limited_range(validated(task, Task).pressure, limits)
 
 
 def check_target(target: Target) -> None:
-    """Refuse a target that is not valid."""
+    """Refuse a target that is invalid."""
     with refusing("target"):
         validated(target, Target)
 
 
 def check_trajectory(trajectory: Trajectory, limits: PressureLimits, slew: Array) -> None:
-    """Refuse a trajectory that is not valid, or whose pressures break limits or slew (n,)."""
+    """Refuse a trajectory that is invalid, or whose pressures break limits or slew (n,)."""
     with refusing("trajectory"):
         if not isinstance(trajectory, Trajectory):
             raise InputError(f"expected a Trajectory, not {type(trajectory).__name__}")
-        # one by one: all at once would hold Python's lock, and so the control thread, for too long
+        # one by one: all at once would keep Python's lock from the control thread for too long
         waypoints = tuple(validated(waypoint, Waypoint) for waypoint in trajectory.waypoints)
         validated(trajectory.model_copy(update={"waypoints": waypoints[:1]}), Trajectory)
         checked = Trajectory(waypoints=waypoints)
@@ -78,7 +78,7 @@ def check_trajectory(trajectory: Trajectory, limits: PressureLimits, slew: Array
 
 
 def _check_pressures(pressures: Array, limits: PressureLimits) -> None:
-    """Refuse pressures (k, n) of waypoints that are not of this arm, or beyond its limits."""
+    """Refuse waypoints' pressures (k, n) of another number of channels or beyond the limits."""
     n = pressures.shape[1]
     if n != limits.n:
         raise InputError(
@@ -94,9 +94,9 @@ def _check_pressures(pressures: Array, limits: PressureLimits) -> None:
 
 
 def check_rates(times: Array, pressures: Array, slew: Array, *, before_first: int = 0) -> None:
-    """Refuse waypoints at times (k,), in s, with pressures (k, n) that change faster than slew.
+    """Refuse waypoints at times (k,), in s, whose pressures (k, n) change faster than slew.
 
-    `before_first` of them are no waypoints: there the arm is before.
+    The first `before_first` rows are no waypoints but states of the arm before the first one.
     """
     rates = np.abs(np.diff(pressures, axis=0)) / np.diff(times)[:, None]
     for index, channel in np.argwhere(rates > slew * (1 + _ROUNDING)):
@@ -109,17 +109,17 @@ def check_rates(times: Array, pressures: Array, slew: Array, *, before_first: in
 
 
 def highest_pressures(task: Task, limits: PressureLimits) -> Array:
-    """Return the highest pressures (n,) that a task permits on a rig, in Pa."""
+    """Return the highest pressures (n,) that a task permits within the rig's limits, in Pa."""
     return np.array(limited_range(task.pressure, limits).max, dtype=float)
 
 
 def check_press(robot: Manipulator, limits: PressureLimits, task: Task) -> None:
-    """Refuse a press that the arm cannot hold within the rig's limits, or cannot feel.
+    """Refuse a press that the arm cannot exert within the rig's limits, or cannot feel.
 
     Raises
     ------
     InputError
-        It says why.
+        With the reason.
     """
     if task.press is None:
         return
@@ -132,8 +132,8 @@ def check_press(robot: Manipulator, limits: PressureLimits, task: Task) -> None:
 def limited_range(pressure: PressureRange, limits: PressureLimits) -> PressureRange:
     """Return a task's limits of pressure for each channel, completed by those of a rig.
 
-    A limit beyond the rig's by no more than `PressureLimits.slack`, by rounding, becomes the rig's;
-    one that is farther beyond, and a channel that is left no pressure, is an `InputError`.
+    Limits beyond the rig's by at most `PressureLimits.slack`, as by rounding, become the rig's.
+    `InputError`: a limit is farther beyond, or a channel has no pressure left.
     """
     lower = _bound("min", pressure.min, limits.low, limits)
     upper = _bound("max", pressure.max, limits.high, limits)
@@ -148,7 +148,7 @@ def limited_range(pressure: PressureRange, limits: PressureLimits) -> PressureRa
 def _bound(
     key: str, given: float | tuple[float | None, ...] | None, default: Array, limits: PressureLimits
 ) -> Array:
-    """Return one of a task's limits for each channel (n,), within those of the rig."""
+    """Return one of a task's limits for each channel (n,), completed by those of the rig."""
     values = np.array(given, dtype=float)  # None, no limit, becomes NaN
     if values.shape not in ((), (limits.n,)):
         raise InputError(
@@ -165,19 +165,21 @@ def _bound(
 
 
 def contents(value: Any) -> Any:
-    """Return a schema's fields as plain data, also those of a subclass, but for those of None."""
+    """Return a schema's fields, a subclass's as well, as plain data without those that are None."""
     if isinstance(value, BaseModel):
         fields = {name: getattr(value, name) for name in type(value).model_fields}
         fields |= value.model_extra or {}
         given = {name: field for name, field in fields.items() if field is not None}
-        return {name: contents(field) for name, field in given.items() if name not in _NOT_CONTENT}
+        return {
+            name: contents(field) for name, field in given.items() if name not in _IGNORED_FIELDS
+        }
     if isinstance(value, list | tuple):
         return [contents(item) for item in value]
     return value
 
 
 def differences(one: Any, other: Any, place: str = "") -> list[str]:
-    """Return the keys at which two contents differ, dotted."""
+    """Return the dotted keys at which two contents differ."""
     if isinstance(one, dict) and isinstance(other, dict):
         return [
             found
@@ -194,20 +196,20 @@ def differences(one: Any, other: Any, place: str = "") -> list[str]:
 
 
 def listed(places: list[str]) -> str:
-    """Return keys as an error names them, a few of them at most."""
-    more = f" and {len(places) - _LISTED} more" if len(places) > _LISTED else ""
-    return ", ".join(places[:_LISTED]) + more
+    """Return keys for an error message, the first few of them."""
+    more = f" and {len(places) - _MAX_LISTED} more" if len(places) > _MAX_LISTED else ""
+    return ", ".join(places[:_MAX_LISTED]) + more
 
 
 def validated(given: object, model: type[ModelT]) -> ModelT:
     """Return a description as an instance of exactly this model.
 
-    It is refused if it is no such description, a value is not valid, or a key would be lost.
+    `InputError`: it is of another type, a value is invalid, or the model would lose a key.
     """
     if not isinstance(given, model):
         raise InputError(f"expected a {model.__name__}, not {type(given).__name__}")
     plain = contents(given)
     made = model(**plain)
     if different := differences(plain, contents(made)):
-        raise InputError(f"{model.__name__}: {listed(different)}: not a value that can be had")
+        raise InputError(f"{model.__name__}: {listed(different)}: not a valid value")
     return made

@@ -1,10 +1,9 @@
 """The controller: from a task, pressure readings and tracker samples to the next pressures.
 
-It moves in the space of pressures, where every straight line between permitted pressures is
-permitted, along a smooth reference to the plan (`Reference`). It corrects at the tip, for the
-offset that the observer (`ArmObserver`) finds and the plan does not account for yet, and damps the
-vibration of the arm (`TipFeedback`). A small quadratic program (`Allocation`) combines both within
-all limits.
+It follows a smooth reference to the plan (`Reference`) in the space of pressures, where every
+straight line between permitted pressures is permitted. Feedback at the tip (`TipFeedback`) corrects
+the offset that the observer (`ArmObserver`) estimates and the plan does not account for yet, and
+damps the arm's vibration. A small quadratic program (`Allocation`) combines both within all limits.
 """
 
 from __future__ import annotations
@@ -47,8 +46,8 @@ from stiffopt.rig.settings import ControlSettings, Safety
 
 Array = NDArray[np.float64]
 
-_NORMAL = 1.959963984540054  # 97.5 % quantile
-_HELD = 2.5  # periods without a command, after which others have commanded
+_NORMAL = 1.959963984540054  # 97.5 % quantile of the normal distribution
+_HELD = 2.5  # periods without `compute`, after which others have commanded the pressures
 
 
 class TipController:
@@ -59,25 +58,25 @@ class TipController:
     robot :
         The model of the arm.
     limits :
-        Of the commands.
+        Limits of the commands.
     slew :
         Greatest rate of change (n,), in Pa/s.
     period :
-        Of the loop, in s.
+        Period of the loop, in s.
     control, safety :
         Settings of the rig.
     vibrates :
-        Whether the arm vibrates as its robot file implies, where the settings leave that open.
+        Whether to model a vibration, if the settings leave that open.
     scene :
-        What the arm has to keep clear of; None: nothing is checked.
+        Objects that the arm has to keep clear of; None: nothing is checked.
     plan_in_process :
-        Whether plans are made in a process of their own; otherwise at once, for simulated time.
+        Whether to plan in a separate process; otherwise inline, for simulated time.
     tuning :
-        Of the parts.
+        Tuning of the parts.
 
     Attributes
     ----------
-    forecast : of requests that are to be checked against the scene; None without one.
+    forecast : checks requests against the scene; None without one.
     """
 
     def __init__(
@@ -130,19 +129,19 @@ class TipController:
             self.begin(self._now)
 
     def begin(self, now: float) -> None:
-        """Start anew with a vented arm and no task."""
+        """Restart with a vented arm and no task."""
         self._now = now
         self.replanner.begin()
         self._arm.begin(now)
         self._reference.begin(np.concatenate([self._arm.pressures.command, np.zeros(6)]))
         self._feedback.begin(np.zeros(6))
-        self._permitted = self.limits.low, self.limits.high  # commands (n,), by the task
+        self._permitted = self.limits.low, self.limits.high  # commands (n,) that the task permits
         self._at_rest = True  # the reference begins at the present pressures
         self._computed_at = now
-        self._adapted_at = -math.inf  # when the model changed; not since the last request
-        self._watched_at = -math.inf  # when it was last looked whether the tip rests
+        self._adapted_at = -math.inf  # last adaptation of the model since the last request
+        self._watched_at = -math.inf  # last check whether the tip rests
         self._windows.begin()
-        self._led_to: Target | None = None  # by a trajectory of pressures, now
+        self._led_to: Target | None = None  # present target of a trajectory of pressures
 
     def set_task(self, task: Task) -> None:
         """Pursue a task; see `Controller.set_task`."""
@@ -189,7 +188,7 @@ class TipController:
     def _follow_posture(self, trajectory: Trajectory, pressures: Array, now: float) -> None:
         """Follow a trajectory of pressures (k, n) as the posture.
 
-        It begins later by the delay of the reference, which so does not cut off its beginning.
+        It begins later by the reference's delay, so that the reference does not miss its beginning.
         """
         start, n = self._start(now), pressures.shape[1]
         if self.forecast is not None:
@@ -203,9 +202,9 @@ class TipController:
         self._computed_at, self._led_to = now, None
 
     def _start(self, now: float) -> Array:
-        """Where a motion begins: pressures and the offset of the tip that goes with them (n + 6,).
+        """Return the start of a motion: pressures and the tip's offset for them (n + 6,).
 
-        That is where the reference leads, or else the pressures that are held.
+        The start is the reference's goal, or the held pressures if others have commanded them.
         """
         if not self._is_held(now):
             return self._reference.goal
@@ -215,12 +214,12 @@ class TipController:
 
     @property
     def _offset(self) -> Array:
-        """Offset of the tip (6,) that is made up for: all but what a press wants."""
+        """Offset of the tip (6,) to compensate: without the displacement that a press intends."""
         course, offset = self.replanner.pursuit.course, self._arm.tip.offset
         return course.corrected(offset) if isinstance(course, Pressing) else offset
 
     def _is_held(self, now: float) -> bool:
-        """Whether the pressures are not those that the reference leads to."""
+        """Whether the pressures are held, so that they are not the reference's."""
         return self._at_rest or now - self._computed_at > _HELD * self._period
 
     def _pursue(self, pursuit: Pursuit) -> None:
@@ -228,16 +227,17 @@ class TipController:
         permitted = pursuit.task.pressure_bounds(self.robot.description)
         self.replanner.pursue(pursuit)
         self._adapted_at = -math.inf
-        self._permitted = permitted  # last, since it cannot fail: the pursuit has changed
+        self._permitted = permitted  # last: the pursuit has changed and this cannot fail
 
     def check_ahead(self, request: Task | Target | Trajectory) -> None:
-        """Refuse what would lead the arm too near to the scene; any thread may ask."""
+        """Refuse a request that leads the arm too near to the scene; for any thread."""
         self._requests.check_ahead(request, self.forecast, self._bracing is not None)
 
     def resume(self, now: float) -> None:
-        """Control again from where the pressures are.
+        """Resume control from the present pressures.
 
-        A trajectory of pressures goes on where it was: its way is clear, a shorter one may not be.
+        A trajectory of pressures continues where it stopped: its way is clear, a shortcut may not
+        be.
         """
         course = self.replanner.pursuit.course
         pause = now - self._computed_at - self._period
@@ -277,7 +277,7 @@ class TipController:
         )  # fmt: skip
 
     def _way(self, now: float) -> Array:
-        """Effective pressures (2, n) on the reference's path now, and where that leads."""
+        """Return effective pressures (2, n): on the reference's path now, and at its goal."""
         n, goal = self.robot.n_pressures, self._start(now)
         here = goal if self._is_held(now) else self._reference.path
         return np.stack([here[:n], goal[:n]])
@@ -296,7 +296,7 @@ class TipController:
         self._press(now)
         plan = self._plan(now)
         last, n = pressures.command, len(pressures.command)
-        if plan is None:  # nothing to do, or no plan yet
+        if plan is None:  # no pursuit, or no plan yet
             self._at_rest = True
             _, high = self._arm.channels.commands(last, *self._permitted)
             return ControlOutput(np.minimum(last, high), True, np.zeros(n, dtype=bool))
@@ -308,7 +308,7 @@ class TipController:
         reference.omega = self._arm.tip.omega
         reference.advance(plan)
         if self._arm.leaning is not None:
-            return self._held_to(reference.command - pressures.command_offset, last)
+            return self._feedforward(reference.command - pressures.command_offset, last)
         tip = self._arm.compiled.path.at(reference.path[:n])
         self._arm.watch.intend(now, tip.pose[:3, 3] + reference.path[n : n + 3])
         course = self.replanner.pursuit.course
@@ -327,16 +327,16 @@ class TipController:
             return ControlOutput(last.copy(), False, self._feedback.saturated.copy())
         return ControlOutput(command, True, self._feedback.saturated.copy())
 
-    def _held_to(self, pressures: Array, last: Array) -> ControlOutput:
-        """Command pressures (n,) as they are: contacts change how the arm swings."""
-        most = self._slew * self._period
+    def _feedforward(self, pressures: Array, last: Array) -> ControlOutput:
+        """Command pressures (n,) without feedback: contacts change how the arm vibrates."""
+        step = self._slew * self._period
         low, high = self._arm.channels.commands(self._reference.path[: len(last)], *self._permitted)
-        command = np.clip(np.clip(pressures, last - most, last + most), low, high)
+        command = np.clip(np.clip(pressures, last - step, last + step), low, high)
         self._feedback.saturated = np.zeros(len(last), dtype=bool)
         return ControlOutput(command, True, self._feedback.saturated.copy())
 
     def _plan(self, now: float) -> Array | None:
-        """Pressures and offset (n + 6,) that the reference is to lead to; None without a plan."""
+        """Return the reference's next goal, pressures and offset (n + 6,); None without a plan."""
         reference, estimator, replanner = self._reference, self._arm.tip, self.replanner
         course, tuning = replanner.pursuit.course, self._tuning
         if isinstance(course, PostureCourse):
@@ -357,20 +357,20 @@ class TipController:
         return found
 
     def _brace_planned(self, course: Bracing, found: Array | None, now: float) -> Array | None:
-        """Begin a brace when its plan is there; until then the arm stays where it is."""
+        """Begin a brace once it is planned; until then the arm stays where it is."""
         plan = self.replanner.current
         if plan is None:
             return None if self._at_rest else self._start(now)
-        if plan.approach is None:  # the arm does better to keep clear of the objects
+        if plan.approach is None:  # the plan keeps clear of the objects
             self.replanner.pursue(self.replanner.pursuit.to(course.task.target))
             return found
         course.begin(plan.approach, self._start(now)[: self.robot.n_pressures])
         return self._brace(course, now)
 
     def _brace(self, course: Bracing, now: float) -> Array | None:
-        """Go on with a brace; see `_plan`. The tip's offset is left as it is."""
+        """Advance a brace; see `_plan`. The tip's offset is not compensated."""
         self._reference.slew_share = self._tuning.reference.slew_share
-        self.replanner.latest()  # an answer that nobody takes would look like a slow planner
+        self.replanner.latest()  # otherwise the planner would seem slow
         before = course.pressures
         is_there = not self._is_held(now) and self._is_near(before)
         course.advance(min(now - self._computed_at, _HELD * self._period), is_there)
@@ -386,7 +386,7 @@ class TipController:
         return np.concatenate([course.pressures, self._arm.tip.offset])
 
     def _is_near(self, pressures: Array) -> bool:
-        """Whether the reference is at rest, at pressures (n,)."""
+        """Whether the reference rests at pressures (n,)."""
         n, tuning = len(pressures), self._tuning.reference
         off = float(np.abs(self._reference.path[:n] - pressures).max())
         return off <= tuning.there and bool(
@@ -404,12 +404,12 @@ class TipController:
         course.correct(elapsed, error, tip.pose[:3, :3] @ tip.jacobian[:3])
 
     def _shift(self, change: Array) -> None:
-        """Let reference and feedback go on without a jump where the offset changes by (6,)."""
+        """Shift reference and feedback by a change of the offset (6,), without a jump."""
         self._reference.shift(change)
         self._feedback.shift(change)
 
     def _press(self, now: float) -> None:
-        """Go on with a press."""
+        """Advance a press, if there is one."""
         course, tip = self.replanner.pursuit.course, self._arm.modelled
         if not isinstance(course, Pressing) or tip is None:
             return
@@ -421,14 +421,14 @@ class TipController:
         )  # fmt: skip
 
     def _is_known(self, now: float) -> bool:
-        """Whether no change of the model's stiffness by adaptation is due."""
+        """Whether no adaptation of the model's stiffness is pending or recent."""
         if not self._adapts:
             return True
         known, calm = self.replanner.known, self._tuning.adaptation.calm_time
         return known is not None and known.proposal is None and now - self._adapted_at > calm
 
     def _adapt(self, now: float) -> None:
-        """Watch the tip at rest, and go on with other numbers of the arm when it is time."""
+        """Record the tip at rest, and adapt the model when it is time."""
         if now - self._watched_at < self._tuning.windows.every:
             return
         self._watched_at = now
@@ -443,7 +443,7 @@ class TipController:
             self._go_on_with(known.proposal)
 
     def _rests(self, now: float) -> bool:
-        """Whether the arm is at rest, steered, and seen."""
+        """Whether the arm is at rest, controlled, and seen."""
         estimator, t = self._arm.tip, self._tuning.windows
         sample = estimator.sample
         if sample is None or now - sample.time > t.seen or self._is_held(now):
@@ -455,7 +455,7 @@ class TipController:
         return float(np.abs(estimator.vibration[0]).max()) < t.vibration
 
     def _go_on_with(self, adapted: Adapted) -> None:
-        """Go on with other numbers of the arm, so that nothing moves at this moment."""
+        """Change the model's numbers so that nothing moves at this time."""
         change = self._arm.change_robot(adapted.description)
         if change is not None:
             self._shift(change)
@@ -498,7 +498,7 @@ class TipController:
         stiffness = math.nan
         if pursuit.stiffness is not None:
             stiffness = pursuit.stiffness(tip.compliance, tip.pose[:3, :3])
-        ratio = math.exp(_NORMAL * self.replanner.deviation)  # NaN if it is not known
+        ratio = math.exp(_NORMAL * self.replanner.deviation)  # NaN if unknown
         planned = np.full(n, np.nan)
         if self._led_to is not None:
             planned = self._reference.goal[:n] - self._arm.pressures.history_offset
@@ -537,7 +537,7 @@ class TipController:
         )
 
     def notices(self) -> tuple[Notice, ...]:
-        """Return what is wrong."""
+        """Return alarms and events."""
         notices = (*self.replanner.notices(self._away()), *self._arm.channels.notices())
         course = self.replanner.pursuit.course
         if isinstance(course, Pressing | Bracing):
@@ -554,7 +554,7 @@ class TipController:
         return notices
 
     def _away(self) -> tuple[float, float] | None:
-        """Distance and angle of a tip that rests on its plan from its target; else None."""
+        """Return distance and angle from the target, in m and rad, if the tip rests short of it."""
         plan, pursuit = self.replanner.plan, self.replanner.pursuit
         if plan is None or plan.reached or pursuit.course is not None or not self._has_arrived():
             return None
@@ -570,5 +570,5 @@ class TipController:
     def _model_is_wrong(self) -> bool:
         """Whether the offset is too large to be an error of this arm's model."""
         offset = self._arm.tip.offset[:3]
-        most = self._tuning.feedback.max_offset * self.robot.length
-        return float(offset @ offset) > most**2
+        limit = self._tuning.feedback.max_offset * self.robot.length
+        return float(offset @ offset) > limit**2

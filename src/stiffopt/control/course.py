@@ -1,4 +1,4 @@
-"""`Course`: the smooth interpolation of a trajectory, a target for each moment."""
+"""`Course`: the smooth interpolation of a trajectory, which gives a target at each time."""
 
 from __future__ import annotations
 
@@ -17,30 +17,30 @@ from stiffopt.paths.trajectory import Trajectory, check_times
 
 Array = NDArray[np.float64]
 
-_OPPOSITE = -0.99  # cosine between directions beyond which the way between them is ambiguous
-_SHORT = 0.05  # length of an interpolated direction below which it is ambiguous
+_OPPOSITE = -0.99  # cosine below which directions count as opposite: no unique way between them
+_SHORT = 0.05  # length below which an interpolated direction is undefined
 _BETWEEN = np.arange(1, 8) / 8  # shares of the way between waypoints at which that is checked
 
 
 class Course:
-    """A trajectory under way: a target for each moment.
+    """A trajectory under way: a target at each time.
 
     Positions, directions and quaternions follow cubic splines through the waypoints; directions and
-    quaternions are normalised. The splines are at rest at both ends, and hold there.
+    quaternions are normalised. The splines begin and end at rest, and stay at their ends.
 
     Parameters
     ----------
     trajectory :
         The waypoints.
     begin :
-        When it begins, in s.
+        Time at which it begins, in s.
     position, rotation :
-        Of the tip at that time, (3,) and (3, 3): the start, if the first waypoint is later.
+        Of the tip at that time, (3,) and (3, 3): the start if the first waypoint is later.
 
     Raises
     ------
     InputError
-        Successive waypoints have opposite directions, or no finite spline leads through them.
+        Successive waypoints have opposite directions, or no finite spline passes through them.
     """
 
     def __init__(
@@ -100,7 +100,7 @@ def _refuse_opposites(directions: list[list[float]]) -> None:
 
 
 def _nearer_signs(quaternions: list[list[float]]) -> list[list[float]]:
-    """Return quaternions, each with the sign that is nearer to the one before."""
+    """Choose the sign of each quaternion that is nearer to the last one."""
     rows = [np.array(quaternions[0])]
     for q in quaternions[1:]:
         closeness = float(rows[-1] @ np.array(q))
@@ -113,7 +113,7 @@ def _nearer_signs(quaternions: list[list[float]]) -> list[list[float]]:
 
 
 def _numbers(rows: object) -> Array:
-    """Return lists of numbers as an array; refuse anything else."""
+    """Return lists of equally many numbers as an array; refuse anything else."""
     try:
         return np.array(rows, dtype=float)
     except (TypeError, ValueError, OverflowError):
@@ -121,7 +121,7 @@ def _numbers(rows: object) -> Array:
 
 
 def _spline(knots: Array, rows: list[list[float]]) -> Callable[..., Array]:
-    """Return the spline through rows at knots: a function of one time or of many."""
+    """Return the spline through rows at knots, as a function of one or many times."""
     values = _numbers(rows)
     if not (np.isfinite(knots).all() and np.isfinite(values).all()):
         raise InputError("waypoints, and where the tip is at the beginning, must be finite")
@@ -139,7 +139,7 @@ def _spline(knots: Array, rows: list[list[float]]) -> Callable[..., Array]:
 
 
 def _checked(spline: Callable[..., Array], knots: Array) -> Callable[..., Array]:
-    """Return a spline that will be normalised; refuse it if it comes close to zero."""
+    """Return a spline that will be normalised; refuse one that passes near zero."""
     gaps = np.diff(knots)[:, None] * _BETWEEN
     between = spline((knots[:-1, None] + gaps).ravel())
     if (np.linalg.norm(between, axis=-1) < _SHORT).any():

@@ -1,19 +1,19 @@
-"""Kalman filter of the tip's pose, from pressures and a late, noisy, at times wrong tracker.
+"""Kalman filter of the tip's pose, from pressures and a late, noisy and sometimes wrong tracker.
 
-In the base frame, the tip is where the model has it at the effective pressures, plus an offset d
+In the base frame, the tip is at the model's position for the effective pressures, plus an offset d
 that changes slowly (model error, payload, creep), plus a vibration xi in the soft plane::
 
     y = s(p) + d + xi,      xi' = w - s_v',      w' = -2 zeta omega w - omega^2 xi
 
-s_v is the part of the static displacement that the first bending mode takes part in (`BendingMode`)
-and w the speed of that mode. The orientation has an offset of its own, and turns with the
-vibration.
+s_v is the part of the static displacement in which the first bending mode takes part
+(`BendingMode`), and w the speed of that mode. The orientation has an offset of its own, and turns
+with the vibration.
 
 The vibration is the sum of a driven one, which the pressures excite from rest, and a free one,
-which samples correct. A sample is compared with the state at its capture: with the driven vibration
-of that moment, and with the free one propagated back to it. The correction is propagated to the
-present, which for a linear system equals filtering again from the time of capture. The model's
-error grows with the tip's displacement, and so does the process noise of d and xi.
+which samples correct. A sample is compared with the state at its capture: the driven vibration of
+that time, and the free one propagated back to it. The correction is propagated to the present,
+which for a linear system equals filtering again from the time of capture. The model's error grows
+with the tip's displacement, and so does the process noise of d and xi.
 """
 
 from __future__ import annotations
@@ -39,12 +39,12 @@ from stiffopt.rig.interface import PoseSample
 Array = NDArray[np.float64]
 Symbols = Any  # of CasADi
 
-_MODE_EVERY = 8  # steps; frequency and soft plane change slowly
+_MODE_EVERY = 8  # steps between updates of frequency and soft plane, which change slowly
 _NO_ROTATION = (1.0, 0.0, 0.0, 0.0)
 
 
 class _PastTip(NamedTuple):
-    """The tip that the pressures alone account for, at one moment."""
+    """The tip at one time as the pressures alone predict it."""
 
     time: float
     static: Array  # (3,)
@@ -76,7 +76,7 @@ class TipEstimator:
     Parameters
     ----------
     period :
-        Of the steps, in s.
+        Duration of a step, in s.
     n :
         Number of channels.
     mode :
@@ -94,11 +94,11 @@ class TipEstimator:
         self._correct = _correction(tuning, mode is not None)
         self._orientation = _orientation()
         self.omega = math.inf  # of the vibration, in rad/s; infinite before it is known
-        self._times = np.array([1.0, period])  # omega, and since the step before
+        self._times = np.array([1.0, period])  # omega, and duration of the step
         self.begin()
 
     def begin(self) -> None:
-        """Start anew, with an arm at rest."""
+        """Restart with an arm at rest."""
         self._past.clear()
         self._free = np.zeros((2, 3))
         self.offset = np.zeros(6)  # tip pose relative to the model's: d in m, and a rotation vector
@@ -107,14 +107,15 @@ class TipEstimator:
         self._pressures: Array | None = None
         deviations = (0.1, 0.05, 0.1) if self._mode is not None else (0.0, 0.0, 0.1)
         self._covariance = np.diag(np.square(deviations))  # of xi, w, d in the soft plane
-        # of d along the stiff axis, and of the orientation's offset
+        # variances of d along the stiff axis and of the orientation's offset
         self._variances = np.array([deviations[2] ** 2, 0.5**2])
-        self._displacements = np.zeros(2)  # of the model's tip, and of what drives the vibration
+        # path lengths since the last sample, of the model's tip and of the mode's excitation
+        self._displacements = np.zeros(2)
         self._used_until = -math.inf
         self._ticks = 0
         self.sample: PoseSample | None = None  # the latest that was used
-        self.predicted: Array = np.zeros(3)  # for the moment of its capture, offset left out
-        self.swing = 0.0  # amplitudes of both vibrations then, in m
+        self.predicted: Array = np.zeros(3)  # position at its capture without the offset
+        self.swing = 0.0  # sum of the amplitudes of both vibrations at that time, in m
         self._first: PoseSample | None = None
         self._unchanged: tuple[Array, Array] | None = None  # a sample, and the model's tip with it
         self._last_sample, self._rejected = -math.inf, 0
@@ -145,9 +146,9 @@ class TipEstimator:
         return self.sample is not None and self.sample.quaternion is not None
 
     def advance(self, now: float, pressures: Array, tip: TipAt) -> None:
-        """Predict the state at the end of a step, at a time in s.
+        """Predict the state at the end of a step, at the time `now`, in s.
 
-        Pressures (n,) are effective ones, in Pa, and `tip` is the model's tip there.
+        `pressures` (n,) are effective ones, in Pa; `tip` is the model's tip there.
         """
         if self._mode is not None:
             self._update_mode(tip)
@@ -168,15 +169,15 @@ class TipEstimator:
     def take(self, samples: Sequence[PoseSample]) -> SampleCounts:
         """Correct the state by samples, each at the time of its capture.
 
-        Samples are left out that are older than the newest that was used or than the memory, that
-        did not see the tip, or that repeat a pose to the last digit although the arm has moved.
+        Samples are ignored if they are older than the newest that was used or than the memory, if
+        they did not see the tip, or if they repeat a pose exactly although the arm has moved.
         """
         used = rejected = 0
         for sample in samples:
             if not sample.visible or not self._past:
                 continue
             if not self._used_until < sample.time <= self._past[-1].time + self._period:
-                continue  # old, from the future, or NaN
+                continue  # too old, from the future, or NaN
             past = self._past_at(sample.time)
             if past is None or self._is_frozen(sample, past):
                 continue
@@ -192,10 +193,10 @@ class TipEstimator:
         return SampleCounts(used, rejected, self._used_until)
 
     def change_model(self, before: TipAt, after: TipAt) -> Array:
-        """Go on with another model, of which the tip is `after` where that of the last was.
+        """Change to another model, whose tip is `after` where the last model's tip is `before`.
 
-        The estimated tip stays where it is: the offset takes up the difference, which is returned
-        (6,), in m and rad.
+        The estimated tip stays where it is: the offset takes up the difference. Return the change
+        of the offset (6,), in m and rad.
         """
         shift = after.pose[:3, 3] - before.pose[:3, 3]
         turn = after.pose[:3, :3] @ before.pose[:3, :3].T
@@ -215,13 +216,13 @@ class TipEstimator:
         return change
 
     def set_frequency(self, omega: float, tip: TipAt) -> None:
-        """Let the mode have a frequency, in rad/s, where the model's tip is this one."""
+        """Set the mode's frequency, in rad/s, at the configuration of the model's tip `tip`."""
         if self._mode is not None:
             compliances = np.linalg.eigvalsh(tip.compliance[:3, :3])
             self._mode = self._mode.at_frequency(omega, lateral_stiffness(compliances))
 
     def _update_mode(self, tip: TipAt) -> None:
-        """Compute frequency, soft plane and lean from the compliance, every few steps."""
+        """Update frequency, soft plane and lean from the compliance, every few steps."""
         self._ticks += 1
         if self._ticks % _MODE_EVERY != 1 or self._mode is None:
             return
@@ -238,17 +239,17 @@ class TipEstimator:
         self._lean = turning @ axes[:, 1:] @ np.diag(1 / compliances[1:]) @ axes[:, 1:].T
 
     def _amplitude(self, vibration: Array) -> float:
-        """Amplitude of a vibration (2, 3), in m."""
+        """Return the amplitude of a vibration (2, 3), in m."""
         return math.hypot(*vibration[0].tolist(), *(vibration[1] / self.omega).tolist())
 
     def _transition(self, duration: float) -> Array:
-        """Transition matrix (2, 2) of the free vibration over a duration in s."""
+        """Return the transition matrix (2, 2) of the free vibration over a duration in s."""
         if not math.isfinite(self.omega):
             return np.eye(2)
         return np.array(transition(self.omega, self._tuning.damping, duration))
 
     def _past_at(self, time: float) -> _PastTip | None:
-        """Interpolate the past at a moment; None if it is older than the memory."""
+        """Interpolate the past at a time; None if it is older than the memory."""
         past = self._past
         if time < past[0].time:
             return None
@@ -268,8 +269,8 @@ class TipEstimator:
         )
 
     def _is_plausible(self, sample: PoseSample, past: _PastTip) -> bool:
-        """Whether the tip can have come there since the last sample, or is expected there."""
-        if self.sample is None:  # the first is used once a second one agrees
+        """Whether the tip can have moved there since the last sample, or is expected there."""
+        if self.sample is None:  # use the first one once a second one agrees
             before, self._first = self._first, sample
             return before is not None and self._is_near(sample, before.position, before.time)
         if self._is_near(sample, self.sample.position, self._last_sample):
@@ -279,13 +280,13 @@ class TipEstimator:
         return self._is_near(sample, expected, self._last_sample)
 
     def _is_near(self, sample: PoseSample, position: Array, since: float) -> bool:
-        """Whether a tip that was at a position (3,) at a time can have come to the sample's."""
+        """Whether a tip at a position (3,) at a time `since` can have reached the sample's."""
         elapsed = min(sample.time - since, self._tuning.longest_gap)
         reach = self._tuning.max_speed * elapsed + 10 * self._tuning.noise
         return math.dist(sample.position, position) <= reach
 
     def _is_frozen(self, sample: PoseSample, past: _PastTip) -> bool:
-        """Whether a tracker repeats a position although the model's tip has moved."""
+        """Whether the tracker repeats a position although the model's tip has moved."""
         if self._unchanged is None or (sample.position != self._unchanged[0]).any():
             self._unchanged = sample.position, past.static
             return False
@@ -311,9 +312,9 @@ class TipEstimator:
 
 
 def _prediction(mode: BendingMode | None, n: int, damping: float) -> Formula:
-    """One step of the state.
+    """Return the formula of one step of the state.
 
-    Inputs: pose (4, 4) and Jacobian (6, n) of the model's tip, its position (3,) before, driven and
+    Inputs: pose (4, 4) and Jacobian (6, n) of the model's tip, its last position (3,), driven and
     free vibration (2, 3), soft plane (3, 3), change of the pressures (n,), (omega, duration).
     Outputs: position (3,), both vibrations, and the displacements (2,) of tip and mode.
     """
@@ -324,7 +325,7 @@ def _prediction(mode: BendingMode | None, n: int, damping: float) -> Formula:
     position, excitation = pose[:3, 3], ca.SX.zeros(3)
     driven_after, free_after = driven, free
     if mode is not None:
-        # half of the excitation acts before the step, half after it
+        # half of the excitation acts at the beginning of the step, half at its end
         excitation = soft_plane @ (
             pose[:3, :3] @ (jacobian[:3, :] @ (ca.DM(mode.participation) * change))
         )
@@ -337,12 +338,12 @@ def _prediction(mode: BendingMode | None, n: int, damping: float) -> Formula:
 
 
 def _correction(tuning: EstimatorTuning, vibrates: bool) -> Formula:
-    """The measurement update by one sample.
+    """Return the formula of the measurement update by one sample.
 
-    Inputs, at the capture: the model's position (3,) and rotation (3, 3), driven vibration (2, 3).
+    Inputs at the capture: the model's position (3,) and rotation (3, 3), driven vibration (2, 3).
     Now: free vibration (2, 3), offset and turn (3,), soft plane and lean (3, 3), covariance (3, 3)
     of xi, w and d in the soft plane, variances (2,) of d along the stiff axis and of the turn.
-    Of the sample: (age, time since the one before, omega), displacements (2,) since then, position
+    Of the sample: (age, time since the last sample, omega), displacements (2,) since then, position
     (3,), quaternion (4,), and 1 if it has one. Outputs: free vibration, offset, turn, covariance
     and variances.
     """
@@ -357,7 +358,7 @@ def _correction(tuning: EstimatorTuning, vibrates: bool) -> Formula:
     has_orientation = ca.SX.sym("has_orientation")
     age, elapsed, omega = times[0], times[1], times[2]
 
-    # process noise, of the time since the last sample and the displacement since then
+    # process noise, from the time and the displacement since the last sample
     model_error = (t.model_error * displacements[0]) ** 2
     drift = t.drift**2 * elapsed + model_error
     length = ca.fmax(1e-3, ca.norm_2(static))
@@ -404,7 +405,7 @@ def _correction(tuning: EstimatorTuning, vibrates: bool) -> Formula:
 
 
 def _orientation() -> Formula:
-    """Rotation (3, 3) and quaternion (4,) of the tip.
+    """Return the formula of the tip's rotation (3, 3) and quaternion (4,).
 
     Inputs: offset of the orientation (3,), lean (3, 3), vibration (3,), the model's rotation (3,
     3).
@@ -417,5 +418,5 @@ def _orientation() -> Formula:
 
 
 def _rotation(vector: Symbols) -> Symbols:
-    """Rotation (3, 3) by a rotation vector (3,)."""
+    """Return the rotation (3, 3) of a rotation vector (3,)."""
     return lie.exp(ca.vertcat(ca.SX.zeros(3), vector))[:3, :3]

@@ -1,8 +1,8 @@
 """The linear feedback law at the tip, as rows of a linear system in the pressures.
 
-Relative to the reference, the tip is to move by the correction: the offset that the reference was
-planned with, less the offset estimated now. The vibration of an arm is damped as well. In each axis
-of the soft plane, relative to the reference, it obeys ::
+Relative to the reference, the tip is to move by the correction: the offset that the plan accounts
+for minus the offset estimated now. Feedback also damps the arm's vibration. In each axis of the
+soft plane, relative to the reference, it obeys ::
 
     tau sigma' = u - sigma                       the mode's static displacement, behind regulators
     epsilon'' = -2 zeta omega epsilon' - omega^2 (epsilon - sigma)                        the tip
@@ -11,8 +11,8 @@ and the linear-quadratic regulator ``v = -K (sigma, epsilon, epsilon')`` that mi
 ``int epsilon^2 + effort u^2`` brings it to rest.
 
 Channels of different segments excite the mode differently for the same motion of the tip. At the
-limits of pressure, rows for the tip alone could drive the mode the wrong way, so that it has rows
-of its own.
+limits of pressure, rows for the tip alone could excite the mode instead of damping it, so the mode
+has rows of its own.
 """
 
 from __future__ import annotations
@@ -32,26 +32,29 @@ from stiffopt.optimise.target import Target
 Array = NDArray[np.float64]
 Symbols = Any  # of CasADi
 
-_FREQUENCIES = np.geomspace(2.0, 200.0, 60)  # rad/s, at which gains are tabulated
+_FREQUENCIES = np.geomspace(2.0, 200.0, 60)  # rad/s, of the table of gains
 
 
 @dataclass(frozen=True)
 class TrackingRows:
     """Rows J and values v, in m, of a system J (p - r) = v in pressures p near the reference r.
 
-    They are symbolic, for `Allocation` to make one formula of them and its own terms.
+    They are symbolic: `Allocation` combines them with its own terms in one formula.
     """
 
     inputs: list[Symbols]  # see `tracking_rows`
-    matrices: list[Symbols]  # those of them that have one column per channel
+    matrices: list[Symbols]  # the inputs that have one column per channel
     rows: Symbols  # J (t, n)
     values: Symbols  # v (t,)
     linear: Symbols  # Jacobian (3, n) of the tip's position, base axes, in m/Pa
-    task_rows: int  # number of the first rows, which are the task's
+    task_rows: int  # number of rows of the task; they come first
 
 
 def prescribed_components(target: Target) -> Array:
-    """1 for components (5,) that a target prescribes, else 0: x, y, z, pointing, orientation."""
+    """Return 1 for each component (5,) that a target prescribes, 0 for others.
+
+    The components are x, y, z, pointing and orientation.
+    """
     position = target.position or (None, None, None)
     components = [*position, target.pointing, target.orientation]
     return np.array([float(component is not None) for component in components])
@@ -68,13 +71,13 @@ def tracking_rows(
 
     Its inputs are pose (4, 4) and Jacobian (6, n) of the tip on the reference, as `TipModel` gives
     them; the components that the target prescribes (5,), see `prescribed_components`; and the
-    correction of the tip (6,) in base axes, in m and as a rotation vector. Angles count as
-    displacements at the end of `FeedbackTuning.lever`.
+    correction of the tip (6,) in base axes, in m and as a rotation vector. `FeedbackTuning.lever`
+    converts angles to displacements.
 
-    For an arm that vibrates they are also: its vibration and the speed of that (2, 3); the soft
-    plane (3, 3); omega, in rad/s; gains K (3,), see `GainSchedule`; the effective pressures (n,) a
-    dead time from now; those that the reference has in the chambers then; those on its path; and
-    the rate of the latter (n,).
+    For an arm that vibrates there are also: its vibration and the vibration's speed (2, 3); the
+    soft plane (3, 3); omega, in rad/s; gains K (3,), see `GainSchedule`; the effective pressures
+    (n,) a dead time from now; those that the reference has in the chambers then; those on the
+    reference's path; the rate of the latter (n,); and the vibration intended, as the first (2, 3).
 
     Parameters
     ----------
@@ -124,7 +127,7 @@ def tracking_rows(
 class GainSchedule:
     """Gains K (3,) of the linear-quadratic regulator over the frequency of the vibration.
 
-    The arguments are those of `lqr_gains`.
+    The parameters are those of `lqr_gains`.
     """
 
     def __init__(self, period: float, lag: float, damping: float, effort: float) -> None:
@@ -134,7 +137,7 @@ class GainSchedule:
         self._last: tuple[float, Array] = (-1.0, np.zeros(3))
 
     def at(self, omega: float) -> Array:
-        """Gains (3,) at an angular frequency in rad/s; the last one in s."""
+        """Return gains (3,) at an angular frequency in rad/s; the last gain is in s."""
         if omega != self._last[0]:
             columns = [np.interp(omega, _FREQUENCIES, column) for column in self._table.T]
             self._last = omega, np.array(columns)
@@ -142,9 +145,10 @@ class GainSchedule:
 
 
 def lqr_gains(omega: float, damping: float, lag: float, period: float, effort: float) -> Array:
-    """Gains (3,) of the linear-quadratic regulator at one frequency, sampled at the loop's period.
+    """Return gains (3,) of the linear-quadratic regulator, sampled at the loop's period.
 
-    The arm has an angular frequency, in rad/s, and a damping ratio, its regulators a lag, in s.
+    `omega` is the vibration's angular frequency, in rad/s, `damping` its damping ratio; `lag` is
+    that of the regulators, in s, and `period` the loop's, in s.
     """
     A = np.array(
         [[-1 / lag, 0, 0], [0, 0, 1], [omega**2, -(omega**2), -2 * damping * omega]], dtype=float

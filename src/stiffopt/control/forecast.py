@@ -1,8 +1,8 @@
-"""`Forecast`: where a request would lead the arm, and whether the way there is clear of the scene.
+"""`Forecast`: checks before a request is accepted that the arm's way there is clear of the scene.
 
-It is asked before a request is accepted, in the thread of whoever makes it, and plans in a process
-of its own as the controller does. What the controller then plans is checked again (`Planning`), and
-each command is watched (`ClearanceWatch`).
+It runs in the thread of the client, and plans in a separate process, as the controller would. The
+plans that the controller makes later are checked again (`Planning`), and `ClearanceWatch` checks
+each command.
 """
 
 from __future__ import annotations
@@ -30,21 +30,21 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Present:
-    """Where the controller is."""
+    """The state of the controller that a forecast starts from."""
 
     pursuit: Pursuit
     plan: Plan | None
-    way: Array  # effective pressures (2, n): on the reference's path, and where that leads
+    way: Array  # effective pressures (2, n): on the reference's path, and at its goal
     offset: Array  # of the tip (6,), see `PlanRequest`
-    pressure_offset: Array  # (n,), likewise
-    available: tuple[Array, Array]  # lowest and highest (n,), likewise
-    adapted: Adapted | None  # the arm, likewise
+    pressure_offset: Array  # (n,), see `PlanRequest`
+    available: tuple[Array, Array]  # lowest and highest (n,), see `PlanRequest`
+    adapted: Adapted | None  # the present model
     position: Array  # of the tip (3,)
     rotation: Array  # (3, 3)
 
 
 class Forecast:
-    """Refuses what would lead an arm too near to its scene. Any thread may ask."""
+    """Refuses requests that lead the arm too near to its scene. Any thread may call it."""
 
     def __init__(self, planner: InlinePlanner | ProcessPlanner, tuning: ForecastTuning) -> None:
         self._planner, self._tuning = planner, tuning
@@ -53,10 +53,10 @@ class Forecast:
         self._serial, self._pursued = 0, Pursuit()
         self._checked: tuple[Trajectory, Array] | None = None
         self.present: Present | None = None
-        """What the control thread has said last."""
+        """Set by the control thread in each tick."""
 
     def check(self, pursuit: Pursuit) -> None:
-        """Refuse a pursuit of a target or a trajectory of targets; `CommandError` says why."""
+        """Refuse a target or a trajectory of targets that is blocked, by a `CommandError`."""
         with self._lock:
             here, self._deadline = self.here(), time.monotonic() + self._tuning.patience
             if isinstance(pursuit.course, Course):
@@ -65,7 +65,7 @@ class Forecast:
                 self._plan(pursuit, here, here.plan, here.way, pursuit.target)
 
     def check_posture(self, trajectory: Trajectory, pressures: Array) -> None:
-        """Refuse a trajectory of pressures (k, n); `CommandError` says why."""
+        """Refuse a trajectory of pressures (k, n) that is blocked, by a `CommandError`."""
         with self._lock:
             here, self._deadline = self.here(), time.monotonic() + self._tuning.patience
             way = np.vstack([here.way[-1:], pressures])
@@ -77,7 +77,7 @@ class Forecast:
             self._checked = trajectory, here.way[-1]
 
     def confirm(self, trajectory: Trajectory, start: Array) -> None:
-        """Refuse a trajectory of pressures that was not checked from where it begins now (n,)."""
+        """Refuse a trajectory of pressures unless it was checked from the present start (n,)."""
         checked = self._checked
         if checked is None or checked[0] is not trajectory:
             raise CommandError("the way of this trajectory has not been checked; send it again")
@@ -92,7 +92,7 @@ class Forecast:
         self._planner.close()
 
     def _check_course(self, pursuit: Pursuit, course: Course, here: Present) -> None:
-        """Check a trajectory of targets, as the plans for moments close to each other go."""
+        """Check a trajectory of targets by successive plans for targets close to each other."""
         tuning = self._tuning
         times = np.linspace(course.begin, course.end, tuning.most)
         targets = [course.at(time) for time in times]
@@ -109,7 +109,7 @@ class Forecast:
     def _plan(
         self, pursuit: Pursuit, here: Present, last: Plan | None, way: Array, target: Target | None
     ) -> Plan:
-        """Plan for a target, and refuse if the way from the last plan is blocked."""
+        """Plan for a target; refuse if the way from the last plan is blocked."""
         if pursuit.is_new_after(self._pursued):
             self._serial += 1
         self._pursued = pursuit
@@ -126,13 +126,13 @@ class Forecast:
         return plan
 
     def here(self) -> Present:
-        """Where the controller is; `CommandError` if that is not known yet."""
+        """Return the controller's present state; `CommandError` if it is not known yet."""
         if self.present is None:
             raise CommandError("it is not known yet where the arm is; ask again")
         return self.present
 
     def _answer(self, request: PlanRequest) -> Plan:
-        """Wait for the planner; its plan has the very offset of the request."""
+        """Wait for the planner's answer, which has the same offset object as the request."""
         requester, planner = current_requester(), self._planner
         failures = planner.failures
         planner.request(request)

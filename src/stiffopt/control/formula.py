@@ -1,7 +1,7 @@
-"""Small formulas that are evaluated in every tick, compiled to CasADi's virtual machine.
+"""Small formulas that every tick evaluates, compiled for CasADi's virtual machine.
 
-It runs a hundred operations in the time of one NumPy call; with NumPy alone a tick would take most
-of a period of 2 ms.
+The virtual machine runs a hundred operations in the time of one NumPy call. With NumPy, a tick
+would take most of a period of 2 ms.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ Array = NDArray[np.float64]
 class Formula:
     """A function of arrays, given by CasADi symbols and expressions; for one thread at a time.
 
-    Columns (k, 1) are passed and returned as (k,), scalars are returned as (1,).
+    Columns (k, 1) are passed and returned as (k,); scalars are returned as (1,).
 
     Parameters
     ----------
     inputs, outputs :
         Symbols, and expressions of them.
     matrices :
-        Those of them that remain matrices even with a single column, such as a Jacobian with one
-        column per channel.
+        Inputs and outputs that stay matrices even with a single column, such as a Jacobian with
+        one column per channel.
     """
 
     def __init__(

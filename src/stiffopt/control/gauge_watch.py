@@ -1,4 +1,4 @@
-"""Whether the gauges of the vented arm are alive: dead ones must not be trusted under pressure."""
+"""Checks on the vented arm that its gauges are alive: dead ones are unsafe under pressure."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from stiffopt.rig.interface import PressureReading
 
 Array = NDArray[np.float64]
 
-_KEPT = 200  # readings
-_ENOUGH = 30  # of them, before anything is said
+_WINDOW = 200  # readings
+_ENOUGH = 30  # readings, before the gauges are judged
 
 
 class GaugeWatch:
-    """Keeps the latest readings of a vented arm.
+    """Keeps the latest readings of a vented arm, and finds dead gauges in them.
 
-    A gauge that reads nothing is dead where the rig file says that there is one. One that reads the
-    very same number all the time is dead if that is not 0, which converters that cannot say less
-    read of a vented arm, or if it was commissioned and had noise then.
+    A gauge that the rig file declares is dead if it reads nothing. One that always reads exactly
+    the same number is dead if that number is not 0, or if the gauge had noise when it was
+    commissioned. A constant 0 alone is no proof: some converters read 0 at a vented arm.
     """
 
     def __init__(self) -> None:
-        self._readings: deque[Array] = deque(maxlen=_KEPT)
+        self._readings: deque[Array] = deque(maxlen=_WINDOW)
         self._time = -np.inf
 
     def learn(self, reading: PressureReading) -> None:
@@ -35,11 +35,11 @@ class GaugeWatch:
             self._readings.append(reading.pressures)
 
     def forget(self) -> None:
-        """Start over: the arm was under pressure."""
+        """Discard all readings: the arm was under pressure."""
         self._readings.clear()
 
     def dead(self, measured: Sequence[bool], noisy: Sequence[bool]) -> Iterator[str]:
-        """Yield what is wrong with the gauges.
+        """Yield the problems of the gauges.
 
         Parameters
         ----------

@@ -1,7 +1,7 @@
-"""The interface between the supervisor of the control loop and the controller that it runs.
+"""The interface between the control loop's supervisor and the controller that it runs.
 
-The supervisor keeps the arm safe whatever the controller does; the controller decides on pressures
-and need not know of states, faults or devices. `TipController` implements it, and so do the
+The supervisor keeps the arm safe whatever the controller does. The controller decides on pressures;
+it needs no knowledge of states, faults or devices. `TipController` implements it, and so do the
 baselines of the closed-loop benchmark.
 """
 
@@ -28,8 +28,8 @@ class SampleCounts:
     """How many of a tick's tracker samples were used."""
 
     used: int  # plausible samples, late ones included
-    rejected: int  # samples to which no arm could have moved
-    latest: float  # capture time of the newest used so far, in s; minus infinity before it
+    rejected: int  # samples too far away for any motion of the arm
+    latest: float  # capture time of the newest used so far, in s; minus infinity before any
 
 
 @dataclass(frozen=True)
@@ -37,11 +37,11 @@ class ControlOutput:
     """The command that a controller computes in a tick."""
 
     pressures: Array  # (n,), in Pa
-    valid: bool  # whether they are a solution; else the solver failed and they are the last ones
+    valid: bool  # False: the solver failed, and the pressures are the last ones
     saturated: NDArray[np.bool_]  # channels (n,) at a limit that keeps the tip from its target
     # effective pressures (n,) to which the command leads, in Pa; None: the command
     posture: Array | None = None
-    leans: bool = False  # whether the arm may touch objects of the scene: a brace's own checks hold
+    leans: bool = False  # whether the arm may touch objects: then the brace checks its contacts
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Notice:
     text: str  # a sentence for people
     severity: Severity = Severity.WARNING  # how bad it is
     standing: bool = False  # an alarm while the controller repeats it; otherwise an event
-    hold: bool = False  # whether the pressures are to be held until there is a new task
+    hold: bool = False  # whether to hold the pressures until there is a new task
 
 
 class Controller(Protocol):
@@ -62,10 +62,10 @@ class Controller(Protocol):
         """Compile the model; raise `InputError` if model or settings do not permit control."""
 
     def begin(self, now: float) -> None:
-        """Start anew with a vented arm and without a task, which means to keep the pressures."""
+        """Restart with a vented arm and no task: the pressures stay."""
 
     def set_task(self, task: Task) -> None:
-        """Pursue a task from now on; raise `InputError`, changing nothing, if it is not valid."""
+        """Pursue a task from now on; raise `InputError`, changing nothing, if it is invalid."""
 
     def set_target(self, target: Target) -> None:
         """Go to another target, with the stiffness goal and limits of the task; the same errors."""
@@ -74,16 +74,16 @@ class Controller(Protocol):
         """Follow a trajectory that begins now; the same errors."""
 
     def set_channels(self, without: Sequence[int]) -> None:
-        """Do without some channels, counted from 0, from now on, and without no others."""
+        """Take exactly these channels, counted from 0, out of use."""
 
     def check_ahead(self, request: Task | Target | Trajectory) -> None:
         """Raise `InputError` if the way there is not clear of the rig's scene.
 
-        Called from the threads of those who ask, before the request is handed over.
+        The client's thread calls this before it hands the request over.
         """
 
     def resume(self, now: float) -> None:
-        """Control again after others have commanded the pressures, without a jump."""
+        """Resume control, without a jump, after others have commanded the pressures."""
 
     def observe(
         self,
@@ -92,16 +92,16 @@ class Controller(Protocol):
         reading: PressureReading,
         samples: Sequence[PoseSample],
     ) -> SampleCounts:
-        """Take in the set-points (n,) since the last tick, pressures and samples; in every tick."""
+        """Take in set-points (n,) since the last tick, pressures and samples; in every tick."""
 
     def compute(self, now: float) -> ControlOutput:
-        """Return the next command, within all limits; in the ticks in which it is active."""
+        """Return the next command, within all limits; only in ticks in the state `active`."""
 
     def status(self, now: float) -> ControllerStatus:
         """Return the controller's part of the state."""
 
     def notices(self) -> tuple[Notice, ...]:
-        """Return the alarms that stand, and the events since the last call."""
+        """Return standing alarms, and events since the last call."""
 
     def close(self) -> None:
         """End the processes of the controller."""

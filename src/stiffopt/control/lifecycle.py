@@ -1,4 +1,4 @@
-"""The life of a control loop: its states and transitions, and its record of events and alarms."""
+"""Life cycle of the control loop: its states and transitions, its events and alarms."""
 
 from __future__ import annotations
 
@@ -44,15 +44,15 @@ _ADVICE = {
 class Lifecycle:
     """The state of a control loop.
 
-    `in_real_time`: ticks have deadlines, so no code is compiled in the background while it is
-    armed.
+    With `in_real_time`, ticks have deadlines, so no code is compiled in the background while the
+    loop is armed.
     """
 
     def __init__(self, *, in_real_time: bool = False) -> None:
         self.in_real_time = in_real_time
         self.state = State.UNCONFIGURED
-        self.reason = ""  # for the state, where nobody requested it
-        self._no_compiler = ExitStack()  # begins in the background while the arm is armed
+        self.reason = ""  # for a state that nobody requested
+        self._no_compiler = ExitStack()  # open while the arm is armed
 
     @property
     def armed(self) -> bool:
@@ -60,7 +60,7 @@ class Lifecycle:
         return self.state in ARMED
 
     def change(self, state: State, reason: str = "") -> None:
-        """Go to another state; `CommandError` if there is no such transition."""
+        """Change the state; `CommandError` if there is no such transition."""
         if state not in _TRANSITIONS[self.state]:
             raise CommandError(f"{state} cannot follow {self.state}")
         was_armed = self.armed
@@ -71,7 +71,7 @@ class Lifecycle:
             self._no_compiler.close()
 
     def permit(self, request: str) -> None:
-        """Refuse a request that the state does not permit, and say what to do instead."""
+        """Refuse a request that the state does not permit, with advice."""
         if self.state not in _REQUESTS[request]:
             advice = _ADVICE[self.state] if request != "reset" else "there is no fault"
             why = f" ({self.reason})" if self.state is State.FAULT else ""
@@ -79,7 +79,7 @@ class Lifecycle:
 
 
 class EventBuffer:
-    """The latest `size` events, in the order in which they happened; for all threads."""
+    """The latest `size` events, in order; safe for threads."""
 
     def __init__(self, size: int = 10_000) -> None:
         self._events: deque[Event] = deque(maxlen=size)
@@ -93,9 +93,9 @@ class EventBuffer:
             self._count += 1
 
     def since(self, index: int) -> tuple[list[Event], int]:
-        """Return the events from an index on, as far as the buffer has them, and the next index.
+        """Return the events from an index on that the buffer still has, and the next index.
 
-        The index is 0 at first, and then that which the last call has returned.
+        The first index is 0; later ones are those that the last call returned.
         """
         with self._lock:
             new = min(max(self._count - index, 0), len(self._events))
@@ -104,9 +104,9 @@ class EventBuffer:
 
 
 class Alarms:
-    """The alarms that stand `now`, one of each kind; setting or clearing one is an event.
+    """The present alarms (`now`), one of each kind; setting or clearing one is an event.
 
-    For all threads.
+    Safe for threads.
     """
 
     def __init__(self, events: EventBuffer) -> None:
@@ -128,7 +128,7 @@ class Alarms:
             self._events.add(time, kind, text, severity)
 
     def clear(self, time: float, kind: str) -> None:
-        """Clear the alarm of a kind, if it stands."""
+        """Clear the alarm of a kind, if it is set."""
         if kind not in self._standing:
             return
         with self._lock:

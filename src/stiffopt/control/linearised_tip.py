@@ -1,7 +1,7 @@
-"""The model of the arm in the loop: its tip, linearised where it was evaluated last.
+"""The model of the arm in the loop: its tip, linearised about the last point of evaluation.
 
-The loaded model takes a good part of a tick. Between two ticks pressures change little, so that it
-is evaluated only where they have left the range in which its linearisation is good enough.
+The loaded model takes a good part of a tick. Pressures change little between ticks, so the model is
+evaluated only when they leave the range in which its linearisation is accurate enough.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ Array = NDArray[np.float64]
 
 
 class LeaningTip:
-    """The tip of an arm on its way into contact, of equilibria that were found before.
+    """The tip of an arm on its way into contact, from equilibria that were computed before.
 
     Parameters
     ----------
     approach :
-        The way into contact. Pressures off this way take the model of its nearest equilibrium.
+        The way into contact. Pressures beside it use the model of its nearest equilibrium.
     """
 
     def __init__(self, approach: BraceApproach) -> None:
@@ -33,7 +33,7 @@ class LeaningTip:
         self._along = end / float(end @ end)
 
     def at(self, pressures: Array) -> TipAt:
-        """Return the tip at pressures (n,), in Pa, linear about the nearest equilibrium."""
+        """Return the tip at pressures (n,), in Pa, linearised about the nearest equilibrium."""
         approach = self._approach
         share = min(max(float(self._along @ pressures), 0.0), 1.0)
         index = round(share * (len(approach.tips) - 1))
@@ -45,26 +45,26 @@ class LeaningTip:
 
 
 class ArmModel:
-    """The model of an arm at the three places where the loop needs its tip.
+    """The model of an arm, for each of the uses that the loop has for its tip.
 
     Parameters
     ----------
     robot :
         The arm.
     path_range :
-        Change of pressure over which the tip on the reference's path is taken to be linear, in Pa.
+        Change of pressure over which the tip on the reference's path counts as linear, in Pa.
 
     Attributes
     ----------
     chambers, path : LinearisedTip
-        At the effective pressures, and on the reference's path.
+        The tip at the effective pressures, and on the reference's path.
     waypoints : TipModel
-        At a trajectory's waypoints, and wherever else it is asked for seldom.
+        The tip at a trajectory's waypoints, and for other rare uses.
 
     Raises
     ------
     InputError
-        If the arm is loaded and there is no compiler: too slow for a loop.
+        If the arm is loaded and there is no compiler: the model is too slow for a loop.
     """
 
     def __init__(self, robot: Manipulator, path_range: float) -> None:
@@ -78,7 +78,7 @@ class ArmModel:
             )
 
     def change(self, robot: Manipulator, pressures: Array) -> None:
-        """Go on with another arm; `StiffoptError`, and no change, if none stands at (n,) Pa."""
+        """Change to another arm; `StiffoptError`, and no change, if it is unstable at (n,) Pa."""
         last = self._robot
         try:
             self._take(robot)
@@ -94,18 +94,18 @@ class ArmModel:
 
 
 class LinearisedTip:
-    """Pose, Jacobian and compliance of the tip at pressures that change little from call to call.
+    """Pose, Jacobian and compliance of the tip at pressures that change little between calls.
 
-    Pressures beyond the robot's limits are taken for those at the limit.
+    Pressures beyond the robot's limits are clipped to them.
 
     Parameters
     ----------
     robot :
         The arm.
     linear_range :
-        Change of pressure over which the model is taken to be linear, in Pa, as the norm over all
-        channels. Over 600 Pa the position is right to a few micrometres, over 3 kPa the Jacobian to
-        a few percent.
+        Change of pressure over which the model counts as linear, in Pa, as the norm over all
+        channels. Over 600 Pa the position is accurate to a few micrometres, over 3 kPa the Jacobian
+        to a few percent.
     """
 
     def __init__(self, robot: Manipulator, linear_range: float = 600.0) -> None:
@@ -122,23 +122,23 @@ class LinearisedTip:
         return self._model.is_fast
 
     def change(self, robot: Manipulator) -> None:
-        """Go on with another arm; see `TipModel.change`."""
+        """Change to another arm; see `TipModel.change`."""
         self._tip = None
         self._operating_point = np.full(robot.n_pressures, np.inf)
         self._model.change(robot)
 
     def lean(self, leaning: LeaningTip | None) -> None:
-        """Go on with an arm that leans on objects; None: with the free one."""
+        """Change to the model of an arm that leans on objects; None: of the free arm."""
         self._leaning, self._tip = leaning, None
         self._operating_point = np.full_like(self._operating_point, np.inf)
 
     def at(self, pressures: Array) -> TipAt:
         """Return the tip at pressures (n,), in Pa; `StiffoptError` without an equilibrium there."""
-        tip, there = self._tip, self._operating_point
+        tip, point = self._tip, self._operating_point
         if tip is None:
-            p, _, _ = self._linearisation(pressures, there, np.eye(4), np.zeros((6, len(there))))
+            p, _, _ = self._linearisation(pressures, point, np.eye(4), np.zeros((6, len(point))))
         else:
-            p, distance, pose = self._linearisation(pressures, there, tip.pose, tip.jacobian)
+            p, distance, pose = self._linearisation(pressures, point, tip.pose, tip.jacobian)
             if distance[0] < self._linear_range and self._leaning is None:
                 return TipAt(pose, tip.jacobian, tip.compliance)
         try:
@@ -150,18 +150,19 @@ class LinearisedTip:
 
 
 def _linearisation(low: Array, high: Array) -> Formula:
-    """Pressures (n,) within limits, their distance from the operating point, and the pose there.
+    """Return the formula of a linearisation about an operating point.
 
-    Inputs are pressures (n,), and those (n,), pose (4, 4) and Jacobian (6, n) of the operating
-    point. The orientation is that of the operating point.
+    Inputs: pressures (n,); pressures (n,), pose (4, 4) and Jacobian (6, n) of the operating point.
+    Outputs: the pressures within limits (n,), their distance from the operating point, and the pose
+    there, with the orientation of the operating point.
     """
     n = len(low)
-    pressures, there = ca.SX.sym("pressures", n), ca.SX.sym("there", n)
+    pressures, point = ca.SX.sym("pressures", n), ca.SX.sym("point", n)
     pose, jacobian = ca.SX.sym("pose", 4, 4), ca.SX.sym("jacobian", 6, n)
     within = ca.fmin(ca.fmax(pressures, ca.DM(low)), ca.DM(high))
     p = ca.if_else(ca.fabs(pressures) < np.inf, within, np.nan)
-    change = p - there
+    change = p - point
     displaced = ca.SX(pose)
     displaced[:3, 3] += pose[:3, :3] @ (jacobian[:3, :] @ change)
     outputs = [p, ca.norm_2(change), displaced]
-    return Formula([pressures, there, pose, jacobian], outputs, [jacobian])
+    return Formula([pressures, point, pose, jacobian], outputs, [jacobian])

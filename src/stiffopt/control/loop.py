@@ -1,4 +1,4 @@
-"""The control loop: ticks at its deadlines, takes requests of any thread, publishes snapshots."""
+"""The control loop: ticks on time, serves requests from any thread, publishes snapshots."""
 
 from __future__ import annotations
 
@@ -37,32 +37,32 @@ _STARTING = (
 class ControlLoop:
     """Runs a controller on a rig, tick by tick, and keeps the arm safe.
 
-    It begins unconfigured; `configure` checks the rig and leaves it inactive, which means vented;
+    The loop starts unconfigured. `configure` checks the rig and leaves it inactive and vented;
     `arm` activates the controller. Every failure either holds the pressures or is a fault, which
     vents and lasts until `reset`.
 
-    Requests may come from any thread: the control thread carries them out in its next tick, or the
-    caller at once while the loop does not run. They return when that is done. A request that is
-    refused raises `InputError` with the reason, and nothing has changed. During the first
-    configuration, which may take long, requests are refused at once, except for `vent`, which is
+    Any thread may make requests. The control thread carries them out in its next tick; while the
+    loop does not run, the caller does so at once. A request returns when it has been carried out.
+    A refused request raises `InputError` with the reason and changes nothing. The first
+    configuration may take long; meanwhile all requests are refused at once, except `vent`, which is
     carried out.
 
     Parameters
     ----------
     rig :
-        Robot, tracker and clock; of its supply the limits alone are used.
+        Robot, tracker and clock. Only the limits of its supply are used.
     controller :
         The controller.
     outlet :
         The only way to the supply.
     safety :
-        What is a fault.
+        Limits and timeouts beyond which there is a fault.
     period :
-        Between ticks, in s.
+        Time between ticks, in s.
     tuning :
-        Of the supervision.
+        Tuning of the supervision.
     clearance :
-        Keeps commands clear of the rig's scene; None: there is none.
+        Keeps commands clear of the rig's scene; None without a scene.
     """
 
     def __init__(
@@ -94,9 +94,9 @@ class ControlLoop:
     # -- requests -------------------------------------------------------------------------------
 
     def configure(self) -> None:
-        """Connect supply and tracker, which vents, and check the rig; it is inactive then.
+        """Connect supply and tracker, which vents, and check the rig; then it is inactive.
 
-        The reason of a refusal begins with the name of the check that failed; there may be several.
+        A refusal names each check that failed, then its reason; several may fail.
         """
         self._check_started()
         self._configuring = True
@@ -108,8 +108,8 @@ class ControlLoop:
     def arm(self) -> None:
         """Check the vented arm and activate the controller; pressures stay until there is a task.
 
-        The loop must have ticked for some time before, to learn the rhythm of the tracker. A
-        refusal names the check that failed, as that of `configure`.
+        The loop must have run for some time before, to learn the rhythm of the tracker. A refusal
+        names the checks that failed, as that of `configure`.
         """
         requester = current_requester()  # checks may take long
         self._request(
@@ -143,15 +143,15 @@ class ControlLoop:
         self._carry_out(lambda now: self._supervisor.follow_trajectory(now, trajectory))
 
     def _check_ahead(self, request: Task | Target | Trajectory) -> None:
-        """Have it checked in this thread, which may take long: the control thread has to tick."""
-        if self._supervisor.lifecycle.armed:  # or else it is refused for that
+        """Run the controller's slow checks in this thread: the control thread has to tick."""
+        if self._supervisor.lifecycle.armed:  # otherwise the control thread refuses the request
             with refusing("request"):
                 self._supervisor.controller.check_ahead(request)
 
     def set_channels(self, without: Sequence[int]) -> None:
         """Take some channels, counted from 0, out of use, and give all others back.
 
-        A channel that is out is let down while the controller steers; plans do without it.
+        The controller lets the pressure of such a channel down; plans do without it.
         """
         chosen = [checked_integer("a channel", channel, 0) for channel in without]
         self._request(lambda now: self._supervisor.controller.set_channels(chosen))
@@ -159,16 +159,17 @@ class ControlLoop:
     def hold(self, reason: str = "asked to", *, lasting: bool = True) -> None:
         """Keep the pressures as they are until the next task, target or trajectory.
 
-        A hold that is not `lasting`, because nobody is there who would end it, ends after
-        `Safety.hold_timeout`: the pressures are let down then.
+        A hold that is not `lasting`, because no client is left to end it, ends after
+        `Safety.hold_timeout`; then the pressures are let down.
         """
         self._request(lambda now: self._supervisor.hold(now, reason, lasting=lasting))
 
     def vent(self, reason: str = "asked to") -> None:
-        """Vent at once; it is inactive then, or still in fault.
+        """Vent at once; the loop is inactive then, or still in fault.
 
-        If the supply does not accept that, `InputError` says so. The loop is then in fault and
-        repeats it in every tick, or still unconfigured; connecting the supply vents it.
+        If the supply does not accept the command, `InputError` reports it. The loop is then in
+        fault and repeats the command in every tick, or still unconfigured; connecting the supply
+        vents it.
         """
         if self._starting:  # directly: nothing else commands the supply yet
             self._supervisor.vent_while_starting()
@@ -176,15 +177,15 @@ class ControlLoop:
         self._request(lambda now: self._supervisor.vent(now, reason))
 
     def reset(self) -> None:
-        """Leave the fault; it is inactive then. Refused while the reason for it is still there."""
+        """Leave the fault and become inactive. Refused while the reason for it persists."""
         self._request(self._supervisor.reset)
 
     def add_alarm(self, kind: str, text: str) -> None:
-        """Set an alarm that others have found; it does not affect control."""
+        """Set an alarm that another part of the program found; it does not affect control."""
         self._supervisor.alarms.set(self.rig.clock.now(), kind, text)
 
     def clear_alarm(self, kind: str) -> None:
-        """Clear such an alarm."""
+        """Clear an alarm that `add_alarm` set."""
         self._supervisor.alarms.clear(self.rig.clock.now(), kind)
 
     def snapshot(self) -> Snapshot:
@@ -194,7 +195,7 @@ class ControlLoop:
     def listen(self, listener: Callable[[Snapshot], None]) -> None:
         """Call a function with the snapshot at the end of each tick, in the control thread.
 
-        It must not wait. An error that it raises is an alarm and does not affect control.
+        The listener must not block. An error that it raises becomes an alarm.
         """
         self._listeners.append(listener)
 
@@ -203,7 +204,7 @@ class ControlLoop:
         return self._configuring and self._supervisor.lifecycle.state is State.UNCONFIGURED
 
     def _check_started(self) -> None:
-        """Refuse a request that would otherwise wait for the rig, and come as a surprise later."""
+        """Refuse a request while the loop starts, rather than carry it out much later."""
         if self._starting:
             raise CommandError(_STARTING)
 
@@ -226,13 +227,13 @@ class ControlLoop:
         """Tick until `stop` is set, then let the pressures down and vent.
 
         It returns within `Safety.ramp_time` and about a second, whatever the devices do, as long as
-        the clock runs. Ticks that are overdue are skipped.
+        the clock runs. It skips ticks that are overdue.
         """
         self._requests.begin()
         try:
-            due = self._ticked(self.rig.clock.now())
+            due = self._tick_at(self.rig.clock.now())
             while not stop.is_set():
-                due = self._ticked(due)
+                due = self._tick_at(due)
             self._let_down(due)
         finally:
             try:
@@ -243,7 +244,7 @@ class ControlLoop:
     def close(self) -> None:
         """Vent, disconnect supply and tracker, and end the controller.
 
-        `DeviceError`: the supply does not accept the command to vent.
+        `DeviceError` if the supply does not accept the command to vent.
         """
         try:
             self._supervisor.outlet.close()
@@ -252,8 +253,8 @@ class ControlLoop:
                 self.rig.tracker.close()
             self._supervisor.controller.close()
 
-    def _ticked(self, due: float) -> float:
-        """Tick when it is due; return when the next tick is."""
+    def _tick_at(self, due: float) -> float:
+        """Wait until `due`, tick, and return when the next tick is due."""
         clock = self.rig.clock
         try:
             clock.sleep_until(due)
@@ -265,7 +266,7 @@ class ControlLoop:
         return self._timing.next_due(due, clock.now())
 
     def tick(self, due: float | None = None) -> None:
-        """Tick once, now; it may have been due at a time, in s."""
+        """Tick once, now; `due` is when this tick was due, in s."""
         began = time.perf_counter()
         clock, supervisor, timing = self.rig.clock, self._supervisor, self._timing
         with self._requests.turn:
@@ -284,7 +285,7 @@ class ControlLoop:
                 self.add_alarm("listener", f"unexpected {type(error).__name__}: {error}")
 
     def _let_down(self, due: float) -> None:
-        """Tick on until the pressures are let down, for a bounded time and number of ticks."""
+        """Continue to tick until the pressures are down, for a limited time and number of ticks."""
         supervisor = self._supervisor
         if supervisor.lifecycle.armed:
             supervisor.carry_out(lambda now: supervisor.disarm(now, "stopping"))
@@ -292,7 +293,7 @@ class ControlLoop:
         for _ in range(math.ceil(self._stop_time / self.period)):
             if supervisor.vented or self.rig.clock.now() > end:
                 break
-            due = self._ticked(due)
+            due = self._tick_at(due)
 
     def _vent_at_the_end(self) -> None:
         with self._requests.turn:
@@ -302,7 +303,7 @@ class ControlLoop:
             self._snapshot = self._current_snapshot(now)
 
     def _current_snapshot(self, now: float) -> Snapshot:
-        """Return the state now; a controller that fails to give its own is a fault."""
+        """Return the state now; a controller that cannot report its status is a fault."""
         supervisor = self._supervisor
         limits, reading = supervisor.outlet.limits, supervisor.reading
         status = self._unknown
@@ -331,27 +332,27 @@ class ControlLoop:
 
 
 _EDGES = tuple(float(f"{m}e{e}") for e in range(-6, 0) for m in (1, 2, 5))
-"""Upper edges of the histogram of lateness, from 1 us to 0.5 s, three per decade."""
+"""Upper edges of the histogram of lateness, in s: three per decade, 1 us to 0.5 s."""
 
 
-_WATCHED = 30.0  # s, over which the lateness of ticks is looked at before arming
+_LATENESS_WINDOW = 30.0  # s before arming, in which the lateness of ticks counts
 
 
 class TickTiming:
-    """When ticks of a period, in s, are due, and how late and how long they were."""
+    """Schedule and timing statistics of ticks with a period, in s."""
 
     def __init__(self, period: float) -> None:
         self._period = period
         self._lateness = [0] * (len(_EDGES) + 1)  # the last bin has no upper edge
         self._ticks = self._overruns = 0
         self._tick_time = 0.0
-        # lateness of the latest ticks, in s, but of those that followed an overrun
-        self._latest: deque[float] = deque(maxlen=round(_WATCHED / period))
-        self.overruns_in_a_row = 0  # the last ticks that ended after the next one was due
-        self.missed = 0  # ticks that were skipped because they were overdue
+        # lateness of the latest ticks, in s, except of those that followed an overrun
+        self._latest: deque[float] = deque(maxlen=round(_LATENESS_WINDOW / period))
+        self.overruns_in_a_row = 0  # latest ticks that ended after the next one was due
+        self.missed = 0  # overdue ticks that were skipped
 
     def begin(self, due: float | None, now: float) -> None:
-        """Note when a tick begins, and when it was due, if it was."""
+        """Note when a tick begins, and when it was due, if known, in s."""
         if due is not None:
             self._lateness[bisect_left(_EDGES, now - due)] += 1
             if not self.overruns_in_a_row:
@@ -359,9 +360,9 @@ class TickTiming:
 
     @property
     def latest(self) -> float:
-        """How late ticks began lately because the computer was busy, in s: the third worst.
+        """Third largest lateness of recent ticks, in s, which shows how busy the computer is.
 
-        Single ones are late when other threads of this program start.
+        The two largest are left out: single ticks are late when other threads here start.
         """
         return ([0.0, 0.0, 0.0, *sorted(self._latest)])[-3]
 
@@ -376,7 +377,7 @@ class TickTiming:
             self.overruns_in_a_row = 0
 
     def next_due(self, due: float, now: float) -> float:
-        """Return when the next tick is due that is not overdue already; count those that are."""
+        """Return when the next tick is due, in s; skip and count ticks that are overdue."""
         due += self._period
         if due < now:
             late = int((now - due) / self._period) + 1

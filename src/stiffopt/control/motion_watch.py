@@ -1,17 +1,17 @@
-"""Whether the tip moves as the pressures say: what makes the loop doubt its tracker or its arm.
+"""Checks that the tip moves as the pressures imply; if not, the loop doubts tracker or arm.
 
-The tip is seen at y, the model predicts it at s, and the reference intends it to be at r. Four
-tests look for what no push, payload or error of a model explains:
+The tracker measures the tip at y, the model predicts s, and the reference intends r. Four tests
+look for what no push, payload or model error explains:
 
-* response: r has moved, and y not along with s, but elsewhere or not at all;
-* slip: the offset d of the estimator has changed, and the orientation's offset has not turned as an
-  arm does that something bends by d: about 3 d / (2 length), or at least two thirds of that;
-* drift: y - s moves on and on, faster than the model's error can change on the way of s;
-* swing: y - r swings, and the swings do not decay.
+* response: r has moved, but y has not moved along with s, or has moved elsewhere;
+* slip: the estimator's offset d has changed, but the orientation's offset has not turned as
+  bending by d turns an arm: by about 3 d / (2 length), or at least two thirds of that;
+* drift: y - s keeps moving, faster than the model's error can change while s moves;
+* swing: y - r oscillates, and does not decay.
 
-A push or a payload moves y - s too, but then it rests. What creeps is seen at three time scales.
-The model may be wrong by a share of what each segment moves the tip, also where two of them move it
-against each other.
+A push or a payload moves y - s too, but then it rests. Drift is tested at three time scales, so
+that creep is told apart. The model may be wrong by a share of the motion that each segment causes,
+even if segments move the tip in opposite directions.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ from stiffopt.optimise.tip import TipAt
 
 Array = NDArray[np.float64]
 
-_TIME, _SEEN, _PREDICTED, _INTENDED = 0, slice(1, 4), slice(4, 7), slice(7, 10)  # of a row
+_TIME, _SEEN, _PREDICTED, _INTENDED = 0, slice(1, 4), slice(4, 7), slice(7, 10)  # columns of a row
 _OFFSET, _TURN, _SWING, _PRESSURES = slice(10, 13), slice(13, 16), 16, slice(17, None)
 
 
 @dataclass(frozen=True)
 class Doubt:
-    """Why the loop does not trust what it sees.
+    """A reason not to trust the measured motion.
 
     Attributes
     ----------
@@ -61,7 +61,7 @@ class MotionWatch:
 
     Attributes
     ----------
-    doubt : what is doubted; it stands until it is forgiven, or the arm goes on.
+    doubt : the present doubt; it stays until `forgive` or `go_on`.
     """
 
     def __init__(self, robot: RobotDescription, tuning: MotionTuning) -> None:
@@ -71,39 +71,39 @@ class MotionWatch:
         self._segments = [slice(a, b) for a, b in pairwise([0, *ends])]
         longest = max(scale.interval * scale.count for scale in tuning.scales)
         self._kept = round(longest / tuning.spacing) + 2
-        width = _PRESSURES.start + ends[-1]  # of a sample; see `_SEEN` and the others
+        width = _PRESSURES.start + ends[-1]  # of a row; see `_TIME` and the others
         self._rows: Array = np.empty((2 * self._kept, width))
         self.begin()
 
     def begin(self) -> None:
-        """Start anew."""
+        """Restart."""
         self._count = self._misses = self._slips = 0
-        self._path = 0.0  # that r has gone, in m
+        self._path = 0.0  # length of the way of r, in m
         self._intended: deque[tuple[float, Array]] = deque(maxlen=self._kept)
         self._swings = [_Swings(self._tuning) for _ in range(3)]
         self.doubt: Doubt | None = None
 
     def go_on(self) -> None:
-        """Go on after a pause, in which the arm was not steered, or not seen."""
+        """Continue after a pause in which the arm was not controlled, or not seen."""
         self._intended.clear()
         self._misses = self._slips = 0
         self._swings = [_Swings(self._tuning) for _ in range(3)]
         self.forgive()
 
     def forgive(self) -> None:
-        """Doubt no more what was doubted: somebody has looked at it."""
+        """Drop the doubt: somebody has looked at it."""
         if self.doubt is not None:
             self.begin()
 
     def change_model(self, change: Array) -> None:
-        """Go on with another model, from which the tip is off by another offset (6,)."""
+        """Adjust past samples to another model, for which the tip's offset changes by (6,)."""
         rows = self._rows[: self._count]
         rows[:, _PREDICTED] -= change[:3]
         rows[:, _OFFSET] += change[:3]
         rows[:, _TURN] += change[3:]
 
     def intend(self, now: float, position: Array) -> None:
-        """Note where the reference intends the tip to be (3,), in each tick that is steered."""
+        """Note the tip position (3,) that the reference intends; in each tick of control."""
         self._intended.append((now, position))
 
     def take(
@@ -123,15 +123,15 @@ class MotionWatch:
         Parameters
         ----------
         time :
-            Of its capture, in s.
+            Time of capture, in s.
         seen, predicted :
-            Position (3,) in the sample and as the model predicts it for that moment, in m.
+            Position (3,) in the sample and as the model predicts it for that time, in m.
         offset :
-            Of the tip's pose from the model's (6,), in m and rad, as it is estimated.
+            Estimated offset (6,) of the tip's pose from the model's, in m and rad.
         pressures :
-            Effective ones (n,), in Pa.
+            Effective pressures (n,), in Pa.
         tip :
-            The model's tip at these.
+            The model's tip at these pressures.
         turns :
             Whether the tracker measures orientations.
         swing :
@@ -168,15 +168,15 @@ class MotionWatch:
         return None
 
     def _since(self, duration: float) -> Array:
-        """Samples (k, 17 + n) of the last so many seconds."""
+        """Return the samples (k, 17 + n) of the last so many seconds."""
         rows = self._rows[: self._count]
         return rows[np.searchsorted(rows[:, _TIME], rows[-1, _TIME] - duration) :]
 
     def _explained(self, changes: Array, jacobian: Array) -> Array:
-        """Errors (k,) of the model's motion that are no surprise, in m.
+        """Return the model errors (k,) to expect over changes between samples, in m.
 
-        `changes` (k, 17 + n) are differences of samples; Jacobian (3, n) of the tip's position,
-        base axes.
+        `changes` (k, 17 + n) are differences of samples; the Jacobian (3, n) is of the tip's
+        position, base axes.
         """
         moved = np.zeros(len(changes))
         for channels in self._segments:
@@ -185,7 +185,7 @@ class MotionWatch:
         return self._tuning.model_error * moved
 
     def _no_response(self, jacobian: Array) -> Doubt | None:
-        """The tip was to move, and the model has it moved, but it is not seen to."""
+        """Test whether the tip has not moved although reference and model have."""
         tuning, rows = self._tuning, self._since(self._tuning.response_window)
         ways = rows[-1] - rows[:-1]
         way, seen = ways[:, _PREDICTED], ways[:, _SEEN]
@@ -200,9 +200,9 @@ class MotionWatch:
         off = np.sqrt(((seen - way)[suspects] ** 2).sum(axis=1))
         steps = np.diff(rows, axis=0)
         speeds = np.sqrt((steps[:, _PREDICTED] ** 2).sum(axis=1)) / steps[:, _TIME]
-        late = tuning.late * (speeds[suspects] + speeds[-1:])  # y than s, in m
+        late = tuning.late * (speeds[suspects] + speeds[-1:])  # error by a delay of y, in m
         swing = rows[suspects, _SWING] + rows[-1, _SWING]
-        # along the way, on which segments may have moved the tip against each other
+        # summed along the way, on which segments may have moved the tip in opposite directions
         own = np.cumsum(self._explained(steps, jacobian)[::-1])[::-1][suspects]
         explained = own + late + swing + tuning.noise + 6 * tuning.scatter
         missed = suspects[off > explained]
@@ -225,7 +225,7 @@ class MotionWatch:
         return Doubt("no-response", f"{text}{':' if moved < most / 2 else ''} {causes}")
 
     def _slip(self, jacobian: Array, tip: TipAt) -> Doubt | None:
-        """The offset has changed as no force, wherever it acts, changes it."""
+        """Test whether the offset has changed as no force, wherever it acts, changes it."""
         tuning, rows = self._tuning, self._since(self._tuning.slip_window)
         way = rows[-1] - rows[0]
         moved, turned = way[_OFFSET], way[_TURN]
@@ -248,7 +248,7 @@ class MotionWatch:
         )
 
     def _drift(self, jacobian: Array) -> Doubt | None:
-        """The tip moves on without a cause in the pressures."""
+        """Test whether the tip keeps moving without a cause in the pressures."""
         for scale in self._tuning.scales:
             if speed := self._drift_speed(scale, jacobian):
                 return Doubt(
@@ -260,7 +260,7 @@ class MotionWatch:
         return None
 
     def _drift_speed(self, scale: DriftScale, jacobian: Array) -> float:
-        """Speed of a drift that has lasted for all intervals of a scale, in m/s, or 0."""
+        """Return the speed of a drift over all intervals of a scale, in m/s; 0 if there is none."""
         duration = scale.interval * scale.count
         first = self._rows[0, _TIME] if self._count else np.inf
         if self._rows[self._count - 1, _TIME] - duration < first:
@@ -291,7 +291,7 @@ class MotionWatch:
 
 
 class _Turn(NamedTuple):
-    """A value y - r of one axis, in m, when, and how far r had gone by then, in m."""
+    """A turning point: its time, in s, y - r of one axis, and the way of r until then, in m."""
 
     time: float
     error: float
@@ -299,7 +299,7 @@ class _Turn(NamedTuple):
 
 
 class _Swings:
-    """Turning points of y - r along one axis, and whether its swings last."""
+    """Finds turning points of y - r along one axis, and swings that last."""
 
     def __init__(self, tuning: MotionTuning) -> None:
         self._tuning = tuning
@@ -317,7 +317,7 @@ class _Swings:
             self._extreme, self._rising = now, not self._rising
 
     def lasting(self) -> float:
-        """Size of swings that do not decay, in m; 0 if there are none."""
+        """Return the size of swings that do not decay, in m; 0 if there are none."""
         tuning, turns = self._tuning, self._turns
         if len(turns) <= tuning.swings or turns[-1].time - turns[0].time > tuning.swing_window:
             return 0.0

@@ -1,4 +1,4 @@
-"""The observer: the state of the arm, from commands, pressure readings and tracker samples."""
+"""The observer: estimates the arm's state from commands, pressure readings and tracker samples."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ from stiffopt.rig.settings import ControlSettings, Safety
 
 Array = NDArray[np.float64]
 
-_MOST_STEPS = 50  # of the estimators in one tick, after a pause
+_MAX_STEPS = 50  # of the estimators in one tick, after a pause
 
 
 class ArmObserver:
-    """Estimates pressures and tip, feels contacts, and watches whether the arm moves as it should.
+    """Estimates pressures and tip, senses contacts, and checks that the arm moves as it should.
 
     Parameters
     ----------
@@ -46,11 +46,11 @@ class ArmObserver:
     Attributes
     ----------
     channels, pressures, tip, touch, watch :
-        Its parts; `tip` is the estimator of the tip.
+        The observer's parts; `tip` is the estimator of the tip.
     model : ArmModel or None
         None until `check` has compiled it.
     modelled : TipAt or None
-        The tip that the model has at the effective pressures.
+        The model's tip at the effective pressures.
     leaning : LeaningTip or None
         The model of the braced tip, while the arm may lean on objects.
     """
@@ -94,7 +94,7 @@ class ArmObserver:
         self._now = 0.0
 
     def check(self) -> None:
-        """Compile and try the model; the errors of `ArmModel`."""
+        """Compile and try the model; raises the errors of `ArmModel`."""
         if self.model is None:
             self.model = ArmModel(self._robot, self._tuning.reference.model_range)
             self._set_frequency()
@@ -102,19 +102,19 @@ class ArmObserver:
 
     @property
     def compiled(self) -> ArmModel:
-        """The model, which is compiled now if `check` has not been called."""
+        """The model, compiled now if `check` has not been called."""
         self.check()
         assert self.model is not None
         return self.model
 
     def _set_frequency(self) -> None:
-        """Let the vented arm swing as the settings say, whatever its model."""
+        """Give the vented arm the frequency of the settings, if they have one."""
         if self._frequency is not None and self.model is not None:
             vented = self.model.waypoints.at(np.zeros(self._robot.n_pressures))
             self.tip.set_frequency(2 * math.pi * self._frequency, vented)
 
     def begin(self, now: float) -> None:
-        """Start anew with a vented arm."""
+        """Restart with a vented arm."""
         self._now = now
         self.pressures.begin()
         self.tip.begin()
@@ -122,7 +122,7 @@ class ArmObserver:
         self.watch.begin()
         self.modelled: TipAt | None = None
         self.leaning: LeaningTip | None = None
-        self._looked_at = now  # capture of the last sample, in s
+        self._looked_at = now  # capture time of the last sample, in s
         if self.model is not None:
             self.model.chambers.lean(None)
             zero = self.pressures.command
@@ -137,8 +137,8 @@ class ArmObserver:
         samples: Sequence[PoseSample],
         course: AnyCourse | None,
     ) -> SampleCounts:
-        """Estimate pressures and tip; see `Controller.observe`. `course` is under way."""
-        steps = min(max(1, round((now - self._now) / self._period)), _MOST_STEPS)
+        """Estimate pressures and tip; see `Controller.observe`. `course` is the present one."""
+        steps = min(max(1, round((now - self._now) / self._period)), _MAX_STEPS)
         self._now = now
         self.pressures.advance(steps, commanded, reading.pressures)
         effective = self.pressures.effective
@@ -176,9 +176,9 @@ class ArmObserver:
         )  # fmt: skip
 
     def lean_on(self, leaning: LeaningTip | None) -> Array:
-        """Go on with the model of an arm that leans on objects; None: of the free one.
+        """Change to the model of an arm that leans on objects; None: of the free arm.
 
-        Returns the change (6,) of the tip's offset, which takes up what the model changes by.
+        Return the change (6,) of the tip's offset, which takes up the change of the model.
         """
         model, effective = self.compiled.chambers, self.pressures.effective
         before = model.at(effective)
@@ -190,9 +190,9 @@ class ArmObserver:
         return change
 
     def change_robot(self, description: RobotDescription) -> Array | None:
-        """Go on with other numbers of the arm; None, and no change, if no such arm stands.
+        """Change the model's numbers; None, and no change, if such an arm has no equilibrium.
 
-        Returns the change (6,) of the tip's offset, which takes up what the model changes by.
+        Return the change (6,) of the tip's offset, which takes up the change of the model.
         """
         model, effective = self.compiled, self.pressures.effective
         before = model.chambers.at(effective)
@@ -204,7 +204,7 @@ class ArmObserver:
         return self._shift(before, model.chambers.at(effective))
 
     def _shift(self, before: TipAt, after: TipAt) -> Array:
-        """Let the offset (6,) take up what the model changes by."""
+        """Let the offset (6,) take up the difference between two models."""
         self.modelled = after
         change = self.tip.change_model(before, after)
         self.watch.change_model(change)

@@ -1,10 +1,10 @@
-"""Where plans are made: at once, on a simulated clock, or in a process of its own, in real time.
+"""Runs the planning: inline on a simulated clock, in a separate process in real time.
 
 The control loop hands requests to an `InlinePlanner` or a `ProcessPlanner` and takes the newest
-plan. The process keeps computing time and Python's lock from delaying a tick; when it dies it is
-started again. Writing to it is part of a tick, so only what is new is sent: of a request the fields
-that differ from the one before (a task takes longer than all the rest), of a plan what its request
-does not have.
+plan. A separate process keeps computing time and Python's lock from delaying a tick; if it dies, it
+is restarted. A tick writes to the process, so only news is sent: the fields of a request that
+differ from the last one (a task takes longer than all the rest), and the fields of a plan that its
+request does not have.
 """
 
 from __future__ import annotations
@@ -32,38 +32,26 @@ from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.scene import Scene
 
 _RESTART_AFTER = 1.0  # s between two starts of the process
-_PREPARATION = 0.5  # s; a new task that takes longer is reported
+_PREPARATION = 0.5  # s; preparing a new task for longer is reported
 _NICE = 5  # of the process: the control loop comes first
-_IDLE = 1.0  # s without a request, after which compiled code is asked for
-_ARRAYS = (
-    "offset",
-    "pressure_offset",
-    "low",
-    "high",
-    "way",
-)  # of a request: compared and sent by value, every time
-_OBJECTS = (
-    "serial",
-    "task",
-    "target",
-    "search",
-    "last",
-    "windows",
-    "adapted",
-)  # immutable: compared by identity
+_IDLE = 1.0  # s without a request until the process compiles code
+# fields of a request: arrays are sent every time
+_ARRAYS = ("offset", "pressure_offset", "low", "high", "way")
+# immutable fields are sent if they are other objects than in the last request
+_OBJECTS = ("serial", "task", "target", "search", "last", "windows", "adapted")
 
 
 class InlinePlanner:
-    """Plans within the request, while time stands still, as in a simulation."""
+    """Plans within the request, while simulated time stands still."""
 
     def __init__(self, robot: Manipulator, scene: Scene | None = None) -> None:
         self._planning = Planning(robot, scene)
         self._plan: Plan | None = None
         self._notices: tuple[Notice, ...] = ()
-        self.failures = 0  # requests that had no answer
+        self.failures = 0  # requests without an answer
 
     def request(self, request: PlanRequest) -> None:
-        """Plan."""
+        """Make a plan."""
         try:
             self._plan = self._planning.plan(request)
             self._notices = ()
@@ -84,19 +72,19 @@ class InlinePlanner:
 
 
 class ProcessPlanner:
-    """Plans in a process of its own, so that the control loop never waits.
+    """Plans in a separate process, so that the control loop never waits.
 
-    When planning fails unexpectedly or the process dies, the last plan stays, an alarm reports it,
-    and another process is started.
+    When planning fails unexpectedly or the process dies, the last plan stays, an alarm reports the
+    failure, and a new process is started.
 
     Parameters
     ----------
     robot :
         The arm.
     scene :
-        What the ways to plans have to be clear of.
+        Objects from which the ways to plans keep clear.
     patience :
-        Duration of a plan beyond which there is an alarm, in s. The first of a kind of task may be
+        Planning time beyond which there is an alarm, in s. The first task of a kind may have to be
         compiled, which takes seconds.
     """
 
@@ -108,7 +96,7 @@ class ProcessPlanner:
         self._serial = -1  # of the last request that was sent
         self._plan: Plan | None = None
         self._failure, self._closed = "", False
-        self.failures = 0  # requests that had no answer
+        self.failures = 0  # requests without an answer
         self._start()
 
     def _start(self) -> None:
@@ -117,7 +105,7 @@ class ProcessPlanner:
             self._process = subprocess.Popen(
                 [sys.executable, "-P", "-m", "stiffopt.control.planner", str(theirs.fileno())],
                 pass_fds=(theirs.fileno(),),
-                start_new_session=True,  # a terminal's Ctrl-C is not for it
+                start_new_session=True,  # a terminal's Ctrl-C must not end it
             )
         _set_batch_policy(self._process.pid)
         self._end = PlannerEnd(ours.detach())
@@ -126,7 +114,7 @@ class ProcessPlanner:
         self._end.connection.send((self._robot, self._scene))
 
     def request(self, request: PlanRequest) -> None:
-        """Have a plan made as soon as the process is free; it replaces a request that waits."""
+        """Request a plan once the process is free; this replaces a waiting request."""
         if self._waiting is not None and self._waiting.serial == request.serial:
             request = replace(request, search=self._waiting.search or request.search)
         self._waiting = request
@@ -138,7 +126,7 @@ class ProcessPlanner:
         return self._plan
 
     def notices(self) -> tuple[Notice, ...]:
-        """Return whether planning has failed, or takes too long."""
+        """Return whether planning has failed or takes too long."""
         busy_since = self._busy_since
         if self._failure:
             return (Notice("planner", self._failure, standing=True),)
@@ -164,7 +152,7 @@ class ProcessPlanner:
             self._process.wait()
 
     def _exchange(self) -> None:
-        """Receive plans, and send the request that waits if the process is free."""
+        """Receive plans; send the waiting request if the process is free."""
         if self._closed or (self._busy_since is None and self._waiting is None):
             return
         try:
@@ -197,9 +185,9 @@ class ProcessPlanner:
 def _set_batch_policy(process: int) -> None:
     """Schedule a process as SCHED_BATCH, where the system has that.
 
-    A request wakes it. It would otherwise pre-empt the control loop in the middle of that tick and
-    plan for milliseconds on the same processor. It also gives up the loop's priorities, which it
-    inherits if the loop started it.
+    A request wakes the process. Otherwise it would pre-empt the control loop within that tick and
+    plan for milliseconds on the same processor. This also drops the loop's priorities, which the
+    process inherits.
     """
     with suppress(AttributeError, OSError):
         os.sched_setscheduler(process, os.SCHED_BATCH, os.sched_param(0))
@@ -207,33 +195,33 @@ def _set_batch_policy(process: int) -> None:
 
 
 class PlannerEnd:
-    """The control loop's end of the connection; a call raises `OSError` if the other is closed."""
+    """The control loop's end of the connection; calls raise `OSError` if the other is closed."""
 
     def __init__(self, handle: int) -> None:
         self.connection = Connection(handle)
         self._poll = select.poll()  # `Connection.poll` is slow: it makes a selector each time
-        self._poll.register(handle, select.POLLIN)  # errors are reported in any case
+        self._poll.register(handle, select.POLLIN)  # errors are always reported
         self._sent: PlanRequest | None = None
 
     def has_answer(self) -> bool:
-        """Whether there is something to receive, if only that the other end is closed."""
+        """Whether there is something to receive, or the other end is closed."""
         return bool(self._poll.poll(0))
 
     def send(self, request: PlanRequest) -> None:
-        """Send a request; the one before must have been answered."""
+        """Send a request; the last one must have been answered."""
         before = self._sent
         news: dict[str, Any] = {
             name: getattr(request, name)
             for name in _OBJECTS
             if before is None or getattr(request, name) is not getattr(before, name)
         }
-        for name in _ARRAYS:  # as lists: pickling an array takes twenty times as long
+        for name in _ARRAYS:  # as lists: pickling an array takes twenty times longer
             news[name] = getattr(request, name).tolist()
         self.connection.send_bytes(pickle.dumps(news, pickle.HIGHEST_PROTOCOL))
         self._sent = request
 
     def receive(self) -> Plan | str | None:
-        """Receive a plan, or why there is none; None when the process is ready."""
+        """Receive a plan, or the reason for none; None when the process is ready."""
         answer: dict[str, Any] | str | None = self.connection.recv()
         request = self._sent
         if request is None or answer is None or isinstance(answer, str):
@@ -262,7 +250,7 @@ class PlanningEnd:
         return PlanRequest(**{**self._fields, **arrays})
 
     def answer(self, answer: Plan | str | None) -> None:
-        """Send the plan for the last request, or why there is none; None: the process is ready."""
+        """Send the plan for the last request, or the reason for none; None: ready."""
         if isinstance(answer, Plan):
             names = (
                 *("reached", "stiffness", "message", "far", "blocked", "doubt"),
@@ -275,7 +263,7 @@ class PlanningEnd:
 
 
 def main(end: PlanningEnd) -> None:
-    """Receive arm and scene, answer None, then each request with a plan or why there is none.
+    """Run the process: receive arm and scene, answer None, then serve requests.
 
     It ends when the other end is closed.
     """
@@ -288,7 +276,7 @@ def main(end: PlanningEnd) -> None:
         request = end.request()
         try:
             end.answer(planning.plan(request))
-        except Exception as error:  # whatever it is, the next request may succeed
+        except Exception as error:  # the next request may succeed
             end.answer(f"{type(error).__name__}: {error}")
             planning = Planning(robot, scene)
 

@@ -1,12 +1,12 @@
-"""Plans: the stiffest pressures for a target, given the tip's offset from the model.
+"""Planning: the stiffest pressures for a target, given the tip's offset from the model.
 
-The target, moved back by the tip's offset, is what the model has to reach. The optimiser then finds
-the pressures that are stiffest on the arm as it is, but for errors of the modelled stiffness. A
-plan is the local optimum next to the last plan. When the offset has changed much and the arm is at
-rest, all configurations are searched again, and the arm leaves its own only for one that is clearly
-better. For a target that is out of reach, the plan is the configuration nearest to it.
+The target is moved back by the tip's offset; the model has to reach the result. The optimiser then
+finds the pressures that are stiffest on the real arm, except for errors of the modelled stiffness.
+A plan is the local optimum next to the last plan. When the offset has changed much and the arm is
+at rest, all configurations are searched again; the arm changes to another one only if that is
+clearly better. For a target that is out of reach, the plan is the nearest configuration.
 
-On a rig with a scene a plan also says whether the body keeps clear of it on the way there.
+On a rig with a scene, a plan also reports whether the body keeps clear of it on the way.
 """
 
 from __future__ import annotations
@@ -38,29 +38,29 @@ from stiffopt.paths.leaning import BraceApproach, approach_to
 Array = NDArray[np.float64]
 
 _BAR = 1e5
-_SLACK = 100.0  # Pa, by which an answer may be beyond limits
+_SLACK = 100.0  # Pa, by which an answer may exceed its limits
 _EXACT = Tolerance(position=PlanningTuning.position_tolerance, angle=PlanningTuning.angle_tolerance)
 
 
 @dataclass(frozen=True)
 class PlanRequest:
-    """Everything that a plan is made for."""
+    """Everything that a plan depends on."""
 
     serial: int  # number of the task; a plan for an earlier one is discarded
-    task: Task | None  # stiffness goal and limits; None: there is only a way to be checked
-    target: Target | None  # takes the place of the task's own
+    task: Task | None  # stiffness goal and limits; None: only check the way
+    target: Target | None  # replaces the task's own
     offset: Array  # tip pose relative to the model's (6,), m and rad (rotation vector), base axes
     pressure_offset: Array  # effective pressures relative to commands (n,), in Pa
-    search: bool = False  # whether all configurations are to be searched, as for a new target
+    search: bool = False  # whether to search all configurations, as for a new target
     # lowest and highest effective pressures (n,) that the channels can have, in Pa, within the
-    # task's limits; empty: these
+    # task's limits; empty: the task's limits
     low: Array = field(default_factory=lambda: np.zeros(0))
     high: Array = field(default_factory=lambda: np.zeros(0))
-    # where a scene is to be kept: effective pressures (k, n) on the way before the plan, in Pa
+    # with a scene: effective pressures (k, n) on the way to the plan, in Pa
     way: Array = field(default_factory=lambda: np.zeros((0, 0)))
-    last: Plan | None = None  # takes the place of the planner's own last plan
-    windows: tuple[Window, ...] = ()  # of the tip at rest, from which numbers are adapted
-    adapted: Adapted | None = None  # the arm that the offset belongs to; None: as its file has it
+    last: Plan | None = None  # replaces the planner's own last plan
+    windows: tuple[Window, ...] = ()  # of the tip at rest, for adaptation
+    adapted: Adapted | None = None  # the model that the offset refers to; None: the robot file's
 
 
 @dataclass(frozen=True)
@@ -71,20 +71,20 @@ class Plan:
     pressures: Array  # effective (n,), in Pa
     offset: Array  # of the tip (6,), for which the plan was made
     target: Target | None
-    reached: bool  # whether the model reaches it
-    stiffness: float  # along the task's first direction; NaN where it names none
-    message: str  # why it is not reached
-    blocked: str = ""  # why the way there is not clear of the scene
-    doubt: str = ""  # that the model extrapolates there
-    far: bool = False  # whether `message` is of `nearest_words`
-    adapted: Adapted | None = None  # the arm that it was made with, as in the request
+    reached: bool  # whether the model reaches the target
+    stiffness: float  # along the task's first direction; NaN if it has none
+    message: str  # why the target is not reached
+    blocked: str = ""  # why the way to the plan is not clear of the scene
+    doubt: str = ""  # a warning if the model extrapolates there
+    far: bool = False  # whether `message` was made by `nearest_words`
+    adapted: Adapted | None = None  # the model that it was made with, as in the request
     deviation: float = math.nan  # of the stiffness there, relative
-    estimate: Estimate | None = None  # of the arm's numbers, if it is new
-    approach: BraceApproach | None = None  # from rest to an arm that leans on objects there
+    estimate: Estimate | None = None  # of the model's numbers, if it is new
+    approach: BraceApproach | None = None  # from rest until the arm leans on objects there
 
 
 class Planning:
-    """Makes plans for an arm, each from the last one."""
+    """Makes plans for an arm, each starting from the last one."""
 
     def __init__(self, robot: Manipulator, scene: Scene | None = None) -> None:
         self._tuning, self._scene = PlanningTuning(), scene
@@ -99,14 +99,14 @@ class Planning:
         self._leaning: tuple[int, Plan | None] = (-1, None)
 
     def _put(self, robot: Manipulator) -> None:
-        """Plan for this arm from now on."""
+        """Use this model from now on."""
         self._robot, self._tip = robot, TipModel(robot)
         self._ways = None if self._scene is None else Ways(robot, self._scene)
         self._search = NearestSearch(self._tip, FeedbackTuning().lever, NearestTuning())
         self._solver: PressureSolver | None = None
 
     def _go_on_with(self, request: PlanRequest) -> None:
-        """Plan for the arm of a request, next to the last plan if it is another one."""
+        """Use the model of a request, and carry the last plan over to it."""
         if request.adapted is self._adapted:
             return
         self._adapted = adapted = request.adapted
@@ -116,7 +116,7 @@ class Planning:
             self._last = replace(self._last, offset=request.offset)
 
     def _deviation(self, plan: Plan, task: Task) -> float:
-        """Relative deviation of a plan's stiffness; NaN if it is not known."""
+        """Return the relative deviation of a plan's stiffness; NaN if unknown."""
         measure = task.measures[0] if task.measures else None
         if not plan.reached or not isinstance(measure, StiffnessMeasure):
             return math.nan
@@ -124,12 +124,12 @@ class Planning:
         return self._learning.deviation(plan.pressures, checked)
 
     def ask_for_code(self) -> None:
-        """Have compiled code for the last task made, which was not while the arm was armed."""
+        """Compile code for the last task if that was not done while the arm was armed."""
         if self._solver is not None and not self._is_compiled:
             self._is_compiled = self._solver.is_compiled
 
     def plan(self, request: PlanRequest) -> Plan:
-        """Return the plan for a request; `StiffoptError`: the optimiser could not be run."""
+        """Return the plan for a request; `StiffoptError` if the optimiser cannot run."""
         self._go_on_with(request)
         if request.task is None or request.target is None:
             return self._checked(request)
@@ -144,7 +144,7 @@ class Planning:
         return replace(plan, blocked=blocked)
 
     def _checked(self, request: PlanRequest) -> Plan:
-        """No plan, but whether the way of a request, through waypoints, is clear."""
+        """Check a request's way through waypoints; the result holds no new plan."""
         if self._ways is None:
             raise InputError("a request without a task, and no scene to check its way")
         blocked = self._ways.blocked(request.way, waypoints=True)
@@ -186,7 +186,7 @@ class Planning:
         return self._last
 
     def _braced(self, request: PlanRequest, task: Task, asked: Target) -> Plan | None:
-        """Plan for an arm that leans on something; None where it does better to keep clear."""
+        """Plan for an arm that leans on objects; None if keeping clear of them is better."""
         solution = PressureSolver(self._robot, task.model_copy(update={"target": asked})).solve()
         if not solution.contacts or solution.pressures is None:
             return None
@@ -199,13 +199,13 @@ class Planning:
         except Unsolved as reason:
             return replace(plan, blocked=str(reason))
         blocked = ""
-        if self._ways is not None and len(request.way):  # first down to rest, clear of everything
+        if self._ways is not None and len(request.way):  # the arm first goes down to rest
             rest = np.zeros_like(plan.pressures)
             blocked = self._ways.blocked(np.vstack([request.way[:1], rest]))
         return replace(plan, approach=approach, blocked=blocked)
 
     def _effective_limits(self, request: PlanRequest) -> tuple[Array, Array]:
-        """Limits (n,) of effective pressures that some permitted command has, in Pa.
+        """Return limits (n,) of the effective pressures that permitted commands lead to, in Pa.
 
         The offset never widens the task's limits, beyond which the model does not hold.
         """
@@ -220,7 +220,7 @@ class Planning:
         return np.clip(request.low, *shifted), np.clip(request.high, *shifted)
 
     def _next_to(self, last: Plan, target: Target) -> PressureSolution | None:
-        """The optimum next to the last plan; another one once it has stayed the answer for long."""
+        """Return the optimum next to the last plan; a distant one only if it persists."""
         solution = self._solve(target, last.pressures)
         if solution is None or solution.pressures is None:
             return None
@@ -239,10 +239,10 @@ class Planning:
     def _better(
         self, request: PlanRequest, target: Target, solution: PressureSolution, last: Plan
     ) -> PressureSolution:
-        """The stiffest configuration, if the offset has changed and the arm is at rest.
+        """Return the stiffest configuration, if the offset has changed and the arm is at rest.
 
-        Each change of configuration makes the next one harder, since the offset, and with it the
-        choice, may be different in each configuration.
+        Each change of configuration raises the advantage required for the next one: the offset, and
+        with it the choice, may differ between configurations.
         """
         changed = float(np.linalg.norm((request.offset - self._searched_at)[:3]))
         drift = float(np.linalg.norm((request.offset - last.offset)[:3]))
@@ -258,7 +258,7 @@ class Planning:
         return other
 
     def _solve(self, target: Target, guess: Array | None) -> PressureSolution | None:
-        """The optimiser's solution; None where it has none that holds, soon enough."""
+        """Return the optimiser's solution; None if it finds none that is valid in time."""
         assert self._solver is not None  # made before
         self._is_compiled = self._is_compiled or self._solver.is_compiled
         if self._is_compiled:
@@ -275,7 +275,7 @@ class Planning:
         return solution if solution.found else None
 
     def _nearest(self, request: PlanRequest, task: Task, target: Target) -> Plan:
-        """Plan for a target that is out of reach, or cannot be had with the stiffness required."""
+        """Plan for a target that is out of reach, or unreachable at the required stiffness."""
         start = 0.5 * (self._limits[0] + self._limits[1])
         if self._last is not None:
             start = np.clip(self._last.pressures, *self._limits)
@@ -291,7 +291,7 @@ class Planning:
         )  # fmt: skip
 
     def _displacement(self, last: Plan, target: Target) -> Array:
-        """Displacement (3,) of the model's target from that of the last plan, in m."""
+        """Return by how much (3,) the model's target has moved since the last plan, in m."""
         before = None
         if last.target is not None:
             before = model_target(last.target, last.offset).position
@@ -302,7 +302,7 @@ class Planning:
 
 
 def nearest_words(distance: float, angle: float, tolerance: Tolerance) -> str:
-    """Say how far from its target a tip is, in m and rad."""
+    """Report how far a tip is from its target, in m and rad."""
     words = f"the nearest pose is {1e3 * distance:.1f} mm away"
     if angle > tolerance.angle:
         words += f" and {math.degrees(angle):.1f} deg"
@@ -310,18 +310,18 @@ def nearest_words(distance: float, angle: float, tolerance: Tolerance) -> str:
 
 
 def model_target(target: Target, offset: Array) -> Target:
-    """Return the target of the model that puts an arm with an offset (6,) on a target.
+    """Return the target at which the model must aim so that an arm with an offset is on target.
 
-    The offset is that of `PlanRequest`.
+    The offset (6,) is that of `PlanRequest`.
     """
     return target.moved_back(offset).model_copy(update={"tolerance": _EXACT})
 
 
 class NearestSearch:
-    """Finds the pressures nearest to a target that is out of reach, soon enough for a loop.
+    """Finds the pressures nearest to a target that is out of reach, fast enough for the loop.
 
-    Gauss-Newton on the squared pose error, within the limits of pressure. Angles count by a lever,
-    in m/rad, as in feedback.
+    It minimises the squared pose error by Gauss-Newton, within the limits of pressure. A lever, in
+    m/rad, converts angles, as in feedback.
     """
 
     def __init__(self, tip: TipModel, lever: float, tuning: NearestTuning) -> None:
@@ -331,10 +331,10 @@ class NearestSearch:
     def find(
         self, target: Target, bounds: tuple[Array, Array], start: Array
     ) -> tuple[Array, float, float]:
-        """Return the optimum within lower and upper bounds (n,) next to pressures (n,), in Pa.
+        """Return a local optimum between the bounds (n,), from a start (n,), in Pa.
 
-        With the pressures come the position and angle errors there, in m and rad. The target is the
-        model's.
+        Returns pressures (n,), and the position and angle errors there, in m and rad. The target is
+        the model's.
         """
         tuning = self._tuning
         low, high = bounds[0] / _BAR, bounds[1] / _BAR

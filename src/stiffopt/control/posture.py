@@ -1,4 +1,4 @@
-"""`PostureCourse`: a trajectory of pressures, which the arm follows as its posture."""
+"""`PostureCourse`: a trajectory of pressures that the arm follows as its posture."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ Array = NDArray[np.float64]
 
 
 class PostureCourse:
-    """A trajectory of pressures under way: on straight lines from waypoint to waypoint.
+    """A trajectory of pressures under way, on straight lines from waypoint to waypoint.
 
-    At a waypoint the tip is to be at the waypoint's target. Between two of them it goes as the
-    pressures take it: what is interpolated is by how much the targets differ from where the model
-    has the tip at the waypoints' pressures.
+    At a waypoint, the tip is to be at the waypoint's target. The target differs from the model's
+    tip at the waypoint's pressures. Between waypoints this difference is interpolated, and the tip
+    goes where the pressures take it plus the difference.
 
     Parameters
     ----------
     trajectory :
         The waypoints, with n pressures each.
     begin :
-        When it begins, in s.
+        Time at which it begins, in s.
     start :
-        Where it begins (n + 6,), if the first waypoint is later: see `goal`.
+        Start (n + 6,) if the first waypoint is later, as `goal` returns it.
     pose_at :
-        The model's tip pose (4, 4) at pressures (n,).
+        Returns the model's tip pose (4, 4) at pressures (n,).
     """
 
     def __init__(
@@ -54,13 +54,13 @@ class PostureCourse:
         self.begin = begin
 
     def wait(self, duration: float) -> None:
-        """Let what is left of it be so much later, in s."""
+        """Delay the rest of the trajectory by a duration, in s."""
         self.begin += duration
 
     def goal(self, now: float) -> Array:
-        """Pressures at a time, and how the tip is to differ from the model's there (n + 6,).
+        """Return pressures at a time, and the tip's intended offset from the model (n + 6,).
 
-        The difference is a displacement, in m, and a rotation vector, both in base axes.
+        The offset is a displacement, in m, and a rotation vector, both in base axes.
         """
         times = self._times
         t = min(max(now - self.begin, times[0]), times[-1])
@@ -77,11 +77,11 @@ class PostureCourse:
         return found
 
     def at(self, now: float) -> Target:
-        """Return the kind of target that all waypoints have."""
+        """Return the first waypoint's target; all waypoints have targets of its kind."""
         return self._first
 
     def target(self, pose: Array, difference: Array) -> Target:
-        """Return the target where the model has the tip at a pose (4, 4); see `goal`."""
+        """Return the target for a model's tip pose (4, 4) and a difference (6,), see `goal`."""
         update: dict[str, object] = {}
         rotation = lie.exp(np.append(np.zeros(3), difference[3:]))[:3, :3] @ pose[:3, :3]
         if self._first.position is not None:
@@ -98,7 +98,7 @@ class PostureCourse:
         return self._first.model_copy(update=update)
 
     def _difference(self, waypoint: int) -> Array:
-        """Of a waypoint's target from the model's tip there (6,), found when it is needed."""
+        """Return the difference (6,) at a waypoint, computed when it is first needed."""
         if waypoint not in self._known:
             target = self._targets[waypoint]
             assert target is not None  # the start is known
@@ -109,7 +109,7 @@ class PostureCourse:
 
 
 def difference(target: Target, pose: Array) -> Array:
-    """How a tip at a pose (4, 4) has to move to be at a target (6,); 0 where that asks nothing."""
+    """Return the motion (6,) from a pose (4, 4) to a target; 0 in components left free."""
     found, rotation = np.zeros(6), pose[:3, :3]
     if target.position is not None:
         pairs = zip(target.position, pose[:3, 3], strict=True)

@@ -1,16 +1,16 @@
-"""To press on something with a given force: approach, press, and go back where that fails.
+"""Pressing with a given force: approach, press, and go back if that fails.
 
-From the target of the task on, the place s(p) + d where the tip would be if nothing touched it is
-led along the direction n, by a shift v. The offset d is corrected across n only; along n it stays
-as it was when the approach began. So nothing is made up for that holds the tip back: it presses
-like a spring of the arm's own compliance c along n. Until something is felt, v grows with the speed
-of the approach. Then, with F the force that is wanted and f the one that is felt::
+A press starts at the task's target. From there the tip's position without contact, s(p) + d, is
+shifted by v along the direction n. The offset d is corrected across n only; along n it keeps its
+value from the beginning of the approach. So the controller does not compensate what holds the tip
+back: the arm presses like a spring with its own compliance c along n. Until a force is felt, v
+grows with the speed of the approach. Then, with the wanted force F and the estimated force f::
 
     v' = c (F - f) / T,    not faster than the speed of the approach
 
 Against a rigid surface f = (v - v0) / c, and the force settles with the time constant T; against a
-soft one of stiffness k more slowly, by 1 + 1 / (c k), and never with an overshoot by this law. What
-is felt comes late by some 0.1 s, much less than T.
+soft one of stiffness k it settles more slowly, by a factor 1 + 1 / (c k). The law has no overshoot.
+The estimated force is about 0.1 s late, much less than T.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ Array = NDArray[np.float64]
 
 
 class Phase(StrEnum):
-    """Where a press is."""
+    """The phase of a press."""
 
     GOING = "going"  # to the target, where the approach begins
     APPROACHING = "approaching"
@@ -42,19 +42,19 @@ class Phase(StrEnum):
 
 
 class Pressing:
-    """A press under way: a target for each moment.
+    """A press under way: a target at each time.
 
     Parameters
     ----------
     press, target :
-        What is wanted, and where the approach begins.
+        The press, and the target at which the approach begins.
     tuning :
         Times and limits.
 
     Attributes
     ----------
-    phase : where it is.
-    force : with which the tip presses along the direction, as it is felt, in N; NaN before.
+    phase : the present phase.
+    force : estimated force of the tip along the direction, in N; NaN before the approach.
     """
 
     def __init__(self, press: Press, target: Target, tuning: PressingTuning) -> None:
@@ -63,13 +63,14 @@ class Pressing:
         self._direction: Array = np.zeros(3)  # n, base axes
         self._shift = 0.0  # v, in m
         self._start: Array = np.zeros(3)  # tip (3,) when the approach began
-        self._offset: Array = np.zeros(6)  # d then
-        self._waited = self._felt_nothing = self._within = self._off = 0.0  # times in s
+        self._offset: Array = np.zeros(6)  # d at that time
+        # durations, in s: at rest, without a force, within and outside the tolerance
+        self._waited = self._felt_nothing = self._within = self._off = 0.0
         self._touched, self._why = False, ""
-        self._told: list[Notice] = []
+        self._notices: list[Notice] = []
 
     def at(self, now: float) -> Target:
-        """Return the target of the arm without contact, at any time."""
+        """Return the present target of the arm without contact."""
         position = self._target.position
         if position is None or not self._shift:
             return self._target
@@ -80,7 +81,7 @@ class Pressing:
         return self._target.model_copy(update={"position": moved})
 
     def shown(self, tip: Array) -> Target:
-        """Return the target across the direction; along it, that is where the tip (3,) is."""
+        """Return the target to report: across the direction; along it, the tip's position (3,)."""
         position = self._target.position
         if position is None or self.phase in (Phase.GOING, Phase.ENDED):
             return self._target
@@ -93,7 +94,7 @@ class Pressing:
 
     @property
     def presses(self) -> bool:
-        """Whether the tip presses on something by now."""
+        """Whether the tip presses on something now."""
         return self.phase is Phase.PRESSING and self._touched
 
     @property
@@ -103,11 +104,11 @@ class Pressing:
 
     @property
     def touches_on_purpose(self) -> bool:
-        """Whether what holds the tip back is no error that has to be made up for."""
+        """Whether the controller must not compensate what holds the tip back."""
         return self.phase in (Phase.APPROACHING, Phase.PRESSING, Phase.RETREATING)
 
     def corrected(self, offset: Array) -> Array:
-        """Return the offset (6,) that is made up for, of the one that is estimated."""
+        """Return the part of the estimated offset (6,) to compensate."""
         if not self.touches_on_purpose:
             return offset
         n, corrected = self._direction, offset.copy()
@@ -115,7 +116,7 @@ class Pressing:
         return corrected
 
     def change_model(self, change: Array) -> None:
-        """Go on with another model, from which the tip is off by another offset (6,)."""
+        """Adjust to another model, for which the tip's offset changes by (6,)."""
         self._offset = self._offset + change
 
     def advance(
@@ -129,22 +130,23 @@ class Pressing:
         rotation: Array,
         compliance: Array,
     ) -> None:
-        """Go on by a tick.
+        """Advance by a tick.
 
         Parameters
         ----------
         elapsed :
-            Since the tick before, in s.
+            Time since the last tick, in s.
         arrived :
             Whether the arm rests at its target.
         known :
-            Whether its stiffness is known as well as it can be soon.
+            Whether no better estimate of its stiffness is due soon.
         tip, offset :
             Position (3,) of the tip, in m, and its offset (6,) from the model.
         felt :
-            Force on the tip.
+            Estimated force on the tip.
         rotation, compliance :
-            Of the model's tip in base axes (3, 3), and of its position (3, 3) by forces, in m/N.
+            Rotation (3, 3) of the model's tip, and compliance (3, 3) of its position, in m/N, both
+            in base axes.
         """
         if self.phase is Phase.GOING:
             self._waited = self._waited + elapsed if arrived else 0.0
@@ -186,7 +188,7 @@ class Pressing:
         self._within = self._within + elapsed if abs(missing) <= press.tolerance else 0.0
         if self._felt_nothing > t.lost and self._why:
             self._retreat("the contact was lost")
-        elif self._felt_nothing > t.lost:  # it was none
+        elif self._felt_nothing > t.lost:  # it was no contact
             self.phase, self._felt_nothing = Phase.APPROACHING, 0.0
         elif gone > press.travel:
             self._retreat(
@@ -202,31 +204,31 @@ class Pressing:
             self._shift = max(0.0, self._shift + float(np.clip(rate, -limit, limit)) * elapsed)
         if self.force > press.force / 2 and not self._touched:
             self._touched = True
-            self._tell("touch", f"something is felt, after {1e3 * gone:.1f} mm")
+            self._notify("touch", f"something is felt, after {1e3 * gone:.1f} mm")
         if self._within >= t.settled and not self._why:
             self._why = "held"
-            self._tell("pressing", f"presses with {1e3 * self.force:.0f} mN")
+            self._notify("pressing", f"presses with {1e3 * self.force:.0f} mN")
 
     def _held_back(self, gone: float) -> float:
-        """By how much the tip is held back, in m: a bound that needs no estimate of the force."""
+        """Return by how much the tip is held back, in m: needs no estimate of the force."""
         return self._shift - gone
 
     def _retreat(self, why: str) -> None:
         self.phase, self._why = Phase.RETREATING, why
 
-    def _tell(self, kind: str, text: str) -> None:
-        self._told.append(Notice(kind, text, Severity.INFO))
+    def _notify(self, kind: str, text: str) -> None:
+        self._notices.append(Notice(kind, text, Severity.INFO))
 
     def notices(self) -> tuple[Notice, ...]:
-        """Return what has happened since the last call, and what is wrong."""
-        told, self._told = tuple(self._told), []
+        """Return events since the last call, and alarms."""
+        found, self._notices = tuple(self._notices), []
         if self.phase in (Phase.RETREATING, Phase.ENDED):
             text = f"{self._why}; the tip goes back to where it began, until there is a new task"
-            return (*told, Notice("press-failed", text, standing=True))
+            return (*found, Notice("press-failed", text, standing=True))
         if self.phase is Phase.PRESSING and self._off > self._tuning.patience:
             text = (
                 f"the tip presses with {1e3 * self.force:.0f} mN instead of "
                 f"{1e3 * self.press.force:g} mN"
             )
-            return (*told, Notice("press-force", text, standing=True))
-        return told
+            return (*found, Notice("press-force", text, standing=True))
+        return found

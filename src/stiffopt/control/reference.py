@@ -1,14 +1,14 @@
 """The reference: a smooth path from the present pressures to those of the plan.
 
-Plans jump. Their pressures, and the offset of the tip that goes with them, pass a limit of slew and
-four equal lags ``a / (s + a)``, which leave a path x(t) with three derivatives. The command that
-makes the arm follow this path is ::
+Plans jump. Their pressures, and the tip's offset that belongs to them, pass a slew limit and four
+equal lags ``a / (s + a)``, which give a path x(t) with three derivatives. The command that makes
+the arm follow this path is ::
 
     x_command = (1 + tau s) (1 + 2 zeta / omega s + s^2 / omega^2) x,
 
-the inverse of regulators and first bending mode, one dead time early. All channels have the same
-filter, so that they follow a straight line in the space of pressures, on which no limit can be
-violated, and reach the plan together.
+the inverse of the regulators and the first bending mode; the command leads by one dead time. All
+channels have the same filter. So they follow a straight line in the space of pressures, on which no
+limit can be violated, and reach the plan together.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ from stiffopt.control.formula import Formula
 Array = NDArray[np.float64]
 
 _LAGS = 4
-_LONGEST = 2.0  # s, of half a vibration; values of a slower one are averaged over twice this
-# of the lags' states: the last one, and its derivatives in units of the rate
+_LONGEST = 2.0  # s, longest half period of a vibration that is averaged over
+# from the lags' states to the last state and its derivatives, in units of the rate
 _DIFFERENCES = np.array(
     [[0, 0, 0, 0, 1], [0, 0, 0, 1, -1], [0, 0, 1, -2, 1], [0, 1, -3, 3, -1]], dtype=float
 )
 
 
 class Reference:
-    """The path to the plan, of n pressures and `extra` = m numbers that go with them.
+    """The path to the plan, of n pressures and `extra` = m numbers that belong to them.
 
-    Steps take a period, in s. The pressures change by at most a share of the slew (n,), in Pa/s.
-    The regulators have a lag, in s, the vibration a damping ratio.
+    A step takes `period`, in s. The pressures change by at most a share of the slew (n,), in Pa/s.
+    `lag` is that of the regulators, in s; `damping` the vibration's damping ratio.
     """
 
     def __init__(
@@ -49,7 +49,7 @@ class Reference:
     ) -> None:
         self._period, self._lag, self._damping = period, lag, damping
         self._step = _step(slew * period, extra)
-        self.slew_share = slew_share  # of the slew, which the pressures may take
+        self.slew_share = slew_share  # share of the slew that the pressures may use
         self._filter_of: tuple[float, float] | None = None  # rate and omega
         self._filter: tuple[Array, ...] = ()
         self.rate = 1.0  # a of the four lags, in 1/s
@@ -57,13 +57,13 @@ class Reference:
         self.begin(np.zeros(len(slew) + extra))
 
     def begin(self, values: Array) -> None:
-        """Start anew, at rest at pressures and what goes with them (n + m,)."""
+        """Restart at rest, at pressures and the numbers that belong to them (n + m,)."""
         self._states = np.tile(values, (_LAGS + 1, 1))
-        # the path now and its first three derivatives by time, in s
+        # the path now and its first three time derivatives, in s
         self.motion = np.concatenate([self._states[-1:], np.zeros((_LAGS - 1, len(values)))])
 
     def shift(self, change: Array) -> None:
-        """Add a change (m,) to the numbers that go with the pressures, everywhere on the path."""
+        """Add a change (m,) to the numbers that belong to the pressures, along the whole path."""
         n = self._states.shape[1] - len(change)
         self._states[:, n:] += change
         self.motion[0, n:] += change
@@ -75,7 +75,7 @@ class Reference:
 
     @property
     def goal(self) -> Array:
-        """Where the path comes to rest if the plan stays where it has come to (n + m,)."""
+        """Where the path comes to rest if the plan no longer changes (n + m,)."""
         value: Array = self._states[0]
         return value
 
@@ -88,7 +88,8 @@ class Reference:
     def advance(self, plan: Array) -> None:
         """Take a step towards a plan (n + m,).
 
-        It sets the pressures (n,) to be commanded, and those in the chambers when that acts, in Pa.
+        This sets `command`, the pressures (n,) to command, and `chamber`, those in the chambers
+        when the command acts, in Pa.
         """
         if self._filter_of != (self.rate, self.omega):
             self._filter_of, self._filter = (self.rate, self.omega), self._matrices()
@@ -97,9 +98,9 @@ class Reference:
         )
 
     def _matrices(self) -> tuple[Array, ...]:
-        """Transition matrix (5, 5) under a constant input, and weights; see `_step`."""
+        """Return the transition matrix (5, 5) under a constant input, and weights; see `_step`."""
         a, x = self.rate, self.rate * self._period
-        # the step response of k lags in series is 1 less the sum of the first k of these
+        # the step response of k lags in series is 1 minus the sum of the first k terms
         terms = [math.exp(-x) * x**k / math.factorial(k) for k in range(_LAGS)]
         M = np.eye(_LAGS + 1)
         for i in range(1, _LAGS + 1):
@@ -116,12 +117,13 @@ class Reference:
 
 
 class VibrationFilter:
-    """Averages what feedback corrects over one vibration, so that correcting it excites none.
+    """Averages what feedback corrects over one vibration, so that the correction excites none.
 
     The average of a value over the period T of the vibration has zeros at its frequency and at all
-    multiples of it, near which the second bending mode is in some postures. The first mode, of a
-    damping ratio zeta, follows the average on a path without a residue: with D = T / 2, it is the
-    response to two steps of half the height, D apart (zero-vibration shaping), averaged over D.
+    multiples of it; in some postures the second bending mode is near one of them. The first mode,
+    with damping ratio zeta, follows the average on a path without residual vibration. With D = T /
+    2, the average is the response to two steps of half the height, D apart (zero-vibration
+    shaping), averaged over D.
     """
 
     def __init__(self, period: float, damping: float, m: int) -> None:
@@ -130,13 +132,13 @@ class VibrationFilter:
         self.begin(np.zeros(m))
 
     def begin(self, values: Array) -> None:
-        """Start anew, with values (m,) that have not changed for long."""
-        # the newest first, twice: any `_kept` in a row are in one piece
+        """Restart with values (m,) that have long been constant."""
+        # the newest first, stored twice: any `_kept` in a row are contiguous
         self._past = np.tile(values, (2 * self._kept, 1))
         self._newest = self._kept
         self._omega, self._weights = math.inf, np.array([[1.0], [1.0], [0.0]])
         self.value = values  # the average
-        self.motion = np.stack([values, np.zeros(len(values))])  # path of the mode, and its rate
+        self.motion = np.stack([values, np.zeros(len(values))])  # path and speed of the mode
 
     def shift(self, change: Array) -> None:
         """Add a change (m,) to all values, past ones as well."""
@@ -145,7 +147,7 @@ class VibrationFilter:
         self.motion = self.motion + np.stack([change, np.zeros(len(change))])
 
     def advance(self, values: Array, omega: float) -> None:
-        """Take in values (m,) at an angular frequency, in rad/s; infinite: no vibration."""
+        """Take in values (m,) with a vibration of `omega`, in rad/s; infinite: no vibration."""
         self._newest = (self._newest or self._kept) - 1
         self._past[self._newest] = self._past[self._newest + self._kept] = values
         if omega != self._omega:
@@ -155,7 +157,7 @@ class VibrationFilter:
         self.motion = np.stack(motion)
 
     def _shape(self, omega: float) -> Array:
-        """Weights (3, k), for the newest value first, of average, path and its rate."""
+        """Return weights (3, k) of average, path and speed, for the newest value first."""
         half = min(math.pi / omega, _LONGEST) / self._period
         if half < 1:
             return np.array([[1.0, 0.0], [1.0, 0.0], [1 / self._period, -1 / self._period]])
@@ -173,11 +175,11 @@ class VibrationFilter:
 
 
 def _step(reach: Array, extra: int) -> Formula:
-    """States (5, n + m), motion (4, n + m), command and chamber (n,) after a step.
+    """Return the formula of a step: states (5, n + m), motion (4, n + m), command, chamber (n,).
 
-    Inputs: states, whose first is the input of the lags; the plan (n + m,); transition matrix (5,
-    5); differences (4, 5); weights (4,) of the motion in command and chamber; the share of `reach`
-    by which the n pressures change at most in a step.
+    Inputs: states, the first of which is the input of the lags; the plan (n + m,); transition
+    matrix (5, 5); differences (4, 5); weights (4,) of the motion in command and chamber; the share
+    of `reach`, the greatest change of the n pressures in a step, that may be used.
     """
     n = len(reach)
     states, plan = ca.SX.sym("states", _LAGS + 1, n + extra), ca.SX.sym("plan", n + extra)
@@ -186,7 +188,7 @@ def _step(reach: Array, extra: int) -> Formula:
     command, chamber = ca.SX.sym("command", _LAGS), ca.SX.sym("chamber", _LAGS)
     slew_share = ca.SX.sym("slew_share")
     way = plan.T - states[0, :]
-    # all channels go the share of their way that the slowest one can go in a step
+    # all channels take the share of their way that the slowest one can cover in a step
     needed = ca.mmax(ca.fabs(way[:n]).T / ca.DM(reach))
     share = ca.if_else(needed > slew_share, slew_share / needed, 1)
     begun = ca.vertcat(states[0, :] + share * way, states[1:, :])

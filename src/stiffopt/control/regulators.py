@@ -1,18 +1,18 @@
-"""Pressures in the chambers, estimated from commands and readings, and those that act on the arm.
+"""Pressures in the chambers, estimated from commands and readings, and their effect on the arm.
 
 Each regulator follows its set-point after a dead time, as a first-order lag of limited slew::
 
     tau x' = u + b - x
 
-Readings correct the pressure x and the offset b, so that a regulator that saturates, leaks or is
-slightly off is modelled where it is and not where it should be. An arm with hysteresis or creep
-then has the shape of another pressure, the effective one (`stiffopt.model.history`).
+Readings correct the pressure x and the offset b, so that the model follows a regulator that
+saturates, leaks or is slightly off. An arm with hysteresis or creep has the shape of another
+pressure, the effective one (`stiffopt.model.history`).
 
-The discrete lag ``x += (1 - exp(-h / tau)) (u - x)``, limited by the slew, stands in four places
-that must not share code: here with readings as feedback; in `stiffopt.safety.expected_pressure` as
-a bound that no reading may move; in the simulated plant, as what the others are tested against; and
-in `stiffopt.model.history`, exact for steps of any length, for calibration. A test holds them
-equal where they describe the same regulator.
+The discrete lag ``x += (1 - exp(-h / tau)) (u - x)``, limited by the slew, is in four places that
+must not share code: here with readings as feedback; in `stiffopt.safety.expected_pressure` as a
+bound that no reading may move; in the simulated plant, against which the others are tested; and in
+`stiffopt.model.history`, exact for steps of any length, for calibration. A test checks that they
+agree where they describe the same regulator.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ Array = NDArray[np.float64]
 
 
 class RegulatorModel:
-    """Pressures behind the regulators of n channels, estimated in steps of a period, in s.
+    """Pressures behind the regulators of n channels, in steps of `period`, in s.
 
-    The regulators have a lag (n,) and a dead time, in s, and a greatest slew (n,), in Pa/s.
+    The regulators have lags (n,) and a dead time, in s, and a greatest slew (n,), in Pa/s.
     """
 
     def __init__(
@@ -55,16 +55,16 @@ class RegulatorModel:
         self.begin(np.zeros(n))
 
     def begin(self, pressures: Array) -> None:
-        """Start anew, settled at pressures (n,)."""
+        """Restart, settled at pressures (n,)."""
         self.pressures = pressures.copy()  # now, in Pa
         self.offset = np.zeros_like(pressures)  # b, in Pa: settled pressures relative to commands
         self.ahead = self.pressures  # a dead time from now; no further command can change them
-        self._sent = np.tile(pressures, (self._depth, 1))  # the next to arrive comes first
+        self._sent = np.tile(pressures, (self._depth, 1))  # commands under way, the oldest first
 
     def advance(self, commanded: Array, reading: Array) -> Array:
         """Take a step with commands (n,) and, at its end, readings (n,); NaN: not measured.
 
-        Return the pressures (n,) then, in Pa.
+        Return the pressures (n,) after it, in Pa.
         """
         sent = self._sent
         sent[:-1] = sent[1:]
@@ -76,9 +76,9 @@ class RegulatorModel:
 
 
 class PressureEstimator:
-    """Commanded, chamber and effective pressures of an arm, in steps of a period, in s.
+    """Commanded, chamber and effective pressures of an arm, in steps of `period`, in s.
 
-    The robot may have a history: hysteresis, creep, and a lag that replaces that of the regulators.
+    The robot may have a history: hysteresis, creep, and a lag that replaces the regulators'.
     """
 
     def __init__(
@@ -97,14 +97,14 @@ class PressureEstimator:
         self.begin()
 
     def begin(self) -> None:
-        """Start anew with a vented arm."""
+        """Restart with a vented arm."""
         zero = np.zeros(self._robot.n_pressures)
         self._memory = _memory(self._robot)
         self._regulators.begin(zero)
         self.channels.begin()
-        self.command = zero  # pressures that were commanded last, in Pa
-        self.chamber = zero  # those in the chambers
-        self.effective = zero  # those that would give a settled arm its present shape
+        self.command = zero  # last commanded pressures, in Pa
+        self.chamber = zero  # pressures in the chambers
+        self.effective = zero  # pressures that would give a settled arm its present shape
 
     def advance(self, steps: int, commanded: Array, reading: Array) -> None:
         """Take steps with commands (n,) and readings (n,) in Pa; NaN: not measured."""
@@ -126,7 +126,7 @@ class PressureEstimator:
     def command_offset(self) -> Array:
         """Settled effective pressures relative to commands (n,), in Pa.
 
-        The offset of a regulator is part of it as far as commands may compensate it.
+        It contains the part of the regulators' offset that commands may compensate.
         """
         return self.history_offset + self.channels.compensated(self._regulators.offset)
 
@@ -139,9 +139,9 @@ class PressureEstimator:
 def _step(
     share: Array, reach: Array, depth: int, period: float, tuning: RegulatorTuning
 ) -> Formula:
-    """Pressures, offset and pressures ahead (n,) each after a step.
+    """Return the formula of a step: pressures, offset and pressures ahead (n,) after it.
 
-    Inputs are pressures and offset (n,), the commands under way (depth, n) and readings (n,).
+    Inputs: pressures and offset (n,), the commands under way (depth, n) and readings (n,).
     """
     n = len(share)
     x, offset, reading = ca.SX.sym("x", n), ca.SX.sym("offset", n), ca.SX.sym("reading", n)
@@ -152,7 +152,7 @@ def _step(
         return x + ca.fmin(ca.fmax(change, -ca.DM(reach)), ca.DM(reach))
 
     now = lagged(x, offset, sent[0, :])
-    error = ca.if_else(ca.fabs(reading) < np.inf, reading - now, 0)  # NaN is not less
+    error = ca.if_else(ca.fabs(reading) < np.inf, reading - now, 0)  # 0 for NaN
     offset_after = offset + tuning.offset_gain * period**2 * error / ca.DM(share)
     now = now + min(1.0, tuning.pressure_gain * period) * error
     ahead = now
@@ -162,9 +162,9 @@ def _step(
 
 
 def _regulation(robot: RobotDescription, control: ControlSettings) -> tuple[Array, float]:
-    """Lags (n,) and dead time in s, of the robot file where it knows them, else of the rig.
+    """Return lags (n,) and dead time, in s, of the robot file or, if unknown there, of the rig.
 
-    The control loop needs the likeliest values; `safety.expected_pressure` takes the slowest.
+    The control loop needs the likeliest values; `safety.expected_pressure` uses the slowest.
     """
     lags, dead_time = [], control.regulator_dead_time
     for segment in robot.segments:
@@ -177,7 +177,7 @@ def _regulation(robot: RobotDescription, control: ControlSettings) -> tuple[Arra
 
 
 def _memory(robot: RobotDescription) -> Memory | None:
-    """Hysteresis and creep of a rested arm, without lags, which the regulators' model has."""
+    """Return hysteresis and creep of a rested arm; the regulators' model has the lags."""
     histories: list[History | None] = []
     places: list[int] = []
     for segment in robot.segments:

@@ -1,4 +1,4 @@
-"""What the controller pursues, and when it has a new plan made, for which target and offset."""
+"""The controller's pursuit (task, target or trajectory), and when to request a plan for it."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ class Pursuit:
     """What the controller pursues."""
 
     task: Task | None = None  # within the limits of the rig; None: nothing is pursued
-    target: Target | None = None  # takes the place of the task's own
-    # a trajectory or a press under way, which takes the place of the target
+    target: Target | None = None  # replaces the task's own
+    # a motion under way, whose target replaces `target`
     course: AnyCourse | None = None
     prescribed: Array = field(default_factory=lambda: np.zeros(5))  # see `prescribed_components`
     stiffness: Callable[[Array, Array], float] | None = None  # in the task's first direction
@@ -41,22 +41,22 @@ class Pursuit:
 
     @classmethod
     def of(cls, task: Task, limited: Task, course: AnyCourse | None = None) -> Pursuit:
-        """Return the pursuit of a task, given with the limits of the rig as well."""
+        """Return the pursuit of a task; `limited` is the task within the limits of the rig."""
         prescribed = prescribed_components(task.target)
         unit = task.measures[0].unit if task.measures else "N/m"
         return cls(limited, task.target, course, prescribed, stiffness_function(task), unit)
 
     def to(self, target: Target, course: AnyCourse | None = None) -> Pursuit:
-        """Return the pursuit of another target, or course that begins there."""
+        """Return the pursuit of another target, or of a course that begins there."""
         prescribed = prescribed_components(target)
         return replace(self, target=target, course=course, prescribed=prescribed)
 
     def target_at(self, now: float) -> Target | None:
-        """Return the target at a moment, in s."""
+        """Return the target at a time, in s."""
         return self.target if self.course is None else self.course.at(now)
 
     def is_new_after(self, before: Pursuit) -> bool:
-        """Whether it is planned for from the beginning, not from the plan before."""
+        """Whether planning starts from scratch, not from the last plan."""
         if self.task is not before.task or before.target is None:
             return True
         if bool((self.prescribed != before.prescribed).any()):
@@ -76,9 +76,9 @@ class Pursuit:
 
 
 class Replanner:
-    """Has plans made for what is pursued, at intervals, and keeps the newest.
+    """Requests plans for the pursuit at intervals, and keeps the newest.
 
-    The period of the loop and the dead time of the regulators are in s.
+    `period` of the loop and `dead_time` of the regulators are in s.
     """
 
     def __init__(
@@ -89,9 +89,9 @@ class Replanner:
         dead_time: float,
     ) -> None:
         self._planner, self._tuning = planner, tuning
-        self.known: Estimate | None = None  # of the arm's numbers
-        self.adapted: Adapted | None = None  # the arm that plans are for; None: as its file has it
-        self._newest: Plan | None = None  # that was looked at
+        self.known: Estimate | None = None  # of the model's numbers
+        self.adapted: Adapted | None = None  # the model that plans use; None: the robot file's
+        self._newest: Plan | None = None  # the last that `latest` took
         self._lead = dead_time + 0.5 * period
         self._serial, self._search = 0, True
         self.begin()
@@ -99,14 +99,14 @@ class Replanner:
     def begin(self) -> None:
         """Start anew, with nothing to pursue."""
         self.pursuit = Pursuit()
-        self.plan: Plan | None = None  # the newest, which may be of the task before
+        self.plan: Plan | None = None  # the newest, possibly of the task before
         self._offset = np.zeros(6)
         self.deviation = math.nan  # of the plan's stiffness, relative
         self._available: Array | None = None  # (2, n), see `update`
         self._renew()
 
     def pursue(self, pursuit: Pursuit) -> None:
-        """Pursue something else from now on; an error changes nothing."""
+        """Change the pursuit; an error changes nothing."""
         before = self.pursuit
         far_position, far_angle = self._tuning.far_position, self._tuning.far_angle
         new = pursuit.is_new_after(before)
@@ -115,7 +115,7 @@ class Replanner:
         if new:
             self._renew()
         if isinstance(pursuit.course, PostureCourse):
-            self.plan = None  # of another posture than that which the arm is led to
+            self.plan = None  # it belongs to another posture than the trajectory's
         self._search = self._search or far
         self._requested_at = -math.inf
 
@@ -135,21 +135,21 @@ class Replanner:
         way: Array | None = None,
         windows: tuple[Window, ...] = (),
     ) -> Array | None:
-        """Request a plan when it is time, and take the newest.
+        """Request a plan when it is time; return the newest.
 
         Parameters
         ----------
         now :
-            In s.
+            Time, in s.
         offset, pressure_offset :
             See `PlanRequest`.
         omega :
             Angular frequency of the vibration, in rad/s.
         delay :
-            Of the reference behind the plan, in s.
+            Delay of the reference behind the plan, in s.
         available :
-            Lowest and highest pressures (n,) that the channels can have, in Pa; when they change
-            by more than a little, all configurations are searched.
+            Lowest and highest pressures (n,) that the channels can have, in Pa. A change of more
+            than a little starts a search of all configurations.
         way :
             See `PlanRequest`; None without a scene.
         windows :
@@ -157,7 +157,7 @@ class Replanner:
 
         Returns
         -------
-        Effective pressures of the plan and the offset it was made for (n + 6,); None without one.
+        Effective pressures and offset of the plan (n + 6,); None without a plan.
         """
         task, target = self.pursuit.task, self.pursuit.target
         interval = self._tuning.interval
@@ -165,9 +165,9 @@ class Replanner:
         if task is not None and target is not None and now - self._requested_at >= interval - 1e-6:
             search = self._search and self.pursuit.course is None
             self._requested_at, self._search = now, False
-            if self.pursuit.course is not None:  # where it is when the reference is there
+            if self.pursuit.course is not None:  # the target when the reference will be there
                 target = self.pursuit.course.at(now + delay + self._lead)
-            # The offset depends on the posture: the posture follows it slowly, the tip at once.
+            # The offset depends on the posture. Plans follow it slowly, feedback at once.
             time = max(self._tuning.offset_time, self._tuning.offset_periods / omega)
             share = 1.0 if search else -math.expm1(-interval / time)
             self._offset = self._offset + share * (offset - self._offset)
@@ -184,7 +184,7 @@ class Replanner:
         return self.plan if self.plan is not None and self.plan.serial == self._serial else None
 
     def go_on_with(self, adapted: Adapted, change: Array) -> None:
-        """Plan for an arm with other numbers, of which the offset differs by a change (6,)."""
+        """Plan with an adapted model, whose offset differs by a change (6,)."""
         self.adapted = adapted
         if self.known is not None:
             self.known = replace(self.known, proposal=None)
@@ -194,7 +194,7 @@ class Replanner:
         self._requested_at = -math.inf
 
     def _note_available(self, available: tuple[Array, Array]) -> None:
-        """Have all configurations searched where the channels have become others."""
+        """Have all configurations searched after a change of the available pressures."""
         now = np.stack(available)
         if self._available is None:
             self._available = now
@@ -202,7 +202,7 @@ class Replanner:
             self._available, self._search = now, True
 
     def latest(self) -> Array | None:
-        """Take the newest plan, unless the way there is blocked; see `update`."""
+        """Take the newest plan, unless its way is blocked; return as `update` does."""
         plan = self._planner.latest()
         if plan is not None and plan.serial == self._serial and plan is not self._newest:
             self._newest, self.deviation = plan, plan.deviation
@@ -215,10 +215,10 @@ class Replanner:
         return np.concatenate([self.plan.pressures, self.plan.offset])
 
     def notices(self, away: tuple[float, float] | None = None) -> tuple[Notice, ...]:
-        """Return what is wrong with the planner and with its plan.
+        """Return what is wrong with the planner and its plan.
 
-        `away` are distance and angle of the tip from its target, in m and rad, where it is at rest
-        on its plan; else the plan's own count.
+        `away` is the measured distance of the tip from its target, in m, and the angle, in rad, for
+        a tip at rest on its plan; None: use the plan's own.
         """
         notices, plan = self._planner.notices(), self.plan
         if plan is not None and plan.serial == self._serial and not plan.reached:
@@ -240,7 +240,7 @@ class Replanner:
 
 
 def is_far(before: Target | None, target: Target | None, position: float, angle: float) -> bool:
-    """Whether a target is farther from the one before than a distance, in m, or an angle."""
+    """Whether two targets are farther apart than a distance, in m, or an angle, in rad."""
     (here, *directions), (there, *others) = target_arrays(before), target_arrays(target)
     if here is not None and there is not None:
         distance = float(np.linalg.norm(np.nan_to_num(there - here)))

@@ -1,4 +1,4 @@
-"""The queue of requests that other threads make and the control thread carries out."""
+"""The queue of requests, which other threads make and the control thread carries out."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from stiffopt.errors import CommandError
 
 Action = Callable[[], None]
 
-_CHECK_EVERY = 0.1  # s after which a waiting thread looks whether its request can still be served
+_CHECK_EVERY = 0.1  # s between checks of a waiting thread whether its request can still be served
 _GIVEN_UP = "nobody waits for this any more; it is not done"
 
 
@@ -30,7 +30,7 @@ class Requester:
         return self._gone
 
     def give_up(self) -> bool:
-        """Wait no more; return whether the request had not been begun, and so never will be."""
+        """Stop waiting; return True if the request has not begun, and so never will."""
         with self._lock:
             self._gone = True
             return not self._begun
@@ -48,7 +48,7 @@ _requester: ContextVar[Requester | None] = ContextVar("requester", default=None)
 
 @contextmanager
 def requested_by(requester: Requester) -> Iterator[None]:
-    """Make this thread's requests in the body those of a requester who may give them up."""
+    """Attribute the requests of this thread, in the body, to a requester, who may give them up."""
     before = _requester.set(requester)
     try:
         yield
@@ -57,33 +57,33 @@ def requested_by(requester: Requester) -> Iterator[None]:
 
 
 def current_requester() -> Requester:
-    """Return the requester of this thread; without `requested_by`, one who never gives up."""
+    """Return this thread's requester; without `requested_by`, one that never gives up."""
     return _requester.get() or Requester()
 
 
 class RequestQueue:
-    """Has requests carried out by the thread that serves them, or at once where none does."""
+    """Runs requests in the thread that serves them, or at once in the caller's if none serves."""
 
     def __init__(self) -> None:
-        self.turn = threading.RLock()  # held during a tick, and while a request is carried out
+        self.turn = threading.RLock()  # held during a tick and during a request
         self._queue: deque[tuple[Future[None], Action]] = deque()
         self._server: threading.Thread | None = None
 
     def begin(self) -> None:
-        """Serve from now on, in this thread; `CommandError` if another one does already."""
+        """Serve from now on in this thread; `CommandError` if another thread serves."""
         with self.turn:
             if self._served():
                 raise CommandError("the loop runs already")
             self._server = threading.current_thread()
 
     def end(self) -> None:
-        """Serve no more; waiting requests are refused."""
+        """Stop serving; refuse waiting requests."""
         with self.turn:
             self._server = None
             self.serve(refusing="the loop has ended")
 
     def serve(self, refusing: str = "") -> None:
-        """Carry out the waiting requests, or refuse them for a reason."""
+        """Carry out the waiting requests, or refuse them for the reason `refusing`."""
         while True:
             try:
                 outcome, action = self._queue.popleft()
@@ -101,9 +101,9 @@ class RequestQueue:
                 outcome.set_result(None)
 
     def submit(self, action: Action) -> None:
-        """Have a request carried out, wait for it, and raise what it raises.
+        """Run a request, wait for its end, and raise what it raises.
 
-        `CommandError`: the loop has ended, or the request was given up before it was begun (see
+        `CommandError`: the loop has ended, or the requester gave up before the request began (see
         `requested_by`).
         """
         requester = current_requester()
@@ -118,7 +118,7 @@ class RequestQueue:
         outcome: Future[None] = Future()
         self._queue.append((outcome, carry_out))
         while not wait([outcome], _CHECK_EVERY).done:
-            if requester.gone and outcome.cancel():  # which fails once it is being carried out
+            if requester.gone and outcome.cancel():  # it cannot be cancelled once it runs
                 raise CommandError(_GIVEN_UP)
             if not self._served():
                 self.serve(refusing="the loop has ended")

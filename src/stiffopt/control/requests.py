@@ -1,4 +1,4 @@
-"""From a request to what the controller pursues; what cannot be pursued is refused."""
+"""Turns a request into a pursuit of the controller, or refuses it."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from stiffopt.schema import BadKeyError
 
 Array = NDArray[np.float64]
 
-_SLACK = 1e-3  # Pa, of a limit, by rounding
+_SLACK = 1e-3  # Pa, for rounding at limits
 
 
 class Requests:
-    """Makes pursuits of requests, for one arm on one rig.
+    """Turns requests into pursuits, for one arm on one rig.
 
     All methods raise `InputError` with the reason of a refusal, and change nothing.
 
@@ -59,7 +59,7 @@ class Requests:
         return Pursuit.of(task, self._limited(task), course)
 
     def of_target(self, target: Target, last: Pursuit, course: AnyCourse | None = None) -> Pursuit:
-        """Return the pursuit of a target, with goal and limits of the last task, if any."""
+        """Return the pursuit of a target, with goal and limits of the last task if there is one."""
         if last.task is not None:
             return last.to(target, course)
         task = Task(robot=self._robot.description.name, target=target)
@@ -68,9 +68,9 @@ class Requests:
     def check_posture(
         self, trajectory: Trajectory, pressures: Array, start: Array, task: Task | None
     ) -> None:
-        """Refuse a trajectory of pressures (k, n) that cannot be had from a start (n,), in Pa.
+        """Refuse a trajectory of pressures (k, n) that cannot begin at a start (n,), in Pa.
 
-        Nor may it leave the limits of the task that is pursued.
+        It must also stay within the limits of the present task.
         """
         time = trajectory.waypoints[0].time
         if time > 0:
@@ -84,9 +84,9 @@ class Requests:
     def check_ahead(
         self, request: Task | Target | Trajectory, forecast: Forecast | None, leans: bool
     ) -> None:
-        """Refuse what would lead the arm too near to the scene; any thread may ask.
+        """Refuse a request that leads the arm too near to the scene; for any thread.
 
-        An arm that leans on objects, or is about to, has its way checked when it is planned.
+        For a brace, or while the arm leans on objects, the way is checked when it is planned.
         """
         if isinstance(request, Task):
             check_press(self._robot, self._limits, request)
@@ -107,16 +107,16 @@ class Requests:
             forecast.check(self.of_target(request, here.pursuit, course))
 
     def _in_the_rigs_scene(self, task: Task) -> Task:
-        """Return a task in the rig's scene, which must have the objects that it leans on."""
+        """Return a task in the rig's scene; refuse it if the scene lacks the brace's objects."""
         if self._scene is None:
             raise InputError("brace: the rig file has no scene, so nothing to lean on is known")
-        there = task.model_copy(update={"scene": self._scene})
-        assert there.brace is not None
+        on_rig = task.model_copy(update={"scene": self._scene})
+        assert on_rig.brace is not None
         try:
-            there.brace.check(there)
+            on_rig.brace.check(on_rig)
         except BadKeyError as error:
             raise InputError(f"{dotted(error.loc)}: {error}; that is of the rig's scene") from None
-        return there
+        return on_rig
 
     def _limited(self, task: Task) -> Task:
         """Return a task with the rig's limits of pressure as well; see `limited_range`."""
@@ -124,11 +124,11 @@ class Requests:
         on_rig = task.model_copy(update={"pressure": limited_range(task.pressure, self._limits)})
         lower, upper = on_rig.pressure_bounds(description)
         pressure = PressureRange(min=tuple(lower.tolist()), max=tuple(upper.tolist()))
-        # a load shows in the tip's offset, by as much as there is of it
+        # without its load, whose actual effect is part of the tip's offset
         return task.model_copy(update={"pressure": pressure, "load": None, "press": None})
 
     def _check_first(self, first: Array, start: Array) -> None:
-        """Refuse pressures (n,) of a waypoint at 0 s that the arm does not have at the start."""
+        """Refuse pressures (n,) of a waypoint at 0 s that differ from the arm's start (n,)."""
         for channel in np.flatnonzero(np.abs(first - start) > self._tuning.posture.there):
             raise InputError(
                 f"waypoint 1 is at 0 s and has {first[channel] * 1e-5:.4g} bar in channel "
@@ -138,7 +138,7 @@ class Requests:
 
 
 def _check_within(pressures: Array, low: Array, high: Array) -> None:
-    """Refuse waypoints' pressures (k, n) beyond the limits of the task that is pursued."""
+    """Refuse waypoints' pressures (k, n) beyond the limits of the present task."""
     beyond = (pressures < low - _SLACK) | (pressures > high + _SLACK)
     for index, channel in np.argwhere(beyond):
         raise InputError(

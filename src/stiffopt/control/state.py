@@ -1,9 +1,9 @@
 """The state of the control loop: the one definition of each of its fields.
 
-A field's definition is its line in one of the dataclasses below: its type, and a `Shown` that says
-what it means, in which unit, and where it is shown. The HTTP and WebSocket interface, the client,
-recordings and live telemetry, metrics, the status on the terminal, the lines for programs and the
-table in docs/daemon-api.md are all made from these definitions. To add a field, add a line here.
+A field is defined by its line in one of the dataclasses below: its type, and a `Shown` with its
+meaning, its unit and the places that show it. All interfaces follow from these definitions: HTTP,
+WebSocket and client, recordings and live telemetry, metrics, the status on the terminal, the lines
+for programs and the table in docs/daemon-api.md. To add a field, add a line here.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 
-# definitions of fields that share a topic, and what goes with it
+# `Shown` for fields that share a topic or a unit
 _event, _tracker, _timing, _tip, _state = (
     partial(Shown, topic=topic) for topic in ("/event", "/tracker", "/timing", "/tip", "/state")
 )
@@ -33,10 +33,10 @@ _stiffness = partial(_tip, unit=("N/m", "N*m/rad"), unit_field="stiffness_unit")
 
 
 class State(StrEnum):
-    """Where in its life a control loop is.
+    """The state of a control loop.
 
-    ``unconfigured``: nothing was checked yet. ``inactive``: vented, ready to be armed. ``active``:
-    steers. ``holding``: pressures stay, or are let down, while something stands in the way of
+    ``unconfigured``: not checked yet. ``inactive``: vented, ready to be armed. ``active``:
+    controls the tip. ``holding``: pressures stay, or are let down, while something prevents
     control. ``fault``: vented; only an explicit reset leaves it.
     """
 
@@ -67,7 +67,7 @@ class Event:
 
 @dataclass(frozen=True)
 class Alarm:
-    """Something that is wrong now, though control goes on."""
+    """Something that is wrong now, though control continues."""
 
     kind: Annotated[str, Shown("a word for programs")]
     text: Annotated[str, Shown("a sentence for people")]
@@ -85,12 +85,14 @@ class SeenPose:
     quaternion: Annotated[
         Array | None, _tracker("of the tip, w first", size=4, json="quaternion_wxyz")
     ]
-    doubted: Annotated[bool, _tracker("no arm could have moved there, or it came with such a one")]
+    doubted: Annotated[
+        bool, _tracker("too far for any motion of the arm, or it came with such a one")
+    ]
 
 
 @dataclass(frozen=True)
 class AdaptedNumber:
-    """A number of the arm as it is estimated while the arm is at work."""
+    """A number of the model as estimated during operation."""
 
     key: Annotated[str, Shown("its key in the robot file; `base.` ones are tilts, in rad")]
     value: Annotated[float, Shown("its value, in SI")]
@@ -116,7 +118,7 @@ class Timing:
         _timing("upper edges (k,) of a histogram of how late ticks begin", "s", decimals=9),
     ] = ()
     lateness_counts: Annotated[
-        tuple[int, ...], _timing("counts (k + 1,) of that histogram; the last are later")
+        tuple[int, ...], _timing("counts (k + 1,) of that histogram; the last counts later ticks")
     ] = (0,)
 
     @property
@@ -261,7 +263,7 @@ class ControllerStatus:
     brace: Annotated[
         str,
         _tip(
-            "where a brace is: `planning`, `going to rest`, `approaching`, `held`, `releasing` or "
+            "phase of a brace: `planning`, `going to rest`, `approaching`, `held`, `releasing` or "
             "`released`; empty without one"
         ),
     ] = ""
@@ -273,7 +275,7 @@ class ControllerStatus:
     ] = math.nan
     adapted: Annotated[
         tuple[AdaptedNumber, ...],
-        Shown("numbers of the arm as they are estimated while it is at work"),
+        Shown("numbers of the model as estimated during operation"),
     ] = ()
     lost: Annotated[
         Flags,
@@ -297,13 +299,13 @@ class ControllerStatus:
 class Snapshot(ControllerStatus):
     """The state of the control loop at the end of a tick.
 
-    SI units; poses in the base frame; gauge pressures. NaN is what is not known, None what is not
-    prescribed. The last field is not shown: all `samples` that the tracker has delivered since the
-    last tick, in order of arrival, used or not.
+    SI units; poses in the base frame; gauge pressures. Unknown values are NaN, targets that are not
+    prescribed None. The last field is not shown: all `samples` that the tracker has delivered since
+    the last tick, used or not, in order of arrival.
     """
 
     time: Annotated[float, Shown("on the rig's clock", "s")]
-    state: Annotated[State, _state("where in its life the loop is", line=True)]
+    state: Annotated[State, _state("state of the loop", line=True)]
     reason: Annotated[str, _state("why, where the state is not as requested", line=True)]
     commanded: Annotated[
         Array, _pressure("set-points of the channels", topic="/pressure", label="commanded")
@@ -312,14 +314,16 @@ class Snapshot(ControllerStatus):
     measured_time: Annotated[
         float, Shown("when the pressures were read, on the rig's clock", "s", topic="/pressure")
     ] = math.nan
-    low: Annotated[Array, Shown("least that may be commanded", "Pa", topic="/limits")]
-    high: Annotated[Array, _pressure("most that may be commanded", topic="/limits", label="limit")]
+    low: Annotated[Array, Shown("lowest permitted command", "Pa", topic="/limits")]
+    high: Annotated[Array, _pressure("highest permitted command", topic="/limits", label="limit")]
     saturated: Annotated[
         Flags, Shown("channels at a limit that keeps the tip from its target", topic="/pressure")
     ]
     rejected: Annotated[
         int,
-        Shown("samples of the last tick that no arm could have moved to", json="rejected_samples"),
+        Shown(
+            "samples of the last tick too far for any motion of the arm", json="rejected_samples"
+        ),
     ] = 0
     alarms: Annotated[tuple[Alarm, ...], _state("what is wrong now")] = ()
     timing: Annotated[Timing, Shown("how punctual the loop is")] = Timing()
@@ -327,6 +331,6 @@ class Snapshot(ControllerStatus):
 
     @property
     def pressures(self) -> Array | None:
-        """Measured pressures (n,) in Pa, commanded ones where none are known; None: neither."""
+        """Measured pressures (n,) in Pa, commanded where not measured; None if neither is known."""
         found = np.where(np.isfinite(self.measured), self.measured, self.commanded)
         return found if np.isfinite(found).all() else None

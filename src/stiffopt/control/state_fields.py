@@ -1,6 +1,6 @@
-"""The form in which fields of the control loop's state are defined, and its reader.
+"""The metadata of a field of the control loop's state (`Shown`), and its reader (`entries`).
 
-`stiffopt.control.state` has the definitions themselves.
+The fields themselves are in `stiffopt.control.state`.
 """
 
 from __future__ import annotations
@@ -18,33 +18,33 @@ from numpy.typing import NDArray
 from stiffopt.units import unit_suffix
 
 _DECIMALS = {"s": 6, "Pa": 1, "m": 7, "rad": 7, "": 7, "N/m": 4, "N": 5}
-"""How finely quantities are logged: finer than any sensor."""
+"""Decimals in the log by unit: finer than any sensor."""
 
 
 @dataclass(frozen=True)
 class Shown:
-    """What a field of the state means, and how it is shown in each place."""
+    """The meaning of a field of the state, and how each interface shows it."""
 
     about: str  # its meaning
-    # SI unit; the JSON name ends in it. Of several, the field `unit_field` says which holds, and
-    # each has a JSON name of its own
+    # SI unit; the JSON name ends in it. If there are several, the field `unit_field` says which one
+    # applies, and each has its own JSON name
     unit: str | tuple[str, ...] = ""
     unit_field: str = ""
     size: int = 0  # of an array; 0: one value per channel
-    # name in the HTTP interface if that is not the field's name with the unit. Several names share
-    # the elements of an array; no name: the interface does not have it
+    # name in the HTTP interface, by default the field's name with the unit. Several names share the
+    # elements of an array; no name: the interface does not have the field
     json: str | tuple[str, ...] | None = None
-    topic: str = ""  # of telemetry, live and recorded; empty: it is not logged
-    key: str = ""  # its name in the messages of the topic, by default the one in the interface
-    decimals: int | None = None  # that are logged; by default those of the unit
-    # name for Prometheus after ``stiffopt_``; a counter for a whole number, else a gauge
+    topic: str = ""  # of telemetry, live and recorded; empty: not logged
+    key: str = ""  # name in the topic's messages, by default the one in the HTTP interface
+    decimals: int | None = None  # in the log; by default those of the unit
+    # name for Prometheus after ``stiffopt_``; an integer is a counter, other values are gauges
     metric: str = ""
-    # value of the metric's label ``kind``, which tells fields that share a metric apart
+    # value of the metric's label ``kind``, to distinguish fields that share a metric
     label: str = ""
-    row: str = ""  # of the status on the terminal in which it is shown
-    armed_only: bool = True  # whether that row is left out while the arm is vented
-    unknown: str = "-"  # what the row says for NaN
-    line: bool = False  # whether a change of it makes a line of ``stiffopt run --json``
+    row: str = ""  # of the status on the terminal
+    armed_only: bool = True  # whether to hide that row while the arm is vented
+    unknown: str = "-"  # text of the row for NaN
+    line: bool = False  # whether `stiffopt run --json` writes a line when it changes
 
 
 class Kind(Enum):
@@ -63,27 +63,27 @@ class Kind(Enum):
 
 @dataclass(frozen=True)
 class Entry:
-    """A field's definition, with the defaults filled in."""
+    """A field's definition, completed by the defaults."""
 
     name: str  # of the field
     kind: Kind  # of its value
     type: Any  # of the value; of a record, or the items of `RECORDS`, the dataclass
     optional: bool  # whether the value may be None
-    in_array: bool  # whether its values are in an array; else in a tuple
+    in_array: bool  # whether several values are an array, not a tuple
     shown: Shown  # its definition
-    # of which one holds at a time, as `Shown.unit_field` says; empty if there is no choice
+    # alternatives, of which `Shown.unit_field` names the one that applies; empty if there are none
     units: tuple[str, ...]
     # names in the HTTP interface, in the order of `units` or of the array's parts
     json: tuple[str, ...]
-    key: str  # in the messages of the topic
-    decimals: int  # likewise
+    key: str  # in the topic's messages
+    decimals: int  # in the log
 
 
 _READ: dict[type, tuple[Entry, ...]] = {}
 
 
 def entries(record: type) -> tuple[Entry, ...]:
-    """Return the fields of a dataclass that are shown; its own come before those of its bases."""
+    """Return the documented fields of a dataclass; its own come before those of its bases."""
     if record not in _READ:
         _READ[record] = tuple(_entries(record))
     return _READ[record]
@@ -126,7 +126,7 @@ def _entry(name: str, hint: Any, shown: Shown) -> Entry:
 
 
 def _kind(hint: Any) -> tuple[Kind, Any]:
-    """Return the kind of a type, and the type of what is in it."""
+    """Return the kind of a type, and the type itself or that of its items."""
     if get_origin(hint) in (Union, UnionType):
         raise TypeError(f"a field of the state cannot be {hint}")
     if get_origin(hint) is tuple:

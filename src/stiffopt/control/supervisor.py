@@ -1,6 +1,6 @@
-"""The state machine of the control loop: what a tick does in each state, and what requests change.
+"""The state machine of the control loop: what a tick does in each state, what requests change.
 
-It has no threads and no time of its own: `ControlLoop` calls it, one call at a time.
+It has no threads and no clock of its own: `ControlLoop` makes its calls one at a time.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class _Hold:
-    """Why pressures are held; a `lasting` hold ends only by a request."""
+    """The reason for holding the pressures; only a request ends a `lasting` hold."""
 
     reason: str
     lasting: bool = False
@@ -45,41 +45,41 @@ class _Hold:
 
 @dataclass(frozen=True)
 class _Ramp:
-    """Pressures (n,) that are let down from a time on, within a duration in s, and why.
+    """Lets pressures (n,) down from the time `begin` on, within a duration in s.
 
-    `ways` are the shares of them (k, n) that are left, one after the other, from 1 to 0.
+    `stages` (k, n) are the shares of the pressures left at equal intervals, from 1 to 0.
     """
 
     begin: float
     duration: float
     pressures: Array
     reason: str
-    ways: Array
+    stages: Array
 
     def progress(self, now: float) -> float:
-        """How far it is at a time, from 0 to 1.
+        """Return the progress of the ramp at a time, from 0 to 1.
 
-        A request may begin the ramp during a tick, later than that tick's `now`: then it is 0.
+        It is 0 before `begin`: a request during a tick begins a ramp later than that tick's `now`.
         """
         return min(max((now - self.begin) / self.duration, 0.0), 1.0)
 
     def share(self, now: float) -> Array:
-        """Return the share (n,) of the pressures that is left at a time."""
-        last = len(self.ways) - 1
+        """Return the shares (n,) of the pressures that are left at a time."""
+        last = len(self.stages) - 1
         place = self.progress(now) * last
         before = min(int(place), last - 1)
         after = place - before
-        left: Array = (1 - after) * self.ways[before] + after * self.ways[before + 1]
+        left: Array = (1 - after) * self.stages[before] + after * self.stages[before + 1]
         return left
 
 
 class Supervisor:
     """Supervises a controller: state, faults, holds, letting down and venting.
 
-    Requests raise `InputError` with the reason when they are refused; nothing has changed then.
-    A failure while something changes is a fault. `ControlLoop` has checked their arguments.
-    `now` is the time on the rig's clock, in s. A `clearance` watch keeps commands clear of the
-    scene; None: there is none.
+    A refused request raises `InputError` with the reason and changes nothing. A failure while
+    something changes is a fault. `ControlLoop` has checked the requests' arguments. `now` is the
+    time on the rig's clock, in s. The `clearance` watch keeps commands clear of the scene; None
+    without a scene.
     """
 
     def __init__(
@@ -105,28 +105,28 @@ class Supervisor:
         self._tracker = TrackerWatch(safety, period)
         self._gauges = GaugeWatch()
         self._no_channels: NDArray[np.bool_] = np.zeros(n, dtype=bool)
-        self._stuck_low = self._monitor.saturated
-        self._unsupervised: tuple[int, ...] = ()
+        self._reported_saturated = self._monitor.saturated
+        self._reported_unsupervised: tuple[int, ...] = ()
         self._zero: Array = np.zeros(n)
-        self.commanded: Array = self._zero  # set-points (n,) that the supply has, in Pa
-        self._requested: Array = self._zero  # before the outlet limited it
-        # the latest set-points, over the time that the chambers may lag behind them
+        self.commanded: Array = self._zero  # set-points (n,) of the supply, in Pa
+        self._requested: Array = self._zero  # the same before the outlet limited them
+        # the latest set-points, over the time by which the chambers may lag behind them
         lag = int(np.ceil(tuning.chamber_lag / period))
         self._recent: deque[Array] = deque([self._zero], maxlen=max(2, lag))
         self._held: Array | None = None
-        # the latest; NaN before the first, and where it is impossible
+        # the latest reading; NaN before the first one, and for implausible values
         self.reading = PressureReading(float("nan"), np.full(n, np.nan))
         self.samples: tuple[PoseSample, ...] = ()  # delivered since the last tick
-        self.rejected = 0  # of these
+        self.rejected = 0  # number of these samples that were rejected
         self.saturated = self._no_channels  # (n,) at a limit that keeps them from their goal
-        self._exchanged: PressureReading | None = None  # with the last command
-        self._holds: dict[str, _Hold] = {}  # of each kind
-        # since when the loop has held by itself, again and again, and when it did so last, in s
+        self._returned_reading: PressureReading | None = None  # of the last command
+        self._holds: dict[str, _Hold] = {}  # by kind
+        # begin and end of the last series of holds that no client asked for, in s
         self._held_since = self._held_until = -np.inf
         self._ramp: _Ramp | None = None
-        self.vented = True  # the supply has accepted the command to vent, and no pressure since
+        self.vented = True  # the supply's last accepted command was to vent
         self._trouble: Trouble | None = None
-        self._failures = 0  # of the controller, in a row
+        self._failures = 0  # of the controller, in succession
         self._leans = False  # whether the arm may touch objects of the scene
         self._force_limited_at = -np.inf
         self._alarm_kinds: frozenset[str] = frozenset()
@@ -136,7 +136,7 @@ class Supervisor:
     # -- a tick ---------------------------------------------------------------------------------
 
     def tick(self, now: float, serve: Callable[[], None]) -> None:
-        """Measure, serve requests, command; an error is a fault, never an exception."""
+        """Measure, serve requests, command. An error becomes a fault, never an exception."""
         if self.lifecycle.state is not State.UNCONFIGURED:
             self._guarded(self._measure, now)
         serve()
@@ -146,7 +146,7 @@ class Supervisor:
         self._ticked_at = self._clock.now()
 
     def overran(self, now: float, in_a_row: int) -> None:
-        """Note how many ticks in a row took too long."""
+        """React to a number of successive ticks that took too long."""
         if self.lifecycle.armed and in_a_row >= self._safety.max_overruns:
             self.fault(now, "overruns", f"{in_a_row} ticks in a row took too long")
 
@@ -174,7 +174,7 @@ class Supervisor:
     def _try_to_vent(self, now: float) -> None:
         try:
             self.outlet.vent()
-        except Exception as error:  # of any kind: the next tick tries again
+        except Exception as error:  # the next tick tries again, whatever the error
             self.vented = False
             self.alarms.set(
                 now,
@@ -188,7 +188,7 @@ class Supervisor:
             self._note_commanded(now, self._zero)
             self.alarms.clear(now, "not-vented")
             self.alarms.clear(now, "force-limit")
-        self._exchanged = None
+        self._returned_reading = None
         self._failures = 0
         self.saturated = self._no_channels
 
@@ -202,7 +202,7 @@ class Supervisor:
         pause = now - self._ticked_at
         if self.lifecycle.armed and not pause <= self._safety.command_timeout:
             self.fault(now, "stalled", f"the loop stood still for {pause:.3g} s")
-        reading, self._exchanged = self._exchanged, None
+        reading, self._returned_reading = self._returned_reading, None
         if reading is None:
             reading = self.outlet.read()
         tracker = self.rig.tracker
@@ -226,16 +226,16 @@ class Supervisor:
         self._update_alarms(now)
 
     def _update_alarms(self, now: float) -> None:
-        """Set and clear the alarms of what is measured."""
+        """Set and clear the alarms that follow from measurements."""
         monitor = self._monitor
-        if monitor.saturated is not self._stuck_low:
-            self._stuck_low = monitor.saturated
+        if monitor.saturated is not self._reported_saturated:
+            self._reported_saturated = saturated = monitor.saturated
             text = "stays below its command: no more pressure, or a leak"
-            self._set_channel_alarm(now, "saturated", np.flatnonzero(self._stuck_low), text)
-        if monitor.unsupervised is not self._unsupervised:
-            self._unsupervised = monitor.unsupervised
+            self._set_channel_alarm(now, "saturated", np.flatnonzero(saturated), text)
+        if monitor.unsupervised is not self._reported_unsupervised:
+            self._reported_unsupervised = monitor.unsupervised
             text = "has no gauge: leaks and stuck regulators are not seen there"
-            self._set_channel_alarm(now, "unsupervised", self._unsupervised, text)
+            self._set_channel_alarm(now, "unsupervised", monitor.unsupervised, text)
         if self._tracker.sight(now) is Sight.SEEN:
             self.alarms.clear(now, "tracker-missing")
         else:
@@ -248,7 +248,7 @@ class Supervisor:
             self.alarms.clear(now, kind)
 
     def _actuate(self, now: float) -> None:
-        """Command the pressures that the state requires."""
+        """Command the pressures that the present state requires."""
         if self.lifecycle.state is State.FAULT and not self.vented:
             self._try_to_vent(now)
         if self.lifecycle.armed:
@@ -259,7 +259,7 @@ class Supervisor:
             self._hold_or_ramp(now)
 
     def _check_tracker(self, now: float) -> None:
-        """Hold, let down or go on, by whether the tracker sees the tip."""
+        """Hold, let down or continue, by whether the tracker sees the tip."""
         if self._tracker.jumping:
             self.fault(
                 now,
@@ -293,7 +293,7 @@ class Supervisor:
             self.saturated = self.saturated | output.saturated
 
     def _too_near(self, output: ControlOutput) -> str:
-        """Why a command would bring the body too near to the scene; empty if it does not."""
+        """Return why a command would bring the body too near to the scene; empty if it is clear."""
         self._leans = output.leans
         if self._clearance is None or output.leans:
             return ""
@@ -301,18 +301,18 @@ class Supervisor:
         return self._clearance.too_near(posture)
 
     def _count_failure(self, now: float, text: str) -> None:
-        """Count failures of the controller in a row; after some the pressures are held."""
+        """Count successive failures of the controller; hold the pressures after some of them."""
         self._failures += 1
         if self._failures >= self._tuning.max_failures:
             self.alarms.set(now, "solver", f"{text}, {self._failures} times in a row")
             self._hold(now, "solver", text)
 
     def _hold_or_ramp(self, now: float) -> None:
-        """Command the held pressures, or those that are left on the ramp."""
+        """Command the held pressures, or those of the ramp."""
         self._end_a_long_hold(now)
         ramp = self._ramp
         if ramp is None:
-            if self._held is None:  # once: a late reply must not change them
+            if self._held is None:  # only once: a late reading must not change them
                 self._held = self._present_pressures()
             self._command(now, self._held)
             return
@@ -322,24 +322,25 @@ class Supervisor:
         self._command(now, let_down(ramp.pressures, ramp.share(now), self.outlet.limits))
 
     def _present_pressures(self) -> Array:
-        """Pressures (n,) that stop the arm: what the chambers have that lag behind rising commands.
+        """Return pressures (n,) that stop the arm, in Pa.
 
-        Whatever the gauges read, none is above the last command, or below all recent ones.
+        Chambers lag behind rising commands, so these are the measured pressures. Whatever the
+        gauges read, none is above the last command or below all recent ones.
         """
         last = np.minimum(self._requested, self.commanded)
         measured = np.maximum(self.reading.pressures, np.min(self._recent, axis=0))
-        held: Array = np.fmin(measured, last)  # NaN: not measured
+        held: Array = np.fmin(measured, last)  # ignores NaN: not measured
         return held
 
     def _end_a_long_hold(self, now: float) -> None:
-        """Let down what is held for longer than the rig permits, but for a client's own hold."""
-        most = self._safety.hold_timeout
+        """Let down after `Safety.hold_timeout`, unless a client asked for the hold."""
+        limit = self._safety.hold_timeout
         own = [hold for hold in self._holds.values() if not hold.lasting]
         if self._ramp is not None or not own:
             return
         self._held_until = now
-        if most is not None and now - self._held_since >= most:
-            text = f"held for {most:g} s, and still: {own[0].reason}"
+        if limit is not None and now - self._held_since >= limit:
+            text = f"held for {limit:g} s, and still: {own[0].reason}"
             self._let_down(now, "hold-timeout", text)
 
     def _command(self, now: float, pressures: Array, *, controlled: bool = False) -> bool:
@@ -348,13 +349,13 @@ class Supervisor:
         self._requested = pressures
         applied = self.outlet.apply(PressureCommand(pressures, now, timeout))
         self._note_commanded(now, applied.pressures)
-        self._exchanged = applied.reading
+        self._returned_reading = applied.reading
         self.saturated = self._monitor.saturated
         if applied.refused:
             text = f"a command was refused: {applied.refused}"
             if controlled:
                 self._count_failure(now, text)
-            else:  # of pressures that were accepted before: their state is unknown
+            else:  # these pressures were accepted before, so the supply's state is unknown
                 self.fault(now, "refused", text)
             return False
         if applied.limited:
@@ -363,7 +364,7 @@ class Supervisor:
         return True
 
     def _set_force_alarm(self, now: float, limited: bool) -> None:
-        """Keep an alarm while the limit of force shortens commands, and for a while after."""
+        """Set an alarm while the limit of force reduces commands, and for a while after."""
         if limited:
             self._force_limited_at = now
             text = "commands are shortened: more would be above safety.max_force, the total force"
@@ -372,7 +373,7 @@ class Supervisor:
             self.alarms.clear(now, "force-limit")
 
     def _report_notices(self, now: float) -> None:
-        """Make alarms and events of the controller's notices."""
+        """Turn the controller's notices into alarms and events."""
         notices = self.controller.notices()
         standing = frozenset(n.kind for n in notices if n.standing)
         for notice in notices:
@@ -402,7 +403,7 @@ class Supervisor:
             self.lifecycle.change(State.HOLDING, reason)
 
     def _resume(self, now: float) -> None:
-        """Control again if no reason to hold is left."""
+        """Control again if no reason to hold remains."""
         if self._ramp is not None or self.lifecycle.state is not State.HOLDING:
             return
         if self._holds:
@@ -414,13 +415,13 @@ class Supervisor:
         self.events.add(now, "active", "steering again")
 
     def _let_down(self, now: float, kind: str, reason: str) -> None:
-        """Begin to let the pressures down; a ramp under way goes on."""
+        """Begin to let the pressures down, unless a ramp is under way."""
         if self._ramp is not None:
             return
-        shares, warning = np.array([self._zero + 1, self._zero]), ""
-        if self._clearance is not None and not self._leans:  # it lets go as it came: all together
-            shares, warning = self._clearance.way_down(self.commanded)
-        self._ramp = _Ramp(now, self._safety.ramp_time, self.commanded, reason, shares)
+        stages, warning = np.array([self._zero + 1, self._zero]), ""
+        if self._clearance is not None and not self._leans:  # a braced arm scales all together
+            stages, warning = self._clearance.way_down(self.commanded)
+        self._ramp = _Ramp(now, self._safety.ramp_time, self.commanded, reason, stages)
         if self.lifecycle.state is State.ACTIVE:
             self.lifecycle.change(State.HOLDING, f"letting down: {reason}")
         else:
@@ -487,9 +488,10 @@ class Supervisor:
     def arm(
         self, now: float, unwanted: Callable[[], bool] = lambda: False, lateness: float = 0.0
     ) -> None:
-        """Check the arm and arm it, unless that is unwanted by then; see `ControlLoop.arm`.
+        """Check the arm and arm it; see `ControlLoop.arm`.
 
-        `lateness` is how late ticks began lately, in s.
+        After the checks, `unwanted` says whether the client has given up. `lateness` is how late
+        ticks began lately, in s.
         """
         self.lifecycle.permit("arm")
         with refusing("arming"):
@@ -525,7 +527,7 @@ class Supervisor:
         self._gauges.forget()
         self._tracker.begin(now)
         self._doubted_at = self._held_since = self._held_until = -np.inf
-        self._exchanged, self._failures, self._ticked_at = None, 0, now
+        self._returned_reading, self._failures, self._ticked_at = None, 0, now
         self._holds.clear()
         self._leans = False
         self.lifecycle.change(State.ACTIVE)
@@ -547,7 +549,7 @@ class Supervisor:
         self._recent = deque([self.commanded], maxlen=self._recent.maxlen)
         try:
             self.outlet.restrict(highest)
-        except DeviceError as error:  # the controller has the task, and the gate has not
+        except DeviceError as error:  # the controller has the task, but the gate does not
             self.fault(now, "device", f"a device fails: {error}")
             raise
         self._go_on(now, "task", "there is a new task")
@@ -574,11 +576,11 @@ class Supervisor:
             self.events.add(now, event, text)
         for kind in ("asked", "solver", "clearance"):
             self._holds.pop(kind, None)
-        if event != "target":  # a stream of them must not end a doubt that stands
+        if event != "target":  # a stream of targets must not end a doubt
             self._holds.pop("doubt", None)
         try:
             self._resume(now)
-        except Exception as error:  # the request is pursued already: too late to refuse it
+        except Exception as error:  # too late to refuse: the request is already pursued
             self.fault(now, "internal", f"unexpected {type(error).__name__}: {error}")
             raise CommandError(self.lifecycle.reason) from error
 
@@ -600,7 +602,7 @@ class Supervisor:
                 raise CommandError(self.lifecycle.reason)
 
     def vent_while_starting(self) -> None:
-        """Vent while another thread configures, which this does not disturb."""
+        """Vent while another thread configures; the configuration continues."""
         try:
             self.outlet.vent()
         except StiffoptError as error:
@@ -610,13 +612,13 @@ class Supervisor:
             ) from error
 
     def finish(self, now: float) -> None:
-        """Vent for good, with several attempts."""
+        """Vent for good, in several attempts if necessary."""
         for _ in range(self._tuning.vent_attempts):
             if self.lifecycle.armed or not self.vented:
                 self._stop(now, "stopped")
 
     def reset(self, now: float) -> None:
-        """Leave a fault whose reason is gone; see `ControlLoop.reset`."""
+        """Leave a fault whose reason has gone; see `ControlLoop.reset`."""
         self.lifecycle.permit("reset")
         left = ""
         try:
@@ -625,7 +627,7 @@ class Supervisor:
             self._note_commanded(now, self._zero)
             self.alarms.clear(now, "not-vented")
             self._measure(now)
-        except Exception as error:  # which would be a fault in a tick
+        except Exception as error:  # in a tick this would be a fault
             left = str(error)
         if not left:
             trouble = self._trouble

@@ -1,4 +1,4 @@
-"""Errors of the tip to its target, and its stiffness, evaluated in every tick.
+"""Errors of the tip relative to its target, and its stiffness, for every tick.
 
 The formulas are those of the optimiser: the residuals of `stiffopt.optimise.terms` and
 `directional_stiffness` of `stiffopt.model.compliance`, compiled once per kind of target.
@@ -26,20 +26,20 @@ from stiffopt.optimise.tip import TipAt
 Array = NDArray[np.float64]
 
 _INEQUALITY_WEIGHT = 30.0
-"""Of an inequality, in least squares; it may be missed by about a thousandth of the error."""
+"""Weight of an inequality in least squares; it may be violated by a thousandth of the error."""
 
 
 class TipErrors:
-    """Position and angle errors of a tip to targets, and their derivatives by the pressures."""
+    """Position and angle errors of a tip, and their derivatives by the pressures."""
 
     def __init__(self) -> None:
         self._norms: dict[Hashable, Formula] = {}
         self._weighted: dict[Hashable, Formula] = {}
 
     def at(self, target: Target | None, position: Array, rotation: Array) -> tuple[float, float]:
-        """Return the position error, in m, and angle error of a tip (3,) with axes (3, 3).
+        """Return position error, in m, and angle error, in rad, of a tip (3,) with axes (3, 3).
 
-        NaN where the target prescribes nothing.
+        NaN for what the target leaves free.
         """
         if target is None:
             return math.nan, math.nan
@@ -56,8 +56,8 @@ class TipErrors:
     ) -> tuple[Array, Array, float, float]:
         """Return the error of the model's tip as one vector of lengths (t,), for least squares.
 
-        Angles count by a lever, in m/rad. With the error, in m, come its Jacobian (t, n) in m/Pa,
-        and the position and angle errors, in m and rad; 0 where the target prescribes nothing.
+        `lever`, in m/rad, converts angles. Return the error, in m, its Jacobian (t, n), in m/Pa,
+        and the position and angle errors, in m and rad; 0 for what the target leaves free.
         """
         terms, n = _terms_of_tip(target), tip.jacobian.shape[1]
         key = (n, lever, *(term.structure for term in terms))
@@ -71,7 +71,7 @@ class TipErrors:
 
 
 def _norms(terms: tuple[Term, ...]) -> Formula:
-    """Lengths of residuals; inputs: position (3,), rotation (3, 3), parameters of each term."""
+    """Return norms of residuals; inputs: position (3,), rotation (3, 3), each term's parameters."""
     position, rotation = ca.SX.sym("position", 3), ca.SX.sym("rotation", 3, 3)
     parameters = [ca.SX.sym("parameters", len(term.parameters)) for term in terms]
     residuals = _residuals(terms, position, rotation, parameters)
@@ -79,7 +79,7 @@ def _norms(terms: tuple[Term, ...]) -> Formula:
 
 
 def _weighted(terms: tuple[Term, ...], n: int, lever: float) -> Formula:
-    """Error (t,), its Jacobian (t, n) and lengths of residuals.
+    """Return the formula of the error (t,), its Jacobian (t, n) and the norms of residuals.
 
     Inputs: pose (4, 4) and Jacobian (6, n) of the tip, parameters of each term. The residuals are
     differentiated by a twist xi of the tip, ``pose exp(xi)``, at xi = 0.
@@ -113,7 +113,10 @@ def _terms_of_tip(target: Target) -> tuple[Term, ...]:
 
 
 def stiffness_function(task: Task) -> Callable[[Array, Array], float] | None:
-    """Stiffness along a task's first direction, of a compliance (6, 6) and rotation (3, 3)."""
+    """Return a function from compliance (6, 6) and rotation (3, 3) to the task's stiffness.
+
+    The stiffness is along the task's first direction; None if there is none.
+    """
     if not task.measures:
         return None
     measure = task.measures[0]
@@ -133,9 +136,9 @@ def stiffness_function(task: Task) -> Callable[[Array, Array], float] | None:
 
 
 def turn_of_a_push(tip: TipAt) -> Array:
-    """Turn of the tip per displacement by a force at the tip (3, 3), base axes, in rad/m.
+    """Return the turn of the tip (3, 3) per displacement by a force at it, base axes, in rad/m.
 
-    In the two directions in which the tip is softest; a displacement along the third turns nothing.
+    It covers the tip's two softest directions; a displacement along the third turns nothing.
     """
     rotation = tip.pose[:3, :3]
     compliances, axes = np.linalg.eigh(tip.compliance[:3, :3])
@@ -145,7 +148,7 @@ def turn_of_a_push(tip: TipAt) -> Array:
 
 
 def target_arrays(target: Target | None) -> tuple[Array | None, Array | None, Array | None]:
-    """Position (3,), NaN for free axes, pointing (3,) and quaternion (4,) of a target."""
+    """Return position (3,), NaN for free axes, pointing (3,) and quaternion (4,) of a target."""
     if target is None:
         return None, None, None
     position = None

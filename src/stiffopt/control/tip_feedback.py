@@ -1,4 +1,4 @@
-"""From the reference and the observed arm to the next command: correction, damping, limits."""
+"""From the reference and the estimated arm to the next command: correction, damping, limits."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ class TipFeedback:
     Parameters
     ----------
     arm :
-        As it is observed.
+        The observer of the arm.
     limits, slew, period, control, safety :
         See `TipController`; slew (n,), in Pa/s.
     mode :
         The arm's first bending mode; None for an arm that does not vibrate.
     tuning :
-        Of the feedback.
+        Tuning of the feedback.
 
     Attributes
     ----------
-    saturated : channels (n,) at a limit that keeps the tip from its target
+    saturated : flags (n,) of channels at a limit that keeps the tip from its target.
     """
 
     def __init__(
@@ -65,16 +65,16 @@ class TipFeedback:
         )
 
     def begin(self, offset: Array) -> None:
-        """Start anew with an offset (6,) of the tip."""
+        """Restart with an offset (6,) of the tip."""
         self._averaged.begin(offset)
         self.saturated = np.zeros(len(self._arm.pressures.command), dtype=bool)
 
     def resume(self, offset: Array) -> None:
-        """Go on after a pause with an offset (6,) of the tip."""
+        """Continue after a pause with an offset (6,) of the tip."""
         self._averaged.begin(offset)
 
     def shift(self, change: Array) -> None:
-        """Let the offset change by as much (6,), as the model does."""
+        """Shift the offset by a change (6,) of the model."""
         self._averaged.shift(change)
 
     def command(
@@ -91,17 +91,17 @@ class TipFeedback:
         Parameters
         ----------
         tip :
-            Of the model, on the reference's path.
+            The model's tip on the reference's path.
         reference :
-            Where the arm is led to, with the offset that it was planned with.
+            The reference, with the offset that its plan accounts for.
         prescribed :
             Components (5,) that the target prescribes; see `prescribed_components`.
         offset :
-            Of the tip (6,), estimated now.
+            Present estimate of the tip's offset (6,).
         goal :
-            Command (n,) that the reference asks for, in Pa.
+            Command (n,) of the reference, in Pa.
         limits :
-            Of the command (n,), lowest and highest, in Pa.
+            Lowest and highest command (n,), in Pa.
         """
         n = len(goal)
         correction = reference.path[n:] - self._correctable(offset)
@@ -117,9 +117,9 @@ class TipFeedback:
         return command
 
     def _correctable(self, offset: Array) -> Array:
-        """Offset (6,) that feedback corrects now.
+        """Return the offset (6,) that feedback corrects now.
 
-        That of an arm that vibrates is averaged over a vibration, except along its stiff axis.
+        For an arm that vibrates it is averaged over a vibration, except along the stiff axis.
         """
         estimator = self._arm.tip
         self._averaged.advance(offset, estimator.omega)
@@ -129,7 +129,7 @@ class TipFeedback:
         return corrected
 
     def _vibration_inputs(self, reference: Reference) -> tuple[ArrayLike, ...]:
-        """Inputs of `tracking_rows` for an arm that vibrates."""
+        """Return the inputs of `tracking_rows` for an arm that vibrates."""
         if self._gains is None:
             return ()
         estimator, pressures = self._arm.tip, self._arm.pressures

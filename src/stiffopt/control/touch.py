@@ -1,26 +1,28 @@
-"""What touches the tip: a force, told apart from errors of the model, creep and vibration.
+"""Estimate the contact force at the tip.
 
-The tip is seen at y, the model predicts it at s for the present pressures. What is between them is
-estimated in each axis, for displacements u, e and xi, rates r of u and b of e, and a speed eta::
+Model error, creep and vibration also displace the tip, so the estimator separates them from the
+force. The tracker measures the tip at y; the model predicts s for the present pressures. In each
+axis, the difference is modelled as the sum of displacements u, e and xi, with rates r of u and b of
+e, and a speed eta of xi::
 
     y - s = u + e + xi,    u' = r,    r' = -r / T_r,    e' = b + g s_n',    b' = -b / T,
     xi' = eta,    eta' = -2 zeta omega eta - omega^2 xi
 
 A force F on the tip displaces it by u = C F in the directions in which it is soft; along a stiff
 axis no force can be felt. e is the error of the model. It changes with motion, by a share of the
-way, and creeps at the rate b, which motion sets off. xi is the vibration of the first bending mode
-that pressures do not account for. A force that begins displaces the equilibrium and not the tip:
-u + xi stays, so that the swing which follows tells its size before it has decayed. While the tip
-approaches something along n, g is the error per way s_n of the model's tip along n: it is learned
-before the tip touches.
+way, and creeps at the rate b, which motion sets off. xi is the part of the first bending mode's
+vibration that pressures do not explain. A force that begins displaces the equilibrium, not the tip:
+u + xi stays the same, so the following vibration shows its size before it has decayed. While the
+tip approaches something along n, g is the error per way s_n of the model's tip along n; it is
+learned before the contact.
 
-Force and error look alike in one sample, and differ in how they begin. While nothing touches the
-tip, u is zero. At intervals a hypothesis begins: that a force has begun or changed just then, or
-has gone. Each is a Kalman filter of its own; the logarithm of its likelihood is compared with that
-of the present filter (the generalised likelihood ratio test of Willsky and Jones, 1976). One that
-is better by far replaces the present filter. A push that grows for seconds is found in parts.
+In one sample, force and error look alike; they differ in how they begin. Without contact, u is
+zero. At intervals a hypothesis starts: a force has just begun, changed or gone. Each hypothesis is
+a Kalman filter of its own; its log-likelihood is compared with that of the present filter (the
+generalised likelihood ratio test of Willsky and Jones, 1976). One that is far better replaces the
+present filter. A push that grows for seconds is found in parts.
 
-Noise is alike in all axes, so that each filter has one covariance (7, 7) and a mean (7, 3).
+All axes have the same noise, so each filter has one covariance (7, 7) and a mean (7, 3).
 """
 
 from __future__ import annotations
@@ -37,7 +39,7 @@ from stiffopt.optimise.tip import TipAt
 
 Array = NDArray[np.float64]
 
-_U, _R, _E, _B, _G, _XI, _ETA = range(7)
+_U, _R, _E, _B, _G, _XI, _ETA = range(7)  # indices of the state
 
 
 @dataclass(frozen=True)
@@ -46,10 +48,10 @@ class TipForce:
 
     Attributes
     ----------
-    touches : whether something is felt; else the force is zero, but on an approach.
-    force : (3,), in N; nothing along axes in which the arm cannot feel.
-    covariance : of the force (3, 3), in N^2. Along an axis without feeling, it is that of all
-        forces that are thought possible.
+    touches : whether a force is felt; otherwise the force is zero, except on an approach.
+    force : (3,), in N; zero along axes in which the arm cannot feel.
+    covariance : of the force (3, 3), in N^2. Along axes in which the arm cannot feel, it is that of
+        all forces considered possible.
     displacement : of the tip by the force (3,), in m.
     """
 
@@ -61,13 +63,13 @@ class TipForce:
 
 @dataclass
 class _Filters:
-    """The present filter, and after it the hypotheses, k in all."""
+    """The present filter, followed by the hypotheses, k in all."""
 
     means: Array  # (k, 7, 3)
     covariances: Array  # (k, 7, 7)
-    evidence: Array  # (k,) logarithms of likelihoods over that of the present filter
+    evidence: Array  # (k,) log-likelihoods relative to the present filter
     since: Array  # (k,) when they began, in s
-    released: NDArray[np.bool_]  # (k,) whether the force has gone then
+    released: NDArray[np.bool_]  # (k,) whether the hypothesis is that the force has gone
 
     def keep(self, chosen: Array | list[int]) -> _Filters:
         return _Filters(
@@ -97,12 +99,12 @@ class TouchEstimator:
     damping :
         Damping ratio of the vibration.
     tuning :
-        Noise, and when a force is believed.
+        Noise, and thresholds of the force.
 
     Attributes
     ----------
-    felt : the force, as of the last sample; NaN before the first.
-    stiffness_error : relative deviation of the arm's stiffness; NaN where it is not known.
+    felt : the force at the last sample; NaN before the first.
+    stiffness_error : relative deviation of the arm's stiffness; NaN if unknown.
     """
 
     def __init__(
@@ -111,17 +113,17 @@ class TouchEstimator:
         self._tuning, self._damping, self._vibrates = tuning, damping, vibrates
         self._ends = np.cumsum([0, *segments[:-1]])
         swings = float(vibrates)
-        self._seen = np.array([1.0, 0.0, 1.0, 0.0, 0.0, swings, 0.0])  # of the state, in y - s
-        # direction and speed of an approach, on which a force may come at any moment
+        self._seen = np.array([1.0, 0.0, 1.0, 0.0, 0.0, swings, 0.0])  # row of y - s in the state
+        # direction and speed of an approach, during which a force may begin at any time
         self._approach: tuple[Array, float] | None = None
-        self._approached = 0.0  # way of the model's tip since it began, in m
+        self._approached = 0.0  # way of the model's tip since the approach began, in m
         self._presses = False
-        # change of the state by a force that begins
+        # change of the state when a force begins
         self._begins = np.array([1.0, 0.0, 0.0, 0.0, 0.0, -swings, 0.0])
         self.begin()
 
     def begin(self) -> None:
-        """Start anew, with nothing at the tip."""
+        """Restart, without contact."""
         t = self._tuning
         deviations = [0.0, 0.0, t.first_error, t.first_rate, 0.0, 0.0, 0.0]
         if self._vibrates:
@@ -130,14 +132,14 @@ class TouchEstimator:
             np.zeros((1, 7, 3)), np.diag(np.square(deviations))[None], np.zeros(1),
             np.array([-math.inf]), np.array([False]),
         )  # fmt: skip
-        self._believed = False  # that there is a force
+        self._believed = False  # whether a force is felt
         self._time = -math.inf
         self._pressures: Array = np.zeros(0)
-        self._way = 0.0  # of the model's tip in the last moments, in m
-        # displacement (3, s) in the time of creep, by each segment; parts to and fro cancel
+        self._way = 0.0  # recent way of the model's tip, in m; see `TouchTuning.motion_time`
+        # displacement (3, s) by each segment within the time of creep; to and fro cancel
         self._recent_way = np.zeros((3, len(self._ends)))
-        self._better = self._quiet = 0  # samples in a row
-        self._begun = -math.inf  # the last hypothesis
+        self._better = self._quiet = 0  # successive samples
+        self._begun = -math.inf  # time of the last hypothesis, in s
         self._softest = 1.0  # largest compliance, in m/N
         # stiffness (3, 3) of the tip in the directions of feeling, and projection on these
         self._stiffness, self._felt_axes = np.eye(3), np.eye(3)
@@ -146,17 +148,18 @@ class TouchEstimator:
         self.felt = TipForce(False, unknown, np.full((3, 3), np.nan), np.zeros(3))
 
     def expect(self, direction: Array | None, speed: float = 0.0, *, presses: bool = False) -> None:
-        """Be prepared for a force that grows slowly, as when the tip approaches something.
+        """Prepare for a force that grows slowly, as when the tip approaches something.
 
         Parameters
         ----------
         direction :
-            Of the approach (3,), base axes; None: there is none. Nothing touches when it begins.
+            Direction (3,) of the approach, base axes; None: no approach. There must be no contact
+            when it begins.
         speed :
-            Of the approach, in m/s.
+            Speed of the approach, in m/s.
         presses :
-            Whether the tip presses on something by now: it hardly moves along the direction then,
-            and what the pressures would move it by, the force displaces it by.
+            Whether the tip presses on something now. It then hardly moves along the direction: the
+            force displaces it by as much as the pressures would move it.
         """
         self._presses = presses
         if direction is None:
@@ -168,19 +171,19 @@ class TouchEstimator:
             self._believed, self._approached = False, 0.0
             self._merge()
             f = self._filters
-            for state in (_G, _B):  # the arm has rested: it creeps no more
+            for state in (_G, _B):  # the arm has rested, so creep has ended
                 f.means[:, state] = f.covariances[:, state] = f.covariances[:, :, state] = 0.0
             f.covariances[:, _G, _G] = self._tuning.approach_error**2
         self._approach = direction, speed
 
     @property
     def _has_force(self) -> bool:
-        """Whether the present filter has a force: a believed one, or one that may come."""
+        """Whether the present filter has a force: one that is felt, or that may begin."""
         learned = self._approach is not None and self._approached > self._tuning.learning_way
         return self._believed or learned
 
     def change_model(self, change: Array) -> None:
-        """Go on with another model, from which the tip is off by another offset (6,)."""
+        """Adjust to another model, for which the tip's offset changes by (6,)."""
         self._filters.means[:, _E] += change[:3]
 
     def take(
@@ -191,14 +194,14 @@ class TouchEstimator:
         Parameters
         ----------
         time :
-            Of its capture, in s.
+            Time of capture, in s.
         away :
-            Position (3,) seen less the one that the model predicts for that moment, with the
-            vibration that pressures excite, in m.
+            Measured position (3,) minus the model's prediction for that time, in m. The prediction
+            includes the vibration that pressures excite.
         pressures :
-            Effective ones (n,), in Pa.
+            Effective pressures (n,), in Pa.
         tip :
-            The model's tip at these.
+            The model's tip at these pressures.
         omega :
             Angular frequency of the vibration, in rad/s.
         """
@@ -229,7 +232,7 @@ class TouchEstimator:
         return TipForce(self._believed, force, covariance, felt @ displacement)
 
     def _variance(self) -> float:
-        """Variance of u; where nothing is felt, that of a force which could have been felt."""
+        """Return the variance of u; without a force, that of one that could have been felt."""
         filters = self._filters
         if self._has_force or len(filters.since) == 1:
             return float(filters.covariances[0, _U, _U])
@@ -245,17 +248,17 @@ class TouchEstimator:
         self._stiffness, self._felt_axes = axes / compliances[soft] @ axes.T, axes @ axes.T
 
     def _moved(self, pressures: Array, tip: TipAt) -> Array:
-        """Displacement (3, s) of the model's tip by each segment since the last sample, in m."""
+        """Return displacements (3, s) of the model's tip by segment since the last sample, in m."""
         columns = tip.jacobian[:3] * (pressures - self._pressures)
         self._pressures = pressures.copy()
         moved: Array = np.add.reduceat(columns, self._ends, axis=1)
         return moved
 
     def _process(self, elapsed: float, moved: Array, omega: float) -> tuple[Array, Array, Array]:
-        """Transition (7, 7), covariance (7, 7) of its noise, and change (3,) of u by the motion.
+        """Return transition (7, 7), covariance (7, 7) of its noise, and change (3,) of u by motion.
 
-        The errors of a motion in one direction add up, not their squares: the variance grows with
-        the square of the way of the last moments.
+        During a motion in one direction the errors add up, not their squares: the variance grows
+        with the square of the recent way.
         """
         t = self._tuning
         before = self._way * math.exp(-elapsed / t.motion_time)
@@ -271,7 +274,7 @@ class TouchEstimator:
         Q[_B, _B] = t.creep**2 * grown + (t.creep_change * _length(self._recent_way)) ** 2 * elapsed
         pressed = np.zeros(3)
         if self._approach is not None:
-            Q[_B, _B] = 0.0  # or the beginning of a contact would be taken for creep
+            Q[_B, _B] = 0.0  # otherwise a beginning contact would be taken for creep
             along = float(self._approach[0] @ moved.sum(axis=1))
             self._approached += along
             if self._presses:
@@ -306,7 +309,7 @@ class TouchEstimator:
         f.covariances = F @ f.covariances @ F.T + noises
 
     def _correct(self, away: Array, noise: float) -> None:
-        """Correct all filters by a position (3,), and compare them."""
+        """Correct all filters by a position (3,) relative to the model's, and compare them."""
         f, seen = self._filters, self._seen
         means, covariances = f.means, f.covariances
         missed = away - seen @ means
@@ -318,7 +321,7 @@ class TouchEstimator:
         stiff[:, [_U, _R, _XI, _ETA]] = 0.0
         f.means = means + gains[:, :, None] * soft[:, None]
         f.means += stiff[:, :, None] * (missed - soft)[:, None]
-        if self._approach is not None:  # what the tip comes to pushes it back, and never on
+        if self._approach is not None:  # a contact can only push the tip back
             ahead = np.maximum(f.means[:, _U] @ self._approach[0], 0.0)
             onward = ahead[:, None] * self._approach[0]
             f.means[:, _U] -= onward
@@ -326,11 +329,11 @@ class TouchEstimator:
         f.covariances = covariances - gains[:, :, None] * seen_with[:, None]
         squares = 0.5 * (soft**2).sum(axis=1) / variances
         widths = np.log(variances)
-        # a filter without force is narrower, which is no evidence that a force has gone
+        # a filter without force has less variance, which is no evidence that a force has gone
         f.evidence += squares[0] - squares + np.where(f.released, 0.0, widths[0] - widths)
 
     def _decide(self) -> None:
-        """Take a hypothesis that is better by far, begin others, and let a small force go."""
+        """Adopt a far better hypothesis, start new ones, and drop a small force."""
         t, f = self._tuning, self._filters
         best = int(np.argmax(f.evidence))
         displaced = f.means[best, _U] - f.means[0, _U]
@@ -349,7 +352,7 @@ class TouchEstimator:
             self._let_go()
 
     def _begin_hypotheses(self) -> None:
-        """That a force has begun, or changed, just now; and that it has gone."""
+        """Start the hypotheses that a force has just begun or changed, and that it has gone."""
         t, f = self._tuning, self._filters
         self._begun = self._time
         kept = np.flatnonzero(self._time - f.since[1:] < t.hypothesis_time) + 1
@@ -359,14 +362,14 @@ class TouchEstimator:
         jump[_R, _R] = self._rate() ** 2
         f = f.with_one(mean, covariance + jump, self._time, released=False)
         if self._believed:
-            gone = np.eye(7)  # the tip stays where it is, and its equilibrium does not
+            gone = np.eye(7)  # the equilibrium jumps, the tip stays where it is
             gone[:, _U] -= self._begins
             gone[_R, _R] = 0.0
             f = f.with_one(gone @ mean, gone @ covariance @ gone.T, self._time, released=True)
         self._filters = f
 
     def _let_go(self) -> None:
-        """Feel no force any more that has been small for a while: its rest is an error."""
+        """Drop a force that has been small for a while; the rest counts as model error."""
         t = self._tuning
         force = float(np.linalg.norm(self._stiffness @ self._filters.means[0, _U]))
         least = max(t.gone_share * t.least_force, self._deviation())
@@ -377,16 +380,16 @@ class TouchEstimator:
         self._merge()
 
     def _deviation(self) -> float:
-        """Standard deviation of the force of the present filter where the tip is softest, in N."""
+        """Return the standard deviation of the force along the softest direction, in N."""
         return math.sqrt(self._filters.covariances[0, _U, _U]) / self._softest
 
     def _rate(self) -> float:
-        """Standard deviation of the rate of u while a force changes, in m/s."""
+        """Return the standard deviation of the rate of u while a force changes, in m/s."""
         rate = self._tuning.rate * self._softest
         return rate if self._approach is None else max(rate, self._approach[1])
 
     def _merge(self) -> None:
-        """Take what is left of a force for an error, and forget the hypotheses."""
+        """Turn the rest of a force into model error, and drop the hypotheses."""
         merged = np.eye(7)
         merged[_E, _U], merged[_U, _U], merged[_R, _R] = 1.0, 0.0, 0.0
         self._filters = self._filters.keep([0])
@@ -395,12 +398,12 @@ class TouchEstimator:
 
 
 def _length(way: Array) -> float:
-    """Sum of the lengths of the segments' ways (3, s)."""
+    """Return the sum of the lengths of the segments' ways (3, s)."""
     return float(np.sqrt((way**2).sum(axis=0)).sum())
 
 
 def _vibration(omega: float, damping: float, duration: float) -> Array:
-    """Transition (2, 2) of a free vibration; see `stiffopt.control.vibration.transition`."""
+    """Return the transition (2, 2) of a free vibration; see `vibration.transition`."""
     damped = omega * math.sqrt(1 - damping**2)
     decay = math.exp(-damping * omega * duration)
     c, s = decay * math.cos(damped * duration), decay * math.sin(damped * duration) / damped

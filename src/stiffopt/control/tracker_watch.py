@@ -28,26 +28,27 @@ class Sight(Enum):
 class TrackerWatch:
     """Watches for how long the tip has not been seen, and whether it seems to jump.
 
-    Only samples count that were used and are newer than all before. The usual interval and age of
-    samples are learned until the loop is armed; a sample is overdue by its age beyond the usual.
+    A sample counts only if it was used and is newer than all before. Until the loop is armed, the
+    watch learns the usual interval and age of samples; a sample is overdue by its age beyond the
+    usual one.
 
     A tip that was missing is seen again after `TrackerTuning.back` ticks with new samples in which
-    none was overdue: single samples must not switch control on and off. It is lost when no sample
-    was used for the timeout.
+    none was overdue, so that single samples do not switch control on and off. It is lost when no
+    sample was used for the timeout.
 
-    With a tracker so slow that the frames which may be missing take longer than the timeout, the
-    tip is missing at the timeout, and lost shortly after. With an interval longer than the timeout
-    it is never seen. The period of the loop, in s, is the resolution of these times.
+    If the tracker is so slow that the permitted number of missing frames takes longer than the
+    timeout, the tip is missing at the timeout and lost shortly after. If its interval exceeds the
+    timeout, the tip is never seen. The loop's period, in s, is the resolution of these times.
     """
 
     def __init__(self, safety: Safety, period: float, tuning: TrackerTuning | None = None) -> None:
         self._safety, self._period = safety, period
         self.tuning = tuning = tuning or TrackerTuning()
-        self.jumps = 0  # samples in a row that were rejected
+        self.jumps = 0  # successive samples that were rejected
         self._back = tuning.back  # ticks with new samples since the tip was missing
         self._frame: int | None = None
         self._reported = self._latest = -np.inf
-        # interval between samples, and their age on arrival, in s; a guess before they are learned
+        # interval between samples, and their age on arrival, in s; a guess until learned
         self.usual = safety.tracker_timeout / safety.tracker_frames, 0.0
         self._before = -np.inf
         self._intervals: deque[float] = deque(maxlen=tuning.window)
@@ -55,14 +56,14 @@ class TrackerWatch:
         self._positions: deque[Array] = deque(maxlen=tuning.window)
 
     def forget(self) -> None:
-        """Learn anew; until there are enough samples, interval and age stay as they were."""
+        """Learn again; until there are enough samples, interval and age keep their values."""
         self._before = -np.inf
         self._intervals.clear()
         self._ages.clear()
         self._positions.clear()
 
     def begin(self, now: float) -> None:
-        """Start anew from a time at which the tip is seen, in s: the first samples take a while."""
+        """Restart at a time at which the tip is seen, in s: the first samples take a while."""
         self.jumps = 0
         self._latest = max(self._latest, now - self.usual[1])
 
@@ -108,13 +109,13 @@ class TrackerWatch:
     def update(self, now: float, seen: SampleCounts) -> None:
         """Take in how many samples of a tick were used or rejected."""
         if self._latest == -np.inf:
-            self._latest = now  # from here on it may be missing
+            self._latest = now  # the tip may be missing from now on
         is_new = False
         if seen.used:
             self.jumps = 0
             if is_new := seen.latest > self._reported:
                 self._reported = seen.latest
-                self._latest = min(seen.latest, now)  # not from the future
+                self._latest = min(seen.latest, now)  # never in the future
         elif seen.rejected:
             self.jumps += seen.rejected
         if self._by_age(now) is not Sight.SEEN:
@@ -132,21 +133,21 @@ class TrackerWatch:
         return Sight.MISSING if sight is Sight.SEEN and self._back < self.tuning.back else sight
 
     def _by_age(self, now: float) -> Sight:
-        """Return the same by the age of the newest sample alone."""
+        """Return whether the tip is seen, by the age of the newest sample alone."""
         interval, _ = self.usual
         overdue = self.overdue(now)
         slack = self._period + self.tuning.jitter * interval
         timeout = self._safety.tracker_timeout
         if overdue > timeout + slack:
             return Sight.LOST
-        # missing precedes lost by the slack at least, and so by one tick
+        # a tip is missing at least the slack, and so one tick, before it is lost
         if overdue > min(self._safety.tracker_frames * interval + slack, timeout):
             return Sight.MISSING
         return Sight.SEEN
 
     @property
     def jumping(self) -> bool:
-        """Whether so many samples in a row were rejected that it is a fault."""
+        """Whether so many successive samples were rejected that it is a fault."""
         return self.jumps >= self._safety.max_jumps
 
 

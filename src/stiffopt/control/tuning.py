@@ -1,7 +1,7 @@
-"""Tuning of the control loop: the numbers that somebody may want to change, by concept.
+"""Tuning of the control loop: numbers that somebody may want to change, by concept.
 
-They hold for all arms and rigs. What differs from one rig to the next, such as limits, the lag of
-the regulators or the noise of the tracker, stands in the rig file (`stiffopt.rig.settings`).
+They apply to all arms and rigs. What differs between rigs, such as limits, the lag of the
+regulators or the noise of the tracker, is in the rig file (`stiffopt.rig.settings`).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ class EstimatorTuning:
     # fastest that a tip moves, in m/s; samples that would need more are rejected
     max_speed: float = 1.0
     model_error: float = 0.2  # error of the model's displacement, as a share of that displacement
-    # error of what excites the vibration, as a share of the mode's displacement
+    # relative error of the mode's displacement, which excites the vibration
     excitation_error: float = 0.05
     drift: float = 3e-4  # growth of the offset's standard deviation at rest, in m / sqrt(s)
     angular_drift: float = 3e-3  # the same of the orientation's offset, in rad / sqrt(s)
@@ -30,13 +30,11 @@ class EstimatorTuning:
     memory: float = 0.4  # age beyond which a sample is dropped, in s
     # compliance, as a share of the largest, below which a direction vibrates less
     soft_share: float = 0.15
-    # lower bound of the vibration's angular frequency, in rad/s; that of an arm about to buckle
-    # would be 0
+    # lower bound of the vibration's angular frequency, in rad/s; it is 0 for an arm about to buckle
     least_frequency: float = 0.5
-    # displacement of the model, in m, after which a pose that has not changed in one digit is a
-    # frozen reading
+    # displacement of the model, in m, after which an exactly unchanged pose is a frozen reading
     frozen: float = 2e-3
-    patience: int = 40  # rejected samples in a row after which the filter starts anew from them
+    patience: int = 40  # successive rejected samples after which the filter restarts from them
     # time since the last sample, in s, for which `max_speed` allows a displacement; a tip that
     # jumped and stays there is thus never accepted
     longest_gap: float = 0.05
@@ -44,27 +42,27 @@ class EstimatorTuning:
 
 @dataclass(frozen=True)
 class RegulatorTuning:
-    """Observer gains of the regulators' model, and what is done about those that do not follow.
+    """Observer gains of the regulators' model, and the treatment of channels that do not follow.
 
-    `Channels` says what limited and stuck channels are.
+    `Channels` explains limited and stuck channels.
     """
 
     pressure_gain: float = 30.0  # rate at which a reading corrects the pressure, in 1/s
     offset_gain: float = 225.0  # rate at which it corrects the offset, in 1/s^2
-    # largest offset of a regulator that commands make up for at once, in Pa
+    # largest offset of a regulator that commands compensate at once, in Pa
     max_compensation: float = 3e3
-    # largest shortfall that they make up for in time, as a share of `Safety.max_pressure_error`
+    # largest shortfall that they compensate slowly, as a share of `Safety.max_pressure_error`
     make_up_share: float = 0.8
-    # time constant of that, in s: slower than the pressure monitor, which finds sudden leaks
+    # its time constant, in s: slower than the pressure monitor, which finds sudden leaks
     make_up_time: float = 1.0
-    told_share: float = 0.5  # share of that shortfall from which there is an alarm
-    reading_time: float = 0.1  # time constant that takes the noise from readings, in s
+    told_share: float = 0.5  # share of that shortfall above which there is an alarm
+    reading_time: float = 0.1  # time constant that smooths readings, in s
     patience: float = 0.5  # time for which a channel must be short, or above, in s
     follows: float = 3e3  # distance from a command, in Pa, at which a regulator follows
     # distance of a command below the pressure of a channel that does not fall, as a share of
     # `Safety.max_pressure_error`
     probe_share: float = 0.5
-    let_down_share: float = 0.1  # share of the slew with which a channel is let down on request
+    let_down_share: float = 0.1  # share of the slew with which a removed channel is let down
 
 
 @dataclass(frozen=True)
@@ -77,10 +75,10 @@ class ReferenceTuning:
     rigid_rate: float = 100.0
     # share of the slew that the reference may take; the rest is for feedback
     slew_share: float = 0.9
-    # change of pressure (norm over all channels) over which the model's derivatives along the
-    # reference are not evaluated again, in Pa
+    # change of pressure (norm over all channels) over which the model on the reference is not
+    # linearised again, in Pa
     model_range: float = 3e3
-    # distance from the plan at which it has arrived, in Pa, and speed at which it rests, in Pa/s
+    # distance from the plan at which it has arrived, in Pa, and rate below which it rests, in Pa/s
     there: float = 5e3
     at_rest: float = 5e4
 
@@ -96,35 +94,35 @@ class FeedbackTuning:
     # change of the tip's position below which a change of pressure is left to the plan, in m/bar:
     # the square root of epsilon of the quadratic program
     posture_weight: float = 0.3e-3
-    # error that a limit may cause at the tip without a channel being reported as saturated, in m
+    # error that a limit may cause at the tip before its channel is reported as saturated, in m
     unreported_error: float = 2e-4
-    # share of the arm's length beyond which the tip's offset is no error of this arm's model
+    # share of the arm's length beyond which the tip's offset cannot be an error of its model
     max_offset: float = 0.5
 
 
 @dataclass(frozen=True)
 class ReplanningTuning:
-    """When plans are made anew, and how quickly they follow the estimated offset."""
+    """When to make new plans, and how quickly they follow the estimated offset."""
 
     interval: float = 0.05  # between plans, in s
     # time constant with which the plan's offset follows the estimate, in s
     offset_time: float = 1.0
-    # least such time constant of an arm that vibrates, in rad of its vibration
+    # lower bound of that time constant for an arm that vibrates, in rad of its vibration
     offset_periods: float = 3.0
     # change of a target, in m, after which all configurations are searched
     far_position: float = 5e-3
     far_angle: float = math.radians(5)  # the same of its orientation or pointing, in rad
-    # change of a pressure that a channel can have, in Pa, after which they are searched too
+    # change of an available pressure, in Pa, after which all configurations are searched
     other_pressure: float = 1e4
 
 
 @dataclass(frozen=True)
 class PostureTuning:
-    """How trajectories of pressures are followed."""
+    """How the loop follows trajectories of pressures."""
 
-    # share of the slew that the reference may take on them: they are within it already
+    # share of the slew that the reference may take: the trajectories are within it already
     slew_share: float = 1.0
-    # distance in pressure at which the arm is where a trajectory begins, in Pa
+    # distance in pressure below which the arm is at the start of a trajectory, in Pa
     there: float = 1e4
 
 
@@ -132,13 +130,13 @@ class PostureTuning:
 class ForecastTuning:
     """How requests are checked against the rig's scene before they are accepted."""
 
-    patience: float = 8.0  # in which a way must have been checked, in s
-    look: float = 2e-3  # between looks for the planner's answer, in s
-    # distance and angle between targets of a trajectory for which plans are made, in m and rad
+    patience: float = 8.0  # for the check of a way, in s
+    look: float = 2e-3  # interval of looking for the planner's answer, in s
+    # distance and angle between the targets of a trajectory to plan for, in m and rad
     spacing: float = 1e-3
     turn: float = math.radians(1)
-    most: int = 1000  # such targets
-    # distance in pressure that the arm may have moved since a way was checked, in Pa
+    most: int = 1000  # number of such targets
+    # distance in pressure by which the arm may have moved since the check of a way, in Pa
     moved: float = 1e4
 
 
@@ -147,7 +145,7 @@ class AdaptationTuning:
     """How the arm's numbers are adapted (`Adaptation`), and how often the model changes."""
 
     bound: float = 3.0  # of each coordinate, in prior deviations
-    mass: float = 0.01  # deviation of the mass at the tip that the file does not have, in kg
+    mass: float = 0.01  # deviation of the tip mass that the file does not have, in kg
     iterations: int = 2  # of Gauss-Newton
     # discrepancy of the model: of the position, in m, and as a share of its displacement from rest;
     # of the orientation, in rad
@@ -155,37 +153,37 @@ class AdaptationTuning:
     model_error: float = 0.04
     angle_error: float = 0.02
     stiffness_error: float = 0.05  # of the stiffness, relative
-    reach: float = 5e4  # distance in pressure over which it is the same, in Pa
+    reach: float = 5e4  # distance in pressure over which the discrepancy is correlated, in Pa
     memory: float = 1800.0  # time in which the deviation of a window's error grows e-fold, in s
     # change of an applied number, in prior deviations, below which it stays; largest one in a step
     least_step: float = 0.05
     step: float = 1.0
-    interval: float = 10.0  # between two changes of the model, in s, or until another target
-    # after such a change, time in s in which the plan is followed slowly, and share of the slew
+    interval: float = 10.0  # between two changes of the model, in s, unless the target changes
+    # time after such a change for which the plan is followed slowly, in s, and share of the slew
     calm_time: float = 4.0
     slew_share: float = 0.1
-    # distance in pressure after which the deviation of the stiffness is computed anew, in Pa
+    # distance in pressure after which the deviation of the stiffness is computed again, in Pa
     elsewhere: float = 3e4
-    at_rest: float = 1e3  # change of a pressure from plan to plan, in Pa, below which it rests
+    at_rest: float = 1e3  # change of a pressure between plans below which it is at rest, in Pa
 
 
 @dataclass(frozen=True)
 class WindowTuning:
     """When the tip is at rest, and how long it is averaged (`WindowWatch`)."""
 
-    every: float = 0.04  # between two looks, in s
+    every: float = 0.04  # interval of checks for rest, in s
     wait: float = 0.6  # time at rest before a window, in s
     duration: float = 0.8  # of a window, in s
-    again: float = 10.0  # from a window to the next one of the same rest, in s
-    # changes within a window above which it begins anew: of a pressure, in Pa, of the tip, in m
+    again: float = 10.0  # from a window to the next one at the same rest, in s
+    # changes within a window above which it restarts: of a pressure, in Pa, of the tip, in m
     drift_pressure: float = 4e3
     drift_position: float = 3e-4
     vibration: float = 3e-4  # above which the tip is not at rest, in m
-    seen: float = 0.3  # age of the latest sample above which it is not known, in s
-    same: float = 1e4  # distance in pressure below which it is the same posture, in Pa
-    # distance of the tips of two windows of one posture, in m, at which the load is another one
+    seen: float = 0.3  # age of the latest sample above which rest is unknown, in s
+    same: float = 1e4  # distance in pressure below which postures count as the same, in Pa
+    # distance between the tips of two windows of one posture above which the load has changed, in m
     changed: float = 2e-3
-    most: int = 10  # windows that are kept
+    most: int = 10  # number of windows to keep
 
 
 @dataclass(frozen=True)
@@ -200,12 +198,12 @@ class PlanningTuning:
     at_rest: float = 5e-5
     # distance in pressure beyond which an optimum is another configuration, in Pa
     neighbourhood: float = 2e4
-    # what each metre of a target's displacement adds to it, in Pa/m
+    # growth of that distance per metre of a target's displacement, in Pa/m
     neighbourhood_per_metre: float = 2e7
-    # plans for which an optimum in another configuration is refused before it is taken
+    # successive plans that refuse an optimum in another configuration before one takes it
     patience: int = 20
-    position_tolerance: float = 1e-5  # with which plans are made, in m
-    angle_tolerance: float = 1e-3  # likewise, in rad
+    position_tolerance: float = 1e-5  # of plans, in m
+    angle_tolerance: float = 1e-3  # of plans, in rad
 
 
 @dataclass(frozen=True)
@@ -214,33 +212,33 @@ class NearestTuning:
 
     iterations: int = 40  # at most
     max_step: float = 0.3e5  # largest change of a pressure in an iteration, in Pa
-    progress: float = 1e-7  # of the error, in m, below which the search ends
+    progress: float = 1e-7  # decrease of the error below which the search ends, in m
     regularisation: float = 1e-4  # of the normal equations, in m/bar
 
 
 @dataclass(frozen=True)
 class SupervisionTuning:
-    """Patience of the state machine; what is a fault is decided by `Safety` of the rig file."""
+    """Patience of the state machine; `Safety` of the rig file defines faults."""
 
-    # time for which the alarm of the total force outlasts the last command that was shortened, in s
+    # time for which the alarm of the total force outlasts the last limited command, in s
     force_alarm: float = 0.5
-    max_failures: int = 3  # failures of the controller in a row after which pressures are held
+    max_failures: int = 3  # successive failures of the controller after which pressures are held
     chamber_lag: float = 0.3  # by which the pressures in the chambers may lag behind commands, in s
-    # time of steering after which a hold is a new one, and its timeout begins anew, in s
+    # time of control after which a hold is a new one, and its timeout starts again, in s
     hold_memory: float = 2.0
     # time after a doubt in which another one lets the pressures down at once, in s
     doubt_memory: float = 30.0
-    vent_attempts: int = 3  # to vent when the loop ends
-    # time after the ramp in which the ending loop goes on trying to vent, in s
+    vent_attempts: int = 3  # when the loop ends
+    # time after the ramp in which the ending loop keeps trying to vent, in s
     stop_margin: float = 0.5
-    # distance of the vented tip from the model's, as a share of the arm's length, beyond which the
-    # arm is not armed
+    # distance of the vented tip from the model's, as a share of the arm's length, beyond which
+    # arming is refused
     vented_offset: float = 0.1
 
 
 @dataclass(frozen=True)
 class DriftScale:
-    """A drift that counts: in so many intervals, each in s, faster than a speed in m/s."""
+    """A drift: faster than `least_speed`, in m/s, in each of `count` intervals, in s."""
 
     interval: float
     count: int
@@ -249,92 +247,91 @@ class DriftScale:
 
 @dataclass(frozen=True)
 class MotionTuning:
-    """What in the tip's motion is doubted (`MotionWatch`)."""
+    """Thresholds for doubting the tip's motion (`MotionWatch`)."""
 
-    spacing: float = 0.02  # least time between two samples that are compared, in s
-    longest_pause: float = 0.1  # since the arm was steered, after which none is compared, in s
-    # by what share of what each segment moves the tip the model may be wrong
+    spacing: float = 0.02  # minimum time between two samples that are compared, in s
+    longest_pause: float = 0.1  # without control, after which samples are not compared, in s
+    # error of the model, as a share of the motion that each segment causes
     model_error: float = 0.35
-    noise: float = 1e-3  # of a motion that is seen, in m
+    noise: float = 1e-3  # of a measured motion, in m
     scatter: float = 5e-5  # standard deviation of a tracked position in each axis, in m
-    # way from which on a response is looked at: a length in m, and a share of the arm's length
+    # shortest way for a test of the response: in m, and as a share of the arm's length
     least_motion: float = 3e-3
     least_motion_share: float = 0.025
-    response_window: float = 0.6  # in which the tip must have moved as the model has it, in s
-    least_response: float = 0.25  # share of that way by which it must have moved along it
+    response_window: float = 0.6  # within which the tip must have moved like the model's, in s
+    least_response: float = 0.25  # share of the model's way by which it must have moved along it
     most_across: float = 0.75  # share of that way by which it may have moved across it
-    late: float = 0.01  # by which the tip may move later than the model has it, in s
-    misses: int = 2  # samples in a row that show no response
+    late: float = 0.01  # by which the tip may move later than the model's, in s
+    misses: int = 2  # successive samples that show no response
     slip_window: float = 1.0  # in which a slip is looked for, in s
-    # share of the turn that a push brings along by which the measured turn must miss it
+    # share of the turn that a push would cause by which the measured turn must miss it
     slip: float = 0.7
     least_turn: float = 0.02  # by which it must miss it at least, in rad
-    slips: int = 4  # samples in a row that show a slip
+    slips: int = 4  # successive samples that show a slip
     scales: tuple[DriftScale, ...] = (
         DriftScale(0.25, 5, 2e-3),
         DriftScale(1.0, 5, 6e-4),
         DriftScale(2.5, 4, 3.5e-4),
     )
-    turn: float = 1e-3  # way back after which a swing has turned, in m
-    swings: int = 4  # between turns, one after the other
-    least_swing: float = 4.5e-3  # from one turn to the next, in m
-    decay: float = 0.8  # a last swing that is a smaller share of the largest decays
-    swing_window: float = 6.0  # in which they must be, in s
+    turn: float = 1e-3  # motion back after which a swing has turned, in m
+    swings: int = 4  # successive swings between turning points
+    least_swing: float = 4.5e-3  # smallest size of a swing, in m
+    decay: float = 0.8  # the swings decay if the last one is a smaller share of the largest
+    swing_window: float = 6.0  # in which the swings must be, in s
 
 
 @dataclass(frozen=True)
 class TouchTuning:
-    """Noise of what is between model and tip, and when a force is believed (`TouchEstimator`)."""
+    """Noise of the tip relative to the model, and thresholds of a force (`TouchEstimator`)."""
 
-    force: float = 0.1  # standard deviation of forces that are thought possible, in N
-    stiffness_error: float = 0.1  # of the arm, relative, where it is not known
+    force: float = 0.1  # standard deviation of forces that are considered possible, in N
+    stiffness_error: float = 0.1  # of the arm, relative, where it is unknown
     noise: float = 1e-4  # of a position, in m
-    late: float = 0.01  # by which the tip may move later than the model has it, in s
-    # error of the model, as a share of the way of the last moments, and how long these last, in s
+    late: float = 0.01  # by which the tip may move later than the model's, in s
+    # error of the model, as a share of the recent way, and time constant of "recent", in s
     model_error: float = 0.03
     motion_time: float = 0.6
-    # what a fast motion adds to that share, and how fast that is, in m/s
+    # addition to that share in a fast motion, and speed of a fast motion, in m/s
     fast_error: float = 0.15
     fast: float = 0.1
-    drift: float = 1e-4  # growth of its standard deviation at rest, in m / sqrt(s)
-    # rate of creep after a motion, as a share of its way, in 1/s; the time in which it decays, in
-    # s; and its growth at random, as a share of the way of that time, in 1/s / sqrt(s)
+    drift: float = 1e-4  # growth of the error's standard deviation at rest, in m / sqrt(s)
+    # rate of creep after a motion, as a share of its way, in 1/s; time constant of its decay, in s;
+    # and its random growth, as a share of the way within that time, in 1/s / sqrt(s)
     creep: float = 0.03
     creep_time: float = 5.0
     creep_change: float = 0.01
-    # share of a motion that may excite the vibration beyond what the model has
+    # share of a motion that may excite vibration that the model does not predict
     swing_error: float = 0.1
-    # growth of the standard deviation of the vibration's speed, in m/s / sqrt(s); and, as a share,
-    # by how much its frequency may be off
+    # growth of the standard deviation of the vibration's speed, in m/s / sqrt(s); and relative
+    # error of its frequency
     agitation: float = 2e-3
     detuned: float = 0.06
-    # standard deviations when it begins: in m, m/s, m and m/s
+    # standard deviations at the start: in m, m/s, m and m/s
     first_error: float = 0.02
     first_rate: float = 1e-3
     first_swing: float = 0.01
     first_speed: float = 0.03
-    longest_gap: float = 1.0  # between samples, after which it begins anew, in s
-    spacing: float = 0.1  # between the beginnings of hypotheses, in s
-    hypothesis_time: float = 2.0  # after which one is given up, in s
-    jump: float = 0.012  # standard deviation of a force when a hypothesis begins, in N
-    # growth of a force's standard deviation, in N / sqrt(s): while a hypothesis is open, for so
-    # many seconds, and later
+    longest_gap: float = 1.0  # between samples, after which the estimator restarts, in s
+    spacing: float = 0.1  # between the starts of hypotheses, in s
+    hypothesis_time: float = 2.0  # after which a hypothesis is dropped, in s
+    jump: float = 0.012  # standard deviation of a force when a hypothesis starts, in N
+    # growth of a force's standard deviation, in N / sqrt(s): in the first `open_time` of a
+    # hypothesis, in s, and later
     open_rate: float = 0.05
     open_time: float = 0.3
     force_rate: float = 0.003
-    rate: float = 0.02  # standard deviation of the rate of a force that changes, in N/s
-    rate_time: float = 0.7  # in which that rate decays, in s
-    evidence: float = 15.0  # logarithm of the likelihood ratio from which one is believed
-    samples: int = 3  # in a row in which it must be
-    least_force: float = 3e-3  # that counts, in N
-    gone_share: float = 0.7  # share of it below which a force is none any more
-    quiet: int = 20  # after so many samples in a row
-    # while the tip approaches something: the way in which the model's error there is learned, in m,
-    # and its deviation before, as a share of the way
+    rate: float = 0.02  # standard deviation of the rate of a changing force, in N/s
+    rate_time: float = 0.7  # time constant of that rate, in s
+    evidence: float = 15.0  # log-likelihood ratio above which a hypothesis is adopted
+    samples: int = 3  # successive samples above it
+    least_force: float = 3e-3  # smallest force that counts, in N
+    gone_share: float = 0.7  # share of it below which a force counts as gone
+    quiet: int = 20  # successive samples below that share
+    # during an approach: way in which the model's error there is learned, in m, and the error's
+    # deviation before that, as a share of the way
     learning_way: float = 1.5e-3
     approach_error: float = 0.1
-    # while it presses: the share of a motion by which the force displaces the tip back, and its
-    # deviation
+    # during a press: share of a motion by which the force displaces the tip back, and its deviation
     held_share: float = 0.9
     held_error: float = 0.15
 
@@ -343,19 +340,19 @@ class TouchTuning:
 class PressingTuning:
     """How the tip presses on something (`Pressing`)."""
 
-    # time at the target before the approach begins, in s; and the longest time that it waits until
-    # the arm's stiffness is known better
+    # time at the target before the approach, in s; and its upper bound while a better estimate of
+    # the arm's stiffness is due
     rest: float = 0.5
     longest_rest: float = 8.0
     time: float = 0.7  # time constant of the force against a rigid surface, in s
-    touch_share: float = 0.2  # share of the force from which the approach slows down
-    lost: float = 0.4  # time without a contact after which it is lost, in s
+    touch_share: float = 0.2  # share of the force above which the approach becomes a press
+    lost: float = 0.4  # time without a force after which the contact is lost, in s
     # largest share of the force that may be felt, or that the arm's compliance explains; and by
-    # how much the tip may be held back beyond that, in m
+    # how much more the tip may be held back, in m
     most_force: float = 1.6
     held_back: float = 2e-3
-    settled: float = 0.5  # time within the tolerance after which it is told, in s
-    patience: float = 5.0  # time beyond it after which there is an alarm, in s
+    settled: float = 0.5  # time within the tolerance after which an event reports it, in s
+    patience: float = 5.0  # time beyond the tolerance after which there is an alarm, in s
 
 
 @dataclass(frozen=True)
@@ -364,48 +361,48 @@ class BracingTuning:
 
     at_rest: float = 2e3  # pressure below which the arm is at rest, in Pa
     to_rest: float = 3.0  # time in which it goes to rest, in s
-    settle: float = 1.0  # time at the end of the approach before it is held, in s
-    # distance between the tips of the braced and the free arm that can be told apart, in m; share
-    # of it from which the arm is free; and samples in a row
+    settle: float = 1.0  # time at the end of the approach before the brace counts as held, in s
+    # distance between the tips of the braced and the free arm that the tracker can distinguish, in
+    # m; share of it beyond which the arm is free; and successive samples
     told_apart: float = 4e-3
     free_share: float = 0.6
     samples: int = 3
-    off_plan: float = 1.5e4  # pressure beside the wanted one from which nothing is judged, in Pa
-    swing_time: float = 0.08  # over which the seen tip is averaged, in s
-    # displacement of the tip from which a push is felt, in m; time constant with which what is
-    # smaller becomes the model's error, in s; and time after which a push does, too
+    off_plan: float = 1.5e4  # pressure error above which contacts are not judged, in Pa
+    swing_time: float = 0.08  # time constant of averaging the measured tip, in s
+    # displacement of the tip above which a push is felt, in m; time constant with which a smaller
+    # one becomes the model's error, in s
     felt: float = 6e-4
     error_time: float = 2.0
-    # at first, while the tip goes to its target and the arm creeps most: for how long, and with
-    # which time constant, in s
+    # at first, while the tip goes to its target and the arm creeps most: duration and such a time
+    # constant, in s
     settling: float = 8.0
     settling_time: float = 0.3
-    longest_push: float = 60.0
+    longest_push: float = 60.0  # after which a push becomes the model's error too, in s
     # deviation of that displacement, in m, and of pushes, in N
     deviation: float = 5e-4
     usual_push: float = 0.1
-    every: float = 0.05  # between two looks at what the contacts hold, in s
-    looks: int = 2  # in a row
+    every: float = 0.05  # interval of checks of the contacts, in s
+    looks: int = 2  # successive checks
     time: float = 3.0  # time constant with which the tip goes to its target, in s
-    force_weight: float = 0.1  # error of the tip that a change of a contact force counts as, in m/N
-    pressure_weight: float = 2e-8  # likewise of a pressure, in m/Pa
+    force_weight: float = 0.1  # error of the tip equivalent to a change of contact force, in m/N
+    pressure_weight: float = 2e-8  # the same for a pressure, in m/Pa
     most_change: float = 1e4  # largest change of a planned pressure, in Pa
 
 
 @dataclass(frozen=True)
 class TrackerTuning:
-    """What is known of a tracker's rhythm, and when it is trusted again."""
+    """When a tracker's rhythm is known, and when it is trusted again."""
 
     window: int = 24  # samples from which interval and latency are learned
-    enough: int = 8  # samples without which neither is known
-    # ticks with new samples, none overdue, after which a tip that was missing is seen again
+    enough: int = 8  # minimum number of samples for that
+    # ticks with new samples, none overdue, after which a missing tip is seen again
     back: int = 8
     jitter: float = 0.25  # share of an interval by which a sample may be late
 
 
 @dataclass(frozen=True)
 class ControlTuning:
-    """Tuning of `TipController`, by part; the rig file has noise, speed and damping of the tip."""
+    """Tuning of `TipController`, by part; noise, speed and damping come from the rig file."""
 
     regulators: RegulatorTuning = field(default_factory=RegulatorTuning)
     estimator: EstimatorTuning = field(default_factory=EstimatorTuning)

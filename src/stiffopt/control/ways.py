@@ -1,7 +1,7 @@
-"""Whether an arm's body keeps clear of the rig's scene: on a way before it goes there, and now.
+"""Checks that the arm's body keeps clear of the rig's scene: on a planned way, and in each tick.
 
-A way is a line of straight pieces in the space of pressures. All is by the model: pressures are
-effective ones, and an arm that differs from its model is as much nearer or farther.
+A way is a line of straight pieces in the space of pressures. The model decides, at effective
+pressures; an arm that differs from its model is nearer or farther by that difference.
 """
 
 from __future__ import annotations
@@ -21,37 +21,37 @@ from stiffopt.model.scene import Scene
 
 Array = NDArray[np.float64]
 
-_PIECE = 1e4  # Pa, of the longest piece of a way, over which each point of the body goes straight
-_CURVED = 1.1  # how much longer the way of a point is than the one straight between two states
+_PIECE = 1e4  # Pa, longest initial piece of a way, over which points of the body go straight
+_CURVED = 1.1  # bound of the length of a point's way over the straight distance between two states
 _FORGIVEN = 1e-4  # m, by which a state may be nearer than the clearance
 _UNSEEN = 2e-4  # m, by which the body may be nearer between two states
-_EXACT = 5e-4  # m, to which a shortfall is found
+_EXACT = 5e-4  # m, accuracy of a shortfall
 _STATIONS = 13  # along the body, whose ways are measured
 _SAMPLES = 64  # pressures at which the body's speed is measured
-_FASTER = 1.5  # than there, it may be elsewhere
+_SPEED_FACTOR = 1.5  # safety factor on that speed
 _DOWN = 5  # states on each piece of a way down
-_MOST_COST = 5e-3  # s, of looking for a way down, which a tick has to wait for
+_MAX_COST = 5e-3  # s, of choosing a way down, for which a tick has to wait
 
 
 class Ways:
-    """Checks ways of an arm through a scene."""
+    """Checks an arm's ways through a scene."""
 
     def __init__(self, robot: Manipulator, scene: Scene) -> None:
         self._robot, self._scene = robot, scene
 
     def blocked(self, way: Array, *, waypoints: bool = False) -> str:
-        """Why the body does not keep its clearance on a way (k, n), in Pa; empty if it does.
+        """Return why the body does not keep its clearance on a way (k, n), in Pa; empty if it does.
 
-        An arm that is nearer to the scene already where the way begins must not come nearer still.
-        The way is divided until the body cannot come nearer unseen: it is nowhere nearer by more
-        than 0.2 mm than what is accepted.
+        An arm that is nearer to the scene at the beginning of the way must not come nearer still.
+        The way is divided until the body cannot come nearer between two states by more than 0.2 mm
+        than is accepted.
 
         Parameters
         ----------
         way :
             Its corners.
         waypoints :
-            Whether the corners but the first are waypoints, which the reason names.
+            Whether all corners but the first are waypoints, to be named in the reason.
         """
         robot = self._robot
         states, legs = _divided(np.clip(way, robot.pressure_min, robot.pressure_max))
@@ -84,12 +84,12 @@ class Ways:
         return np.asarray(self._robot.clearance(states, self._scene))
 
     def _lines(self, states: Array) -> Array:
-        """Positions (N, stations, 3) along the body."""
+        """Return positions (N, stations, 3) along the body."""
         return np.asarray(self._robot.backbone(states, n=_STATIONS)[..., :3, 3])
 
 
 class ClearanceWatch:
-    """Watches, tick by tick, that commands keep half of the clearance that the scene asks for."""
+    """Checks in each tick that a command keeps half of the clearance that the scene asks for."""
 
     def __init__(self, robot: Manipulator, scene: Scene) -> None:
         self._robot, self._scene = robot, scene
@@ -108,15 +108,15 @@ class ClearanceWatch:
         samples = np.random.default_rng(0).uniform(low, high, (_SAMPLES, len(low)))
         at = np.linspace(0.0, robot.length, _STATIONS)
         jacobians = robot.body_jacobian(samples, at)[:, :, :3]  # (N, stations, 3, n)
-        self._speed = _FASTER * np.linalg.norm(jacobians, axis=2).max(axis=(0, 1))
+        self._speed = _SPEED_FACTOR * np.linalg.norm(jacobians, axis=2).max(axis=(0, 1))
         self._measure_cost()
 
     def begin(self) -> None:
-        """Start anew: nothing is known of where the body is."""
+        """Restart: forget where the body is."""
         self._at = np.zeros(self._robot.n_pressures)
         self._clearance = -np.inf
         if math.isfinite(self._cost):
-            self._measure_cost()  # what was compiled in the background since then is quicker
+            self._measure_cost()  # code compiled in the background since then is faster
 
     def _measure_cost(self) -> None:
         robot = self._robot
@@ -126,11 +126,11 @@ class ClearanceWatch:
         self._cost = (time.perf_counter() - begin) / _DOWN
 
     def too_near(self, pressures: Array) -> str:
-        """Why the body must not go to effective pressures (n,) in Pa; empty if it may.
+        """Return why the body must not go to effective pressures (n,), in Pa; empty if it may.
 
-        It may go where it has half of the clearance, or no less than it has now: so it gets away
-        from where it should not be. The clearance is not computed where the body cannot have
-        come near enough since it was.
+        It may go where it has half of the clearance, or no less than it has now, so that it can
+        leave a place too near to the scene. The clearance is computed again only if the body can
+        have come too near since the last time.
         """
         robot = self._robot
         moved = float(np.abs(pressures - self._at) @ self._speed)
@@ -147,21 +147,21 @@ class ClearanceWatch:
         return ""
 
     def way_down(self, pressures: Array) -> tuple[Array, str]:
-        """How to let pressures (n,), in Pa, down past the scene.
+        """Choose how to let pressures (n,), in Pa, down past the scene.
 
-        All channels together, or one segment after the other: the first of these ways on which the
-        body does not come nearer to the scene than half of its clearance, or than it is; or else
-        the one on which it keeps farthest from it.
+        The candidates let down all channels together, or one segment after the other. The first one
+        is chosen on which the body keeps half of the clearance, or its present one; otherwise the
+        one on which it keeps farthest away.
 
         Returns
         -------
         shares :
             Of the pressures (k, n), from 1 to 0.
         warning :
-            That the body comes too near all the same, or that it was not looked at; empty if not.
+            That the body comes too near all the same, or that this was not checked; may be empty.
         """
         ways = self._ways_down
-        if self._cost * _DOWN * sum(len(way) - 1 for way in ways) > _MOST_COST:
+        if self._cost * _DOWN * sum(len(way) - 1 for way in ways) > _MAX_COST:
             return ways[0], "whether the body keeps clear on the way down was not looked at"
         best = ways[0], -np.inf, np.zeros_like(pressures)
         robot = self._robot
@@ -181,7 +181,7 @@ class ClearanceWatch:
 
 
 def _ways_down(robot: Manipulator) -> list[Array]:
-    """Shares of the pressures (k, n): of all at once, the distal segment first, or last."""
+    """Return shares of the pressures (k, n): all at once, distal segment first, or last."""
     segments = robot.description.segments
     owner = np.repeat(np.arange(len(segments)), [s.n_channels for s in segments])
     ways = [np.array([np.ones(len(owner)), np.zeros(len(owner))])]
@@ -192,7 +192,7 @@ def _ways_down(robot: Manipulator) -> list[Array]:
 
 
 def shortfall(robot: Manipulator, scene: Scene, pressures: Array) -> str:
-    """What an arm at pressures (n,) is too near to, and by how much."""
+    """Report which object an arm at pressures (n,) is too near to, and by how much."""
     found = robot.clearances(pressures, scene)
     distance, asked = 1e3 * float(found.distances.min()), 1e3 * scene.clearance
     near = f"be {distance:.1f} mm from" if distance >= 0 else f"go {-distance:.1f} mm into"
@@ -203,7 +203,7 @@ def shortfall(robot: Manipulator, scene: Scene, pressures: Array) -> str:
 
 
 def _divided(way: Array) -> tuple[Array, NDArray[np.intp]]:
-    """States (N, n) on a way (k, n), and the number of the piece to which each belongs, from 1."""
+    """Divide a way (k, n) into states (N, n); also return the piece (N,) of each, from 1."""
     states, legs = [way[:1]], [np.ones(1, dtype=np.intp)]
     for number, (start, end) in enumerate(pairwise(way), start=1):
         count = max(1, int(np.ceil(np.abs(end - start).max() / _PIECE)))

@@ -1,4 +1,4 @@
-"""Windows: the tip at rest, averaged, from which the arm's numbers are adapted."""
+"""Windows: averages of the tip at rest, from which the arm's numbers are adapted."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ Array = NDArray[np.float64]
 
 
 class WindowWatch:
-    """Collects windows while the arm rests: one of each posture, the newest of it.
+    """Collects windows while the arm rests: the newest one of each posture.
 
     Attributes
     ----------
-    windows : those that are known; a new tuple when it changes.
+    windows : the present windows; a new tuple when they change.
     """
 
     def __init__(self, tuning: WindowTuning) -> None:
@@ -26,17 +26,17 @@ class WindowWatch:
         self.begin()
 
     def begin(self) -> None:
-        """Begin to wait for rest; windows stay."""
-        self._rested: float | None = None  # since when
-        self._since = 0.0  # since when the next window is waited for
+        """Wait for rest; windows stay."""
+        self._rested: float | None = None  # when the rest began, in s
+        self._since = 0.0  # when the wait for the next window began, in s
         self._first: Array | None = None
 
     def has_rested(self, now: float) -> bool:
-        """Whether the arm has rested for long enough to be looked at."""
+        """Whether the arm has rested for long enough."""
         return self._rested is not None and now - self._rested >= self._tuning.wait
 
     def look(self, now: float, pressures: Array, estimator: TipEstimator) -> None:
-        """Look at an arm at rest, at effective pressures (n,), and at its estimated tip."""
+        """Average an arm at rest: effective pressures (n,) and the estimated tip."""
         t = self._tuning
         if self._rested is None:
             self._rested = self._since = now
@@ -49,7 +49,7 @@ class WindowWatch:
             self._first, self._sum, self._count, self._begun = values, 0 * values, 0, now
         moved = np.abs(values - self._first)
         if moved[:n].max() > t.drift_pressure or moved[n:].max() > t.drift_position:
-            self._first = None  # it creeps still
+            self._first = None  # the arm still creeps
             return
         self._sum += values
         self._count += 1
@@ -61,9 +61,9 @@ class WindowWatch:
         self._first, self._since = None, now + t.again
 
     def _add(self, window: Window) -> None:
-        """Add a window in place of those of its posture, or of the oldest one if there are many.
+        """Add a window, replacing those of its posture, or the oldest one if there are many.
 
-        Where the tip is elsewhere in the same posture, all that was seen before is void.
+        If the tip has moved at the same posture, all earlier windows are void.
         """
         t, others = self._tuning, list(self.windows)
         for other in self.windows:
@@ -71,6 +71,6 @@ class WindowWatch:
                 continue
             others.remove(other)
             if np.linalg.norm(other.position - window.position) > t.changed:
-                others = []  # a load has been put on, or taken off
+                others = []  # the load has changed
                 break
         self.windows = (*others[-(t.most - 1) :], window)
