@@ -14,12 +14,12 @@ from stiffopt.daemon.reports import RefusalError
 from stiffopt.errors import InputError
 
 MAX_BODY = 1_000_000
-"""Bytes of the longest request."""
-_READING = ("GET", "HEAD")
+"""Bytes of the longest request body."""
+_READ_METHODS = ("GET", "HEAD")
 
 
 class Token:
-    """The secret that a client shows to be allowed to move the arm."""
+    """The secret that a client must present to move the arm."""
 
     def __init__(self, text: str) -> None:
         if not text or not all("!" <= c <= "~" for c in text):
@@ -57,10 +57,10 @@ class Access:
     """ASGI middleware that refuses requests without the token and those of foreign web pages.
 
     - The headers Host and Origin must be those of a page of the daemon, see `check_place`.
-    - Any other method than GET and HEAD needs the token.
-    - A body that is too long is refused before it is read whole.
+    - All methods except GET and HEAD need the token.
+    - A body that is too long is refused before it is read completely.
 
-    `hosts` are names of this machine, other than localhost.
+    `hosts` are names of this machine besides localhost.
     """
 
     def __init__(self, app: ASGIApp, *, token: Token, hosts: Iterable[str] = ()) -> None:
@@ -77,7 +77,7 @@ class Access:
         try:
             check_place(headers.getlist("host"), headers.getlist("origin"), self._hosts)
             if scope["type"] == "http":
-                if scope["method"] not in _READING:
+                if scope["method"] not in _READ_METHODS:
                     self._token.check_headers(headers)
                 receive = await _collected(receive, headers)
             elif "authorization" in headers:
@@ -93,7 +93,7 @@ class Access:
 
 
 async def _collected(receive: Receive, headers: Headers) -> Receive:
-    """Read the body, unless it is too long, and return a `Receive` that gives it once more."""
+    """Read the body, unless it is too long; return a `Receive` that delivers it again."""
     too_long = RefusalError(413, "too-long", f"the body is longer than {MAX_BODY} bytes")
     given = headers.get("content-length", "0")
     if given.isdecimal() and (len(given) > 12 or int(given) > MAX_BODY):
@@ -103,7 +103,7 @@ async def _collected(receive: Receive, headers: Headers) -> Receive:
     more = True
     while more:
         message = await receive()
-        if message["type"] != "http.request":  # the client is gone
+        if message["type"] != "http.request":  # the client has disconnected
             return _again(message, receive)
         parts.append(message.get("body", b""))
         size += len(parts[-1])

@@ -1,4 +1,4 @@
-"""Calls that may hang, in threads that do not keep the process from ending."""
+"""Calls that may hang, in threads that cannot keep the process from ending."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 
 def call_in_thread(name: str, function: Callable[[], Any]) -> Future[Any]:
-    """Call a function in a daemon thread of its own; its result or exception is in the future."""
+    """Call a function in a new daemon thread; the future has its result or exception."""
     call: Future[Any] = Future()
     call.set_running_or_notify_cancel()  # it cannot be cancelled
 
@@ -24,5 +24,5 @@ def call_in_thread(name: str, function: Callable[[], Any]) -> Future[Any]:
 
 
 def ends_within(seconds: float, call: Future[Any]) -> bool:
-    """Wait for a call for some time at most; return whether it has ended."""
+    """Wait for a call for at most so many seconds; return whether it has ended."""
     return bool(wait([call], max(seconds, 0.0)).done)

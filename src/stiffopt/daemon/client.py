@@ -38,9 +38,9 @@ if TYPE_CHECKING:
     from websockets.sync.client import ClientConnection
 
 _TOKEN = "STIFFOPT_TOKEN"
-_POLL = 0.05  # s between two looks at the state
-_STEADY = 0.3  # s for which an arm that has settled stays near
-_LOST = "lease"  # the code of a refusal that says that the client does not have control
+_POLL = 0.05  # s between polls of the state
+_STEADY = 0.3  # s for which the tip must stay near its target to have settled
+_LOST = "lease"  # code of a refusal because the client does not have control
 _STATUS = {"input": 422, "too-long": 413, "no-answer": 503, "busy": 503, "internal": 500}
 
 
@@ -59,31 +59,31 @@ class Client:
     Control is lost, and the arm held, when the daemon does not hear from the client for a time.
     With the heartbeat ``"automatic"``, a thread of the client renews control as long as the thread
     that took it lives. That proves that the process runs, not that the program in it makes any
-    progress: a planner that hangs keeps control. With ``"manual"``, control is renewed only by what
-    the program does: commands, `renew`, targets of a stream, `wait_until_settled`. Use that where
-    no person watches the arm.
+    progress: a planner that hangs keeps control. With ``"manual"``, only what the program does
+    renews control: commands, `renew`, targets of a stream, `wait_until_settled`. Use that where no
+    person watches the arm.
 
-    A `with` block that ends by an exception holds the arm where it is; one that ends well gives
-    control back and lets the arm go on with what it does. Methods may be called from any thread.
+    A `with` block that ends by an exception holds the arm where it is. One that ends normally gives
+    control back; the arm continues what it does. Methods may be called from any thread.
 
     Parameters
     ----------
     url :
-        Of the daemon.
+        URL of the daemon.
     token :
-        The token, or the path of the file that it is in; None: that of the environment variable
-        STIFFOPT_TOKEN, which may be either too. Reading needs none.
+        The token, or the path of its file; None: from the environment variable STIFFOPT_TOKEN,
+        which may be either. Reading needs no token.
     name :
-        That others see who find that control is taken.
+        Name shown to others who find that control is taken.
     heartbeat :
         How control is renewed, see above.
     timeout :
-        Seconds after which an answer is given up.
+        Time to wait for an answer, in s.
 
     Raises
     ------
     InputError
-        The URL is none, or the file of the token cannot be read.
+        The URL is invalid, or the token's file cannot be read.
     MissingExtraError
         httpx is not installed.
     """
@@ -142,12 +142,12 @@ class Client:
         return record_of(Snapshot, self._ask("GET", "state"))
 
     def events(self, since: int = 0) -> tuple[list[Event], int]:
-        """Return what has happened since an index, and the index after that."""
+        """Return the events since an index, and the next index."""
         answer = self._ask("GET", "events", query={"since": since})
         return [record_of(Event, event) for event in answer["events"]], int(answer["next"])
 
     def robot(self) -> RobotReport:
-        """Return what arm there is."""
+        """Return the arm's name, channels, limits and length."""
         return RobotReport.model_validate(self._ask("GET", "robot"))
 
     def wait_until_settled(
@@ -158,9 +158,9 @@ class Client:
         Parameters
         ----------
         position_tolerance, angle_tolerance :
-            How near, in m and rad, it must be for 0.3 s without a break.
+            Largest errors, in m and rad, which must hold for 0.3 s without a break.
         timeout :
-            In s.
+            Time to wait, in s.
 
         Returns
         -------
@@ -170,9 +170,9 @@ class Client:
         Raises
         ------
         CommandError
-            The arm is not being moved (any more), or nothing is asked of the tip.
+            The arm is not being moved (any more), or the tip has no target.
         ServiceError
-            It did not settle in time.
+            The tip did not settle in time.
         """
         end = time.monotonic() + timeout
         near_since = math.inf
@@ -203,7 +203,7 @@ class Client:
 
     @property
     def in_control(self) -> bool:
-        """Whether this client has taken control and does not know that it has lost it."""
+        """Whether this client has taken control and does not know of its loss."""
         return self._lease is not None
 
     def take_control(self) -> None:
@@ -229,7 +229,7 @@ class Client:
             self._beat.start()
 
     def release(self) -> None:
-        """Give control back; the arm goes on with what it does."""
+        """Give control back; the arm continues what it does."""
         self._enough.set()
         if self.in_control:
             try:
@@ -238,7 +238,7 @@ class Client:
                 self._lease = None
 
     def renew(self) -> None:
-        """Be heard: keep control for another while."""
+        """Send a heartbeat: keep control for another interval."""
         self._ask("POST", "lease/renew")
 
     def _keep_control(
@@ -248,9 +248,9 @@ class Client:
             try:
                 self._ask("POST", "lease/renew", timeout=4 * period)
             except ServiceError:
-                continue  # perhaps it answers the next time
+                continue  # it may answer the next time
             except StiffoptError:
-                return  # control is lost; the next command says so
+                return  # control is lost; the next command reports it
 
     # Commands -----------------------------------------------------------------------------------
 
@@ -280,7 +280,7 @@ class Client:
         position, pointing, orientation :
             Instead of a task: its target, see `set_target`.
         rest :
-            Instead of a task: `tolerance`, `stiffness`, `load` and `pressure` of it.
+            Instead of a task: its `tolerance`, `stiffness`, `load` and `pressure`.
         """
         robot = None
         if task is not None:
@@ -308,9 +308,9 @@ class Client:
         Parameters
         ----------
         target :
-            A `Target`; or instead
+            A `Target`; or instead of it:
         position :
-            x, y, z in m, in the base frame; None for an axis that is free.
+            x, y, z in m, in the base frame; None for a free axis.
         pointing, orientation :
             Direction of the tip, or its quaternion (w, x, y, z).
         """
@@ -329,7 +329,7 @@ class Client:
         Parameters
         ----------
         trajectory :
-            A `Trajectory`; or instead
+            A `Trajectory`; or instead of it:
         times, positions :
             (k,) in s and (k, 3) in m.
         """
@@ -341,7 +341,7 @@ class Client:
     def set_channels(self, without: Sequence[int]) -> None:
         """Take channels, counted from 1, out of use, and give all others back.
 
-        Those that are out are let down, and plans do without them; an empty list gives all back.
+        Their pressure is let down, and plans do without them; an empty list gives all back.
         """
         self._ask("POST", "channels", body={"without": list(without)})
 
@@ -363,7 +363,7 @@ class Client:
         Parameters
         ----------
         rate :
-            Of the states, in Hz; 0 for none.
+            Rate of the states, in Hz; 0 for none.
         """
         return ClientStream(self, rate)
 
@@ -382,7 +382,7 @@ class Client:
         query: dict[str, Any] | None = None,
         timeout: float | None = None,
     ) -> Any:
-        """Return the daemon's answer; a refusal is raised as an exception."""
+        """Return the daemon's answer; raise a refusal as an exception."""
         lease = self._lease
         try:
             answer = self._http.request(
@@ -393,7 +393,7 @@ class Client:
                 headers=self._headers,
                 timeout=self._httpx.USE_CLIENT_DEFAULT if timeout is None else timeout,
             )
-        except (self._httpx.HTTPError, RuntimeError) as error:  # RuntimeError: it was closed
+        except (self._httpx.HTTPError, RuntimeError) as error:  # RuntimeError: closed client
             raise ServiceError(
                 f"the daemon at {self.url} cannot be reached: {error or type(error).__name__}"
             ) from None
@@ -408,9 +408,9 @@ class Client:
 class ClientStream:
     """A WebSocket that carries targets to the daemon and states back; see `Client.stream`.
 
-    Targets are sent without waiting for the answers. One that is refused raises `CommandError`,
-    or `InputError`, at the next `send` or `state`, but for a target that a newer one has
-    overtaken: that is what happens if they come faster than the arm takes them, and does no harm.
+    `send` does not wait for the answer. A refused target raises `CommandError` or `InputError` at
+    the next `send` or `state`. The exception are targets that a newer one has superseded: that
+    happens if they come faster than the arm takes them, and does no harm.
     """
 
     def __init__(self, client: Client, rate: float) -> None:
@@ -427,7 +427,7 @@ class ClientStream:
         self.accepted = 0
         """Targets that the daemon has accepted so far."""
         self.superseded = 0
-        """Targets that a newer one has overtaken so far."""
+        """Targets that a newer one has superseded so far."""
 
     def __enter__(self) -> Self:
         """Connect; raise `ServiceError` if the daemon does not answer."""
@@ -479,7 +479,7 @@ class ClientStream:
         self._send({"target": message, "seq": next(self._numbers)})
 
     def state(self, timeout: float = 5.0) -> Snapshot:
-        """Return the newest state that has not been returned yet, waiting for it if need be.
+        """Return the newest state that was not returned before; wait for it if necessary.
 
         Raises
         ------
@@ -489,10 +489,10 @@ class ClientStream:
             None came in time, or the stream has ended.
         """
         with self._news:
-            there = self._news.wait_for(
+            is_there = self._news.wait_for(
                 lambda: self._state is not None or self._ended or self._refused, timeout
             )
-            if there and self._state is not None:
+            if is_there and self._state is not None:
                 state, self._state = self._state, None
                 if self._refused is None:
                     return state
@@ -528,7 +528,7 @@ class ClientStream:
                     self._news.notify_all()
         except ConnectionClosed as error:
             reason = str(error)
-        except Exception as error:  # of any kind: the waiting thread must learn of it
+        except Exception as error:  # whatever it is, the waiting thread must learn of it
             reason = f"{reason} ({type(error).__name__})"
         with self._news:
             self._ended = ServiceError(f"the stream has ended: {reason}")
@@ -548,13 +548,13 @@ class ClientStream:
 
 
 def daemon_url(service: ServiceSettings) -> str:
-    """Return where a client on the daemon's machine reaches it, by the rig file's `service`."""
+    """Return the URL of a daemon for clients on its machine, from the rig file's `service`."""
     host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(service.host, service.host)
     return f"http://{bracketed(host)}:{service.port}"
 
 
 def _token(given: str | os.PathLike[str] | None) -> str | None:
-    """Return the token that is given, or that is in the file of that path."""
+    """Return a token that is given itself or by the path of its file."""
     if given is None or given == "":
         return None
     try:
@@ -586,7 +586,7 @@ def _trajectory(times: Any, positions: Any) -> Trajectory:
 
 
 def _refusal_in(answer: Any) -> tuple[str, str]:
-    """Return the code and the message of a refusal, also of one that is not the daemon's."""
+    """Return code and message of a refusal, even if it does not come from a daemon."""
     try:
         error = answer.json()["error"]
         return str(error["code"]), str(error["message"])

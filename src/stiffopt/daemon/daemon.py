@@ -46,20 +46,20 @@ _FASTEST = 500.0  # Hz
 
 @dataclass(frozen=True)
 class DaemonTimes:
-    """How long the parts of a daemon may take, in s.
+    """Time limits of the parts of a daemon, in s.
 
     Attributes
     ----------
-    arming : in which an arm that was just connected must become ready to be armed.
-    arming_again : between attempts to arm, in which the tracker sees the tip some times.
-    telemetry : in which telemetry must have started.
-    tidy : between collections of garbage.
-    stop : beyond `Safety.ramp_time`, in which a daemon has ended, whatever hangs. The times below
-        add up to less, so that the command has some time left to report the outcome.
-    control : beyond the ramp, in which the control thread must have ended.
-    to_first_point : that the way to a motion's first point takes at least.
-    keeper, vent, supply, rest : in which the keeper, a direct command to vent, the supply and all
-        other parts must have ended.
+    arming : for an arm that was just connected to become ready to be armed.
+    arming_again : between attempts to arm; the tracker sees the tip some times meanwhile.
+    telemetry : for telemetry to start.
+    tidy : between garbage collections.
+    stop : beyond `Safety.ramp_time`, for a daemon to end, whatever hangs. The limits below add up
+        to less, so that the command can still report the outcome.
+    control : beyond the ramp, for the control thread to end.
+    to_first_point : minimum for the way to a motion's first point.
+    keeper, vent, supply, rest : for the end of the keeper, of a direct command to vent, of the
+        supply, and of all other parts.
     """
 
     arming: float = 10.0
@@ -81,26 +81,26 @@ TIMES = DaemonTimes()
 class Daemon:
     """The daemon of a rig: guard, control loop, telemetry and the HTTP interface.
 
-    `start` connects and starts everything; the arm is vented and inactive then, until `arm` is
-    called here or by a client. `stop`, or the end of a `with` block, lets the pressures down,
-    vents, and ends everything.
+    `start` connects and starts everything; the arm stays vented and inactive until `arm` is called
+    here or by a client. `stop`, or the end of a `with` block, lets the pressures down, vents, and
+    ends everything.
 
     Parameters
     ----------
     rig :
         The rig file.
     service :
-        Whether ports are opened: the control interface, and Foxglove.
+        Whether to open ports: the control interface, and Foxglove.
     log_folder :
-        Where recordings go; None: where the rig file says.
+        Folder of the recordings; None: the rig file's.
     json_lines :
         Whether the guard writes JSON on stderr.
 
     Attributes
     ----------
-    trouble : why it is not certain that the arm is vented, after `stop`; empty if it is.
+    trouble : after `stop`, why the arm may not be vented; empty if it is vented for certain.
     hung : parts that had not ended when `stop` did. Their threads do not keep the process from
-        ending, but a library that they are in may: see `os._exit`.
+        ending, but a library in them may: see `os._exit`.
 
     Raises
     ------
@@ -170,7 +170,7 @@ class Daemon:
 
     @property
     def url(self) -> str | None:
-        """URL of the control interface; None where there is none."""
+        """URL of the control interface; None if there is none."""
         return None if self._server is None else self._server.url
 
     @property
@@ -180,27 +180,27 @@ class Daemon:
 
     @property
     def token_file(self) -> Path | None:
-        """The file of the token; None where it is in the environment, or no port is open."""
+        """The file of the token; None if it is in the environment, or no port is open."""
         return None if self._server is None else self._secret.path
 
     @property
     def foxglove_port(self) -> int | None:
-        """Where Foxglove can connect; None where it cannot."""
+        """Port for Foxglove; None if there is none."""
         return None if self._telemetry is None else self._telemetry.port
 
     @property
     def recording(self) -> str | None:
-        """The file that is recorded to; None while there is none."""
+        """The present or last file of the recording; None if there is none."""
         return None if self._telemetry is None else self._telemetry.recording.path
 
     @property
     def ended(self) -> bool:
-        """Whether control has ended: asked to, or by `failure`."""
+        """Whether control has ended, by request or by `failure`."""
         return self._control is None or not self._control.is_alive()
 
     @property
     def failure(self) -> BaseException | None:
-        """What ended the control thread, if it was not asked to end."""
+        """The error that ended the control thread, or None."""
         if self._hangs:
             return TimeoutError("the control thread hangs")
         return None if self._control is None else self._control.failure
@@ -208,7 +208,9 @@ class Daemon:
     # Start and end -------------------------------------------------------------------------------
 
     def start(self) -> None:
-        """Listen, start the guard, connect, check the rig, and begin to tick; it stays vented.
+        """Open the port, start the guard, connect, check the rig, and begin to tick.
+
+        The arm stays vented.
 
         Raises
         ------
@@ -255,10 +257,10 @@ class Daemon:
         return read_motion(path, self.robot.description)
 
     def arm(self, task: Task | None = None, motion: MotionTable | None = None) -> None:
-        """Arm as soon as the vented arm has been seen for long enough.
+        """Arm as soon as the tracker has seen the vented arm for long enough.
 
-        Then pursue a task, or play a motion. If it cannot be armed, or what it is to do does not
-        suit, it is inactive and `InputError` is raised.
+        Then pursue a task, or play a motion. If arming, task or motion are refused, the arm becomes
+        inactive and `InputError` is raised.
         """
         end = time.monotonic() + TIMES.arming
         while True:
@@ -281,31 +283,31 @@ class Daemon:
             raise
 
     def _play(self, motion: MotionTable) -> None:
-        """Go to the first point of a motion, slower than the slew allows, and follow it."""
+        """Go to the first point of a motion, at half of the slew at most, and follow it."""
         way = np.abs(motion.pressures[0] - self.loop.snapshot().commanded)
         begin = max(TIMES.to_first_point, 2 * float((way / self.loop.rig.slew).max()))
         ranges = self.robot.pressure_max - self.robot.pressure_min
         self.loop.follow_trajectory(motion.trajectory(ranges, begin))
 
     def begin_stop(self) -> None:
-        """Let the pressures down, vent and end control; this does not wait for it."""
+        """Begin to let the pressures down, vent and end control; do not wait for the end."""
         if not self._stopping.is_set():
             self._stop_begun = time.monotonic()
             self._stopping.set()
             self._manager.stopping()
 
     def vent(self, reason: str = "asked to", patience: float = 0.5) -> None:
-        """Let all pressure out at once, also when the control thread does not answer."""
+        """Vent at once, even if the control thread does not answer within `patience`, in s."""
         if not ends_within(patience, call_in_thread("vent", lambda: self.loop.vent(reason))):
             ends_within(TIMES.vent, call_in_thread("vent-link", self.link.vent))
 
     def stop(self) -> State:
         """End everything and return the last state.
 
-        The pressures are let down and vented first, and the guard, which owns the supply, is ended;
-        neither waits for anything else. Then all the rest ends. From `begin_stop` on, or from here
-        if that was not called, this takes `Safety.ramp_time` and less than `TIMES.stop`, whatever
-        hangs. To stop twice does nothing.
+        First the pressures are let down and vented, and the guard, which owns the supply, ends;
+        neither waits for anything else. Then everything else ends. Counted from `begin_stop`, or
+        from here if that was not called, this takes less than `Safety.ramp_time` and `TIMES.stop`,
+        whatever hangs. A second call does nothing.
         """
         if self._stopped:
             return self.loop.snapshot().state
@@ -328,12 +330,12 @@ class Daemon:
         return state
 
     def _left(self, beyond: float, least: float = 0.0) -> float:
-        """Return what is left of the ramp and a time beyond it, from the beginning of the end."""
+        """Return the time left until `beyond` after the ramp, at least `least`, in s."""
         end = self._stop_begun + self.description.safety.ramp_time + beyond
         return max(end - time.monotonic(), least)
 
     def _end_control(self) -> None:
-        """Wait for the control thread, which lets the pressures down; vent if it hangs."""
+        """Wait for the control thread to let the pressures down; vent if it hangs."""
         if self._control is None:
             return
         self._control.join(self._left(TIMES.control))
@@ -343,7 +345,7 @@ class Daemon:
             self.vent("the control thread hangs", patience=0.0)
 
     def _end_the_rest(self) -> None:
-        """End what does not command pressures, all at once, and note what does not end."""
+        """End the parts that do not command pressures, all at once; note those that hang."""
         works: dict[str, Callable[[], object]] = {"planner": self._controller.close}
         if self.loop.rig.tracker is not None:
             works["tracker"] = self.loop.rig.tracker.close
@@ -375,7 +377,7 @@ class Daemon:
     # Parts ---------------------------------------------------------------------------------------
 
     def _make_telemetry(self, service: bool) -> Telemetry | None:
-        """Return the telemetry; without it, a daemon that opens no ports runs all the same."""
+        """Return the telemetry; a daemon that opens no ports can run without."""
         settings = self.description.service
         if not service:
             settings = settings.model_copy(update={"foxglove_port": None})
@@ -416,7 +418,7 @@ class Daemon:
         return Server(app, settings.host, settings.port)
 
     def _start_telemetry(self) -> None:
-        """Begin to record; where that hangs, as on a disk, control goes on without."""
+        """Start to record; if that hangs, as on a disk, control goes on without it."""
         if self._telemetry is None:
             return
         self._recorded = True
@@ -437,11 +439,11 @@ class Daemon:
             )
 
     def _warn(self, kind: str, text: str) -> None:
-        """Append an event that is a warning."""
+        """Add an event with the severity of a warning."""
         self.loop.events.add(self._clock.now(), kind, text, Severity.WARNING)
 
     def _listen(self) -> None:
-        """Open the port, then write the token: the daemon that has the port keeps its own."""
+        """Open the port before writing the token: a daemon that has the port keeps its token."""
         if self._server is None:
             return
         given = self._secret.path is None
@@ -456,10 +458,10 @@ class Daemon:
 
 
 class ControlThread(threading.Thread):
-    """Ticks the control loop in real time until `stopping` is set, then lets the pressures down.
+    """Runs the control loop in real time until `stopping` is set, then lets the pressures down.
 
-    In each tick, the service manager hears that the loop lives, and telemetry gets the state. The
-    loop has vented if a `failure` ended the thread.
+    In each tick the service manager gets a sign of life, and telemetry the state. If a `failure`
+    ended the thread, the loop has vented.
     """
 
     def __init__(
@@ -481,15 +483,15 @@ class ControlThread(threading.Thread):
         """Tick; see `ControlLoop.run`."""
         try:
             with real_time() as granted:
-                self._tell("control", granted.notice, well=not granted.denied)
+                self._report("control", granted.notice, well=not granted.denied)
                 notice = self._link.real_time
-                self._tell("guard", notice, well=not notice.startswith("not"))
+                self._report("guard", notice, well=not notice.startswith("not"))
                 self._loop.run(self._stopping)
         except BaseException as error:  # `run` has vented; `Daemon.failure` has it
             self.failure = error
 
     def ticked(self, now: Snapshot) -> None:
-        """Pass on the state at the end of a tick; in this thread."""
+        """Pass the state at the end of a tick on; called in this thread."""
         self._manager.watchdog()
         if self._telemetry is not None:
             self._telemetry.put(now)
@@ -497,7 +499,7 @@ class ControlThread(threading.Thread):
             self._tidied = now.time
             tidy(thoroughly=now.state not in ARMED)
 
-    def _tell(self, who: str, notice: str, *, well: bool) -> None:
+    def _report(self, who: str, notice: str, *, well: bool) -> None:
         severity = Severity.INFO if well else Severity.WARNING
         self._loop.events.add(self._loop.rig.clock.now(), "real-time", f"{who}: {notice}", severity)
 

@@ -1,4 +1,4 @@
-"""What watches a running daemon: systemd's watchdog, events of log records, and a keeper thread."""
+"""Supervision of a running daemon: systemd's watchdog, events from log records, a keeper thread."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from stiffopt.safety.guard_client import GuardLink
 class ServiceManager:
     """Notifies systemd, if it started this process: ready, alive, state, stopping.
 
-    The environment tells: ``NOTIFY_SOCKET``, and ``WATCHDOG_USEC`` if it wants signs of life.
-    Nothing here waits: what the manager does not take at once is lost. Raises `MissingExtraError`
-    if there is a manager and sdnotify is not installed.
+    The environment variable ``NOTIFY_SOCKET`` shows that it did, ``WATCHDOG_USEC`` that it wants
+    signs of life. Nothing here waits: messages that the manager does not accept at once are lost.
+    Raises `MissingExtraError` if there is a manager and sdnotify is not installed.
 
     Attributes
     ----------
-    watchdog_interval : seconds after which the manager ends a process that has not called
-        `watchdog`; None: it does not.
+    watchdog_interval : time in s without `watchdog` after which the manager ends the process;
+        None: it does not.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
@@ -39,18 +39,18 @@ class ServiceManager:
         self._fed = float("-inf")
 
     def ready(self) -> None:
-        """Say that the start is over."""
+        """Report that the daemon has started."""
         self._say("READY=1")
 
     def status(self, text: str) -> None:
-        """Say what the daemon does, for people."""
+        """Report what the daemon does, for people."""
         self._say("STATUS=" + " ".join(text.split()))
 
     def watchdog(self) -> None:
-        """Say that the control loop lives; to be called by it alone, in every tick.
+        """Report that the control loop lives; only the loop itself may call this, in every tick.
 
-        (A timer or another thread would go on when the loop hangs.) One call in half an interval is
-        passed on.
+        (A timer or another thread would go on when the loop hangs.) At most two calls per interval
+        are passed on.
         """
         if self.watchdog_interval is None:
             return
@@ -60,11 +60,11 @@ class ServiceManager:
             self._say("WATCHDOG=1")
 
     def stopping(self) -> None:
-        """Say that the end has begun."""
+        """Report that the daemon has begun to stop."""
         self._say("STOPPING=1")
 
     def close(self) -> None:
-        """Say no more."""
+        """Send no more notifications."""
         notifier, self._notifier = self._notifier, None
         self.watchdog_interval = None
         if notifier is not None and notifier.socket is not None:
@@ -72,7 +72,7 @@ class ServiceManager:
 
     def _say(self, text: str) -> None:
         if self._notifier is not None:
-            # sdnotify sends Latin-1 and systemd reads UTF-8: the bytes must be those of the latter
+            # sdnotify encodes as Latin-1, systemd expects UTF-8: make the bytes those of UTF-8
             self._notifier.notify(text.encode().decode("latin-1"))
 
 
@@ -85,7 +85,7 @@ def _notifier() -> Any:
 
 
 def _interval() -> float | None:
-    """Return the watchdog's interval in s, if it is meant for this process."""
+    """Return the watchdog's interval in s if it applies to this process."""
     try:
         interval = float(os.environ["WATCHDOG_USEC"]) * 1e-6
         meant_for = int(os.environ.get("WATCHDOG_PID", os.getpid()))
@@ -96,16 +96,16 @@ def _interval() -> float | None:
 
 _OURS = "stiffopt"
 _LOGGERS = (_OURS, "uvicorn", "websockets", "foxglove", "asyncio")
-_QUIET = 1.0  # s between two records of the same place in the code
+_QUIET = 1.0  # s between two records from the same line of code
 _LONGEST = 300  # characters of a text, part of which a client may have written
 
 
 class LogEvents(logging.Handler):
     """A logging handler that turns warnings and errors into events of the control loop.
 
-    Clients without the token can provoke records. So that these do not push all else out of the
-    events, one record per second is taken from each place in the code; those of libraries are never
-    more than warnings.
+    Clients without the token can provoke records. So that these cannot push out all other events,
+    only one record per second is taken from each line of code; records of libraries are at most
+    warnings.
     """
 
     def __init__(self, loop: ControlLoop, clock: Callable[[], float] = time.monotonic) -> None:
@@ -114,7 +114,7 @@ class LogEvents(logging.Handler):
         self._taken: dict[tuple[str, str, int], float] = {}
 
     def attach(self) -> None:
-        """Take the records of stiffopt and of the libraries that serve it."""
+        """Take records of stiffopt and of the libraries that serve its interface."""
         for name in _LOGGERS:
             logging.getLogger(name).addHandler(self)
 
@@ -126,9 +126,9 @@ class LogEvents(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
         """Append an event; a malformed record must not fail the code that logs it."""
         with suppress(Exception):
-            self._tell(record)
+            self._add(record)
 
-    def _tell(self, record: logging.LogRecord) -> None:
+    def _add(self, record: logging.LogRecord) -> None:
         place, now = (record.name, record.pathname, record.lineno), self._clock()
         if now - self._taken.get(place, -_QUIET) < _QUIET:
             return
@@ -144,7 +144,7 @@ class LogEvents(logging.Handler):
 
 
 def _text(record: logging.LogRecord) -> str:
-    """Return the text of a record, even if its arguments do not fit its format."""
+    """Return a record's text, even if its arguments do not fit its format."""
     try:
         lines = record.getMessage().splitlines() or [""]
         return lines[0][:_LONGEST] + _where(record)
@@ -154,7 +154,7 @@ def _text(record: logging.LogRecord) -> str:
 
 
 def _where(record: logging.LogRecord) -> str:
-    """Return the exception of a record, and the line that raised it."""
+    """Describe a record's exception and the line that raised it."""
     error = record.exc_info[1] if record.exc_info else None
     if error is None:
         return ""
@@ -163,21 +163,21 @@ def _where(record: logging.LogRecord) -> str:
     return f" ({type(error).__name__}: {str(error)[:_LONGEST]}{where})"
 
 
-_LOOK = 0.1  # s
-_AGAIN = 2.0  # s from a failed attempt to start a guard to the next
+_CHECK_EVERY = 0.1  # s
+_AGAIN = 2.0  # s between a failed attempt to start a guard and the next
 _GUARD, _SERVICE = "guard", "service"
 
 
 class Keeper:
     """A thread that watches the guard and the HTTP interface of a running daemon.
 
-    - A guard process that has ended, which is a fault for the loop, is replaced. Its link has
-      vented the supply by then, as far as that answers, and has ended a guard that hung.
-    - When the control interface ends, the heartbeat of the client in control is no longer checked:
+    - If the guard process has ended, which is a fault for the loop, it is replaced. By then its
+      link has vented the supply, if that answers, and has ended a guard that hung.
+    - If the control interface ends, nothing checks the heartbeat of the client in control any more:
       the arm is held.
     - The service manager gets the state, for people.
 
-    `serving` says whether the control interface serves; None where there is none.
+    `serving` returns whether the control interface serves; None if there is none.
     """
 
     def __init__(
@@ -202,14 +202,14 @@ class Keeper:
         self._thread.start()
 
     def stop(self, timeout: float = 2.0) -> None:
-        """End; a guard that is just being started is not waited for."""
+        """Stop checking; do not wait for a guard that is being started."""
         self._enough.set()
         if self._thread is not None:
             self._thread.join(timeout)
 
     def look(self) -> None:
         """Check everything once."""
-        self._tell()
+        self._report_state()
         if not self._link.alive:
             self._replace_guard()
         if self._serving is not None and not self._serving() and not self._held:
@@ -219,14 +219,14 @@ class Keeper:
                 self._loop.hold("the control interface has ended", lasting=False)
 
     def _run(self) -> None:
-        while not self._enough.wait(_LOOK):
+        while not self._enough.wait(_CHECK_EVERY):
             try:
                 self.look()
-            except Exception as error:  # the other checks go on
+            except Exception as error:  # the other checks must go on
                 text = f"unexpected {type(error).__name__}: {error}"
                 self._loop.add_alarm("keeper", text)
 
-    def _tell(self) -> None:
+    def _report_state(self) -> None:
         now = self._loop.snapshot()
         text = f"{now.state}: {now.reason}" if now.reason else str(now.state)
         if text != self._status:
@@ -242,7 +242,7 @@ class Keeper:
             "the guard process has ended; the supply is vented directly, and cannot be armed until "
             "another guard has been started",
         )
-        with suppress(StiffoptError):  # what it has to say of the old one is known
+        with suppress(StiffoptError):  # errors of the old guard no longer matter
             self._link.close()
         try:
             self._link.open()

@@ -18,16 +18,16 @@ class _Grant:
     client: str
     identity: str
     heard: float
-    busy: int = 0  # commands that are being carried out
+    busy: int = 0  # commands in progress
     lost: bool = False
 
 
 class ControlLease:
     """Control over the arm, granted to one client at a time.
 
-    A client that is not heard for `heartbeat` seconds loses it, and the arm is to be held. `check`
-    tells of the loss, and no client gets control until `settle` is called after that. What a
-    client without control asks for is refused by `RefusalError`. Any thread may call any method.
+    A client that is not heard for `heartbeat` seconds loses control, and the arm is to be held.
+    `check` reports the loss; no client gets control until `settle` is called after it. Requests of
+    clients without control raise `RefusalError`. Any thread may call any method.
     """
 
     def __init__(self, heartbeat: float, clock: Clock) -> None:
@@ -38,16 +38,17 @@ class ControlLease:
 
     @property
     def holder(self) -> LeaseReport | None:
-        """Who has control, or None."""
+        """The client in control, or None."""
         with self._lock:
             if self._grant is None:
                 return None
             return LeaseReport(client=self._grant.client, expires_in_s=self._left(self._grant))
 
     def take(self, client: str) -> str:
-        """Give control to a client and return what it must show with each command.
+        """Grant control to a client; return the lease to send with each command.
 
-        It is refused if another has it, or has just lost it and the arm is not held yet.
+        `RefusalError` if another client has control, or has just lost it and the arm is not yet
+        held.
         """
         with self._lock:
             grant = self._grant
@@ -64,19 +65,19 @@ class ControlLease:
             return self._grant.identity
 
     def renew(self, identity: str | None) -> None:
-        """Note that the client was heard."""
+        """Note a heartbeat of the client."""
         with self._lock:
             self._own(identity).heard = self._clock.now()
 
     def release(self, identity: str | None) -> None:
-        """Take control back from a client that does not want it any more."""
+        """End the control of a client at its own request."""
         with self._lock:
             self._own(identity)
             self._grant = None
 
     @contextmanager
     def used(self, identity: str | None) -> Iterator[None]:
-        """Carry out a command of the client in the body: it counts as heard until that ends."""
+        """Carry out a client's command in the body; the client counts as heard until its end."""
         with self._lock:
             grant = self._own(identity)
             grant.heard = self._clock.now()
@@ -89,13 +90,13 @@ class ControlLease:
                 grant.busy -= 1
 
     def check(self, now: float) -> str | None:
-        """Return who has lost control at a time, in s, until `settle` is called; or None."""
+        """Return the client that has lost control at a time, in s, until `settle`; or None."""
         with self._lock:
             grant = self._grant
             return grant.client if grant is not None and self._is_lost(grant, now) else None
 
     def settle(self) -> None:
-        """Note that the arm was held after a loss: others may take control."""
+        """Note that the arm was held after a loss, so that others may take control."""
         with self._lock:
             if self._grant is not None and self._grant.lost:
                 self._grant = None
@@ -115,14 +116,14 @@ class ControlLease:
         return grant
 
     def _is_lost(self, grant: _Grant, now: float | None = None) -> bool:
-        """Say whether control is lost; once it is, it stays so."""
+        """Return whether control is lost, which is permanent."""
         now = self._clock.now() if now is None else now
         if not grant.busy and now - grant.heard > self.heartbeat:
             grant.lost = True
         return grant.lost
 
     def _left(self, grant: _Grant) -> float:
-        """Return the time in s after which control is lost if nothing is heard; not negative."""
+        """Return the time, in s, after which control is lost in silence; not negative."""
         left = grant.heard + self.heartbeat - self._clock.now()
         return min(max(left, 0.0), self.heartbeat)
 

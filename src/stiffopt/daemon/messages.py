@@ -1,8 +1,8 @@
 """JSON messages of clients (tasks, targets, trajectories), derived from the schemas of the files.
 
 A message is the JSON form of a `Schema`: the same keys, plain numbers in SI units, and names that
-end in the unit. It is made from the fields of the schema, so that a key which is added to a schema
-is in its message too. Unknown keys, text for numbers, NaN and infinities are refused.
+end in the unit. It is generated from the fields of the schema, so that a key added to a schema is
+also in its message. Unknown keys, text instead of numbers, NaN and infinities are refused.
 """
 
 from __future__ import annotations
@@ -49,13 +49,13 @@ from stiffopt.units import QuantityKind, unit_suffix
 
 MAX_MESSAGE = 16_384
 """Characters of the longest message to a stream."""
-_MAX_TEXT = 65_536  # characters of a task file; to read more would keep the control loop waiting
+_MAX_TEXT = 65_536  # characters of a task file; reading more would delay the control loop
 _MAX_ITEMS = 50  # of a list of descriptions, such as stiffness measures
-_TOLD = 5  # mistakes in an answer
+_MAX_MISTAKES = 5  # in an answer
 _MAX_NUMBERS = 200  # of a list with one number per channel
 
 _UNITS_IN_NAMES = {"orientation": "orientation_wxyz", "matrix": "matrix_n_per_m"}
-"""Names of fields whose type does not tell the unit or the order of their numbers."""
+"""Names of fields whose type shows neither the unit nor the order of their numbers."""
 
 ModelT = TypeVar("ModelT")
 ClassT = TypeVar("ClassT", bound=type)
@@ -99,13 +99,13 @@ def _valid(adapter: TypeAdapter[ModelT], given: Any, place: Loc) -> ModelT:
 
 
 def sentence(mistakes: Sequence[Any]) -> str:
-    """Return pydantic's list of mistakes as one sentence."""
+    """Format pydantic's list of mistakes as one sentence."""
     parts = []
-    for mistake in mistakes[:_TOLD]:
+    for mistake in mistakes[:_MAX_MISTAKES]:
         place = dotted([step for step in mistake["loc"] if not str(step).startswith("<")])
         reason = str(mistake["msg"])
         parts.append(f"{place}: {reason}" if place else reason)
-    more = f"; and {len(mistakes) - _TOLD} more" if len(mistakes) > _TOLD else ""
+    more = f"; and {len(mistakes) - _MAX_MISTAKES} more" if len(mistakes) > _MAX_MISTAKES else ""
     return "; also ".join(parts) + more
 
 
@@ -113,12 +113,12 @@ def sentence(mistakes: Sequence[Any]) -> str:
 
 
 class SchemaMessage(_Message):
-    """The JSON form of a `Schema`; `message_of` makes one for each.
+    """The JSON form of a `Schema`; `message_of` makes a subclass for each.
 
     Attributes
     ----------
     schema_class : the schema.
-    names : of its fields in JSON, by their names in the schema.
+    names : JSON names of its fields, by their names in the schema.
     """
 
     schema_class: ClassVar[type[Schema]]
@@ -126,10 +126,10 @@ class SchemaMessage(_Message):
 
     @classmethod
     def of(cls, given: Schema, **more: Any) -> Self:
-        """Return the message for a description, in which `more` keys are replaced.
+        """Return the message for a description, with the keys in `more` replaced.
 
-        It raises `InputError` if the description is of a subclass whose further keys have no place
-        in the message, or has values that no message may have.
+        `InputError`: the description is of a subclass with further keys, which the message would
+        lose, or has values that no message may have.
         """
         lost: list[Loc] = []
         message = {**_json_of(given, (), lost), **more}
@@ -141,12 +141,12 @@ class SchemaMessage(_Message):
         return _valid(TypeAdapter(cls), message, ())
 
     def read(self, **more: Any) -> Any:
-        """Return the description, in which `more` keys are replaced, or raise `InputError`."""
+        """Return the description, with the keys in `more` replaced; may raise `InputError`."""
         return self.schema_class(**{**_keys_of(self), **more})
 
 
 def _json_of(value: Any, place: Loc, lost: list[Loc]) -> Any:
-    """Return a description as JSON; keys that its message does not have are added to `lost`."""
+    """Return a description as JSON; add keys that its message does not have to `lost`."""
     if isinstance(value, Schema):
         message = next(_MADE[each] for each in type(value).__mro__ if each in _MADE)
         found = {}
@@ -178,9 +178,9 @@ _MADE: dict[type[Schema], type[SchemaMessage]] = {}
 
 
 def message_of(schema: type[Schema], base: type[SchemaMessage] = SchemaMessage) -> Any:
-    """Return the message class of a schema, which has its fields and those of the schemas in it.
+    """Return the message class of a schema, including those of the schemas in it.
 
-    Fields that `base` has take the place of those of the same name.
+    Fields of `base` replace those of the same name.
     """
     if schema not in _MADE or base is not SchemaMessage:
         hints = get_type_hints(schema, include_extras=True)
@@ -212,7 +212,7 @@ def _with_fields_of(schema: type[Schema]) -> Callable[[ClassT], ClassT]:
 
 
 def _is_left_out(info: FieldInfo) -> bool:
-    """Whether messages lack a field: it is a constant, a file or read from a file."""
+    """Whether messages lack a field: it is a constant, a file, or read from a file."""
     args = get_args(info.annotation)
     is_constant = get_origin(info.annotation) is Literal and len(args) == 1
     return bool(info.exclude) or is_constant or Mesh in args
@@ -301,10 +301,10 @@ class TaskMessage(SchemaMessage):
 
 
 def trajectory_of(given: Any) -> Trajectory:
-    """Return the trajectory in the JSON of a `TrajectoryMessage`.
+    """Return the trajectory in the JSON of a `TrajectoryMessage`; `InputError` for a mistake.
 
-    Its waypoints are read one by one: ten thousand at once would block the interpreter, and so the
-    control thread, for too long. A mistake raises `InputError`.
+    Waypoints are read one by one: ten thousand at once would block the interpreter, and so the
+    control thread, for too long.
     """
     waypoints = given.get("waypoints") if isinstance(given, dict) else None
     if not isinstance(waypoints, list) or not 1 <= len(waypoints) <= MAX_WAYPOINTS:
@@ -341,8 +341,8 @@ TaskRequest = Annotated[
 def task_of(given: Any, robot: str) -> Task:
     """Return the task in the JSON of a `TaskRequest`; `robot` is the name of the daemon's.
 
-    No file is read, whatever the text of a task file names. A mistake, or another robot, raises
-    `InputError`.
+    No file is read, whatever the text of a task file names. `InputError`: there is a mistake, or
+    the task is for another robot.
     """
     request = _valid(_TASK, given, ())
     if isinstance(request, TaskText):
@@ -365,7 +365,7 @@ def _task_of_text(text: str, robot: str) -> Task:
 
 
 def _check_scene(given: Any) -> None:
-    """Refuse a scene that would have a file read here: a scene file, or a mesh."""
+    """Refuse a scene that needs a file here: a scene file, or a mesh."""
     objects = given.get("objects") if isinstance(given, dict) else None
     meshes = [each for each in objects or () if isinstance(each, dict) and "mesh" in each]
     if isinstance(given, str) or meshes:

@@ -1,4 +1,4 @@
-"""Metrics for Prometheus, computed when they are read; the control loop does nothing for them."""
+"""Metrics for Prometheus, computed when they are read: they cost the control loop nothing."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ if TYPE_CHECKING:
 
 
 _SHARED = {"pressure_pascals": "Gauge pressures of the channels."}
-"""Help of metrics that several fields share."""
+"""Help texts of metrics that several fields share."""
 
 
 class Metrics:
     """The metrics of a control loop and its telemetry, as text for Prometheus.
 
-    The name of the rig is a label of each. Raises `MissingExtraError` without prometheus-client.
+    Each has the rig's name as a label. Raises `MissingExtraError` without prometheus-client.
     """
 
     def __init__(self, name: str, loop: ControlLoop, telemetry: Telemetry | None = None) -> None:
@@ -40,7 +40,7 @@ class Metrics:
         self._registry.register(self)
 
     def render(self) -> bytes:
-        """Return all metrics as text; from any thread."""
+        """Return all metrics as text; callable from any thread."""
         from prometheus_client import generate_latest
 
         with self._lock:
@@ -83,7 +83,7 @@ class Metrics:
         return late
 
     def _of_fields(self, record: Any) -> Iterator[Any]:
-        """Yield the metrics of a record whose definitions name one."""
+        """Yield the metrics of a record's fields that define one."""
         shared: dict[str, Any] = {}
         for entry in entries(type(record)):
             name, about = entry.shown.metric, entry.shown.about

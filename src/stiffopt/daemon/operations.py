@@ -35,16 +35,16 @@ from stiffopt.model.description import RobotDescription
 from stiffopt.rig.interface import Clock
 
 _VENTED = (State.UNCONFIGURED, State.INACTIVE, State.FAULT)
-_WAITING = 8  # calls of the loop at once; more than a lively client needs
+_MAX_CALLS = 8  # calls of the loop at once; more than a lively client needs
 _log = logging.getLogger(__name__)
 
 
 class Operations:
     """The daemon's interface without HTTP: reading, control and commands.
 
-    All methods are for one event loop. The control loop is called in threads, and what it does not
-    answer within `patience`, in s, is given up. A client that was not heard for `heartbeat`, in s,
-    loses control, and the arm is held.
+    All methods are for one event loop. They call the control loop in threads, and give up after
+    `patience`, in s. A client that was not heard for `heartbeat`, in s, loses control, and the arm
+    is held.
     """
 
     def __init__(
@@ -55,14 +55,14 @@ class Operations:
         clock: Clock,
         patience: float,
     ) -> None:
-        units.get_ready()  # not when a task comes: the control loop shares the interpreter
+        units.get_ready()  # now, not with the first task: the control loop needs the interpreter
         self.loop = loop
         self.robot = robot
         self.lease = ControlLease(heartbeat, clock)
         self._clock = clock
         self._patience = patience
         self._running = 0  # calls of the loop
-        self._task: TaskMessage | None = None  # the last that was accepted, while it matters
+        self._task: TaskMessage | None = None  # the last accepted, while it matters
         self._reported: tuple[Snapshot, dict[str, Any]] | None = None  # the last state as JSON
         self._holding: asyncio.Task[None] | None = None
 
@@ -70,12 +70,12 @@ class Operations:
         """Return the state of the loop and who has control, as `StateReport` describes it."""
         holder = self.lease.holder
         now = self.loop.snapshot()
-        if self._reported is None or self._reported[0] is not now:  # streams ask for the same one
+        if self._reported is None or self._reported[0] is not now:  # streams share states
             self._reported = (now, json_of(now))
         return {**self._reported[1], "lease": None if holder is None else holder.model_dump()}
 
     def robot_report(self) -> RobotReport:
-        """Return what arm this is."""
+        """Return a description of the arm."""
         snapshot, robot = self.loop.snapshot(), self.robot
         return RobotReport(
             name=robot.name,
@@ -87,7 +87,7 @@ class Operations:
         )
 
     def task(self) -> TaskReport:
-        """Return what is being done."""
+        """Return the present task and target."""
         now = self.loop.snapshot()
         wanted = {
             "position_m": now.target_position,
@@ -106,23 +106,23 @@ class Operations:
     # Control ----------------------------------------------------------------------------------
 
     async def take(self, client: str) -> GrantReport:
-        """Give a client control; raise `RefusalError` if another has it."""
-        await self.watch()  # the client that had it may be gone
+        """Grant control to a client; raise `RefusalError` if another has it."""
+        await self.watch()  # the client that had it may have gone silent
         identity = self.lease.take(client)
         beat = self.lease.heartbeat
         return GrantReport(lease=identity, heartbeat_s=beat, renew_every_s=beat / 4)
 
     async def release(self, identity: str | None) -> None:
-        """Take control back from a client; a hold of its own has nobody left who would end it."""
+        """End a client's control; a hold then gets a timeout, as no client is left to end it."""
         holder, now = self.lease.holder, self.loop.snapshot()
         self.lease.release(identity)
         if holder is not None and now.state is State.HOLDING:
             reason = f"{now.reason}; '{holder.client}' has given control back"
-            with suppress(StiffoptError):  # it is let down already
+            with suppress(StiffoptError):  # the pressures are being let down
                 await self._call(partial(self.loop.hold, reason, lasting=False), urgent=True)
 
     async def watch(self) -> None:
-        """Hold the arm if the client in control is not heard any more; to be called repeatedly."""
+        """Hold the arm if the client in control has gone silent; to be called repeatedly."""
         client = self.lease.check(self._clock.now())
         if client is None:
             return
@@ -131,13 +131,13 @@ class Operations:
         await asyncio.wait([self._holding], timeout=1.0)
 
     async def _hold_after(self, client: str) -> None:
-        """Hold the arm; control is free after the loop has held it or has refused to."""
+        """Hold the arm; control becomes free once the loop has held it or has refused to."""
         reason = f"nothing was heard from '{client}', which had control"
         call = call_in_thread("command", partial(self.loop.hold, reason, lasting=False))
         await _ended(call)
         try:
             call.result()
-        except StiffoptError as refused:  # such as: there is nothing to hold
+        except StiffoptError as refused:  # for example because there is nothing to hold
             _log.info("'%s' has lost control; not held: %s", client, refused)
         except Exception:
             _log.exception("'%s' has lost control, and the arm could not be held", client)
@@ -159,14 +159,14 @@ class Operations:
         Parameters
         ----------
         identity :
-            The lease that the client shows.
+            The lease that the client sent.
         function :
-            Calls the loop. It may raise `InputError`, and is called in another thread, as it may
-            take long and other clients must be answered meanwhile.
+            Calls the loop. It may raise `InputError`. It runs in another thread, since it may take
+            long and other clients must be answered meanwhile.
         urgent :
-            Call it however many calls are already waiting: it makes the arm safer.
+            Whether it makes the arm safer: then no limit of waiting calls applies.
         ends_task :
-            Whether there is no task after it.
+            Whether it ends the present task.
         """
         with self.lease.used(identity):
             await self._call(function, urgent=urgent)
@@ -175,7 +175,7 @@ class Operations:
         return self._done()
 
     async def vent(self) -> DoneReport:
-        """Vent at once, whichever client has control; also after the patience has ended."""
+        """Vent at once, for any client; the loop does so even if the patience ends before."""
         await self._call(
             partial(self.loop.vent, "a client asked for it"), urgent=True, lasting=True
         )
@@ -204,14 +204,14 @@ class Operations:
     ) -> Any:
         """Call a function that waits for the control loop, in a thread; return its result.
 
-        With `lasting`, the loop still does it after the patience has ended.
+        With `lasting`, the loop carries it out even after the patience has ended.
 
         Raises
         ------
         RefusalError
-            It fails, does not return in time, or too many calls are waiting already.
+            It fails, does not return in time, or too many calls are waiting.
         """
-        if self._running >= _WAITING and not urgent:
+        if self._running >= _MAX_CALLS and not urgent:
             raise RefusalError(503, "busy", "the control loop has too much to do; try again")
         requester = Requester()
 
@@ -225,7 +225,7 @@ class Operations:
         ended.add_done_callback(self._count_down)
         try:
             await asyncio.wait([ended], timeout=self._patience)
-        finally:  # also where the client has gone
+        finally:  # also if the client has disconnected
             never = not call.done() and requester.give_up()
         if call.done():
             try:
@@ -249,11 +249,11 @@ async def _ended(call: Future[Any]) -> None:
     """Wait for the end of a call in another thread."""
     events, ended = asyncio.get_running_loop(), asyncio.Event()
 
-    def tell(_: object) -> None:
-        with suppress(RuntimeError):  # the event loop has ended meanwhile
+    def notify(_: object) -> None:
+        with suppress(RuntimeError):  # the event loop has ended
             events.call_soon_threadsafe(ended.set)
 
-    call.add_done_callback(tell)
+    call.add_done_callback(notify)
     await ended.wait()
 
 

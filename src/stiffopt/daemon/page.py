@@ -1,4 +1,4 @@
-"""The HTML page that documents the HTTP interface, made from its OpenAPI schema; works offline."""
+"""The HTML page that documents the HTTP interface, from its OpenAPI schema; works offline."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _METHODS = ("get", "post", "delete")
 
 
 def page_of(schema: dict[str, Any]) -> str:
-    """Return the HTML page that shows an OpenAPI schema."""
+    """Return an HTML page for an OpenAPI schema."""
     info = schema["info"]
     calls = [
         _call(path, method, item[method])
@@ -64,7 +64,7 @@ def _paragraphs(text: str) -> str:
 
 
 def _linked(part: dict[str, Any]) -> str:
-    """Return links to the models that a part of the schema refers to."""
+    """Return links to the models to which a part of the schema refers."""
     names = sorted({ref.rsplit("/", 1)[1] for ref in _references(part)})
     return ", ".join(f'<a href="#{escape(n)}">{escape(n)}</a>' for n in names)
 

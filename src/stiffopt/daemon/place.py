@@ -1,8 +1,8 @@
-"""The rule for the headers Host and Origin, by which foreign web pages are kept out.
+"""The rule for the headers Host and Origin that keeps foreign web pages out.
 
 A web page in a browser on this machine can send requests to servers on it. So the header Host must
 be an IP address or a known name, which no foreign name server can resolve to this machine (DNS
-rebinding), and the header Origin, if there is one, must be the server's own.
+rebinding). The header Origin, if there is one, must be the server's own.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ def check_place(
     server: str = "daemon",
     setting: str = "the host of the rig file's service",
 ) -> None:
-    """Raise `RefusalError` unless a request was sent by a page of the server itself, or by none.
+    """Raise `RefusalError` unless a request comes from the server's own page, or from no page.
 
     Parameters
     ----------
     hosts, origins :
-        All headers Host and Origin of the request.
+        All Host and Origin headers of the request.
     known :
-        Names of this machine, other than localhost.
+        Names of this machine besides localhost.
     server, setting :
-        What the server is called in a refusal, and what sets its name.
+        How a refusal calls the server, and the setting of its name.
     """
     names = {"localhost", *(host.lower().rstrip(".") for host in known)} - {""}
     name = _host_name(hosts[0]) if len(hosts) == 1 else ""

@@ -1,6 +1,6 @@
-"""The recording of a run: MCAP files that follow one another, within limits of size and disk space.
+"""The recording of a run: a series of MCAP files, within limits of size and disk space.
 
-Nothing here raises an exception; what is wrong is in `RunRecording.trouble`.
+Nothing here raises an exception; `RunRecording.trouble` reports what is wrong.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ _NEW = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
 
 @dataclass(frozen=True)
 class RecordingLimits:
-    """How much is recorded, and how often the disk is looked at.
+    """Limits of a recording, and intervals of its checks.
 
     Attributes
     ----------
-    min_free : bytes that are left free on the disk; a recording that would need them ends.
-    margin : factor on `min_free` of what must be free before a recording begins.
-    largest : bytes of a file, after which another one follows.
-    look : s between two looks at how much is free.
-    retry : s after a failure until recording is tried again.
+    min_free : bytes to leave free on the disk; a recording that would need them ends.
+    margin : factor on `min_free` for the free bytes that a recording needs to begin.
+    largest : bytes of a file after which the next one begins.
+    look : interval between checks of the free space, in s.
+    retry : time from a failure to the next attempt, in s.
     """
 
     min_free: float = 200e6
@@ -41,31 +41,31 @@ class RecordingLimits:
 
 
 def free_bytes(folder: str) -> float:
-    """Return how many bytes an ordinary user may still write into a folder."""
-    there = os.statvfs(folder)
-    return float(there.f_bavail * there.f_frsize)
+    """Return how many bytes an ordinary user may still write in a folder."""
+    disk = os.statvfs(folder)
+    return float(disk.f_bavail * disk.f_frsize)
 
 
 class RunRecording:
     """Records everything that is logged in a context of foxglove.
 
-    What fails is tried again after a while, in another file.
+    After a failure it tries again, with a new file.
 
     Parameters
     ----------
     folder, name :
-        Where the files go, for this user alone, and the name of the rig that they are named after.
+        Folder of the files, readable by this user alone, and the rig's name, for their names.
     context, about :
-        Of foxglove, and the metadata of each file.
+        Context of foxglove, and metadata of each file.
     wall, free :
-        Give the date in s since 1970 and the bytes that are free in a folder.
+        Return the date in s since 1970, and the free bytes of a folder.
     limits :
-        How much is recorded.
+        Limits of the recording.
 
     Attributes
     ----------
-    path : the file that is written, or was last; None before the first.
-    trouble : why nothing is recorded, as a sentence; empty while all is well.
+    path : the present or last file; None before the first.
+    trouble : why nothing is recorded, as a sentence; empty if all is well.
     """
 
     def __init__(
@@ -86,12 +86,12 @@ class RunRecording:
         self._context, self._about = context, about
         self._wall, self._free, self._limits = wall, free, limits
         self._file: McapWriter | None = None
-        self._ended = 0  # bytes of the files before
+        self._ended = 0  # bytes of the files that are closed
         self._look_at = self._retry_at = -float("inf")
 
     @property
     def is_open(self) -> bool:
-        """Whether something is recorded."""
+        """Whether a file is being written."""
         return self._file is not None
 
     @property
@@ -100,7 +100,7 @@ class RunRecording:
         return self._ended + (0 if self._file is None else self._file.size)
 
     def commit(self, now: float) -> None:
-        """Write what was logged to the disk, or try to begin; `now` in s on any steady clock."""
+        """Write logged messages to the disk, or try to begin; `now` is in s on a steady clock."""
         if self._file is None and now < self._retry_at:
             return
         try:
@@ -117,7 +117,7 @@ class RunRecording:
             self._retry_at = now + self._limits.retry
 
     def close(self) -> None:
-        """End the file with its index; to close twice does nothing."""
+        """End the file with its index; a second call does nothing."""
         file, self._file = self._file, None
         if file is None:
             return
@@ -140,7 +140,7 @@ class RunRecording:
             self._begin()
 
     def _begin(self) -> None:
-        """Begin another file, for this user alone; it takes the place of none."""
+        """Begin a new file, for this user alone; never overwrite one."""
         try:
             make_private(self._folder)
             self._check_free(self._limits.margin * self._limits.min_free)

@@ -1,6 +1,6 @@
 """The daemon's answers over HTTP, as models of their JSON, and its refusals.
 
-The models of the loop's state and of its events are made from `stiffopt.control.state`.
+The models of the loop's state and events are generated from `stiffopt.control.state`.
 """
 
 from __future__ import annotations
@@ -15,16 +15,16 @@ from stiffopt.daemon.messages import TargetMessage, TaskMessage
 from stiffopt.errors import CommandError, InputError, ServiceError, StiffoptError, printable
 
 LEASE_HEADER = "Stiffopt-Lease"
-"""Header in which a client shows that it has control."""
+"""Header in which a client sends the lease that proves its control."""
 _LONGEST = 1000  # characters of a message
 
 
 Values = list[float | None]
-Text = Annotated[str, BeforeValidator(printable)]  # a file's name, say, need not be valid Unicode
+Text = Annotated[str, BeforeValidator(printable)]  # e.g. a file's name may be invalid Unicode
 
 
 def _report_model(name: str, record: type, **more: Any) -> type[BaseModel]:
-    """Return the pydantic model of the JSON that `json_of` makes of a record."""
+    """Return the pydantic model of the JSON that `json_of` makes from a record."""
     fields: dict[str, Any] = {}
     for entry in entries(record):
         kind: Any = {
@@ -131,12 +131,12 @@ class RefusalError(StiffoptError):
 
     @property
     def body(self) -> dict[str, Any]:
-        """What the client is sent."""
+        """JSON to send to the client."""
         return {"error": {"code": self.code, "message": self.message}}
 
 
 def refusal_of(error: StiffoptError) -> RefusalError:
-    """Return the refusal that a client is sent for an error of the control loop."""
+    """Return the refusal to send to a client for an error of the control loop."""
     if isinstance(error, RefusalError):
         return error
     if isinstance(error, InputError) and not isinstance(error, CommandError):
@@ -145,7 +145,7 @@ def refusal_of(error: StiffoptError) -> RefusalError:
 
 
 def error_of(status: int, message: str) -> StiffoptError:
-    """Return the exception that a client raises for a status of the daemon."""
+    """Return the exception that the client raises for an HTTP status of the daemon."""
     if status in (401, 403, 404, 405, 409):
         return CommandError(message)
     if status in (413, 422):

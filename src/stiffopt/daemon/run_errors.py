@@ -1,4 +1,4 @@
-"""How far the tip of a recorded run was from its targets, on its way to them and at them."""
+"""Errors of the tip in a recorded run: on its way to targets, and at them."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ Mask = NDArray[np.bool_]
 ARRIVED = 1e-3
 """A target is held from when the tip first comes this near to it, in m, ..."""
 ARRIVED_ANGLE = radians(1.0)
-"""... and this near in angle, in rad. A target that goes further in one tick is another."""
+"""... and this near in angle, in rad. A target that moves by more in one tick is a new one."""
 
 
 class ErrorStatistics(NamedTuple):
-    """Errors in some of the ticks of a run; the unit is that of the errors.
+    """Statistics of errors in some ticks of a run, in the unit of the errors.
 
     Attributes
     ----------
-    mean, p95, largest : the mean, the 95th percentile and the largest.
-    ticks : how many there are.
+    mean, p95, largest : the mean, the 95th percentile and the largest error.
+    ticks : number of errors.
     """
 
     mean: float
@@ -36,7 +36,7 @@ class ErrorStatistics(NamedTuple):
 
     @classmethod
     def of(cls, errors: Array) -> ErrorStatistics | None:
-        """Those of errors (N,) that are known; None if there are none."""
+        """Return the statistics of the finite ones of errors (N,); None if there are none."""
         known = errors[np.isfinite(errors)]
         if not len(known):
             return None
@@ -45,11 +45,11 @@ class ErrorStatistics(NamedTuple):
 
 
 class RunStages(NamedTuple):
-    """In which ticks (N,) of a run the tip was on its way to a target, and in which at it.
+    """Flags of the ticks (N,) of a run: on the way to a target, and at it.
 
     A target is approached from when it is set, or the loop becomes active again, until the tip is
-    within `ARRIVED` of it, and is held from then on, also where it moves on slowly as that of a
-    trajectory does. Ticks in which the loop does not steer, or has no target, are neither.
+    within `ARRIVED` of it. It is held from then on, even if it moves slowly, as in a trajectory.
+    Ticks without control, or without a target, are neither.
     """
 
     approach: Mask
@@ -57,7 +57,7 @@ class RunStages(NamedTuple):
 
     @classmethod
     def of(cls, run: RecordedRun) -> RunStages:
-        """Those of a run."""
+        """Return the stages of a run."""
         steers = _steers(run)
         near = _within(run.position_error, ARRIVED) & _within(run.angle_error, ARRIVED_ANGLE)
         hold = np.zeros(len(run), dtype=bool)
@@ -69,7 +69,7 @@ class RunStages(NamedTuple):
 
 
 def _steers(run: RecordedRun) -> Mask:
-    """The ticks in which the loop is active and has a target."""
+    """Return flags of the ticks in which the loop is active and has a target."""
     active = np.zeros(len(run), dtype=bool)
     for span in run.states:
         if span.kind == "active":
@@ -82,7 +82,7 @@ def _within(error: Array, limit: float) -> Mask:
 
 
 def _targets(run: RecordedRun, steers: Mask) -> Iterator[slice]:
-    """The ticks of each target in turn."""
+    """Yield the ticks of each target in turn."""
     begins = np.flatnonzero(steers & ~np.concatenate([[False], steers[:-1] & ~_jumps(run)]))
     breaks = np.union1d(np.append(begins, len(run)), np.flatnonzero(~steers))
     for begin, end in zip(begins, breaks[np.searchsorted(breaks, begins) + 1], strict=True):
@@ -90,7 +90,7 @@ def _targets(run: RecordedRun, steers: Mask) -> Iterator[slice]:
 
 
 def _jumps(run: RecordedRun) -> Mask:
-    """Whether the target is another in the next tick (N - 1,)."""
+    """Return whether the next tick has a new target (N - 1,)."""
     moved = _change(run.target_position) > ARRIVED
     for name in ("target_pointing", "target_quaternion"):
         moved |= _change(getattr(run, name)) > ARRIVED_ANGLE
@@ -98,7 +98,7 @@ def _jumps(run: RecordedRun) -> Mask:
 
 
 def _change(values: Array) -> Array:
-    """How far vectors (N, k) go in one tick (N - 1,); infinitely far if other parts are known."""
+    """Return how far vectors (N, k) move per tick (N - 1,); infinite if other parts are known."""
     same = (np.isnan(values[1:]) == np.isnan(values[:-1])).all(axis=1)
     distance = np.linalg.norm(np.nan_to_num(np.diff(values, axis=0)), axis=1)
     return np.where(same, distance, np.inf)

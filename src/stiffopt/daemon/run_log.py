@@ -1,4 +1,4 @@
-"""Reads the recording of a run, and makes a log for calibration of it."""
+"""Reader of a recorded run, and its conversion to a log for calibration."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from stiffopt.logs.mcap_log import LOG_METADATA, log_of_contents
 
 Array = NDArray[np.float64]
 
-_HELD = ("/limits",)  # topics that are logged when they change, and hold until then
+_HELD = ("/limits",)  # topics that are logged only when they change
 
 
 @dataclass(frozen=True)
 class RunSpan:
-    """An interval of time in which a state, with its reason, or an alarm, with its text, held."""
+    """An interval with one state and its reason, or with an alarm and its text; times in s."""
 
     begin: float
     end: float
@@ -35,7 +35,7 @@ class RunSpan:
 
 @dataclass(frozen=True, eq=False)
 class RecordedRun:
-    """A recorded run, in SI units; NaN is what is unknown. Time 0 is where the recording begins.
+    """A recorded run, in SI units; unknown values are NaN. Time 0 is the start of the recording.
 
     Fields of `stiffopt.control.state.Snapshot` that are logged as numbers are attributes, with one
     row per tick: ``run.commanded`` is (N, n), ``run.position_error`` is (N,).
@@ -47,13 +47,13 @@ class RecordedRun:
     channels : number of channels of each segment.
     time : of the ticks (N,), in s.
     fields : the state in each tick, by the names of `Snapshot`.
-    captured : times of capture of the tracker's samples (M,), in s, increasing.
-    stiffness_unit : of its stiffnesses; of recordings of several, or of none, all.
+    captured : capture times of the tracker's samples (M,), in s, increasing.
+    stiffness_unit : unit of the stiffnesses; all units if the recording has several or none.
     seen_position, seen_quaternion : of the tip in the samples (M, 3) and (M, 4), w first.
-    doubted : samples (M,) that no arm could have moved to, or that came with such a one.
-    states, alarms, events : in order of time, which is that of the run.
+    doubted : samples (M,) too far for any motion of the arm, or that came with such a sample.
+    states, alarms, events : in order of time.
     timing : the last ``/timing`` message; empty if there is none.
-    complete : whether the recording was ended properly, and nothing in it is damaged.
+    complete : whether the recording was ended properly and is undamaged.
     """
 
     about: Mapping[str, str]
@@ -86,7 +86,7 @@ class RecordedRun:
         return sum(self.channels)
 
     def snapshots(self) -> Iterator[Snapshot]:
-        """Yield the state in each tick, as far as it was logged; what was not has its default."""
+        """Yield the state in each tick; fields that were not logged have their defaults."""
         places = {entry.name: entry for entry in entries(Snapshot) if entry.name in self.fields}
         spans = iter(self.states)
         span = next(spans, None)
@@ -105,12 +105,12 @@ class RecordedRun:
 
 
 def read_run(path: str | os.PathLike[str]) -> RecordedRun:
-    """Read a recording of the daemon, also one that was cut short by a kill.
+    """Read a recording of the daemon, even if it was cut short by a kill.
 
     Raises
     ------
     FileError
-        It cannot be read, is no recording of a run, or nothing whole is left of it.
+        It cannot be read, is no recording of a run, or has no whole message left.
     MissingExtraError
         mcap is not installed.
     """
@@ -123,9 +123,9 @@ def read_run(path: str | os.PathLike[str]) -> RecordedRun:
 
 
 def read_log_of_recording(path: str | os.PathLike[str]) -> tuple[Log, bool]:
-    """Read the log of a run or of an experiment (.mcap); also whether the recording is whole.
+    """Read the log of a run or of an experiment (.mcap), and whether the recording is whole.
 
-    It raises as `read_run`.
+    Raises as `read_run`.
     """
     found = read_mcap(path)
     if LOG_METADATA in found.metadata:
@@ -181,7 +181,7 @@ def _run(about: Mapping[str, str], found: McapContents) -> RecordedRun:
 
 
 def _fields(found: McapContents, time: Array, begin: float, n: int) -> dict[str, Array]:
-    """Return the fields of the state that are numbers, in the ticks at some times (N,)."""
+    """Return the state's numeric fields in ticks at times (N,)."""
     fields: dict[str, Array] = {}
     for entry in entries(Snapshot):
         topic = entry.shown.topic
@@ -274,18 +274,17 @@ def _alarms(messages: Sequence[Mapping[str, Any]], begin: float, end: float) -> 
     return tuple(sorted(spans, key=lambda span: span.begin))
 
 
-_GAP = 0.1  # s without a sample, which rows without a tip fill ...
-_STEP = 0.05  # ... s apart
-_NEAR = 0.1  # s between a sample and a pressure reading that belongs to it
-_DIGITS = 6  # of a time in s, as log v1 writes it
+_GAP = 0.1  # s without a sample, after which rows without a tip are added ...
+_STEP = 0.05  # ... at intervals of this, in s
+_NEAR = 0.1  # s at most between a sample and its pressure reading
+_DIGITS = 6  # of a time in s, as in log v1
 
 
 def log_of_run(run: RecordedRun) -> Log:
-    """Return the log of a run, with a row for each sample of the tracker; there may be no rows.
+    """Return the log of a run, with a row for each sample of the tracker; it may be empty.
 
-    A sample that no arm could have moved to, or without a tip, gives a row without a tip. Two
-    samples of the same time give one row. Samples from before the first command are left out, since
-    the pressures are not known.
+    A doubted sample, or one without a tip, gives a row without a tip. Two samples of the same time
+    give one row. Samples before the first command are left out, since their pressures are unknown.
     """
     within = (run.captured >= run.time[0]) & (run.captured <= run.time[-1] + _NEAR)
     captured = np.round(run.captured[within], _DIGITS)
@@ -294,7 +293,7 @@ def log_of_run(run: RecordedRun) -> Log:
     unknown = run.doubted[within] | ~np.isfinite(position).all(axis=1)
     position[unknown] = quaternion[unknown] = np.nan
 
-    order = np.lexsort((unknown, captured))  # of the same time, those that saw something first
+    order = np.lexsort((unknown, captured))  # at equal times, samples with a tip come first
     captured, first = np.unique(captured[order], return_index=True)
     position, quaternion = position[order][first], quaternion[order][first]
 

@@ -1,8 +1,8 @@
-"""The token that a client needs to move the arm, and the file in which this user can read it.
+"""The token that a client needs to move the arm, and its file, which only this user can read.
 
-The token is given in the environment, or drawn at random and written to the file. Other users may
+The token comes from the environment, or is drawn at random and written to the file. Other users may
 be able to write to the folder, so files and links that they put there are refused. A token that is
-too short is refused where other machines can reach the interface.
+too short is refused if other machines can reach the interface.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from stiffopt.rig.settings import ServiceSettings
 
 MIN_TOKEN = 16
 """Characters of a token that is not easily guessed."""
-_LONGEST = 4096  # bytes of a file that is read whole
+_LONGEST = 4096  # bytes to read of a file
 _LOCK = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
 _OTHERWISE = "give another log.folder or service.token_file"
 _READ = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
 
 
 def make_private(folder: str | os.PathLike[str]) -> None:
-    """Make a folder, and what is missing above it, for this user alone; `OSError` if it fails."""
+    """Make a folder and its missing parents, for this user alone; `OSError` if that fails."""
     last = Path(folder)
     missing = [path for path in (last, *last.parents) if not path.exists()]
     for path in reversed(missing):
@@ -38,7 +38,7 @@ def make_private(folder: str | os.PathLike[str]) -> None:
 
 
 def _check_folder(folder: Path) -> None:
-    """Raise `FileError` where another user could exchange files in a folder.
+    """Raise `FileError` if another user could exchange files in a folder.
 
     It must belong to this user or to root, and be writable for all only if it is sticky.
     """
@@ -56,9 +56,9 @@ def _check_folder(folder: Path) -> None:
 
 
 def _check_mine(path: Path, opened: int | None = None) -> None:
-    """Raise `FileError` unless a file is a regular one of this user, or is not there.
+    """Raise `FileError` unless a file is a regular one of this user, or does not exist.
 
-    A file that is open is looked at by its descriptor, and any other by its name.
+    An open file is checked by its descriptor, any other by its name.
     """
     try:
         found = os.lstat(path) if opened is None else os.fstat(opened)
@@ -89,13 +89,13 @@ def _read_mine(path: Path) -> str:
 
 
 class Secret:
-    """A token, and the file in which a drawn one can be read by this user alone.
+    """A token, and the file from which this user alone can read a drawn one.
 
-    The file belongs to one daemon as long as it runs: a second one, which would replace the token,
-    is kept out by a lock (flock) on another file, which the kernel releases however a process ends.
-    The lock file is not removed, since another process may be about to lock it. No symbolic link is
-    followed, and nothing is written where another user could exchange it.
-    `path` is None where the token is in the environment.
+    The file belongs to one daemon as long as it runs. A lock (flock) on another file, which the
+    kernel releases however a process ends, keeps out a second daemon, which would replace the
+    token. The lock file is not removed, since another process may be about to lock it. No symbolic
+    link is followed, and nothing is written where another user could exchange it.
+    `path` is None if the token comes from the environment.
     """
 
     def __init__(
@@ -109,12 +109,12 @@ class Secret:
         self._lock: int | None = None  # an open file
 
     def write(self) -> None:
-        """Write the file, in the place of what is there; no other user can read it at any moment.
+        """Write the file, replacing an old one; no other user can ever read it.
 
         Raises
         ------
         FileError
-            It cannot be written, is that of another daemon, which runs, or is not a regular file of
+            It cannot be written, belongs to another running daemon, or is not a regular file of
             this user in a folder that others cannot change.
         """
         if self.path is None:
@@ -140,7 +140,7 @@ class Secret:
             ) from None
 
     def _take(self, path: Path) -> None:
-        """Lock the file of the token against other daemons."""
+        """Lock the token's file against other daemons."""
         if self._lock is not None:
             return
         place = path.with_name(f".{path.name}.lock")
@@ -148,7 +148,7 @@ class Secret:
         try:
             lock = os.open(place, _LOCK, 0o600)
         except PermissionError:
-            if not place.exists():  # nothing can be written in this folder
+            if not place.exists():  # the folder is not writable
                 raise
             raise FileError(
                 place,
@@ -168,13 +168,13 @@ class Secret:
         except FileError:
             os.close(lock)
             raise
-        except OSError:  # a file system without locks: nothing is to be known of others there
+        except OSError:  # a file system without locks cannot show other daemons
             os.close(lock)
             return
         self._lock = lock
 
     def remove(self) -> None:
-        """Remove the file, if it is still that of this token."""
+        """Remove the file, if it still has this token."""
         if self.path is None:
             return
         with suppress(OSError, ValueError):
@@ -189,9 +189,9 @@ class Secret:
 
 
 def is_loopback(host: str) -> bool:
-    """Return whether only this machine can reach what listens on a host.
+    """Return whether only this machine can reach a server on a host.
 
-    A name is on loopback if all its addresses are; one that has no address is not.
+    A name is on loopback if it has addresses and all of them are.
     """
     try:
         found = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
@@ -203,8 +203,8 @@ def is_loopback(host: str) -> bool:
 def check_exposure(host: str, token: str, *, given: bool) -> list[tuple[str, str]]:
     """Return the warnings for a control interface on a host: kinds and texts of events.
 
-    `given` is whether a person chose the token; else it was drawn. A token that is too short for a
-    host which other machines can reach raises `InputError`.
+    `given` is whether a person chose the token, rather than that it was drawn. `InputError`: the
+    token is too short for a host that other machines can reach.
     """
     beyond, short = not is_loopback(host), given and len(token) < MIN_TOKEN
     if beyond and short:
@@ -227,12 +227,12 @@ def check_exposure(host: str, token: str, *, given: bool) -> list[tuple[str, str
 
 
 def bracketed(host: str) -> str:
-    """Return a host as it is written in a URL."""
+    """Return a host as a URL writes it."""
     return f"[{host}]" if ":" in host else host
 
 
 def is_address(name: str) -> bool:
-    """Return whether a host is given as an IP address, and not by name."""
+    """Return whether a host is an IP address, not a name."""
     try:
         ip_address(name)
     except ValueError:

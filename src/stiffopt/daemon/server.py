@@ -1,8 +1,8 @@
-"""The HTTP server of the daemon: uvicorn in a thread, with limits on the connections of clients.
+"""The HTTP server of the daemon: uvicorn in a thread, with limits on the clients' connections.
 
-There is a limit to connections, to streams (WebSockets) and to the time that a connection may idle.
-Where there are too many, connections that have not shown the token are closed first; they never
-take the place of one that has.
+Limited are the numbers of connections and of streams (WebSockets), and the time that a connection
+may idle. If there are too many, connections without the token are closed first; they never take the
+place of one with the token.
 """
 
 from __future__ import annotations
@@ -31,28 +31,28 @@ except ModuleNotFoundError as error:
     raise MissingExtraError(error.name or "uvicorn", "daemon") from error
 
 MAX_CONNECTIONS = 128
-"""Without the token, streams included; and as many with it, streams not included. Each is an open
-file, of which a process may have a thousand or so."""
+"""Connections without the token, streams included; and as many with it, without streams. Each is an
+open file, of which a process may have about a thousand."""
 MAX_STREAMS = 16
-"""Without the token, and as many with it; a hundred would keep the control loop from its work."""
+"""Streams without the token, and as many with it; a hundred would delay the control loop."""
 GRACE = 1.0
-"""Seconds in which a stream that exceeds the limit may show the token."""
+"""Time in s in which a stream beyond the limit may show the token."""
 CONNECTION = "connection"
 """Key of a WebSocket's `LimitedConnection` in the state of its scope."""
 _HANDSHAKES = 50.0
-"""A second, of streams without the token; each takes some milliseconds of computing."""
+"""Rate, in 1/s, of streams without the token; each takes some milliseconds of computing."""
 PATIENCE = 30.0
-"""Seconds in which a connection must have had an answer to a request; else it is closed."""
+"""Time in s in which a connection must have had an answer to a request, or be closed."""
 _BUSY = b'{"error": {"code": "busy", "message": "too many streams without the token"}}'
 _REFUSAL = (
     b"HTTP/1.1 503 Service Unavailable\r\nContent-Type: application/json\r\nConnection: close\r\n"
     b"Content-Length: %d\r\n\r\n%s" % (len(_BUSY), _BUSY)
 )
 _STARTING = 10.0  # s
-_CONNECTIONS = 1024  # that have not been accepted yet
-_AT_ONCE = 16  # of these are accepted, then others are heard; far fewer than make anyone give way
-_IDLE = 10  # s; longer than clients keep a connection that they do not use
-_CLOSING = 1  # s for requests that are being answered when the server stops
+_CONNECTIONS = 1024  # that wait to be accepted
+_AT_ONCE = 16  # connections accepted before others are served; too few to push out any other
+_IDLE = 10  # s; longer than clients keep an unused connection
+_CLOSING = 1  # s to finish answers when the server stops
 _log = logging.getLogger(__name__)
 
 
@@ -68,22 +68,22 @@ class Server:
 
     @property
     def url(self) -> str:
-        """Where clients of this machine reach it."""
+        """URL for clients on this machine."""
         host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(self._host, self._host)
         return f"http://{bracketed(host)}:{self.port}"
 
     @property
     def alive(self) -> bool:
-        """Whether it serves."""
+        """Whether the server runs."""
         return self._thread is not None and self._thread.is_alive() and bool(self._server.started)
 
     def start(self) -> None:
-        """Listen, and return when clients are answered.
+        """Listen; return when clients are answered.
 
         Raises
         ------
         InputError
-            The address cannot be listened on.
+            It cannot listen on the address.
         ServiceError
             The server does not start.
         """
@@ -96,9 +96,9 @@ class Server:
             backlog=_AT_ONCE,
             timeout_keep_alive=_IDLE,
             ws=type("Stream", (StreamProtocol,), {"limiter": limiter}),
-            ws_max_size=8 * MAX_MESSAGE,  # what is longer ends the connection
+            ws_max_size=8 * MAX_MESSAGE,  # a longer message ends the connection
             ws_max_queue=4,
-            ws_per_message_deflate=False,  # a small message must not become a large one
+            ws_per_message_deflate=False,  # a small message must not expand to a large one
             lifespan="on",
             log_config=None,
             log_level=logging.WARNING,
@@ -118,10 +118,10 @@ class Server:
                 self.stop()
                 raise ServiceError(f"the control interface does not start at {self.url}")
             time.sleep(0.005)
-        listening.listen(_CONNECTIONS)  # `backlog` has made it less
+        listening.listen(_CONNECTIONS)  # uvicorn has set it to `backlog`
 
     def stop(self, timeout: float = 5.0) -> None:
-        """End all connections and stop listening; to stop what does not run does nothing."""
+        """End all connections and stop listening; does nothing if the server does not run."""
         if self._thread is None:
             return
         self._server.should_exit = True
@@ -163,10 +163,10 @@ class Server:
 
 
 class LimitedConnection:
-    """One connection of a client, from when it is accepted until it is lost.
+    """One connection of a client, from its acceptance to its loss.
 
-    `drop` closes it at once; `waits_since` returns since when it waits for its client, in s, or
-    None while its client waits for it.
+    `drop` closes it at once. `waits_since` returns since when it has waited for its client, in s,
+    or None while the client waits for an answer.
 
     Attributes
     ----------
@@ -185,11 +185,11 @@ class LimitedConnection:
 
 
 class ConnectionLimiter:
-    """The connections of a server, and the rule by which one is closed to make room.
+    """The connections of a server, and the rule for closing one to make room.
 
-    Where too many have not shown the token, the oldest of them is dropped. One that has shown it
-    makes room only for others that have: the one that has waited longest for its client is dropped.
-    All methods are for one event loop. `trusts` says whether the headers of a request show the
+    If too many have not shown the token, the oldest of them is dropped. One that has shown it makes
+    room only for others that have: the one that has waited longest for its client is dropped. All
+    methods are for one event loop. `trusts` returns whether the headers of a request show the
     token.
     """
 
@@ -200,7 +200,7 @@ class ConnectionLimiter:
     ) -> None:
         self.trusts = trusts
         self._clock = clock
-        self._anonymous: dict[LimitedConnection, None] = {}  # as sets that keep the order
+        self._anonymous: dict[LimitedConnection, None] = {}  # dicts serve as ordered sets
         self._trusted: dict[LimitedConnection, None] = {}
         self._handshakes, self._counted = 0.0, clock()
 
@@ -211,12 +211,12 @@ class ConnectionLimiter:
             self._drop(next(iter(self._anonymous)))
 
     def remove(self, connection: LimitedConnection) -> None:
-        """Forget a connection that is lost; to forget it twice does nothing."""
+        """Forget a lost connection; a second call does nothing."""
         self._anonymous.pop(connection, None)
         self._trusted.pop(connection, None)
 
     def trust(self, connection: LimitedConnection) -> bool:
-        """Note that it has shown the token; return False if that makes one stream too many."""
+        """Note that a connection has shown the token; return False if it is a stream too many."""
         if connection.trusted:
             return True
         if connection.served and self._count_streams(trusted=True) >= MAX_STREAMS:
@@ -229,20 +229,20 @@ class ConnectionLimiter:
         return True
 
     def distrust(self, connection: LimitedConnection) -> None:
-        """Note that it has shown a wrong token."""
+        """Note that a connection has shown a wrong token."""
         if connection.trusted:
             connection.trusted = False
             self._trusted.pop(connection, None)
             self.add(connection)
 
     def admit_stream(self, connection: LimitedConnection) -> bool:
-        """Let a stream be served; return False if there are too many of its kind."""
+        """Admit a stream; return False if there are too many of its kind."""
         if not connection.served and self._count_streams(trusted=connection.trusted) < MAX_STREAMS:
             connection.served = True
         return connection.served
 
     def permits_handshake(self) -> bool:
-        """Count a handshake without the token; return False if there were too many just now."""
+        """Count a handshake without the token; return False if there were too many lately."""
         now = self._clock()
         passed, self._counted = now - self._counted, now
         self._handshakes = max(self._handshakes - passed * _HANDSHAKES, 0.0)
@@ -256,7 +256,7 @@ class ConnectionLimiter:
         return sum(c.served and c.trusted is trusted for c in connections)
 
     def _make_room_for(self, newest: LimitedConnection) -> None:
-        """Drop one of too many with the token: if none waits for its client, the newest."""
+        """Drop one of too many with the token: the newest, if none waits for its client."""
         plain = [c for c in self._trusted if not c.is_stream]
         if len(plain) > MAX_CONNECTIONS:
             since = {c: c.waits_since() for c in plain if c is not newest}
@@ -269,17 +269,17 @@ class ConnectionLimiter:
 
 
 class BoundedProtocol(H11Protocol):
-    """An HTTP connection under a `ConnectionLimiter`, which is closed when it idles.
+    """An HTTP connection under a `ConnectionLimiter`; it is closed when it idles.
 
-    Reading needs no token, so that anyone on this machine may connect. Clients that send nothing,
-    send slowly or connect again and again must not keep out one that wants to vent. (uvicorn's own
-    `limit_concurrency` would answer all clients with 503 then.)
+    Reading needs no token, so anyone on this machine may connect. Clients that send nothing, send
+    slowly or reconnect all the time must not keep out one that wants to vent. (uvicorn's own
+    `limit_concurrency` would then answer all clients with 503.)
     """
 
     limiter: ConnectionLimiter
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Add it to the limiter, and begin to count how long it idles."""
+        """Add the connection to the limiter, and start its idle time."""
         super().connection_made(transport)
         self.connection = LimitedConnection(self.drop, self._waits_since)
         self._closing: asyncio.TimerHandle | None = None
@@ -289,21 +289,21 @@ class BoundedProtocol(H11Protocol):
         self.limiter.add(self.connection)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Remove it."""
+        """Remove the connection from the limiter."""
         self._stop_waiting()
         self.limiter.remove(self.connection)
         super().connection_lost(exc)
 
     def on_response_complete(self) -> None:
-        """Count from now on."""
+        """Restart the idle time."""
         self._begin_to_wait()
         super().on_response_complete()
 
     def handle_websocket_upgrade(self, event: Any) -> None:
-        """Make it a stream.
+        """Turn the connection into a stream.
 
         Too frequent handshakes without the token are refused before any work is done for them, and
-        after a delay: such a client would try again at once.
+        after a delay, because such a client would try again at once.
         """
         self._stop_waiting()
         if not self.connection.trusted and not self.limiter.permits_handshake():
@@ -317,19 +317,19 @@ class BoundedProtocol(H11Protocol):
         super().handle_websocket_upgrade(event)
 
     def drop(self) -> None:
-        """Close it at once."""
-        self.connections.discard(self)  # it is gone; its socket is closed in the next round
+        """Close the connection at once."""
+        self.connections.discard(self)  # now; the event loop closes the socket later
         self.transport.abort()
 
     def shutdown(self) -> None:
-        """End when the server does."""
+        """Close the connection when the server stops."""
         if self._is_refused:  # h11 waits for an answer that never comes
             self.drop()
         else:
             super().shutdown()
 
     def _should_upgrade(self) -> bool:
-        """Look for the token in the headers of a request, which have just come."""
+        """Check the headers of a request, which have just arrived, for the token."""
         if not self.connection.trusted and self.limiter.trusts(Headers(raw=self.headers)):
             self.limiter.trust(self.connection)
         return super()._should_upgrade()
@@ -339,7 +339,7 @@ class BoundedProtocol(H11Protocol):
         self.transport.close()
 
     def _waits_since(self) -> float | None:
-        """Return since when it waits for its client; None if the client waits for an answer."""
+        """Return since when it waits for its client; None while the client waits for it."""
         cycle = self.cycle
         waits = cycle is None or cycle.response_complete or cycle.more_body
         return self._since if waits else None
@@ -361,6 +361,6 @@ class StreamProtocol(WebSocketsSansIOProtocol):
     limiter: ConnectionLimiter
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Remove it."""
+        """Remove the connection from the limiter."""
         self.limiter.remove(self.app_state[CONNECTION])
         super().connection_lost(exc)

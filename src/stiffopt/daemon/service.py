@@ -75,7 +75,7 @@ SI units stand in the names; null is what is not known. Gauge pressures; poses i
 _log = logging.getLogger(__name__)
 
 _UNREAD = WrapValidator(lambda given, _: given)
-"""Leaves a body that may be long unread: `Operations` reads it in a thread of its own."""
+"""Leaves a body that may be long unparsed: `Operations` parses it in another thread."""
 LeaseHeader = Annotated[
     str | None,
     Header(alias=LEASE_HEADER, description="from POST /v1/lease", max_length=100),
@@ -100,14 +100,14 @@ def create_app(
     loop, robot, heartbeat, clock, patience :
         See `Operations`.
     token :
-        That a client needs to move the arm.
+        The token that a client needs to move the arm.
     metrics :
-        Returns what Prometheus reads at ``/metrics``; None: there is no such page.
+        Returns the metrics for ``/metrics``; None: there is no such page.
     hosts :
-        Names of this machine, other than localhost, to which clients may send requests.
+        Names of this machine besides localhost to which clients may send requests.
 
-    Its ``state.limiter`` limits the connections in a `Server`. A token that a header cannot carry
-    raises `InputError`.
+    The application's ``state.limiter`` limits the connections in a `Server`. `InputError`: a header
+    cannot carry the token.
     """
     secret = Token(token)
     operations = Operations(loop, robot, heartbeat, clock or SystemClock(), patience)
@@ -126,7 +126,7 @@ def create_app(
         version="1",
         description=_ABOUT,
         lifespan=watching,
-        docs_url=None,  # that page would be loaded from the internet
+        docs_url=None,  # that page would load code from the internet
         redoc_url=None,
         redirect_slashes=False,
     )
@@ -163,7 +163,7 @@ async def _watch(operations: Operations) -> None:
     while True:
         try:
             await operations.watch()
-        except Exception:  # the client in control must be watched whatever happens
+        except Exception:  # the watch must go on
             _log.exception("the watch over who has control failed; it goes on")
         await asyncio.sleep(period)
 
@@ -201,7 +201,7 @@ def _reading(operations: Operations) -> APIRouter:
 
 
 def _trusted(codes: Iterable[int], tag: str) -> APIRouter:
-    """Return a router of calls that need the token; that they do is seen to by `Access`."""
+    """Return a router for calls that need the token, which `Access` checks."""
     scheme = HTTPBearer(auto_error=False, description="The token.", scheme_name="token")
     return APIRouter(
         tags=[tag], dependencies=[Depends(scheme)], responses=_responses(401, 403, 413, *codes)
@@ -258,7 +258,7 @@ def _moving(operations: Operations) -> APIRouter:
         request: Annotated[TaskRequest, _UNREAD], lease: LeaseHeader = None
     ) -> DoneReport:
         """Pursue a task, given as a message or as the text of a task file."""
-        return await operations.set_task(lease, request)  # which is JSON still
+        return await operations.set_task(lease, request)  # still unparsed JSON
 
     @router.post("/target")
     async def set_target(request: TargetMessage, lease: LeaseHeader = None) -> DoneReport:

@@ -1,6 +1,6 @@
-"""Records of the loop's state as JSON, and read from it, by the definitions of their fields.
+"""Conversion of records of the loop's state to JSON and back, by the definitions of their fields.
 
-SI units end the names; null is what is not known. See `stiffopt.control.state`.
+Names end in SI units; unknown values are null. See `stiffopt.control.state`.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ RecordT = TypeVar("RecordT")
 def json_of(record: Any, *, rounded: bool = False) -> dict[str, Any]:
     """Return a record of the state, such as a `Snapshot` or an `Event`, as JSON.
 
-    With `rounded`, numbers have the decimals of their definitions.
+    With `rounded`, numbers have the decimals that their definitions give.
     """
     found: dict[str, Any] = {}
     for entry in entries(type(record)):
@@ -70,7 +70,7 @@ def plain(value: Any, entry: Entry, *, rounded: bool = False) -> Any:
 def record_of(record: type[RecordT], given: Mapping[str, Any]) -> RecordT:
     """Return the record from which `json_of` made some JSON; null becomes NaN.
 
-    Unknown keys, as of a newer daemon, are ignored; a wrong or missing value raises `ServiceError`.
+    Unknown keys, as of a newer daemon, are ignored. `ServiceError`: a value is wrong or missing.
     """
     try:
         return _record_of(record, given)

@@ -1,4 +1,4 @@
-"""The WebSocket of the daemon: sends states at a steady rate, receives targets and answers them."""
+"""The daemon's WebSocket: sends states at a steady rate, receives and answers targets."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ ModelT = TypeVar("ModelT", bound=BaseModel)
 
 DEFAULT_RATE = 20.0
 MAX_RATE = 100.0
-"""Of states, in Hz."""
+"""Rate of states, in Hz."""
 
 
 class AccessMessage(BaseModel):
@@ -46,8 +46,8 @@ class StreamedTarget(BaseModel):
 class Stream:
     """One WebSocket connection.
 
-    Of targets that come faster than the control loop takes them, only the newest is passed on:
-    a stale one would move the arm to where the client no longer wants it.
+    If targets come faster than the control loop takes them, only the newest is passed on: a stale
+    one would move the arm to where the client no longer wants it.
 
     The WebSocket is not accepted yet; `Access` has checked its headers.
     """
@@ -67,11 +67,11 @@ class Stream:
         self._lease = websocket.headers.get(LEASE_HEADER)
         self._next: StreamedTarget | None = None
         self._arrived = asyncio.Event()
-        self._shown = asyncio.Event()  # the token, in a message
+        self._shown = asyncio.Event()  # set when a message shows the token
         self._sending = asyncio.Lock()
 
     async def run(self) -> None:
-        """Serve until the client goes, unless there are too many others."""
+        """Serve until the client disconnects, unless there are too many streams."""
         await self._socket.accept()
         with suppress(WebSocketDisconnect):
             try:
@@ -96,7 +96,7 @@ class Stream:
             await asyncio.gather(*tasks, return_exceptions=True)
 
     async def _be_admitted(self, receiving: asyncio.Task[None]) -> None:
-        """Wait until it may be served; where streams are too many, it may still show the token."""
+        """Wait for admission; a stream beyond the limit may still show the token."""
         if self._limiter.admit_stream(self._connection):
             return
         if not self._connection.trusted:
@@ -113,7 +113,7 @@ class Stream:
         due = clock.time()
         while True:
             await self._send({"type": "state", "state": self._operations.state()})
-            due = max(due + period, clock.time())  # a slow reader gets fewer, not older ones
+            due = max(due + period, clock.time())  # a slow reader gets fewer states, not older
             await asyncio.sleep(due - clock.time())
 
     async def _receive(self) -> None:
@@ -147,7 +147,7 @@ class Stream:
             await self._answer(replaced.seq, newer)
 
     def _show(self, token: str) -> None:
-        """Trust the client from now on, or no longer, by what it shows."""
+        """Trust the client or not, by the token that it shows."""
         try:
             self._token.check(token)
         except RefusalError:
@@ -209,7 +209,7 @@ def _parsed(text: str | None) -> Any:
 
 
 def _seq(given: Any) -> int | None:
-    """Return the number of a message, if it has one, even if the rest of it is wrong."""
+    """Return the number of a message, if it has one, even if the rest is wrong."""
     seq = given.get("seq") if isinstance(given, dict) else None
     return seq if type(seq) is int and 0 <= seq <= 2**53 else None
 

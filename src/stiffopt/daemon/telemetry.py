@@ -1,7 +1,7 @@
-"""Telemetry: sends the state of the loop to Foxglove and records it, in a thread of its own.
+"""Telemetry: sends the loop's state to Foxglove and records it, in a thread of its own.
 
-The loop hands over a snapshot in each tick, which takes a microsecond. A failure here raises an
-alarm, and control goes on.
+In each tick the loop hands over a snapshot, which takes a microsecond. A failure here raises an
+alarm, and control continues.
 """
 
 from __future__ import annotations
@@ -33,19 +33,19 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class TelemetryRates:
-    """How often what is logged, and how much waits; times in s.
+    """Intervals of the kinds of messages, in s, and sizes.
 
     Attributes
     ----------
-    wake : between two looks at what the loop has handed over.
-    commit : between two writes to the disk: what a killed process loses.
+    wake : between checks for new snapshots.
+    commit : between writes to the disk; a killed process loses this much.
     queue : snapshots that may wait; the oldest are dropped first.
-    tick : between two snapshots that are logged; to log more would cost the loop its punctuality.
+    tick : between logged snapshots; more of them would delay the loop.
     frames, shape, state : between messages of the frames, of the arm's shape and the timing, and
         of the state while it does not change.
-    calm : after which a loss or a failure is forgotten.
-    shape_poses : along the arm that Foxglove draws.
-    shape_share : of the interpreter's time, which the control thread needs too, for the shape.
+    calm : without a loss or failure, after which its alarm is cleared.
+    shape_poses : poses along the arm for Foxglove.
+    shape_share : share of the interpreter's time for the shape; the control thread needs it too.
     """
 
     wake: float = 0.02
@@ -69,15 +69,15 @@ class Telemetry:
     Parameters
     ----------
     robot, name :
-        The model of the arm, which is kept in the recording, and the name of the rig.
+        The model of the arm, which the recording keeps, and the name of the rig.
     loop, clock :
-        Of the rig.
+        The rig's loop and clock.
     folder :
-        Where recordings go.
+        Folder of the recordings.
     settings :
-        Where Foxglove may connect.
+        Settings of Foxglove's port.
     backbone :
-        Gives poses (m, 4, 4) along the arm for pressures (n,), in Pa.
+        Returns poses (m, 4, 4) along the arm for pressures (n,), in Pa.
     about :
         Further metadata for the recording, such as the text of the rig file.
     wall :
@@ -124,7 +124,7 @@ class Telemetry:
         self._working = threading.Lock()
         self._next_event = 0
         self._last_state: object = None
-        self._logged = np.inf  # nothing was handed over yet
+        self._logged = np.inf  # time of the last snapshot; none yet
         self._due_tick = self._due_state = self._due_frames = self._due_shape = -np.inf
         self._due_commit = -np.inf
         self._alarms: dict[str, str] = {}
@@ -133,27 +133,27 @@ class Telemetry:
 
     @property
     def port(self) -> int | None:
-        """Where Foxglove can connect; None while it cannot."""
+        """Port for Foxglove; None if there is none."""
         return None if self._server is None else int(self._server.port)
 
     def put(self, snapshot: Snapshot) -> None:
-        """Hand over a snapshot; called by the control thread in each tick, and never waits."""
+        """Hand over a snapshot; the control thread calls this in each tick. It never waits."""
         if len(self._queue) == RATES.queue:
             self.dropped += 1
         self._queue.append(snapshot)
 
     def start(self) -> None:
-        """Listen, record, and work in a thread of its own."""
+        """Open the port, begin to record, and start the thread."""
         self._listen()
         self.work()
         self._thread = threading.Thread(target=self._run, name="telemetry", daemon=True)
         self._thread.start()
 
     def stop(self, patience: float = 5.0) -> None:
-        """Log the rest, end the recording and stop the server; to stop twice does nothing.
+        """Log the rest, end the recording and stop the server; a second call does nothing.
 
-        If what is being written, as to a disk that hangs, is not done after `patience`, in s,
-        nothing more is recorded, and it raises `TimeoutError`.
+        `TimeoutError`: a write, as to a disk that hangs, has not ended after `patience`, in s; then
+        nothing more is recorded.
         """
         if self._stopped:
             return
@@ -166,7 +166,7 @@ class Telemetry:
             self._thread = None
         end = self._loop.snapshot()
         if end.time > (self._queue[-1].time if self._queue else self._logged):
-            self.put(end)  # what became of it after the last tick
+            self.put(end)  # the state after the last tick
         self.work(last=True)
         self.recording.close()
         if self._server is not None:
@@ -176,10 +176,10 @@ class Telemetry:
         self._stopped = True
 
     def work(self, *, last: bool = False) -> None:
-        """Log what has come since the last call; with `last`, write it to the disk at once."""
+        """Log what has arrived since the last call; with `last`, write it to the disk at once."""
         with self._working:
             if not self.recording.is_open:
-                self._commit(time.monotonic())  # to have it before anything is logged
+                self._commit(time.monotonic())  # open the file before anything is logged
             while self._queue:
                 self._attempt(self._log, self._queue.popleft())
                 time.sleep(0)  # the control thread may want the interpreter
@@ -233,7 +233,7 @@ class Telemetry:
             regular = on_time and now.time <= self._due_tick + RATES.tick
             self._due_tick = (self._due_tick if regular else now.time) + RATES.tick
             self._channels.log_tick(now)
-        self._channels.log_samples(now)  # each of them
+        self._channels.log_samples(now)  # all samples, in every tick
         if now.time >= self._due_frames:
             self._due_frames = now.time + RATES.frames
             self._channels.log_frames(now)
@@ -253,7 +253,7 @@ class Telemetry:
         self._set_alarm("log", self.recording.trouble)
 
     def _look_back(self, now: float) -> None:
-        """Raise an alarm for lost snapshots, and clear alarms after a while without a failure."""
+        """Raise an alarm for lost snapshots; clear alarms after a while without a failure."""
         if now > self._failed_at + RATES.calm:
             self._set_alarm("telemetry", "")
         if self.dropped > self._dropped_before:
@@ -264,7 +264,7 @@ class Telemetry:
             self._set_alarm("telemetry-lost", "")
 
     def _set_alarm(self, kind: str, text: str) -> None:
-        """Raise an alarm, or clear it if the text is empty; if that changes anything."""
+        """Raise an alarm if it is new, or clear it if the text is empty."""
         if self._alarms.get(kind, "") == text:
             return
         self._alarms[kind] = text
@@ -283,7 +283,7 @@ class ArmShape:
         self._last: Array | None = None
 
     def __call__(self, pressures: Array) -> Array:
-        """Return poses (m, 4, 4) along the arm, now or a little while ago."""
+        """Return poses (m, 4, 4) along the arm, possibly slightly old ones."""
         now = time.monotonic()
         if self._last is None or now >= self._due:
             self._last = self._robot.backbone(pressures, RATES.shape_poses)
@@ -295,7 +295,7 @@ class ArmShape:
 def about_run(
     robot: RobotDescription, name: str, first: Snapshot, begin: float, offset: int
 ) -> dict[str, str]:
-    """Return the metadata of a recording: all that a reader needs, other than the messages."""
+    """Return the metadata of a recording: all that a reader needs besides the messages."""
     from stiffopt import __version__
 
     return {

@@ -1,9 +1,9 @@
 """Topics of telemetry, live and recorded: the fields of the loop's state as messages.
 
-The definition of a field in `stiffopt.control.state` names its topic. The messages are JSON, and
-frames, the arm as a line and events as a log are messages of Foxglove's own too, which its panels
+The definition of a field in `stiffopt.control.state` names its topic. The messages are JSON.
+Frames, the arm as a line and events are also sent as Foxglove's own message types, which its panels
 show without set-up. Foxglove refuses union types in a schema (``["number", "null"]``), so a schema
-gives the type of a value that is known: an unknown scalar is left out, an unknown item is null.
+has the type of a known value; an unknown scalar is left out, an unknown item is null.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ METADATA = "stiffopt-run"
 """Name of the metadata record of a run."""
 FORMAT = "stiffopt-run/1"
 STATES = tuple(map(str, State))
-"""Their index is `state_number`, which can be plotted."""
+"""The index of a state is `state_number`, which can be plotted."""
 
 _TIME_DECIMALS = 6
 _ENCODER = json.JSONEncoder(allow_nan=False, check_circular=False, separators=(",", ":"))
 _COUNT = {"type": "integer"}
-_FURTHER: Mapping[str, Mapping[str, Any]] = {  # what is no field of the state
+_FURTHER: Mapping[str, Mapping[str, Any]] = {  # entries that are no fields of the state
     "/state": {
         "state_number": {
             "type": "integer",
@@ -44,12 +44,12 @@ _FURTHER: Mapping[str, Mapping[str, Any]] = {  # what is no field of the state
 
 @cache
 def _logged(record: type, topic: str) -> tuple[Entry, ...]:
-    """Return the fields of a record that are logged in a topic."""
+    """Return the fields of a record that belong to a topic."""
     return tuple(entry for entry in entries(record) if entry.shown.topic == topic)
 
 
 def state_topics() -> tuple[str, ...]:
-    """Return the topics that the fields of a `Snapshot` are logged in."""
+    """Return the topics of the fields of a `Snapshot`."""
     return tuple(dict.fromkeys(filter(None, (e.shown.topic for e in entries(Snapshot)))))
 
 
@@ -98,21 +98,21 @@ Array = NDArray[np.float64]
 BASE, TIP, TARGET, SEEN = "base", "tip", "target", "tip_seen"
 """Names of the frames; all are children of the base."""
 
-_SELDOM = ("/state", "/limits")
+_RARE = ("/state", "/limits")
 _TARGET_SIZE = 0.004  # m
 _ARM_COLOUR, _TARGET_COLOUR = (0.31, 0.47, 0.65, 0.7), (0.84, 0.15, 0.16, 0.8)
 _FORCE_COLOUR = (0.55, 0.34, 0.29, 1.0)
 _FORCE_THICKNESS = 0.002  # m
-_LENGTH_OF_FORCE = 1.0  # m per N that a force is drawn with: a millimetre for each mN
-_WITHIN_95 = 2.8  # standard deviations in three dimensions
-_LARGEST_ELLIPSOID = 0.2  # m, along an axis in which nothing can be felt
+_LENGTH_OF_FORCE = 1.0  # m per N: scale of a drawn force, a millimetre for each mN
+_WITHIN_95 = 2.8  # standard deviations of a 95 % region in three dimensions
+_LARGEST_ELLIPSOID = 0.2  # m, along an axis in which the arm cannot feel
 
 
 class TelemetryChannels:
     """Writes snapshots, events and the shape of the arm to the topics of a context of foxglove.
 
-    `offset` is the date of time 0 on the rig's clock, in ns since 1970; `thickness` that of the arm
-    as it is drawn, in m.
+    `offset` is the date of time 0 on the rig's clock, in ns since 1970; `thickness` is that of the
+    drawn arm, in m.
     """
 
     def __init__(self, context: Any, offset: int, thickness: float) -> None:
@@ -125,7 +125,7 @@ class TelemetryChannels:
             topic: Channel(topic, schema=schema, context=context)
             for topic, schema in topic_schemas().items()
         }
-        self._each_tick = [topic for topic in state_topics() if topic not in _SELDOM]
+        self._each_tick = [topic for topic in state_topics() if topic not in _RARE]
         self._frames = FrameTransformsChannel("/tf", context=context)
         self._scene = SceneUpdateChannel("/scene", context=context)
         self._log = LogChannel("/log", context=context)
@@ -141,12 +141,12 @@ class TelemetryChannels:
         return self._offset + round(time * 1e9)
 
     def log_tick(self, now: Snapshot) -> None:
-        """Log the topics that are logged in each tick, such as pressures and the tip."""
+        """Log the topics of each tick, such as pressures and the tip."""
         for topic in self._each_tick:
             self._log_json(topic, now.time, now)
 
     def log_samples(self, now: Snapshot) -> None:
-        """Log the tracker's samples, with the times of capture."""
+        """Log the tracker's samples, with their capture times."""
         for sample in now.samples:
             if sample.visible and not now.rejected:
                 self._seen = sample
@@ -166,7 +166,7 @@ class TelemetryChannels:
         self._log_json("/limits", now.time, now)
 
     def log_timing(self, now: Snapshot, dropped: int) -> None:
-        """Log how punctual the loop is, and how many snapshots never got here."""
+        """Log the loop's timing, and the number of snapshots dropped before they were logged."""
         self._log_json("/timing", now.time, now.timing, dropped=dropped)
 
     def log_event(self, event: Event) -> None:
@@ -186,7 +186,7 @@ class TelemetryChannels:
         self._log_json("/event", event.time, event)
 
     def log_arm(self, now: Snapshot, poses: Array) -> None:
-        """Log the arm's shape from poses (m, 4, 4) along it, and the target."""
+        """Log the arm's shape, as poses (m, 4, 4) along it, and the target."""
         from foxglove.messages import (
             LinePrimitive,
             Point3,
@@ -215,7 +215,7 @@ class TelemetryChannels:
         self._scene.log(SceneUpdate(entities=entities), log_time=moment)
 
     def log_frames(self, now: Snapshot) -> None:
-        """Log the frames of the tip, the target and the tip as it was last seen."""
+        """Log the frames of the tip, of the target and of the tip in the last sample."""
         from foxglove.messages import FrameTransforms
 
         moment = self.nanoseconds(now.time)
@@ -252,7 +252,7 @@ def _colour(parts: Sequence[float]) -> Any:
 
 
 def _frame(moment: int, name: str, position: Array, quaternion: Array | None) -> Any:
-    """Return a frame in the base, or None while it is not known where it is."""
+    """Return a frame in the base, or None if its place is unknown."""
     from foxglove.messages import FrameTransform, Quaternion, Vector3
 
     w, x, y, z = (1.0, 0.0, 0.0, 0.0) if quaternion is None else quaternion.tolist()
@@ -269,7 +269,7 @@ def _frame(moment: int, name: str, position: Array, quaternion: Array | None) ->
 
 
 def _entity(moment: int, name: str, **shapes: Any) -> Any:
-    """Return an entity of the base frame; it disappears unless it is drawn again within 1 s."""
+    """Return an entity of the base frame; it disappears unless redrawn within 1 s."""
     from foxglove.messages import Duration, SceneEntity
 
     stamp, soon = _timestamp(moment), Duration(1)
@@ -305,7 +305,7 @@ def _force(moment: int, now: Snapshot) -> Any:
 
 
 def target_place(now: Snapshot) -> Array | None:
-    """Return where the target is (3,), with the tip's coordinate along free axes."""
+    """Return the position (3,) of the target, with the tip's coordinates along free axes."""
     if now.target_position is None:
         return None
     where: Array = np.where(np.isfinite(now.target_position), now.target_position, now.tip_position)
