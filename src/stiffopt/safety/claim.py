@@ -18,7 +18,7 @@ from threading import Lock
 
 from stiffopt.errors import DeviceError
 
-_WAIT = 1.0  # s; a program that is just ending still vents for some tens of milliseconds
+_WAIT = 1.0  # s; a program that is ending may take some tens of milliseconds to vent
 _AGAIN = 0.02  # s between two attempts
 
 
@@ -54,11 +54,11 @@ class Claim:
 
     @property
     def held(self) -> bool:
-        """Whether this object holds the claim; a supply without endpoints is never held."""
+        """Whether this object holds the claim; always False for a supply without endpoints."""
         return bool(self._names)
 
     def take(self) -> None:
-        """Claim all endpoints; does nothing if they are held already.
+        """Claim all endpoints; do nothing if they are already held.
 
         Raises
         ------
@@ -80,7 +80,7 @@ class Claim:
                 raise
 
     def release(self) -> None:
-        """Free all endpoints; does nothing if they are not held."""
+        """Free all endpoints; do nothing if they are not held."""
         with self._lock:
             self._give_back()
 

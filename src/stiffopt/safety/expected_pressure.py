@@ -32,11 +32,11 @@ class Regulation:
 
     @classmethod
     def slowest(cls, robot: RobotDescription, control: ControlSettings, n: int) -> Regulation:
-        """Return the slower, for each of n channels, of the rig file's and the robot file's lags.
+        """Return the slower of the rig file's and the robot file's lags, for each of n channels.
 
         The lag in a calibrated robot file may be that of the arm behind its regulators, or of both.
-        Assuming too slow a regulator delays the detection of a fault; assuming too fast a one would
-        find faults that are none. For a robot with another number of channels only the rig counts.
+        Too slow a regulation delays the detection of a fault; too fast a one causes false faults.
+        If the robot has another number of channels, only the rig file counts.
         """
         lag, dead_time = control.regulator_lag, control.regulator_dead_time
         if sum(segment.n_channels for segment in robot.segments) != n:
@@ -56,11 +56,11 @@ class Regulation:
 class ExpectedPressure:
     """Bounds on the pressures of healthy regulators.
 
-    Only their slowest response is known: dead time, lag, limited rate. Each may be faster, also
-    faster in one direction. So the lower bound rises as slowly as possible and falls at once, and
-    the upper bound rises at once and falls as slowly as possible. Every regulator that is no slower
-    stays between the two, whatever its commands. Readings do not correct the bounds, since they are
-    compared with them.
+    Only their slowest response is known: dead time, lag, limited rate. Any regulator may be faster,
+    even in one direction only. So the lower bound rises as slowly as possible and falls at once;
+    the upper bound rises at once and falls as slowly as possible. Every regulator that is not
+    slower stays between the two, whatever its commands. Readings are compared with the bounds and
+    so must not correct them.
 
     Parameters
     ----------
@@ -86,11 +86,11 @@ class ExpectedPressure:
         self._time = -np.inf
 
     def tell(self, time: float, commanded: Array) -> None:
-        """Record set-points (n,), in Pa, that hold from a moment on."""
+        """Record set-points (n,), in Pa, that apply from a time on, in s."""
         self._told.append((time, commanded))
 
     def follow(self, time: float) -> float:
-        """Advance the bounds to a moment; return the time since the last call, in s."""
+        """Advance the bounds to a time; return the time since the last call, both in s."""
         if np.isinf(self._time):
             self._time = time
         elapsed = time - self._time
@@ -99,7 +99,7 @@ class ExpectedPressure:
         told, acting = self._told, self._time - self._dead_time
         while len(told) > 1 and told[1][0] <= acting:
             told.popleft()
-        # any of these commands may have acted meanwhile
+        # any of these commands may have acted since then
         commands = np.array([commanded for _, commanded in told])
         least, most = np.minimum.reduce(commands), np.maximum.reduce(commands)
         reach = self._slew * elapsed

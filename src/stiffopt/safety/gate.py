@@ -41,13 +41,13 @@ class Applied:
     pressures : ndarray
         Set-points (n,) of the supply, in Pa.
     reading : PressureReading
-        Newest measured pressures; their time tells how old they are.
+        Newest measured pressures, with the time of the measurement.
     limited : bool
         Whether the set-points differ from the command, because of its rate or force.
     refused : str
         Why the command was refused; empty if it was carried out.
     force_limited : bool
-        Whether it was shortened because of the total force.
+        Whether it was reduced because of the total force.
     """
 
     pressures: Array
@@ -58,7 +58,7 @@ class Applied:
 
 
 class Outlet(Protocol):
-    """Interface that takes a stream of commands to a supply, through the safety gate."""
+    """Interface that passes a stream of commands to a supply, through the safety gate."""
 
     limits: PressureLimits
 
@@ -69,13 +69,13 @@ class Outlet(Protocol):
         """Vent and disconnect."""
 
     def arm(self) -> None:
-        """Take commands from now on; set-points are 0 at first."""
+        """Accept commands from now on; set-points are 0 at first."""
 
     def restrict(self, high: Array) -> None:
         """Let no channel rise above a task's limits (n,), in Pa, until the next call or `arm`."""
 
     def vent(self) -> None:
-        """Let all pressure out at once; no command is taken until `arm`."""
+        """Let all pressure out at once; refuse commands until `arm`."""
 
     def apply(self, command: PressureCommand) -> Applied:
         """Carry out a command as far as allowed; raise `DeviceError` if the supply fails."""
@@ -85,7 +85,7 @@ class Outlet(Protocol):
 
 
 def let_down(pressures: Array, share: float | Array, limits: PressureLimits) -> Array:
-    """Return a share, clipped to 0 to 1, of pressures (n,), in Pa, while they are let down.
+    """Return the share (clipped to 0 to 1) of pressures (n,), in Pa, that is left on a ramp.
 
     The share is one for all channels, or (n,). A channel that would fall below a low limit above 0
     goes to 0.
@@ -96,13 +96,13 @@ def let_down(pressures: Array, share: float | Array, limits: PressureLimits) -> 
 
 
 class SafetyGate:
-    """Passes commands on to a supply after checking range, rate of change, total force and age.
+    """Checks range, rate of change, total force and age of commands, and passes them to a supply.
 
     A command that is malformed, not finite, out of range, expired or from the future is refused,
     and the last set-points stay. A command that changes too fast, or needs too great a force, is
-    carried out as far as the limits allow. Rates are limited from one write to the next, of rising
-    and falling pressures alike; only venting is immediate. A rise that would take the total force
-    above its limit is shortened by the same share in all channels; falling always passes.
+    carried out as far as the limits allow. Rates are limited from one write to the next, for rising
+    and falling pressures alike; only venting is immediate. If a rise would take the total force
+    above its limit, it is reduced by the same share in all channels; falling always passes.
 
     A channel whose low limit is above 0 has no set-points between 0 and that limit: it stays at 0
     for as long as a rise from 0 to the limit takes, then steps to the limit.
@@ -121,8 +121,8 @@ class SafetyGate:
     clock :
         Clock of the rig.
     period :
-        Time between commands, in s. A pause longer than `CommandRules.pause_periods` of them
-        allows no greater step than these do.
+        Time between commands, in s. After a pause longer than `CommandRules.pause_periods` of
+        them, a step is no larger than these periods allow.
 
     Attributes
     ----------
@@ -173,7 +173,7 @@ class SafetyGate:
 
     @property
     def armed(self) -> bool:
-        """Whether commands are taken."""
+        """Whether commands are accepted."""
         return self._armed
 
     def open(self) -> None:
@@ -198,7 +198,7 @@ class SafetyGate:
         Raises
         ------
         DeviceError
-            Venting failed, see `PressureSupply.close`. The supply stays claimed, since closing is
+            Venting failed, see `PressureSupply.close`. The supply stays claimed, because closing is
             tried again when the interpreter exits.
         """
         with self._lock:
@@ -207,7 +207,7 @@ class SafetyGate:
             self._claim.release()
 
     def arm(self) -> None:
-        """Take commands from now on; the set-points are 0 then.
+        """Accept commands from now on; the set-points are 0 at first.
 
         Raises
         ------
@@ -235,7 +235,7 @@ class SafetyGate:
     def restrict(self, high: ArrayLike) -> None:
         """Let no channel rise above a task's limits (n,), in Pa, until the next call or `arm`.
 
-        A channel that is above its limit already may stay there, or fall.
+        A channel that is already above its limit may stay there, or fall.
 
         Raises
         ------
@@ -249,12 +249,12 @@ class SafetyGate:
             self._task_high = np.minimum(given, self.limits.high)
 
     def vent(self) -> None:
-        """Let all pressure out at once; no command is taken until `arm`.
+        """Let all pressure out at once; refuse commands until `arm`.
 
         Raises
         ------
         DeviceError
-            The supply failed: try again, as `expire` does too.
+            The supply failed: try again; `expire` does so too.
         """
         with self._lock:
             self._armed = False
@@ -264,7 +264,7 @@ class SafetyGate:
             self._forget(self.clock.now())
 
     def expire(self, now: float) -> bool:
-        """Vent if no valid command came for too long, or venting failed before; call it often.
+        """Vent if no valid command came for too long, or if venting failed before; call it often.
 
         Parameters
         ----------
@@ -273,7 +273,7 @@ class SafetyGate:
 
         Returns
         -------
-        Whether it vented.
+        True if it vented.
 
         Raises
         ------
@@ -297,7 +297,7 @@ class SafetyGate:
         Raises
         ------
         DeviceError
-            The supply does not answer; it may or may not have the new set-points.
+            The supply does not answer; whether it has the new set-points is unknown.
         """
         with self._lock:
             now = self.clock.now()
@@ -345,7 +345,7 @@ class SafetyGate:
         return np.minimum(wanted, np.maximum(self._task_high, self._ramp))
 
     def _within_rate(self, wanted: Array, now: float) -> Array:
-        """Return the pressures (n,) nearest to a command that the slew limit allows by now."""
+        """Return the pressures (n,) nearest to a command that the slew limit now allows."""
         elapsed = min(max(now - self._written_at, 0.0), self._longest)
         reach = self._slew * elapsed
         nearest: Array = np.minimum(np.maximum(wanted, self._ramp - reach), self._ramp + reach)
@@ -355,7 +355,7 @@ class SafetyGate:
         return nearest
 
     def _within_force(self, wanted: Array) -> Array:
-        """Shorten the rising part of a step to `wanted` (n,) so that the force keeps its limit."""
+        """Reduce the rising part of a step to `wanted` (n,) so that the force keeps its limit."""
         if self._max_force is None:
             return wanted
         most = self._force(wanted)
@@ -365,7 +365,7 @@ class SafetyGate:
         least = self._force(fallen)
         if most <= least:
             return wanted
-        # the force is convex along the step: this share of it is never too much
+        # the force is convex along the step, so this share of it never exceeds the limit
         share = max(0.0, self._max_force - least) / (most - least)
         shortened: Array = fallen + share * (wanted - fallen)
         return shortened
@@ -395,7 +395,7 @@ def effective_slew(rig: Rig) -> Array:
 
 
 def gate_before(rig: Rig, safety: Safety, period: float) -> SafetyGate:
-    """Return the gate before the supply of a rig of bare devices.
+    """Return the gate for the supply of a rig of bare devices.
 
     Parameters
     ----------

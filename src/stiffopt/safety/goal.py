@@ -1,9 +1,9 @@
-"""Goals: commands of programs that command now and then, and the follower that keeps to them.
+"""Goals: commands that stay valid for a while, and the follower that carries them out.
 
-A control loop commands in each of its ticks and must not fall silent. A script commands once and
-sleeps. Its command is a *goal*: `GoalFollower` approaches it through the safety gate, repeats it
-for as long as it is valid, and then lets the pressures down and vents. `GoalSupply` is the supply
-that programs see; its goals go to a follower in this process or, by a `GuardLink`, in the guard.
+A control loop commands in every tick and must not fall silent. A script commands once and sleeps.
+Its command is a *goal*: `GoalFollower` approaches it through the safety gate, repeats it while it
+is valid, and then lets the pressures down and vents. Programs use a `GoalSupply`; its goals go to a
+follower in this process or, through a `GuardLink`, in the guard.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ class GoalFollower:
     period :
         Time between ticks, in s.
     ramp_time :
-        Time in which the pressures are let down after a goal has expired, in s.
+        Duration of letting the pressures down after a goal has expired, in s.
     clock :
         Clock of the rig.
 
@@ -96,13 +96,13 @@ class GoalFollower:
 
     @classmethod
     def before(cls, gate: SafetyGate, safety: Safety, period: float, clock: Clock) -> GoalFollower:
-        """Return a follower that repeats goals well before the gate finds them too old."""
+        """Return a follower that repeats goals well before they are too old for the gate."""
         often = min(period, safety.command_timeout / COMMANDS.repeats)
         return cls(gate, period=often, ramp_time=safety.ramp_time, clock=clock)
 
     @property
     def armed(self) -> bool:
-        """Whether goals are taken."""
+        """Whether goals are accepted."""
         return self._gate.armed
 
     @property
@@ -130,7 +130,7 @@ class GoalFollower:
             self._gate.close()
 
     def arm_for_goals(self) -> None:
-        """Take goals from now on; all set-points are 0 until the first one comes.
+        """Accept goals from now on; all set-points are 0 until the first one.
 
         Raises
         ------
@@ -162,7 +162,7 @@ class GoalFollower:
         Raises
         ------
         CommandError
-            The goal is refused and the last one stays, as it does if `Applied.refused` says so.
+            The goal is refused and the last one stays, as if `Applied.refused` reports it.
         DeviceError
             The supply does not answer.
         """
@@ -236,7 +236,7 @@ class GoalFollower:
         return applied
 
     def _rest(self, why: str) -> None:
-        """Drop the goal: the supply is vented."""
+        """Drop the goal, because the supply is vented."""
         self.due, self._until = math.inf, math.inf
         self._goal = self._told = self._nothing
         self._let_down_from = None
@@ -244,17 +244,17 @@ class GoalFollower:
 
 
 class GoalSupply(Supply):
-    """The supply of a rig as programs see it: each command is a goal, and all limits hold.
+    """The supply of a rig as programs see it: each command is a goal, and all limits apply.
 
     A goal is approached within the slew and force limits of robot and rig, and repeated until it
-    expires: a `PressureCommand` says when, plain pressures are valid for 0.5 s. Then the pressures
-    are let down within `Safety.ramp_time` and vented. In real time the guard process does all this,
-    and vents at once when this process ends; a simulated rig does it on its own clock.
+    expires: at the time that a `PressureCommand` gives, or after 0.5 s for plain pressures. Then
+    the pressures are let down within `Safety.ramp_time` and vented. In real time the guard process
+    does all this, and vents at once when this process ends; a simulated rig uses its own clock.
 
     Parameters
     ----------
     outlet :
-        Takes the goals: a follower in this process, or the link to a guard that has one.
+        Accepts the goals: a follower in this process, or the link to a guard that has one.
     clock :
         Clock of the rig.
     """
@@ -271,7 +271,7 @@ class GoalSupply(Supply):
 
     @property
     def armed(self) -> bool:
-        """Whether goals are taken; not so after `open`, `vent` and expiry."""
+        """Whether goals are accepted; not after `open`, `vent` and expiry."""
         return self.is_open and self._outlet.armed
 
     @property
@@ -284,12 +284,12 @@ class GoalSupply(Supply):
         self._outlet.check_arming()
 
     def arm(self) -> None:
-        """Take commands from now on; all set-points are 0 then. See `SafetyGate.arm`."""
+        """Accept commands from now on; all set-points are 0 at first. See `SafetyGate.arm`."""
         self._must_be_open()
         self._outlet.arm_for_goals()
 
     def command(self, pressures: ArrayLike | PressureCommand) -> None:
-        """Let the pressures go to (n,), in Pa, and stay there until the command expires."""
+        """Bring the pressures to (n,), in Pa, and keep them until the command expires."""
         self._pursue(pressures)
 
     def exchange(self, pressures: ArrayLike | PressureCommand) -> PressureReading:

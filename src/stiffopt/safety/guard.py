@@ -1,20 +1,19 @@
-"""The guard: a process of its own that owns the supply and vents when its client fails.
+"""The guard: a separate process that owns the supply and vents when its client fails.
 
-`stiffopt.safety.guard_client.GuardLink` starts it. It takes two kinds of commands and passes them
+`stiffopt.safety.guard_client.GuardLink` starts it. It accepts two kinds of commands and passes them
 through the safety gate:
 
-- A control loop sends a *stream*. If no command comes for the guard's timeout, because the loop
+- A control loop sends a *stream*. If no command arrives for the guard's timeout, because the loop
   was killed or stopped or hangs, the guard vents.
-- A program that commands now and then sends *goals*, which say for how long they are valid. The
-  guard approaches and repeats a goal, and lets the pressures down when it has expired, see
-  `stiffopt.safety.goal`.
+- A program that commands now and then sends *goals* with a time of validity. The guard approaches
+  and repeats a goal, and lets the pressures down when it has expired, see `stiffopt.safety.goal`.
 
 In both cases it vents when the client's process has ended, on every signal that would end the guard
-and can be handled, and when ``stiffopt vent`` calls on the vent line. After it has vented by itself
-it is *tripped*: it takes no command until it is armed by a client that has been told of the trip.
+and can be handled, and when ``stiffopt vent`` calls on the vent line. After it has vented on its
+own, it is *tripped*: it refuses commands until a client that knows of the trip arms it.
 
 Two limits: while the supply's driver waits for its device, at most for the driver's own timeouts,
-the guard does nothing else; and a guard that is killed vents nothing. Its client then vents in its
+the guard does nothing else; and a guard that is killed cannot vent. Its client then vents in its
 place (`stiffopt.safety.rescue`), and so does the device's own watchdog.
 """
 
@@ -58,7 +57,7 @@ _ASKED = "asked to"
 _POSES = 200  # tracker samples per packet
 _LONGEST = 500  # characters of a text: an answer must fit into one packet
 _IGNORED = ("SIGINT", "SIGPIPE", "SIGTSTP", "SIGTTIN", "SIGTTOU")  # the client decides on the end
-_HARMLESS = ("SIGCHLD", "SIGCONT", "SIGURG", "SIGWINCH")  # by default these do nothing
+_HARMLESS = ("SIGCHLD", "SIGCONT", "SIGURG", "SIGWINCH")  # their default action does nothing
 _FATAL = ("SIGKILL", "SIGSTOP", "SIGSEGV", "SIGBUS", "SIGFPE", "SIGILL")
 
 
@@ -74,9 +73,9 @@ class Guard:
     timeout :
         Silence of a stream after which the guard vents, in s.
     follower :
-        Brings the supply to goals; None: only streams are taken.
+        Brings the supply to goals; None: only streams are accepted.
     line :
-        Vent line on which ``stiffopt vent`` calls; None: there is none.
+        Vent line for calls of ``stiffopt vent``; None: there is none.
     clock :
         Returns the time in s; `time.monotonic` is common to all processes.
     pause :
@@ -88,8 +87,8 @@ class Guard:
     as_json :
         Whether log lines on stderr are JSON instead of sentences.
     orphaned :
-        Returns whether the client's process has ended. A child that it has forked may keep its end
-        of the channel open.
+        Returns whether the client's process has ended. A forked child of it may keep its end of the
+        channel open.
     """
 
     def __init__(
@@ -129,7 +128,7 @@ class Guard:
         self._reading = PressureReading(np.nan, np.full(n, np.nan))
         self._armed = False
         self._goals = False  # whether it is armed for goals
-        self._due: float | None = None  # when a silent stream is vented; None: no stream
+        self._due: float | None = None  # time when a silent stream is vented; None: no stream
         self._to_vent: float | None = None  # next attempt to vent; None: vented, or armed
         self._trips = 0
         self._tripped = ""
@@ -138,11 +137,11 @@ class Guard:
         self._broken_told = 0.5  # broken packets reported; the next report is at twice as many
 
     def leave(self, reason: str) -> None:
-        """End soon, and vent on the way; for signal handlers."""
+        """End soon, after venting; for signal handlers."""
         self._leaving = reason
 
     def serve(self) -> int:
-        """Run until the client has ended or asks for the end; return the exit code."""
+        """Run until the client has ended or requests the end; return the exit code."""
         try:
             while not self._leaving:
                 self.step()
@@ -154,7 +153,7 @@ class Guard:
         return code
 
     def step(self) -> None:
-        """Handle the messages that have come, or wait a little for them; check all deadlines."""
+        """Wait briefly for messages, handle them, and check all deadlines."""
         self._handle(self._channel.receive(self._patience()))
         self._answer_callers()
         if self._channel.broken >= 2 * self._broken_told:
@@ -181,7 +180,7 @@ class Guard:
     # messages ------------------------------------------------------------------------------------
 
     def _handle(self, messages: Sequence[Message]) -> None:
-        """Handle messages: requests to vent first; of several commands the newest alone."""
+        """Handle messages: requests to vent first, and only the newest of several commands."""
         vents = [
             i for i, m in enumerate(messages) if isinstance(m, GuardRequest) and m.do == "vent"
         ]
@@ -202,14 +201,14 @@ class Guard:
                 self._answer(message.sequence, error="a command to vent has overtaken this")
             elif isinstance(message, GuardRequest):
                 later.append(message)
-        for request in later:  # that came before a request to vent, and could wait
+        for request in later:  # they came before a request to vent, and could wait
             self._carry_out_request(request)
         if newest is not None:
             self._check_deadline()
             self._pass_on(newest)
 
     def _overtaken(self, frame: CommandFrame | None, by: str) -> None:
-        """Answer a goal that is not pursued; a stream needs no such answer."""
+        """Answer a goal that is not pursued; a command of a stream needs no such answer."""
         if frame is not None and frame.goal:
             self._answer(
                 frame.sequence,
@@ -217,10 +216,10 @@ class Guard:
             )
 
     def _extend_deadline(self, frame: CommandFrame) -> None:
-        """Extend the deadline of a stream from when the frame was sent: it may have waited here."""
+        """Extend a stream's deadline, counted from when the frame was sent: it may have waited."""
         if self._due is None or frame.goal:
             return
-        if not frame.sent <= self._due:  # NaN is no time either
+        if not frame.sent <= self._due:  # NaN is too late as well
             self._trip(self._silence)
         else:
             self._due = min(frame.sent, self._clock()) + self._timeout
@@ -256,7 +255,7 @@ class Guard:
         return self._outlet.apply(command)
 
     def _follow(self) -> None:
-        """Let the follower repeat a goal, or let the pressures down after it, when it is due."""
+        """When it is due, let the follower repeat a goal, or let down after it has expired."""
         follower = self._follower
         if follower is None or follower.due + self._epoch > self._clock():
             return
@@ -302,7 +301,7 @@ class Guard:
         self._answer(request.sequence, error=error, value=value)
 
     def _arm(self, told: Any, *, goals: bool) -> None:
-        """Arm, unless the client has not been told of the last trip; it knows `told` trips."""
+        """Arm, unless the client, which knows of `told` trips, does not know of the last one."""
         if self._tripped and told != self._trips:
             raise DeviceError(f"the guard had vented: {self._tripped}")
         if self._to_vent is not None:
@@ -335,7 +334,7 @@ class Guard:
     # actions -------------------------------------------------------------------------------------
 
     def _trip(self, reason: str) -> str:
-        """Vent and take no command until a client that knows of it arms; return why it failed."""
+        """Vent, and refuse commands until a client that knows of it arms; return the error."""
         self._tripped = reason[:_LONGEST]
         self._trips += 1
         error = self._vent()
@@ -345,7 +344,7 @@ class Guard:
         return error
 
     def _vent(self) -> str:
-        """Vent; if that fails return why, and try again soon."""
+        """Vent; if that fails, return the error and schedule another attempt."""
         self._armed, self._due = False, None
         try:
             (self._follower or self._outlet).vent()
@@ -432,8 +431,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     ----------
     arguments :
         File descriptor of the inherited socket, and optionally ``json`` for JSON lines on stderr;
-        by default those of the command line. The rig comes pickled on standard input, from the
-        process that started this one.
+        None: those of the command line. The parent process sends the rig, pickled, on standard
+        input.
     """
     parent = os.getppid()
     _ignore(_IGNORED)
@@ -442,7 +441,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     descriptor, as_json = int(given[0]), JSON in given[1:]
     with ExitStack() as stack:
         channel = stack.enter_context(closing(GuardChannel(socket.socket(fileno=descriptor))))
-        with suppress(OSError, AttributeError):  # systems without these look now and then
+        with suppress(OSError, AttributeError):  # other systems rely on `orphaned`
             ended = os.pidfd_open(parent)
             stack.callback(os.close, ended)
             channel.wake_for([ended])
@@ -489,12 +488,12 @@ def _on_signals(handler: Callable[[int, Any], object]) -> None:
     """
     left = {getattr(signal, name) for name in (*_IGNORED, *_HARMLESS, *_FATAL)}
     for number in signal.valid_signals() - left:
-        with suppress(OSError, ValueError):  # the system keeps some for itself
+        with suppress(OSError, ValueError):  # the system reserves some
             signal.signal(number, handler)
 
 
 def _open_rig(channel: GuardChannel) -> Owned:
-    """Make and connect the rig that comes on standard input; report what takes long."""
+    """Make and connect the rig that standard input describes; report slow steps."""
 
     def tell(message: Warning | str, *_: object, **__: object) -> None:
         channel.send(GuardNotice("notice", {"text": str(message)}))

@@ -1,8 +1,8 @@
-"""The client's side of the guard: it starts the process, commands through it and watches over it.
+"""The client's side of the guard: it starts the process, commands through it and supervises it.
 
-`GuardLink` is what control loop, scripts and experiments use. It starts a `GuardProcess`, talks to
-it through an `Exchange` of messages, and has a `GuardWatch` vent the supply directly when the guard
-is gone.
+Control loop, scripts and experiments use a `GuardLink`. It starts a `GuardProcess`, exchanges
+messages with it (`Exchange`), and lets a `GuardWatch` vent the supply directly when the guard has
+ended or hangs.
 """
 
 from __future__ import annotations
@@ -50,11 +50,11 @@ from stiffopt.safety.settings import CLIENT
 
 Array = NDArray[np.float64]
 
-_START_SLICE = 0.05  # s between looks at a guard that starts
+_START_SLICE = 0.05  # s between checks of a guard that starts
 _SLICE = 0.02  # s; no thread keeps others from receiving for longer
-_RESEND = 1e-3  # s until a message is sent again that the full socket did not take
+_RESEND = 1e-3  # s until a message that did not fit into the socket is sent again
 _RESOLUTION = 1e-3  # s, of waiting for the socket
-_KEPT = 4096  # tracker samples that nobody has taken; the oldest go first
+_KEPT = 4096  # tracker samples that nobody has taken; the oldest are dropped first
 _log = logging.getLogger(__name__)
 
 
@@ -70,7 +70,7 @@ class GuardProcess:
 
     Attributes
     ----------
-    channel : connection to it.
+    channel : connection to the process.
     pid : process id.
     """
 
@@ -80,7 +80,7 @@ class GuardProcess:
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with theirs:
             command = [sys.executable, "-P", "-m", "stiffopt.safety.guard", str(theirs.fileno())]
-            # in a session of its own: Ctrl-C and Ctrl-Z on the terminal are not for the guard
+            # in a session of its own: the terminal's Ctrl-C and Ctrl-Z must not reach the guard
             self._process = subprocess.Popen(
                 command + [JSON] * json_lines,
                 stdin=subprocess.PIPE,
@@ -133,14 +133,14 @@ class GuardProcess:
         return True
 
     def kill(self) -> None:
-        """Kill the process at once, even if it is stopped; it does not vent then."""
+        """Kill the process at once, even if it is stopped; then it does not vent."""
         self._process.kill()
         self._process.wait()
 
     def end(self) -> int:
         """Close the connection, which makes the guard vent and end; return its exit code.
 
-        It is terminated, and in the end killed, only if it does not end by itself.
+        If it does not end by itself, it is terminated and finally killed.
         """
         self.channel.close()
         for force in (self._process.terminate, self._process.kill):
@@ -150,11 +150,11 @@ class GuardProcess:
                 force()
         with suppress(subprocess.TimeoutExpired):
             return self._process.wait(CLIENT.end)
-        return -1  # not even that ends it: the system itself waits for a device
+        return -1  # it cannot even be killed: the system itself waits for a device
 
 
 def _failure(kind: str, args: list[str]) -> Exception:
-    """Return the error because of which the guard did not start."""
+    """Return the error that kept the guard from starting."""
     if kind == "MissingExtraError":
         return MissingExtraError(*args)
     return DeviceError(" ".join(args))
@@ -163,18 +163,19 @@ def _failure(kind: str, args: list[str]) -> Exception:
 class Exchange:
     """Sends messages to a guard and matches its answers. Any thread may call any method.
 
-    A thread that waits for its answer receives for all threads; none is needed for receiving alone.
+    A thread that waits for its answer receives for all threads, so no thread is needed for
+    receiving.
 
     Parameters
     ----------
     channel :
         Connection to the guard.
     patience :
-        Time that one call of the supply's driver may take, in s.
+        Longest time of one call of the supply's driver, in s.
 
     Attributes
     ----------
-    newest : newest answer of the guard to anything; None before the first.
+    newest : newest answer of the guard to any message; None before the first.
     to_command : newest answer to a command of a stream; None before the first since arming.
     answer_within : time in which the guard must answer a request, in s.
     unanswered_pings : number of pings since the last message of the guard.
@@ -188,7 +189,7 @@ class Exchange:
         self._channel = channel
         self._numbers = itertools.count(1)
         self._receiving = threading.Lock()
-        self._answers: dict[int, GuardAnswer] = {}  # to requests that are waited for
+        self._answers: dict[int, GuardAnswer] = {}  # to requests with a waiting thread
         self._waiting: set[int] = set()
         self._unanswered: deque[tuple[int, float]] = deque()  # commands, and when they were sent
         self._answered = 0  # sequence number of the newest answer
@@ -201,7 +202,7 @@ class Exchange:
         Raises
         ------
         DeviceError
-            The guard is gone, or does not answer.
+            The guard has ended, or does not answer.
         """
         sequence, now = next(self._numbers), time.monotonic()
         pressures = np.asarray(goal.pressures, dtype=float)
@@ -214,7 +215,7 @@ class Exchange:
         Raises
         ------
         DeviceError
-            The guard is gone, or takes nothing.
+            The guard has ended, or does not accept the command.
         """
         sequence, now = next(self._numbers), time.monotonic()
         pressures = np.asarray(command.pressures, dtype=float)
@@ -230,12 +231,12 @@ class Exchange:
         self._receive()
 
     def ask(self, do: str, **about: Any) -> GuardAnswer:
-        """Send a request and return the answer, which may be that it failed.
+        """Send a request and return the answer, which may report a failure.
 
         Raises
         ------
         DeviceError
-            The guard is gone, or does not answer.
+            The guard has ended, or does not answer.
         """
         return self._answer_to(GuardRequest(next(self._numbers), do, about), f"'{do}'")
 
@@ -257,23 +258,23 @@ class Exchange:
             self._answers.pop(sequence, None)
 
     def ping(self) -> None:
-        """Ask for a sign of life and receive what has come; does not wait."""
+        """Request a sign of life and receive what has arrived; do not wait."""
         self._channel.send(GuardRequest(0, "ping"))
         self.unanswered_pings += 1
         self._receive()
 
     def take_poses(self) -> tuple[PoseSample, ...]:
-        """Return the tracker samples that have come since the last call."""
+        """Return the tracker samples that have arrived since the last call."""
         self._receive()
         return tuple(self._poses.popleft() for _ in range(len(self._poses)))
 
     @property
     def closed(self) -> bool:
-        """Whether the connection is closed, by the guard's end or from here."""
+        """Whether the connection is closed, by either end."""
         return self._channel.closed
 
     def must_live(self) -> None:
-        """Raise `DeviceError` if the guard is gone."""
+        """Raise `DeviceError` if the guard has ended."""
         if self.closed:
             raise DeviceError(
                 "the guard process has ended; the supply is vented directly, as far as it answers"
@@ -297,7 +298,7 @@ class Exchange:
             raise DeviceError(f"the guard process did not answer to {what} in time")
 
     def _receive(self, wait: float = 0.0) -> None:
-        """Receive what has come; wait for a message for up to `wait` s, but never for long."""
+        """Receive what has arrived; wait up to `wait` s for a message, but never for long."""
         if not self._receiving.acquire(timeout=wait):
             return  # another thread receives, also for this one
         try:
@@ -319,7 +320,7 @@ class Exchange:
             if message.broken != self._broken:
                 self._broken = message.broken
                 _log.warning("the guard could not understand %d messages so far", message.broken)
-            self._answered = max(self._answered, message.sequence)  # 0: unasked
+            self._answered = max(self._answered, message.sequence)  # 0: a report, no answer
             while self._unanswered and self._unanswered[0][0] <= message.sequence:
                 self._unanswered.popleft()
             if message.sequence in self._waiting:
@@ -329,10 +330,10 @@ class Exchange:
 class GuardLink:
     """Commands a supply through the guard process that owns it; see `stiffopt.safety.guard`.
 
-    It takes streams, as an `Outlet`, and goals, as a `GoalFollower` does. Times are those of
-    `time.monotonic`. Any thread may call any method. When the guard has vented by itself, `apply`,
-    `pursue` and `arm` raise `GuardTripped` once; after that, or after `vent`, `arm` works again.
-    When the guard is gone, or hangs, the supply is vented directly, see `GuardWatch`.
+    It accepts streams, as an `Outlet`, and goals, as a `GoalFollower`. Times are those of
+    `time.monotonic`. Any thread may call any method. When the guard has vented on its own, `apply`,
+    `pursue` and `arm` raise `GuardTripped` once; after that, or after `vent`, `arm` works again. If
+    the guard has ended or hangs, the supply is vented directly, see `GuardWatch`.
 
     Parameters
     ----------
@@ -341,15 +342,15 @@ class GuardLink:
     limits :
         Limits of the commands.
     spare :
-        Second object for the same supply, with which it is vented directly when the guard is gone;
-        never opened before. None for a simulated supply, which is gone with its guard.
+        Second object for the same supply, never opened before, for venting directly when the guard
+        has ended. None for a simulated supply, which ends with its guard.
     json_lines :
         Whether the guard writes JSON lines on stderr instead of sentences.
 
     Attributes
     ----------
     has_dump_valve : whether venting also opens a valve.
-    real_time : which real-time privileges the guard has got, in words; known after `open`.
+    real_time : the guard's real-time privileges, in words; known after `open`.
     """
 
     def __init__(
@@ -374,7 +375,7 @@ class GuardLink:
         self._rescue_time = (
             0.0 if spare is None else max(CLIENT.rescue, 2 * CLIENT.hung_calls * spare.patience)
         )
-        self._told = 0  # trips of the guard that the caller has been told of
+        self._told = 0  # trips of the guard that the caller knows of
 
     # start and end -------------------------------------------------------------------------------
 
@@ -419,7 +420,7 @@ class GuardLink:
                 watch.wait(self._rescue_time)
             watch.stop()
         if not lost:
-            with suppress(DeviceError):  # its exit code tells more
+            with suppress(DeviceError):  # its exit code says more
                 self._ask("close")
         code = self._end()
         if code != 0 and not (watch is not None and watch.vent(self._rescue_time)):
@@ -445,7 +446,7 @@ class GuardLink:
         return self._process is not None and self._process.alive
 
     def _has_ended(self) -> bool:
-        """Whether the guard has ended; waits briefly for one whose connection is closed already."""
+        """Whether the guard has ended; wait briefly if its connection is already closed."""
         if self._process is None:
             return True
         closed = self._exchange is None or self._exchange.closed
@@ -453,9 +454,9 @@ class GuardLink:
 
     @property
     def hung(self) -> bool:
-        """Whether the guard runs, but has not answered for so long that it must be hung.
+        """Whether the guard runs, but has been silent for so long that it must hang.
 
-        Unanswered pings are counted, not seconds, since this process may have been stopped too.
+        Unanswered pings are counted instead of seconds, since this process may have been stopped.
         """
         pings = 0 if self._exchange is None else self._exchange.unanswered_pings
         longest = (
@@ -466,7 +467,7 @@ class GuardLink:
         return self.alive and pings * CLIENT.ping > longest
 
     def ping(self) -> None:
-        """Ask the guard for a sign of life without waiting for it."""
+        """Request a sign of life from the guard; do not wait for it."""
         if self._exchange is not None:
             self._exchange.ping()
 
@@ -493,14 +494,14 @@ class GuardLink:
         Raises
         ------
         GuardTripped
-            The guard had vented by itself and the caller had not been told yet.
+            The guard had vented on its own and the caller did not know yet.
         DeviceError
             The supply or the guard fails.
         """
         self._arm(goals=False)
 
     def arm_for_goals(self) -> None:
-        """Arm for goals; all set-points are 0 until the first one comes.
+        """Arm for goals; all set-points are 0 until the first one.
 
         Raises
         ------
@@ -530,7 +531,7 @@ class GuardLink:
 
     @property
     def armed(self) -> bool:
-        """Whether the guard takes commands."""
+        """Whether the guard accepts commands."""
         return self.alive and self._answer("ping").armed
 
     @property
@@ -539,13 +540,13 @@ class GuardLink:
         return self._answer("ping").commanded.copy()
 
     def vent(self) -> None:
-        """Let all pressure out at once; waits for nothing but the guard.
+        """Let all pressure out at once; wait for nothing but the guard.
 
         Raises
         ------
         DeviceError
-            The supply did not take it; the guard tries on as long as it lives. Or the guard is
-            gone, and the supply could not be vented directly yet.
+            The supply did not accept it; the guard keeps trying as long as it lives. Or the guard
+            has ended, and the supply could not be vented directly yet.
         """
         try:
             self._told = self._ask("vent").trips
@@ -569,7 +570,7 @@ class GuardLink:
         Raises
         ------
         DeviceError
-            The guard is gone, does not answer or has vented by itself, or the supply fails.
+            The guard has ended, does not answer or has vented on its own, or the supply fails.
         """
         exchange = self._open_exchange()
         exchange.send(command, CLIENT.fresh)
@@ -579,7 +580,7 @@ class GuardLink:
         exchange.must_live()
         if newest is None or silence > max(CLIENT.silent, self._patience):
             raise DeviceError(f"the guard process has not answered for {silence:.2g} s")
-        # the newest set-points and readings, with the outcome of the newest command
+        # newest set-points and readings, with the outcome of the newest command
         return _applied(newest, exchange.to_command or newest)
 
     def pursue(self, goal: PressureCommand) -> Applied:
@@ -588,9 +589,9 @@ class GuardLink:
         Raises
         ------
         GuardTripped
-            The guard has vented by itself.
+            The guard has vented on its own.
         DeviceError
-            The guard is gone or does not answer, or the supply fails.
+            The guard has ended or does not answer, or the supply fails.
         """
         answer = self._open_exchange().send_goal(goal)
         self._check_trip(answer)
@@ -628,7 +629,7 @@ class GuardLink:
         return self._ask(word, **about).value
 
     def take_poses(self) -> tuple[PoseSample, ...]:
-        """Return the new samples of a simulated tracker; does not wait."""
+        """Return the new samples of a simulated tracker; do not wait."""
         return () if self._exchange is None else self._exchange.take_poses()
 
     def _ask(self, do: str, **about: Any) -> GuardAnswer:
@@ -639,7 +640,7 @@ class GuardLink:
         return answer
 
     def _answer(self, do: str, **about: Any) -> GuardAnswer:
-        """Return the answer to a request, also if it failed."""
+        """Return the answer to a request, even if it failed."""
         return self._open_exchange().ask(do, **about)
 
     def _open_exchange(self) -> Exchange:

@@ -1,7 +1,7 @@
-"""What the guard process owns, and how its client uses a simulated rig that lives there.
+"""The devices that the guard process owns, and the client's access to those of a simulated rig.
 
-The guard owns the supply, behind the gate. A simulated rig in real time is one world with its arm,
-so its tracker and probe live in the guard process too (`HostedDevices`); the client has
+The guard owns the supply, behind the gate. A simulated rig in real time is one world together with
+its arm, so its tracker and probe are in the guard process too (`HostedDevices`). The client uses
 `ForwardedTracker` and `ForwardedProbe` in their place.
 """
 
@@ -35,7 +35,7 @@ from stiffopt.safety.vent_line import VentLine
 if TYPE_CHECKING:
     from stiffopt.safety.guard_client import GuardLink
 
-_LOOK = 0.005  # s between two looks at a stage that moves
+_LOOK = 0.005  # s between checks of a moving stage
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Owned:
     timeout : silence of a stream after which the guard vents, in s.
     line : makes the vent line on which the guard listens for `stiffopt vent`.
     epoch : time 0 of the rig's clock on `time.monotonic`, in s.
-    hosted : tracker, probe and truth of a simulated rig; None on real devices.
+    hosted : tracker, probe and truth of a simulated rig; None for real devices.
     """
 
     gate: SafetyGate
@@ -61,7 +61,7 @@ class Owned:
 
 
 def owned(description: RigDescription, robot: RobotDescription) -> Owned:
-    """Make what the guard of a rig owns; nothing is connected yet.
+    """Make what the guard of a rig owns, without connecting to anything.
 
     Raises
     ------
@@ -83,7 +83,7 @@ def owned(description: RigDescription, robot: RobotDescription) -> Owned:
 
 
 def simulated_endpoint(description: RigDescription) -> str:
-    """Return the name under which guards of a simulated rig listen; several may share it."""
+    """Return the name at which guards of a simulated rig listen; several may share it."""
     return f"simulated {description.name}"
 
 
@@ -101,11 +101,11 @@ class HostedDevices:
         self._tracker, self._probe = rig.tracker, rig.probe
 
     def poses(self) -> Sequence[PoseSample]:
-        """Let simulated time reach the present and return the new samples of the tracker."""
+        """Advance simulated time to the present; return the tracker's new samples."""
         if self._tracker is None:
             return ()
         self._tracker.open()
-        with suppress(DeviceError):  # a simulation that fails: the supply reports that too
+        with suppress(DeviceError):  # the simulation fails, which the supply reports too
             return self._tracker.read()
         return ()
 
@@ -115,7 +115,7 @@ class HostedDevices:
         Raises
         ------
         DeviceError
-            There is no such word, or the probe fails.
+            There is no such request, or the probe fails.
         InputError
             There is no such fault, or the rig file does not allow faults.
         """
@@ -133,7 +133,7 @@ class HostedDevices:
         raise DeviceError(f"a simulated rig knows nothing of '{word}'")
 
     def _use_probe(self, probe: ForceProbe, word: str, about: dict[str, Any]) -> Any:
-        """Carry out a request of a `ForwardedProbe`; a move only begins here."""
+        """Carry out a request of a `ForwardedProbe`; a move only starts here."""
         probe.open()
         match word:
             case "probe-align":
@@ -155,14 +155,14 @@ class HostedDevices:
 
 
 class ForwardedTracker(PoseTracker):
-    """The client's side of a hosted tracker; its poses are those of the tip in the base already."""
+    """The client's side of a hosted tracker; its poses are already those of the tip in the base."""
 
     def __init__(self, link: GuardLink) -> None:
         super().__init__(clock=SystemClock())
         self._link = link
 
     def _open(self) -> None:
-        self._link.take_poses()  # drop what was seen before
+        self._link.take_poses()  # drop old samples
 
     def _close(self) -> None:
         pass
@@ -198,7 +198,7 @@ class ForwardedProbe(ForceProbe):
         self._ask("withdraw")
 
     def move_to(self, position: float, speed: float) -> None:
-        """Move the plate and return when it is there; see `ForceProbe.move_to`."""
+        """Move the plate and return when it has arrived; see `ForceProbe.move_to`."""
         if not (np.isfinite(position) and np.isfinite(speed) and speed > 0):
             raise CommandError("expected a finite position and a speed above 0")
         self._ask("move", position=float(position), speed=float(speed))

@@ -1,7 +1,7 @@
 """Messages between the guard process and its client, and the local socket that carries them.
 
-Each message is one packet of a ``SOCK_SEQPACKET`` socket. Commands, answers and poses, which are
-frequent, are packed binary; the rest is JSON. All times are on `time.monotonic`, which is one clock
+Each message is one packet of a ``SOCK_SEQPACKET`` socket. The frequent ones (commands, answers and
+poses) are packed in binary form, the others are JSON. All times are on `time.monotonic`, one clock
 for all processes of a machine.
 """
 
@@ -31,7 +31,7 @@ _AT_ONCE = 1000  # packets per receive: a flood must not keep the receiver from 
 _SEQUENCE_END = 1 << 64
 _POSE = 10  # numbers per pose: time, received, frame, position (3), quaternion (4)
 JSON = "json"
-"""Command line argument with which a guard process writes JSON lines on stderr."""
+"""Command line argument that makes a guard process write JSON lines on stderr."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class CommandFrame:
 
     Attributes
     ----------
-    sequence : number of the message; the client counts all that it sends.
+    sequence : number of the message; the client counts all its messages.
     sent : when it was sent, in s.
     time, valid_for : when the command was given and for how long it is valid, in s.
     pressures : (n,), in Pa.
@@ -69,13 +69,13 @@ class GuardAnswer:
 
     Attributes
     ----------
-    sequence : number of the message that is answered; 0: the guard reports by itself. Older
-        commands that have no answer were overtaken by this one.
+    sequence : number of the message that is answered; 0: a report of the guard. It replaces the
+        missing answers to older commands.
     commanded : set-points (n,) of the supply, in Pa.
-    measured, time : measured pressures (n,), in Pa, and when they were read; NaN where unknown.
-    armed : whether the guard takes commands.
-    limited, force_limited : whether this command was limited at all, and for the total force.
-    trips : how often the guard has tripped so far.
+    measured, time : measured pressures (n,), in Pa, and when they were read; NaN if unknown.
+    armed : whether the guard accepts commands.
+    limited, force_limited : whether the command was limited at all, and by the total force.
+    trips : number of trips of the guard so far.
     broken : number of packets so far that the guard could not decode.
     tripped : why the guard is tripped now; empty if it is not.
     refused : why the command was refused; empty if it was carried out.
@@ -121,7 +121,7 @@ class GuardRequest:
 
     Attributes
     ----------
-    sequence : number of the message; the client counts all that it sends.
+    sequence : number of the message; the client counts all its messages.
     do : name of the request.
     about : its arguments by name.
     """
@@ -137,7 +137,7 @@ class GuardRequest:
 
 @dataclass(frozen=True)
 class GuardNotice:
-    """A report of a guard that starts: ``notice``, then ``ready`` or ``failed``.
+    """A report of a starting guard: ``notice``, then ``ready`` or ``failed``.
 
     Attributes
     ----------
@@ -155,7 +155,7 @@ class GuardNotice:
 
 @dataclass(frozen=True)
 class TrackedPoses:
-    """Samples of a simulated tracker that lives in the guard process."""
+    """Samples of a simulated tracker in the guard process."""
 
     samples: tuple[PoseSample, ...]
 
@@ -208,7 +208,7 @@ def unpack(packet: bytes) -> Message:
 
 
 def _require(*given: tuple[Any, type]) -> None:
-    """Raise `ValueError` unless each value is of its type; True is no integer here."""
+    """Raise `ValueError` unless each value is exactly of its type; True is no integer here."""
     for value, kind in given:
         if type(value) is not kind:
             raise ValueError(f"expected {kind.__name__}, not {type(value).__name__}")
@@ -234,7 +234,7 @@ def _pose(row: Array) -> PoseSample:
 
 
 class GuardChannel:
-    """One end of the socket between guard and client; it never blocks on the other end.
+    """One end of the socket between guard and client; it never waits for the other end.
 
     Parameters
     ----------
@@ -243,7 +243,7 @@ class GuardChannel:
 
     Attributes
     ----------
-    closed : whether either end has been closed.
+    closed : whether either end is closed.
     broken : number of packets that could not be decoded and were dropped.
     """
 
@@ -258,7 +258,7 @@ class GuardChannel:
         self.broken = 0
 
     def wake_for(self, descriptors: Sequence[int]) -> None:
-        """Let `receive` also return early when one of these file descriptors becomes readable."""
+        """Make `receive` return early if one of these file descriptors becomes readable."""
         for descriptor in descriptors:
             self._poll.register(descriptor, select.POLLIN)
 
@@ -303,7 +303,7 @@ class GuardChannel:
         return any(events & gone for _, events in self._hang_up.poll(0))
 
     def close(self) -> None:
-        """Close this end, which tells the other one."""
+        """Close this end, which the other one notices."""
         self.closed = True
         self._end.close()
 

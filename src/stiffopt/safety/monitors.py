@@ -33,33 +33,33 @@ class Trouble:
 class PressureMonitor:
     """Compares the measured pressures of n channels with their commands.
 
-    It is a fault at once if readings do not come any more, if a reading is far outside the limits,
-    or if a channel that was measured before reads NaN. It is a fault if a reading is outside what a
-    healthy regulator can have by now, see `ExpectedPressure`, by more than the tolerance
-    `Safety.max_pressure_error`, for `Safety.pressure_error_time`: a leak if it is below, a stuck
-    regulator if it is above.
+    Three things are a fault at once: readings no longer arrive, a reading is far outside the
+    limits, or a channel that was measured before reads NaN. A reading that is outside the range of
+    a healthy regulator, see `ExpectedPressure`, by more than the tolerance
+    `Safety.max_pressure_error` is a fault after `Safety.pressure_error_time`: a leak if it is
+    below, a stuck regulator if it is above.
 
-    A leak and a regulator whose supply has too little pressure both read below the command. They
-    are told apart by what the channel has reached since it was armed: a regulator at the end of its
-    supply still reaches that, a leak does not. So a channel that stays below its command by half
-    the tolerance is saturated, which is an alarm; one that stays below what it has reached leaks.
-    While its command is at rest, a tenth of the pressure is enough for a leak, if that is more than
-    half the tolerance. A channel that leaked from the beginning is saturated until its command
-    changes, and is found by its response, see `Shortage`.
+    A leak and a regulator whose supply has too little pressure both read below the command. The
+    pressure that the channel has reached since it was armed distinguishes them: a regulator at the
+    end of its supply still reaches it, a leak does not. So a channel that stays below its command
+    by half the tolerance is saturated, which is an alarm; one that stays below what it has reached
+    leaks. While its command is at rest, the loss of a tenth of the pressure counts as a leak, if
+    that is more than half the tolerance. A channel that leaked from the beginning is saturated
+    until its command changes; then its response shows the leak, see `Shortage`.
 
     Several channels that fall together, while none reads more, are on a sagging line and saturated,
-    see `SupplyLine`. One alone that falls below what it has reached counts as leaking, though its
-    line might sag too.
+    see `SupplyLine`. A single one that falls below what it has reached counts as leaking, though
+    its line might sag too.
 
-    While nothing has been commanded since arming, three readings above the tolerance are enough for
-    a stuck regulator.
+    Before the first command since arming, three readings above the tolerance show a stuck
+    regulator.
 
     Parameters
     ----------
     limits :
         Limits of the commands.
     safety :
-        The tolerance, how long it may be exceeded, and how old a reading may be.
+        The tolerance, how long it may be exceeded, and the greatest age of a reading.
     regulation :
         Slowest response of healthy regulators.
     slew :
@@ -68,7 +68,7 @@ class PressureMonitor:
     Attributes
     ----------
     saturated : ndarray of bool
-        Channels (n,) that stay below what they should have; replaced when it changes.
+        Channels (n,) that stay below what they should have; a new array when it changes.
     unsupervised : tuple of int
         Channels, counted from 0, that have never been measured.
     """
@@ -84,17 +84,17 @@ class PressureMonitor:
         self._time, self._oldest = safety.pressure_error_time, safety.command_timeout
         self._tolerance: Array = np.array(most)
         self._half: Array = 0.5 * most
-        self._reached: Array = np.zeros(n)  # the highest readings since it was armed
+        self._reached: Array = np.zeros(n)  # highest readings since arming
         self._shortage = Shortage(self._tolerance, safety.pressure_error_time)
         self._line = SupplyLine(self._half)
-        self._still: Array = np.full(n, np.inf)  # time since which each command is at rest
+        self._still: Array = np.full(n, np.inf)  # time when each command came to rest
         self._near: Array = np.zeros(n)
         self._idle, self._rising = True, 0  # nothing commanded yet; readings above the tolerance
         self._most = np.stack(
             (most, most, 0.5 * most)
         )  # tolerances (3, n) of: leak, stuck, saturated
-        self._least = np.stack((0.5 * most, most, 0.5 * most))  # least values of these
-        self._for: Array = np.zeros((3, n))  # s for which exceeded, less s for which not
+        self._least = np.stack((0.5 * most, most, 0.5 * most))  # smallest values of `_most`
+        self._for: Array = np.zeros((3, n))  # time exceeded minus time not exceeded, in s
         self._doubtful = False  # whether any of these times is not 0
         self._excess: Array = np.zeros((3, n))
         span = limits.high - np.minimum(limits.low, 0.0)
@@ -114,7 +114,7 @@ class PressureMonitor:
         self._idle = self._idle and not commanded.any()
 
     def clear(self) -> None:
-        """Start over, as after arming."""
+        """Restart, as after arming."""
         self._for[:] = 0.0
         self._doubtful = False
         self._reached = np.zeros_like(self._reached)
@@ -124,7 +124,7 @@ class PressureMonitor:
         self.saturated = np.zeros_like(self.saturated)
 
     def update(self, now: float, reading: PressureReading) -> Trouble | None:
-        """Judge a reading; return the fault, if there is one."""
+        """Judge a reading; return a fault, or None."""
         trouble = self.implausible(now, reading)
         if trouble is not None:
             return trouble
@@ -165,7 +165,7 @@ class PressureMonitor:
         return self._found(lasting, p)
 
     def _found(self, lasting: NDArray[np.bool_], p: Array) -> Trouble | None:
-        """Return the fault of a channel whose reading (n,) was wrong for long enough."""
+        """Return the fault of a channel whose reading (n,) was wrong for too long, or None."""
         for channel in np.flatnonzero(lasting[1]):
             return self._stuck(int(channel), p)
         for channel in np.flatnonzero(lasting[0]):
@@ -186,7 +186,7 @@ class PressureMonitor:
         )
 
     def implausible(self, now: float, reading: PressureReading) -> Trouble | None:
-        """Return the fault of a reading that is impossible, by age, shape or value."""
+        """Return the fault of a reading with an impossible age, shape or value, or None."""
         p = reading.pressures
         if not -self._oldest <= now - reading.time <= self._oldest:
             return Trouble(
@@ -217,7 +217,7 @@ class PressureMonitor:
         self.unsupervised = tuple(int(c) for c in np.flatnonzero(~self._measures))
 
     def under_pressure(self, reading: PressureReading) -> str:
-        """Return which channel of a vented supply is not at 0, in words; empty if all are."""
+        """Report a channel of a vented supply that is not at 0; empty if all are at 0."""
         p = reading.pressures
         for channel in np.flatnonzero(np.abs(p) > self._tolerance):  # NaN is not
             return f"channel {channel + 1} reads {_bar(p[channel])}, though it is vented"

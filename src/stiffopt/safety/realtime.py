@@ -31,12 +31,12 @@ _NICE = -10  # of the other threads of a process that has a real-time thread
 
 @dataclass(frozen=True)
 class RealTimeReport:
-    """Which real-time privileges a thread has got.
+    """The real-time privileges of a thread.
 
     Attributes
     ----------
-    granted : privileges, in a few words each.
-    denied : privileges that it has not got, why, and how to allow them: a sentence each.
+    granted : privileges that it has, in a few words each.
+    denied : privileges that it lacks, why, and how to allow them: a sentence each.
     """
 
     granted: tuple[str, ...]
@@ -52,12 +52,12 @@ class RealTimeReport:
 
 @contextmanager
 def real_time(priority: int = 80) -> Iterator[RealTimeReport]:
-    """Context in which the calling thread is real-time; everything is restored at its end.
+    """Make the calling thread real-time in the body; restore everything at its end.
 
     The thread gets a `SCHED_FIFO` priority and exact timers. For the whole process, until the last
-    such context ends, memory is locked, other threads run before other programs, threads switch
-    more often, and garbage is collected only by `tidy`. What is not permitted is left out and
-    reported; nothing is raised.
+    such body ends, memory is locked, other threads run before other programs, threads switch more
+    often, and only `tidy` collects garbage. What the system does not permit is left out and
+    reported; no error is raised.
 
     Parameters
     ----------
@@ -76,15 +76,15 @@ def real_time(priority: int = 80) -> Iterator[RealTimeReport]:
 
 
 def tidy(*, thoroughly: bool) -> None:
-    """Collect garbage, which does not happen by itself while a thread is real-time.
+    """Collect garbage, which is not automatic while a thread is real-time.
 
-    Takes tens of microseconds; if `thoroughly`, some milliseconds, so only while nothing moves.
+    It takes tens of microseconds; if `thoroughly`, some milliseconds, so only while the arm rests.
     """
     gc.collect(2 if thoroughly else 1)
 
 
 def load_of_processors() -> float:
-    """How many processes wanted each processor in the last minute; 0 where that is not known."""
+    """Return the mean number of runnable processes per processor in the last minute; 0: unknown."""
     try:
         return os.getloadavg()[0] / (os.cpu_count() or 1)
     except (AttributeError, OSError):
@@ -159,7 +159,7 @@ def _first_in_first_out(priority: int) -> Step:
 
 
 def _exact_timers() -> tuple[str, Undo]:
-    """Let sleeps end on time instead of up to 50 us later; needs no permission."""
+    """Make sleeps end on time instead of up to 50 us later; needs no permission."""
     libc = _libc()
     if libc is None:
         return "", lambda: None
@@ -169,10 +169,10 @@ def _exact_timers() -> tuple[str, Undo]:
 
 
 def _favoured_threads() -> tuple[str, Undo]:
-    """Let the other threads of this process run before other programs.
+    """Make the other threads of this process run before other programs.
 
-    One that waits for a processor while it has Python's lock keeps the real-time thread waiting.
-    Threads that they start inherit it.
+    A thread that waits for a processor while it has Python's lock delays the real-time thread.
+    Threads started by them inherit this.
     """
     try:
         threads = [int(name) for name in os.listdir("/proc/self/task")]
@@ -192,7 +192,7 @@ def _favoured_threads() -> tuple[str, Undo]:
 
 
 def _locked_memory() -> tuple[str, Undo]:
-    """Lock used memory, if no limit of locked memory could be exceeded later."""
+    """Lock memory in use, unless a limit of locked memory could be exceeded later."""
     libc = _libc()
     if libc is None:
         raise _NotPermittedError("memory cannot be locked (the C library has no mlockall)")
@@ -216,7 +216,7 @@ def _locked_memory() -> tuple[str, Undo]:
 
 
 def _held_collector() -> tuple[str, Undo]:
-    if not gc.isenabled():  # somebody else sees to it
+    if not gc.isenabled():  # another part of the program has disabled it
         return "", lambda: None
     gc.collect()
     gc.freeze()

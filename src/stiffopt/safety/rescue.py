@@ -1,4 +1,4 @@
-"""Venting without a guard: the client of a guard that is gone vents the supply itself, at once."""
+"""Venting without a guard: when the guard has ended, its client vents the supply at once."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _log = logging.getLogger(__name__)
 def vent_directly(supply: PressureSupply) -> bool:
     """Vent a supply; return False if another program has claimed it.
 
-    Venting is allowed even then, but that program may raise the pressure again.
+    Even then it is vented, but that program may raise the pressure again.
 
     Raises
     ------
@@ -35,7 +35,7 @@ def vent_directly(supply: PressureSupply) -> bool:
     except DeviceError:
         alone = False
     try:
-        with supply:  # to open it vents it, and so does to close it
+        with supply:  # opening and closing both vent
             pass
     finally:
         claim.release()
@@ -43,11 +43,11 @@ def vent_directly(supply: PressureSupply) -> bool:
 
 
 class WatchedGuard(Protocol):
-    """What a watch needs of a `stiffopt.safety.guard_client.GuardLink`."""
+    """The part of a `stiffopt.safety.guard_client.GuardLink` that a watch needs."""
 
     @property
     def pid(self) -> int | None:
-        """Process id; None where it is not known."""
+        """Process id; None if unknown."""
 
     @property
     def alive(self) -> bool:
@@ -58,21 +58,21 @@ class WatchedGuard(Protocol):
         """Whether it has not answered for too long."""
 
     def ping(self) -> None:
-        """Ask for a sign of life."""
+        """Request a sign of life."""
 
     def kill(self) -> None:
         """Kill the process."""
 
 
 class GuardWatch:
-    """Watches a guard in a thread of its own and vents the supply when the guard is gone or hung.
+    """Watches a guard in a separate thread and vents the supply when the guard has ended or hangs.
 
     Parameters
     ----------
     guard :
         The client's link to the guard.
     supply :
-        Another object for the guard's supply, not open; None: the supply is simulated and gone with
+        Another object for the guard's supply, not open; None: the supply is simulated and ends with
         the guard.
 
     Attributes
@@ -97,7 +97,7 @@ class GuardWatch:
         self._thread.start()
 
     def stop(self, timeout: float = 1.0) -> None:
-        """Stop watching: the guard is about to end regularly."""
+        """Stop watching, because the guard is about to end regularly."""
         self._ended.set()
         if threading.current_thread() is not self._thread:
             self._thread.join(timeout)
@@ -113,7 +113,7 @@ class GuardWatch:
     def vent(self, timeout: float = 0.0) -> bool:
         """Vent the supply of a lost guard from this thread; return whether it is vented.
 
-        It is tried once, and again until `timeout` s are over.
+        It is tried at least once, and repeated for up to `timeout` s.
         """
         end = time.monotonic() + timeout
         while not self._try() and time.monotonic() < end:
@@ -123,7 +123,7 @@ class GuardWatch:
     def _run(self) -> None:
         try:
             if self._supply is not None:
-                with suppress(Exception):  # whatever fails, go on to watch
+                with suppress(Exception):  # whatever fails, the watch must go on
                     self._supply.prepare()
             self._watch()
             if not self._ended.is_set():
@@ -135,7 +135,7 @@ class GuardWatch:
         """Return when the guard has ended, or after `stop`."""
         poll = select.poll()
         with ExitStack() as stack:
-            with suppress(OSError, AttributeError):  # without pidfd it is only polled
+            with suppress(OSError, AttributeError):  # without pidfd, polling alone must do
                 end = os.pidfd_open(self._guard.pid or 0)
                 stack.callback(os.close, end)
                 poll.register(end, select.POLLIN)
@@ -147,7 +147,7 @@ class GuardWatch:
                         self._guard.kill()
 
     def _rescue(self) -> None:
-        """Vent, and try again until the supply answers."""
+        """Vent; repeat until the supply answers."""
         told = False
         while not self._try():
             if not told:
@@ -159,14 +159,14 @@ class GuardWatch:
             _log.warning("the guard is gone; the supply was vented directly")
 
     def _try(self) -> bool:
-        """Vent the supply unless it is vented already; return whether it is."""
+        """Vent the supply unless it is already vented; return whether it is vented."""
         with self._venting:
             if self.rescued.is_set():
                 return True
             try:
-                if self._supply is not None:  # a simulated arm is gone with its guard
+                if self._supply is not None:  # a simulated arm ends with its guard
                     vent_directly(self._supply)
-            except Exception as error:  # a driver's bug is no reason not to try again
+            except Exception as error:  # even a driver's bug is followed by another attempt
                 self.error = str(error) or type(error).__name__
                 return False
             self.error = ""

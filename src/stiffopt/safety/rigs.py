@@ -1,4 +1,4 @@
-"""Opening a rig so that every command to its supply passes the safety gate."""
+"""Functions that open a rig so that every command to its supply passes the safety gate."""
 
 from __future__ import annotations
 
@@ -28,23 +28,23 @@ from stiffopt.safety.hosted import ForwardedProbe, ForwardedTracker
 def open_rig(path: str | os.PathLike[str], *, real_time: bool = False) -> Rig:
     """Return the rig that a rig file describes; nothing is connected before `Rig.open`.
 
-    Its supply takes goals, see `stiffopt.safety.goal.GoalSupply`: the limits of robot, rig, supply
-    and channels hold for all commands, and an arm that nobody commands any more is vented.
+    Its supply accepts goals, see `stiffopt.safety.goal.GoalSupply`: the limits of robot, rig,
+    supply and channels apply to all commands, and an arm without further commands is vented.
 
     Parameters
     ----------
     path :
         The rig file.
     real_time :
-        Whether time passes by itself on a simulated rig; otherwise it passes while one sleeps on
-        the rig's clock. Real devices always run in real time.
+        Whether time passes by itself on a simulated rig; otherwise it passes while the program
+        sleeps on the rig's clock. Real devices always run in real time.
 
     Raises
     ------
     FileError
         A file is wrong.
     MissingExtraError
-        The simulator is needed and numba is not installed.
+        The rig is simulated and numba is not installed.
     """
     description = load_rig_description(path)
     robot = load_description(description.robot, base=Path(path).parent)
@@ -65,7 +65,7 @@ def rig_for_programs(
 def gated_rig(rig: Rig, safety: Safety, period: float) -> Rig:
     """Put gate and goal follower in front of the supply of a rig of bare devices, in place.
 
-    For rigs on a simulated clock, all in this process: the follower is ticked by the rig's clock.
+    For rigs on a simulated clock, all in this process: the rig's clock ticks the follower.
 
     Parameters
     ----------
@@ -94,15 +94,15 @@ def guarded_rig(
 ) -> tuple[Rig, GuardLink]:
     """Return a rig in real time whose supply a guard process owns, and the link to the guard.
 
-    Nothing is started before one of them is opened. Opening or closing the rig opens or closes the
-    link too.
+    Nothing starts before the rig or the link is opened. Opening or closing the rig opens or closes
+    the link too.
 
     Parameters
     ----------
     rig :
         A rig file, or its content.
     robot :
-        Robot of the rig; needed if its content is given.
+        Robot of the rig; required with the content of a rig file.
     json_lines :
         Whether the guard writes JSON lines on stderr.
 

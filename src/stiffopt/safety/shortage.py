@@ -1,7 +1,7 @@
 """Why a channel stays below its command: a leak, or too little pressure in the supply line.
 
-`Shortage` tells the two apart by how one channel responds when its command changes, `SupplyLine` by
-several channels that fall together.
+`Shortage` distinguishes the two by the response of one channel to a change of its command,
+`SupplyLine` by several channels that fall together.
 """
 
 from __future__ import annotations
@@ -17,24 +17,24 @@ Array = NDArray[np.float64]
 class Shortage:
     """Finds channels that have leaked from the beginning, by their response to a changed command.
 
-    One command and one reading cannot tell a leak from a regulator whose supply has no more
+    One command and one reading cannot distinguish a leak from a regulator whose supply has no more
     pressure: both channels stay below their commands. But the latter reads the same at any command,
     whereas behind a leak the pressure rises and falls with the command, roughly in proportion. So
-    for each channel that is short at rest its command and reading are remembered; if the command
-    changes, and the channel at rest again is still short but reads more, or less, accordingly, it
+    the command and reading of each channel that is short at rest are remembered. If the command
+    changes, and the channel at rest again is still short but reads accordingly more or less, it
     leaks.
 
     A disconnected tube has no pressure at any command, like a line without pressure. A channel
-    with less than the share `nothing` of what is due, while another one has more than the share
-    `much` of it, counts as leaking, also while commands move. In between, a leak that takes all
-    that its regulator can deliver cannot be told from a line that has no more.
+    below the share `nothing` of its expected pressure counts as leaking if another one is above the
+    share `much` of it, even while commands move. Between these cases, a leak that takes all that
+    its regulator can deliver is indistinguishable from a line that has no more.
 
     Parameters
     ----------
     tolerance :
         Shortage (n,) that is too much, in Pa; a response must be at least half of it.
     time :
-        For how long that must be so, in s.
+        Minimum duration of these conditions, in s.
     """
 
     def __init__(self, tolerance: Array, time: float) -> None:
@@ -64,11 +64,11 @@ class Shortage:
         elapsed :
             Time since the last reading, in s.
         short :
-            Channels (n,) that have been below what is due for long enough, for no known reason.
+            Channels (n,) that have been below what is due for too long, for no known reason.
         due, reading :
             Expected and measured pressures (n,), in Pa.
         at_rest :
-            Channels (n,) whose commands are at rest; readings of others tell nothing here.
+            Channels (n,) whose commands are at rest; readings of others show nothing here.
         """
         self._due[~short] = self._gave[~short] = np.nan
         first = short & at_rest & np.isnan(self._due)
@@ -93,21 +93,20 @@ class Shortage:
 
 
 class SupplyLine:
-    """Tells a sagging supply line from leaks, by channels that fall together.
+    """Distinguishes a sagging supply line from leaks, by channels that fall together.
 
-    Regulators on a line with too little pressure all pass on the pressure of the line. So if a
-    channel is short, another one reads the same and is short too, at least by half as much, and no
-    channel reads more, then that is the pressure of the line. A leaking channel reads less than the
-    others, or is short alone.
+    Regulators on a line with too little pressure all deliver the pressure of the line. That is
+    found if one channel is short, another one reads the same and is short by at least half as much,
+    and no channel reads more. A leaking channel reads less than the others, or is the only short
+    one.
 
-    A line that has lost more than half of the highest pressure that was read has failed, rather
-    than sagged.
+    A line that has lost more than half of the highest measured pressure has failed, not sagged.
 
     Parameters
     ----------
     shortage :
-        Pressure (n,) below what is due from which a channel is short, in Pa; readings that differ
-        by less are the same.
+        Pressure (n,) below what is due beyond which a channel is short, in Pa; readings that differ
+        by less count as the same.
 
     Attributes
     ----------
@@ -147,7 +146,7 @@ class SupplyLine:
         highest = float(np.fmax.reduce(reading))
         together = (missing > self._little) & (reading > highest - self._shortage)
         if np.count_nonzero(together) < MONITOR.line_channels or not (together & short).any():
-            self.pressure = max(self.pressure, highest)  # NaN, if nothing is measured, does not win
+            self.pressure = max(self.pressure, highest)  # ignores NaN: nothing measured
             return self._none
         if highest < MONITOR.line_lost * float(reached.max()):
             self.pressure = np.inf

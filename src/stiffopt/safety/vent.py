@@ -19,15 +19,15 @@ from stiffopt.safety.vent_line import SocketPeer, ask_to_vent, trusted
 
 _PATIENCE = 3.0  # s in which a guard must have vented, beyond the time that its driver needs
 _CALLS = 4  # driver calls, at most, that venting takes
-_GONE = 2.0  # s in which a killed process must be gone
+_GONE = 2.0  # s in which a killed process must have ended
 
 
 def vent_rig(path: str | os.PathLike[str]) -> str:
-    """Vent the supply of a rig, by the guard that owns it or else directly; return how, in words.
+    """Vent the supply of a rig, by its guard or else directly; return how, in words.
 
-    A guard that does not answer is killed. If no trusted guard says that it has vented, the supply
-    is vented directly, even if another guard owns it. None of this uses the network, unless the
-    device itself does, and no other user can prevent it.
+    A guard that does not answer is killed. Unless a trusted guard reports that it has vented, the
+    supply is vented directly, even if another guard owns it. None of this uses the network, unless
+    the device itself does, and no other user can prevent it.
 
     Raises
     ------
@@ -55,7 +55,7 @@ def vent_rig(path: str | os.PathLike[str]) -> str:
 
 
 def _vent_by_guards(endpoint: str, patience: float) -> tuple[str, list[str]]:
-    """Call the guards of a supply to vent; return the success and the failures, in words."""
+    """Call the guards of a supply to vent; return success and failures, in words."""
     done, failed = [], []
     for reply in ask_to_vent(endpoint, patience):
         guard = reply.guard
@@ -92,7 +92,7 @@ def _vent_simulated(description: RigDescription) -> str:
 
 
 def _ended(guard: SocketPeer) -> bool:
-    """Kill a guard that does not answer; return whether it is gone."""
+    """Kill a guard that does not answer; return whether it has ended."""
     if guard.pid <= 0:
         return False
     if _is_guard(guard.pid):

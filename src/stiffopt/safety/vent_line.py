@@ -1,11 +1,11 @@
-"""The vent line: a local socket by which anybody entitled can have a guard vent.
+"""The vent line: a local socket by which every entitled user can make a guard vent.
 
 It needs no network, and no other user can block it. Each guard listens at an abstract socket
 address that begins with its supply's endpoint and ends with its process id and a random part, so
 that nobody can take the address first; a caller finds all such addresses in the kernel's table. The
-kernel also tells each side who the other one is: a guard accepts only root and its own user, and
+kernel also identifies each side to the other: a guard accepts only root and its own user, and
 closes all other connections at once; a caller trusts only guards of its own user and root. The
-caller sends ``vent`` and is answered in JSON once the supply is vented.
+caller sends ``vent`` and gets an answer in JSON once the supply is vented.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from stiffopt.safety.claim import address_of
 
 _WORD = b"vent"
 _BACKLOG = 64
-_AT_ONCE = 64  # callers that are accepted in one step
-_WAITING = 8  # callers of this user that have connected and sent nothing yet
+_AT_ONCE = 64  # callers accepted in one step
+_WAITING = 8  # callers that have connected and sent nothing yet
 _STRANGERS = 32  # guards of other users that root calls
-_LEAST = 0.05  # s that each guard has to answer, at least
+_LEAST = 0.05  # s, minimum time for each guard's answer
 _CREDENTIALS = struct.Struct("3i")
 _ANSWER = 4096  # bytes
 
@@ -58,14 +58,14 @@ def _peer(connection: socket.socket) -> SocketPeer:
 
 
 class Caller:
-    """A connection of somebody who is entitled to vent."""
+    """A connection from a user who is entitled to vent."""
 
     def __init__(self, connection: socket.socket, peer: SocketPeer) -> None:
         self._connection = connection
         self.peer = peer
 
     def asks(self) -> bool | None:
-        """Return whether the word ``vent`` has come; None: nothing has come yet."""
+        """Return whether the word ``vent`` has arrived; None: nothing has arrived yet."""
         try:
             return self._connection.recv(64).startswith(_WORD)
         except BlockingIOError:
@@ -74,7 +74,7 @@ class Caller:
             return False
 
     def answer(self, error: str = "") -> None:
-        """Send the outcome, an error or empty if the supply is vented, and hang up."""
+        """Send the outcome (an error, or empty if the supply is vented) and hang up."""
         with suppress(OSError):
             self._connection.send(json.dumps({"error": error}).encode())
         self.hang_up()
@@ -102,7 +102,7 @@ class VentLine:
         return [s.fileno() for s in self._listening]
 
     def wanting_to_vent(self) -> list[Caller]:
-        """Return the callers that want to vent, since the last call; each is to be answered."""
+        """Return callers since the last call that want to vent; each needs an answer."""
         for listening in self._listening:
             self._accept(listening)
         said = [(caller, caller.asks()) for caller in self._callers]
@@ -159,7 +159,7 @@ class Reply:
     ----------
     guard : the guard's process.
     answered : whether it answered.
-    error : why its supply may not be vented; empty if it says that it is.
+    error : why its supply may not be vented; empty if it reports that it is.
     """
 
     guard: SocketPeer
@@ -168,7 +168,7 @@ class Reply:
 
 
 def trusted(uid: int) -> bool:
-    """Return whether a guard of a user is trusted when it says that a supply is vented.
+    """Return whether to trust the report of a user's guard that a supply is vented.
 
     Root and this user are trusted, and for root also the user who became root by ``sudo``.
     """
@@ -176,7 +176,7 @@ def trusted(uid: int) -> bool:
 
 
 def guards_of(endpoint: str) -> list[SocketPeer]:
-    """Return the processes that listen for an endpoint, whoever their users are."""
+    """Return the processes, of any user, that listen for an endpoint."""
     found = []
     for peer, line in _lines_of(endpoint):
         found.append(peer)
@@ -193,7 +193,7 @@ def ask_to_vent(endpoint: str, patience: float = 5.0) -> list[Reply]:
     endpoint :
         Name of the supply.
     patience :
-        Time in which all must have answered, in s.
+        Time for all answers together, in s.
     """
     asked: list[tuple[SocketPeer, socket.socket | None]] = []
     strangers = 0
@@ -233,7 +233,7 @@ def _reply(peer: SocketPeer, line: socket.socket | None, end: float) -> Reply:
 def _lines_of(endpoint: str) -> Iterator[tuple[SocketPeer, socket.socket | None]]:
     """Yield the guards of an endpoint, each with a connection if it accepts one at once.
 
-    A guard that hangs may accept none; its process is taken from its address then, and checked.
+    A guard that hangs may accept none; then its address names its process, which is checked.
     """
     shown = address_of("vent", endpoint).replace("\0", "@") + "/"
     try:
@@ -251,14 +251,14 @@ def _lines_of(endpoint: str) -> Iterator[tuple[SocketPeer, socket.socket | None]
             peer = _process_of(name.removeprefix(shown))
             if peer is not None:
                 yield peer, None
-        except OSError:  # gone meanwhile
+        except OSError:  # it has ended in the meantime
             line.close()
         else:
             yield _peer(line), line
 
 
 def _process_of(place: str) -> SocketPeer | None:
-    """Return the process that an address names, with its user as the kernel has it."""
+    """Return the process that an address names, with its user according to the kernel."""
     number = place.partition("-")[0]
     if not number.isdecimal():
         return None
