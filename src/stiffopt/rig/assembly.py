@@ -1,4 +1,4 @@
-"""Makes the devices that a rig file describes, without the safety gate in front of the supply.
+"""Makes the devices that a rig file describes, without the safety gate before the supply.
 
 Programs that command an arm use `stiffopt.open_rig`, whose supply is behind the gate. Only
 `stiffopt.safety` and tests make bare devices.
@@ -28,7 +28,7 @@ def make_rig(
     else:
         clock = SystemClock()
         device = supply.device(limits, clock)
-        device.restrict(supply.limits_within(limits))  # whatever its driver makes of them
+        device.restrict(supply.limits_within(limits))  # even if its driver ignores them
         rig = Rig(
             robot,
             device,

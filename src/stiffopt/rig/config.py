@@ -1,4 +1,4 @@
-"""The rig file: which devices there are, how to reach them and what they may do."""
+"""The rig file: which devices there are, how to reach them, and their limits and settings."""
 
 from __future__ import annotations
 
@@ -40,11 +40,11 @@ _SECTIONS = {
     "plant": "stiffopt.plant.settings:PlantSettings",
     "lab": "stiffopt.plant.settings:LabSettings",
 }
-"""Parts of a rig file that belong to other packages, which are imported where they are needed."""
+"""Sections of a rig file that other packages define; they are imported when needed."""
 
 
 def _reader(class_of: Callable[[dict[str, Any]], type[Schema]]) -> BeforeValidator:
-    """Return the validator of a part of a rig file whose class depends on what it says."""
+    """Return the validator of a section whose class depends on its content."""
 
     def read(value: Any, info: ValidationInfo) -> Any:
         if not isinstance(value, dict):
@@ -53,7 +53,7 @@ def _reader(class_of: Callable[[dict[str, Any]], type[Schema]]) -> BeforeValidat
         try:
             return model.model_validate(value, context=info.context)
         except ValidationError as error:
-            # told here, where the class is known: which keys it has, and which is the nearest
+            # explained here, where the class is known, with its keys and the nearest of them
             mistakes = []
             for details in error.errors():
                 loc, reason = explain(model, details, value if read_from_file(info) else None)
@@ -71,7 +71,7 @@ def _reader(class_of: Callable[[dict[str, Any]], type[Schema]]) -> BeforeValidat
 
 
 class _DeviceJsonSchema:
-    """The JSON Schema of a device: that of a driver of stiffopt, or of a driver from elsewhere."""
+    """The JSON Schema of a device: that of stiffopt's driver, or open for other drivers."""
 
     def __init__(self, kind: str) -> None:
         self.kind = kind
@@ -90,7 +90,7 @@ class _DeviceJsonSchema:
 
 
 def _device(kind: str) -> BeforeValidator:
-    """Return the validator of a device, whose class is that of its driver."""
+    """Return the validator of a device; its driver determines the class."""
 
     def class_of(value: dict[str, Any]) -> type[DeviceSettings]:
         if "driver" not in value:
@@ -105,7 +105,7 @@ def _device(kind: str) -> BeforeValidator:
 
 
 class _SectionJsonSchema:
-    """The JSON Schema of a part whose class is that of another package."""
+    """The JSON Schema of a section that another package defines."""
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -115,7 +115,7 @@ class _SectionJsonSchema:
 
 
 def _section(name: str) -> BeforeValidator:
-    """Return the validator of a part whose class is that of another package."""
+    """Return the validator of a section that another package defines."""
     return _reader(lambda _: load(_SECTIONS[name]))
 
 
@@ -270,7 +270,7 @@ def _check_against(description: RigDescription, robot: RobotDescription) -> None
 
 
 def limits_of(description: RigDescription, robot: RobotDescription) -> PressureLimits:
-    """Return what may be commanded: the robot's limits, tightened by the rig's."""
+    """Return the limits of commands: the robot's, tightened by the rig's."""
     high = np.array(robot.pressure_max)
     if description.safety.max_pressure is not None:
         high = np.minimum(high, description.safety.max_pressure)
@@ -278,7 +278,7 @@ def limits_of(description: RigDescription, robot: RobotDescription) -> PressureL
 
 
 def slew_of(description: RigDescription, robot: RobotDescription) -> NDArray[np.float64] | None:
-    """Return the greatest rates of change (n,), in Pa/s, or None where there is no limit."""
+    """Return the greatest rates of change (n,), in Pa/s, or None if there is no limit."""
     rates = [r for r in (robot.pressure_slew, description.safety.max_slew) if r is not None]
     if not rates:
         return None
@@ -288,12 +288,12 @@ def slew_of(description: RigDescription, robot: RobotDescription) -> NDArray[np.
 
 
 def registration_of(tracker: TrackerSettings, robot: RobotDescription) -> Registration:
-    """What makes a tracker's readings poses of the tip in the base frame.
+    """Return the registration that turns a tracker's readings into tip poses in the base frame.
 
     Raises
     ------
     InputError
-        The robot file shall correct the poses, and cannot.
+        The tracker relies on the robot file's correction, but the file has none that fits.
     """
     given = tracker.registration
     if not tracker.calibrated:

@@ -1,4 +1,4 @@
-"""What all devices have in common: a clock, an open and a closed state, and settings."""
+"""The basis of all devices: a clock, opening and closing, and settings in the rig file."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ class Clock(ABC):
 
     @abstractmethod
     def now(self) -> float:
-        """Time in s; it only grows."""
+        """Return the time, in s; it never decreases."""
 
     @abstractmethod
     def sleep_until(self, moment: float) -> None:
         """Return when `now` has reached `moment`."""
 
     def sleep(self, duration: float) -> None:
-        """Let a duration in s pass."""
+        """Wait for a duration, in s."""
         self.sleep_until(self.now() + duration)
 
 
@@ -34,18 +34,18 @@ class SystemClock(Clock):
     """Real time, unaffected by changes of the wall clock."""
 
     def now(self) -> float:
-        """Time in s since some moment in the past."""
+        """Return the time, in s, since a fixed moment in the past."""
         return time.monotonic()
 
     def sleep_until(self, moment: float) -> None:
-        """Sleep until a moment."""
+        """Sleep until a time, in s."""
         remaining = moment - time.monotonic()
         if remaining > 0:
             time.sleep(remaining)
 
 
 class Opened(ABC):
-    """Base of rigs and devices: opened and closed, by `with` or by hand."""
+    """Base of rigs and devices: open and close them by `with` or by hand."""
 
     @abstractmethod
     def open(self) -> None:
@@ -93,7 +93,7 @@ class Device(Opened):
             self._is_open = True
 
     def close(self) -> None:
-        """Disconnect; to close what is closed does nothing."""
+        """Disconnect; a second call does nothing."""
         if self._is_open:
             self._is_open = False
             self._close()
@@ -112,11 +112,11 @@ class Device(Opened):
 
 
 class MisfitError(InputError):
-    """A part of a rig file contradicts another part of it, or the robot.
+    """A section of a rig file contradicts another section, or the robot.
 
     Attributes
     ----------
-    place : the keys that lead to the part at fault, from the top of the rig file.
+    place : keys that lead to the mistake, from the top of the rig file.
     """
 
     def __init__(self, reason: str, *place: str | int) -> None:
@@ -125,15 +125,15 @@ class MisfitError(InputError):
 
 
 class RigSection(Schema):
-    """A part of a rig file that another package defines, such as a device or the plant."""
+    """A section of a rig file that another package defines, such as a device or the plant."""
 
     def check_against(self, rig: Any, robot: RobotDescription) -> None:
-        """Check this part against the rest of the rig (a `RigDescription`) and its robot.
+        """Check this section against the rest of the rig (a `RigDescription`) and its robot.
 
         Raises
         ------
         MisfitError
-            They contradict each other.
+            There is a contradiction.
         """
 
 
@@ -142,9 +142,9 @@ class DeviceSettings(RigSection):
 
     Attributes
     ----------
-    driver : name of the driver, or its class as ``package.module:Class``. A driver that may only be
-        named in one way declares it as a `Literal`.
-    extra : of stiffopt, that installs the libraries of this driver; empty: it needs none.
+    driver : name of the driver, or its class as ``package.module:Class``. A driver that has only
+        one name declares it as a `Literal`.
+    extra : stiffopt's extra that installs the driver's libraries; empty: it needs none.
     peer : ``module:Class`` of the `stiffopt.lab.bench.Peer` that plays this device in the virtual
         lab; empty: there is none.
     simulated : whether the device belongs to a simulated arm.
@@ -159,7 +159,7 @@ class DeviceSettings(RigSection):
     @model_validator(mode="before")
     @classmethod
     def _names_its_class(cls, value: Any) -> Any:
-        """Give settings that are made in code the name by which a rig file finds this class."""
+        """Give settings made in code the name by which a rig file finds this class."""
         if isinstance(value, dict) and cls.model_fields["driver"].is_required():
             return {"driver": f"{cls.__module__}:{cls.__qualname__}", **value}
         return value

@@ -1,7 +1,7 @@
 """Endpoints: one name for each device, whichever of its addresses a rig file gives.
 
-Two addresses of the same device must give the same endpoint, so that a supply can be claimed by it:
-a link in ``/dev/serial/by-id`` and the port it leads to, a host name and the address it stands for.
+A supply is claimed by its endpoint. So all addresses of a device must give the same endpoint: a
+link in ``/dev/serial/by-id`` and its port, a host name and its IP address.
 """
 
 from __future__ import annotations
@@ -34,19 +34,19 @@ def tcp_endpoints(host: str, port: int) -> tuple[str, ...]:
 
 
 def _host(address: str) -> str:
-    """Return an address, or the word for this machine if it is one of this machine's."""
+    """Return an address, or the same word for all addresses of this machine."""
     family = socket.AF_INET6 if ":" in address else socket.AF_INET
     plain = address.removeprefix("::ffff:") if "." in address else address
     if plain != address:
         family = socket.AF_INET
     with suppress(OSError), socket.socket(family, socket.SOCK_DGRAM) as probe:
-        probe.bind((plain, 0))  # only an address of this machine can be bound to
+        probe.bind((plain, 0))  # only works with an address of this machine
         return _THIS_MACHINE
     return plain
 
 
 def serial_endpoints(port: str) -> tuple[str, ...]:
-    """Return the endpoint of a serial port: the device itself where the system has one."""
+    """Return the endpoint of a serial port: its device number if the system has one."""
     path = os.path.realpath(port)
     with suppress(OSError):
         found = os.stat(path)

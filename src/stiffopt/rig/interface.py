@@ -1,9 +1,9 @@
-"""The rig: one interface to supply, tracker and probe, and all that a driver needs to import.
+"""The rig: one interface to supply, tracker and probe, and everything that a driver imports.
 
 A supply sets and reads the pressures of the channels, a tracker measures the pose of the tip, a
-probe pushes the tip and measures the force. What all devices of a kind must do (refuse, clamp,
-vent, check, register) is done here, once; a driver only moves data, in the methods that begin with
-an underscore.
+probe pushes the tip and measures the force. Tasks common to all devices of a kind (refuse, clamp,
+vent, check, register) are solved here, once. A driver only moves data, in the methods that begin
+with an underscore.
 
 Everything is in SI: Pa (gauge), m, N, s; poses are those of the tip in the base frame. All times
 are seconds on the clock of the rig, which never jumps.
@@ -69,16 +69,16 @@ __all__ = [
 
 @dataclass(frozen=True)
 class Observation:
-    """The latest pressures, and the poses since the observation before.
+    """The latest pressures, and the poses since the last observation.
 
     Attributes
     ----------
     time : float
-        When it was put together.
+        When it was made.
     pressure : PressureReading
         The latest reading.
     poses : tuple of PoseSample
-        What the tracker has delivered since the last observation, in order of arrival.
+        Samples of the tracker since the last observation, in order of arrival.
     """
 
     time: float
@@ -87,22 +87,23 @@ class Observation:
 
 
 class Rig(Opened):
-    """An arm with its devices, real or simulated: what controllers and experiments see.
+    """An arm with its devices, real or simulated, as controllers and experiments see it.
 
     Parameters
     ----------
     robot :
         Description of the arm.
     supply, tracker, probe :
-        The devices; a tracker and a probe need not be there.
+        The devices; tracker and probe are optional.
     clock :
-        Of all of them. Time passes only through it: a simulated rig moves while one sleeps.
+        Clock of all devices. Only the clock lets time pass: a simulated rig moves while a program
+        sleeps on it.
     slew :
-        Greatest rate of change of a set-point (n,), in Pa/s; inf where there is no limit.
+        Greatest rate of change of a set-point (n,), in Pa/s; inf without a limit.
     max_force :
         Greatest sum over the channels of pressure times chamber area, in N; None: no limit.
     settings :
-        What the rig was made from, such as the content of a rig file; None: nothing of the kind.
+        Source of the rig, such as the content of a rig file, or None.
     """
 
     def __init__(
@@ -128,7 +129,7 @@ class Rig(Opened):
 
     @property
     def devices(self) -> tuple[Device, ...]:
-        """All devices; the supply comes last, so that nothing moves before the rest is there."""
+        """All devices; the supply is last, so that nothing moves before the others are ready."""
         return tuple(d for d in (self.tracker, self.probe, self.supply) if d is not None)
 
     def open(self) -> None:
@@ -147,13 +148,13 @@ class Rig(Opened):
             opened.pop_all()
 
     def close(self) -> None:
-        """Vent, then close all devices, also those after one that fails."""
+        """Vent, then close all devices, even if one fails."""
         with ExitStack() as stack:
             for device in self.devices:
                 stack.callback(device.close)
 
     def observe(self) -> Observation:
-        """Read the pressures and collect what the tracker has delivered since the last call.
+        """Read the pressures and the tracker's samples since the last call.
 
         Raises
         ------
@@ -167,10 +168,10 @@ class Rig(Opened):
     def command(
         self, pressures: ArrayLike | PressureCommand, valid_for: float | None = None
     ) -> None:
-        """Have the pressures go to (n,), in Pa, and stay there for `valid_for` seconds.
+        """Bring the pressures to (n,), in Pa, and keep them there for `valid_for` seconds.
 
         On a rig of `stiffopt.open_rig` this is a goal: the set-points approach it within the
-        limits of slew and force, and are let down and vented when it has expired.
+        limits of slew and force; when it has expired, they are let down and vented.
         """
         if valid_for is not None:
             if isinstance(pressures, PressureCommand):
@@ -179,7 +180,7 @@ class Rig(Opened):
         self.supply.command(pressures)
 
     def force(self, pressures: ArrayLike) -> float:
-        """Return the sum of pressure (n,) times chamber area, in N; a vacuum relieves nothing."""
+        """Return the sum of pressure (n,) times chamber area, in N; a vacuum counts as 0."""
         return total_force(pressures, self.robot.channel_areas)
 
     def vent(self) -> None:

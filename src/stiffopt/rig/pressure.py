@@ -1,4 +1,4 @@
-"""Pressure supplies: the commands that they take, the limits that they keep, and how they vent."""
+"""Pressure supplies: their commands, their limits, and how they vent."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from stiffopt.rig.device import Clock, Device, DeviceSettings
 Array = NDArray[np.float64]
 
 _FLOAT = np.dtype(float)
-_LOOK = 0.05  # s between looks at whether somebody else commands the device
+_LOOK = 0.05  # s between checks whether another program commands the device
 _SLACK = 1e-6  # of a channel's range
 
 
@@ -54,12 +54,12 @@ class PressureLimits:
         return len(self.low)
 
     def within(self, other: PressureLimits) -> PressureLimits:
-        """Return the pressures that both allow.
+        """Return the limits that allow what both allow.
 
         Raises
         ------
         InputError
-            Another number of channels, or a channel for which nothing is left.
+            The other has another number of channels, or leaves a channel no pressure.
         """
         if other.n != self.n:
             raise InputError(f"there are {self.n} channels, but limits for {other.n}")
@@ -70,11 +70,11 @@ class PressureLimits:
 
     @property
     def slack(self) -> Array:
-        """By how much (n,) a pressure may be beyond a limit and counts as rounded, in Pa."""
+        """Excess of a pressure (n,) over a limit that counts as rounding, in Pa."""
         return _SLACK * (self.high - self.low)
 
     def check(self, pressures: ArrayLike) -> Array:
-        """Return pressures (n,) if they may be commanded.
+        """Return pressures (n,) if they are permitted.
 
         Raises
         ------
@@ -88,7 +88,7 @@ class PressureLimits:
             given = np.asarray(pressures)
         except ValueError:  # ragged
             given = np.array("")
-        if given.dtype.kind not in "fiu":  # text and booleans are no pressures
+        if given.dtype.kind not in "fiu":  # neither text nor booleans
             raise CommandError("expected one pressure in Pa for each channel")
         p = given.astype(float)
         if p.shape != self.low.shape:
@@ -105,7 +105,7 @@ class PressureLimits:
         return self.clamp(p)
 
     def clamp(self, pressures: Array) -> Array:
-        """Return what is nearest within the limits; 0 stays, and what is not finite becomes 0."""
+        """Return the nearest pressures within the limits; 0 stays; NaN and inf become 0."""
         within = self._copy_within(pressures)
         if within is not None:
             return within
@@ -114,17 +114,17 @@ class PressureLimits:
         return np.where(p == 0, 0.0, np.clip(p, self.low, self.high))
 
     def _copy_within(self, pressures: ArrayLike) -> Array | None:
-        """Return a copy of pressures (n,) of which nothing is to be refused or changed.
+        """Return a copy of pressures (n,) that need neither refusal nor change; otherwise None.
 
-        None if that is not plain: this is what each tick does three times, and no more than that.
+        A quick check, since each tick makes it three times.
         """
         if type(pressures) is not np.ndarray or pressures.dtype != _FLOAT:
             return None
         if pressures.shape != self.low.shape:
             return None
-        p: Array = pressures + 0.0  # makes 0 of -0; the copy is looked at, which nobody changes
+        p: Array = pressures + 0.0  # turns -0 into 0; the copy cannot change during the check
         for value, (low, high) in zip(p.tolist(), self._bounds, strict=True):
-            if not (low <= value <= high or value == 0):  # NaN is not either
+            if not (low <= value <= high or value == 0):  # NaN fails too
                 return None
         return p
 
@@ -147,7 +147,7 @@ class PressureReading:
 
 @dataclass(frozen=True)
 class PressureCommand:
-    """Pressures to be set, and for how long: commands expire.
+    """Pressures to set, and for how long: commands expire.
 
     Attributes
     ----------
@@ -156,7 +156,7 @@ class PressureCommand:
     time : float
         When it was given.
     valid_for : float
-        Seconds after which a command that was not repeated holds no longer.
+        Time after which the command expires unless it is repeated, in s.
     """
 
     pressures: ArrayLike
@@ -164,22 +164,22 @@ class PressureCommand:
     valid_for: float = 0.5
 
     def expired(self, now: float) -> bool:
-        """Say whether the command is too old to be carried out."""
+        """Return whether the command is too old, or from the future."""
         return not 0 <= now - self.time <= self.valid_for
 
 
 def total_force(pressures: ArrayLike, areas: ArrayLike) -> float:
-    """Return the sum of pressure (n,) times chamber area (n,), in N; a vacuum relieves nothing."""
+    """Return the sum of pressure (n,) times chamber area (n,), in N; a vacuum counts as 0."""
     return float(np.asarray(areas) @ np.maximum(np.asarray(pressures, dtype=float), 0.0))
 
 
 class Supply(Device):
-    """Interface of all that sets and reads the pressures of the channels; see `Rig.supply`.
+    """Interface of every object that sets and reads the pressures of the channels.
 
     Attributes
     ----------
     limits : PressureLimits
-        What may be commanded.
+        Limits of the commands.
     """
 
     limits: PressureLimits
@@ -192,31 +192,31 @@ class Supply(Device):
     @property
     @abstractmethod
     def commanded(self) -> Array:
-        """The set-points (n,) that the device has, in Pa; a copy."""
+        """Set-points (n,) of the device, in Pa; a copy."""
 
     @property
     @abstractmethod
     def armed(self) -> bool:
-        """Whether commands of pressure are taken; not so after `open` and `vent`."""
+        """Whether commands of pressure are accepted; not after `open` and `vent`."""
 
     @property
     @abstractmethod
     def has_dump_valve(self) -> bool:
-        """Whether `vent` also opens a valve that needs no regulator's cooperation."""
+        """Whether `vent` also opens a valve that works without the regulators."""
 
     def check_arming(self) -> None:
         """Raise `CommandError` if this supply may never be armed; it need not be open."""
 
     @abstractmethod
     def arm(self) -> None:
-        """Take commands from now on; all set-points are 0 then.
+        """Accept commands from now on; all set-points are 0 at first.
 
         Raises
         ------
         CommandError
             This supply may not be armed, see `check_arming`.
         DeviceError
-            The device did not take it; the supply is not armed.
+            The device did not accept it; the supply is not armed.
         """
 
     @abstractmethod
@@ -226,15 +226,15 @@ class Supply(Device):
         Raises
         ------
         CommandError
-            Wrong number, not finite, out of range, expired, or the supply is not armed: nothing
+            Wrong number, not finite, out of range, expired, or the supply is not armed; nothing
             has changed.
         DeviceError
-            The device did not take it, or held something else than it was told before.
+            The device did not accept it, or had other set-points than were last written.
         """
 
     @abstractmethod
     def exchange(self, pressures: ArrayLike | PressureCommand) -> PressureReading:
-        """Set the pressures (n,), in Pa, and read the measured ones; raises as `command` does."""
+        """Set pressures (n,), in Pa, and read the measured ones; raises as `command`."""
 
     @abstractmethod
     def read(self) -> PressureReading:
@@ -242,32 +242,32 @@ class Supply(Device):
 
     @abstractmethod
     def vent(self) -> None:
-        """Let all pressure out at once; no pressure is taken until `arm`.
+        """Let all pressure out at once; refuse pressures until `arm`.
 
         Raises
         ------
         DeviceError
-            The device did not take it.
+            The device did not accept it.
         """
 
 
 class SupplySettings(DeviceSettings):
     """Base of a supply's settings in a rig file: how to reach it, and its channels.
 
-    A subclass has the key ``channels`` with an item for each channel of the robot. Where such an
-    item has ``min`` or ``max``, in Pa, no supply that `device` returns commands less or more,
-    whatever its driver does.
+    A subclass has the key ``channels`` with an item for each channel of the robot. If such an item
+    has ``min`` or ``max``, in Pa, no supply from `device` commands less or more, whatever its
+    driver does.
 
     Attributes
     ----------
-    simulator : of a supply that is `simulated`, the ``module:function`` that makes the rig of the
-        whole simulated arm, see `stiffopt.rig.assembly.make_rig`.
+    simulator : for a `simulated` supply, the ``module:function`` that makes the rig of the whole
+        simulated arm, see `stiffopt.rig.assembly.make_rig`.
     """
 
     simulator: ClassVar[str] = ""
 
     def device(self, limits: PressureLimits, clock: Clock | None = None) -> PressureSupply:
-        """Return the supply, not yet open, limited to what rig and channels allow.
+        """Return the supply, not yet open, limited to the range of rig and channels.
 
         Raises
         ------
@@ -305,7 +305,7 @@ class SupplySettings(DeviceSettings):
         return PressureLimits(low, high)
 
     def measures(self, channel: int) -> bool:
-        """Whether a channel (from 0) has a gauge; a driver for supplies without says so here."""
+        """Whether a channel (from 0) has a gauge; drivers of supplies without one override it."""
         return True
 
     def _make(self, limits: PressureLimits, clock: Clock | None) -> PressureSupply:
@@ -313,27 +313,27 @@ class SupplySettings(DeviceSettings):
         raise NotImplementedError(f"{type(self).__name__} makes no supply")
 
     def _reach(self, channel: int) -> tuple[float, float]:
-        """Return the lowest and highest pressure that the hardware can say, in Pa."""
+        """Return the lowest and highest pressure that the hardware can represent, in Pa."""
         return -np.inf, np.inf
 
 
 class PressureSupply(Supply):
     """A device that sets and reads the pressures of all channels: the base of all drivers.
 
-    Nothing reaches a device that is out of range or not finite: `command` refuses it, and what is
-    handed to the driver's `_write` has been clamped once more. A supply vents when it is opened,
-    when it is closed, also by an exception, and when the interpreter exits; once vented it takes
-    no pressure until it is armed. Any thread may call any method.
+    No pressure that is out of range or not finite reaches a device: `command` refuses it, and
+    values for the driver's `_write` are clamped once more. A supply vents when it is opened, when
+    it is closed, even by an exception, and when the interpreter exits; once vented it refuses
+    pressures until it is armed. Any thread may call any method.
 
-    It knows nothing of rates, forces and other programs: those are the business of
-    `stiffopt.safety`, in front of it.
+    It knows nothing of rates, forces and other programs: `stiffopt.safety`, in front of it, handles
+    those.
 
     Attributes
     ----------
-    is_simulated : whether nobody can be hurt by it.
-    has_watchdog : whether the device vents by itself when no command comes any more.
-    has_dump_valve : whether `vent` also opens a valve that needs no regulator's cooperation.
-    patience : seconds that one call may take at most, while the device answers within its timeout.
+    is_simulated : whether it cannot hurt anybody.
+    has_watchdog : whether the device vents on its own when commands stop.
+    has_dump_valve : whether `vent` also opens a valve that works without the regulators.
+    patience : longest time of one call, in s, while the device answers within its timeout.
     """
 
     is_simulated: bool = False
@@ -346,14 +346,14 @@ class PressureSupply(Supply):
         self._limits = limits
         self._commanded: Array = np.zeros(limits.n)
         self._armed = False
-        self._looked_at = 0.0  # when what the device holds was last compared
-        self._lock = threading.RLock()  # what was checked is written before anything else happens
+        self._looked_at = 0.0  # time of the last check for another program, in s
+        self._lock = threading.RLock()  # a checked command is written before anything else happens
 
     # hardware -------------------------------------------------------------------------------------
 
     @property
     def endpoints(self) -> tuple[str, ...]:
-        """What the supply is claimed by, so that no two programs command it; empty: by nothing.
+        """Names by which the supply is claimed, so that no two programs command it; may be empty.
 
         A driver returns the names of its device from `stiffopt.rig.endpoints`. By default all
         supplies of a class count as one device.
@@ -367,7 +367,7 @@ class PressureSupply(Supply):
 
     @property
     def limits(self) -> PressureLimits:
-        """What may be commanded; to set it may tighten it, and never makes it wider."""
+        """Limits of the commands; setting them may tighten them, but never widens them."""
         return self._limits
 
     @limits.setter
@@ -375,17 +375,17 @@ class PressureSupply(Supply):
         self._limits = self._limits.within(limits)
 
     def restrict(self, limits: PressureLimits) -> None:
-        """Tighten the limits; they never become wider again."""
+        """Tighten the limits; they are never widened again."""
         self.limits = limits
 
     def prepare(self) -> None:
-        """Import what connecting needs, so that it takes no time when it is urgent."""
+        """Import the libraries for connecting in advance, in case it becomes urgent."""
 
     # commands -------------------------------------------------------------------------------------
 
     @property
     def commanded(self) -> Array:
-        """What was last written (n,), in Pa; a copy."""
+        """Last written set-points (n,), in Pa; a copy."""
         return self._commanded.copy()
 
     def open(self) -> None:
@@ -407,7 +407,7 @@ class PressureSupply(Supply):
         Raises
         ------
         DeviceError
-            The device did not take the command to vent; it is disconnected all the same, and
+            The device did not accept the command to vent. It is disconnected all the same, and
             venting is tried again when the interpreter exits.
         """
         with self._lock:
@@ -427,14 +427,14 @@ class PressureSupply(Supply):
                 super().close()
 
     def command(self, pressures: ArrayLike | PressureCommand) -> None:
-        """Set the pressures (n,), in Pa, until they are set again: a device keeps no time."""
+        """Set pressures (n,), in Pa, until they are set again: a device does not expire them."""
         with self._lock:
             checked = self._checked(pressures)
             self._look_for_others()
             self._write_clamped(checked)
 
     def exchange(self, pressures: ArrayLike | PressureCommand) -> PressureReading:
-        """Set the pressures and read the measured ones, in one exchange where the device can."""
+        """Set the pressures and read the measured ones, in one exchange if the device can."""
         with self._lock:
             last = self.limits.clamp(self._checked(pressures))
             self._look_for_others()
@@ -452,7 +452,7 @@ class PressureSupply(Supply):
             return self._reading(self._read())
 
     def vent(self) -> None:
-        """Open the dump valve, where there is one, and set all channels to 0 Pa."""
+        """Open the dump valve, if there is one, and set all channels to 0 Pa."""
         with self._lock:
             self._must_be_open()
             self._armed = False
@@ -463,13 +463,13 @@ class PressureSupply(Supply):
 
     @property
     def armed(self) -> bool:
-        """Whether commands of pressure are taken; not so after `open` and `vent`."""
+        """Whether commands of pressure are accepted; not after `open` and `vent`."""
         return self._armed
 
     def arm(self) -> None:
-        """Take commands from now on, and close the dump valve, which `vent` opens.
+        """Accept commands from now on, and close the dump valve, which `vent` opens.
 
-        All set-points are 0 then: that was written before the valve closed.
+        All set-points are 0, written before the valve closes.
         """
         with self._lock:
             self._must_be_open()
@@ -503,26 +503,26 @@ class PressureSupply(Supply):
         self._commanded = last
 
     def _look_for_others(self) -> None:
-        """Check from time to time, before a command, that nobody else has commanded the device."""
+        """Check now and then, before a command, that no other program commands the device."""
         now = self.clock.now()
         if self._armed and now - self._looked_at >= _LOOK:
             self._looked_at = now
             self._check_held()
 
     def _check_held(self) -> None:
-        """Raise `DeviceError` if the device holds other set-points than it was told last.
+        """Raise `DeviceError` if the device has other set-points than were last written.
 
-        Another program commands it then, or its own watchdog has run out. Called before a command
-        of an armed supply, every 50 ms; a driver that can read its set-points back looks here.
+        Then another program commands it, or its own watchdog has run out. Called every 50 ms before
+        a command of an armed supply; a driver that can read its set-points back overrides this.
         """
 
     @abstractmethod
     def _write(self, pressures: Array) -> None:
-        """Write set-points (n,), in Pa, and check by reading them back where the device can."""
+        """Write set-points (n,), in Pa, and verify them by reading back if the device can."""
 
     @abstractmethod
     def _read(self) -> ArrayLike:
-        """Return measured pressures (n,), in Pa; NaN for channels that measure none."""
+        """Return measured pressures (n,), in Pa; NaN for channels without a gauge."""
 
     def _exchange(self, pressures: Array) -> ArrayLike | None:
         """Write set-points and return measured pressures at once; None: the device cannot.
@@ -532,14 +532,14 @@ class PressureSupply(Supply):
         return None
 
     def _dump(self, *, open_valve: bool) -> None:
-        """Open or close the dump valve, where there is one."""
+        """Open or close the dump valve, if there is one."""
 
 
-_not_known_to_be_vented: set[PressureSupply] = set()  # held, so that none is forgotten
+_not_known_to_be_vented: set[PressureSupply] = set()  # keeps them alive until they are vented
 
 
 def vent_at_exit(supply: PressureSupply) -> None:
-    """Have a supply vented when the interpreter exits: nobody could vent it so far."""
+    """Vent a supply when the interpreter exits, because nothing could vent it so far."""
     _not_known_to_be_vented.add(supply)
 
 
@@ -549,5 +549,5 @@ def _vent_all() -> None:
         try:
             supply.open()  # which vents; does nothing if it is open
             supply.close()
-        except BaseException as error:  # the other supplies must be vented too, also after Ctrl-C
+        except BaseException as error:  # even Ctrl-C must not keep the others from being vented
             print(f"A SUPPLY COULD NOT BE VENTED: {error}", file=sys.stderr)

@@ -16,11 +16,11 @@ class ForceSample:
     Attributes
     ----------
     time : float
-        When it was read.
+        When it was measured.
     force : float
-        Force with which the probe pushes the tip along its axis, in N.
+        Force of the probe on the tip along its axis, in N.
     position : float
-        Place of the probe along its axis, in m.
+        Position of the probe along its axis, in m.
     """
 
     time: float
@@ -37,7 +37,7 @@ class ProbeSettings(DeviceSettings):
 
 
 class ForceProbe(Device):
-    """Pushes on the tip along one axis and feels the force."""
+    """Pushes the tip along one axis and measures the force."""
 
     @property
     def needs_a_person(self) -> bool:
@@ -46,17 +46,17 @@ class ForceProbe(Device):
 
     @abstractmethod
     def align(self, direction: Iterable[float]) -> None:
-        """Make a unit vector (3,) in the base frame the axis; on a real rig, ask that it be done.
+        """Make a unit vector (3,) in the base frame the axis; a person does it on a real rig.
 
         The probe is then at position 0, just clear of the tip.
         """
 
     @abstractmethod
     def move_to(self, position: float, speed: float) -> None:
-        """Move to a place along the axis, in m, at a speed in m/s, and return when there."""
+        """Move to a position along the axis, in m, at a speed in m/s; return on arrival."""
 
     def withdraw(self) -> None:
-        """Take the probe out of the arm's way; on a real rig, ask that it be done.
+        """Take the probe out of the arm's way; a person does it on a real rig.
 
         It has to be aligned before it is used again.
         """

@@ -1,9 +1,9 @@
-"""Drivers by name: which there are, and the settings class for the ``driver`` of a rig file.
+"""Drivers by name: the list of drivers, and the settings class for the ``driver`` of a rig file.
 
-A driver comes with stiffopt, or in an installed package that announces it as an entry point of the
-group ``stiffopt.supply``, ``stiffopt.tracker`` or ``stiffopt.probe``, or that a rig file names in
-full as ``package.module:Class``. Nothing is imported before a rig file names it, and nothing at all
-that is not installed: a module in the working directory or beside a rig file is refused.
+A driver comes with stiffopt, or with an installed package. The package announces it as an entry
+point of the group ``stiffopt.supply``, ``stiffopt.tracker`` or ``stiffopt.probe``, or the rig file
+names it in full as ``package.module:Class``. A driver is imported only when a rig file names it,
+and only if it is installed: a module in the working directory or beside a rig file is refused.
 """
 
 from __future__ import annotations
@@ -67,14 +67,14 @@ def driver_class(kind: str, driver: Any) -> type[DeviceSettings]:
     Parameters
     ----------
     kind :
-        Of the device: a key of `KINDS`.
+        Kind of the device, a key of `KINDS`.
     driver :
-        What a rig file says: a name, or ``package.module:Class``.
+        Value in the rig file: a name, or ``package.module:Class``.
 
     Raises
     ------
     InputError
-        There is no such driver, it is not installed, or it is none for this kind of device.
+        There is no such driver, it is not installed, or it is for another kind of device.
     """
     if not isinstance(driver, str):
         raise InputError(f"expected the name of a driver, not {shown(driver)}")
@@ -90,13 +90,13 @@ def driver_class(kind: str, driver: Any) -> type[DeviceSettings]:
 
 
 def load(reference: str) -> Any:
-    """Import what ``module:name`` refers to."""
+    """Import the object that ``module:name`` refers to."""
     module, _, name = reference.partition(":")
     return getattr(import_module(module), name)
 
 
 def one_of(words: Iterable[str]) -> str:
-    """Return words as an enumeration: ``a, b or c``."""
+    """Join words to an enumeration: ``a, b or c``."""
     *most, last = words
     return f"{', '.join(most)} or {last}" if most else last
 
@@ -123,12 +123,12 @@ def _load_announced(kind: str, name: str) -> Any:
 
 
 def _load_installed(reference: str, owners: Iterable[Distribution]) -> Any:
-    """Load a class after making sure that its module is installed by one of these packages.
+    """Load a class after checking that one of these packages has installed its module.
 
     Raises
     ------
     InputError
-        It is not, or it cannot be imported.
+        None has, or the class cannot be imported.
     """
     module, _, name = reference.partition(":")
     owned = list(owners)
@@ -148,13 +148,13 @@ def _load_installed(reference: str, owners: Iterable[Distribution]) -> Any:
         ) from None
     except AttributeError:
         raise InputError(f"the module {module} has no class '{name}'") from None
-    except Exception as error:  # whatever the package of somebody else does
+    except Exception as error:  # of any kind, in foreign code
         reason = f"{type(error).__name__}: {error}"
         raise InputError(f"the driver {reference} cannot be imported: {reason}") from None
 
 
 def _specs(module: str) -> Iterator[ModuleSpec]:
-    """Yield what would be imported for a module, its packages first, each before it is imported."""
+    """Yield the specs of a module's packages and of itself, each before it is imported."""
     parts = module.split(".")
     for count in range(1, len(parts) + 1):
         name = ".".join(parts[:count])
@@ -165,7 +165,7 @@ def _specs(module: str) -> Iterator[ModuleSpec]:
 
 
 def _owns(owner: Distribution, origin: str) -> bool:
-    """Say whether an installed package has put this file there, or refers to it if editable."""
+    """Return whether an installed package contains this file, or refers to it if editable."""
     path, root = Path(origin).resolve(), Path(str(owner.locate_file(""))).resolve()
     files = [line.partition(",")[0] for line in (owner.read_text("RECORD") or "").splitlines()]
     if path.is_relative_to(root) and path.relative_to(root).as_posix() in files:
@@ -183,14 +183,14 @@ def _announced(kind: str) -> Iterator[tuple[EntryPoint, Distribution]]:
     seen = set()
     for distribution in _installed():
         entries = distribution.entry_points.select(group=f"stiffopt.{kind}")
-        if entries and distribution.name not in seen:  # the first one is the one that is imported
+        if entries and distribution.name not in seen:  # Python imports the first one
             seen.add(distribution.name)
             for entry in entries:
                 yield entry, distribution
 
 
 def _installed() -> Iterable[Distribution]:
-    """Return the installed packages; the working directory is no place where packages are."""
+    """Return the installed packages, without those in the working directory."""
     here = Path.cwd().resolve()
     path = [entry for entry in sys.path if entry and Path(entry).resolve() != here]
     return distributions(path=path)

@@ -14,12 +14,12 @@ from stiffopt.units import Duration, Force, Frequency, Length, Ratio, Speed
 
 
 def _none(value: Any) -> Any:
-    """Read the word ``none`` as None, which a file cannot say otherwise."""
+    """Read the word ``none`` as None: a file has no other way to write it."""
     return None if value == "none" else value
 
 
 def _beside(value: Any, info: ValidationInfo) -> Any:
-    """Make of a path in a file one that does not depend on where the program runs."""
+    """Make a path in a file independent of the working directory."""
     folder = info.context.get("folder") if isinstance(info.context, Mapping) else None
     return str(Path(folder) / value) if folder is not None and isinstance(value, str) else value
 

@@ -18,7 +18,7 @@ from stiffopt.units import Duration, Length
 
 Array = NDArray[np.float64]
 
-_QUEUED = 4096  # samples that a tracker keeps until they are read; the oldest go first
+_QUEUED = 4096  # samples that a tracker keeps until they are read; the oldest are dropped first
 _NORM_SLACK = 0.05  # by which the norm of a tracker's quaternion may differ from 1
 _NOWHERE = (np.nan, np.nan, np.nan)
 
@@ -98,14 +98,14 @@ class TrackerSettings(DeviceSettings):
 class PoseTracker(Device):
     """Base of trackers.
 
-    A driver calls `_deliver` with each sample of the device, from any thread; registration, sign of
-    the quaternion and plausibility are handled here. `read` never waits: a silent device delivers
-    nothing, which only the age of the latest sample shows.
+    A driver calls `_deliver` with each sample of the device, from any thread. This class handles
+    registration, sign of the quaternion and plausibility. `read` never waits: if a device is
+    silent, only the age of the latest sample shows it.
 
     Attributes
     ----------
     registration : Registration
-        What makes the device's readings poses of the tip in the base frame.
+        Turns the device's readings into poses of the tip in the base frame.
     """
 
     def __init__(
@@ -118,7 +118,7 @@ class PoseTracker(Device):
         self._latest_visible: PoseSample | None = None
 
     def open(self) -> None:
-        """Connect; samples of an earlier time are forgotten."""
+        """Connect; drop earlier samples."""
         if not self._is_open:
             self._arrived.clear()
             self._latest = self._latest_visible = None
@@ -140,13 +140,13 @@ class PoseTracker(Device):
         return self._latest
 
     def age(self) -> float:
-        """Seconds since the latest capture that saw the tool; infinite before the first."""
+        """Return the time since the latest capture that saw the tool, in s; infinite before it."""
         self._poll()
         latest = self._latest_visible
         return self.clock.now() - latest.time if latest else float("inf")
 
     def _poll(self) -> None:
-        """Deliver what has arrived, in drivers that have no thread to do so."""
+        """Deliver arrived samples, in drivers without a thread for that."""
 
     def _deliver(self, raw: RawPose) -> None:
         """Register a sample of the device and queue it."""
@@ -164,7 +164,7 @@ class PoseTracker(Device):
         if raw.quaternion is not None:
             quaternion = np.array(raw.quaternion, dtype=float).reshape(-1)
             norm = math.hypot(*quaternion.tolist()) if quaternion.shape == (4,) else math.nan
-            seen = seen and abs(norm - 1) <= _NORM_SLACK  # NaN is not seen either
+            seen = seen and abs(norm - 1) <= _NORM_SLACK  # NaN fails too
             quaternion = quaternion / norm if seen else None
         if not seen:
             nowhere = np.full(3, np.nan)
@@ -189,11 +189,11 @@ class StreamedSettings(TrackerSettings):
 
 
 class StreamedTracker(PoseTracker):
-    """A tracker whose samples a thread delivers.
+    """A tracker whose samples are delivered by a thread.
 
     Attributes
     ----------
-    errors : number of bad or missing replies and lost connections, all of which it survives.
+    errors : number of bad or missing replies and lost connections so far.
     last_error : the last of them, as a sentence; empty before the first.
     out_of_range : number of samples beyond `StreamedSettings.range`.
     """
@@ -213,7 +213,7 @@ class StreamedTracker(PoseTracker):
     def _hand_over(
         self, time: float, frame: int, position: ArrayLike, quaternion: ArrayLike | None
     ) -> None:
-        """Deliver a pose in m, unless it is out of range; then deliver that nothing was seen."""
+        """Deliver a pose in m; if it is out of range, deliver that nothing was seen."""
         if np.linalg.norm(position) > self._longest:
             self.out_of_range += 1
             position = _NOWHERE

@@ -18,9 +18,9 @@ from stiffopt.rig.interface import Clock, StreamedSettings, StreamedTracker
 from stiffopt.units import Duration, Frequency
 
 _READER = Path(__file__).with_name("ndi_reader.py")
-_END = 0.9  # s that the reader is given to end by itself
+_END = 0.9  # s for the reader to end on its own
 _BETWEEN_TRIES = 0.5  # s before a lost device is looked for again
-_POLLS_PER_FRAME = 10  # a frame is seen at most a tenth of a period late
+_POLLS_PER_FRAME = 10  # so a frame is seen at most a tenth of a period late
 
 
 class AuroraSettings(StreamedSettings):
@@ -60,14 +60,14 @@ class AuroraSettings(StreamedSettings):
 
 
 class AuroraTracker(StreamedTracker):
-    """Starts `ndi_reader` as a process, listens to it in a thread, and starts it again if it ends.
+    """Runs `ndi_reader` as a process, reads its output in a thread, and restarts it if it ends.
 
-    A process, not a thread: the library waits up to 5 s for a silent device and cannot be
-    interrupted, and it does not check the length of what it is sent. A process can be killed, and
-    if it crashes the one that holds the pressures lives on.
+    It is a process, not a thread: the library waits up to 5 s for a silent device, cannot be
+    interrupted, and does not check the length of replies. A process can be killed, and if it
+    crashes, the process that holds the pressures survives.
 
-    A frame counts as captured `latency` before it was asked for: the reply takes time on the wire
-    that the frame does not.
+    A frame counts as captured `latency` before its request: the reply takes time on the wire that
+    the frame does not.
     """
 
     def __init__(self, settings: AuroraSettings, clock: Clock | None = None) -> None:
@@ -76,11 +76,11 @@ class AuroraTracker(StreamedTracker):
         self._process: subprocess.Popen[str] | None = None
         self._thread: threading.Thread | None = None
         self._starting = threading.Lock()
-        self._settled = threading.Event()  # the first connection stands, or failed
+        self._settled = threading.Event()  # set when the first connection works or has failed
         self._refusal = ""  # why the first connection failed
         self._lost = ""  # why the last one ended
-        self._frame = -1  # last of the device's
-        self._frames_before = 0  # in earlier sessions of the device
+        self._frame = -1  # last frame number of the device
+        self._frames_before = 0  # number of frames in earlier sessions of the device
 
     def _open(self) -> None:
         require_package("ndicapi", self.settings.extra, "ndicapy")
@@ -100,7 +100,7 @@ class AuroraTracker(StreamedTracker):
                 )
             if self._refusal:
                 raise DeviceError(f"aurora: {self._refusal}")
-        except BaseException:  # also when somebody does not want to wait any longer
+        except BaseException:  # even if the wait was interrupted
             self._close()
             raise
 
@@ -129,11 +129,11 @@ class AuroraTracker(StreamedTracker):
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
             text=True,
-            start_new_session=True,  # Ctrl-C is for the process that vents, not for this one
+            start_new_session=True,  # Ctrl-C must only reach the process that vents
         )
 
     def _listen(self) -> None:
-        """Take what the reader says until the tracker is closed."""
+        """Process the reader's output until the tracker is closed."""
         while (process := self._process) is not None and process.stdout is not None:
             with process.stdout as lines:
                 for line in lines:
@@ -157,7 +157,7 @@ class AuroraTracker(StreamedTracker):
     def _take(self, line: str) -> None:
         try:
             message: dict[str, Any] = json.loads(line)
-        except ValueError:  # the reader was killed while it wrote
+        except ValueError:  # the reader was killed while writing
             return
         if "frame" in message:
             self._take_frame(message["at"], message["frame"], message["pose"])
@@ -169,9 +169,9 @@ class AuroraTracker(StreamedTracker):
             self._lost = message["lost"]
 
     def _take_frame(self, asked: float, frame: int, pose: list[float] | None) -> None:
-        if frame == self._frame:  # it hangs, and was connected anew
+        if frame == self._frame:  # the device hangs, and was reconnected
             return
-        if frame < self._frame:  # the device began to count anew
+        if frame < self._frame:  # the device has restarted its count
             self._frames_before += self._frame + 1
         self._frame = frame
         number = self._frames_before + frame
@@ -185,7 +185,7 @@ class AuroraTracker(StreamedTracker):
 
 
 def _end(process: subprocess.Popen[str]) -> None:
-    """Ask a reader to end, then make it."""
+    """Ask a reader to end; kill it if it does not."""
     if process.stdin is not None:
         process.stdin.close()
     try:

@@ -1,9 +1,9 @@
 """NI-DAQmx for the drivers that use it: the connection, and tasks with one job each.
 
 The driver software is on this machine or behind NI's gRPC device server. nidaqmx gives its gRPC
-calls no deadline: a server that hangs would hang its caller for ever. Here every call gets one, and
-every failure becomes a `DeviceError`. A server that cannot be reached while tasks are closed still
-holds their channels when it comes back: they are closed then.
+calls no deadline: if a server hung, its caller would hang for ever. Here every call has one, and
+every failure becomes a `DeviceError`. If a server is unreachable while tasks are closed, it keeps
+their channels; they are closed when it is reachable again.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ Array = NDArray[np.float64]
 Terminals = Literal["default", "rse", "nrse", "differential", "pseudo-differential"]
 
 _RESERVED = -50103
-_NO_ANSWER = ("DEADLINE_EXCEEDED", "UNAVAILABLE", "CANCELLED")  # by the names of gRPC
-_EXPIRED = (-200678, -200644)  # a write, a reset of the timer after the watchdog has expired
+_NO_ANSWER = ("DEADLINE_EXCEEDED", "UNAVAILABLE", "CANCELLED")  # names of gRPC's status codes
+_EXPIRED = (-200678, -200644)  # errors of a write or a timer reset after the watchdog has expired
 _HINTS = {
     _RESERVED: "close the program that uses the device, or reset the device in NI MAX",
     -200220: "check the name of the device in NI MAX",
@@ -67,7 +67,7 @@ class WatchdogExpiredError(DeviceError):
 
 
 class SilentError(DeviceError):
-    """The server has not answered, or not in time."""
+    """The server has not answered in time."""
 
 
 _left: dict[str, deque[Any]] = defaultdict(deque)
@@ -75,28 +75,28 @@ _left: dict[str, deque[Any]] = defaultdict(deque)
 
 
 class Daqmx:
-    """Connection to NI-DAQmx, which makes tasks; it first closes those left from earlier.
+    """Connection to NI-DAQmx, which makes tasks; it first closes tasks left over from earlier.
 
     Parameters
     ----------
     address :
-        Of NI's gRPC device server; None: the driver on this machine.
+        Address of NI's gRPC device server; None: the driver on this machine.
     timeout :
-        Of every call, in s.
+        Timeout of every call, in s.
     extra :
-        Of stiffopt that brings nidaqmx, for the message when it is missing.
+        stiffopt's extra with nidaqmx, for the message if it is missing.
 
     Raises
     ------
     DeviceError
-        The server still does not answer, and tasks have been left on it.
+        The server still does not answer, and tasks were left on it.
     """
 
     def __init__(self, address: str | None, timeout: float, extra: str) -> None:
         self.timeout = timeout
         self.nidaqmx = library("nidaqmx", "nidaqmx", extra)
         self.silent = False
-        """Whether the server has left a task that was to be closed without an answer."""
+        """Whether the server has not answered when a task was closed."""
         self._address = address
         self._where = f"the NI-DAQ server at {address}" if address else "NI-DAQmx"
         self._channel: Any = None
@@ -117,7 +117,7 @@ class Daqmx:
             self._channel.close()
 
     def leave(self, handle: Any) -> None:
-        """Keep in mind a task that the server did not close, by nidaqmx's name for it."""
+        """Remember a task that the server did not close, by nidaqmx's handle."""
         if self._address and handle is not None:
             _left[self._address].append(handle)
 
@@ -136,11 +136,11 @@ class Daqmx:
                     _left[address].append(handle)
                     raise
                 except DeviceError:
-                    continue  # the server has started anew and does not know it
+                    continue  # the server has restarted and does not know it
 
     @property
     def options(self) -> dict[str, Any]:
-        """Keywords with which a task is made on the server, or here."""
+        """Keyword arguments for making a task on the server, or here."""
         if self._channel is None:
             return {}
         module = importlib.import_module("nidaqmx.grpc_session_options")
@@ -149,7 +149,7 @@ class Daqmx:
 
     @contextmanager
     def errors(self, doing: str) -> Iterator[None]:
-        """Turn what nidaqmx raises into a sentence that begins with what was being done."""
+        """Turn nidaqmx's exceptions into a sentence that begins with the operation."""
         errors = self.nidaqmx.errors
         try:
             yield
@@ -202,7 +202,7 @@ class InputChannel(NamedTuple):
 
 
 class _Task:
-    """A DAQmx task with one job; it is closed again if it cannot be set up."""
+    """A DAQmx task with one job; it is closed again if its set-up fails."""
 
     def __init__(self, daq: Daqmx, doing: str) -> None:
         self._daq = daq
@@ -224,28 +224,28 @@ class _Task:
         raise NotImplementedError
 
     def close(self) -> None:
-        """Clear the task, whatever state it is in; to close twice does nothing."""
+        """Clear the task, whatever its state; a second call does nothing."""
         task, self._task = self._task, None
         if task is None:
             return
-        handle, left = task._handle, True  # nidaqmx forgets it even if it could not close
+        handle, left = task._handle, True  # nidaqmx forgets the handle even if closing fails
         try:
             if not self._daq.silent:
                 with self._daq.errors(self._doing):
                     task.close()  # stops it first
                 left = False
         except SilentError:
-            self._daq.silent = True  # one wait is enough
+            self._daq.silent = True  # do not wait again for the next task
         except DeviceError:
-            left = False  # there is no one left who would care
+            left = False  # the server answered: it no longer has the task
         finally:
             if left:
                 self._daq.leave(handle)
-            task._handle = None  # else it complains when it is collected
+            task._handle = None  # otherwise nidaqmx warns when the task is collected
 
 
 class AnalogueOutput(_Task):
-    """Voltages, all written at once; nobody else can use the channels meanwhile."""
+    """Voltages, all written at once; meanwhile no other program can use the channels."""
 
     def __init__(self, daq: Daqmx, channels: Sequence[tuple[str, float, float]]) -> None:
         self._channels = channels
@@ -256,7 +256,7 @@ class AnalogueOutput(_Task):
             self._task.ao_channels.add_ao_voltage_chan(name, min_val=low, max_val=high)
         writers = importlib.import_module("nidaqmx.stream_writers")
         self._writer = writers.AnalogMultiChannelWriter(self._task.out_stream, auto_start=True)
-        self._writer.verify_array_shape = False  # it asks the device for its channels each time
+        self._writer.verify_array_shape = False  # the check would query the device each time
         self._task.start()
 
     def write(self, volts: Array) -> None:
@@ -271,7 +271,8 @@ class AnalogueInput(_Task):
     Parameters
     ----------
     shared :
-        Another task reads inputs of the same device: hold it only while reading, which is slower.
+        Whether another task reads inputs of the same device. If so, reserve it only while reading,
+        which is slower.
     """
 
     def __init__(
@@ -332,7 +333,7 @@ class DigitalOutput(_Task):
 
 
 class WatchdogTask(_Task):
-    """The device's own timer: not fed in time, it drives a digital line by itself."""
+    """The device's own timer: unless it is fed in time, the device sets a digital line itself."""
 
     def __init__(self, daq: Daqmx, line: str, timeout: float, *, high: bool) -> None:
         self._line, self._timeout, self._high = line, timeout, high
@@ -353,7 +354,7 @@ class WatchdogTask(_Task):
         self._task.cfg_watchdog_do_expir_states([state])
 
     def start(self) -> None:
-        """Begin to count, or go on."""
+        """Start the timer, or restart it."""
         if self.running:
             self.feed()
             return
@@ -362,23 +363,23 @@ class WatchdogTask(_Task):
         self.running = True
 
     def feed(self) -> None:
-        """Start the count anew.
+        """Restart the timer.
 
         Raises
         ------
         WatchdogExpiredError
-            Too late.
+            It has expired.
         """
         with self._daq.errors("feeding the watchdog"):
             self._task.reset_timer()
 
     def stop(self) -> None:
-        """Count no longer."""
+        """Stop the timer."""
         with self._daq.errors("stopping the watchdog"):
             self._task.control(self._daq.nidaqmx.constants.TaskMode.TASK_STOP)
         self.running = False
 
     def clear(self) -> None:
-        """Let the device take digital writes again after the watchdog has expired."""
+        """Make the device accept digital writes again after the watchdog has expired."""
         with self._daq.errors("clearing the watchdog"):
             self._task.clear_expiration()

@@ -1,7 +1,7 @@
 """The driver ``modbus``: a supply over Modbus, such as output couplers, IO-Link masters, valves.
 
-pymodbus speaks the protocol, over TCP or a serial line. Where the pressures are, and how they are
-written, is in `stiffopt.rig.drivers.modbus_registers`.
+pymodbus handles the protocol, over TCP or a serial line. `stiffopt.rig.drivers.modbus_registers`
+describes where and how the pressures are stored.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ _CODES = {
     "readwrite_registers": 23,
 }
 _FAILURES = (OSError, struct.error, IndexError, ValueError)
-"""What pymodbus lets through when a device is gone or talks nonsense, besides its own errors."""
+"""Exceptions besides its own that pymodbus raises if a device is gone or sends nonsense."""
 
 
 class ModbusTcp(Schema):
@@ -83,7 +83,7 @@ class ModbusTcp(Schema):
         return f"the Modbus device at {self.host}:{self.port}"
 
     def endpoints(self) -> tuple[str, ...]:
-        """Return what a supply at this address is claimed by."""
+        """Return the endpoints by which a supply at this address is claimed."""
         return tcp_endpoints(self.host, self.port)
 
     def client(self, **options: Any) -> Any:
@@ -113,7 +113,7 @@ class ModbusSerial(Schema):
         return f"the Modbus device on {self.port}"
 
     def endpoints(self) -> tuple[str, ...]:
-        """Return what a supply on this line is claimed by."""
+        """Return the endpoints by which a supply on this line is claimed."""
         return serial_endpoints(self.port)
 
     def options(self) -> dict[str, Any]:
@@ -179,7 +179,7 @@ class ModbusSettings(SupplySettings):
         return self
 
     def _check_addresses(self) -> None:
-        """Refuse registers beyond the last one, and what would overwrite a set-point."""
+        """Refuse registers beyond the last address, and writes that overwrite a set-point."""
         taken = dict.fromkeys(self.watchdog.addresses if self.watchdog else (), "the watchdog")
         for index, point in enumerate(self.setpoints):
             for address in point.addresses:
@@ -196,12 +196,12 @@ class ModbusSettings(SupplySettings):
 
     @property
     def setpoints(self) -> tuple[PressureRegister, ...]:
-        """Where each channel is commanded."""
+        """Register that commands each channel."""
         return tuple(self._point(c.setpoint, "holding") for c in self.channels)
 
     @property
     def read_backs(self) -> tuple[PressureRegister, ...]:
-        """Where each channel's command can be read back."""
+        """Register from which each channel's command is read back."""
         pairs = zip(self.channels, self.setpoints, strict=True)
         return tuple(
             point if c.setpoint.read_back is None else replace(point, address=c.setpoint.read_back)
@@ -210,7 +210,7 @@ class ModbusSettings(SupplySettings):
 
     @property
     def readings(self) -> dict[int, PressureRegister]:
-        """Where the channels that are measured, counted from 0, are read."""
+        """Register of each measured channel, by channel, counted from 0."""
         return {
             index: self._point(c.reading, c.reading.table or self.table)
             for index, c in enumerate(self.channels)
@@ -219,7 +219,7 @@ class ModbusSettings(SupplySettings):
 
     @property
     def connection(self) -> ModbusTcp | ModbusSerial:
-        """How the device is reached."""
+        """The connection to the device."""
         connection = self.tcp or self.serial
         if connection is None:
             raise InputError("expected one of the keys 'tcp' and 'serial'")
@@ -249,8 +249,8 @@ class ModbusSettings(SupplySettings):
 class ModbusSupply(PressureSupply):
     """Regulators behind Modbus.
 
-    A request that fails is an error at once and ends the connection; the next one connects anew,
-    once. Nothing is sent twice but zeros, when the supply vents.
+    A request that fails is an error at once and ends the connection; the next one reconnects, once.
+    Only zeros are ever sent twice, when the supply vents.
     """
 
     _line: ModbusLine
@@ -260,7 +260,7 @@ class ModbusSupply(PressureSupply):
     ) -> None:
         super().__init__(limits, clock)
         self.settings = settings
-        self._watched = 0  # the connection on which the watchdog was started
+        self._watched = 0  # number of the connection on which the watchdog was started
         self._beat = 0
         self._setpoints = settings.setpoints
         self._read_backs = settings.read_backs
@@ -269,7 +269,7 @@ class ModbusSupply(PressureSupply):
         self._verified = runs_of(enumerate(self._read_backs)) if settings.verify else ()
         self._measured = runs_of(self._readings.items())
         self._joint = self._joint_run() if settings.read_write else None
-        self._told: Registers | None = None  # what the device must hold; None: that is not known
+        self._told: Registers | None = None  # registers that the device must have; None: unknown
         self.has_watchdog = settings.watchdog is not None
         self.has_dump_valve = settings.dump_valve is not None
         requests = len(self._written) + len(self._verified) + len(self._measured) + 1
@@ -277,7 +277,7 @@ class ModbusSupply(PressureSupply):
 
     @property
     def endpoints(self) -> tuple[str, ...]:
-        """The address of the device; its unit does not count, for many devices ignore it."""
+        """The address of the device, without its unit, which many devices ignore."""
         return self.settings.connection.endpoints()
 
     def prepare(self) -> None:
@@ -285,7 +285,7 @@ class ModbusSupply(PressureSupply):
         pymodbus_library("pymodbus.client")
 
     def _joint_run(self) -> RegisterRun | None:
-        """Return what function 23 reads, if it can write and read all in one request."""
+        """Return the registers to read by function 23, if it can write and read all at once."""
         readings = list(self._readings.items())
         verified = [item for run in self._verified for item in run.points]
         if len(self._written) > 1 or any(run.table != "holding" for run in self._measured):
@@ -304,7 +304,7 @@ class ModbusSupply(PressureSupply):
             self._line.connect()
             self._watch()
         except BaseException:
-            with suppress(DeviceError):  # a watchdog that fails must not keep it from venting
+            with suppress(DeviceError):  # even if the watchdog fails, vent
                 self._write_once(self._encoded(np.zeros(self.n)), whatever_happens=True)
             self._line.close()
             raise
@@ -313,7 +313,7 @@ class ModbusSupply(PressureSupply):
         self._line.close()
 
     def _watch(self) -> None:
-        """Start the device's watchdog, once on every connection: the device may be a fresh one."""
+        """Start the device's watchdog, once per connection, since the device may be a new one."""
         watchdog = self.settings.watchdog
         self._line.connect()
         if watchdog is None or self._watched == self._line.connections:
@@ -336,7 +336,7 @@ class ModbusSupply(PressureSupply):
     # set-points ----------------------------------------------------------------------------------
 
     def _encoded(self, pressures: Array) -> Registers:
-        """Return the registers of each channel: within its limits, whatever the pressures are."""
+        """Return each channel's registers, always within its limits."""
         last = self.limits.clamp(pressures)
         channels = zip(self._setpoints, last, self.limits.low, self.limits.high, strict=True)
         return {
@@ -372,7 +372,7 @@ class ModbusSupply(PressureSupply):
 
     def _check_held(self) -> None:
         told = self._told
-        if told is None or self.settings.serial is not None:  # which has one master, and is slow
+        if told is None or self.settings.serial is not None:  # a serial line has only one master
             return
         for run in self._verified:
             self._read_back(run, told)
@@ -427,7 +427,7 @@ class ModbusSupply(PressureSupply):
         except ModbusRefusedError as error:
             if error.code != _ILLEGAL_FUNCTION:
                 raise
-            self._joint = None  # it has done nothing; from now on it gets two requests
+            self._joint = None  # the device did nothing; use two requests from now on
             return None
         self._trigger()
         measured = np.full(self.n, np.nan)
@@ -455,7 +455,7 @@ class ModbusSupply(PressureSupply):
 
 
 def _insist(act: Callable[[], object]) -> None:
-    """Send a request that makes the arm safe; if it fails, once more on a new connection."""
+    """Send a request that makes the arm safe; if it fails, repeat it on a new connection."""
     try:
         act()
     except DeviceError:
@@ -463,7 +463,7 @@ def _insist(act: Callable[[], object]) -> None:
 
 
 class ModbusRefusedError(DeviceError):
-    """The device has answered that it will not do it.
+    """The device has refused the request.
 
     Attributes
     ----------
@@ -478,22 +478,22 @@ class ModbusRefusedError(DeviceError):
 class ModbusLine:
     """Sends requests to a device and returns its answers.
 
-    A request that fails ends the connection; the next one connects anew, once. No request is
-    ever sent twice, and none is sent after `close`: a closed line stays closed. Any thread may call
-    any method.
+    A request that fails ends the connection; the next one reconnects, once. No request is ever sent
+    twice, and none is sent after `close`: a closed line stays closed. Any thread may call any
+    method.
 
     Parameters
     ----------
     address :
-        How the device is reached.
+        The connection.
     unit :
-        Its number on the line.
+        Number of the device on the line.
     timeout :
-        For each answer, in s.
+        Time for each answer, in s.
 
     Attributes
     ----------
-    connections : how often it has connected.
+    connections : number of connections so far.
     """
 
     def __init__(
@@ -512,7 +512,7 @@ class ModbusLine:
         self._lock = RLock()
 
     def connect(self) -> None:
-        """Connect, where there is no connection."""
+        """Connect, unless there is a connection."""
         with self._lock:
             if self._closed:
                 raise DeviceError(f"the connection to {self.address} is closed; nothing was sent")
@@ -530,7 +530,7 @@ class ModbusLine:
             self._client.close()
 
     def close(self) -> None:
-        """End the connection for good, when the request that is under way has its answer."""
+        """End the connection for good, after the answer to a request under way."""
         with self._lock:
             self._closed = True
             self.disconnect()
@@ -541,7 +541,7 @@ class ModbusLine:
         Parameters
         ----------
         what :
-            What is asked for, in words, for messages.
+            The request in words, for messages.
         function, args, options :
             Method of pymodbus's client and its arguments.
 
@@ -550,7 +550,7 @@ class ModbusLine:
         ModbusRefusedError
             The device refuses.
         DeviceError
-            It does not answer, or not as it should.
+            It does not answer, or answers wrongly.
         """
         with self._lock:
             self.connect()
@@ -558,7 +558,7 @@ class ModbusLine:
                 method = getattr(self._client, function)
                 answer = method(*args, device_id=self.unit, **options)
             except BaseException as error:
-                # Whatever it was: a late answer must not be taken for that to the next request.
+                # A late answer must not be taken for that to the next request.
                 self.disconnect()
                 if not isinstance(error, self._failures):
                     raise
@@ -567,7 +567,7 @@ class ModbusLine:
             code = answer.function_code
             echo = answer.address if function.startswith("write") and code < 0x80 else None
             if code & 0x7F != _CODES[function] or (echo is not None and echo != args[0]):
-                self.disconnect()  # it may answer an earlier request; pymodbus lets it pass
+                self.disconnect()  # the answer may be to an earlier request, unnoticed by pymodbus
                 raise DeviceError(f"{self.address} answers something else: {what}")
         if code >= 0x80:
             reason = _EXCEPTIONS.get(answer.exception_code, "it does not say why")
@@ -576,7 +576,7 @@ class ModbusLine:
         return answer
 
     def ask_registers(self, what: str, n: int, function: str, *args: Any, **opts: Any) -> list[int]:
-        """Send a request that is answered with `n` registers, and return these."""
+        """Send a request and return the `n` registers of the answer."""
         with self._lock:
             registers = self.ask(what, function, *args, **opts).registers
             if len(registers) != n:
@@ -608,6 +608,6 @@ def pymodbus_library(name: str) -> Any:
     package = "pyserial" if name == "serial" else "pymodbus"
     module = library(name, package, ModbusSettings.extra)
     log = logging.getLogger("pymodbus.logging")
-    if not log.handlers:  # else it prints what is raised as an error anyway
+    if not log.handlers:  # otherwise it prints what is raised anyway
         log.addHandler(logging.NullHandler())
     return module

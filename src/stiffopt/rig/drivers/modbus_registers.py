@@ -1,4 +1,4 @@
-"""The register map of a Modbus supply: where pressures are, and how counts stand for them."""
+"""The register map of a Modbus supply: where the pressures are, and how counts encode them."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _RANGES = {
     "uint32": (0, 0xFFFFFFFF),
     "float32": (-1e12, 1e12),
 }
-_LONGEST = 120  # registers; what every request, also to read and write at once, may carry
+_LONGEST = 120  # registers that every request may carry, even one that reads and writes
 
 
 class PressureScale(Schema):
@@ -64,16 +64,16 @@ class PressureScale(Schema):
 
     @property
     def rises(self) -> bool:
-        """Whether more counts are more pressure."""
+        """Whether more counts mean more pressure."""
         return (self.counts[1] > self.counts[0]) == (self.pressure[1] > self.pressure[0])
 
     def to_pressure(self, count: float) -> float:
-        """Pressure in Pa at a count."""
+        """Return the pressure in Pa at a count."""
         (c0, c1), (p0, p1) = self.counts, self.pressure
         return p0 + (count - c0) * (p1 - p0) / (c1 - c0)
 
     def to_count(self, pressure: float) -> float:
-        """Count at a pressure in Pa, not rounded."""
+        """Return the count at a pressure in Pa, not rounded."""
         (c0, c1), (p0, p1) = self.counts, self.pressure
         return c0 + (pressure - p0) * (c1 - c0) / (p1 - p0)
 
@@ -171,13 +171,13 @@ class ModbusWatchdog(Schema):
 
     @property
     def addresses(self) -> tuple[int, ...]:
-        """All registers that are written for it."""
+        """All registers that the watchdog writes."""
         others = tuple(item.address for item in (*self.before, *self.after))
         return (self.address, *others, *(() if self.trigger is None else (self.trigger,)))
 
     @property
     def counts(self) -> int:
-        """The timeout as the register takes it, never longer than asked for."""
+        """Value of the register for the timeout, rounded down."""
         return int(self.timeout / self.resolution + 1e-9)
 
     @model_validator(mode="after")
@@ -200,18 +200,18 @@ class ModbusDumpValve(Schema):
     energised: Literal["closed", "open"] = "closed"
 
     def coil_for(self, *, open_valve: bool) -> bool:
-        """State of the coil for a state of the valve."""
+        """Return the state of the coil for a state of the valve."""
         return open_valve == (self.energised == "open")
 
 
 @dataclass(frozen=True)
 class PressureRegister:
-    """The registers of one pressure, and how it is written in them.
+    """The registers of one pressure, and its encoding.
 
     Attributes
     ----------
     address, table : of its first register.
-    type, word_order, scale : how the pressure is written.
+    type, word_order, scale : encoding of the pressure.
     """
 
     address: int
@@ -231,16 +231,16 @@ class PressureRegister:
         return range(self.address, self.address + self.width)
 
     def pressure_range(self) -> tuple[float, float]:
-        """Lowest and highest pressure that can be written, in Pa."""
+        """Return the lowest and highest pressure that can be encoded, in Pa."""
         ends = sorted(self.scale.to_pressure(count) for count in _RANGES[self.type])
         return ends[0], ends[1]
 
     def encode(
         self, pressure: float, *, lowest: float = -math.inf, highest: float = math.inf
     ) -> tuple[int, ...]:
-        """Return the registers for what is nearest to a finite pressure, but within limits.
+        """Return the registers for the pressure nearest to a finite one, within limits.
 
-        0 is written whatever the limits are, and never as more than the highest, if that is
+        0 is written whatever the limits are, and never as more than the highest limit if that is
         above 0.
 
         Raises
@@ -263,13 +263,13 @@ class PressureRegister:
         return self.registers(count)
 
     def registers(self, count: float) -> tuple[int, ...]:
-        """Return the registers for a count that the type can hold."""
+        """Return the registers for a count within the range of the type."""
         value = count if self.type == "float32" else int(count)
         words = struct.unpack(f">{self.width}H", struct.pack(_FORMATS[self.type], value))
         return words[::-1] if self.word_order == "little" else words
 
     def decode(self, registers: Sequence[int]) -> float:
-        """Return the pressure in Pa that registers stand for; it may be NaN."""
+        """Return the pressure in Pa that registers encode; it may be NaN."""
         words = registers[::-1] if self.word_order == "little" else registers
         (count,) = struct.unpack(_FORMATS[self.type], struct.pack(f">{self.width}H", *words))
         return self.scale.to_pressure(count)
@@ -287,11 +287,11 @@ class PressureRegister:
 
 @dataclass(frozen=True)
 class RegisterRun:
-    """Registers without a gap, which one request reads or writes.
+    """Contiguous registers, which one request reads or writes.
 
     Attributes
     ----------
-    table, start, count : which.
+    table, start, count : their table, first address and number.
     points : the pressures in them, by channel, counted from 0.
     """
 
@@ -313,13 +313,13 @@ class RegisterRun:
         return f"{self.table} register{'s' if self.count > 1 else ''} {what}"
 
     def cut(self, registers: Sequence[int], point: PressureRegister) -> Sequence[int]:
-        """Return the registers of a point out of those of the run."""
+        """Return the registers of a point from those of the run."""
         offset = point.address - self.start
         return registers[offset : offset + point.width]
 
 
 def runs_of(points: Iterable[tuple[int, PressureRegister]]) -> tuple[RegisterRun, ...]:
-    """Return the fewest runs that cover points; they never cover a register that has none."""
+    """Return the fewest runs that cover points, without registers in between."""
     found: list[RegisterRun] = []
     for item in sorted(points, key=lambda item: (item[1].table, item[1].address)):
         point = item[1]

@@ -1,11 +1,11 @@
-"""Program that reads an NDI tracker through ndicapi, run by `AuroraTracker` as its own process.
+"""Program that reads an NDI tracker through ndicapi; `AuroraTracker` runs it as a process.
 
-ndicapi is C code that does not check the length of replies and waits seconds for missing ones. In
-its own process it can neither crash the one that holds the pressures nor delay its end.
+ndicapi is C code that does not check the length of replies and waits seconds for missing ones. In a
+separate process it can neither crash the process that holds the pressures nor delay its end.
 
-The settings are its one argument, in JSON; it writes one JSON object per line. It ends when its
-standard input ends, and when the device is lost. It is run by its file name and imports nothing of
-the package, so that it starts at once.
+The only argument is the settings in JSON; the program writes one JSON object per line. It ends when
+its standard input ends, or when the device is lost. It is run by its file name and imports nothing
+of the package, so that it starts quickly.
 """
 
 from __future__ import annotations
@@ -21,26 +21,26 @@ from typing import Any
 
 try:
     import termios
-except ImportError:  # Windows: the library's own patience of 5 s must do
+except ImportError:  # on Windows the library's own timeout of 5 s must do
     termios = None  # type: ignore[assignment]
 
 BAUD_CODES = {9600: 0, 19200: 2, 38400: 3, 57600: 4, 115200: 5}
 INIT_PATIENCE = 1.0  # s for the first answer, before other speeds and a reset are tried
 RESET_PATIENCE = 4.0  # s for the answer to a reset
-SETUP_PATIENCE = 5.0  # s for what makes the device work: sensors, field generator
+SETUP_PATIENCE = 5.0  # s for setting up sensors and field generator
 POLL_PATIENCE = 0.3  # s for a frame
-LAST_MOMENT = 0.7  # s from the order to end to the end
-TEXT_ONLY = ("AURORA Rev 007", "AURORA Rev 008")  # firmware whose binary replies are not usable
+LAST_MOMENT = 0.7  # s from the request to end to a forced end
+TEXT_ONLY = ("AURORA Rev 007", "AURORA Rev 008")  # firmware whose binary replies are unusable
 NDI_IDS = {(0x0403, product) for product in range(0xDA70, 0xDA75)}
 NDI_VENDOR = 0x23F2
 
 
 class LostError(Exception):
-    """The tracker cannot be used, or no longer."""
+    """The tracker is unusable, or was lost."""
 
 
 class SerialPort:
-    """The serial port, opened a second time to tell why it fails and to shorten timeouts."""
+    """The serial port, opened a second time to explain failures and to shorten timeouts."""
 
     def __init__(self, port: str) -> None:
         self.fd = -1
@@ -62,27 +62,27 @@ class SerialPort:
             raise LostError(f"{port} is not a serial port; {known_ports()}")
 
     def wait_for(self, patience: float) -> None:
-        """Let the library wait so long for a reply, in s."""
+        """Set how long the library waits for a reply, in s."""
         if termios is not None:
             attributes = termios.tcgetattr(self.fd)
             attributes[6][termios.VTIME] = max(1, round(patience * 10))
             termios.tcsetattr(self.fd, termios.TCSANOW, attributes)
 
     def set_speed(self, baud: int) -> None:
-        """Set this end of the line."""
+        """Set the speed of this end of the line."""
         if termios is not None:
             attributes = termios.tcgetattr(self.fd)
             attributes[4] = attributes[5] = getattr(termios, f"B{baud}")
             termios.tcsetattr(self.fd, termios.TCSANOW, attributes)
 
     def close(self) -> None:
-        """Let go of it."""
+        """Close the port."""
         if self.fd >= 0:
             os.close(self.fd)
 
 
 def known_ports() -> str:
-    """Return a sentence that names the serial ports there are."""
+    """Return a sentence that lists the serial ports."""
     from serial.tools import list_ports
 
     names = sorted(port.device for port in list_ports.comports())
@@ -90,7 +90,7 @@ def known_ports() -> str:
 
 
 def find_port() -> str:
-    """Return the port of the one NDI device; ports of other makers are never spoken to."""
+    """Return the port of the only NDI device, without opening ports of other makers."""
     from serial.tools import list_ports
 
     ports = [
@@ -119,24 +119,24 @@ class Session:
             raise LostError(f"{port} cannot be opened; is another program using it?")
 
     def ask(self, command: str) -> str:
-        """Send a command, return the reply; the library raises OSError for errors."""
+        """Send a command and return the reply; the library raises OSError for errors."""
         return str(self.ndi.ndiCommand(self.device, command))
 
     def greet(self, likely: int) -> None:
-        """Initialise the device, whatever speed it was left at, and agree on the speed."""
+        """Initialise the device at whatever speed it has, and set the speed of both ends."""
         speeds = dict.fromkeys((likely, 9600, self.baud))
         if not any(self.is_heard_at(speed) for speed in speeds):
             self.reset()
         self.line.wait_for(SETUP_PATIENCE)
         self.ask(f"COMM:{BAUD_CODES[self.baud]}0000")
         self.line.set_speed(self.baud)
-        time.sleep(0.1)  # the device needs it to change its speed
+        time.sleep(0.1)  # time for the device to change its speed
 
     def is_heard_at(self, speed: int) -> bool:
-        """Say whether the device can be initialised at a speed."""
+        """Return whether the device can be initialised at a speed."""
         self.line.wait_for(INIT_PATIENCE)
         self.line.set_speed(speed)
-        for _ in range(2):  # what came before at another speed may spoil the first command
+        for _ in range(2):  # bytes sent at another speed may spoil the first command
             try:
                 self.ask("INIT:")
             except OSError:
@@ -161,18 +161,18 @@ class Session:
             ) from None
 
     def handles(self, kind: int) -> list[int]:
-        """Return the port handles of a kind: 1 to be freed, 2 to be initialised."""
+        """Return the port handles of a kind: 1 for those to free, 2 for those to initialise."""
         self.ask(f"PHSR:{kind:02X}")
         count = int(self.ndi.ndiGetPHSRNumberOfHandles(self.device))
         return [int(self.ndi.ndiGetPHSRHandle(self.device, i)) for i in range(count)]
 
     def enable(self, sensor: int) -> int:
-        """Initialise all sensors, enable one of them, return its handle."""
+        """Initialise all sensors, enable one of them, and return its handle."""
         for handle in self.handles(1):
             self.ask(f"PHF:{handle:02X}")
         found: dict[int, str] = {}
         while new := [handle for handle in self.handles(2) if handle not in found]:
-            for handle in new:  # the second sensor of a port shows only after the first
+            for handle in new:  # the second sensor of a port appears after the first
                 found[handle] = ""
                 try:
                     self.ask(f"PINIT:{handle:02X}")
@@ -191,13 +191,13 @@ class Session:
         return handle
 
     def needs_text(self) -> bool:
-        """Say whether the firmware is too old for binary replies."""
+        """Return whether the firmware is too old for binary replies."""
         version = self.ask("VER:0")
         tags = [row.partition(":")[2] for row in version.split("\n") if row.startswith("Freeze")]
         return any(tag.strip() in TEXT_ONLY for tag in tags)
 
     def close(self) -> None:
-        """Stop tracking, go back to the speed of an unknown device, let go of the line."""
+        """Stop tracking, restore the default speed, and close the line."""
         with suppress(OSError):
             self.line.wait_for(0.2)
             self.ask("TSTOP:")
@@ -205,13 +205,13 @@ class Session:
         self.abandon()
 
     def abandon(self) -> None:
-        """Let go of the line."""
+        """Close the line."""
         self.ndi.ndiClose(self.device)
         self.line.close()
 
 
 def follow(session: Session, settings: dict[str, Any], stop: threading.Event, tell: Any) -> None:
-    """Track until told to stop; every frame is told once."""
+    """Track until `stop` is set; report every frame once by `tell`."""
     ndi, device = session.ndi, session.device
     session.greet(settings["likely_baud"])
     wanted = settings["reply"]
@@ -249,7 +249,7 @@ def follow(session: Session, settings: dict[str, Any], stop: threading.Event, te
 
 
 def run(settings: dict[str, Any], stop: threading.Event, tell: Any) -> None:
-    """Connect and track; what ends it but an order is told."""
+    """Connect and track; report why it ends unless `stop` was set."""
     try:
         ndi = importlib.import_module("ndicapy")
         port = find_port() if settings["port"] == "auto" else settings["port"]
@@ -272,13 +272,13 @@ def run(settings: dict[str, Any], stop: threading.Event, tell: Any) -> None:
 def main() -> None:
     """Run with the settings of the command line."""
     lines = os.fdopen(os.dup(1), "w", buffering=1)
-    os.dup2(2, 1)  # should the library print
+    os.dup2(2, 1)  # in case the library prints
     stop = threading.Event()
 
     def tell(**message: Any) -> None:
         try:
             lines.write(f"{json.dumps(message)}\n")
-        except OSError:  # nobody listens any more
+        except OSError:  # the parent process has ended
             os._exit(0)
 
     def watch() -> None:

@@ -33,11 +33,11 @@ Array = NDArray[np.float64]
 
 
 class _VoltageLine(Schema):
-    """A voltage that stands for a pressure: a straight line through two points.
+    """A voltage that encodes a pressure: a straight line through two points.
 
     Attributes
     ----------
-    volts, pressures : of the two points, in V and Pa.
+    volts, pressures : the two points, in V and Pa.
     """
 
     volts: Pair[Voltage] = (0.0, 10.0)
@@ -51,11 +51,11 @@ class _VoltageLine(Schema):
         return self
 
     def volts_for(self, pressure: float) -> float:
-        """Return the voltage in V that stands for a pressure in Pa."""
+        """Return the voltage in V for a pressure in Pa."""
         return float(_through(pressure, self.pressures, self.volts))
 
     def pressure_at(self, volts: float) -> float:
-        """Return the pressure in Pa for which a voltage in V stands."""
+        """Return the pressure in Pa for a voltage in V."""
         return float(_through(volts, self.volts, self.pressures))
 
 
@@ -203,11 +203,11 @@ class NidaqSupply(PressureSupply):
         self._vented = np.array([output.volts_for(0.0) for output in outputs])
         self.has_watchdog = settings.watchdog is not None  # which opens the dump valve
         self.has_dump_valve = settings.dump_valve is not None
-        self.patience = 3 * settings.timeout  # outputs, valve and inputs have a deadline each
+        self.patience = 3 * settings.timeout  # of outputs, valve and inputs
 
     @property
     def endpoints(self) -> tuple[str, ...]:
-        """The devices whose outputs it has, on this machine or behind a server."""
+        """The devices that have its outputs, on this machine or behind a server."""
         names = sorted({c.output.channel.split("/")[0].lower() for c in self._settings.channels})
         places: tuple[str, ...] = ("ni-daq",)
         if self._settings.grpc is not None:
@@ -248,7 +248,7 @@ class NidaqSupply(PressureSupply):
         self._opened.close()
 
     def _input_channels(self) -> list[InputChannel]:
-        """Return the measured pressures first, then the outputs that are read back."""
+        """Return the inputs: first the measured pressures, then the outputs to read back."""
         inputs = [channel.input for channel in self._settings.channels]
         found = [InputChannel(i.channel, i.terminals, *i.range) for i in inputs if i is not None]
         for channel, low, high in zip(
@@ -275,7 +275,7 @@ class NidaqSupply(PressureSupply):
         return self._pressures(found)
 
     def _send(self, pressures: Array) -> Array:
-        """Write set-points, and return the volts that were written."""
+        """Write set-points; return the written voltages (n,)."""
         outputs = [channel.output for channel in self._settings.channels]
         volts = np.array([o.volts_for(p) for o, p in zip(outputs, pressures, strict=True)])
         volts = np.where(np.isfinite(volts), volts, self._vented)
@@ -289,7 +289,7 @@ class NidaqSupply(PressureSupply):
         return volts
 
     def _check(self, wanted: Array, inputs: Array) -> None:
-        """Refuse outputs that are not where they should be; they come last of the inputs."""
+        """Refuse outputs with a wrong voltage; `inputs` has them last."""
         found = inputs[len(inputs) - len(self._read_backs) :]
         for index, volts in zip(self._read_backs, found, strict=True):
             if not abs(volts - wanted[index]) <= self._settings.read_back_tolerance:
@@ -300,7 +300,7 @@ class NidaqSupply(PressureSupply):
                 )
 
     def _pressures(self, inputs: Array | None) -> Array:
-        """Return measured pressures (n,), which come first of the inputs."""
+        """Return measured pressures (n,), in Pa; `inputs` has them first."""
         pressures = np.full(self.n, np.nan)
         volts = iter([] if inputs is None else inputs)
         for index, channel in enumerate(self._settings.channels):
@@ -314,7 +314,7 @@ class NidaqSupply(PressureSupply):
 
 
 class _Valve:
-    """The valve; a watchdog with a timeout in s opens it when the software is silent."""
+    """The valve; a watchdog with a timeout in s opens it if the software falls silent."""
 
     def __init__(self, daq: Daqmx, settings: NidaqDumpValve, timeout: float | None) -> None:
         self._opens_when_high = settings.closed_when == "low"
@@ -330,27 +330,27 @@ class _Valve:
             raise
 
     def open(self) -> None:
-        """Empty the arm."""
+        """Open the valve, which empties the arm."""
         try:
             self._line.write(high=self._opens_when_high)
         except WatchdogExpiredError:
             if self._watchdog is None:
                 raise
-            # The device holds the valve open, but takes no other word for it until it is told.
+            # The device holds the valve open, but refuses writes until the watchdog is cleared.
             self._watchdog.clear()
             self._line.write(high=self._opens_when_high)
-        # Only now: if the line could not be written, the watchdog still opens the valve.
+        # Not before: if the write had failed, the watchdog would still open the valve.
         if self._watchdog is not None and self._watchdog.running:
             self._watchdog.stop()
 
     def shut(self) -> None:
-        """Let the arm be filled, watched from before the valve shuts."""
+        """Close the valve; start the watchdog before."""
         if self._watchdog is not None:
             self._watchdog.start()
         self._line.write(high=not self._opens_when_high)
 
     def feed(self) -> bool:
-        """Tell the watchdog that the software lives; return False if it comes too late."""
+        """Feed the watchdog; return False if it has expired."""
         if self._watchdog is not None and self._watchdog.running:
             try:
                 self._watchdog.feed()
@@ -359,9 +359,9 @@ class _Valve:
         return True
 
     def close(self, clock: Clock) -> None:
-        """Let go of the line, which keeps its level."""
+        """Release the line, which keeps its level."""
         if self._watchdog is not None:
-            if self._watchdog.running:  # the valve could not be opened: the device shall do it
+            if self._watchdog.running:  # opening the valve failed: let the device do it
                 clock.sleep(1.2 * self._timeout)
             self._watchdog.close()
         self._line.close()

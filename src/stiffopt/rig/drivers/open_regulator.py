@@ -1,7 +1,7 @@
 """The driver ``open-regulator``: a microcontroller with valves, which controls the pressures.
 
-Board, firmware and protocol are described in docs/open-regulator.md. The board vents by itself;
-this driver never keeps it alive: each of its commands comes from somebody who commands.
+docs/open-regulator.md describes board, firmware and protocol. The board vents on its own if
+commands stop; this driver never keeps it alive: each command comes from a caller.
 """
 
 from __future__ import annotations
@@ -111,8 +111,8 @@ class OpenRegulatorSettings(SupplySettings):
 class OpenRegulatorSupply(PressureSupply):
     """A board that controls the pressures of its channels.
 
-    A command holds until `Identity.silence` after the board's time that is sent along: that of its
-    last report. A command that was held up anywhere is refused by the board.
+    Each command carries the board's time of its last report, and is valid for `Identity.silence`
+    after that. So the board refuses a command that was delayed anywhere.
     """
 
     has_watchdog = True
@@ -126,8 +126,8 @@ class OpenRegulatorSupply(PressureSupply):
         self._outputs = np.array([channel.output for channel in settings.channels]) - 1
         self._line: BoardLine
         self._identity: Identity
-        self._told: tuple[int, ...] | None = None  # None: what the board holds is not known
-        self._seen: tuple[float, Status] | None = None  # the last report, and when it came
+        self._told: tuple[int, ...] | None = None  # set-points that the board has; None: unknown
+        self._seen: tuple[float, Status] | None = None  # time of the last report, and the report
         self.patience = settings.startup + 6 * settings.timeout
 
     @property
@@ -140,7 +140,7 @@ class OpenRegulatorSupply(PressureSupply):
         self._new_line()
 
     def statistics(self) -> dict[str, int]:
-        """Return what the board has counted since its start; see docs/open-regulator.md.
+        """Return the board's counters since its start; see docs/open-regulator.md.
 
         Raises
         ------
@@ -203,7 +203,7 @@ class OpenRegulatorSupply(PressureSupply):
     # commands ------------------------------------------------------------------------------------
 
     def _counts(self, pressures: Array) -> tuple[int, ...]:
-        """Return pressures (n,) in units, for each channel of the board, rounded down."""
+        """Return pressures (n,) in units, rounded down, for each channel of the board."""
         counts = np.zeros(self._identity.channels, dtype=int)
         counts[self._outputs] = np.floor(self.limits.clamp(pressures) / UNIT + 1e-6)
         return tuple(counts.tolist())
@@ -222,7 +222,7 @@ class OpenRegulatorSupply(PressureSupply):
         return self._report()
 
     def _begin(self) -> None:
-        """Arm the board, with the limits; one that is armed already has them."""
+        """Set the limits and arm the board, unless it is armed already."""
         if self._report().armed:
             return
         most, chosen = self._identity.max_slew, self.settings.slew
@@ -238,7 +238,7 @@ class OpenRegulatorSupply(PressureSupply):
         counts, before = self._counts(pressures), self._told
         self._told = None
         if any(counts) and before is not None and not any(before):
-            self._begin()  # silence at no pressure has vented the board, and nothing else
+            self._begin()  # silence without pressure has vented the board, for no other reason
         time, validity = self._recent().time, round(self._identity.silence * 1e3)
         payload = struct.pack(f"<IH{len(counts)}h", time, validity, *counts)
         status = self._keep(self._line.status(SET, payload))
@@ -273,7 +273,7 @@ class OpenRegulatorSupply(PressureSupply):
 
 
 def _insist(act: Callable[[], Any]) -> Any:
-    """Send a request that makes the arm safe, again if it fails."""
+    """Send a request that makes the arm safe; repeat it if it fails."""
     for _ in range(_TRIES - 1):
         with suppress(DeviceError):
             return act()

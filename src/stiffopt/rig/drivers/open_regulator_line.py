@@ -16,12 +16,12 @@ from stiffopt.rig.device import library
 VERSION = 1
 EXTRA = "open-regulator"
 UNIT = 10.0
-"""What a pressure counts in, in Pa."""
+"""Unit of pressures on the line, in Pa."""
 
 IDENTITY, LIMITS, ARM, SET, VENT, READ, STATISTICS = range(1, 8)
 REPLY, ERROR_REPLY = 0x80, 0xFF
 IS_VENTED = 6
-_LOOK = 0.005  # s between looks at the clock while nothing comes
+_LOOK = 0.005  # s between checks of the time while nothing arrives
 _NAMES = {
     IDENTITY: "say what it is",
     LIMITS: "take limits",
@@ -56,16 +56,16 @@ _ERRORS = {
 
 @dataclass(frozen=True)
 class Identity:
-    """What a board says of itself.
+    """The identity of a board, as it reports it.
 
     Attributes
     ----------
     board : its number.
     version : of the protocol.
     firmware : its version.
-    channels : how many it has.
+    channels : number of channels.
     silence : time without a command after which it vents, in s.
-    max_pressure, max_slew : which it never exceeds, in Pa and Pa/s.
+    max_pressure, max_slew : limits that it never exceeds, in Pa and Pa/s.
     """
 
     board: int
@@ -78,7 +78,7 @@ class Identity:
 
     @classmethod
     def of(cls, board: int, payload: bytes) -> Self:
-        """Read a payload, which all versions of the protocol share."""
+        """Decode a payload, which is the same in all versions of the protocol."""
         version, major, minor, channels, silence, pressure, slew = struct.unpack(
             "<BBBBHHH", payload
         )
@@ -88,12 +88,12 @@ class Identity:
 
 @dataclass(frozen=True)
 class Status:
-    """What a board reports.
+    """A report of a board.
 
     Attributes
     ----------
     time : since the board's start, in ms.
-    armed : whether it takes set-points; else it is vented.
+    armed : whether it accepts set-points; otherwise it is vented.
     reason : why it is vented, or was last, in words.
     supply : pressure in front of the valves, in units.
     set_points, readings : of each channel, in units.
@@ -108,7 +108,7 @@ class Status:
 
     @classmethod
     def of(cls, payload: bytes) -> Self:
-        """Read a payload; raise `DeviceError` if it is none."""
+        """Decode a payload; raise `DeviceError` if it is invalid."""
         if len(payload) < 13 or len(payload) % 4 != 1:
             raise DeviceError(f"a report of {len(payload)} bytes makes no sense")
         moment, armed, cause, channel, supply = struct.unpack_from("<IBBBh", payload)
@@ -124,7 +124,7 @@ def in_words(cause: int, channel: int, n: int = 6) -> str:
 
 
 def framed(body: bytes) -> bytes:
-    """Return a body as it is sent: with its CRC, stuffed, between zeros."""
+    """Return the frame of a body: with its CRC, COBS-encoded, between zeros."""
     whole = body + struct.pack("<H", binascii.crc_hqx(body, 0xFFFF))
     return b"\0" + bytes(_cobs().encode(whole)) + b"\0"
 
@@ -141,7 +141,7 @@ def body_of(frame: bytes) -> bytes | None:
 
 
 class BoardRefusedError(DeviceError):
-    """The board has answered that it will not do it.
+    """The board has refused the request.
 
     Attributes
     ----------
@@ -154,19 +154,19 @@ class BoardRefusedError(DeviceError):
 
 
 class BoardLine:
-    """Sends requests to a board, and returns its answers; nothing is sent twice.
+    """Sends requests to a board and returns its answers; nothing is sent twice.
 
-    After a failure the line is read empty before the next request; a port that is gone is opened
-    anew. Any thread may call any method.
+    After a failure, old input is dropped before the next request; a lost port is reopened. Any
+    thread may call any method.
 
     Parameters
     ----------
     port, baudrate :
         Of the serial line.
     board :
-        Number of the board that is asked, and must answer.
+        Number of the board that must answer.
     timeout :
-        For each answer, in s.
+        Time for each answer, in s.
     """
 
     def __init__(self, port: str, baudrate: int, board: int, timeout: float) -> None:
@@ -182,7 +182,7 @@ class BoardLine:
         return f"the open regulator on {self.port}"
 
     def close(self) -> None:
-        """Let go of the port."""
+        """Close the port."""
         with self._lock:
             line, self._serial = self._serial, None
             if line is not None:
@@ -190,14 +190,14 @@ class BoardLine:
                     line.close()
 
     def identity(self, timeout: float) -> Identity:
-        """Ask whatever board is there what it is; wait for the answer some s."""
+        """Return the identity of any board on the line; wait for it up to `timeout`, in s."""
         body = self._exchange(IDENTITY, b"", 0, timeout)
         if body[3] == ERROR_REPLY or len(body) < 14:
             raise DeviceError(wrong_version(str(self), body[0]))
         return Identity.of(body[1], body[4:14])
 
     def status(self, kind: int = READ, payload: bytes = b"") -> Status:
-        """Send a request that is answered with a status."""
+        """Send a request whose answer is a status; return it."""
         return Status.of(self.ask(kind, payload))
 
     def ask(self, kind: int, payload: bytes = b"") -> bytes:
@@ -208,7 +208,7 @@ class BoardLine:
         BoardRefusedError
             The board refuses.
         DeviceError
-            It does not answer, or not as it should.
+            It does not answer, or answers wrongly.
         """
         body = self._exchange(kind, payload, self.board, self.timeout)
         if body[0] != VERSION:
@@ -247,7 +247,7 @@ class BoardLine:
         return body
 
     def _ready(self) -> Any:
-        """Return the port, open and silent."""
+        """Return the port, open and without old input."""
         if self._serial is None:
             self._serial = self._port()
             self._doubtful = True
@@ -294,7 +294,7 @@ def _cobs() -> Any:
 
 
 def _failures() -> tuple[type[Exception], ...]:
-    """Return what pyserial raises, or lets through, when a port is gone."""
+    """Return the exceptions that pyserial raises or lets through when a port is gone."""
     with suppress(ImportError):
         import termios
 

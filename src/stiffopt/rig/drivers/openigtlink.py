@@ -19,10 +19,10 @@ from stiffopt.rig.interface import Clock, StreamedSettings, StreamedTracker
 from stiffopt.units import Duration
 
 _HEADER = 58  # bytes before the body of a message
-_LONGEST = 64 * 2**20  # bytes of a body; a longer one means that the stream is not understood
-_BETWEEN_TRIES = 0.5  # s before a lost server is called again
-_CALL = 0.5  # s in which a lost server must take the call
-_PATIENCE = 0.2  # s in which a read returns, so that closing is prompt
+_LONGEST = 64 * 2**20  # bytes of a body; a longer one means that the stream is not OpenIGTLink
+_BETWEEN_TRIES = 0.5  # s between attempts to reach a lost server
+_CALL = 0.5  # s for a lost server to accept a connection
+_PATIENCE = 0.2  # s, timeout of a read, so that closing is prompt
 _SKEW = 0.01  # by which the columns of a rotation may fail to be orthonormal
 _DRIFT = 1e-3  # by which the sender's clock may be fast or slow; NTP slews by half of it
 
@@ -53,19 +53,19 @@ class OpenIGTLinkSettings(StreamedSettings):
 
 
 class SenderClock:
-    """Maps times of the sender's clock to ours, knowing only when messages arrived.
+    """Maps times of the sender's clock to ours from the arrival times of messages.
 
-    A message's stamp plus the least difference seen between arrival and stamp is when it would
-    have arrived at the fastest: what is held up on the way does not become younger by it. The
-    least difference grows slowly with time, as clocks drift; a clock that goes back was set.
+    The smallest difference between arrival and stamp so far belongs to the fastest message. A
+    message's stamp plus this difference is when it would have arrived without a delay. The smallest
+    difference grows slowly with time, as clocks drift; a clock that jumps back was set.
     """
 
     def __init__(self) -> None:
         self._newest = -np.inf
-        self._fastest = (0.0, np.inf)  # stamp and difference
+        self._fastest = (0.0, np.inf)  # stamp and difference of the fastest message
 
     def fastest_arrival(self, stamp: float, arrival: float) -> float:
-        """Return when a message with this stamp would have arrived at the fastest."""
+        """Return when a message with this stamp would have arrived without a delay."""
         if not stamp > 0:  # senders without a clock write 0
             return arrival
         difference = arrival - stamp
@@ -75,22 +75,21 @@ class SenderClock:
             self._fastest = (stamp, difference)
             least = difference
         self._newest = stamp
-        return min(stamp + least, arrival)  # rounding may put it later
+        return min(stamp + least, arrival)  # rounding may make it later
 
 
 class OpenIGTLinkTracker(StreamedTracker):
-    """Reads the server's stream in a thread; pyigtl understands the messages.
+    """Reads the server's stream in a thread; pyigtl decodes the messages.
 
-    pyigtl's own client is not used: when the server closes the connection it occupies a core
-    without noticing, it loses its place in the stream when a header comes in two parts, and it
-    delivers no more than about 97 messages a second, without the time of their arrival.
+    pyigtl's own client is not used: when the server closes the connection, it occupies a core
+    without noticing; it loses its place in the stream when a header arrives in two parts; and it
+    delivers at most about 97 messages a second, without the time of their arrival.
 
-    PLUS sends nothing for a tool that it does not see: only the age tells.
+    PLUS sends nothing for a tool that it does not see: only the age of the last sample shows it.
 
     Attributes
     ----------
-    heard : names of the devices whose messages came; helpful when `OpenIGTLinkSettings.name` is
-        wrong.
+    heard : names of the devices in the messages; helpful if `OpenIGTLinkSettings.name` is wrong.
     """
 
     def __init__(self, settings: OpenIGTLinkSettings, clock: Clock | None = None) -> None:
@@ -115,7 +114,7 @@ class OpenIGTLinkTracker(StreamedTracker):
         try:
             chosen = self.settings
             found = socket.getaddrinfo(chosen.host, chosen.port, type=socket.SOCK_STREAM)
-            self._address = found[0][4][:2]  # once: a name server may keep one waiting
+            self._address = found[0][4][:2]  # resolved once: a name server may be slow
             connection = self._connect(chosen.connect_timeout)
         except OSError as error:
             raise DeviceError(
@@ -139,7 +138,7 @@ class OpenIGTLinkTracker(StreamedTracker):
         return connection
 
     def _run(self, connection: socket.socket | None) -> None:
-        """Follow the server until the tracker is closed, across connections."""
+        """Read from the server, reconnecting if necessary, until the tracker is closed."""
         while not self._stopping.is_set():
             try:
                 if connection is None:
@@ -165,7 +164,7 @@ class OpenIGTLinkTracker(StreamedTracker):
                 self._take({**fields, "crc": int.from_bytes(header[-8:])}, body, arrival)
 
     def _receive(self, connection: socket.socket, size: int) -> bytes:
-        """Return so many bytes, or fewer when the tracker is being closed."""
+        """Return `size` bytes, or none when the tracker is being closed."""
         received = bytearray()
         began = time.monotonic()
         while len(received) < size and not self._stopping.is_set():
@@ -222,5 +221,5 @@ class OpenIGTLinkTracker(StreamedTracker):
 
 
 def pyigtl_messages() -> Any:
-    """Return the part of pyigtl that packs and unpacks messages."""
+    """Return the module of pyigtl that packs and unpacks messages."""
     return library("pyigtl", "pyigtl", OpenIGTLinkSettings.extra).messages

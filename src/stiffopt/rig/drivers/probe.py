@@ -1,9 +1,9 @@
-"""The driver ``probe``: a force sensor on a linear stage of Zaber that pushes on the tip.
+"""The driver ``probe``: a force sensor on a linear stage of Zaber that pushes the tip.
 
-A person mounts the rail along each direction; the stage moves along the rail and stops when the
-force is too high. zaber-motion speaks to the stage, over TCP or a serial line. Native units are
-converted here, since zaber-motion would ask a database on the internet. The sensor is on an
-analogue input of an NI-DAQ device.
+A person mounts the rail along each direction; the stage moves along the rail and stops if the force
+is too high. zaber-motion controls the stage, over TCP or a serial line. Native units are converted
+here, because zaber-motion would query a database on the internet. The sensor is on an analogue
+input of an NI-DAQ device.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ from stiffopt.units import Duration, Force, ForcePerVoltage, Length, Speed, Volt
 SPEED_FACTOR = 1.6384
 """Zaber's native units of speed for one microstep per second."""
 
-_POLL = 0.002  # s between two looks at a moving stage
+_POLL = 0.002  # s between polls of a moving stage
 _ARRIVED = 5e-6  # m from the target
-_PATIENCE = 2.0  # s longer than a move should take
-_MOMENT = 0.1  # s after which a device that takes one connection takes the next
-_SATURATED = 0.999  # of the converter's range
-_WORSE = 1.2  # factor on a force that is too high already while the probe backs off
+_PATIENCE = 2.0  # s by which a move may exceed its expected time
+_MOMENT = 0.1  # s between two connections to a device that accepts only one
+_SATURATED = 0.999  # share of the converter's range
+_WORSE = 1.2  # factor on an excessive force that is allowed while the probe backs off
 
 
 class ZaberStageSettings(Schema):
@@ -113,7 +113,7 @@ class ForceSensorSettings(Schema):
 
     @property
     def largest(self) -> float:
-        """Force that can be felt in either sense, in N."""
+        """Greatest force that can be measured in both directions, in N."""
         volts = _SATURATED * min(-self.range[0], self.range[1])
         return abs(self.sensitivity) * volts
 
@@ -154,9 +154,9 @@ class ZaberProbeSettings(ProbeSettings):
         Parameters
         ----------
         clock :
-            Of the rig.
+            Clock of the rig.
         prompt :
-            Asks a person to do something and returns when it is done; by default on the terminal.
+            Asks a person to do something and returns when it is done; None: on the terminal.
         """
         return ZaberProbe(self, clock, prompt)
 
@@ -170,7 +170,7 @@ def ask_at_the_terminal(request: str) -> None:
 
 
 class ZaberProbe(ForceProbe):
-    """The stage with the sensor; its position is 0 where it was aligned, and grows to the tip."""
+    """The stage with the sensor; its position is 0 where it was aligned, positive to the tip."""
 
     def __init__(
         self,
@@ -192,12 +192,12 @@ class ZaberProbe(ForceProbe):
         return True
 
     def align(self, direction: Iterable[float]) -> None:
-        """Ask that the rail be mounted along a unit vector (3,) in the base frame; tare there.
+        """Ask a person to mount the rail along a unit vector (3,) in the base frame; then tare.
 
         Raises
         ------
         CommandError
-            Not a unit vector.
+            The direction is not a unit vector.
         """
         self._must_be_open()
         axis = np.array(list(direction), dtype=float)
@@ -214,7 +214,7 @@ class ZaberProbe(ForceProbe):
         self._aligned = True
 
     def move_to(self, position: float, speed: float) -> None:
-        """Move to a place along the axis, in m, at a speed in m/s, and return when there.
+        """Move to a position along the axis, in m, at a speed in m/s; return on arrival.
 
         Raises
         ------
@@ -237,7 +237,7 @@ class ZaberProbe(ForceProbe):
         self._stage.move_to(place, speed, lambda: self._guard(most))
 
     def withdraw(self) -> None:
-        """Back off to where it was aligned, and ask that the rail be taken out of the way."""
+        """Return to where it was aligned, and ask a person to take the rail away."""
         self._must_be_open()
         self._back_off()
         self._aligned = False
@@ -262,7 +262,7 @@ class ZaberProbe(ForceProbe):
             stack.callback(daq.close)
             force = settings.force
             wired = InputChannel(force.channel, force.terminals, *force.range)
-            # The supply's inputs are often on the same device: hold it only while reading.
+            # The supply's inputs are often on the same device: reserve it only while reading.
             self._input = AnalogueInput(daq, [wired], shared=True)
             stack.callback(self._input.close)
             self._stage = ZaberStage(settings.stage, settings.timeout, self.clock)
@@ -273,10 +273,10 @@ class ZaberProbe(ForceProbe):
             self._opened = stack.pop_all()
 
     def _close(self) -> None:
-        # The supply vents at about this time, and the arm goes where it wants: it should not find
-        # the probe in its way. Back along the way it came, no further than where a person has put
-        # it, is the one move that is known to be free and that takes force off the tip. Before
-        # an alignment nothing is known about the way, and the stage stays where it stands.
+        # The supply vents at about this time, and the arm moves: the probe must not be in its way.
+        # Only the way back to where a person has aligned the probe is known to be free, and it
+        # takes force off the tip. Before an alignment no way is known, so the stage stays where it
+        # is.
         with self._opened:
             with suppress(DeviceError):
                 self._stage.stop()
@@ -338,12 +338,12 @@ class ZaberProbe(ForceProbe):
 
 
 class ZaberStage:
-    """The stage; places are m from its home position.
+    """The stage; positions are in m from its home.
 
     Parameters
     ----------
     guard :
-        Called all the time while the stage moves; if it raises, the stage is stopped.
+        Called continually while the stage moves; if it raises, the stage is stopped.
     """
 
     def __init__(self, settings: ZaberStageSettings, timeout: float, clock: Clock) -> None:
@@ -382,28 +382,28 @@ class ZaberStage:
                     raise
 
     def _must_accept(self, timeout: float) -> None:
-        """Refuse a host that takes no connection in time; zaber-motion waits for minutes."""
+        """Refuse a host that accepts no connection in time; zaber-motion would wait for minutes."""
         settings = self.settings
         try:
             socket.create_connection((settings.host or "", settings.port), timeout).close()
-        except (OSError, ValueError) as error:  # ValueError: no name that a host could have
+        except (OSError, ValueError) as error:  # ValueError: an invalid host name
             reason = f"no answer for {timeout:g} s"
             if not isinstance(error, TimeoutError):
                 reason = getattr(error, "strerror", None) or str(error)
             raise DeviceError(f"connecting to {settings.where} failed: {reason}") from None
 
     def close(self) -> None:
-        """Disconnect; the stage goes on with what it does."""
+        """Disconnect; the stage continues what it does."""
         with suppress(self._failure):
             self._connection.close()
 
     def place(self) -> float:
-        """Return where the stage is, in m."""
+        """Return the position of the stage, in m."""
         with self._errors("reading the position of"):
             return float(self._axis.get_position()) * self.settings.microstep
 
     def knows_its_place(self) -> bool:
-        """Say whether the stage has been homed since it was switched on."""
+        """Return whether the stage has been homed since it was switched on."""
         with self._errors("asking"):
             return bool(self._axis.is_homed())
 
@@ -418,7 +418,7 @@ class ZaberStage:
             raise DeviceError(f"{self.settings.where} could not be homed{self._warnings()}")
 
     def move_to(self, place: float, speed: float, guard: Callable[[], None]) -> None:
-        """Move, and return when there.
+        """Move to a position; return on arrival.
 
         Raises
         ------
@@ -438,7 +438,7 @@ class ZaberStage:
         self._must_be_at(place)
 
     def check(self, place: float, speed: float) -> None:
-        """Refuse a move that is too far or too fast; comparisons with NaN are false."""
+        """Refuse a move that is too far or too fast, or NaN."""
         low, high = self.settings.travel
         if not low <= place <= high:
             raise CommandError(
@@ -483,7 +483,7 @@ class ZaberStage:
 
     @contextmanager
     def _stopping(self) -> Iterator[None]:
-        """Stop the stage whatever goes wrong; say so if that fails too."""
+        """Stop the stage after any error; report it if that fails too."""
         try:
             yield
         except BaseException as error:
