@@ -1,4 +1,4 @@
-"""Discretises the simulated arm: makes the arrays of its rod and material from a robot file."""
+"""Builds the arrays of the simulated rod and its material from a robot file."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ from stiffopt.registration import Placement
 Array = NDArray[np.float64]
 
 _ON_RING = 6  # fibres on each of two rings
-_SAME = 1e-6  # of a segment's length; a load so near to a node acts on the node
-_DENSITY = 1070.0  # kg/m^3; of silicone, for robots that have no gravity and name no density
+_SAME = 1e-6  # of a segment's length; a load as near to a node as this acts on the node
+_DENSITY = 1070.0  # kg/m^3, of silicone; for robots without gravity and density
 
 
 class ChannelEffects(NamedTuple):
-    """How the channels act: as the robot file corrects them, and the mismatch on top.
+    """The effect of the channels: corrections of the robot file, plus the mismatch.
 
     Attributes
     ----------
-    dead_band, gain, offset : (n,); ``gain onset(p) + offset`` acts where the shape is that of the
+    dead_band, gain, offset : (n,); ``gain onset(p) + offset`` acts if the shape is that of the
         pressure p, Pa; see `stiffopt.model.description.Corrections`.
-    angle : by which the channel's chambers are turned about the axis (n,), rad.
+    angle : rotation of the channel's chambers about the axis (n,), rad.
     """
 
     dead_band: Array
@@ -41,7 +41,7 @@ class ChannelEffects(NamedTuple):
     angle: Array
 
     def acting(self, effective: Array) -> Array:
-        """Pressures (m, n) that act where the shape is that of effective ones (m, n), in Pa."""
+        """Return the pressures (m, n) that act for shapes of effective ones (m, n), in Pa."""
         if self.dead_band.any():
             w = np.where(self.dead_band > 0, self.dead_band / 2, 1.0)
             begun = w * (np.logaddexp(0, (effective - self.dead_band) / w) - np.logaddexp(0, -2))
@@ -50,7 +50,7 @@ class ChannelEffects(NamedTuple):
 
 
 def make_channels(robot: RobotDescription, mismatch: Mismatch) -> ChannelEffects:
-    """Return how the channels of an arm act that differs from its robot file by a mismatch."""
+    """Return the effect of the channels of an arm that has this mismatch."""
     parts = [(s.corrections or Corrections(), s.n_channels) for s in robot.segments]
     gain = np.concatenate([corrections.gain or (1.0,) * n for corrections, n in parts])
     offset = np.concatenate([corrections.offset or (0.0,) * n for corrections, n in parts])
@@ -65,7 +65,7 @@ def make_channels(robot: RobotDescription, mismatch: Mismatch) -> ChannelEffects
 
 
 def _check_compensation(given: Compensation, index: int) -> None:
-    """Raise `InputError` if a segment has a compensation that the simulated arm cannot have."""
+    """Raise `InputError` if a segment has a compensation that the simulator does not support."""
     plain = {"bending_radius": 0, "lengthening": 0, "modulus_law": "linear"}
     for name, value in plain.items():
         if getattr(given, name) != value:
@@ -76,7 +76,7 @@ def _check_compensation(given: Compensation, index: int) -> None:
 
 
 def make_memory(robot: RobotDescription) -> Memory | None:
-    """Return the histories of the channels, or None if shapes follow the pressures at once."""
+    """Return the channels' histories, or None if shapes follow the pressures at once."""
     histories = [s.history or NO_HISTORY for s in robot.segments for _ in range(s.n_channels)]
     if all(history == NO_HISTORY for history in histories):
         return None
@@ -91,13 +91,13 @@ def make_rod(
     Parameters
     ----------
     robot :
-        What the robot file says.
+        Description of the arm.
     settings :
-        Of the plant.
+        Settings of the plant.
     mismatch :
-        The one that is in force, with what was drawn.
+        The mismatch of this arm, including its random part.
     station :
-        Arc length at rest that shall be a node, in m; None for the tip.
+        Arc length at rest that must be a node, in m; None for the tip.
     """
     grid = settings.discretisation
     bending, shear = grid.bending_degree + 1, grid.shear_degree + 1
@@ -144,19 +144,19 @@ def make_rod(
 
 
 def station_of(robot: RobotDescription, at: float) -> tuple[int, float, float]:
-    """Segment (from 0), place within it (0 to 1) and lever on its connector (m) of a place.
+    """Return segment (from 0), place within it (0 to 1) and lever on its connector (m).
 
     Parameters
     ----------
     robot :
-        Its lengths count, not those of the arm that is simulated.
+        Defines the lengths; those of the simulated arm do not count.
     at :
         Arc length at rest, connectors included, in m.
 
     Raises
     ------
     InputError
-        There is no such place on the arm.
+        The arm is shorter.
     """
     begin = 0.0
     for s, segment in enumerate(robot.segments):
@@ -177,13 +177,13 @@ def _lengths(robot: RobotDescription, mismatch: Mismatch) -> Array:
 
 
 def _legendre(places: Array, size: int) -> Array:
-    """Values (m, size) of Legendre polynomials at places (m,) between 0 and 1."""
+    """Return values (m, size) of Legendre polynomials at places (m,) between 0 and 1."""
     values = legendre.legvander(2 * np.asarray(places) - 1, size - 1)
-    return np.ascontiguousarray(values, dtype=float)  # of one layout: compiled code is for one
+    return np.ascontiguousarray(values, dtype=float)  # compiled code expects this layout
 
 
 def _cuts(intervals: int) -> Array:
-    """Ends of the intervals, between 0 and 1: Lobatto's points, which integrate inertia best."""
+    """Return the ends of intervals, from 0 to 1: Lobatto points, which integrate inertia best."""
     inner = np.sort(legendre.legroots(legendre.legder([0] * intervals + [1])))
     return np.concatenate(([0.0], (inner + 1) / 2, [1.0]))
 
@@ -201,7 +201,7 @@ def _masses(
     cuts: list[Array],
     intervals: int,
 ) -> Array:
-    """Mass of each node over (position, x axis, y axis) (N, 3, 3)."""
+    """Return the mass of each node over (position, x axis, y axis) (N, 3, 3)."""
     masses = []
     for s, segment in enumerate(robot.segments):
         density = segment.material.density or _DENSITY
@@ -214,7 +214,7 @@ def _masses(
 
 
 def _section_moments(segment: Segment) -> Array:
-    """``int (1, x, y) (1, x, y)' dA`` (3, 3) of the silicone at rest, about the axis."""
+    """Return ``int (1, x, y) (1, x, y)' dA`` (3, 3) of the silicone at rest, about the axis."""
     x, y, dA = _quadrature(segment)
     places = np.stack([np.ones_like(x), x, y])
     moments = (places * dA) @ places.T
@@ -229,12 +229,12 @@ def make_material(
     channels: ChannelEffects,
     viscosity: float,
 ) -> SectionMaterial:
-    """Return the sections of the arm; `viscosity` is that of the dashpot over E, in s.
+    """Return the sections of the arm; `viscosity` is the dashpot's over E, in s.
 
     Raises
     ------
     InputError
-        The robot file has a compensation that the simulated arm cannot have.
+        The robot file has a compensation that the simulator does not support.
     """
     silicone = settings.silicone
     n = robot.n_segments
@@ -282,11 +282,11 @@ def make_material(
 
 
 def _fibres(segment: Segment, scale_area: float, scale_inertia: float) -> tuple[Array, Array]:
-    """Fibres (f, 2) and their areas (f,) in place of a section.
+    """Return fibres (f, 2) that represent a section, and their areas (f,).
 
-    Two rings, mapped as the section's second moments want it, with the radii and areas of the
-    Gauss rule for the squared distance: moments of area up to the sixth are right if the section
-    is symmetric. The compensation scales area and second moments.
+    They form two rings, mapped to match the section's second moments, with the radii and areas of
+    the Gauss rule for the squared distance. For a symmetric section, moments of area up to the
+    sixth are exact. The compensation scales area and second moments.
     """
     x, y, dA = _quadrature(segment)
     area = dA.sum()
@@ -311,7 +311,7 @@ def _fibres(segment: Segment, scale_area: float, scale_inertia: float) -> tuple[
 
 
 def _quadrature(segment: Segment) -> tuple[Array, Array, Array]:
-    """Points and weights (m,) on a section that are exact up to degree seven: discs less discs."""
+    """Return points and weights (m,) of a section, exact up to degree seven: discs minus discs."""
     chambers = segment.chambers
     discs = [(0.0, 0.0, segment.outer_radius, 1.0), (0.0, 0.0, segment.inner_radius, -1.0)]
     for angle in chambers.angles:
@@ -330,7 +330,7 @@ def _quadrature(segment: Segment) -> tuple[Array, Array, Array]:
 
 
 def _chambers(robot: RobotDescription, channels: ChannelEffects) -> tuple[Array, Array]:
-    """Area (n,) and first moments of area (n, 2) of the channels' chambers."""
+    """Return area (n,) and first moments of area (n, 2) of the channels' chambers."""
     force, first = [], []
     turns = iter(channels.angle)
     for segment in robot.segments:
@@ -345,7 +345,7 @@ def _chambers(robot: RobotDescription, channels: ChannelEffects) -> tuple[Array,
 
 
 def node_at(robot: RobotDescription, rod: DiscreteRod, at: float) -> tuple[int, float]:
-    """Node and lever (m) of a place on a rod that was made with a station there."""
+    """Return node and lever (m) of a place on a rod that was made with a station there."""
     segment, place, lever = station_of(robot, at)
     m = int(rod.intervals[segment])
     cuts = np.concatenate(([0.0], np.cumsum(rod.interval[segment, :m]))) / rod.length[segment]
@@ -353,12 +353,12 @@ def node_at(robot: RobotDescription, rod: DiscreteRod, at: float) -> tuple[int, 
 
 
 def draw(robot: RobotDescription, settings: PlantSettings) -> Mismatch:
-    """Return the mismatch of the settings with what their spread and seed add to it.
+    """Return the mismatch of the settings, plus a random part from their spread and seed.
 
     Raises
     ------
     InputError
-        A list has not one value per channel or per segment.
+        A list does not have one value per channel or per segment.
     """
     given = settings.mismatch
     channels, segments = robot.n_pressures, robot.n_segments

@@ -1,17 +1,17 @@
-"""Contact of the rod's body with the objects of a scene: penalty, with friction.
+"""Contact of the rod's body with the objects of a scene: penalty springs, with friction.
 
-The body is a tube of the outer radius about the centre line that ends in a hemisphere at the tip.
-Points on the centre line, a tenth of the radius apart, carry springs: one at a depth d pushes with
-``k max(d, 0)``, rounded at 0, along the gradient of the object's distance. Between two nodes the
-centre line is the cubic through their positions along their z axes, so that a force on a point is
-one of forces and moments on these nodes. A soft object gives way as a whole wherever it is touched
-without a gap: by u, where its own stiffness times u is the sum of the springs' forces.
+The body is a tube of the outer radius about the centre line; it ends in a hemisphere at the tip.
+Points on the centre line, a twentieth of the radius apart, carry springs. A spring at depth d
+pushes with ``k max(d, 0)``, rounded at 0, along the gradient of the object's distance. Between two
+nodes the centre line is the cubic through their positions along their z axes, so that a force on a
+point becomes forces and moments on these nodes. A soft object yields as a whole wherever it is
+touched without a gap: by u, where its own stiffness times u is the sum of the springs' forces.
 
-Friction is Coulomb's, regularised by a spring across the normal at each point, which is carried
-along with the body's skin and slides when its force is the coefficient times the normal force.
+Friction is Coulomb's, regularised by a spring across the normal at each point. The spring moves
+with the body's skin and slides when its force is the friction coefficient times the normal force.
 
-Depths, and with them all forces, are those at the end of a step, as in backward Euler: impacts lose
-energy and do not chatter.
+Depths, and with them all forces, are those at the end of a step, as in backward Euler, so impacts
+lose energy and do not chatter.
 """
 
 from __future__ import annotations
@@ -29,16 +29,18 @@ from stiffopt.plant.settings import BOX, CYLINDER, PLANE, TOUCHABLE, TUBE
 
 Array = Any
 
-_APART = 0.05  # of the body's radius, between two points
+_SPACING = 0.05  # between two points, as a share of the body's radius
 _SPRING = 8e6  # N/m per m along the arm
-_OF_TIP = 0.2  # of its radius along the arm, that the point of the hemisphere also stands for
-_ROUNDED = 2e-6  # m of depth, over which a spring sets in: a kink would upset Newton's method
-_SLACK = 1.25  # length of the centre line between two nodes over their distance, at most
-_MOST = 50  # iterations for how far a soft object gives way; they converge from one side
+_TIP_SHARE = 0.2  # of the radius: length of the arm that the tip's point represents in addition
+_ROUNDED = 2e-6  # m of depth over which a spring sets in: a kink would upset Newton's method
+_SLACK = 1.25  # bound of the centre line's length between two nodes over their distance
+_MAX_ITERATIONS = 50  # for the yield of a soft object; they converge from one side
 
 
 class Surroundings(NamedTuple):
-    """What the body may meet, and the points on it. k objects, m pieces, P points, N nodes.
+    """Objects that the body may touch, and the points on it.
+
+    There are k objects, m pieces, P points and N nodes.
 
     Attributes
     ----------
@@ -47,10 +49,10 @@ class Surroundings(NamedTuple):
     numbers : of the pieces (m, 15), see `stiffopt.model.obstacle.Obstacle.pieces`.
     begin : arc length at rest from which the body counts (k,), m.
     friction : coefficient (k,).
-    stiffness : of the objects (k,), N/m; infinite where they are rigid.
-    first_point : beyond each node (N + 1,).
+    stiffness : of the objects (k,), N/m; infinite for rigid ones.
+    first_point : first point after each node (N + 1,).
     at : arc length of the points at rest (P,), m.
-    share : where they are between two nodes (P,), from 0 to 1.
+    share : position of the points between two nodes (P,), from 0 to 1.
     radius, spring : of the body there (P,), m, and stiffness of the springs, N/m.
     """
 
@@ -68,17 +70,17 @@ class Surroundings(NamedTuple):
 
 
 class ContactForces(NamedTuple):
-    """Forces of the objects on the arm, and room for what leads to them.
+    """Forces of the objects on the arm, and buffers for their computation.
 
     Attributes
     ----------
     wrench : on the nodes, in base axes (N, 6).
     force : of each object (k, 3), in base axes, N.
-    middle : arc length at rest of the middle of what each touches (k,), m.
-    deepest : greatest depth of the body in each (k,), m.
+    middle : arc length at rest of the middle of each contact (k,), m.
+    deepest : greatest depth of the body in each object (k,), m.
     grip : stretch of the springs across the normals (k, P, 3), m.
     energy : in all springs (1,), J.
-    depth, normal : of the points in the object that is looked at (P,), m, and (P, 3).
+    depth, normal : of the points in the present object (P,), m, and (P, 3).
     """
 
     wrench: Array
@@ -94,7 +96,7 @@ class ContactForces(NamedTuple):
 def make_surroundings(
     scene: Scene | None, robot: RobotDescription, rod: DiscreteRod
 ) -> Surroundings:
-    """Points on the body of a rod, and the scene that they may meet."""
+    """Return the points on the body of a rod, and the scene that they may touch."""
     at, node, share, radius, spring = [], [], [], [], []
     start = 0.0
     for s, segment in enumerate(robot.segments):
@@ -104,7 +106,7 @@ def make_surroundings(
         if segment.connector > 0:
             parts.append((segment.connector, first + m, np.array([0.0, 1.0])))
         for length, begin, ends in parts:
-            count = math.ceil(length / (_APART * segment.outer_radius))
+            count = math.ceil(length / (_SPACING * segment.outer_radius))
             places = (np.arange(count) + 0.5) / count
             interval = np.searchsorted(ends, places) - 1
             at += (start + length * places).tolist()
@@ -117,13 +119,13 @@ def make_surroundings(
     node.append(node[-1])
     share.append(1.0)
     radius.append(radius[-1])
-    spring.append(_SPRING * _OF_TIP * radius[-1])
+    spring.append(_SPRING * _TIP_SHARE * radius[-1])
     objects = () if scene is None else scene.objects
     pieces = [item.shape.pieces for item in objects]
     numbers = np.zeros((sum(map(len, pieces)), 15))
     for row, piece in zip(numbers, (piece for own in pieces for piece in own), strict=True):
         centre, rest = piece[:3], piece[3:]
-        both = [*centre, *centre, *rest] if len(piece) == 4 else piece  # a sphere is a short line
+        both = [*centre, *centre, *rest] if len(piece) == 4 else piece  # a sphere: line of length 0
         row[: len(both)] = both
     given = [item.contact for item in objects]
     soft = [np.inf if c is None or c.stiffness is None else c.stiffness for c in given]
@@ -144,7 +146,7 @@ def make_surroundings(
 
 @jit
 def no_forces(around: Surroundings) -> ContactForces:
-    """Room for the forces, all zero."""
+    """Return zero forces and empty buffers."""
     k, P = len(around.kind), len(around.at)
     return ContactForces(
         np.zeros((len(around.first_point), 6)),
@@ -160,7 +162,7 @@ def no_forces(around: Surroundings) -> ContactForces:
 
 @jit
 def _beyond(excess: Array, weight: Array) -> float:
-    """Distance of a box by how far a point is beyond its faces, and its gradient by these."""
+    """Return a box's distance from the excess of a point over its faces; set its gradient."""
     outside, most = 0.0, 0
     for i in range(len(excess)):
         outside += max(excess[i], 0.0) ** 2
@@ -178,7 +180,7 @@ def _beyond(excess: Array, weight: Array) -> float:
 
 @jit
 def _piece_distance(kind: int, q: Array, x: Array, normal: Array) -> float:
-    """Distance of a point (3,) from a piece, m, and its gradient (3,)."""
+    """Return the distance of a point (3,) from a piece, m; set its gradient (3,)."""
     if kind == PLANE:
         distance = 0.0
         for i in range(3):
@@ -230,7 +232,7 @@ def _piece_distance(kind: int, q: Array, x: Array, normal: Array) -> float:
 
 @jit
 def distance(around: Surroundings, k: int, x: Array, normal: Array) -> float:
-    """Distance of a point (3,) from an object, m, and its gradient (3,)."""
+    """Return the distance of a point (3,) from an object, m; set its gradient (3,)."""
     best, own = -np.inf, np.empty(3)
     for piece in range(around.first_piece[k], around.first_piece[k + 1]):
         value = _piece_distance(around.kind[k], around.numbers[piece], x, own)
@@ -242,7 +244,7 @@ def distance(around: Surroundings, k: int, x: Array, normal: Array) -> float:
 
 @jit
 def _cubic(s: float) -> tuple[float, float, float, float]:
-    """Hermite's cubics: of the positions at both ends and of the tangents there."""
+    """Return Hermite's cubics of the positions at both ends and of the tangents there."""
     return (1 + 2 * s) * (1 - s) ** 2, s**2 * (3 - 2 * s), s * (1 - s) ** 2, s**2 * (s - 1)
 
 
@@ -256,7 +258,7 @@ def _chord(r: Array, node: int) -> float:
 
 @jit
 def _place(R: Array, r: Array, node: int, chord: float, s: float, out: Array) -> None:
-    """Position (3,) at a share of the way from a node to the next."""
+    """Set the position (3,) at a share of the way from a node to the next."""
     a, b, c, d = _cubic(s)
     for i in range(3):
         out[i] = a * r[node, i] + b * r[node + 1, i]
@@ -265,7 +267,7 @@ def _place(R: Array, r: Array, node: int, chord: float, s: float, out: Array) ->
 
 @jit
 def _rounded(depth: float) -> float:
-    """``max(depth, 0)``, rounded."""
+    """Return ``max(depth, 0)``, rounded."""
     if depth <= 0:
         return 0.0
     return depth * depth / (2 * _ROUNDED) if depth < _ROUNDED else depth - 0.5 * _ROUNDED
@@ -273,7 +275,7 @@ def _rounded(depth: float) -> float:
 
 @jit
 def _area(depth: float) -> float:
-    """Integral of `_rounded`."""
+    """Return the integral of `_rounded`."""
     if depth <= 0:
         return 0.0
     if depth < _ROUNDED:
@@ -283,14 +285,14 @@ def _area(depth: float) -> float:
 
 @jit
 def _give_way(around: Surroundings, k: int, depth: Array, energy: Array) -> None:
-    """Take from the depths (P,) by how much a soft object gives way where it is touched."""
+    """Subtract from the depths (P,) by how much a soft object yields where it is touched."""
     begin, P = 0, len(depth)
     while begin < P:
         end = begin
         while end < P and depth[end] > 0:
             end += 1
         u = 0.0
-        for _ in range(_MOST if end > begin else 0):
+        for _ in range(_MAX_ITERATIONS if end > begin else 0):
             off, slope = around.stiffness[k] * u, around.stiffness[k]
             for i in range(begin, end):
                 off -= around.spring[i] * _rounded(depth[i] - u)
@@ -317,7 +319,7 @@ def _slip(
     normal: Array,
     grip: Array,
 ) -> None:
-    """Add to a spring's stretch (3,) by how much the skin has moved across the normal, m."""
+    """Add the skin's motion across the normal, m, to a spring's stretch (3,)."""
     s, x, x0, along = around.share[i], np.empty(3), np.empty(3), 0.0
     _place(R, r, node, _chord(r, node), s, x)
     _place(R0, r0, node, _chord(r0, node), s, x0)
@@ -346,10 +348,10 @@ def _spread(
     r: Array,
     wrench: Array,
 ) -> None:
-    """Add the force (3,) on the skin at a point to the wrenches of the nodes (N, 6)."""
+    """Add the force (3,) on the skin at a point to the nodes' wrenches (N, 6)."""
     s, chord, stretch, arm = around.share[i], _chord(r, node), 0.0, np.empty(3)
     a, b, c, d = _cubic(s)
-    for j in range(3):  # the length of the tangents is that of the chord
+    for j in range(3):  # the tangents are as long as the chord
         stretch += F[j] * (c * R[node, j, 2] + d * R[node + 1, j, 2]) / chord
     for end in range(2):
         n, weight = node + end, s if end == 1 else 1 - s
@@ -374,7 +376,7 @@ def touch(
     rubs: bool,
     out: ContactForces,
 ) -> None:
-    """Forces of the objects in a step that ends at some poses of the nodes.
+    """Compute the forces of the objects in a step that ends at given poses of the nodes.
 
     Parameters
     ----------
@@ -442,7 +444,7 @@ def touch(
 
 @jit
 def add_wrenches(forces: ContactForces, R: Array, J: Array, out: Array) -> None:
-    """Put the generalised forces (n,) of the wrenches, with the nodes' axes and Jacobians."""
+    """Set the generalised forces (n,) of the wrenches, from the nodes' axes and Jacobians."""
     out[:] = 0.0
     for n in range(1, len(R)):
         for half in range(2):

@@ -28,7 +28,7 @@ from stiffopt.rig.interface import (
 
 Array = NDArray[np.float64]
 
-_TICK = 0.005  # s, at which a moving stage is looked after
+_TICK = 0.005  # s between checks of a moving stage
 
 
 class SimulatedSupply(PressureSupply):
@@ -55,14 +55,14 @@ class SimulatedSupply(PressureSupply):
 
     @property
     def endpoints(self) -> tuple[str, ...]:
-        """None: every rig has a world of its own."""
+        """Empty: every rig has a world of its own."""
         return ()
 
     def _write(self, pressures: Array) -> None:
         if pressures.any():
             self._answer()
             self._world.command(pressures)
-        else:  # also to an arm that cannot be followed any more
+        else:  # vents even if the simulation has failed
             with suppress(SimulationError):
                 self._world.catch_up()
             self._world.command(pressures)
@@ -77,14 +77,14 @@ class SimulatedSupply(PressureSupply):
         return self._world.measured()
 
     def _dump(self, *, open_valve: bool) -> None:
-        if self.has_dump_valve:  # the valve is wired past the supply, which may be off
+        if self.has_dump_valve:  # the valve works even if the supply is off
             with suppress(SimulationError):
                 self._world.catch_up()
             self._world.dump(open_valve=open_valve)
 
 
 class SimulatedTracker(PoseTracker):
-    """A tracker that sees a simulated arm."""
+    """A tracker of a simulated arm."""
 
     def __init__(self, world: World, registration: Registration, clock: Clock) -> None:
         super().__init__(registration, clock)
@@ -93,7 +93,7 @@ class SimulatedTracker(PoseTracker):
 
     def _open(self) -> None:
         self._world.catch_up()
-        self._world.frames()  # what was captured before nobody asked for
+        self._world.frames()  # drop earlier frames
 
     def _close(self) -> None:
         pass
@@ -145,7 +145,7 @@ class SimulatedProbe(ForceProbe):
         self._world.stage.mount(None)
 
     def move_to(self, position: float, speed: float) -> None:
-        """Move the plate and return when it is there; see `ForceProbe.move_to`."""
+        """Move the plate; return on arrival. See `ForceProbe.move_to`."""
         self._must_be_open()
         self._answer()
         if not (np.isfinite(position) and np.isfinite(speed) and speed > 0):
@@ -173,7 +173,7 @@ class SimulatedRig(Rig):
     Attributes
     ----------
     world :
-        What is true, which no controller may look at, and where faults are injected.
+        The simulated truth, which no controller may read, and the place to inject faults.
     """
 
     world: World
@@ -187,7 +187,7 @@ def simulated_rig(
     *,
     real_time: bool = False,
 ) -> SimulatedRig:
-    """Make the world that a `RigDescription` with simulated devices speaks of, and its devices."""
+    """Make the world of a `RigDescription` with simulated devices, and the devices."""
     plant = plant_of(description)
     supply, tracker, probe = description.supply, description.tracker, description.probe
     world = World(robot, limits, plant, supply, tracker, probe, real_time=real_time)

@@ -1,17 +1,17 @@
 """Time stepping of the rod: one step, and many steps at given pressures.
 
-With inertia, a variational integrator: the discrete Lagrangian of a step from q0 to q1 is
+With inertia, a variational integrator is used. The discrete Lagrangian of a step from q0 to q1 is
 
     L = 1/(2h) (X1 - X0)' m (X1 - X0) - h V(elastic; (q0 + q1)/2) - h/2 (U(q0) + U(q1))
 
-where X are the positions and section axes of the nodes and U the potential of gravity. Momenta
-p0 = -dL/dq0 and p1 = dL/dq1, with the forces that have no potential split in the same way. It has
-no numerical damping; elasticity and contact are implicit, gravity and loads are explicit. Contact
-along the body is that of the step's end, which damps it (`stiffopt.plant.contact`). Without
-inertia, backward Euler: stresses, viscosity included, are in equilibrium with all loads at the end
-of the step.
+where X are the positions and section axes of the nodes and U the potential of gravity. The momenta
+are p0 = -dL/dq0 and p1 = dL/dq1; forces without a potential are split in the same way. The
+integrator has no numerical damping. Elasticity and contact are implicit, gravity and loads are
+explicit. Contact along the body is that of the step's end, which damps it
+(`stiffopt.plant.contact`). Without inertia, backward Euler is used: stresses, viscosity included,
+are in equilibrium with all loads at the end of the step.
 
-Newton's method uses a tangent by finite differences that is kept over many steps.
+Newton's method uses a tangent by finite differences, which is kept over many steps.
 """
 
 from __future__ import annotations
@@ -49,29 +49,28 @@ from stiffopt.plant.rod import (
 
 Array = Any
 
-_CLOSE = 1e-9  # strain by which a step may still be wrong
-_SLOWEST = 0.3  # share of the correction before; if one is larger, the tangent is made anew
+_CLOSE = 1e-9  # strain, tolerance of a step
+_SLOWEST = 0.3  # share of the last correction; if a correction is larger, renew the tangent
 _ITERATIONS = 40
-_LONGEST = 0.004  # s; with inertia, longer steps are taken in parts: weight is explicit
-_SHORTEST = 1 / 64  # share of a step; one that does not work is divided down to this
+_LONGEST = 0.004  # s; with inertia, longer steps are divided, because weight is explicit
+_SHORTEST = 1 / 64  # share of a step; a step that fails is divided down to this
 NUDGE = 1e-7  # strain, for the finite differences
-_STRIDE = 0.3  # strain; no iteration goes further
-_REACH = 0.015  # m; turns curvatures into strains
-
+_STRIDE = 0.3  # strain, bound of one iteration
+_REACH = 0.015  # m; converts curvatures to strains
 
 class RodState(NamedTuple):
-    """State of the rod: what changes in time. n coefficients, N nodes.
+    """The rod's state, which changes with time. n coefficients, N nodes.
 
     Attributes
     ----------
     q, momentum : (n,).
-    rate, last_rate : of q during the last step and the one before (n,), 1/s; the next step's
-        guess continues them.
-    rotations, positions : of the nodes (N, 3, 3), (N, 3), always those of q.
+    rate, last_rate : of q during the last two steps (n,), 1/s; the next step's guess extrapolates
+        them.
+    rotations, positions : of the nodes (N, 3, 3), (N, 3), always consistent with q.
     inverse : of the tangent (n, n).
-    tangent_of : step and kind of equations that the tangent belongs to (2,); 0 where there is none.
+    tangent_of : step and kind of equations of the tangent (2,); 0 if there is none.
     totals : energy dissipated, work of the pressures, and of loads and the plate, so far, and the
-        energy in the contact along the body (4,), J.
+        present energy in the contact along the body (4,), J.
     memory : of the fibres.
     grip : stretch of the contact's springs across the normals, see `ContactForces` (k, P, 3), m.
     """
@@ -93,7 +92,7 @@ class RodState(NamedTuple):
 def _inertia(
     rod: DiscreteRod, J: Array, R: Array, R0: Array, r0: Array, R1: Array, r1: Array, out: Array
 ) -> None:
-    """``J' m (X1 - X0)`` (n,), with Jacobians J and axes R of one of the two ends."""
+    """Set ``J' m (X1 - X0)`` (n,), with Jacobians J and axes R of one of the two ends."""
     out[:] = 0.0
     d = np.empty((3, 3))  # of position, x axis, y axis
     f = np.empty((3, 3))
@@ -125,7 +124,7 @@ def _inertia(
 
 @jit
 def _invert(A: Array, out: Array) -> bool:
-    """Inverse of a matrix by elimination with pivoting; destroys A. False if it has none."""
+    """Invert a matrix by elimination with pivoting; destroys A. Return False if it is singular."""
     n = len(A)
     out[:] = 0.0
     for i in range(n):
@@ -155,13 +154,13 @@ def _invert(A: Array, out: Array) -> bool:
 
 
 class Step(NamedTuple):
-    """Everything that determines one step but the state that it begins from.
+    """Everything that determines one step, except the state at its beginning.
 
     Attributes
     ----------
     rod, around, material, scheme : see there.
-    loads : at its end.
-    inertia : whether the arm has any.
+    loads : at the end of the step.
+    inertia : whether the arm has inertia.
     pressures : in the chambers, constant (n,), Pa.
     """
 
@@ -175,9 +174,9 @@ class Step(NamedTuple):
 
 
 class StepBuffers(NamedTuple):
-    """Arrays that a step works in: Jacobians, poses and forces. Made once per call.
+    """Buffers of a step: Jacobians, poses and forces. Made once per call.
 
-    `touch` is of the plate, `body` of the objects along the body.
+    `touch` belongs to the plate, `body` to the objects along the body.
     """
 
     jacobian: Array
@@ -197,7 +196,7 @@ class StepBuffers(NamedTuple):
 
 @jit
 def residual(step: Step, state: RodState, work: StepBuffers, q: Array, out: Array) -> None:
-    """Imbalance (n,) of a step that ends at q, in N m or the like."""
+    """Set the imbalance (n,) of a step that ends at q, in N m or the like."""
     rod, loads, h = step.rod, step.loads, step.scheme.step
     last = len(state.positions) - 1
     poses(rod, q, work.rotations, work.positions)
@@ -217,7 +216,7 @@ def residual(step: Step, state: RodState, work: StepBuffers, q: Array, out: Arra
             step.scheme.history,
             work.contact,
         )
-    if step.inertia:  # work.jacobian and work.outer are those of the beginning
+    if step.inertia:  # work.jacobian and work.outer are those of the step's beginning
         _inertia(
             rod,
             work.jacobian,
@@ -248,13 +247,13 @@ def residual(step: Step, state: RodState, work: StepBuffers, q: Array, out: Arra
 
 @jit
 def in_strain(rod: DiscreteRod, k: int) -> float:
-    """How much strain a unit of a coefficient is."""
+    """Return the strain that a unit of a coefficient amounts to."""
     return _REACH if k % rod.per_segment >= rod.first[3] else 1.0
 
 
 @jit
 def _correction(rod: DiscreteRod, state: RodState, work: StepBuffers) -> float:
-    """Put Newton's correction (n,) into work.trial; return the largest in it, as a strain."""
+    """Set work.trial to Newton's correction (n,); return its largest element, as a strain."""
     largest = 0.0
     for i in range(len(work.trial)):
         total = 0.0
@@ -269,7 +268,7 @@ def _correction(rod: DiscreteRod, state: RodState, work: StepBuffers) -> float:
 
 @jit
 def _make_tangent(step: Step, state: RodState, work: StepBuffers, q: Array) -> bool:
-    """Put the inverse of the tangent (n, n) at q into the state; return whether there is one."""
+    """Set the state's inverse of the tangent (n, n) at q; return whether it exists."""
     n = len(q)
     for k in range(n):
         nudge = NUDGE / in_strain(step.rod, k)
@@ -284,9 +283,9 @@ def _make_tangent(step: Step, state: RodState, work: StepBuffers, q: Array) -> b
 
 @jit
 def _solve(step: Step, state: RodState, work: StepBuffers, q: Array) -> bool:
-    """Bring q (n,), at first a guess, to the end of a step; return whether that worked.
+    """Iterate q (n,), first a guess, to the end of a step; return whether that succeeded.
 
-    What `residual` leaves in `work` is then that of q.
+    Afterwards, the results of `residual` in `work` belong to q.
     """
     n = len(q)
     h = step.scheme.step
@@ -296,7 +295,7 @@ def _solve(step: Step, state: RodState, work: StepBuffers, q: Array) -> bool:
         residual(step, state, work, q, work.residual)
         known = state.tangent_of[0] == h and state.tangent_of[1] == kind
         largest = _correction(step.rod, state, work) if known else np.inf
-        # An old tangent may no longer serve; NaN comes here too.
+        # An old tangent may no longer do; NaN leads here too.
         if not known or not largest <= _SLOWEST * before:
             if not _make_tangent(step, state, work, q):
                 return False
@@ -307,7 +306,7 @@ def _solve(step: Step, state: RodState, work: StepBuffers, q: Array) -> bool:
             if not np.isfinite(largest):
                 state.tangent_of[0] = 0.0
                 return False
-        if largest < _CLOSE and iteration > 0:  # a guess alone, however good, would drift
+        if largest < _CLOSE and iteration > 0:  # guesses without a correction would drift
             return True
         scale = min(1.0, _STRIDE / max(largest, _CLOSE))
         for i in range(n):
@@ -319,7 +318,7 @@ def _solve(step: Step, state: RodState, work: StepBuffers, q: Array) -> bool:
 
 @jit
 def make_work(n: int, nodes: int, around: Surroundings) -> StepBuffers:
-    """Room for a step."""
+    """Return the buffers of a step."""
     return StepBuffers(
         np.empty((nodes, n, 6)),
         np.empty((nodes, 3, 3)),
@@ -339,18 +338,17 @@ def make_work(n: int, nodes: int, around: Surroundings) -> StepBuffers:
 
 @jit
 def take(step: Step, before: RodLoads, state: RodState, work: StepBuffers) -> bool:
-    """Take one step; return whether that worked.
+    """Take one step; return whether that succeeded.
 
-    `before` are the loads at its beginning, those of the step are at its end. With inertia, the
-    Jacobians and the external forces of the beginning are in `work`, and those of the end are left
-    there.
+    `before` are the loads at its beginning, `step.loads` those at its end. With inertia, `work`
+    must hold the Jacobians and external forces of the beginning; it then holds those of the end.
     """
     rod, end, h = step.rod, step.loads, step.scheme.step
     n, q = len(state.q), work.guess
     for k in range(n):
         q[k] = state.q[k] + h * (2 * state.rate[k] - state.last_rate[k])
     if not _solve(step, state, work, q):
-        q[:] = state.q  # the guess may have led astray
+        q[:] = state.q  # the guess may have been misleading
         if not _solve(step, state, work, q):
             return False
     last = len(state.positions) - 1
@@ -424,9 +422,9 @@ def run(
     state: RodState,
     pressures: Array,
 ) -> int:
-    """Take a step at each row of pressures (m, n), in parts where it is too long.
+    """Take a step at each row of pressures (m, n), divided if it is too long.
 
-    Returns how many steps worked.
+    Return the number of successful steps.
     """
     work = make_work(len(state.q), len(state.positions), around)
     if inertia:

@@ -1,6 +1,6 @@
 """The hardware of the simulated devices: regulators, a tracking camera, a stage with a sensor.
 
-Each acts on the plant or measures it, step by step, and can be made to fail.
+Each acts on the plant or measures it, step by step, and can have faults.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ Array = NDArray[np.float64]
 Compiled = Any  # an array of floats in compiled code; numba infers the rest
 
 IMMOBILE = ("off", "stuck")
-"""Faults of a stage that does not move."""
-_KEPT = 4096  # frames that wait to be read
+"""Faults with which a stage does not move."""
+_QUEUED = 4096  # frames waiting to be read
 _EMPTYING = 0.02  # s; time constant with which a chamber empties through the dump valve
 
 
@@ -37,10 +37,10 @@ class Regulators(NamedTuple):
 
     Attributes
     ----------
-    step : of time, s.
+    step : time step, s.
     lag, slew, saturation : (n,), s, Pa/s and Pa.
     leak : share of the pressure that a leak takes per second (n,).
-    held : pressure at which a regulator is stuck (n,), Pa; NaN where it is not.
+    held : pressure at which a regulator is stuck (n,), Pa; NaN if it is not.
     dumped : whether the dump valve is open.
     """
 
@@ -63,28 +63,28 @@ def regulate(
     ripple: Compiled,
     trace: Compiled,
 ) -> int:
-    """Let the regulators work for a number of steps.
+    """Simulate the regulators for a number of steps.
 
     Parameters
     ----------
     regulators :
-        What they do.
+        Their parameters.
     delayed :
-        Set-points that have not reached the regulators yet (d, n), a ring.
+        Set-points that have not reached the regulators yet (d, n), a ring buffer.
     first :
-        Place in the ring of the oldest.
+        Index of the oldest in the ring.
     set_point :
-        The newest (n,).
+        The newest set-points (n,).
     pressure :
-        In the chambers (n,), without ripple; it is changed.
+        In the chambers (n,), without ripple; updated.
     ripple :
-        To be added at each step (m, n).
+        Added at each step (m, n).
     trace :
-        Becomes the pressure midway through each step (m, n).
+        Set to the pressure midway through each step (m, n).
 
     Returns
     -------
-    Place in the ring of the oldest set-point afterwards.
+    Index of the oldest set-point in the ring afterwards.
     """
     h = regulators.step
     depth = len(delayed)
@@ -120,8 +120,8 @@ class Frame:
     Attributes
     ----------
     number : counted from 1.
-    captured, delivered : when, in s.
-    position : of the sensor in the tracker's frame (3,), in m; NaN where it is not seen.
+    captured, delivered : times, in s.
+    position : of the sensor in the tracker's frame (3,), in m; NaN if it is not seen.
     quaternion : (4,), w first, of any sign.
     """
 
@@ -133,7 +133,7 @@ class Frame:
 
 
 class Camera:
-    """Simulated tracking camera: captures the sensor at the tip and sends frames late.
+    """Simulated tracking camera: captures the sensor at the tip and delivers frames late.
 
     Attributes
     ----------
@@ -147,17 +147,17 @@ class Camera:
         self.count = 0
         self._plant = plant
         self._rng = rng
-        self._sent: deque[Frame] = deque(maxlen=_KEPT)
+        self._sent: deque[Frame] = deque(maxlen=_QUEUED)
         self._last: Frame | None = None
-        self._seen: deque[Array] = deque(maxlen=_KEPT)  # poses (4, 4), one a frame
-        self._fault, self._began = "ok", 0.0  # the last fault, and since when
+        self._seen: deque[Array] = deque(maxlen=_QUEUED)  # poses (4, 4), one per frame
+        self._fault, self._began = "ok", 0.0  # the last fault, and when it began
 
     def next_step(self) -> int:
-        """Step of the plant in which the next frame is captured."""
+        """Return the plant's step in which the next frame is captured."""
         return round((self.count + 1) / self.settings.rate / self._plant.step)
 
     def skip(self) -> None:
-        """Lose the frames of a time that was skipped."""
+        """Drop the frames of a time that was skipped."""
         self.count = max(self.count, int(self._plant.time * self.settings.rate))
 
     def delivered(self, now: float) -> list[Frame]:
@@ -171,7 +171,7 @@ class Camera:
         """Capture a frame, or lose it."""
         self.count += 1
         settings = self.settings
-        chances = self._rng.random(3)  # drawn in every frame, so that faults shift no stream
+        chances = self._rng.random(3)  # drawn in every frame, so that faults shift no random stream
         noise = self._rng.standard_normal(6)
         if fault == "off" or chances[0] < settings.missing:
             return
@@ -188,7 +188,7 @@ class Camera:
         now = self._plant.time
         arrival = now + settings.latency + (FAULT_SIZES.frame_delay if fault == "slow" else 0.0)
         if self._last is not None:
-            arrival = max(arrival, self._last.delivered)  # none overtakes another
+            arrival = max(arrival, self._last.delivered)  # frames stay in order
         if fault == "stuck" and self._last is not None:
             frame = replace(self._last, delivered=arrival)
         else:
@@ -197,15 +197,15 @@ class Camera:
         self._sent.append(frame)
 
     def _creeping(self, fault: str, noise: Array) -> Array:
-        """Pose (4, 4) of the sensor as it is seen with a fault that grows since it began."""
+        """Return the sensor's measured pose (4, 4), with a fault that grows since it began."""
         now, sizes = self._plant.time, FAULT_SIZES
         if fault != self._fault:
             self._fault, self._began = fault, now
         elapsed = now - self._began
-        if fault == "loose" and self._seen:  # lies where it fell, and is seen with its noise
+        if fault == "loose" and self._seen:  # the sensor lies where it fell
             return self._noisy(self._seen[-1], noise)
         self._seen.append(self.sensor_in_tracker())
-        if fault == "lagging":  # an older pose, told as new
+        if fault == "lagging":  # an older pose, reported as new
             age = round(sizes.lag_growth * elapsed * self.settings.rate)
             return self._noisy(self._seen[max(-1 - age, -len(self._seen))], noise)
         T = self._noisy(self._seen[-1], noise)
@@ -218,14 +218,14 @@ class Camera:
         return T
 
     def sensor_in_tracker(self) -> Array:
-        """Pose (4, 4) of the sensor in the tracker's frame, without noise."""
+        """Return the sensor's pose (4, 4) in the tracker's frame, without noise."""
         off = self._plant.mismatch.registration.inverse()
         return np.asarray(
             self.settings.registration.sensor_in_tracker(off @ self._plant.tip_pose())
         )
 
     def _noisy(self, pose: Array, noise: Array) -> Array:
-        """The same with noise (6,), in standard deviations."""
+        """Return a pose with noise (6,), in standard deviations."""
         settings, T = self.settings, pose.copy()
         T[:3, 3] += settings.noise * noise[:3]
         small = np.concatenate(([1.0], 0.5 * settings.angular_noise * noise[3:]))
@@ -240,7 +240,7 @@ class SimulatedStage:
     Parameters
     ----------
     settings, plant, rng :
-        Of the probe, the arm that it pushes, and the source of the sensor's noise.
+        Settings of the probe, the arm that it pushes, and the source of the sensor's noise.
     faults :
         Present fault of each device; that of ``probe`` counts.
     lock :
@@ -249,7 +249,7 @@ class SimulatedStage:
     Attributes
     ----------
     position : m, along its axis.
-    speed : at which it moves now, m/s; 0 while it rests.
+    speed : present speed, m/s; 0 at rest.
     """
 
     def __init__(
@@ -272,7 +272,7 @@ class SimulatedStage:
         self._target = 0.0
 
     def mount(self, direction: ArrayLike | None) -> None:
-        """Mount the stage along a vector (3,) just clear of the tip, or take it away."""
+        """Mount the stage along a vector (3,) just clear of the tip; None: take it away."""
         with self._lock:
             self._axis = None
             if direction is not None:
@@ -284,7 +284,7 @@ class SimulatedStage:
             self.place_plate(0)
 
     def move(self, position: float, speed: float) -> None:
-        """Start to move to a place, m, at a speed, m/s."""
+        """Start to move to a position, m, at a speed, m/s."""
         with self._lock:
             speed = min(speed, self.settings.speed)
             if self._faults["probe"] == "slow":
@@ -299,14 +299,14 @@ class SimulatedStage:
             self.speed = 0.0
 
     def steps_left(self) -> int | None:
-        """Steps of the plant until the stage is there, or None while it rests."""
+        """Return the plant's steps until the stage arrives, or None at rest."""
         if not self.speed:
             return None
         steps = abs(self._target - self.position) / self.speed / self._plant.step
         return max(1, math.ceil(steps - 1e-6))
 
     def place_plate(self, steps: int) -> None:
-        """Tell the plant where the plate is, and how it moves in the steps to come."""
+        """Set the plate of the plant, and its motion in the next steps."""
         if self._axis is None:
             surface = self._plant.settings.surface
             if surface is None:
@@ -321,7 +321,7 @@ class SimulatedStage:
         self._plant.set_plate(self._axis, at, self.settings.stiffness, speed)
 
     def advance(self, steps: int) -> None:
-        """Be where the stage is after some steps of the plant."""
+        """Move the stage by some steps of the plant."""
         if self.speed:
             self.position += self._movement(steps * self._plant.step)
             if abs(self._target - self.position) < 1e-9:
@@ -329,12 +329,12 @@ class SimulatedStage:
         self.place_plate(0)
 
     def _movement(self, duration: float) -> float:
-        """How far the stage goes in some time, m; not beyond its target."""
+        """Return how far the stage moves in a time, m, at most to its target."""
         far = self.speed * duration
         return float(np.clip(self._target - self.position, -far, far))
 
     def force(self) -> float:
-        """Force that the sensor feels, N."""
+        """Return the force that the sensor measures, N."""
         with self._lock:
             noise = float(self.settings.noise * self._rng.standard_normal())
             force = self._plant.contact_force() if self._axis is not None else 0.0

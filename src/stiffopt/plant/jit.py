@@ -1,8 +1,8 @@
-"""Compilation of the simulator's inner loops by numba, kept on disk by content.
+"""Compilation of the simulator's inner loops by numba, with a cache keyed by content.
 
-numba's own cache looks at the time stamp of one file and not at the functions that it calls in
-others; here the cache's folder is named after the text of all files with compiled functions, so
-that code which has changed is never mixed with code that has not.
+numba's own cache checks the time stamp of one file, not of other files with functions that it
+calls. Here the cache's folder is named after the text of all files with compiled functions, so that
+changed code is never mixed with unchanged code.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from stiffopt.errors import MissingExtraError, SlowWarning
 
 FunctionT = TypeVar("FunctionT", bound=Callable[..., Any])
 
-_REORDER = {"contract", "reassoc", "arcp", "nsz"}  # but NaN and infinity stay what they are
+_REORDER = {"contract", "reassoc", "arcp", "nsz"}  # fast mathematics that preserves NaN and inf
 
 
 @cache
@@ -31,14 +31,14 @@ def _folder() -> str:
     return str(Path(root) / "simulator" / hashlib.sha256(text).hexdigest()[:16])
 
 
-_done = False  # whether this process has compiled, or loaded, what it needs
+_done = False  # whether this process has compiled or loaded its functions
 
 
 @contextmanager
 def compiling_once() -> Iterator[None]:
-    """Around the first use of compiled functions: one process compiles while others wait for it.
+    """Enclose the first use of compiled functions: one process compiles, others wait for it.
 
-    Warns of the wait if nothing is kept yet.
+    It warns of the wait if the cache is empty.
     """
     global _done
     with _lock():
@@ -61,7 +61,7 @@ def _lock() -> Iterator[None]:
         import fcntl
 
         handle = open(Path(_folder()) / "lock", "a")  # noqa: SIM115 (closed below)
-    except (ImportError, OSError):  # no such locks, or nowhere to keep what is compiled
+    except (ImportError, OSError):  # no such locks, or no writable cache
         yield
         return
     with handle:
@@ -85,12 +85,12 @@ def jit(function: FunctionT) -> FunctionT:
     config: Any = numba.config
     compile_it: Any = numba.njit
     options = {"nogil": True, "fastmath": _REORDER, "error_model": "numpy"}
-    before = config.CACHE_DIR  # of the whole process: other packages keep theirs
+    before = config.CACHE_DIR  # a setting of the whole process: restore it for other packages
     try:
         config.CACHE_DIR = _folder()
         Path(config.CACHE_DIR).mkdir(parents=True, exist_ok=True)
         compiled = compile_it(cache=True, **options)(function)
-    except (OSError, RuntimeError):  # nowhere to keep it: compiled once per process
+    except (OSError, RuntimeError):  # no writable cache: compile once per process
         compiled = compile_it(**options)(function)
     finally:
         config.CACHE_DIR = before

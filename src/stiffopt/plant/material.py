@@ -1,10 +1,9 @@
 """The silicone: stress in the fibres of a section, with viscosity, creep and hysteresis.
 
-A section is made of fibres along the arm that strain by ``v_z + u_x y - u_y x``. In parallel
-with a fibre's hyperelastic spring there are a dashpot (Kelvin-Voigt), springs in series with a
+A section consists of fibres along the arm with strains ``v_z + u_x y - u_y x``. Each fibre has a
+hyperelastic spring and, in parallel to it, a dashpot (Kelvin-Voigt), springs in series with a
 dashpot (Maxwell: creep), and springs in series with a slider (Jenkin: hysteresis). Shear and twist
-are linear and have the dashpot alone. Stresses and strains are nominal: per area and length at
-rest.
+are linear and have only the dashpot. Stresses and strains are nominal: per area and length at rest.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from stiffopt.plant.rod import DiscreteRod, strain_at
 Array = Any
 
 LINEAR, YEOH = 0, 1
-_SOFTEST = 0.05  # share of the modulus that no pressure takes away
+_SOFTEST = 0.05  # lower bound of the modulus under pressure, as a share of that at rest
 _THINNEST = 0.1  # stretch below which the hyperelastic law is continued by its tangent
 
 
@@ -35,8 +34,8 @@ class SectionMaterial(NamedTuple):
     slip_share, slip_strain : of the Jenkin elements (j,).
     modulus, modulus_slope : of the segments (S,): E at rest in Pa, and its change per norm of the
         segment's pressures.
-    actuation, actuation_slope : of the segments (S,): how much more pressure acts than drawn, at
-        rest, and the slope of the modulus, in place of `modulus_slope`, that free shapes show.
+    actuation, actuation_slope : of the segments (S,): factor on the effect of pressure at rest, and
+        the slope of the modulus that free shapes show, instead of `modulus_slope`.
     shear, torsion : G A / E and G J / E of the segments (S,).
     centroid : of the sections (S, 2), m.
     fibre_x, fibre_y, fibre_area : of the fibres (S, f), m and m^2.
@@ -88,9 +87,9 @@ class Scheme(NamedTuple):
     Attributes
     ----------
     step : s.
-    share : of the end of the step in what elastic stresses are evaluated at: 1/2 is the midpoint
-        rule, which loses no energy; 1 is backward Euler, which has no wiggles.
-    history : whether creep and hysteresis are there; without them the stresses are those in the
+    share : weight of the step's end in the strain for elastic stresses: 1/2 is the midpoint rule,
+        which loses no energy; 1 is backward Euler, which does not oscillate.
+    history : whether there are creep and hysteresis; without them the stresses are those in the
         long run.
     """
 
@@ -101,7 +100,7 @@ class Scheme(NamedTuple):
 
 @jit
 def stress(material: SectionMaterial, strain: float) -> float:
-    """Hyperelastic stress over Young's modulus."""
+    """Return the hyperelastic stress over Young's modulus."""
     if material.law == LINEAR:
         return strain
     stretch = max(1 + strain, _THINNEST)
@@ -115,7 +114,7 @@ def stress(material: SectionMaterial, strain: float) -> float:
 
 @jit
 def energy(material: SectionMaterial, strain: float) -> float:
-    """Hyperelastic energy over Young's modulus."""
+    """Return the hyperelastic energy over Young's modulus."""
     if material.law == LINEAR:
         return 0.5 * strain * strain
     stretch = max(1 + strain, _THINNEST)
@@ -127,10 +126,10 @@ def energy(material: SectionMaterial, strain: float) -> float:
 def pressed_modulus(
     material: SectionMaterial, segment: int, pressures: Array
 ) -> tuple[float, float]:
-    """Young's modulus at these pressures (n,), over that at rest; and what acts per pressure.
+    """Return Young's modulus under pressures (n,) over that at rest, and the effect per pressure.
 
-    The latter is such that the arm's free shapes are those of a modulus with the slope
-    `SectionMaterial.actuation_slope`, and not affected by `SectionMaterial.actuation`.
+    The effect is such that the arm's free shapes are those of a modulus with the slope
+    `SectionMaterial.actuation_slope`, unaffected by `SectionMaterial.actuation`.
     """
     total = 0.0
     for channel in range(material.first_channel[segment], material.first_channel[segment + 1]):
@@ -144,9 +143,10 @@ def pressed_modulus(
 
 @jit
 def creep_coefficients(material: SectionMaterial, scheme: Scheme, out: Array) -> None:
-    """For each Maxwell branch (c, 2): its dashpot ends at ``out[0] creep + out[1] mean``.
+    """Set the coefficients (c, 2) of the Maxwell branches.
 
-    That is the theta method, with the fibre's strain at theta between the ends as `mean`.
+    A branch's dashpot ends the step at ``out[0] creep + out[1] mean``. This is the theta method;
+    `mean` is the fibre's strain at theta between the ends of the step.
     """
     for k in range(len(material.creep_time)):
         rate = scheme.step / material.creep_time[k]
@@ -159,7 +159,7 @@ def creep_coefficients(material: SectionMaterial, scheme: Scheme, out: Array) ->
 
 @jit
 def slip_after(limit: float, spring: float, change: float) -> float:
-    """Strain of a Jenkin element's spring after the fibre's strain has changed."""
+    """Return the strain of a Jenkin element's spring after a change of the fibre's strain."""
     return min(max(spring + change, -limit), limit)
 
 
@@ -174,7 +174,7 @@ def internal_forces(
     after: Array,
     out: Array,
 ) -> None:
-    """Generalised forces (n,) of the stresses less those of the pressures during a step."""
+    """Set the generalised forces (n,) of stresses minus pressures during a step."""
     out[:] = 0.0
     e0 = np.empty(6)
     e1 = np.empty(6)
@@ -204,7 +204,7 @@ def internal_forces(
         for g in range(len(rod.weight)):
             strain_at(rod, s, rod.basis[g], before, e0)
             strain_at(rod, s, rod.basis[g], after, e1)
-            for i in range(6):  # of what is linear: shear at the centroid, and twist
+            for i in range(6):  # the linear part: shear at the centroid, and twist
                 force[i] = pressed * (share * e1[i] + rest * e0[i])
                 force[i] += viscous * (e1[i] - e0[i])
             shear = material.shear[s] * E
@@ -251,7 +251,7 @@ def remember(
     before: Array,
     after: Array,
 ) -> tuple[float, float]:
-    """Take a step into the memory; return the energy dissipated in it and the pressures' work."""
+    """Update the memory by a step; return the energy dissipated and the pressures' work."""
     e0 = np.empty(6)
     e1 = np.empty(6)
     share = scheme.share
@@ -304,7 +304,7 @@ def remember(
 def stored(
     rod: DiscreteRod, material: SectionMaterial, memory: FibreMemory, pressures: Array, q: Array
 ) -> float:
-    """Elastic energy of the segments, of creep and hysteresis too, in J."""
+    """Return the elastic energy of the segments, including creep and hysteresis, in J."""
     e = np.empty(6)
     total = 0.0
     for s in range(len(rod.length)):

@@ -1,13 +1,13 @@
-"""The plant: a simulated arm whose mechanics differ from the optimiser's model.
+"""The plant: a simulated arm whose mechanics differ from the optimiser's model on purpose.
 
-The differences are meant: the rod is per reference length and has distributed weight, inertia,
-shear and stretch; its silicone is hyperelastic, creeps and has hysteresis. Pressure acts normal to
-the section: the force p A on each section at the chamber's centre, constant in the section's axes,
-which is conjugate to the volume that a chamber of constant bore sweeps. (Along the chamber instead
-of normal to the section would change the compliance of a bent arm by about 3 %.)
+The rod has properties per reference length, and distributed weight, inertia, shear and stretch. Its
+silicone is hyperelastic, creeps and has hysteresis. Pressure acts normal to the section, as the
+force p A on each section at the chamber's centre, constant in the section's axes; it is conjugate
+to the volume swept by a chamber of constant bore. (Acting along the chamber instead would change
+the compliance of a bent arm by about 3 %.)
 
-The channels behave as the robot file says: its history lies between the pressures in the chambers
-and those that act, its corrections come after. Silicone and mismatch come on top.
+The channels behave according to the robot file: its history links the pressures in the chambers to
+those that act, then its corrections apply. Silicone and mismatch come in addition.
 """
 
 from __future__ import annotations
@@ -39,11 +39,11 @@ from stiffopt.plant.settings import PlantLoad, PlantSettings
 
 Array = NDArray[np.float64]
 
-_STILL = 1e-3  # s; step for stiffness to motions so fast that nothing creeps or slips
+_STILL = 1e-3  # s, step for the stiffness against fast motions, without creep or slip
 
 
 class SimulationError(DeviceError):
-    """The simulated arm cannot be followed: a load or a pressure is far beyond what it bears."""
+    """The simulation fails: a load or a pressure is far beyond the arm's strength."""
 
 
 @dataclass(frozen=True)
@@ -71,14 +71,14 @@ class Energies:
 
 
 class ObjectForce(NamedTuple):
-    """What an object does to the arm.
+    """The contact force of an object on the arm.
 
     Attributes
     ----------
     object : its name.
     force : on the arm (3,), in base axes, in N.
-    at : arc length at rest of the middle of what is touched, in m.
-    depth : greatest, by which the body is in the object, in m.
+    at : arc length at rest of the middle of the contact, in m.
+    depth : greatest depth of the body in the object, in m.
     """
 
     object: str
@@ -93,11 +93,11 @@ class Settling:
 
     Attributes
     ----------
-    first, shortest, last : lengths of steps, in s: the first, the one below which it gives up, and
-        the one after which viscosity has no effect any more.
-    growth, cut : factor on the next step after one that has worked, and divisor after a failure.
-    tries : steps at most.
-    viscosity : least viscosity that slows the arm down, over the modulus, in s.
+    first, shortest, last : lengths of steps, in s: of the first; of the shortest one before it
+        gives up; and of the last one, after which viscosity has no effect any more.
+    growth, cut : factor on the next step after a success, and divisor after a failure.
+    tries : maximum number of steps.
+    viscosity : lower bound of the viscosity that slows the arm down, over the modulus, in s.
     """
 
     first: float = 0.02
@@ -115,7 +115,7 @@ class Plant:
     Parameters
     ----------
     robot :
-        What the robot file says.
+        Description of the arm.
     settings :
         How this arm differs, and how it is simulated.
 
@@ -146,7 +146,7 @@ class Plant:
             self._tame()
 
     def _tame(self) -> None:
-        """Set the viscosity so that it damps the first bending mode as asked, and settle."""
+        """Set the viscosity for the required damping of the first bending mode, and settle."""
         self.settle(np.zeros(self.robot.n_pressures))
         wanted = self.settings.silicone.damping
         if wanted > 0:
@@ -205,12 +205,12 @@ class Plant:
         return T
 
     def set_load(self, load: PlantLoad | None) -> None:
-        """Let a wrench act from now on, or none.
+        """Apply a wrench from now on, or none.
 
         Raises
         ------
         InputError
-            There is no such place on the arm.
+            The load is not on the arm.
         """
         station = None if load is None else load.at
         if station != (None if self._load is None else self._load.at):
@@ -230,28 +230,28 @@ class Plant:
         stiffness: float = 0.0,
         speed: float = 0.0,
     ) -> None:
-        """Put the flat plate of a probe somewhere, or take it away.
+        """Place the flat plate of a probe, or take it away.
 
         Parameters
         ----------
         normal :
-            Unit vector (3,) in the base frame from the probe towards the tip, or None.
+            Unit vector (3,) in the base frame from the probe towards the tip; None: no plate.
         at :
-            Where the plate is along it, in m: it touches a tip that is less far along.
+            Position of the plate along it, in m: it touches a tip that is less far along.
         stiffness :
             Of the contact, in N/m.
         speed :
-            At which it moves while time passes next, in m/s.
+            Speed of the plate while time passes next, in m/s.
         """
         self._plate = None if normal is None else (np.array(normal, float), at, speed, stiffness)
 
     def contact_force(self) -> float:
-        """Force with which the plate pushes the tip, in N."""
+        """Return the force of the plate on the tip, in N."""
         loads = self._loads()
         return float(contact_force(loads, depth_of(loads, self._state.positions[-1])))
 
     def object_forces(self) -> tuple[ObjectForce, ...]:
-        """What each object of the scene does to the arm that touches it now."""
+        """Return the force of each object of the scene that touches the arm now."""
         scene, state = self.settings.scene, self._state
         forces = contact.no_forces(self._around)
         R, r = state.rotations, state.positions
@@ -266,7 +266,7 @@ class Plant:
         )
 
     def advance(self, duration: float, pressures: ArrayLike) -> None:
-        """Let time pass at constant pressures in the chambers.
+        """Advance time at constant pressures in the chambers.
 
         Parameters
         ----------
@@ -278,7 +278,7 @@ class Plant:
         Raises
         ------
         SimulationError
-            The arm cannot be followed.
+            The simulation fails.
         """
         steps = round(duration / self.step)
         self.follow(np.tile(self._checked(pressures), (steps, 1)))
@@ -289,7 +289,7 @@ class Plant:
         Raises
         ------
         SimulationError
-            The arm cannot be followed; it is where it was when that happened.
+            The simulation fails; the state is that before the failure.
         """
         full = self.settings.dynamics == "full"
         scheme = Scheme(self.step, 0.5 if full else 1.0, True)
@@ -317,26 +317,26 @@ class Plant:
             )
 
     def skip(self, duration: float) -> None:
-        """Let time pass in which nothing happens, in s; rounded down to whole steps."""
+        """Skip a time in which nothing happens, in s; rounded down to whole steps."""
         self._steps += int(duration / self.step)
 
     def settle(self, pressures: ArrayLike, load: PlantLoad | None = None) -> None:
-        """Bring the arm to rest in equilibrium, with all creep done and no hysteresis left.
+        """Bring the arm to equilibrium at rest, with its silicone's creep done and no hysteresis.
 
-        That is, none of its silicone. A history in the robot file begins anew with a rise from no
-        pressure to these, see `stiffopt.model.history.Memory.start`.
+        A history in the robot file, by contrast, restarts with a rise from no pressure to these,
+        see `stiffopt.model.history.Memory.start`.
 
         Parameters
         ----------
         pressures :
             In the chambers (n,), in Pa.
         load :
-            Acts from now on in place of the present one, if given.
+            Replaces the present one from now on, if given.
 
         Raises
         ------
         EquilibriumError
-            There is no equilibrium that a slow arm would come to.
+            A slow arm would reach no equilibrium.
         """
         if load is not None:
             self.set_load(load)
@@ -345,7 +345,7 @@ class Plant:
             self._past.start(p)
             p = self._past.effective
         acting = self._acting(p[None, :])
-        # Viscosity slows an arm without inertia down: steps of growing length follow it to rest.
+        # Viscosity slows down an arm without inertia: steps of growing length follow it to rest.
         settling = self.settling
         slow = self._material._replace(viscosity=max(self._material.viscosity, settling.viscosity))
         self._state.rate[:] = 0.0
@@ -372,7 +372,7 @@ class Plant:
         self._state.totals[:3] = 0.0
 
     def energies(self) -> Energies:
-        """Where the energy is now."""
+        """Return the present energies."""
         state, mass = self._state, self._mass()
         speed = np.linalg.solve(mass, state.momentum)
         weight = np.zeros(3)
@@ -393,7 +393,7 @@ class Plant:
         )
 
     def modes(self, count: int = 6) -> tuple[Array, Array]:
-        """Natural frequencies of small vibrations about the present state.
+        """Return natural frequencies and damping of small vibrations about the present state.
 
         Returns
         -------
@@ -414,7 +414,7 @@ class Plant:
         return omega / (2 * math.pi), damped / (2 * omega)
 
     def _tangent(self, parts: material.SectionMaterial, scheme: Scheme) -> Array:
-        """Change of the imbalance without inertia (n, n) with the end of a step from here."""
+        """Return the derivative (n, n) of the imbalance without inertia by the end of a step."""
         q, n = self._state.q.copy(), len(self._state.q)
         work = dynamics.make_work(n, len(self._state.positions), self._around)
         K, high, low = np.empty((n, n)), np.empty(n), np.empty(n)

@@ -7,8 +7,8 @@ of order four (two Gauss points):
 
     T(b) = T(a) exp(X),   X = h/2 (x1 + x2) + sqrt(3)/12 h^2 [x1, x2].
 
-RodLoads from outside are the weight, a wrench at one place and the plate of a probe at the tip.
-Everything here is compiled and works on arrays that the caller owns.
+Loads from outside (`RodLoads`) are the weight, a wrench at one place and the plate of a probe at
+the tip. Everything here is compiled and works on arrays that the caller owns.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ Array = Any  # an array of floats; numba infers the rest
 
 _COMMUTATOR = math.sqrt(3) / 12
 _SMALL = 0.04  # squared angle below which series are used
-_SOFT = 1e-6  # m, over which contact sets in: a kink would upset Newton's method
+_SOFT = 1e-6  # m over which contact sets in: a kink would upset Newton's method
 
 
 class DiscreteRod(NamedTuple):
-    """The discretised rod: what of an arm does not change in time.
+    """The discretised rod: the part of an arm that is constant in time.
 
     There are S segments, n coefficients and N nodes.
 
@@ -37,12 +37,12 @@ class DiscreteRod(NamedTuple):
 
     Attributes
     ----------
-    first, count : where the coefficients of a strain component begin within a segment (6,), and
-        how many they are (6,).
-    per_segment : coefficients of a segment.
+    first, count : index of the first coefficient of each strain component within a segment (6,),
+        and their number (6,).
+    per_segment : number of coefficients of a segment.
     length, connector : of the segments (S,), m.
     first_node : of the segments (S,).
-    intervals : between the nodes of a segment (S,).
+    intervals : number of intervals between the nodes of a segment (S,).
     interval : their lengths (S, m), m.
     interval_basis : polynomials at the Gauss points of the intervals (S, m, 2, k).
     weight, basis : Gauss points for the stresses (g,), and the polynomials there (g, k).
@@ -70,7 +70,7 @@ class DiscreteRod(NamedTuple):
 
 @jit
 def strain_at(rod: DiscreteRod, segment: int, basis: Array, q: Array, out: Array) -> None:
-    """Strain (6,) at a point with these values of the polynomials; the rod at rest has zero."""
+    """Set the strain (6,) at a point with these values of the polynomials; it is 0 at rest."""
     offset = segment * rod.per_segment
     for c in range(6):
         total = 0.0
@@ -82,7 +82,7 @@ def strain_at(rod: DiscreteRod, segment: int, basis: Array, q: Array, out: Array
 
 @jit
 def _bracket(a: Array, b: Array, out: Array) -> None:
-    """Lie bracket [a, b] of two twists: linear a_w x b_v - b_w x a_v, angular a_w x b_w."""
+    """Set the Lie bracket [a, b] of twists: linear a_w x b_v - b_w x a_v, angular a_w x b_w."""
     a0, a1, a2, w0, w1, w2 = a[0], a[1], a[2], a[3], a[4], a[5]
     b0, b1, b2, u0, u1, u2 = b[0], b[1], b[2], b[3], b[4], b[5]
     out[0] = w1 * b2 - w2 * b1 - u1 * a2 + u2 * a1
@@ -95,7 +95,7 @@ def _bracket(a: Array, b: Array, out: Array) -> None:
 
 @jit
 def _exponential_terms(x: float) -> tuple[float, float, float]:
-    """``sin t / t``, ``(1 - cos t) / t^2`` and ``(t - sin t) / t^3`` for x = t^2."""
+    """Return ``sin t / t``, ``(1 - cos t) / t^2`` and ``(t - sin t) / t^3`` for x = t^2."""
     if x < _SMALL:
         a = 1 - x / 6 * (1 - x / 20 * (1 - x / 42 * (1 - x / 72)))
         b = 0.5 * (1 - x / 12 * (1 - x / 30 * (1 - x / 56 * (1 - x / 90))))
@@ -108,7 +108,7 @@ def _exponential_terms(x: float) -> tuple[float, float, float]:
 
 @jit
 def _exponential(X: Array, R: Array, p: Array) -> None:
-    """Rotation (3, 3) and translation (3,) of exp(X)."""
+    """Set rotation (3, 3) and translation (3,) of exp(X)."""
     w0, w1, w2 = X[3], X[4], X[5]
     x = w0 * w0 + w1 * w1 + w2 * w2
     a, b, c = _exponential_terms(x)
@@ -131,7 +131,7 @@ def _exponential(X: Array, R: Array, p: Array) -> None:
 def _interval_twist(
     rod: DiscreteRod, s: int, m: int, q: Array, x1: Array, x2: Array, X: Array
 ) -> None:
-    """Twist X (6,) over interval m of segment s, and the strains x1, x2 (with e) it is made of."""
+    """Set the twist X (6,) over interval m of segment s, and its strains x1, x2 (with e)."""
     h = rod.interval[s, m]
     strain_at(rod, s, rod.interval_basis[s, m, 0], q, x1)
     strain_at(rod, s, rod.interval_basis[s, m, 1], q, x2)
@@ -152,7 +152,7 @@ def _compose(R: Array, r: Array, dR: Array, dr: Array, R_out: Array, r_out: Arra
 
 @jit
 def poses(rod: DiscreteRod, q: Array, R: Array, r: Array) -> None:
-    """Rotations (N, 3, 3) and positions (N, 3) of the nodes."""
+    """Set rotations (N, 3, 3) and positions (N, 3) of the nodes."""
     x1, x2, X = np.empty(6), np.empty(6), np.empty(6)
     dR, dr = np.empty((3, 3)), np.empty(3)
     R[0] = rod.base_rotation
@@ -173,10 +173,10 @@ def poses(rod: DiscreteRod, q: Array, R: Array, r: Array) -> None:
 
 @jit
 def _exponential_derivative(X: Array, dX: Array, out: Array, work: Array) -> None:
-    """``exp(X)^-1 d exp(X)`` (6,) for a change dX (6,).
+    """Set ``exp(X)^-1 d exp(X)`` (6,) for a change dX (6,).
 
-    The series ``sum (-ad X)^n / (n + 1)! dX`` is summed by the minimal polynomial of ad X,
-    ``ad (ad^2 + t^2)^2 = 0``, which leaves four terms.
+    The series ``sum (-ad X)^n / (n + 1)! dX`` is reduced to four terms by the minimal polynomial of
+    ad X, ``ad (ad^2 + t^2)^2 = 0``.
     """
     x = X[3] * X[3] + X[4] * X[4] + X[5] * X[5]
     if x < _SMALL:
@@ -203,7 +203,7 @@ def _exponential_derivative(X: Array, dX: Array, out: Array, work: Array) -> Non
 
 @jit
 def jacobians(rod: DiscreteRod, q: Array, J: Array) -> None:
-    """Body Jacobians of the nodes, transposed (N, n, 6): their twist in their own axes per q."""
+    """Set the nodes' body Jacobians, transposed (N, n, 6): twist in their own axes per q."""
     x1, x2, X = np.empty(6), np.empty(6), np.empty(6)
     d1, dX, at1, at2 = np.empty(6), np.empty(6), np.empty(6), np.empty(6)
     work = np.empty((2, 6))
@@ -222,7 +222,7 @@ def jacobians(rod: DiscreteRod, q: Array, J: Array) -> None:
                 _carry(here[column], dR, dr, there[column])
             for column in range(end, J.shape[1]):
                 there[column] = 0.0
-            for c in range(6):  # a strain e_c at either Gauss point, then the polynomials
+            for c in range(6):  # effect of a strain e_c at either Gauss point, then the polynomials
                 d1[:] = 0.0
                 d1[c] = 1.0
                 _bracket(d1, x2, dX)
@@ -264,7 +264,7 @@ def _carry(twist: Array, dR: Array, dr: Array, out: Array) -> None:
 
 @jit
 def mass_matrix(rod: DiscreteRod, R: Array, J: Array, out: Array) -> None:
-    """Mass matrix (n, n) of the coefficients."""
+    """Set the mass matrix (n, n) of the coefficients."""
     n = len(out)
     out[:] = 0.0
     A = np.empty((6, 6))
@@ -273,7 +273,7 @@ def mass_matrix(rod: DiscreteRod, R: Array, J: Array, out: Array) -> None:
         A[:] = 0.0
         for i in range(3):
             A[i, i] = m[0, 0]
-        A[2, 3], A[2, 4] = m[0, 2], -m[0, 1]  # v z is the mass's moment times w, and so on
+        A[2, 3], A[2, 4] = m[0, 2], -m[0, 1]  # first moments of mass couple v with w
         A[0, 5], A[1, 5] = -m[0, 2], m[0, 1]
         A[3, 3], A[4, 4] = m[2, 2], m[1, 1]
         A[3, 4] = -m[1, 2]
@@ -298,14 +298,14 @@ class RodLoads(NamedTuple):
 
     Attributes
     ----------
-    node : on which the wrench acts.
-    lever : how far beyond the node along its z axis, on a connector, m.
+    node : node on which the wrench acts.
+    lever : distance of the wrench beyond the node along its z axis, on a connector, m.
     force, moment : (3,), N and N m.
     follows : whether they turn with the node's section.
     plate : unit normal of the probe's plate (3,), from the probe towards the tip.
-    plate_at : where the plate is along its normal, m.
-    plate_speed : at which it moves, m/s.
-    plate_stiffness : N/m; 0 where there is no plate.
+    plate_at : position of the plate along its normal, m.
+    plate_speed : its speed, m/s.
+    plate_stiffness : N/m; 0 without a plate.
     """
 
     node: int
@@ -321,7 +321,7 @@ class RodLoads(NamedTuple):
 
 @jit
 def loads_after(loads: RodLoads, duration: float) -> RodLoads:
-    """RodLoads after some time: the plate moves."""
+    """Return the loads after a duration, in s: the plate moves."""
     return RodLoads(
         loads.node,
         loads.lever,
@@ -337,14 +337,14 @@ def loads_after(loads: RodLoads, duration: float) -> RodLoads:
 
 @jit
 def depth_of(loads: RodLoads, tip: Array) -> float:
-    """How far the tip is behind the plate's face, m; negative where it is clear of it."""
+    """Return the depth of the tip behind the plate's face, m; negative if it is clear of it."""
     along: float = loads.plate[0] * tip[0] + loads.plate[1] * tip[1] + loads.plate[2] * tip[2]
     return loads.plate_at - along
 
 
 @jit
 def contact_force(loads: RodLoads, depth: float) -> float:
-    """Force of the plate on the tip at some depth, N: ``k max(depth, 0)``, rounded at 0."""
+    """Return the force of the plate on the tip at a depth, N: ``k max(depth, 0)``, rounded at 0."""
     if loads.plate_stiffness == 0:
         return 0.0
     rounded: float = 0.5 * loads.plate_stiffness * (depth + math.hypot(depth, _SOFT))
@@ -353,7 +353,7 @@ def contact_force(loads: RodLoads, depth: float) -> float:
 
 @jit
 def contact_energy(loads: RodLoads, depth: float) -> float:
-    """Integral of `contact_force`, J, but for a constant."""
+    """Return the integral of `contact_force`, J, up to a constant."""
     around = math.hypot(depth, _SOFT)
     energy: float = depth * (depth + around) + _SOFT**2 * math.asinh(depth / _SOFT)
     return 0.25 * loads.plate_stiffness * energy
@@ -363,7 +363,7 @@ def contact_energy(loads: RodLoads, depth: float) -> float:
 def external_forces(
     rod: DiscreteRod, loads: RodLoads, R: Array, r: Array, J: Array, out: Array
 ) -> None:
-    """Generalised forces (n,) of gravity and wrench."""
+    """Set the generalised forces (n,) of gravity and wrench."""
     n = len(out)
     last = len(r) - 1
     out[:] = 0.0

@@ -1,8 +1,8 @@
 """Settings of the simulated arm and its devices: the rig file's ``plant``, ``lab`` and drivers.
 
-The plant's settings say how the arm differs from its robot file, and what a robot file does not
-describe: how the silicone stretches, creeps and dissipates. By default the arm is a perfect copy of
-its robot file but for the material, whose values are typical of soft silicones.
+The plant's settings describe how the arm differs from its robot file, and what a robot file does
+not contain: how the silicone stretches, creeps and dissipates. By default the arm is a perfect copy
+of its robot file except for the material, whose values are typical of soft silicones.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ TOUCHABLE = {
     "cylinder": CYLINDER,
     "box": BOX,
 }
-"""Shapes that the simulated arm can touch, by their keys in files, and how it takes them."""
+"""Shapes that the simulated arm can touch, by their keys in files, and their codes."""
 
 Positive = Field(gt=0)
 NotNegative = Field(ge=0)
@@ -132,12 +132,12 @@ class Mismatch(Schema):
     registration: Placement = Placement()
 
     def check_lengths(self, robot: RobotDescription) -> None:
-        """Refuse a list that has not one value per channel or per segment of a robot.
+        """Refuse a list without exactly one value per channel or per segment of a robot.
 
         Raises
         ------
         MisfitError
-            It names the list.
+            With the name of the list.
         """
         channels, segments = robot.n_pressures, robot.n_segments
         for name, length, noun in (
@@ -205,7 +205,7 @@ def check_touchable(scene: Scene) -> Scene:
     Raises
     ------
     InputError
-        It names the object.
+        With the name of the object.
     """
     for item in scene.objects:
         if item.shape.key not in TOUCHABLE:
@@ -235,7 +235,7 @@ class Discretisation(Schema):
 
     @model_validator(mode="after")
     def _has_enough_nodes(self) -> Self:
-        # in each plane, places and turns of the nodes must tell bending from shear
+        # in each plane, positions and rotations of the nodes must distinguish bending from shear
         least = max(self.shear_degree + 1, -(-(self.bending_degree + self.shear_degree + 2) // 2))
         if self.sub_intervals < least:
             raise BadKeyError(
@@ -277,7 +277,7 @@ class PlantSettings(RigSection):
     discretisation: Discretisation = Discretisation()
 
     def check_against(self, rig: Any, robot: RobotDescription) -> None:
-        """Refuse a mismatch of another number of channels or segments, or a misplaced scene."""
+        """Refuse a mismatch with a wrong number of channels or segments, or a misplaced scene."""
         self.mismatch.check_lengths(robot)
         if self.scene is not None:
             try:
@@ -291,12 +291,12 @@ class PlantSettings(RigSection):
 def plant_of(description: Any) -> PlantSettings:
     """Return the plant of a `RigDescription`, or the default one if it has none.
 
-    Without a scene of its own it has the objects of the rig's scene that the arm may lean on.
+    Without a scene of its own it has those objects of the rig's scene that the arm may lean on.
 
     Raises
     ------
     InputError
-        There is one among them that the simulated arm cannot touch.
+        The simulated arm cannot touch one of them.
     """
     plant, scene = description.plant, description.scene
     plant = plant if isinstance(plant, PlantSettings) else PlantSettings()
@@ -366,7 +366,7 @@ class SimulatedTrackerSettings(TrackerSettings):
     flips: Share = 0.0
 
     def check_against(self, rig: Any, robot: RobotDescription) -> None:
-        """Refuse more frames a second than the simulation has steps."""
+        """Refuse a frame rate above the rate of simulation steps."""
         fastest = 1 / plant_of(rig).discretisation.step
         if self.rate > fastest * (1 + 1e-9):
             raise MisfitError(
@@ -397,21 +397,21 @@ class SimulatedProbeSettings(ProbeSettings):
 
 @dataclass(frozen=True)
 class FaultSizes:
-    """How far the devices are off while a fault is injected, see `stiffopt.plant.world.FAULTS`.
+    """Errors of the devices while a fault is injected, see `stiffopt.plant.world.FAULTS`.
 
     Attributes
     ----------
     lag : added to the time constant of a slow regulator, in s.
     leak_time : time constant with which a leaking chamber empties, in s.
-    reading_gain, reading_offset : of a supply that reads wrong pressures, and in Pa.
-    frame_delay : by which the frames of a slow tracker arrive later, in s.
-    tracker_offset : by which a wrong tracker is off (3,), in m.
-    drift : speed of a tracker that drifts (3,), in m/s.
-    turn : speed at which a turning tracker's frame turns about its origin (3,), in rad/s.
-    shake, shake_rate : amplitude (3,) and frequency with which a tracker shakes, in m and Hz.
-    lag_growth : by how much a lagging tracker is later every second, in s.
-    stage_speed : of a slow stage, as a share of its speed.
-    force_gain, force_offset : of a force sensor that reads wrong forces, and in N.
+    reading_gain, reading_offset : of wrong pressure readings, the offset in Pa.
+    frame_delay : additional delay of a slow tracker's frames, in s.
+    tracker_offset : error of a wrong tracker (3,), in m.
+    drift : speed of a drifting tracker (3,), in m/s.
+    turn : angular speed of a turning tracker's frame about its origin (3,), in rad/s.
+    shake, shake_rate : amplitude (3,) and frequency of a shaking tracker, in m and Hz.
+    lag_growth : growth of a lagging tracker's delay per second, in s.
+    stage_speed : speed of a slow stage, as a share of the normal one.
+    force_gain, force_offset : of wrong force readings, the offset in N.
     """
 
     lag: float = 0.5

@@ -1,8 +1,8 @@
 """The simulated world: plant, regulators, tracker and probe under one clock.
 
-The devices show what real ones would: rounded, late and noisy. The truth (`Plant.tip_pose`,
-`World.pressures`) is here and nowhere in the interface of the rig, so that no controller reads it
-by accident.
+The devices report what real ones would: rounded, late and noisy values. The truth
+(`Plant.tip_pose`, `World.pressures`) is only here, not in the interface of the rig, so that no
+controller reads it by accident.
 """
 
 from __future__ import annotations
@@ -43,24 +43,24 @@ FAULTS = {
     ),
     "probe": ("ok", "off", "stuck", "garbage", "wrong", "slow"),
 }
-"""What can be injected, by device. ``stuck`` holds the last value, ``wrong`` is plausible but off,
-``garbage`` is not plausible at all; ``high`` is a regulator stuck at its highest pressure; a
-``loose`` sensor has come off and lies still; a ``lagging`` tracker tells older and older poses as
+"""Faults that can be injected, by device. ``stuck`` holds the last value; ``wrong`` is plausible,
+but off; ``garbage`` is implausible; ``high`` is a regulator stuck at its highest pressure; a
+``loose`` sensor has come off and lies still; a ``lagging`` tracker reports older and older poses as
 new."""
 
-_LONG = 1_000_000  # steps; there is no need to stop for this long
-_LONGEST = 30.0  # s of real time that is caught up with at once; more than that is skipped
+_LONG = 1_000_000  # steps, an upper bound of those without an event
+_LONGEST = 30.0  # s of real time to catch up with at once; anything beyond is skipped
 
 
 class World:
-    """The simulated arm and its devices in time. Methods may be called by any thread.
+    """The simulated arm and its devices in time. Any thread may call any method.
 
     Parameters
     ----------
     robot :
-        What the robot file says.
+        Description of the arm.
     limits :
-        Of the pressures.
+        Limits of the pressures.
     plant, supply, tracker, probe :
         Settings.
     real_time :
@@ -83,7 +83,7 @@ class World:
         self.supply = supply
         self.faults = dict.fromkeys(FAULTS, "ok")
         self.known_faults = dict(FAULTS)
-        """What can be injected; a device of the virtual lab may add faults of its own."""
+        """Faults that can be injected; a device of the virtual lab may add its own."""
         self._faulty: dict[int, str] = {}
         self._real_time = real_time
         n, step = limits.n, self.plant.step
@@ -101,21 +101,21 @@ class World:
         self._delayed = np.zeros((round(supply.dead_time / step), n))
         self._first = 0
         self.set_point = np.zeros(n)
-        """What the regulators were told (n,), in Pa."""
+        """Set-points of the regulators (n,), in Pa."""
         self._commanded_at = 0.0
-        self._filled: Array | None = None  # pressures that something else than the regulators makes
+        self._filled: Array | None = None  # pressures from `fill`, in place of the regulators
         self.pressures = np.zeros(n)
-        """In the chambers (n,), in Pa."""
+        """Pressures in the chambers (n,), in Pa."""
         streams = np.random.SeedSequence([plant.seed, 2]).spawn(4)
         self._ripple, self._gauge, optics, balance = map(np.random.default_rng, streams)
         self.camera = None if tracker is None else Camera(tracker, self.plant, optics)
         self.stage = SimulatedStage(
             probe or SimulatedProbeSettings(), self.plant, balance, self.faults, self.lock
         )
-        self._run(0)  # compiles what has not been compiled yet: no time for that later
+        self._run(0)  # compiles everything now: later there is no time for it
         self.plant.contact_force()
         self.epoch = time.monotonic()
-        """The moment 0 of the world on `time.monotonic`, in real time."""
+        """Time of `time.monotonic` at time 0 of the world, in real time, in s."""
 
     # Time ----------------------------------------------------------------------------------------
 
@@ -125,22 +125,22 @@ class World:
         return self.plant.time
 
     def now(self) -> float:
-        """Time on the rig's clock, in s."""
+        """Return the time on the rig's clock, in s."""
         return time.monotonic() - self.epoch if self._real_time else self.time
 
     def catch_up(self) -> None:
-        """Let the world reach the present; does nothing unless it runs in real time."""
+        """Advance the world to the present; does nothing unless it runs in real time."""
         if self._real_time:
             with self.lock:
                 now = self.now()
-                if now - self.time > _LONGEST:  # a busy machine: nothing happened in that time
+                if now - self.time > _LONGEST:  # the machine was busy: skip that time
                     self.plant.skip(now - self.time - _LONGEST)
                     if self.camera is not None:
                         self.camera.skip()
                 self.advance_to(now)
 
     def advance_to(self, moment: float) -> None:
-        """Let the world run until it is at a moment, in s."""
+        """Advance the world to a time, in s."""
         with self.lock:
             step = self.plant.step
             goal = int(np.ceil(moment / step - 1e-6))
@@ -148,7 +148,7 @@ class World:
                 self._run(min(goal, self._next_event(here)) - here)
 
     def _next_event(self, here: int) -> int:
-        """Return the step at which something other than physics happens next."""
+        """Return the next step with an event besides physics."""
         step = self.plant.step
         events = [here + _LONG]
         if self.camera is not None:
@@ -190,26 +190,26 @@ class World:
     # Supply --------------------------------------------------------------------------------------
 
     def command(self, pressures: ArrayLike) -> None:
-        """Give the regulators their set-points (n,), in Pa."""
+        """Set the regulators' set-points (n,), in Pa."""
         with self.lock:
             p = np.array(pressures, dtype=float)
             if self.supply.resolution > 0:
                 p = np.rint(p / self.supply.resolution) * self.supply.resolution
-            if self.faults["supply"] != "off":  # what does not answer does not hear either
+            if self.faults["supply"] != "off":  # a supply that is off receives nothing
                 self._commanded_at = self.time
                 self.set_point[:] = p
 
     def command_channel(self, channel: int, pressure: float) -> None:
-        """Give one regulator (from 0) its set-point, in Pa."""
+        """Set the set-point of one regulator (from 0), in Pa."""
         with self.lock:
             p = self.set_point.copy()
             p[channel] = pressure
             self.command(p)
 
     def fill(self, pressures: ArrayLike) -> None:
-        """Put pressures (n,), in Pa, into the chambers; the regulators of the world are idle then.
+        """Set the pressures (n,) in the chambers, in Pa; the world's regulators are idle then.
 
-        The chambers reach them by the next step in which time passes.
+        The chambers reach them in the next step of time.
         """
         with self.lock:
             self._filled = np.array(pressures, dtype=float)
@@ -238,21 +238,21 @@ class World:
         return bool(self._regulators.dumped)
 
     def frames(self) -> list[Frame]:
-        """Return the tracker's frames that have been delivered since the last call."""
+        """Return the tracker's frames delivered since the last call."""
         with self.lock:
             return [] if self.camera is None else self.camera.delivered(self.now())
 
     # Faults --------------------------------------------------------------------------------------
 
     def inject(self, device: str, fault: str, channel: int | None = None) -> None:
-        """Let a device misbehave from now on, or be ``ok`` again.
+        """Make a device faulty from now on, or ``ok`` again.
 
         Parameters
         ----------
         device, fault :
             See `known_faults`.
         channel :
-            Of the supply (from 0) that misbehaves; by default all do.
+            Faulty channel of the supply (from 0); None: all of them.
 
         Raises
         ------
@@ -296,18 +296,18 @@ class World:
 
 
 class WorldClock(Clock):
-    """Clock of a world: real time, or time that passes only while somebody sleeps."""
+    """Clock of a world: real time, or time that passes only during sleeps."""
 
     def __init__(self, world: World, *, real_time: bool) -> None:
         self._world = world
         self._real_time = real_time
 
     def now(self) -> float:
-        """Time of the world, in s."""
+        """Return the time of the world, in s."""
         return self._world.now()
 
     def sleep_until(self, moment: float) -> None:
-        """Let the world reach a moment."""
+        """Advance the world to a time, in s."""
         if not self._real_time:
             self._world.advance_to(moment)
             return
