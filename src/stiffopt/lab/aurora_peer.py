@@ -1,8 +1,8 @@
 """The virtual lab's tracker: an NDI Aurora on a pseudo-terminal.
 
 It follows NDI's description of the protocol (Aurora Application Program Interface Guide), not the
-library that reads it. A command is ``NAME:parameters``, a CRC-16 in hexadecimal digits and a
-carriage return, or ``NAME parameters`` without a CRC; a reply ends with its CRC-16, and binary ones
+library that the driver uses. A command is ``NAME:parameters``, a CRC-16 in hexadecimal digits and a
+carriage return, or ``NAME parameters`` without a CRC. A reply ends with its CRC-16; binary replies
 have a header.
 """
 
@@ -21,8 +21,8 @@ from stiffopt.errors import DeviceError
 from stiffopt.lab.bench import Bench, ServedPeer, TrackerFrame
 from stiffopt.rig.drivers.aurora import AuroraSettings
 
-FIRST_HANDLE = 0x0A  # that an Aurora gives to a wired tool
-SLOW = 0.2  # s, by which a slow device answers late
+FIRST_HANDLE = 0x0A  # handle that an Aurora gives to the first wired tool
+SLOW = 0.2  # s, delay of a slow device's answers
 SPEEDS = {"0": 9600, "2": 19200, "3": 38400, "4": 57600, "5": 115200}
 TOOL_IN_PORT, INITIALISED, ENABLED = 0x01, 0x10, 0x20
 VERSION = (
@@ -33,12 +33,12 @@ VERSION = (
 
 
 class AuroraPeer(ServedPeer[AuroraSettings]):
-    """The tracker's control unit with one sensor or more, the bench's at the driver's port.
+    """The tracker's control unit with one or more sensors; the bench's is at the driver's port.
 
     Attributes
     ----------
-    firmware : what it says is its version.
-    garble : spoils the CRC of replies, for rehearsals of a bad line.
+    firmware : version that it reports.
+    garble : whether to spoil the CRC of replies, to rehearse a bad line.
     """
 
     def __init__(
@@ -70,7 +70,7 @@ class AuroraPeer(ServedPeer[AuroraSettings]):
         self._baud = {getattr(termios, f"B{speed}"): speed for speed in SPEEDS.values()}
         self._speed = 9600
         self._forget()
-        self._master, self._slave = os.openpty()  # the slave is held, or the line would hang up
+        self._master, self._slave = os.openpty()  # keep the slave, or the line would hang up
         try:
             tty.setraw(self._slave)
             reader = asyncio.StreamReader()
@@ -113,7 +113,7 @@ class AuroraPeer(ServedPeer[AuroraSettings]):
         self._speed = speed
 
     def _hears(self) -> bool:
-        """Say whether both ends of the line have one speed; else the device gets mere noise."""
+        """Return whether both ends have the same speed; otherwise the device receives noise."""
         return self._baud.get(self._attributes(self._slave)[5]) == self._speed
 
     def _reply(self, command: bytes) -> bytes:
@@ -234,7 +234,7 @@ class AuroraPeer(ServedPeer[AuroraSettings]):
     # The frames ---------------------------------------------------------------------------------
 
     def _poses(self, parameters: str) -> list[tuple[int, TrackerFrame | None]]:
-        """Return what each enabled sensor sees; all see the same."""
+        """Return the frame of each enabled sensor; all see the same."""
         if not self._tracking:
             raise NdiRefusedError(NdiRefusedError.WRONG_MODE)
         if not hexadecimal(parameters or "0001") & 0x0001:
@@ -287,7 +287,7 @@ def crc16(data: bytes) -> int:
 
 
 def parse(command: bytes) -> tuple[str, str]:
-    """Return name and parameters of a command, whose CRC must be right where there is one."""
+    """Return name and parameters of a command; check its CRC if it has one."""
     text = command.decode("latin-1")
     name, colon, rest = text.partition(":")
     if not colon:
@@ -307,7 +307,7 @@ def hexadecimal(text: str) -> int:
 
 
 def pose_as_text(frame: TrackerFrame) -> str:
-    """Return signs and digits, without the points: 1e-4 of the quaternion, 0.01 mm, 1e-4 mm."""
+    """Return signs and digits, without points: 1e-4 of the quaternion, 0.01 mm, 1e-4 mm."""
     numbers = np.array([*frame.quaternion * 1e4, *frame.position * 1e5])
     if not np.isfinite(numbers).all() or np.abs(numbers[4:]).max() > 999999:
         return "MISSING"

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from stiffopt.errors import DeviceError, InputError
 from stiffopt.rig.device import DeviceSettings
 
-if TYPE_CHECKING:  # numba takes its time, and peers need none of it
+if TYPE_CHECKING:  # importing numba is slow, and peers do not need it
     from stiffopt.plant.hardware import Frame
     from stiffopt.plant.world import World
 
@@ -26,21 +26,21 @@ Array = NDArray[np.float64]
 SettingsT = TypeVar("SettingsT", bound=DeviceSettings)
 
 FULL_SCALE = 10e5
-"""Pressure in Pa that a regulator of the lab reaches at full scale, as of a K8P at 10 V."""
+"""Pressure of a lab's regulator at full scale, in Pa, as of a K8P at 10 V."""
 
-_TICK = 0.005  # s, at most, by which the world is behind
-_START = 5.0  # s, within which a device must listen, and within which it must have stopped
+_TICK = 0.005  # s, by which the world is behind at most
+_START = 5.0  # s for a device to start listening, and for it to stop
 
 
 @dataclass(frozen=True)
 class TrackerFrame:
-    """What the tracker's hardware sees in one frame.
+    """One frame of the tracker's hardware.
 
     Attributes
     ----------
     number : of the frame.
     time : of its capture, on `time.monotonic`.
-    position : of the sensor in the tracker's frame (3,), in m; NaN where it is not seen.
+    position : of the sensor in the tracker's frame (3,), in m; NaN if it is not seen.
     quaternion : (4,), w first, of any sign, with the tracker's noise.
     """
 
@@ -51,37 +51,37 @@ class TrackerFrame:
 
 
 class Bench:
-    """The simulated arm and its devices, kept going by a thread between `start` and `close`.
+    """The simulated arm and its devices; a thread advances them between `start` and `close`.
 
-    Every method may be called by any thread. Of the faults, a peer plays two itself: it does not
-    answer at all while `fault` is ``off``, and answers late while it is ``slow``. All others
-    (``stuck``, ``garbage``, ``wrong``) show in what the methods return.
+    Any thread may call any method. A peer implements two of the faults itself: it does not answer
+    while `fault` is ``off``, and answers late while it is ``slow``. The others (``stuck``,
+    ``garbage``, ``wrong``) show in the values that the methods return.
 
     Parameters
     ----------
     world :
-        Made for real time.
+        A world in real time.
 
     Attributes
     ----------
-    failure : what ended the world, if something did.
+    failure : the error that ended the world, or None.
     """
 
     def __init__(self, world: World) -> None:
         self.world = world
         self.failure: BaseException | None = None
-        self._mounted_at = 0.0  # where the stage was, on its own scale, when it was mounted
+        self._mounted_at = 0.0  # position of the stage on its own scale when it was mounted
         self._newest: Frame | None = None
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
 
     def start(self) -> None:
-        """Let time pass."""
+        """Start the thread that advances time."""
         self._thread = threading.Thread(target=self._keep_going, name="virtual-lab", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
-        """Stop; to close twice does nothing."""
+        """Stop; a second call does nothing."""
         self._stop.set()
         if self._thread is not None:
             self._thread.join(2.0)
@@ -91,7 +91,7 @@ class Bench:
         while not self._stop.wait(_TICK):
             try:
                 self.world.catch_up()
-            except Exception as error:  # told by whoever waits for the lab
+            except Exception as error:  # reported by the lab's user
                 self.failure = error
                 return
 
@@ -105,11 +105,11 @@ class Bench:
         return len(self.world.pressures)
 
     def command(self, channel: int, pressure: float) -> None:
-        """Give a regulator (counted from 0) its set-point, in Pa."""
+        """Set the set-point of a regulator (counted from 0), in Pa."""
         self.world.command_channel(channel, pressure)
 
     def fill(self, pressures: ArrayLike) -> None:
-        """Put pressures (n,), in Pa, into the chambers: a peer has regulators of its own."""
+        """Set the pressures (n,) in the chambers, in Pa, for a peer with its own regulators."""
         self.world.fill(pressures)
 
     def channel_faults(self) -> dict[int, str]:
@@ -117,15 +117,15 @@ class Bench:
         return self.world.channel_faults()
 
     def measured(self) -> Array:
-        """Pressures (n,) that the regulators report, in Pa."""
+        """Return the pressures (n,) that the regulators report, in Pa."""
         return self.world.measured()
 
     def dump(self, *, open_valve: bool) -> None:
-        """Open or close the dump valve: open, it empties all chambers."""
+        """Open or close the dump valve, which empties all chambers when open."""
         self.world.dump(open_valve=open_valve)
 
     def frame(self) -> TrackerFrame | None:
-        """Return the newest frame that has left the tracker, or None before the first."""
+        """Return the newest frame that the tracker has sent, or None before the first."""
         with self.world.lock:
             for frame in self.world.frames():
                 self._newest = frame
@@ -138,7 +138,7 @@ class Bench:
     def mount(self, direction: Iterable[float]) -> None:
         """Mount the stage along a unit vector (3,) in the base frame, just clear of the tip.
 
-        It keeps its place on its own scale: only the rail is moved.
+        It keeps its position on its own scale: only the rail is moved.
         """
         with self.world.lock:
             self.world.catch_up()
@@ -147,7 +147,7 @@ class Bench:
 
     @property
     def stage_position(self) -> float:
-        """Place of the probe's stage along its axis, in m."""
+        """Position of the probe's stage along its axis, in m."""
         return self._mounted_at + self.world.stage.position
 
     @property
@@ -156,7 +156,7 @@ class Bench:
         return self.world.stage.speed > 0
 
     def stage_move(self, position: float, speed: float) -> None:
-        """Let the stage start to move, to a place in m at a speed in m/s."""
+        """Start to move the stage to a position in m at a speed in m/s."""
         with self.world.lock:
             self.world.catch_up()
             self.world.stage.move(position - self._mounted_at, speed)
@@ -166,7 +166,7 @@ class Bench:
         self.world.stage.stop()
 
     def force(self) -> float:
-        """Force that the probe's sensor feels, in N."""
+        """Return the force that the probe's sensor measures, in N."""
         return self.world.stage.force()
 
 
@@ -176,14 +176,14 @@ class DevicePeer(ABC, Generic[SettingsT]):
     Parameters
     ----------
     settings :
-        Of the real driver, as they are in the rig file; the peer follows them (register map,
+        Settings of the real driver, as in the rig file. The peer follows them (register map,
         scales, channels), so that a lab can rehearse with its own file.
     bench :
-        What is behind it.
+        The bench behind it.
 
     Attributes
     ----------
-    faults : what this device can do wrong beyond the faults of all devices of its kind.
+    faults : faults of this device beyond those of all devices of its kind.
     """
 
     faults: ClassVar[tuple[str, ...]] = ()
@@ -194,7 +194,7 @@ class DevicePeer(ABC, Generic[SettingsT]):
 
     @classmethod
     def stand_in(cls, simulated: Any, n: int) -> SettingsT:
-        """Return settings with which this device takes the place of a simulated one.
+        """Return settings with which this device replaces a simulated one.
 
         Parameters
         ----------
@@ -206,13 +206,13 @@ class DevicePeer(ABC, Generic[SettingsT]):
         Raises
         ------
         InputError
-            It has no settings that go without saying.
+            It has no default settings.
         """
         raise InputError(f"{cls.__name__} needs settings in the rig file")
 
     @staticmethod
     def on_loopback(host: str | None) -> bool:
-        """Say whether a host is this machine's own address: the lab listens nowhere else."""
+        """Return whether a host is this machine's loopback: the lab listens nowhere else."""
         return host is not None and (host == "localhost" or host.startswith("127."))
 
     @abstractmethod
@@ -221,25 +221,25 @@ class DevicePeer(ABC, Generic[SettingsT]):
 
         Returns
         -------
-        The settings with the address put in, with which the real driver reaches this peer.
+        The settings, with the address at which the real driver reaches this peer.
 
         Raises
         ------
         DeviceError
-            The address that the settings ask for is in use.
+            The address in the settings is in use.
         MissingExtraError
-            The library that speaks the protocol is not installed.
+            The library of the protocol is not installed.
         """
 
     @abstractmethod
     def close(self) -> None:
-        """Stop listening and end every thread; to close twice does nothing."""
+        """Stop listening and end every thread; a second call does nothing."""
 
 
 class ServedPeer(DevicePeer[SettingsT]):
-    """A device that an event loop plays, in a thread of its own.
+    """A device that is served by an event loop in a thread of its own.
 
-    A subclass listens in `_listening`; what it does there runs in the loop and never blocks it.
+    A subclass implements `_listening`, whose code runs in the loop and must never block it.
     """
 
     def __init__(self, settings: SettingsT, bench: Bench) -> None:
@@ -263,16 +263,16 @@ class ServedPeer(DevicePeer[SettingsT]):
             raise
 
     def close(self) -> None:
-        """Stop listening and end the loop; to close twice does nothing."""
+        """Stop listening and end the loop; a second call does nothing."""
         thread, self._thread = self._thread, None
         if thread is not None:
-            with suppress(RuntimeError):  # the loop has ended by itself
+            with suppress(RuntimeError):  # the loop has already ended
                 self._end()
             thread.join(_START)
 
     @abstractmethod
     def _listening(self) -> AbstractAsyncContextManager[SettingsT]:
-        """Listen in a context, which gives the settings that lead here; see `DevicePeer.start`."""
+        """Listen in a context that yields the peer's settings; see `DevicePeer.start`."""
 
     def _run(self, started: Future[SettingsT]) -> None:
         try:

@@ -14,7 +14,7 @@ from stiffopt.errors import DeviceError, InputError
 from stiffopt.model.compiler import cache_directory
 
 PACKAGES = "gcc make gcc-avr avr-libc libsimavr-dev libelf-dev"
-"""Debian packages that are needed."""
+"""Required Debian packages."""
 
 _FILES = ("Makefile", "src", "avr", "simulator")
 _COMMANDS = ("make", "gcc", "avr-gcc", "avr-size")
@@ -22,7 +22,7 @@ _HEADER = Path("/usr/include/simavr/sim_avr.h")
 
 
 def firmware_directory() -> Path:
-    """Return where the firmware's source is: in the package, or in the checkout around it.
+    """Return the folder of the firmware's source, in the package or in the checkout around it.
 
     Raises
     ------
@@ -37,7 +37,7 @@ def firmware_directory() -> Path:
 
 
 def missing_tools() -> str:
-    """Return what to install before firmware can be built and run; empty if all is there."""
+    """Return what to install before firmware can be built and run; empty if nothing is missing."""
     if all(map(shutil.which, _COMMANDS)) and _HEADER.exists():
         return ""
     return (
@@ -46,13 +46,13 @@ def missing_tools() -> str:
 
 
 def built_firmware(**settings: int) -> Path:
-    """Return a folder with ``regulator.elf`` and ``board``; it is built once and then kept.
+    """Return a folder with ``regulator.elf`` and ``board``, built once and then kept.
 
     Parameters
     ----------
     settings :
-        Those of the Makefile, such as ``PAIRS=0``; what the environment variable
-        ``STIFFOPT_FIRMWARE`` says, in the same way, counts more.
+        Settings of the Makefile, such as ``PAIRS=0``. The environment variable
+        ``STIFFOPT_FIRMWARE`` has precedence over them, in the same form.
 
     Raises
     ------
@@ -79,7 +79,7 @@ def built_firmware(**settings: int) -> Path:
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode:
             raise DeviceError(f"the firmware cannot be built: {done.stderr.strip()[-500:]}")
-        if not target.exists():  # else another process was first
+        if not target.exists():  # another process may have been first
             os.replace(making, target)
     finally:
         shutil.rmtree(making, ignore_errors=True)

@@ -21,17 +21,17 @@ from stiffopt.rig.drivers.modbus import (
 )
 from stiffopt.rig.drivers.modbus_registers import PressureRegister
 
-LATE = 0.1  # s, by which a slow device's answers come late
-_TICK = 0.01  # s, between looks at the watchdog
+LATE = 0.1  # s, delay of a slow device's answers
+_TICK = 0.01  # s between checks of the watchdog
 _COILS, _INPUTS = (1, 5, 15), 4  # function codes
 
 
 class ModbusPeer(ServedPeer[ModbusSettings]):
     """A coupler with regulators on its outputs.
 
-    What is written to set-points goes to the bench, readings come from it. An address that the
-    rig file does not name is refused, as by a real device. The watchdog starts with the first
-    write after its time was set; when it runs out, all outputs fall: set-points and coil.
+    Written set-points go to the bench, readings come from it. As in a real device, addresses that
+    the rig file does not name are refused. The watchdog starts with the first write after its time
+    was set; when it runs out, all outputs fall: set-points and coil.
     """
 
     def __init__(self, settings: ModbusSettings, bench: Bench) -> None:
@@ -63,7 +63,7 @@ class ModbusPeer(ServedPeer[ModbusSettings]):
                 terminals = _Terminals()
                 stack.callback(terminals.close)
             server, connection = await self._listen(terminals)
-            stack.push_async_callback(asyncio.sleep, 0)  # transports close in the next round
+            stack.push_async_callback(asyncio.sleep, 0)  # lets the transports close
             stack.push_async_callback(server.shutdown)
             stack.callback(asyncio.create_task(self._watch()).cancel)
             kind = "tcp" if isinstance(connection, ModbusTcp) else "serial"
@@ -74,7 +74,7 @@ class ModbusPeer(ServedPeer[ModbusSettings]):
         options = {"trace_packet": self._trace}
         if terminals is not None:
             asked = self.settings.serial or ModbusSerial(port="")
-            line = asked.model_copy(update={"parity": "none"})  # such terminals know no parity
+            line = asked.model_copy(update={"parity": "none"})  # pseudo-terminals have no parity
             server = servers.ModbusSerialServer(
                 self._device(), port=terminals.inner, **line.options(), **options
             )
@@ -114,7 +114,7 @@ class ModbusPeer(ServedPeer[ModbusSettings]):
         return addresses.union(settings.watchdog.addresses if settings.watchdog else ())
 
     def _trace(self, sending: bool, packet: bytes) -> bytes:
-        """Keep silent while the device is off."""
+        """Send nothing while the device is off."""
         return b"" if sending and self.bench.fault("supply") == "off" else packet
 
     # requests ------------------------------------------------------------------------------------
@@ -128,9 +128,9 @@ class ModbusPeer(ServedPeer[ModbusSettings]):
         registers: list[int],
         values: Sequence[int] | Sequence[bool] | None,
     ) -> Any:
-        """Carry out a request; pymodbus answers with what is left in ``registers``."""
+        """Carry out a request; pymodbus answers with the content of ``registers``."""
         fault = self.bench.fault("supply")
-        if fault == "off":  # `_trace` keeps the answer back
+        if fault == "off":  # `_trace` drops the answer
             return pymodbus_library("pymodbus.constants").ExcCodes.DEVICE_FAILURE
         if fault == "slow":
             await asyncio.sleep(LATE)
@@ -156,7 +156,7 @@ class ModbusPeer(ServedPeer[ModbusSettings]):
                 self.bench.command(channel, pressure)
 
     def _shown(self, table: str) -> dict[int, int]:
-        """Return what a table reads as; a reading hides a set-point at its address."""
+        """Return the content of a table; a reading hides a set-point at its address."""
         shown = dict(self._memory) if table == "holding" else {}
         if table == "holding":
             pairs = zip(self.settings.read_backs, self.settings.setpoints, strict=True)
@@ -187,7 +187,7 @@ class ModbusPeer(ServedPeer[ModbusSettings]):
                 self._fall()
 
     def _fall(self) -> None:
-        """Let all outputs fall, as when the device has just been switched on."""
+        """Reset all outputs, as when the device is switched on."""
         self._last_write = None
         for channel, point in enumerate(self.settings.setpoints):
             self._memory.update(zip(point.addresses, point.encode(0.0), strict=True))
@@ -196,9 +196,9 @@ class ModbusPeer(ServedPeer[ModbusSettings]):
 
 
 class _Terminals:
-    """Two pseudo-terminals, joined: a serial line with both its ends on this machine.
+    """Two joined pseudo-terminals: a serial line with both ends on this machine.
 
-    Both ends are kept open here, else the line would break whenever someone hangs up.
+    Both ends are kept open here, otherwise the line would break when one side hangs up.
     """
 
     def __init__(self) -> None:
@@ -213,7 +213,7 @@ class _Terminals:
             asyncio.get_running_loop().add_reader(source, self._pass_on, source, target)
 
     def _pass_on(self, source: int, target: int) -> None:
-        with suppress(BlockingIOError):  # a full line loses what is sent, as a real one does
+        with suppress(BlockingIOError):  # like a real line, a full one loses data
             os.write(target, os.read(source, 4096))
 
     def close(self) -> None:
@@ -226,12 +226,12 @@ class _Terminals:
 async def _begin(server: Any, failure: str) -> None:
     try:
         await server.serve_forever(background=True)
-    except RuntimeError:  # pymodbus has logged why and does not say it
+    except RuntimeError:  # pymodbus logs the reason and does not raise it
         raise DeviceError(failure) from None
 
 
 def _counts(point: PressureRegister, pressure: float) -> tuple[int, ...]:
-    """Return the registers of a reading; integers know no NaN and then read as full."""
+    """Return the registers of a reading; integer types represent NaN by full scale."""
     if np.isfinite(pressure):
         return point.encode(float(pressure))
     low, high = point.pressure_range()

@@ -1,7 +1,7 @@
 """The virtual lab's NI-DAQ devices: a gRPC server for the real nidaqmx, and regulators behind it.
 
-The server is built on nidaqmx's own stubs. It knows the calls that tasks for voltages, digital
-lines and watchdogs make, and refuses all others as NI's server refuses what it does not know.
+The server is built on nidaqmx's own stubs. It implements the calls for tasks with voltages, digital
+lines and watchdogs, and refuses all others like NI's server.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from stiffopt.lab.bench import FULL_SCALE, Bench, DevicePeer
 from stiffopt.rig.device import library
 from stiffopt.rig.drivers.nidaq import NidaqInput, NidaqOutput, NidaqSettings
 
-LATE = 0.3  # s after which a slow device answers
+LATE = 0.3  # s, delay of a slow device's answers
 THREADS = 8
 
 _VERSION = {0x1272: 24, 0x1923: 5, 0x2F22: 0}  # of the driver: major, minor, update
@@ -39,7 +39,7 @@ _FEED, _CLEAR = 0, 1
 
 
 class _NiError(Exception):
-    """An error that the server answers with: number and text."""
+    """An error to answer with: number and text."""
 
 
 @dataclass
@@ -58,7 +58,7 @@ class _Session:
 
 
 class _Watchdog:
-    """Drives its lines and locks them when it is not fed in time."""
+    """Sets its lines and locks them when it is not fed in time."""
 
     def __init__(self, timeout: float, act: Callable[[dict[str, bool]], None]) -> None:
         self.timeout = timeout
@@ -93,12 +93,12 @@ class DaqServer:
     Parameters
     ----------
     address :
-        To listen on, on this machine; None: any free port.
+        Address to listen on, on this machine; None: any free port.
     extra :
-        Of stiffopt that brings nidaqmx, for the message when it is missing.
+        stiffopt's extra with nidaqmx, for the message if it is missing.
     outputs, inputs, lines :
-        What takes the volts of each analogue output, gives those of each analogue input, and takes
-        the level of each digital line.
+        By name, functions that accept the voltage of an analogue output, return that of an analogue
+        input, and accept the level of a digital line.
     fault :
         Returns the fault of the device: ``ok``, ``off``, ``slow`` and others.
     """
@@ -118,7 +118,7 @@ class DaqServer:
         self._outputs, self._inputs, self._lines = outputs or {}, inputs or {}, lines or {}
         self._fault = fault
         self._sessions: dict[str, _Session] = {}
-        self._locked = False  # by a watchdog that has expired: digital writes are refused
+        self._locked = False  # whether an expired watchdog makes it refuse digital writes
         self._lock = RLock()
         self._closing = Event()
         self._server: Any = None
@@ -129,7 +129,7 @@ class DaqServer:
         grpc = library("grpc", "nidaqmx[grpc]", self._extra)
         self._messages = library("nidaqmx._stubs.nidaqmx_pb2", "nidaqmx[grpc]", self._extra)
         threads = LastingThreads(THREADS, "daq-server")
-        # Without this option two servers may listen on one port, and each gets some of the calls.
+        # Without this option two servers may listen on one port and share the calls.
         server = grpc.server(threads, options=[("grpc.so_reuseport", 0)])
         handlers = {name: self._handler(grpc, name, call) for name, call in self._calls().items()}
         service = grpc.method_handlers_generic_handler("nidaqmx_grpc.NiDAQmx", handlers)
@@ -148,9 +148,9 @@ class DaqServer:
         return f"127.0.0.1:{port}"
 
     def close(self) -> None:
-        """End all sessions and threads; to close twice does nothing."""
+        """End all sessions and threads; a second call does nothing."""
         self._closing.set()
-        if sys.is_finalizing():  # to stop takes a thread, and none starts any more
+        if sys.is_finalizing():  # stopping needs a new thread, which cannot start any more
             return
         server, self._server = self._server, None
         threads, self._threads = self._threads, None
@@ -207,7 +207,7 @@ class DaqServer:
         )
 
     def _answers(self, context: Any) -> bool:
-        """Say whether the call is answered; while the device is off, wait until nobody listens."""
+        """Return whether to answer a call; while the device is off, wait until the client ends."""
         fault = self._fault()
         if fault == "slow":
             self._closing.wait(LATE)
@@ -216,7 +216,7 @@ class DaqServer:
         return fault != "off"
 
     def _created(self, session: _Session) -> dict[str, Any]:
-        name = f"task-{uuid4()}"  # one that no server before this one has given away
+        name = f"task-{uuid4()}"  # a name that no earlier server has used
         self._sessions[name] = session
         return {"task": {"name": name}, "new_session_initialized": True}
 
@@ -267,7 +267,7 @@ class DaqServer:
         return {}
 
     def _must_be_free(self, session: _Session) -> None:
-        """Refuse as NI's driver does: a device runs one task of a kind at a time."""
+        """Refuse like NI's driver: a device runs one task of a kind at a time."""
         for other in self._sessions.values():
             same = (other.kind, other.device) == (session.kind, session.device)
             if other is not session and other.started and same:
@@ -334,7 +334,7 @@ class DaqServer:
 
 
 class LastingThreads(Executor):
-    """Threads that serve on while the interpreter exits, which is when supplies vent."""
+    """Threads that keep serving while the interpreter exits, which is when supplies vent."""
 
     def __init__(self, n: int, name: str) -> None:
         self._jobs: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
@@ -357,7 +357,7 @@ class LastingThreads(Executor):
         return future
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """Let the threads end after what was submitted, and wait for that."""
+        """End the threads after the submitted calls, and wait for them."""
         for _ in self._threads:
             self._jobs.put(None)
         for thread in self._threads:
@@ -369,9 +369,9 @@ class LastingThreads(Executor):
 
 
 class NidaqPeer(DevicePeer[NidaqSettings]):
-    """An NI-DAQ device with regulators, and a dump valve where the settings name one.
+    """An NI-DAQ device with regulators, and a dump valve if the settings name one.
 
-    It listens where ``grpc`` says if that is on this machine, else on a free port.
+    It listens at the address ``grpc`` if that is on this machine, otherwise on a free port.
     """
 
     def __init__(self, settings: NidaqSettings, bench: Bench) -> None:

@@ -1,7 +1,7 @@
 """The virtual lab's open regulator: the real firmware in simavr, on a pseudo-terminal.
 
-The simulated board has valves, supply line and chambers behind its pins (firmware/simulator). What
-the pressures in the chambers are, it tells the bench; the bench's own regulators are not used.
+The simulated board has valves, supply line and chambers behind its pins (firmware/simulator). It
+reports the pressures in the chambers to the bench, whose own regulators are not used.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from stiffopt.lab.bench import Bench, DevicePeer
 from stiffopt.lab.firmware import built_firmware
 from stiffopt.rig.drivers.open_regulator import BoardChannel, OpenRegulatorSettings
 
-PAIRS, MOST = 3, 6  # channels of a board with pairs of valves, and of one with 3-way valves
+PAIRS, MOST = 3, 6  # channels of a board with pairs of valves, and with 3-way valves
 _END = 2.0  # s
-_NOISE = 30  # of 1000 bytes, that are spoilt or lost
+_NOISE = 30  # bytes of 1000 that are corrupted or lost
 _HOLE = 0.067  # dm3/(s bar): empties 20 ml with a time constant of 0.3 s
-_SLOW = 0.5  # s, of the valves
+_SLOW = 0.5  # s, time constant of slow valves
 _ONCE = {"reset": "reset", "brown-out": "brown-out", "hung": "hang"}
 _LINE = {"noise": f"noise {_NOISE}", "losses": f"lose {_NOISE}", "unplugged": "cable 0"}
 
@@ -62,7 +62,7 @@ class OpenRegulatorPeer(DevicePeer[OpenRegulatorSettings]):
         return OpenRegulatorSettings(port="a pseudo-terminal", channels=channels)
 
     def start(self) -> OpenRegulatorSettings:
-        """Build the firmware where that is not done yet, and switch the board on."""
+        """Build the firmware if necessary, and switch the board on."""
         if self._process is not None:
             raise DeviceError("the open regulator of the virtual lab runs already")
         folder = built_firmware(**self._built)
@@ -73,7 +73,7 @@ class OpenRegulatorPeer(DevicePeer[OpenRegulatorSettings]):
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
             text=True,
-            start_new_session=True,  # Ctrl-C is for the lab, which ends the board
+            start_new_session=True,  # Ctrl-C must only reach the lab, which ends the board
         )
         assert self._process.stdout is not None
         port = self._process.stdout.readline().strip()
@@ -87,7 +87,7 @@ class OpenRegulatorPeer(DevicePeer[OpenRegulatorSettings]):
         return self.settings.model_copy(update={"port": port})
 
     def close(self) -> None:
-        """Switch the board off; to close twice does nothing."""
+        """Switch the board off; a second call does nothing."""
         process, self._process = self._process, None
         if process is None:
             return
@@ -101,15 +101,15 @@ class OpenRegulatorPeer(DevicePeer[OpenRegulatorSettings]):
                     stream.close()
 
     def tell(self, command: str) -> None:
-        """Do something to the board; see firmware/simulator/board.c."""
+        """Send a command to the simulated board; see firmware/simulator/board.c."""
         process = self._process
         if process is not None and process.stdin is not None:
-            with suppress(OSError, ValueError):  # it was closed meanwhile
+            with suppress(OSError, ValueError):  # the board was switched off
                 process.stdin.write(f"{command}\n")
                 process.stdin.flush()
 
     def _listen(self, process: subprocess.Popen[str]) -> None:
-        """Pass pressures on to the bench, and its faults on to the board."""
+        """Pass pressures to the bench, and the bench's faults to the board."""
         outputs = [channel.output - 1 for channel in self.settings.channels]
         before: tuple[str, dict[int, str]] = ("ok", {})
         assert process.stdout is not None
@@ -125,7 +125,7 @@ class OpenRegulatorPeer(DevicePeer[OpenRegulatorSettings]):
                         self.tell(command)
 
     def _commands(self, fault: str, faulty: dict[int, str]) -> Iterator[str]:
-        """Yield what makes a board that has these faults and no others."""
+        """Yield the commands that give a board exactly these faults."""
         yield from ("noise 0", "lose 0", "cable 1", f"power {int(fault != 'off')}")
         yield f"lag {_SLOW if fault == 'slow' else 0.005}"
         for index, channel in enumerate(self.settings.channels):

@@ -17,21 +17,21 @@ from stiffopt.lab.bench import Bench, ServedPeer, TrackerFrame
 from stiffopt.rig.drivers.openigtlink import OpenIGTLinkSettings, pyigtl_messages
 
 HOST = "127.0.0.1"
-PAUSE = 0.002  # s between two looks at the bench
-SLOW = 0.2  # s, by which a slow server sends late
-_UNREAD = 1 << 16  # bytes; a client that leaves so many unread is given up
+PAUSE = 0.002  # s between polls of the bench
+SLOW = 0.2  # s, delay of a slow server
+_UNREAD = 1 << 16  # bytes; a client that leaves more unread is disconnected
 
 
 class OpenIGTLinkPeer(ServedPeer[OpenIGTLinkSettings]):
-    """Sends each frame once to whoever is connected, and nothing when the tool is not seen.
+    """Sends each frame once to all clients, and nothing if the tool is not seen.
 
-    Frames carry the time of their capture on a clock of the server's own, as PLUS does. pyigtl
-    packs the messages; its server is not used, as it replaces the signal handlers of the process
-    that vents at Ctrl-C, serves one client at a time and does not notice when that one leaves.
+    Frames carry the time of their capture on the server's own clock, as those of PLUS do. pyigtl
+    packs the messages. Its server is not used: it replaces the signal handlers of the process that
+    vents at Ctrl-C, serves one client at a time and does not notice when that one leaves.
 
     Parameters
     ----------
-    port : to listen on; 0 takes a free one.
+    port : port to listen on; 0: any free one.
     """
 
     def __init__(self, settings: OpenIGTLinkSettings, bench: Bench, port: int = 0) -> None:
@@ -62,7 +62,7 @@ class OpenIGTLinkPeer(ServedPeer[OpenIGTLinkSettings]):
         server.close()
 
     async def _attend(self, reader: asyncio.StreamReader, client: asyncio.StreamWriter) -> None:
-        """Serve a client until it leaves; what it says does not matter."""
+        """Keep a client until it leaves; ignore its messages."""
         self._clients.add(client)
         try:
             with suppress(OSError):

@@ -1,7 +1,7 @@
 """The virtual lab's probe: a Zaber stage on TCP, and the NI-DAQ device that reads its sensor.
 
-The stage speaks Zaber's ASCII protocol. It knows what a program needs that identifies, homes,
-moves, stops and watches one axis, and rejects the rest as the real device does.
+The stage speaks Zaber's ASCII protocol. It implements the commands to identify, home, move, stop
+and watch one axis, and rejects all others as the real device does.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from stiffopt.lab.bench import Bench, DevicePeer, ServedPeer
 from stiffopt.lab.nidaq_peer import DaqServer
 from stiffopt.rig.drivers.probe import SPEED_FACTOR, ZaberProbeSettings
 
-LATE = 0.3  # s after which a slow device answers
+LATE = 0.3  # s, delay of a slow device's answers
 
 _NOT_HOMED, _INTERRUPTED = "WR", "NI"
 _IDENTITY = {
@@ -38,7 +38,7 @@ _IDENTITY = {
 
 
 class _Request(NamedTuple):
-    """A line: device, axis and number of the message as written, and words."""
+    """A request line: device, axis and number of the message as written, and words."""
 
     device: int
     axis: int
@@ -56,7 +56,7 @@ _BAD_DATA = _Answer("BADDATA", accepted=False)
 
 
 class ZaberPeer(ServedPeer[ZaberProbeSettings]):
-    """The stage of a probe; its middle of travel is where the bench has it aligned.
+    """The stage of a probe; the middle of its travel is the position 0 of the bench's stage.
 
     Parameters
     ----------
@@ -89,7 +89,7 @@ class ZaberPeer(ServedPeer[ZaberProbeSettings]):
     async def _attend(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Answer the lines of a connection."""
         try:
-            with suppress(OSError, ValueError):  # the other side has gone, or sends no lines
+            with suppress(OSError, ValueError):  # the client has left, or sends no lines
                 async for line in reader:
                     if text := line.decode("ascii", "replace").strip():
                         writer.write((await self._reply(text)).encode())
@@ -97,7 +97,7 @@ class ZaberPeer(ServedPeer[ZaberProbeSettings]):
             writer.close()
 
     async def _reply(self, line: str) -> str:
-        """Return the answer to a line; empty where the device keeps silent."""
+        """Return the answer to a line; empty if the device stays silent."""
         fault = self.bench.fault("probe")
         if fault == "slow":
             await asyncio.sleep(LATE)
@@ -182,7 +182,7 @@ class ZaberPeer(ServedPeer[ZaberProbeSettings]):
         return round(self._stage.max_speed / self._stage.microstep * SPEED_FACTOR)
 
     def _place(self) -> float:
-        """Place on the rail, in m from home."""
+        """Return the position on the rail, in m from home."""
         return self._middle + self._stage.towards_tip * self.bench.stage_position
 
     def _go(self, place: float, native_speed: float) -> None:
@@ -195,7 +195,7 @@ def _checksum(text: str) -> int:
 
 
 def _parsed(line: str) -> _Request | None:
-    """Return what a line says, or None if it is damaged, which a device ignores."""
+    """Parse a line; return None if it is damaged, since a device ignores that."""
     body, colon, checksum = line.removeprefix("/").partition(":")
     if not line.startswith("/") or (colon and checksum != f"{_checksum(body):02X}"):
         return None
@@ -210,9 +210,8 @@ def _parsed(line: str) -> _Request | None:
 class ProbePeer(DevicePeer[ZaberProbeSettings]):
     """Stage and sensor.
 
-    The sensor's device listens on a free port, whatever ``grpc`` says: on a real rig one server
-    often stands before both the supply and the sensor.
-
+    The sensor's device listens on a free port, whatever ``grpc`` is: on a real rig, one server
+    often serves both the supply and the sensor.
     Parameters
     ----------
     homed :

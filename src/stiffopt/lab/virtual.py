@@ -26,7 +26,7 @@ def with_real_devices(
     description, robot :
         The rig and its robot.
     drivers :
-        That take the place of a simulated `supply`, `tracker` and `probe`.
+        Drivers that replace a simulated `supply`, `tracker` and `probe`.
 
     Raises
     ------
@@ -52,7 +52,7 @@ def with_real_devices(
 
 
 def _peer_class(settings: type[DeviceSettings]) -> type[DevicePeer[Any]]:
-    """Return the class that plays a device in the lab."""
+    """Return the class of the peer for a device's settings."""
     if not settings.peer:
         raise InputError(
             f"the driver of {settings.__name__} cannot be used in the virtual lab: it has no peer"
@@ -67,12 +67,12 @@ class VirtualLab:
     Parameters
     ----------
     description :
-        The rig; where its devices are simulated, `supply`, `tracker` and `probe` name the drivers
-        of the real ones that take their place.
+        The rig. If its devices are simulated, `supply`, `tracker` and `probe` name the drivers of
+        the real ones that replace them.
     robot :
         Its robot.
     supply, tracker, probe :
-        Drivers that have a peer.
+        Drivers with a peer.
     """
 
     def __init__(
@@ -98,7 +98,7 @@ class VirtualLab:
 
     @property
     def world(self) -> World:
-        """What is true, and where faults are injected."""
+        """The simulated truth, and the place to inject faults."""
         return self.bench.world
 
     def start(self) -> RigDescription:
@@ -106,7 +106,7 @@ class VirtualLab:
 
         Returns
         -------
-        The rig file's content with the peers' addresses, which drives them with the real drivers.
+        The rig file's content with the peers' addresses, for the real drivers.
 
         Raises
         ------
@@ -117,7 +117,7 @@ class VirtualLab:
         InputError
             There is no peer for a driver.
         """
-        # behind the protocols is a simulated arm: nobody has to commission it
+        # a simulated arm needs no commissioning
         free = CommissioningSettings(required=False)
         addressed: dict[str, Any] = {"plant": None, "lab": None, "commissioning": free}
         with ExitStack() as stack:
@@ -135,7 +135,7 @@ class VirtualLab:
         return self.description.model_copy(update=addressed)
 
     def close(self) -> None:
-        """End all peers, then time; to close twice does nothing."""
+        """End all peers, then time; a second call does nothing."""
         with ExitStack() as stack:
             stack.callback(self.bench.close)
             while self._peers:

@@ -1,4 +1,4 @@
-"""Logs as CSV (log v1): written row by row, so that a crash loses the last row only, and read."""
+"""Logs as CSV (log v1): a reader, and a writer that goes row by row, so a crash loses one row."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from stiffopt.logs.table import cut_torn_end, read_bytes, read_table, replacing,
 
 
 class LogWriter:
-    """Appends rows to a log (log v1); each is handed to the system when `append` returns.
+    """Appends rows to a log (log v1); each is handed to the system before `append` returns.
 
-    An existing file that has the same columns is continued after `last_time`.
+    An existing file with the same columns is continued after `last_time`.
 
     Parameters
     ----------
@@ -24,13 +24,13 @@ class LogWriter:
 
     Attributes
     ----------
-    last_time : time of the last row; None before the first.
-    was_torn : whether a last line without an end was found and cut off.
+    last_time : time of the last row, in s; None before the first.
+    was_torn : whether an incomplete last line was found and cut off.
 
     Raises
     ------
     FileError
-        It cannot be written, now or later, or is there and has other columns.
+        It cannot be written, now or later, or it exists and has other columns.
     """
 
     def __init__(self, path: str | os.PathLike[str], layout: LogLayout) -> None:
@@ -48,7 +48,7 @@ class LogWriter:
             self._write(header)
 
     def _take_up(self, header: bytes) -> None:
-        """Find where an existing file ends."""
+        """Find the end of an existing file."""
         text = read_bytes(self.path)
         if text and not text.startswith(header) and not header.startswith(text):
             raise FileError(self.path, "is there and has other columns; give another name", line=1)
@@ -79,7 +79,7 @@ class LogWriter:
                 data = data[self._stream.write(data) :]
 
     def close(self) -> None:
-        """Write all rows to the disk and close; to close twice does nothing."""
+        """Write all rows to the disk and close; a second call does nothing."""
         if self._stream.closed:
             return
         with writing(self.path), self._stream:
@@ -93,7 +93,7 @@ class LogWriter:
 
 
 def write_log(path: str | os.PathLike[str], log: Log) -> None:
-    """Write a whole log (log v1), in the place of what is there."""
+    """Write a whole log (log v1), replacing an existing file."""
     with replacing(path) as part, LogWriter(part, log.layout) as writer:
         for row in log.rows():
             writer.append(row)
@@ -113,7 +113,7 @@ def read_log(path: str | os.PathLike[str]) -> Log:
     ------
     FileError
         It cannot be read, a column is missing or unknown, a row has too few or too many fields, a
-        field is no finite number, or time does not increase. It names the line.
+        field is no finite number, or time does not increase; with the line.
     """
     table = read_table(path)
     layout = LogLayout.of_columns(table.path, table.columns)
@@ -131,7 +131,7 @@ def read_log(path: str | os.PathLike[str]) -> Log:
 
 
 def _format(column: str) -> str:
-    """Return how a column's numbers are written: finer than any sensor, in fixed steps."""
+    """Return the format of a column's numbers: finer than any sensor, in fixed steps."""
     if column.endswith("_pa"):
         return "%.1f"  # Pa
     if column.endswith("_m"):

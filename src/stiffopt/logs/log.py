@@ -24,7 +24,7 @@ _BODY = re.compile(r"([a-z][a-z0-9]*(?:_[a-z0-9]+)*)_(?:[xyz]_m|q[wxyz])")
 
 @dataclass(frozen=True)
 class LogLayout:
-    """Which columns a log has.
+    """The columns of a log.
 
     Attributes
     ----------
@@ -32,7 +32,7 @@ class LogLayout:
     measured : whether pressures were measured.
     tip_quaternion : whether the tip's orientation was tracked.
     bodies : names of further bodies, and whether their orientation was tracked.
-    force, stage : whether a probe's force and its place were recorded.
+    force, stage : whether a probe's force and position were recorded.
     """
 
     n: int
@@ -44,7 +44,7 @@ class LogLayout:
 
     @property
     def parts(self) -> dict[str, list[str]]:
-        """Columns of each quantity, in the order in which they are written.
+        """Columns of each quantity, in the order of writing.
 
         The keys are ``time``, ``commanded``, ``measured``, ``BODY position``, ``BODY quaternion``
         (the tip is a body), ``force`` and ``stage``.
@@ -64,7 +64,7 @@ class LogLayout:
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """Names of the columns in the order in which they are written."""
+        """Names of the columns in the order of writing."""
         return tuple(name for names in self.parts.values() for name in names)
 
     def split(self, values: Array) -> dict[str, Array]:
@@ -77,9 +77,9 @@ class LogLayout:
 
     @classmethod
     def of_columns(cls, path: str, columns: Sequence[str]) -> LogLayout:
-        """Return the layout of a file that has these columns, in any order.
+        """Return the layout of a file with these columns, in any order.
 
-        It raises `FileError` if a column is missing, there twice or unknown.
+        `FileError`: a column is missing, appears twice or is unknown.
         """
         names = set(columns)
         for name in columns:
@@ -114,7 +114,7 @@ class Body:
 
     Attributes
     ----------
-    position : (N, 3), in m; NaN where it is missing.
+    position : (N, 3), in m; NaN where missing.
     quaternion : (N, 4), w first; None if no orientation was recorded.
     """
 
@@ -134,8 +134,8 @@ class Log:
     tip_position : (N, 3), in m, in the tracker's or the base frame.
     tip_quaternion : (N, 4), w first, or None.
     bodies : further tracked bodies.
-    force : force (N,) with which a probe pushes the tip along its axis, in N, or None.
-    stage : place (N,) of the probe along its axis, in m, or None.
+    force : force (N,) of a probe on the tip along its axis, in N, or None.
+    stage : position (N,) of the probe along its axis, in m, or None.
     """
 
     time: Array
@@ -175,14 +175,14 @@ class Log:
 
     @property
     def pressures(self) -> Array:
-        """Measured pressures (N, n), in Pa; commanded ones where none were measured."""
+        """Measured pressures (N, n), in Pa; commanded ones where not measured."""
         if self.measured is None:
             return self.commanded
         return np.where(np.isfinite(self.measured), self.measured, self.commanded)
 
     @property
     def layout(self) -> LogLayout:
-        """Which columns it has."""
+        """The columns of this log."""
         return LogLayout(
             n=self.n,
             measured=self.measured is not None,
@@ -266,7 +266,7 @@ def log_of_values(values: Array, layout: LogLayout) -> Log:
 
 
 def check_shapes(shapes: Mapping[str, tuple[NDArray[Any] | None, tuple[int, ...]]]) -> None:
-    """Raise `InputError` unless each array, by its name, has the shape that is given."""
+    """Raise `InputError` unless each array, by its name, has the given shape."""
     for name, (value, shape) in shapes.items():
         if value is not None and value.shape != shape:
             raise InputError(f"{name} must have the shape {shape}, not {value.shape}")
@@ -277,7 +277,7 @@ def _row(values: Array | None, i: int) -> Array | None:
 
 
 def numbers_of(name: str, value: ArrayLike | None, size: int) -> Array:
-    """Return what a row has for a part (size,): NaN for None and for what is not finite."""
+    """Return a row's values of a part (size,); NaN for None and for values that are not finite."""
     if value is None:
         return np.full(size, np.nan)
     numbers = np.asarray(value, dtype=float).reshape(-1)

@@ -1,7 +1,7 @@
-"""MCAP files: the writer, on foxglove-sdk, and the reader, on mcap, of all recordings.
+"""MCAP files of all recordings: the writer, based on foxglove-sdk, and the reader, based on mcap.
 
-A recording is a sequence of chunks, each of which is whole on the disk after a commit, so that a
-killed process loses only what it had not committed. The reader takes such a file as far as it goes.
+A recording is a sequence of chunks. After a commit, each chunk is complete on the disk, so a killed
+process loses only what it had not committed. The reader reads such a file as far as it is intact.
 """
 
 from __future__ import annotations
@@ -19,26 +19,26 @@ from typing import Any, BinaryIO
 from stiffopt.errors import FileError, require_package
 from stiffopt.logs.table import reading
 
-_CHUNK = 1 << 22  # bytes; a commit comes long before
+_CHUNK = 1 << 22  # bytes; commits are much more frequent
 
 
 class McapWriter:
-    """Writes all that is logged in a context of foxglove to a file.
+    """Writes everything that is logged in a context of foxglove to a file.
 
-    foxglove's own writer stops for good, silently, when writing to its file fails. Here it writes
-    to memory, and `commit` copies that to the disk. A file that cannot be written is cut back to
-    its last whole chunk and closed; nothing more is written to it then.
+    foxglove's own writer stops for good, silently, if a write to its file fails. Here it writes to
+    memory, and `commit` copies that to the disk. If a write fails, the file is cut back to its last
+    complete chunk and closed; nothing more is written to it.
 
     Parameters
     ----------
     file :
-        Descriptor of an empty file, open for writing, which is closed here.
+        Descriptor of an empty file, open for writing; this object closes it.
     context :
-        Of foxglove.
+        Context of foxglove.
     metadata :
         Records of metadata, by name.
     profile :
-        Of the file: by which conventions messages are to be read.
+        Profile of the file: the conventions by which messages are to be read.
 
     Attributes
     ----------
@@ -61,7 +61,7 @@ class McapWriter:
         from foxglove.mcap import MCAPCompression, MCAPWriteOptions
 
         self.size = 0
-        self._context = context  # it closes its channels when it is collected
+        self._context = context  # kept: it closes its channels when it is collected
         self._file = file
         self._memory = _Memory()
         try:
@@ -71,7 +71,7 @@ class McapWriter:
                 writer_options=MCAPWriteOptions(
                     profile=profile,
                     compression=MCAPCompression.Zstd,
-                    compression_level=1,  # twice as fast as the default, and as small
+                    compression_level=1,  # twice as fast as the default, with the same size
                     compression_threads=0,
                     chunk_size=_CHUNK,
                 ),
@@ -91,7 +91,7 @@ class McapWriter:
         self._write()
 
     def close(self) -> None:
-        """Write the index and close; raise `OSError` if that fails. To close twice does nothing."""
+        """Write the index and close; `OSError` if that fails. A second call does nothing."""
         if self._file < 0:
             return
         try:
@@ -102,17 +102,17 @@ class McapWriter:
             self._release()
 
     def _write(self) -> None:
-        """Write what is in the memory to the disk, whole or not at all."""
+        """Write the memory's content to the disk, completely or not at all."""
         data, done = self._memory.take(), 0
         try:
             while done < len(data):
                 done += os.write(self._file, memoryview(data)[done:])
         except OSError:
-            with suppress(OSError):  # no torn chunk stays, not even on a full disk
+            with suppress(OSError):  # leave no torn chunk, even on a full disk
                 os.ftruncate(self._file, self.size)
             self._release()
             with suppress(Exception):
-                self._writer.close()  # nothing is logged to it any more
+                self._writer.close()  # ends logging to it
             raise
         self.size += len(data)
 
@@ -124,14 +124,14 @@ class McapWriter:
 
 
 class _Memory:
-    """The file that foxglove writes to: the bytes since the last commit.
+    """The file object for foxglove's writer: it holds the bytes since the last commit.
 
-    foxglove goes back within a chunk to fill in its length, never further.
+    foxglove only seeks back within a chunk, to fill in its length.
     """
 
     def __init__(self) -> None:
         self._data = bytearray()
-        self._begin = self._place = 0  # of the data in the file, and of the next byte
+        self._begin = self._place = 0  # offset of the data in the file, and of the next byte
 
     def write(self, data: bytes | bytearray) -> int:
         start = self._place - self._begin
@@ -153,7 +153,7 @@ class _Memory:
         pass
 
     def take(self) -> bytes:
-        """Return the data, which will not be changed any more, and forget it."""
+        """Return the data, which will not change any more, and drop it."""
         data = bytes(self._data)
         self._begin += len(data)
         self._data.clear()
@@ -162,13 +162,13 @@ class _Memory:
 
 @dataclass
 class McapContents:
-    """What is in an MCAP file.
+    """The contents of an MCAP file.
 
     Attributes
     ----------
     metadata : records of metadata, by name.
-    messages : topics and contents of the JSON messages, in the order in which they were written.
-    complete : whether the recording was ended properly, and nothing in it is damaged.
+    messages : topics and contents of the JSON messages, in the order of writing.
+    complete : whether the recording was ended properly and is undamaged.
     """
 
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
@@ -181,7 +181,7 @@ class McapContents:
 
 
 def read_mcap(path: str | os.PathLike[str]) -> McapContents:
-    """Read a recording, also one that was cut short by a kill: all that is whole.
+    """Read the intact part of a recording, even if a kill has cut it short.
 
     Raises
     ------
@@ -212,7 +212,7 @@ def _contents(stream: BinaryIO) -> McapContents:
                 found.messages.append((topic, json.loads(record.data)))
             except ValueError:
                 if not stream.read(1):
-                    break  # the last message is not whole
+                    break  # the last message is incomplete
                 raise FileError(stream.name, "is damaged: a message is no JSON") from None
         elif isinstance(record, Channel):
             topics[record.id] = record.topic if record.message_encoding == "json" else None
@@ -224,7 +224,7 @@ def _contents(stream: BinaryIO) -> McapContents:
 
 
 def _records(stream: BinaryIO) -> Iterator[Any]:
-    """Yield records up to the end, or to where it was cut short; None for a damaged chunk."""
+    """Yield records up to the end, or to where the file was cut; None for a damaged chunk."""
     from mcap.exceptions import McapError
     from mcap.records import Chunk
     from mcap.stream_reader import StreamReader, breakup_chunk
@@ -240,7 +240,7 @@ def _records(stream: BinaryIO) -> Iterator[Any]:
             continue
         try:
             parts = breakup_chunk(record, validate_crc=True)
-        except Exception:  # whatever a decompressor makes of noise
+        except Exception:  # a decompressor may raise anything
             yield None
             continue
         yield from parts

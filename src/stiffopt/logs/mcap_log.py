@@ -1,10 +1,10 @@
 """A log as MCAP, the format of Foxglove and other viewers: written by experiments, and read back.
 
-A row of the log is one message per topic, all with the same time, and one chunk of the file. A row
+A row of the log is one message per topic, all with the same time, in one chunk of the file. A row
 is on the disk when `append` returns, as in `LogWriter`. The message of ``/pressure`` is written
-last, so that a row that has it is whole.
+last, so a row that has it is complete.
 
-| topic | is |
+| topic | content |
 | --- | --- |
 | /tip, /body/<name> | position_m [3], quaternion_wxyz [4] |
 | /force | force_n, stage_m |
@@ -33,14 +33,14 @@ _SCALARS = ("time_s", "force_n", "stage_m")
 
 
 class McapLogWriter:
-    """Writes the rows of a log to an MCAP file, which replaces what is there.
+    """Writes the rows of a log to an MCAP file, replacing an existing one.
 
     Parameters
     ----------
     path, layout :
-        The file, whose folder must exist, and what is recorded.
+        The file, whose folder must exist, and its columns.
     about :
-        Kept in the file as metadata.
+        Metadata to keep in the file.
 
     Raises
     ------
@@ -61,7 +61,7 @@ class McapLogWriter:
 
         self.path = os.fspath(path)
         self.layout = layout
-        self._start = time.time_ns()  # of the log: viewers want a date
+        self._start = time.time_ns()  # date of the log, for viewers
         self._last_time: float | None = None
         self._topics = _topics(layout)
         context = Context()
@@ -94,7 +94,7 @@ class McapLogWriter:
             self._file.commit()
 
     def close(self) -> None:
-        """Write the index and close; to close twice does nothing."""
+        """Write the index and close; a second call does nothing."""
         with writing(self.path):
             self._file.close()
 
@@ -106,7 +106,7 @@ class McapLogWriter:
 
 
 def read_mcap_log(path: str | os.PathLike[str]) -> Log:
-    """Read what a `McapLogWriter` has written, also if it was killed: all rows that are whole.
+    """Read the complete rows of a `McapLogWriter`, even one that was killed.
 
     Raises
     ------
@@ -119,7 +119,7 @@ def read_mcap_log(path: str | os.PathLike[str]) -> Log:
 
 
 def log_of_contents(path: str | os.PathLike[str], found: McapContents) -> Log:
-    """Return the log that the contents of an MCAP file are; raises as `read_mcap_log`."""
+    """Return the log in the contents of an MCAP file; raises as `read_mcap_log`."""
     name = os.fspath(path)
     if LOG_METADATA not in found.metadata:
         raise FileError(name, "is no MCAP recording of stiffopt")
@@ -133,7 +133,7 @@ def log_of_contents(path: str | os.PathLike[str], found: McapContents) -> Log:
 
 
 def _whole_rows(found: McapContents, layout: LogLayout) -> Iterator[Array]:
-    """Yield the values of the rows whose last message, that of ``/pressure``, is there."""
+    """Yield the values of the rows that have their last message, that of ``/pressure``."""
     place = {
         part: (topic, key)
         for topic, fields in _topics(layout).items()
@@ -155,7 +155,7 @@ def _whole_rows(found: McapContents, layout: LogLayout) -> Iterator[Array]:
 
 
 def _topics(layout: LogLayout) -> dict[str, dict[str, str]]:
-    """Return the fields of each topic's messages, and the part of a row that each field holds."""
+    """Return the fields of each topic's messages, and the row's part that each field holds."""
     bodies = {"/tip": "tip", **{f"/body/{name}": name for name in layout.bodies}}
     topics = {
         topic: {"position_m": f"{body} position", "quaternion_wxyz": f"{body} quaternion"}
@@ -172,7 +172,7 @@ def _topics(layout: LogLayout) -> dict[str, dict[str, str]]:
 
 
 def _schema(topic: str, fields: Mapping[str, str]) -> dict[str, Any]:
-    """Return the JSON schema of a topic; that a value may be null, Foxglove does not understand."""
+    """Return the JSON schema of a topic, without null, which Foxglove does not support."""
     number = {"type": "number"}
     name = "pose" if "position_m" in fields else topic[1:]
     return {
@@ -185,7 +185,7 @@ def _schema(topic: str, fields: Mapping[str, str]) -> dict[str, Any]:
 
 
 def _json_of(key: str, values: Array | None) -> Any:
-    """Return the part of a row that a field holds as JSON, with null for what is missing."""
+    """Return a part of a row as JSON, with null for missing values."""
     if values is None or not np.isfinite(values).any():
         return None
     numbers = [value if np.isfinite(value) else None for value in values.tolist()]

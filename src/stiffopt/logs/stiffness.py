@@ -30,7 +30,7 @@ class StiffnessTable:
     pressures : commanded gauge pressures (N, n), in Pa.
     directions : unit vectors (N, 3) in the base frame.
     boundaries : ``free``, ``guided`` or ``clamped``, for each row.
-    stiffness : (N,), in N/m; NaN where none could be measured.
+    stiffness : (N,), in N/m; NaN where the measurement failed.
     sigma : standard uncertainty (N,) of `stiffness`, in N/m.
     others : further columns (N,), by name.
     """
@@ -66,7 +66,7 @@ class StiffnessTable:
 
 
 def write_stiffness_table(path: str | os.PathLike[str], table: StiffnessTable) -> None:
-    """Write a table as CSV, in the place of what is there."""
+    """Write a table as CSV, replacing an existing file."""
     text = StringIO()
     writer = csv.writer(text, lineterminator="\n")
     pressures = [f"p{k + 1}_pa" for k in range(table.n)]
@@ -85,12 +85,12 @@ def read_stiffness_table(path: str | os.PathLike[str]) -> StiffnessTable:
     ----------
     path :
         CSV with the columns ``p1_pa`` ..., ``direction_x``, ``direction_y``, ``direction_z``,
-        ``boundary``, ``stiffness_n_per_m``, ``sigma_n_per_m`` and any others that hold numbers.
+        ``boundary``, ``stiffness_n_per_m``, ``sigma_n_per_m`` and any further numeric columns.
 
     Raises
     ------
     FileError
-        It cannot be read, a column is missing, a field is wrong. It names the line.
+        It cannot be read, a column is missing, or a field is wrong; with the line.
     """
     name = os.fspath(path)
     try:

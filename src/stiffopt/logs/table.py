@@ -1,4 +1,4 @@
-"""Reads tables of numbers from CSV, strictly and fast: a million rows in a few seconds."""
+"""Strict and fast reader of numeric tables in CSV: a million rows in a few seconds."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ class Table:
 def read_table(path: str | os.PathLike[str]) -> Table:
     """Read a table: a row of names, then numbers; an empty field is a missing value.
 
-    It raises `FileError` if the file cannot be read, a row has too few or too many fields, or a
-    field is no finite number.
+    `FileError`: the file cannot be read, a row has too few or too many fields, or a field is no
+    finite number.
     """
     name = os.fspath(path)
     text = read_bytes(name).removeprefix(b"\xef\xbb\xbf").replace(b"\r\n", b"\n")
@@ -63,14 +63,14 @@ def read_table(path: str | os.PathLike[str]) -> Table:
 
 
 def read_bytes(path: str | os.PathLike[str]) -> bytes:
-    """Return what is in a file; raise `FileError` if it cannot be read."""
+    """Return the content of a file; raise `FileError` if it cannot be read."""
     with reading(path), open(path, "rb") as stream:
         return stream.read()
 
 
 @contextmanager
 def reading(path: str | os.PathLike[str], expected: str = "a file") -> Iterator[None]:
-    """Context in which an `OSError` becomes the `FileError` that a file cannot be read."""
+    """Turn an `OSError` in the body into the `FileError` that a file cannot be read."""
     try:
         yield
     except FileNotFoundError:
@@ -83,7 +83,7 @@ def reading(path: str | os.PathLike[str], expected: str = "a file") -> Iterator[
 
 @contextmanager
 def writing(path: str | os.PathLike[str]) -> Iterator[None]:
-    """Context in which an `OSError` becomes the `FileError` that a file cannot be written."""
+    """Turn an `OSError` in the body into the `FileError` that a file cannot be written."""
     try:
         yield
     except OSError as error:
@@ -92,9 +92,9 @@ def writing(path: str | os.PathLike[str]) -> Iterator[None]:
 
 @contextmanager
 def replacing(path: str | os.PathLike[str]) -> Iterator[str]:
-    """Context that yields the path of a new file, which then takes the place of `path`.
+    """Yield the path of a new file, which replaces `path` after the body.
 
-    It raises `FileError` if that cannot be written.
+    `FileError` if it cannot be written.
     """
     part = f"{os.fspath(path)}.part"
     try:
@@ -127,7 +127,7 @@ def _filled(body: bytes) -> bytes:
 
 
 def _bad_line(path: str, body: bytes, count: int) -> FileError:
-    """Return the error for the first line that is wrong."""
+    """Return the error for the first wrong line."""
     lines = body.split(b"\n")
     for number, raw in enumerate(lines, start=2):
         line = raw.decode("utf-8", errors="replace")

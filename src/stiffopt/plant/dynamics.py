@@ -58,6 +58,7 @@ NUDGE = 1e-7  # strain, for the finite differences
 _STRIDE = 0.3  # strain, bound of one iteration
 _REACH = 0.015  # m; converts curvatures to strains
 
+
 class RodState(NamedTuple):
     """The rod's state, which changes with time. n coefficients, N nodes.
 

@@ -1,4 +1,4 @@
-"""The action ``FollowJointTrajectory``: a trajectory of pressures as a goal, until its end."""
+"""The action ``FollowJointTrajectory``: a trajectory of pressures as a goal that is followed."""
 
 from __future__ import annotations
 
@@ -40,15 +40,15 @@ Done = Callable[[bool, str], None]
 NAME = "~/follow_joint_trajectory"
 
 _UNKNOWN, _EXECUTING, _SUCCEEDED, _CANCELED, _ABORTED = 0, 2, 4, 5, 6  # states of goals
-_WELL, _NOT_WELL = 0, -4  # errors of results: none, and "path tolerance violated"
-_NONE, _REJECTED, _UNKNOWN_GOAL, _TERMINATED = range(4)  # answers to who cancels
+_NO_ERROR, _PATH_VIOLATED = 0, -4  # error codes of results
+_NONE, _REJECTED, _UNKNOWN_GOAL, _TERMINATED = range(4)  # return codes of a cancellation
 _KEPT = 20  # goals whose results are kept
-_LATE = 0.2  # s after the beginning, in which the state may still be that of before
+_LATE = 0.2  # s after the beginning, in which the state may still be older
 
 
 @dataclass
 class _Goal:
-    """A goal that was accepted; `waiting` are the requests for its result."""
+    """An accepted goal; `waiting` are the requests for its result."""
 
     info: Any
     client: Received
@@ -60,23 +60,23 @@ class _Goal:
 
 
 class FollowAction:
-    """Takes one goal at a time; a further one, or any other motion, aborts it.
+    """Accepts one goal at a time; a further goal, or any other motion, aborts it.
 
-    It ends well when its time is over and the arm was steered all the time. Else it is aborted, and
-    the arm is held.
+    A goal succeeds when its time is over and the arm was controlled all the time. Otherwise it is
+    aborted, and the arm is held.
 
     Parameters
     ----------
     node, client :
-        Of the graph, and of the daemon.
+        The node on the graph, and the client of the daemon.
     channels :
         Names of all channels.
     read :
-        Makes a trajectory of a message, or raises `InputError`.
+        Makes a trajectory from a message, or raises `InputError`.
     move, once :
-        Have a command carried out that sets the arm in motion, or another one.
+        Queue a command that sets the arm in motion, or another one.
     reply, refuse :
-        Answer a request, and tell why something is not done.
+        Answer a request, and report why something is not done.
     """
 
     def __init__(
@@ -103,7 +103,7 @@ class FollowAction:
         node.serve(f"{own}/get_result", GetResultRequest, self._ask_result)
 
     def look(self, now: Snapshot) -> None:
-        """Tell how far the goal is, or end it, as the state demands."""
+        """Publish the goal's progress, or end it, depending on the state."""
         goal = self._goal
         if goal is None or now.time < goal.begin + _LATE:
             return
@@ -116,14 +116,16 @@ class FollowAction:
         elif gone >= goal.trajectory.duration:
             self._end(goal, _SUCCEEDED, "")
         else:
-            self._feedback.publish(FeedbackMessage(goal.info.goal_id, self._told(goal, now, gone)))
+            self._feedback.publish(
+                FeedbackMessage(goal.info.goal_id, self._progress(goal, now, gone))
+            )
 
     def replaced(self) -> None:
-        """Abort the goal since another motion was asked for."""
+        """Abort the goal because another motion was requested."""
         if self._goal is not None:
             self._end(self._goal, _ABORTED, "another motion was asked for")
 
-    def _told(self, goal: _Goal, now: Snapshot, gone: float) -> Any:
+    def _progress(self, goal: _Goal, now: Snapshot, gone: float) -> Any:
         times = [waypoint.time for waypoint in goal.trajectory.waypoints]
         columns = np.asarray(goal.trajectory.pressures).T
         desired = np.array([np.interp(gone, times, column) for column in columns])
@@ -168,24 +170,24 @@ class FollowAction:
             self._goals[bytes(info.goal_id.uuid)] = self._goal
             if len(self._goals) > _KEPT:
                 del self._goals[next(iter(self._goals))]
-        self._tell_status()
+        self._publish_status()
 
     def _end(self, goal: _Goal, status: int, why: str) -> None:
         with self._lock:
             if goal.result is not None:
                 return
-            error = _WELL if status == _SUCCEEDED else _NOT_WELL
+            error = _NO_ERROR if status == _SUCCEEDED else _PATH_VIOLATED
             goal.status, goal.result = status, FollowResult(error, why)
             waiting, goal.waiting = goal.waiting, []
             if self._goal is goal:
                 self._goal = None
-        self._tell_status()
+        self._publish_status()
         for service, received in waiting:
             self._reply(service, received, GetResultResponse(status=status, result=goal.result))
 
-    def _tell_status(self) -> None:
-        told = [GoalStatus(goal.info, goal.status) for goal in self._goals.values()]
-        self._status.publish(GoalStatusArray(told))
+    def _publish_status(self) -> None:
+        listed = [GoalStatus(goal.info, goal.status) for goal in self._goals.values()]
+        self._status.publish(GoalStatusArray(listed))
 
     def _ask_result(self, service: Service, received: Received) -> None:
         answer = GetResultResponse(status=_UNKNOWN)
@@ -199,13 +201,13 @@ class FollowAction:
         self._reply(service, received, answer)
 
     def _cancel(self, service: Service, received: Received) -> None:
-        """Cancel the goal if it is meant: by its identity, by its age, or as all goals are."""
+        """Cancel the goal if the request selects it by identity, by age, or selects all goals."""
         wanted, goal = received.message.goal_info, self._goal
         identity, latest = bytes(wanted.goal_id.uuid), seconds_of(wanted.stamp)
 
         def answer(code: int, *goals: Any) -> None:
-            told = CancelGoalResponse(return_code=code, goals_canceling=list(goals))
-            self._reply(service, received, told)
+            response = CancelGoalResponse(return_code=code, goals_canceling=list(goals))
+            self._reply(service, received, response)
 
         def done(held: bool, text: str) -> None:
             if held and goal is not None:

@@ -1,4 +1,4 @@
-"""Recorded runs as bags: MCAP in the layout of rosbag2, with what the node would have published."""
+"""Recorded runs as bags: MCAP in rosbag2's layout, with the messages that the node publishes."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ from stiffopt.ros.names import NodeNames
 from stiffopt.ros.published import PUBLISHED, Message, StateMessages
 
 _NODE = "stiffopt"
-_VERSION = 5  # of the layout: that of Humble, which later ones read
-_SHAPE = 0.2  # s, between two messages of what the arm looks like
-_STATE = 1.0  # s, likewise of the state
+_VERSION = 5  # of the layout: that of Humble, which later versions read
+_SHAPE = 0.2  # s between messages of the arm's shape
+_STATE = 1.0  # s between messages of the state
 _COMMIT = 1000  # messages in a chunk
 _BASIC = {str: "string", bool: "bool"}
 _RULE = "=" * 80
@@ -36,14 +36,14 @@ _RULE = "=" * 80
 def write_bag(
     run: RecordedRun, folder: Path, name: str, check: Callable[[], None] = lambda: None
 ) -> int:
-    """Write a run into an empty folder, as the bag of that name; return the number of messages.
+    """Write a run into an empty folder, as the bag `name`; return the number of messages.
 
     `check` is called now and then, and may raise.
 
     Raises
     ------
     FileError
-        It cannot be written.
+        The bag cannot be written.
     MissingExtraError
         foxglove-sdk is not installed.
     """
@@ -86,7 +86,7 @@ def write_bag(
 
 
 def definition(kind: type[Any]) -> str:
-    """Return the definition of a message with those of all messages in it, as bags carry it."""
+    """Return a message's definition with those of all messages in it, in the form of bags."""
     found: dict[str, str] = {}
 
     def visit(each: type[Any]) -> None:
@@ -113,7 +113,7 @@ def definition(kind: type[Any]) -> str:
 
 
 def _messages(run: RecordedRun, made: StateMessages) -> Iterator[tuple[float, Message]]:
-    """Yield times, in s from the beginning, and messages in their order."""
+    """Yield times, in s from the beginning, and messages, in order."""
     events = list(run.events)
     shape_due = state_due = -float("inf")
     last = None

@@ -1,4 +1,4 @@
-"""Between a ROS 2 graph and the daemon: publishes the state, and asks for what others command."""
+"""The bridge between a ROS 2 graph and the daemon: publishes the state, forwards commands."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ from stiffopt.ros.requests import target_of, task_in, trajectory_of
 from stiffopt.safety.vent import vent_rig
 
 SIMPLE = ("arm", "disarm", "hold", "reset")
-"""Commands that say no more than their name: services, and topics of `Empty`."""
+"""Commands without arguments: services, and topics of `Empty`."""
 MOTIONS: dict[str, type[Any]] = {
     "set_target": PoseStamped,
     "set_target_point": PointStamped,
@@ -55,19 +55,19 @@ _FURTHER = ("vent", "renew", "solve", "solution", "solve_pressure")
 NAMES = (*PUBLISHED, FOLLOW, *(f"~/{name}" for name in (*SIMPLE, *MOTIONS, *_FURTHER)))
 """Names of all topics, services and actions."""
 
-_QUICK = 2.0  # s after which the daemon does not answer; the guard is asked to vent then
-_SHAPE = 0.2  # s, between two messages of what the arm looks like
-_SLOW = 1.0  # s, of diagnostics, and of the scene where somebody new reads it
-_EVENTS = 0.2  # s
+_QUICK = 2.0  # s for the daemon to answer before the guard is called to vent
+_SHAPE = 0.2  # s between messages of the arm's shape
+_SLOW = 1.0  # s between diagnostics, and between checks for new readers of the scene
+_EVENTS = 0.2  # s between polls of events
 _WAITING = 32  # commands; more than any lively node needs
-_SILENT = 5.0  # s without a state, after which the daemon has ended
+_SILENT = 5.0  # s without a state after which the daemon counts as ended
 _LISTEN = 0.05  # s
 _GONE = "its writer is gone already, and control belongs to a writer as long as it lives"
 
 
 @dataclass(frozen=True)
 class _Job:
-    """A command that waits: `newest` ones are replaced by later ones of the same writer."""
+    """A waiting command; a later one of the same writer replaces it if both are `newest`."""
 
     name: str
     writer: Writer
@@ -77,22 +77,22 @@ class _Job:
 
 
 class Bridge:
-    """A node that shows a daemon's arm on a ROS 2 graph, and commands it where that is allowed.
+    """A node that shows a daemon's arm on a ROS 2 graph, and commands it if that is allowed.
 
-    Nothing is decided here that is about safety: commands go through the daemon's interface, with
-    its token and its lease. Venting is asked for at once, by a thread of its own, and of the guard
-    if the daemon does not answer.
+    The bridge decides nothing about safety: commands use the daemon's interface, with its token and
+    lease. Requests to vent are passed on at once, by a thread of their own, and to the guard if the
+    daemon does not answer.
 
     Parameters
     ----------
     rig, description, robot :
         Path and content of the rig file, and the arm.
     url, token :
-        Of the daemon.
+        URL and token of the daemon.
     node :
-        On which everything is published.
+        The node that publishes everything.
     say :
-        Is told what people should know.
+        Called with notices for people.
     """
 
     def __init__(
@@ -111,7 +111,7 @@ class Bridge:
         client = partial(Client, url, token, name=f"ros: {name}"[:80], heartbeat="manual")
         self._client, self._quick = client(), client(timeout=_QUICK)
         self._lease = GraphLease(self._client, description.safety.heartbeat, self._warn)
-        # the daemon is on this machine, and its clock counts from the same moment as ours
+        # the daemon is on this machine, so its clock has the same time 0 as ours
         epoch = time.time() - time.monotonic()
         settings = description.ros
         self._messages = StateMessages(robot, description.name, name, epoch, settings.frame_prefix)
@@ -125,7 +125,7 @@ class Bridge:
         self._vents: deque[Done] = deque()
         self._news = {name: threading.Event() for name in ("jobs", "questions", "vents")}
         self._over = threading.Event()
-        # replies wait for the readers of those who asked, and nothing else waits for replies
+        # a reply may wait for its reader; nothing else waits for replies
         self._answers = ThreadPoolExecutor(1, "replies")
         self._now: Snapshot | None = None
         self._state: String | None = None
@@ -198,25 +198,25 @@ class Bridge:
             self._seen = readers
         if moment >= due["events"]:
             due["events"] = moment + _EVENTS
-            with suppress(StiffoptError):  # a daemon that is busy tells them the next time
+            with suppress(StiffoptError):  # if the daemon is busy, the next poll gets them
                 events, self._next_event = self._quick.events(self._next_event)
                 for event in events:
                     self._publishers["/rosout"].publish(self._messages.log(event))
 
-    def _tell(self, kind: str, text: str, severity: Severity) -> None:
+    def _log(self, kind: str, text: str, severity: Severity) -> None:
         """Log something that is no event of the loop."""
         event = Event(time.monotonic(), kind, text, severity)
         self._publishers["/rosout"].publish(self._messages.log(event))
 
     def _warn(self, text: str) -> None:
-        self._tell("ros", text, Severity.WARNING)
+        self._log("ros", text, Severity.WARNING)
         self._say(text)
 
     # Listening -----------------------------------------------------------------------------------
 
     def _subscribe(self, *, commands: bool) -> None:
         node = self._node
-        for reliable in (True, False):  # whoever vents with either is heard
+        for reliable in (True, False):  # accept both kinds of writers
             node.subscribe("~/vent", Empty, self._vent_topic, reliable=reliable)
         node.serve("~/vent", TriggerRequest, self._vent_service)
         node.subscribe("~/solve", PoseStamped, self._solve_topic, 1)
@@ -244,11 +244,11 @@ class Bridge:
         while not self._over.is_set():
             try:
                 self._node.wait(_LISTEN)
-            except Exception as error:  # one message must not silence the others
+            except Exception as error:  # one bad message must not block the others
                 self._warn(f"a message could not be taken: {type(error).__name__}: {error}")
 
     def _vent_topic(self, source: Subscription) -> None:
-        for _ in source.take():  # which comes twice, as there are two; to vent twice does no harm
+        for _ in source.take():  # possibly twice, by both subscriptions, which does no harm
             self._post("vents", self._vents, self._answer_topic("vent"))
 
     def _vent_service(self, service: Service, received: Received) -> None:
@@ -286,7 +286,7 @@ class Bridge:
             self._move(name, source, received, command, done, newest=newest)
 
     def _once(self, name: str, received: Received, command: Callable[[], None], done: Done) -> None:
-        """Have a command carried out that needs control for no longer."""
+        """Queue a command that needs control only while it is carried out."""
         if received.writer is None:
             done(False, _GONE)
         else:
@@ -303,7 +303,7 @@ class Bridge:
         *,
         newest: bool = False,
     ) -> None:
-        """Have a command carried out that sets the arm in motion."""
+        """Queue a command that sets the arm in motion."""
         if received.writer is None:
             done(False, _GONE)
         else:
@@ -320,7 +320,7 @@ class Bridge:
         last = self._jobs[-1] if self._jobs else None
         if job.newest and last is not None and last.newest:
             if last.writer == job.writer:
-                with suppress(ValueError):  # it is being carried out already
+                with suppress(ValueError):  # it is already being carried out
                     self._jobs.remove(last)
         elif len(self._jobs) >= _WAITING:
             job.done(False, "too many commands wait already")
@@ -340,13 +340,13 @@ class Bridge:
     # Working -------------------------------------------------------------------------------------
 
     def _command(self) -> None:
-        """Carry out commands, and look after the lease between them."""
+        """Carry out commands, and check the lease between them."""
         while not self._over.is_set():
             self._news["jobs"].wait(self._lease.period)
             self._news["jobs"].clear()
             self._guarded(self._lease.look)
             while self._jobs and not self._over.is_set():
-                with suppress(IndexError):  # what waited was dropped by a vent
+                with suppress(IndexError):  # a vent has dropped the waiting commands
                     job = self._jobs.popleft()
                     self._guarded(partial(self._carry_out, job))
                     self._guarded(self._lease.look)
@@ -371,7 +371,7 @@ class Bridge:
             self._action.replaced()
 
     def _vent(self) -> None:
-        """Vent as soon as somebody asks, whatever else is being done."""
+        """Vent as soon as it is requested, whatever else is being done."""
         while not self._over.is_set():
             self._news["vents"].wait()
             self._news["vents"].clear()
@@ -380,7 +380,7 @@ class Bridge:
                 answers.append(self._vents.popleft())
             if answers:
                 with suppress(IndexError):
-                    while True:  # nothing that was asked for before is done after it
+                    while True:  # drop all commands that were requested before
                         self._jobs.popleft().done(False, "not done: somebody vents")
                 self._guarded(partial(self._vent_now, answers))
 
@@ -398,7 +398,7 @@ class Bridge:
             answer(done, text)
 
     def _solve(self) -> None:
-        """Answer questions for pressures, one after the other."""
+        """Solve the requested tasks for pressures, one after the other."""
         while not self._over.is_set():
             self._news["questions"].wait()
             self._news["questions"].clear()
@@ -418,7 +418,7 @@ class Bridge:
             answer(None, str(error))
 
     def _task(self, text: str, target: PoseStamped | None) -> Task:
-        """Return the task that is asked, within the rig's limits."""
+        """Return the requested task, within the rig's limits."""
         task = task_in(text, self._robot.description.name) if text else None
         if target is not None:
             wanted = target_of(target, self._messages.base, time.time())
@@ -433,7 +433,7 @@ class Bridge:
         return task.model_copy(update={"pressure": within})
 
     def _guarded(self, work: Callable[[], object]) -> None:
-        """Do some work; a mistake in it is told, and ends nothing else."""
+        """Run a piece of work; report an error in it and carry on."""
         try:
             work()
         except Exception as error:
@@ -442,16 +442,16 @@ class Bridge:
     # Answering -----------------------------------------------------------------------------------
 
     def _answer_topic(self, name: str) -> Done:
-        """Return what tells of a command that came by a topic: a refusal, in the log."""
+        """Return the callback for a command from a topic: it logs a refusal."""
 
         def answer(done: bool, text: str) -> None:
             if not done:
-                self._tell("refused", f"{name}: {text}", Severity.ERROR)
+                self._log("refused", f"{name}: {text}", Severity.ERROR)
 
         return answer
 
     def _answer_trigger(self, service: Service, received: Received) -> Done:
-        """Return what answers a command that came by a service."""
+        """Return the callback for a command from a service: it answers the request."""
 
         def answer(done: bool, text: str) -> None:
             self._reply(service, received, TriggerResponse(success=done, message=text))
@@ -466,7 +466,7 @@ class Bridge:
             self._solution.publish(self._messages.answer(found.pressures, time.monotonic()))
         else:
             reason = text if found is None else found.message
-            self._tell("refused", f"solve: {reason}", Severity.ERROR)
+            self._log("refused", f"solve: {reason}", Severity.ERROR)
 
     def _answer_solve(
         self, service: Service, received: Received, found: PressureSolution | None, text: str

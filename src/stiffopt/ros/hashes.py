@@ -1,6 +1,6 @@
-"""Hashes of the types' definitions (RIHS01), by which nodes of ROS 2 from Jazzy on compare types.
+"""Hashes of the types' definitions (RIHS01), by which nodes of ROS 2 since Jazzy compare types.
 
-Those of messages, services and actions are of the standard definitions, and of
+Those of messages, services and actions belong to the standard definitions, and to
 ``SolvePressure.srv``.
 """
 

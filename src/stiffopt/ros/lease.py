@@ -1,4 +1,4 @@
-"""Control of the arm for those who write on the graph: one at a time, as long as they live."""
+"""Control of the arm for writers on the graph: one at a time, as long as it lives."""
 
 from __future__ import annotations
 
@@ -12,27 +12,27 @@ from stiffopt.daemon.client import Client
 from stiffopt.errors import CommandError, StiffoptError
 from stiffopt.ros.node import Subscription, Writer
 
-_UNANSWERED = 4  # parts of the heartbeat, in one of which control is renewed
+_RENEWALS = 4  # per heartbeat
 
 
 class GraphLease:
     """The daemon's control lease, held for one writer on the graph.
 
-    Who sets the arm in motion has control: the writer, with the other writers of its process. It
-    ends with the writer's liveliness: when the writer is gone, when it has not asserted that it
-    lives within the lease that it offers, or, where it offers none or one above the daemon's
-    `heartbeat`, when its process has not written anything to this node for that time. The arm is
-    held then, and let down as after any hold that nobody ends. Other commands need control only
-    while they are carried out.
+    The writer that sets the arm in motion has control, together with the other writers of its
+    process. Control ends with the writer's liveliness: when the writer is gone; when it has not
+    asserted its liveliness within the lease that it offers; or, if it offers no lease or one above
+    the daemon's `heartbeat`, when its process has written nothing to this node for that time. The
+    arm is held then, and let down as after any hold that no client ends. Other commands need
+    control only while they are carried out.
 
     Parameters
     ----------
     client :
-        Of the daemon, with the heartbeat ``manual``.
+        Client of the daemon, with the heartbeat ``manual``.
     heartbeat :
-        Of the daemon, in s.
+        Heartbeat of the daemon, in s.
     tell :
-        Is told why control has ended.
+        Called with the reason why control has ended.
     """
 
     def __init__(
@@ -50,17 +50,17 @@ class GraphLease:
 
     @property
     def period(self) -> float:
-        """How often `look` is to be called, in s."""
-        return self._heartbeat / _UNANSWERED
+        """Interval at which to call `look`, in s."""
+        return self._heartbeat / _RENEWALS
 
     @property
     def holder(self) -> str:
-        """Who has control, in words; empty if nobody on the graph has it."""
+        """The process in control, in words; empty if it is not on the graph."""
         holder = self._holder
         return "" if holder is None else f"process {holder[1].participant}"
 
     def hear(self, writer: Writer) -> None:
-        """Note that a process has written something."""
+        """Note that a writer's process has written something."""
         with self._lock:
             if self._holder is not None and self._holder[1].participant == writer.participant:
                 self._heard = self._clock()
@@ -71,7 +71,7 @@ class GraphLease:
         Raises
         ------
         StiffoptError
-            Another has control, or the daemon refuses.
+            Another writer has control, or the daemon refuses.
         """
         self._check(writer)
         had = self._holder is not None
@@ -88,7 +88,7 @@ class GraphLease:
                 self._heard = self._clock()
 
     def once(self, writer: Writer, command: Callable[[], None]) -> None:
-        """Carry out a command that needs control for no longer; raises as `move`."""
+        """Carry out a command that needs control only meanwhile; raises as `move`."""
         self._check(writer)
         self._client.take_control()
         try:
@@ -98,7 +98,7 @@ class GraphLease:
                 self._release()
 
     def look(self) -> None:
-        """Renew control as long as its holder lives; else hold the arm and give control back."""
+        """Renew control while its holder lives; otherwise hold the arm and give control back."""
         holder = self._holder
         if holder is None:
             return
@@ -117,7 +117,7 @@ class GraphLease:
             self._tell(f"control could not be renewed: {error}")
 
     def end(self, reason: str) -> None:
-        """Hold the arm, and give control back, if somebody on the graph has it."""
+        """Hold the arm and give control back, if a writer on the graph has it."""
         if self._holder is None:
             return
         with suppress(StiffoptError):  # there may be nothing to hold
@@ -126,7 +126,7 @@ class GraphLease:
         self._end(reason)
 
     def _death(self, source: Subscription, writer: Writer) -> str:
-        """Return why the writer that has control does not count as alive; empty if it does."""
+        """Return why the writer in control does not count as alive; empty if it does."""
         if not source.lives(writer):
             return "the writer that had control is gone, or does not say that it lives"
         silent = self._clock() - self._heard

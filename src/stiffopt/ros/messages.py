@@ -1,8 +1,8 @@
-"""The ROS 2 messages and services that the node speaks, as types of cyclonedds.
+"""The ROS 2 messages and services of the node, as types of cyclonedds.
 
-Fields, order and types are those of the standard definitions, which are the same in Humble and in
-Jazzy, but for `Gid`. An empty message has one byte on the wire. A request and a reply begin with
-the header of rmw_cyclonedds: who asks, and the number of the question.
+Fields, order and types are those of the standard definitions, which are the same in Humble and
+Jazzy, except for `Gid`. An empty message has one byte on the wire. A request and a reply begin with
+the header of rmw_cyclonedds: the client, and the number of the request.
 """
 
 import types
@@ -32,7 +32,7 @@ _CALL = {"guid": uint64, "number": int64}
 
 
 def _empty(hint: Any) -> Callable[[], Any]:
-    """Return what makes a value of a type: zero, or nothing."""
+    """Return a factory of a type's default value: zero or empty."""
     kind, wire = get_args(hint) or (hint, None)
     if isinstance(wire, array):
         return lambda: [0] * wire.length
@@ -40,7 +40,7 @@ def _empty(hint: Any) -> Callable[[], Any]:
 
 
 def _type(full: str, values: Mapping[str, Any] = {}, /, **fields: Any) -> Any:
-    """Return a dataclass of these fields, empty but for some values, as ROS 2 serialises it."""
+    """Return a dataclass of these fields, empty except for `values`, in ROS 2's serialisation."""
     package, kind, name = full.split("/")
 
     def fill(space: dict[str, Any]) -> None:
@@ -208,4 +208,4 @@ def _layout(size: int) -> tuple[Any, Any, Any]:
 
 
 LAYOUTS = {"humble": _layout(24), "jazzy": _layout(16)}
-"""How a distribution tells what a process has: types of an identity, of a node and of all that."""
+"""Discovery types of each distribution: of an identity, of a node, and of a process."""

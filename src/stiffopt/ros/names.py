@@ -1,4 +1,4 @@
-"""Names of ROS 2: of nodes, namespaces and topics, their remapping, and how DDS calls them."""
+"""Names in ROS 2: of nodes, namespaces and topics, and their remapping."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _NAME = re.compile(rf"(?:~/|/)?{_WORD}(?:/{_WORD})*")
 
 
 def _checked(name: str, what: str) -> str:
-    """Return a name; raise `InputError` if ROS 2 would not take it."""
+    """Return a name; raise `InputError` if it is invalid in ROS 2."""
     if not _NAME.fullmatch(name) or "__" in name:
         raise InputError(
             f"{what} {shown(name)} is no name of ROS 2: expected words of letters, digits and "
@@ -24,19 +24,19 @@ def _checked(name: str, what: str) -> str:
 
 @dataclass(frozen=True)
 class NodeNames:
-    """The full names of what a node has.
+    """The full names of a node's topics and services.
 
     Attributes
     ----------
-    node : its name.
-    namespace : begins with ``/``; ``/`` alone is none.
-    remap : names to use in the place of others. Both may be full (``/a``), relative to the
-        namespace (``a``) or to the node (``~/a``).
+    node : name of the node.
+    namespace : begins with ``/``; ``/`` alone means none.
+    remap : names that replace others. Both may be full (``/a``), relative to the namespace
+        (``a``) or to the node (``~/a``).
 
     Raises
     ------
     InputError
-        One of them is no name of ROS 2, or two rules are for the same name.
+        One of them is invalid in ROS 2, or two rules are for the same name.
     """
 
     node: str
@@ -66,9 +66,9 @@ class NodeNames:
         return self.remap.get(expanded, expanded)
 
     def unused(self, names: Iterable[str]) -> list[str]:
-        """Return the remapped names that are not among some, which the node has."""
-        there = {self._expanded(name) for name in names}
-        return sorted(set(self.remap) - there)
+        """Return the remapped names that are not among the node's `names`."""
+        known = {self._expanded(name) for name in names}
+        return sorted(set(self.remap) - known)
 
     def _expanded(self, name: str) -> str:
         if name.startswith("/"):
@@ -80,7 +80,7 @@ class NodeNames:
 
 
 def remap_rules(texts: Iterable[str]) -> dict[str, str]:
-    """Read rules such as ``~/tip:=/arm/tip``, as ROS 2 writes them; `InputError` if one is none."""
+    """Read rules such as ``~/tip:=/arm/tip``, as ROS 2 writes them; `InputError` if invalid."""
     rules = {}
     for text in texts:
         old, sign, new = text.partition(":=")

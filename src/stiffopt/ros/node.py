@@ -45,18 +45,18 @@ _LOCAL = """\
   <ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>32</MaxAutoParticipantIndex>
   <Peers><Peer address="localhost"/></Peers>
 </Discovery>"""
-_FOREVER = (1 << 63) - 1  # ns, which DDS takes as infinite
+_FOREVER = (1 << 63) - 1  # ns, infinite in DDS
 _ANY = SampleState.Any | ViewState.Any | InstanceState.Any
-_BLOCKED = 20  # ms that a reader which does not acknowledge may keep a write waiting
+_BLOCKED = 20  # ms for which a reader that does not acknowledge may block a write
 _KNOWN = 1000  # writers that are remembered
-_REPLY = 0.5  # s in which a client's reader of replies is to be found
-_HANDLE = (1 << 64) - 1  # handles are unsigned, though listeners are given signed ones
+_REPLY = 0.5  # s to wait for the discovery of a client's reader of replies
+_HANDLE = (1 << 64) - 1  # handles are unsigned, but listeners get signed ones
 
 
 def _qos(depth: int, *more: Any, reliable: bool = True, latched: bool = False) -> Qos:
-    """Return the quality of service that ROS 2 has by default, with a depth of history.
+    """Return ROS 2's default quality of service, with a depth of history.
 
-    `latched` is what ROS 2 calls transient local: who comes later is told the last messages.
+    `latched` is what ROS 2 calls transient local: later readers get the last messages.
     """
     kind, keep = Policy.Reliability, Policy.Durability
     return Qos(
@@ -70,13 +70,13 @@ def _qos(depth: int, *more: Any, reliable: bool = True, latched: bool = False) -
 
 @dataclass(frozen=True)
 class Writer:
-    """Who has written a message.
+    """The writer of a message.
 
     Attributes
     ----------
     handle : of the writer, in this process.
-    participant : of the process that it belongs to, in ROS 2 of a context.
-    lease : after which it must have shown that it lives, in s; infinite where it need not.
+    participant : of its process; a context in ROS 2.
+    lease : time within which it must assert its liveliness, in s; infinite if it need not.
     """
 
     handle: int
@@ -86,7 +86,7 @@ class Writer:
 
 @dataclass(frozen=True)
 class Received:
-    """A message, and its writer, which is None if nothing is known of it."""
+    """A message and its writer, which is None if unknown."""
 
     message: Any
     writer: Writer | None
@@ -99,18 +99,18 @@ class Publisher:
         self._writer = writer
 
     def publish(self, message: Any) -> None:
-        """Write a message, unless a reader that does not acknowledge keeps it from being sent."""
+        """Write a message; drop it if a reader that does not acknowledge blocks it."""
         with suppress(DDSException):
             self._writer.write(message)
 
     @property
     def readers(self) -> frozenset[int]:
-        """Handles of those who read it."""
+        """Handles of the readers."""
         return frozenset(self._writer.get_matched_subscriptions())
 
 
 class _Lives(Listener):
-    """Notes which writers have stopped to show that they live."""
+    """Notes which writers have stopped asserting their liveliness."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -122,7 +122,7 @@ class _Lives(Listener):
 
 
 class Subscription:
-    """Messages of a topic, in the order in which they came, and whether their writers live."""
+    """Messages of a topic, in order of arrival, and the liveliness of their writers."""
 
     def __init__(self, reader: DataReader, lives: _Lives) -> None:
         self._reader, self._lives = reader, lives
@@ -130,7 +130,7 @@ class Subscription:
         self.condition = ReadCondition(reader, _ANY)
 
     def take(self) -> Iterator[Received]:
-        """Yield what has come since."""
+        """Yield the messages since the last call."""
         for sample in self._reader.take(100):
             if isinstance(sample, InvalidSample):  # the end of a writer, not a message
                 continue
@@ -140,12 +140,12 @@ class Subscription:
             yield Received(sample, writer)
 
     def lives(self, writer: Writer) -> bool:
-        """Whether a writer is there, and has not failed to show it since its last message."""
-        there = {handle & _HANDLE for handle in self._reader.get_matched_publications()}
-        return writer.handle in there and writer.handle not in self._lives.lost
+        """Whether a writer exists, and has asserted its liveliness since its last message."""
+        matched = {handle & _HANDLE for handle in self._reader.get_matched_publications()}
+        return writer.handle in matched and writer.handle not in self._lives.lost
 
     def _writer_of(self, handle: int) -> Writer | None:
-        """Return the writer of a handle; None if it is gone, and nothing is known of it."""
+        """Return the writer of a handle; None if it is unknown and gone."""
         if handle not in self._writers:
             try:
                 found = self._reader.get_matched_publication_data(handle)
@@ -168,7 +168,7 @@ class Service:
         self.requests, self._replies = requests, replies
 
     def reply(self, asked: Received, answer: Any) -> None:
-        """Answer a request as soon as the client's reader of replies is known, or soon anyway."""
+        """Answer a request once the client's reader of replies is known, or after a short wait."""
         answer.guid, answer.number = asked.message.guid, asked.message.number
         end = time.monotonic() + _REPLY
         while not self._is_heard(asked.writer) and time.monotonic() < end:
@@ -177,7 +177,7 @@ class Service:
 
     def _is_heard(self, writer: Writer | None) -> bool:
         if writer is None:
-            return True  # nobody is there to be found
+            return True  # no reader to wait for
         for handle in self._replies.get_matched_subscriptions():
             found = self._replies.get_matched_subscription_data(handle)
             if found is not None and found.participant_key == writer.participant:
@@ -194,26 +194,26 @@ def network_interface(name: str | None) -> str:
         There is no such interface.
     """
     place = name or _LOOPBACK
-    there = [name for _, name in socket.if_nameindex()]
-    if place not in there:
+    existing = [name for _, name in socket.if_nameindex()]
+    if place not in existing:
         raise InputError(
-            f"there is no network interface '{place}'; this machine has {', '.join(there)}"
+            f"there is no network interface '{place}'; this machine has {', '.join(existing)}"
         )
     return place
 
 
 class RosNode:
-    """A node with topics and services, which other nodes find as soon as `announce` is called.
+    """A node with topics and services; other nodes find it once `announce` is called.
 
     Parameters
     ----------
     names :
-        Its name, and those of what it has.
+        Names of the node, its topics and services.
     domain, interface :
-        Where it is: the domain of DDS, and the network interface; None for loopback, on which no
-        other machine is.
+        The DDS domain, and the network interface; None for loopback, which no other machine can
+        reach.
     distro :
-        ``humble`` or ``jazzy``, by whose layout the graph is told.
+        ``humble`` or ``jazzy``: the layout of the discovery messages.
 
     Raises
     ------
@@ -232,8 +232,8 @@ class RosNode:
         self.names = names
         self._distro = distro
         place = network_interface(interface)
-        # DDS finds others by multicast, which Linux does not claim to have on loopback; nodes of
-        # Jazzy that keep to this machine use none, and look for others at the ports of localhost
+        # DDS finds others by multicast, which Linux does not report for loopback. Local nodes of
+        # Jazzy do not use it; they look for others at the ports of localhost.
         local = place == _LOOPBACK
         more, discovery = ('multicast="true"', _LOCAL) if local else ("", "")
         config = _CONFIG.format(interface=place, more=more, discovery=discovery)
@@ -250,13 +250,13 @@ class RosNode:
         self._graph = self._write_graph()
 
     def close(self) -> None:
-        """Leave the graph; nothing of the node may be used any more."""
-        # cyclonedds has no call for it: this deletes an entity with all that is in it
+        """Leave the graph; no part of the node may be used afterwards."""
+        # cyclonedds has no function for this; deleting an entity deletes everything in it
         self._participant.__del__()
         self._domain.__del__()
 
     def publisher(self, name: str, kind: type[Any], depth: int = 10, **how: Any) -> Publisher:
-        """Return the publisher of a topic; `how` is `reliable` and `latched`."""
+        """Return the publisher of a topic; `how` may set `reliable` and `latched`."""
         more = self._about(kind)
         return Publisher(self._writer(f"rt{self.names.full(name)}", kind, depth, *more, **how))
 
@@ -269,7 +269,7 @@ class RosNode:
         *,
         reliable: bool = True,
     ) -> Subscription:
-        """Have `take` called by `wait` when there is something in a topic."""
+        """Register `take`, which `wait` calls when a topic has messages."""
         more = self._about(kind)
         return self._subscribe(
             f"rt{self.names.full(name)}", kind, take, depth, *more, reliable=reliable
@@ -278,7 +278,7 @@ class RosNode:
     def serve(
         self, name: str, request: type[Any], take: Callable[[Service, Received], None]
     ) -> None:
-        """Have `take` called by `wait` for each request of a service."""
+        """Register `take`, which `wait` calls for each request of a service."""
         full, reply = self.names.full(name), messages.SERVICES[request]
         mark = ".".join(f"{byte:02x}" for byte in self._participant.guid.bytes[:12])
         more = self._about(request, f"serviceid={mark}.{len(self._writers):08x};")
@@ -291,7 +291,7 @@ class RosNode:
         service = Service(self._subscribe(f"rq{full}Request", request, each, 10, *more), replies)
 
     def announce(self) -> None:
-        """Tell other nodes what this one has; once all of it is made."""
+        """Report this node's readers and writers to other nodes; call it after making them."""
         gid, node, info = messages.LAYOUTS[self._distro]
         size = len(gid().data)
 
@@ -307,13 +307,13 @@ class RosNode:
         self._graph.write(info(named(self._participant), [here]))
 
     def wait(self, seconds: float) -> None:
-        """Wait for messages, this long at most, and pass them on."""
+        """Wait for messages, for so many seconds at most, and pass them on."""
         self._waiting.wait(duration(nanoseconds=round(seconds * 1e9)))
         for subscription, take in self._subscriptions:
             take(subscription)
 
     def _about(self, kind: type[Any], more: str = "") -> tuple[Any, ...]:
-        """Return what an endpoint says about its type: in Jazzy, the hash of its definition."""
+        """Return the user data of an endpoint about its type: in Jazzy, the definition's hash."""
         if self._distro == "jazzy":
             name = messages.ros_name(kind).removesuffix("_Request").removesuffix("_Response")
             more += f"typehash=RIHS01_{TYPE_HASHES[name]};"

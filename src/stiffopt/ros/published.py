@@ -1,4 +1,4 @@
-"""The state of the loop as messages of ROS 2."""
+"""The state of the loop as ROS 2 messages."""
 
 from __future__ import annotations
 
@@ -60,10 +60,10 @@ PUBLISHED: dict[str, tuple[type[Any], int, bool]] = {
     "/diagnostics": (DiagnosticArray, 10, False),
     "/rosout": (Log, 1000, True),
 }
-"""Topics: the type, the depth of the history, and whether who comes later is told the last."""
+"""Topics: the type, the depth of the history, and whether later readers get the last message."""
 
-_STATIONS = 6  # of each segment, both ends included
-_SOON = 1  # s after which a marker vanishes unless it is published again
+_STATIONS = 6  # of each segment, including both ends
+_SOON = 1  # s after which a marker disappears unless it is published again
 _ELLIPSOID_SHARE = 0.25  # of the arm's length, along the stiffest axis
 _TARGET_SIZE = 0.008  # m
 _CYLINDER, _SPHERE, _TRIANGLES = 3, 2, 11  # types of markers
@@ -95,15 +95,15 @@ class StateMessages:
     Parameters
     ----------
     robot :
-        Its names, and what the arm looks like.
+        The model of the arm.
     rig :
         The name of the rig.
     node :
-        That logs are of.
+        Name of the node in logs.
     epoch :
-        The date of time 0 on the rig's clock, in s since 1970.
+        Date of time 0 on the rig's clock, in s since 1970.
     prefix :
-        Of the names of frames.
+        Prefix of the names of frames.
     """
 
     def __init__(
@@ -116,9 +116,9 @@ class StateMessages:
         """Name of the frame of the arm's base."""
 
     def often(self, now: Snapshot) -> Iterator[Message]:
-        """Yield what a controller needs: pressures, tip, target, force and their frames.
+        """Yield the messages for a controller: pressures, tip, target, force and their frames.
 
-        What is not known is left out, but for single pressures, which are NaN.
+        Unknown values are left out, except for single pressures, which are NaN.
         """
         header = self.header(now.time)
         yield "~/pressure", JointState(header, self._channels, now.measured.tolist())
@@ -143,10 +143,10 @@ class StateMessages:
             )
 
     def shape(self, now: Snapshot) -> Iterator[Message]:
-        """Yield what the model looks like at the pressures now: frames of stations, and markers.
+        """Yield the model's shape at the present pressures: frames of stations, and markers.
 
-        A pressure that is not known, or one at which the model has no equilibrium, gives nothing;
-        the latter raises `StiffoptError`.
+        Nothing is yielded if a pressure is unknown. `StiffoptError`: the model has no equilibrium
+        at these pressures.
         """
         pressures = now.pressures
         if pressures is None:
@@ -198,13 +198,13 @@ class StateMessages:
         return MarkerArray(markers)
 
     def state(self, now: Snapshot) -> String:
-        """Return the state in a word, and why it is so."""
+        """Return the state and its reason."""
         return String(f"{now.state}: {now.reason}" if now.reason else str(now.state))
 
     def diagnostics(self, now: Snapshot, control: str) -> DiagnosticArray:
-        """Return how things stand, with all that the state has single values of.
+        """Return a diagnosis, with all single values of the state.
 
-        `control` says who on the graph has control of the arm.
+        `control` names the process on the graph that has control of the arm.
         """
         told = [
             KeyValue(key, value if isinstance(value, str) else json.dumps(value))
@@ -228,7 +228,7 @@ class StateMessages:
         )  # fmt: skip
 
     def answer(self, pressures: Array, time: float) -> JointState:
-        """Return pressures (n,) in Pa that were found."""
+        """Return the pressures (n,), in Pa, of a solution."""
         return JointState(self.header(time), self._channels, pressures.tolist())
 
     def pose(self, pose: Array, time: float) -> PoseStamped:
@@ -250,7 +250,7 @@ class StateMessages:
 
 
 def _pose(position: Array, quaternion: Array) -> Pose:
-    """Return a pose; `quaternion` (4,) has w first, which the message has last."""
+    """Return a pose; `quaternion` (4,) has w first, the message last."""
     w, x, y, z = map(float, quaternion)
     return Pose(Point(*map(float, position)), Quaternion(x, y, z, w))
 

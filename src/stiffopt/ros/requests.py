@@ -1,4 +1,4 @@
-"""Messages of ROS 2 as targets, trajectories and tasks; what makes no sense is refused."""
+"""Conversion of ROS 2 messages to targets, trajectories and tasks; invalid ones are refused."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from stiffopt.ros.published import channel_names, seconds_of
 Array = NDArray[np.float64]
 
 MAX_AGE = 1.0
-"""Between the stamp of a request and now, in s; a recording that is played moves nothing."""
+"""Greatest difference between the stamp of a request and now, in s: no recording moves the arm."""
 MAX_POINTS = 20_000
-"""Of a trajectory; those on straight lines are left out, see `trajectory_through`."""
+"""Of a trajectory; points on straight lines are left out, see `trajectory_through`."""
 _UNIT = 0.01  # by which the length of a quaternion may differ from 1
 
 
 def check_stamp(header: Header, now: float) -> None:
-    """Raise `InputError` unless a message is of now, in s since 1970, or has no stamp."""
+    """Raise `InputError` unless a message has a present stamp (`now` in s since 1970), or none."""
     stamp = seconds_of(header.stamp)
     if stamp and abs(now - stamp) > MAX_AGE:
         which = "old" if stamp < now else "in the future"
@@ -51,7 +51,7 @@ def target_of(message: PoseStamped | PointStamped, base: str, now: float) -> Tar
     Raises
     ------
     InputError
-        It is old, in another frame or not finite, or its quaternion is not of length 1.
+        It is old, in another frame or not finite, or its quaternion does not have length 1.
     """
     check_stamp(message.header, now)
     check_frame(message.header, base)
@@ -74,13 +74,13 @@ def target_of(message: PoseStamped | PointStamped, base: str, now: float) -> Tar
 def trajectory_of(message: JointTrajectory, robot: Manipulator, now: float) -> Trajectory:
     """Return a trajectory of pressures, given in Pa as positions of channels in any order.
 
-    The tip is to be where the model has it. Velocities, accelerations and effort are not used:
+    The model determines the tip's targets. Velocities, accelerations and effort are not used:
     between two points the pressures change linearly.
 
     Raises
     ------
     InputError
-        It is old, does not name each channel once, or has points that are no pressures over time.
+        It is old, does not name each channel once, or its points are no pressures over time.
     """
     check_stamp(message.header, now)
     channels = channel_names(robot.description)
@@ -110,7 +110,7 @@ def trajectory_of(message: JointTrajectory, robot: Manipulator, now: float) -> T
 
 
 def task_in(text: str, robot: str) -> Task:
-    """Return the task of the text of a task file, which may name no other robot and no file."""
+    """Return the task in the text of a task file, which may name no other robot and no file."""
     return task_of({"text": text}, robot).model_copy(update={"robot": None})
 
 
