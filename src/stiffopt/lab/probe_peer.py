@@ -212,6 +212,7 @@ class ProbePeer(DevicePeer[ZaberProbeSettings]):
 
     The sensor's device listens on a free port, whatever ``grpc`` is: on a real rig, one server
     often serves both the supply and the sensor.
+
     Parameters
     ----------
     homed :
