@@ -106,7 +106,7 @@ class PressureSequence:
         return float(self.times[-1])
 
     def at(self, times: ArrayLike) -> Array:
-        """Return pressures (n,) at a time or (N, n) at times (N,), in Pa; constant past the ends."""
+        """Return pressures (n,) at a time or (N, n) at times (N,), in Pa; constant past ends."""
         t = np.asarray(times, dtype=float)
         columns = [np.interp(t, self.times, column) for column in self.pressures.T]
         return np.stack(columns, axis=-1)
