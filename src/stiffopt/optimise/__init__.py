@@ -1,1 +1,1 @@
-"""Which pressures: the task, its nonlinear program, the search and the answer."""
+"""Find the pressures: tasks, their nonlinear programs, searches and answers."""

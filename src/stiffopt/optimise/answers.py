@@ -1,4 +1,4 @@
-"""Makes solutions of what searches find: judges it by the model and writes the messages."""
+"""Turn search results into `PressureSolution`s: judge them by the model and write the messages."""
 
 from collections.abc import Callable, Iterable
 from typing import Any
@@ -30,12 +30,12 @@ Vector = NDArray[np.float64]
 
 
 class Answers:
-    """Makes the solutions of one solver.
+    """Factory of one solver's solutions.
 
     Parameters
     ----------
     prepared :
-        What is prepared for the kind of task.
+        Limits, samples and compiled solvers for the kind of task.
     solve_at_once :
         Solves another task on the arm; see `PressureSolver.solve_at_once`.
     """
@@ -49,7 +49,7 @@ class Answers:
     def if_it_holds(
         self, task: Task, program: Program, answer: CompiledAnswer | None
     ) -> PressureSolution | None:
-        """Solution from an answer of the compiled solver, if it holds."""
+        """Return the solution for an answer of the compiled solver; None if it does not hold."""
         if answer is None:
             return None
         p = answer.pressures
@@ -77,7 +77,7 @@ class Answers:
     def of(
         self, problem: PressureProblem, result: LocalResult, confidence: Confidence
     ) -> PressureSolution:
-        """Judge a result and put it into words."""
+        """Judge a search result and explain it."""
         pressures = np.clip(result.point.x * problem.unit, self.prepared.lower, self.prepared.upper)
         judgement = judge(self.robot, problem.task, pressures)
         return PressureSolution(
@@ -112,7 +112,7 @@ class Answers:
         pressures: Vector,
         message: str = "",
     ) -> Explanation:
-        """Put a judged result into words, unless there are some already."""
+        """Explain a judged result; a given message is kept."""
         task = problem.task
         active = active_bounds(self.robot, task, pressures)
         sensitivities = self._sensitivities(problem, result, judgement, pressures, active)
@@ -129,7 +129,7 @@ class Answers:
         return Explanation(message, tuple(active), freedom, sensitivities)
 
     def blocked_words(self, task: Task, touched: Iterable[str]) -> str:
-        """Name the objects in the way, if the task can be solved without its scene."""
+        """Name the objects in the way if the task can be solved without its scene."""
         if task.scene is None:
             return ""
         coarse = diagnosis.coarse_meshes(self.robot, task.scene, touched)
@@ -141,7 +141,7 @@ class Answers:
 
     @staticmethod
     def _holding(result: LocalResult, active: dict[str, tuple[int, int]]) -> list[str]:
-        """Active limits that the closest configuration presses against."""
+        """Return the active limits that hold the closest configuration back."""
         if result.multipliers is None:
             return list(active)
         return pressed(active, result.multipliers.bounds)
@@ -180,10 +180,10 @@ class Answers:
         )
 
 
-def pressed(active: dict[str, tuple[int, int]], prices: Vector) -> list[str]:
-    """Those of the active limits that have a price, of prices (n,) that count upwards."""
-    least = 1e-6 * float(np.abs(prices).max())
-    return [name for name, (index, side) in active.items() if side * prices[index] > least]
+def pressed(active: dict[str, tuple[int, int]], multipliers: Vector) -> list[str]:
+    """Return the active limits that have a multiplier; (n,), positive towards larger pressure."""
+    rounding = 1e-6 * float(np.abs(multipliers).max())
+    return [n for n, (index, side) in active.items() if side * multipliers[index] > rounding]
 
 
 def _clean(price: float) -> float:

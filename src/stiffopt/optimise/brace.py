@@ -1,4 +1,4 @@
-"""`Brace`, the part ``brace`` of a task file: to lean on objects of the scene to be stiff."""
+"""`Brace`, the key ``brace`` of a task file: objects that the arm may lean on to be stiffer."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ if TYPE_CHECKING:
 
 
 class Brace(Schema):
-    """Objects of the scene that the arm may lean on, and what the contacts have to hold.
+    """Objects of the scene that the arm may lean on, and demands on the contacts.
 
     Attributes
     ----------
     objects : names of objects of the scene that allow contact; the arm leans on one or several.
-    margin : push at the tip, both ways along each direction that is maximised, by which no contact
-        is lost, in N.
-    contacts : sliding, the stiffness is that of contacts that slide without resistance, the lower
-        bound, and one is lost where it lifts off; sticking, it is that of contacts that stick where
-        their object has friction, and one that slips is lost too.
-    approach : how the equilibrium is reached from rest: pressures, with the objects in place, or
-        objects, which come to the arm that is under pressure already.
+    margin : push at the tip, in N, both ways along each direction that is maximised, under which no
+        contact may be lost.
+    contacts : "sliding": contacts slide without resistance, and one is lost where it lifts off; the
+        stiffness is a lower bound.  "sticking": contacts stick where their object has friction, and
+        one that slips is lost too.
+    approach : how the equilibrium is reached from rest.  "pressures": with the objects in place;
+        "objects": they come to the arm when it is under pressure.
     """
 
     objects: Annotated[Items[Annotated[str, Field(min_length=1)]], Field(min_length=1)]
@@ -42,12 +42,12 @@ class Brace(Schema):
         return f"Brace(on {quoted(self.objects)}, margin {1e3 * self.margin:g} mN)"
 
     def check(self, task: Task) -> None:
-        """Refuse what makes no sense in a task.
+        """Reject a brace that does not suit its task.
 
         Raises
         ------
         BadKeyError
-            It says which key, and why.
+            With the key and the reason.
         """
         if task.press is not None:
             raise BadKeyError("brace", "cannot be combined with press; remove one of the two")
@@ -81,12 +81,12 @@ class Brace(Schema):
 
 
 def quoted(names: Iterable[str]) -> str:
-    """Names as people read them: ``'post', 'rib'``."""
+    """Quote and join names: ``'post', 'rib'``."""
     return ", ".join(f"'{name}'" for name in names)
 
 
 def leant_on(scene: Scene, brace: Brace) -> Scene:
-    """The objects of a scene that a brace names, as a scene; the same one each time."""
+    """Return the scene of the objects that a brace names; the same object for the same scene."""
     return _leant_on(SceneKey(scene), brace.objects)
 
 
@@ -96,7 +96,7 @@ def _leant_on(key: SceneKey, names: tuple[str, ...]) -> Scene:
 
 
 def kept_clear_of(scene: Scene, brace: Brace) -> Scene | None:
-    """The other objects, if there are any; the same scene each time."""
+    """Return the scene of the other objects, if any; the same object for the same scene."""
     return _kept_clear_of(SceneKey(scene), brace.objects)
 
 

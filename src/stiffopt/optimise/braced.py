@@ -1,10 +1,10 @@
-"""Where to lean: the search for a braced answer, beside the one that keeps clear of all objects.
+"""Search for braced answers, in which the arm leans on objects.
 
-Samples whose body would enter an object are ranked by where the contact would bring their tip: a
-contact at the station s of least gap g has the force ``f = -g / (n' C_ss n)`` and moves the tip by
-``C_ts n f``, to first order. The most promising ones, unlike each other, are brought to the target
-in contact, exactly and from rest; the descents of `optimise.local` start from the stiffest of them.
-What they end at is judged at the equilibrium that is reached from rest.
+Samples whose body would enter an object are ranked by the tip position that the contact would
+cause.  To first order, a contact at the station s of least gap g has the force
+``f = -g / (n' C_ss n)`` and moves the tip by ``C_ts n f``.  The best ones, unlike each other, are
+brought to the target in contact, exactly and from rest.  Descents of `optimise.local` start from
+the stiffest of them, and their ends are judged at the equilibrium that is reached from rest.
 """
 
 from __future__ import annotations
@@ -41,9 +41,9 @@ Vector = NDArray[np.float64]
 
 
 def candidates(problem: BracedProblem, table: SampleTable) -> Iterator[Vector]:
-    """Variables (n,) at which the arm would lean on an object, the most promising first.
+    """Yield variables (n,) at which the arm would lean on an object, the most promising first.
 
-    In turn for each of the objects, those unlike each other before others.
+    Objects take turns; starts unlike each other come before the rest.
     """
     robot, terms = problem.robot, problem.program.terms
     at = np.linspace(0, robot.length, BRACE.stations + 1)[1:]
@@ -64,8 +64,8 @@ def candidates(problem: BracedProblem, table: SampleTable) -> Iterator[Vector]:
         moved = _moved_by_contact(
             robot, table.pressures[entering], at, station[entering], normals, -deepest[entering]
         )
-        there = _displaced(table.poses[entering], moved)
-        ranked = entering[np.argsort(distances(there, terms, robot.length), kind="stable")]
+        poses = _displaced(table.poses[entering], moved)
+        ranked = entering[np.argsort(distances(poses, terms, robot.length), kind="stable")]
         x = table.pressures[ranked] / problem.unit
         rows.append([int(ranked[i]) for i in unlike_first(problem, x[: 8 * BRACE.effort.screened])])
     for turn in range(max(map(len, rows), default=0)):
@@ -77,7 +77,7 @@ def candidates(problem: BracedProblem, table: SampleTable) -> Iterator[Vector]:
 def _moved_by_contact(
     robot: Manipulator, p: Vector, at: Vector, station: NDArray[np.intp], n: Vector, depth: Vector
 ) -> Vector:
-    """Twists (N, 6) of the tip, in base axes, by a contact at one of the stations of each row."""
+    """Return twists (N, 6) of the tip, in base axes, due to a contact at a station of each row."""
     ends = np.full(len(at), robot.length)
     C = robot.compliance_between(p, np.concatenate([at, ends]), np.concatenate([at, at]))
     rows = np.arange(len(p))
@@ -88,7 +88,7 @@ def _moved_by_contact(
 
 
 def _displaced(poses: Vector, twists: Vector) -> Vector:
-    """Poses (N, 4, 4) moved by twists (N, 6) in base axes."""
+    """Move poses (N, 4, 4) by twists (N, 6) in base axes."""
     found = poses.copy()
     found[:, :3, 3] += twists[:, :3]
     for T, twist in zip(found, twists, strict=True):
@@ -99,7 +99,7 @@ def _displaced(poses: Vector, twists: Vector) -> Vector:
 def _places(
     problem: BracedProblem, starts: Iterable[Vector]
 ) -> Iterator[tuple[int, ProgramPoint | None]]:
-    """Points at the target in contact to descend from, the stiffest first; see `search`."""
+    """Yield points at the target in contact to descend from, the stiffest first; see `search`."""
     found: list[tuple[float, ProgramPoint, ContactEquilibrium]] = []
     tried = 0
     for x in starts:
@@ -122,14 +122,17 @@ def _places(
 def _brought(
     problem: BracedProblem, x: Vector
 ) -> list[tuple[float, ProgramPoint, ContactEquilibrium]]:
-    """A start in contact at the target, with what it is worth, if it comes there."""
-    aside = copy(problem)
-    aside.only_target = True
-    aside.restart()
-    point = reach(aside, x, BRACE.iterations)
+    """Bring a start to the target in contact; return its objective, point and equilibrium.
+
+    The list is empty if it does not arrive.
+    """
+    target_only = copy(problem)
+    target_only.only_target = True
+    target_only.restart()
+    point = reach(target_only, x, BRACE.iterations)
     if point is None or not point.reached:
         return []
-    problem.here = aside.here
+    problem.here = target_only.here
     point = reach(problem, point.x, BRACE.iterations)
     if point is None:
         return []
@@ -143,7 +146,7 @@ def _brought(
 
 
 def braced_answers(problem: BracedProblem, table: SampleTable, guess: Vector | None) -> Search:
-    """Local optima in contact, the best first; those next to a guess (n,) in Pa, if there are."""
+    """Return local optima in contact, best first; only those near a guess, (n,) in Pa, if any."""
     if guess is not None:
         nearby = search(problem, [guess / problem.unit], Effort(1, 1, 1), places=_places)
         if nearby.results:
@@ -153,7 +156,7 @@ def braced_answers(problem: BracedProblem, table: SampleTable, guess: Vector | N
 
 
 def from_rest(problem: BracedProblem, result: LocalResult) -> Braced | None:
-    """The equilibrium at an optimum that is reached from rest, judged; None if there is none."""
+    """Judge the equilibrium at an optimum that is reached from rest; None without contact."""
     pressures = np.clip(result.point.x, problem.lower, problem.upper) * problem.unit
     try:
         eq = problem.robot.contact_equilibrium(
@@ -165,7 +168,7 @@ def from_rest(problem: BracedProblem, result: LocalResult) -> Braced | None:
 
 
 class Braced(NamedTuple):
-    """An optimum in contact, with its equilibrium from rest and what that is worth."""
+    """An optimum in contact, with its equilibrium from rest and its judgement."""
 
     result: LocalResult
     equilibrium: ContactEquilibrium
@@ -178,7 +181,7 @@ class Braced(NamedTuple):
 
 
 def least_maximised(task: Task, stiffnesses: tuple[float, ...]) -> float:
-    """The smallest of those stiffnesses that a task maximises."""
+    """Return the smallest of the stiffnesses that a task maximises."""
     assert task.stiffness is not None
     return min(stiffnesses[: len(task.stiffness.maximise)])
 
@@ -186,7 +189,7 @@ def least_maximised(task: Task, stiffnesses: tuple[float, ...]) -> float:
 def lean(
     problem: BracedProblem, table: SampleTable, free: PressureSolution, guess: Vector | None
 ) -> PressureSolution:
-    """The better of the stiffest answer that leans on something and the one that is free.
+    """Return the stiffer of the best answer that leans on objects and the free one.
 
     Parameters
     ----------
@@ -224,7 +227,7 @@ def _free_answer(task: Task, free: PressureSolution, why: str) -> PressureSoluti
 
 
 def _no_brace(problem: BracedProblem, judged: list[Braced | None]) -> str:
-    """Why no braced answer was found."""
+    """Explain why no braced answer was found."""
     names = quoted(problem.brace.objects)
     lacking = [why for each in judged if each is not None for why in each.judgement.shortfalls]
     if lacking:
@@ -291,7 +294,7 @@ def _braced_answer(
 
 
 def _size(problem: BracedProblem, name: str, radius: float) -> float:
-    """The whole of a limit, of which its price is told: of a force, a margin, or a tolerance."""
+    """Return the full size of a limit, for its price: a force, a margin, or a tolerance."""
     if name.startswith(MARGIN_ON):
         return problem.brace.margin
     forces = {f"{FORCE_ON}{item.name}": item.contact for item in problem.scene.objects}
@@ -300,7 +303,7 @@ def _size(problem: BracedProblem, name: str, radius: float) -> float:
 
 
 def _other_equilibrium(problem: BracedProblem, eq: ContactEquilibrium) -> str:
-    """Say so if the arm could touch nothing at the same pressures; else return nothing."""
+    """Return a message if the arm could also touch nothing at these pressures, or ""."""
     if problem.robot.clearance(eq.pressures, problem.scene) < 0:
         return ""
     tip = problem.robot.tip_pose(eq.pressures)[:3, 3]
@@ -318,7 +321,7 @@ def _other_equilibrium(problem: BracedProblem, eq: ContactEquilibrium) -> str:
 
 
 def _limits(problem: BracedProblem, result: LocalResult) -> tuple[str, ...]:
-    """What keeps a braced answer from being stiffer: constraints and limits with a price."""
+    """Return the constraints and limits that keep a braced answer from being stiffer."""
     point = attempt(problem.needed, result.point.x)
     prices = None if point is None else prices_at(problem, point)
     if point is None or prices is None:

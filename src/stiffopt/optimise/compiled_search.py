@@ -1,4 +1,4 @@
-"""Answers of machine code: the stiffest pressures, or the closest configuration."""
+"""Find answers by machine code: the stiffest pressures, or the closest configuration."""
 
 from dataclasses import replace
 
@@ -28,12 +28,12 @@ Vector = NDArray[np.float64]
 
 
 class CompiledSearch:
-    """Searches by machine code for one kind of task; has no answer until there is some.
+    """Search by machine code for one kind of task; returns None until code is compiled.
 
     Parameters
     ----------
     answers :
-        Of the solver.
+        The solver's factory of solutions.
     """
 
     def __init__(self, answers: Answers) -> None:
@@ -41,7 +41,10 @@ class CompiledSearch:
         self._robot = answers.robot
 
     def fast(self, task: Task, guess: Vector | None) -> tuple[FastSolver, Vector, Program] | None:
-        """Compiled solver of a task, its row of numbers and its program; none knows of contacts."""
+        """Return the task's compiled solver, its row of numbers and its program.
+
+        None without machine code, and for a brace: the compiled solvers do not model contact.
+        """
         if task.brace is not None:
             return None
         program = self._prepared.program(task.target)
@@ -54,7 +57,7 @@ class CompiledSearch:
     def solve(
         self, task: Task, guess: Vector | None, limits: tuple[Vector, Vector] | None = None
     ) -> PressureSolution | None:
-        """Answer of the compiled solver, if there is one that holds."""
+        """Return the compiled solver's answer if it finds one that holds."""
         if limits is not None and guess is not None:
             guess = np.clip(guess, *limits)
         fast = self.fast(task, guess)
@@ -66,13 +69,14 @@ class CompiledSearch:
         return self._answers.if_it_holds(task, program, solver.solve(row))
 
     def nearest(self, task: Task, start: Vector | None = None) -> PressureSolution | None:
-        """Closest configuration by compiled code; None if the pose can be had, or for no code.
+        """Return the closest configuration by machine code; a start (n,) is in Pa.
 
-        Among obstacles the answer from there, if the pose can be had.  A start (n,) is in Pa.
+        None if there is no code, or if the pose is reached.  With a scene, a reached pose is solved
+        from there instead.
         """
         fast = self.fast(task, None)
         answer = None if fast is None else fast[0].closest(fast[1], start)
-        checkpoint()  # a search that was cut short proves nothing
+        checkpoint()  # an interrupted search does not show that the pose is out of reach
         if fast is None or answer is None or answer.slope is None:
             return None
         p = answer.pressures
@@ -100,17 +104,18 @@ class CompiledSearch:
             message=message,
             active_bounds=tuple(active),
             pressures=p,
-            confidence=replace(answer.confidence, reached=0),  # none came to the pose
+            confidence=replace(answer.confidence, reached=0),
             counts=answer.counts,
             timings={},
         )
         return PressureSolution.explained_later(explain, fields)
 
     def among_obstacles(self, task: Task) -> PressureSolution | None:
-        """Answer of compiled code where neither search nor descents to the target had one.
+        """Return an answer among obstacles where `solve` and `nearest` have none.
 
-        The pose can be had, but no stiffness that is demanded; or descents start from the clear
-        sample nearest to the target, or from the clearest ones; or nothing is clear.
+        If the pose is reached and clear but too soft, return the stiffest answer.  Otherwise
+        descend from the clear sample nearest to the target or, if none is clear, from the clearest
+        ones.  If all fail, return the clearest sample.
         """
         fast = self.fast(task, None)
         if fast is None or task.scene is None:
@@ -136,7 +141,7 @@ class CompiledSearch:
     def _too_soft(
         self, task: Task, judgement: Judgement, answer: CompiledAnswer
     ) -> PressureSolution:
-        """The stiffest that was found, where more is demanded."""
+        """Return the stiffest answer, which misses a demanded stiffness."""
         return PressureSolution(
             status="unreachable",
             message=diagnosis.demands_message(judgement),
@@ -148,7 +153,7 @@ class CompiledSearch:
         )
 
     def _clearest(self, task: Task, samples: Vector, distances: Vector) -> PressureSolution:
-        """Of configurations none of which keeps enough clearance the one with most of it."""
+        """Return the sample with the most clearance, where none has enough."""
         p = samples[int(distances.argmax())]
         judgement = judge(self._robot, task, p)
         return PressureSolution(

@@ -1,18 +1,20 @@
-"""Derivatives of an answer by what was asked for: the implicit function theorem.
+"""Derivatives of an answer with respect to the task, by the implicit function theorem.
 
-At an answer the terms f of the objective, the balls, the floors g and the limits that bind fix the
-pressures x (shares of their ranges), the multipliers and the value t of the objective::
+At an answer, the terms f of the objective, the balls c, the floors g and the active limits
+determine the pressures x (shares of their ranges), the multipliers and the value t of the
+objective::
 
     sum lambda_i grad f_i + sum mu_b grad c_b - sum nu_j grad g_j = 0   (pressures off their limits)
     f_i = t,  sum lambda_i = 1,  c_b = (|r_b|^2 / rho_b^2 - 1) / 2 = 0,  g_j = bound_j
 
-(of a ball that is bounded on one side c_b = r_b / rho_b - 1; so is the distance of each place of
-the body that is nearest to an object, see `stiffopt.optimise.least_distances`).  All this is
-F(y, theta) = 0, so that ``dy = -(dF/dy)^-1 dF/dtheta``; the value follows from ``dt = dL/dtheta``
-alone.  The model's first derivatives are exact; second ones are central differences of them, as
-there is no formula for those of an arm under gravity or loads (relative error about 1e-7).  The
-curvature of a ball, of which the radius is small, is taken from its formula.  An answer is exact to
-the optimiser's precision only, so a few steps of Newton's method come first.
+For a one-sided ball, c_b = r_b / rho_b - 1; so is each local minimum of the distance from an
+object, see `stiffopt.optimise.least_distances`.  This system is F(y, theta) = 0, so ``dy =
+-(dF/dy)^-1 dF/dtheta``; the derivative of the value is ``dt = dL/dtheta`` alone.
+
+The model's first derivatives are exact.  Second ones are their central differences (relative error
+about 1e-7), as there is no formula under gravity or loads.  The curvature of a ball, whose radius
+is small, is taken from its formula.  An answer is exact only to the optimiser's precision, so a few
+Newton steps come first.
 """
 
 from collections.abc import Callable, Iterator
@@ -41,7 +43,7 @@ By = Literal["target", "direction", "limits", "clearance"]
 
 
 class _Change(NamedTuple):
-    """Rate at which a point changes: of terms and floors (k,), residual (m,), gradients (., n)."""
+    """Rates of change of a point: terms and floors (k,), residual (m,), gradients (., n)."""
 
     terms: Vector
     term_gradients: Vector
@@ -52,7 +54,7 @@ class _Change(NamedTuple):
 
     @classmethod
     def of(cls, points: list[ProgramPoint], weights: Vector) -> "_Change":
-        """Weighted sum of points."""
+        """Return the weighted sum of points."""
         return cls(
             *(
                 np.tensordot(weights, [getattr(point, name) for point in points], 1)
@@ -63,7 +65,7 @@ class _Change(NamedTuple):
 
 @dataclass
 class _Active:
-    """What binds: indices of terms, constraints and floors; and which pressures are held (n,)."""
+    """Active constraints: indices of terms, constraints and floors; pressures held (n,)."""
 
     terms: list[int]
     balls: list[int]
@@ -85,13 +87,13 @@ class AnswerDerivatives:
     Attributes
     ----------
     weak : tuple of str
-        Constraints that are just about to bind or to let go; where there are any, derivatives hold
-        on that side only on which the same constraints go on to bind.
+        Constraints that are about to become active or inactive.  If there are any, derivatives hold
+        only on the side on which the active constraints stay the same.
 
     Raises
     ------
     DerivativeError
-        If other pressures next to the answer are as good, or it is no optimum.
+        If the answer is not an isolated optimum.
     """
 
     def __init__(self, robot: Manipulator, task: Task, pressures: Vector) -> None:
@@ -122,14 +124,14 @@ class AnswerDerivatives:
         self.weak = tuple(self._weak_names())
 
     def _seems_to_bind(self, i: int, pull: Vector) -> bool:
-        """Whether a constraint is taken to bind at first, by its error and its price."""
+        """Return whether a constraint is first assumed to be active, by its error and its price."""
         c = self._problem.constraints[i]
         if c.first >= self._problem.program.n_own_rows:
-            return bool(pull.any())  # many places may be as near
+            return bool(pull.any())  # many minima may be equally near
         return bool(self._point.errors[i] > c.radius * (1 - DERIVATIVES.near))
 
     def _check_distances(self) -> None:
-        """Refuse places where the slope of a distance changes otherwise to one side."""
+        """Reject an answer at which a distance's slope changes differently on its two sides."""
         problem, point = self._problem, self._point
         bind = [problem.constraints[i] for i in self._active.balls]
         names = {c.first: c.name for c in bind if c.first >= problem.program.n_own_rows}
@@ -142,14 +144,14 @@ class AnswerDerivatives:
             for side in (ways, -ways)
         )  # (n, k, n)
         uneven, even = (np.abs(each).max(axis=(0, 2)) for each in (after + before, after - before))
-        for name, much in zip(names.values(), uneven > DERIVATIVES.edge * even, strict=True):
-            if much:
+        for name, is_edge in zip(names.values(), uneven > DERIVATIVES.edge * even, strict=True):
+            if is_edge:
                 raise DerivativeError(
                     f"the {name} has an edge at the answer, which has no derivatives there"
                 )
 
     def _snap(self) -> None:
-        """Put what is held onto its limits."""
+        """Put held pressures onto their limits."""
         problem, x = self._problem, self._point.x
         nearest = np.where(x - problem.lower < problem.upper - x, problem.lower, problem.upper)
         x = np.where(self._active.held, nearest, np.clip(x, problem.lower, problem.upper))
@@ -178,7 +180,7 @@ class AnswerDerivatives:
         )
 
     def _by(self, of: str, change: _Change, moved: int | None = None) -> Vector:
-        """Derivative of the answer by what changes the program in this way."""
+        """Return the derivative of the answer for a change of the program."""
         if of == "stiffness":
             t = float(self._point.terms.max())
             return np.asarray(-np.exp(-t) * self._value_rate(change))
@@ -191,7 +193,7 @@ class AnswerDerivatives:
         return rate * self._problem.unit
 
     def _by_limits(self, of: str) -> Vector:
-        """Derivatives (..., 2, n) by the lower and the upper limits; zero by those that are off."""
+        """Return derivatives (..., 2, n) by lower and upper limits; zero for inactive ones."""
         problem, n = self._problem, len(self._point.x)
         found = np.zeros((2, n, n) if of == "pressures" else (2, n))
         for i in np.flatnonzero(self._active.held).tolist():
@@ -200,7 +202,7 @@ class AnswerDerivatives:
         return np.moveaxis(found, -1, 0) if of == "pressures" else found
 
     def _clearance_change(self) -> _Change:
-        """Change by the clearance that is asked for, in m."""
+        """Return the change per m of clearance."""
         if self._problem.task.scene is None:
             raise InputError("only a task with a scene has a clearance")
         none = _Change.of([self._point], np.zeros(1))
@@ -208,7 +210,7 @@ class AnswerDerivatives:
         return none._replace(residual=np.where(own, 0.0, 1.0))
 
     def _target_changes(self) -> list[_Change]:
-        """Changes by a motion of the target in base axes: in m, and in rad if it turns."""
+        """Return the changes by a motion of the target in base axes: per m, and per rad."""
         target = self._problem.task.target
         turns = any(term.unit == "rad" for term in target.terms)
         axes = np.eye(6)[: 6 if turns else 3]
@@ -218,7 +220,7 @@ class AnswerDerivatives:
         return self._problem.program.at(self._problem.task.target.moved_back(-by * way))
 
     def _direction_changes(self) -> Iterator[list[_Change]]:
-        """Changes by each component of each direction that is maximised."""
+        """Yield the changes by each component of each direction that is maximised."""
         program = self._problem.program
         for k, measure in enumerate(program.measures[: program.n_terms]):
             if program.aim != "maximise" or not isinstance(measure, StiffnessMeasure):
@@ -226,7 +228,7 @@ class AnswerDerivatives:
             yield [self._difference(partial(_turned, program, k, axis)) for axis in np.eye(3)]
 
     def _difference(self, program_at: Callable[[float], Program]) -> _Change:
-        """Change by a parameter of the program."""
+        """Return the change by a parameter of the program, as a central difference."""
         h, robot = DERIVATIVES.step_of_parameters, self._problem.robot
         programs = (program_at(-h), program_at(h))
         points = [self._evaluate(self._point.x, robot.parameters(p.parameters)) for p in programs]
@@ -235,11 +237,11 @@ class AnswerDerivatives:
     # -- the system -------------------------------------------------------------------------
 
     def _change(self, i: int) -> _Change:
-        """Change by one of the pressures."""
+        """Return the change by one of the pressures."""
         return self._combined(i, (-1.0, 1.0), (-0.5, 0.5))
 
     def _inward_change(self, i: int) -> _Change:
-        """The same at a limit, where there may be a kink: from what is inside of it."""
+        """Return the change by a pressure at a limit, from inside: there may be a kink."""
         if self._point.x[i] <= self._problem.lower[i] + DESCENT.touching:
             return self._combined(i, (1.0, 2.0, 3.0), (-2.5, 4.0, -1.5))
         return self._combined(i, (-1.0, -2.0, -3.0), (2.5, -4.0, 1.5))
@@ -251,13 +253,13 @@ class AnswerDerivatives:
         return _Change.of(points, np.array(weights) / h)
 
     def _split(self) -> tuple[Vector, Vector, Vector]:
-        """Multipliers of the terms, balls and floors that bind."""
+        """Return the multipliers of the active terms, balls and floors."""
         a = len(self._active.terms)
         b = a + len(self._active.balls)
         return self._weights[:a], self._weights[a:b], self._weights[b:]
 
     def _ball_slopes(self, change: _Change) -> tuple[Vector, Vector]:
-        """Rates of the balls that bind (b,), and of their gradients weighed together (n,)."""
+        """Return the rates of the active balls (b,), and their gradients' weighted sum (n,)."""
         rates, slope = [], np.zeros(len(self._point.x))
         for i, weight in zip(self._active.balls, self._split()[1], strict=True):
             c = self._problem.constraints[i]
@@ -273,7 +275,7 @@ class AnswerDerivatives:
         return np.array(rates), slope
 
     def _rates(self, change: _Change) -> Vector:
-        """Rate of F with the unknowns held."""
+        """Return the rate of F with the unknowns fixed."""
         terms, _, floors = self._split()
         active = self._active
         ball_rates, slope = self._ball_slopes(change)
@@ -285,7 +287,7 @@ class AnswerDerivatives:
         )  # fmt: skip
 
     def _value_rate(self, change: _Change) -> float:
-        """Rate of the objective's value: that of the Lagrangian."""
+        """Return the rate of the objective's value, which is that of the Lagrangian."""
         terms, balls, floors = self._split()
         return float(
             terms @ change.terms[self._active.terms]
@@ -294,7 +296,7 @@ class AnswerDerivatives:
         )
 
     def _constraint_slopes(self) -> Vector:
-        """Gradients (k, n) of what binds, as its multipliers weigh it."""
+        """Return the gradients (k, n) of active constraints, in the order of the multipliers."""
         point, active = self._point, self._active
         rows = [*point.term_gradients[active.terms]]
         for i in active.balls:
@@ -306,7 +308,7 @@ class AnswerDerivatives:
         return np.array([*rows, *(-point.floor_gradients[active.floors])])
 
     def _left(self) -> Vector:
-        """F at the present point."""
+        """Return F at the present point."""
         point, active, problem = self._point, self._active, self._problem
         slopes, terms = self._constraint_slopes(), self._split()[0]
         balls = []
@@ -322,7 +324,7 @@ class AnswerDerivatives:
         )  # fmt: skip
 
     def _set_matrix(self) -> None:
-        """Derivative of F by the unknowns: pressures that are free, t, and multipliers."""
+        """Set the derivative of F by the unknowns: free pressures, t, and multipliers."""
         free, active = ~self._active.held, self._active
         slopes = self._constraint_slopes()[:, free]
         n, a, k = int(free.sum()), len(active.terms), len(slopes)
@@ -343,12 +345,12 @@ class AnswerDerivatives:
         self._matrix = K
 
     def _polish(self) -> None:
-        """Newton's method from the answer to the optimum at which the same constraints bind."""
+        """Run Newton's method from the answer to the optimum with the same active constraints."""
         free = ~self._active.held
         n = int(free.sum())
         self._t = float(self._point.terms.max())
         slopes, a = self._constraint_slopes()[:, free], len(self._active.terms)
-        if len(slopes) > a:  # the prices of the answer are as inexact as it is
+        if len(slopes) > a:  # refine the prices, which are as inexact as the answer
             pull = self._weights[:a] @ slopes[:a]
             self._weights[a:] = np.linalg.lstsq(slopes[a:].T, -pull, rcond=None)[0]
         for _ in range(DERIVATIVES.iterations):
@@ -366,10 +368,10 @@ class AnswerDerivatives:
                 return
         raise DerivativeError("the answer is too far from an optimum to have derivatives")
 
-    # -- what binds -------------------------------------------------------------------------
+    # -- active constraints -----------------------------------------------------------------
 
     def _changed(self) -> bool:
-        """Let go what pushes the wrong way, and hold what is violated; whether that was needed."""
+        """Drop multipliers of wrong sign, add violations; return whether the active set changed."""
         problem, point, active, tiny = self._problem, self._point, self._active, DERIVATIVES.tiny
         x, errors = point.x, zip(point.errors, problem.constraints, strict=True)
         violated = (
@@ -399,7 +401,7 @@ class AnswerDerivatives:
         return changed
 
     def _price(self, i: int) -> float:
-        """How much the objective grows as a pressure leaves its limit, per share of its range."""
+        """Return the objective's slope as a pressure leaves its limit, per share of its range."""
         inward = 1.0 if self._point.x[i] <= self._problem.lower[i] + DESCENT.touching else -1.0
         return inward * self._value_rate(self._inward_change(i))
 
@@ -425,17 +427,17 @@ class AnswerDerivatives:
 
 
 def _turned(program: Program, which: int, way: Vector, by: float) -> Program:
-    """The program with one of its directions moved along `way` and brought back to length 1."""
+    """Return the program with one direction moved along `way` and normalised."""
     measures = list(program.measures)
     measure = measures[which]
-    assert isinstance(measure, StiffnessMeasure)  # or nobody would ask
+    assert isinstance(measure, StiffnessMeasure)  # checked in `_direction_changes`
     moved = unit_vector(tuple((np.array(measure.direction) + by * way).tolist()))
     measures[which] = measure.model_copy(update={"direction": moved})
     return replace(program, measures=tuple(measures))
 
 
 def _problem(robot: Manipulator, task: Task, pressures: Vector) -> PressureProblem:
-    """The program of a task, with a row for each place of the body that is near an object."""
+    """Return the program of a task, with a row for each local minimum of a distance."""
     problem = PressureProblem(robot, task)
     if task.scene is None:
         return problem
@@ -443,10 +445,10 @@ def _problem(robot: Manipulator, task: Task, pressures: Vector) -> PressureProbl
 
 
 def _evaluation(problem: PressureProblem) -> Callable[[Vector, Vector], ProgramPoint]:
-    """Everything at pressures (n,), as shares, and parameters; from rest under loads."""
+    """Return the function of pressures (n,), as shares, and parameters; from rest under loads."""
     robot, task = problem.robot, problem.task
     program = Program.of(task, robot.description)
-    bare = task.model_copy(update={"load": None, "press": None})  # which the arm carries already
+    bare = task.model_copy(update={"load": None, "press": None})  # the arm already carries it
     fast = prepared(robot, bare, 0).fast(program) if robot.is_loaded else None
     radii = np.array([c.radius for c in program.constraints(robot.length)])
     own = slice(program.n_own_rows)

@@ -1,4 +1,4 @@
-"""Tasks that cannot be met, or leave no choice: the closest configuration, and messages."""
+"""Closest configurations of tasks that cannot be met, and messages that explain answers."""
 
 from collections.abc import Iterable
 from math import inf
@@ -22,11 +22,11 @@ Vector = NDArray[np.float64]
 def closest_configurations(
     problem: PressureProblem, candidates: Iterable[Vector]
 ) -> list[LocalResult]:
-    """Pressures that come nearest to the target, from all candidates to start from, best first.
+    """Return pressures nearest to the target, found from all candidates, best first.
 
-    The terms are approached one after the other, each within the tolerances of those before or,
-    where these cannot be had, at their least errors: first inequalities, then others, the position
-    last.
+    The terms are approached one after the other: first inequalities, then others, the position
+    last. Each keeps the terms before it within their tolerances or, if these cannot be met, at
+    their least errors.
     """
     xs = list(candidates)
     terms = problem.program.terms
@@ -48,7 +48,7 @@ def closest_configurations(
 
 
 def last_stage(problem: PressureProblem, errors: dict[str, float]) -> PressureProblem:
-    """The last of the stages of `closest_configurations`, where these are the least errors."""
+    """Return the last stage of `closest_configurations`, given the least errors."""
     *before, last = problem.program.in_order_of_approach
     radii = {}
     for term in before:
@@ -59,7 +59,7 @@ def last_stage(problem: PressureProblem, errors: dict[str, float]) -> PressurePr
 
 
 def unimproved(problem: PressureProblem, x: Vector) -> LocalResult:
-    """Pressures as they are, as a result that can be judged beside those of descents."""
+    """Wrap pressures as a result that can be judged like those of descents."""
     problem.restart()
     point = problem.pose(x)
     nearest = problem.changed(problem.closest(problem.program.terms[0].name), floors=False)
@@ -67,7 +67,7 @@ def unimproved(problem: PressureProblem, x: Vector) -> LocalResult:
 
 
 def freedom(problem: PressureProblem, x: Vector) -> int:
-    """Directions in pressure space in which the residuals stay what they are."""
+    """Return the number of independent pressure changes that keep the residuals."""
     problem.restart()
     balls = [ball for ball in problem.pose(x).bounded if not ball.constraint.one_sided]
     rows = [np.zeros((0, len(x))), *(ball.jacobian / ball.radius for ball in balls)]
@@ -75,7 +75,7 @@ def freedom(problem: PressureProblem, x: Vector) -> int:
 
 
 def no_freedom_message(task: Task, n_pressures: int, sensitivities: Sensitivities | None) -> str:
-    """Say that the pose leaves no choice, and what a larger tolerance would buy."""
+    """Explain that the pose leaves no choice, and what a larger tolerance would gain."""
     text = (
         f"no freedom is left: the pose takes all {n_pressures} pressures, so the stiffness is what "
         "it is there"
@@ -94,7 +94,7 @@ def no_freedom_message(task: Task, n_pressures: int, sensitivities: Sensitivitie
 
 
 def unreachable_message(judgement: Judgement, task: Task, holding: list[str]) -> str:
-    """Say how far the closest configuration is and what holds it back."""
+    """Describe how far the closest configuration is and what holds it back."""
     away: list[str] = []
     beyond: list[str] = []
     for term in task.target.terms:
@@ -111,7 +111,7 @@ def unreachable_message(judgement: Judgement, task: Task, holding: list[str]) ->
 
 
 def no_way_message(judgement: Judgement, task: Task, samples: int) -> str:
-    """Say that nothing keeps the clearance, and what the clearest configuration lacks of it."""
+    """Explain that no configuration keeps the clearance, and describe the clearest one."""
     assert task.scene is not None
     words = " and ".join(_intrusions(task.scene, judgement.intruders))
     return (
@@ -121,7 +121,7 @@ def no_way_message(judgement: Judgement, task: Task, samples: int) -> str:
 
 
 def in_the_way(robot: Manipulator, scene: Scene, pressures: Vector) -> str:
-    """Say which objects are nearer than the clearance at pressures (n,), and by how much."""
+    """List the objects nearer than the clearance at pressures (n,), and by how much."""
     near = robot.clearances(pressures, scene)
     missing = (scene.clearance - near.distances).tolist()
     words = _intrusions(scene, dict(zip(near.names, missing, strict=True)))
@@ -129,9 +129,9 @@ def in_the_way(robot: Manipulator, scene: Scene, pressures: Vector) -> str:
 
 
 def mesh_error(robot: Manipulator, scene: Scene, name: str | None) -> float | None:
-    """By how much (m) the clearance of an object that the body touches may be too small.
+    """Return how much too small (m) the clearance of an object may be because of its mesh's grid.
 
-    None where that does not matter: it is no mesh, or less than a tenth of the clearance asked.
+    None if it is no mesh, or if this is less than a tenth of the clearance asked for.
     """
     shape = next((item.shape for item in scene.objects if item.name == name), None)
     if shape is None:
@@ -142,7 +142,7 @@ def mesh_error(robot: Manipulator, scene: Scene, name: str | None) -> float | No
 
 
 def coarse_meshes(robot: Manipulator, scene: Scene | None, names: Iterable[str]) -> str:
-    """Say which of the objects that hold an arm back may do so since their grids are coarse."""
+    """List the objects that may hold an arm back only because their grids are coarse."""
     errors = {name: mesh_error(robot, scene, name) for name in names} if scene is not None else {}
     return "".join(
         f"; distances from '{name}' are up to {display_units().length.text(error, '.2g')} too "
@@ -153,7 +153,7 @@ def coarse_meshes(robot: Manipulator, scene: Scene | None, names: Iterable[str])
 
 
 def _intrusions(scene: Scene, missing: dict[str, float]) -> list[str]:
-    """Say by how much (m) the body lacks the clearance of each object that it is too near."""
+    """Describe by how much (m) the body lacks the clearance of each object that is too near."""
     shapes = {item.name: item.shape for item in scene.objects}
     return [
         f"{display_units().length.text(lack, '.3g')} {shapes[name].amiss} '{name}'"
@@ -163,6 +163,6 @@ def _intrusions(scene: Scene, missing: dict[str, float]) -> list[str]:
 
 
 def demands_message(judgement: Judgement) -> str:
-    """Say which stiffness cannot be had at the pose, and the best that can."""
+    """Describe the stiffness that is not possible at the pose, and the best that is."""
     missed = "; ".join(judgement.shortfalls)
     return f"unreachable: the pose can be had, but not this stiffness there: {missed}"

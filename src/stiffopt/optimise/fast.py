@@ -1,9 +1,8 @@
-"""The compiled solver: a whole search in machine code, task by task or many at once.
+"""`FastSolver`: a whole search in machine code, task by task or many at once.
 
-It is the method of `stiffopt.optimise.search` and `local` written in C (folder ``native``),
-compiled together with the functions of a task's structure; `stiffopt.optimise.loaded` adds what
-arms under gravity or loads need.  What it does not fit, or does not solve, is left to that general
-method.
+It is the method of `stiffopt.optimise.search` and `local`, written in C (folder ``native``) and
+compiled with the functions of a task's structure; `stiffopt.optimise.loaded` adds the functions for
+gravity and loads.  Tasks that it does not support or cannot solve go to the general method.
 """
 
 import ctypes
@@ -32,15 +31,15 @@ Vector = NDArray[np.float64]
 
 _NEAR = 18  # numbers of a term's `Nearness`
 _COUNTS = 14  # numbers of an answer before its pressures
-# as solver.c has them
-_SEARCH, _GUESS_FIRST, _GUESS_ALONE, _JUDGE, _COME, _CLOSEST, _CLOSEST_FROM = range(7)
-_UNSOLVED, ANSWERED, _GLOBAL, _JUDGED, _CAME, _NEAREST, _NOT_FINITE, _TOO_SOFT = range(8)
+# requests and outcomes, as in solver.c
+_SEARCH, _GUESS_FIRST, _GUESS_ALONE, _JUDGE, _REACH_ONLY, _CLOSEST, _CLOSEST_FROM = range(7)
+_UNSOLVED, ANSWERED, _GLOBAL, _JUDGED, _REACHED, _NEAREST, _NOT_FINITE, _TOO_SOFT = range(8)
 
 _integer, _double, _pointer = ctypes.c_int64, ctypes.c_double, ctypes.c_void_p
 
 
 def _mirrored(settings: Any) -> ctypes.Structure:
-    """Settings as the structure in C that has the same fields."""
+    """Return settings as a structure in C with the same fields."""
     kinds = {float: _double, int: _integer}
     values = settings._asdict() if isinstance(settings, Effort) else asdict(settings)
     fields = [(name, kinds[type(value)]) for name, value in values.items()]
@@ -49,13 +48,13 @@ def _mirrored(settings: Any) -> ctypes.Structure:
     return found
 
 
-_REACH, _DESCENT, _CLOSEST_SETTINGS, _EFFORT = map(
+_REACH_SETTINGS, _DESCENT_SETTINGS, _CLOSEST_SETTINGS, _EFFORT = map(
     _mirrored, (REACH, DESCENT, CLOSEST, SEARCH.placed)
 )
 
 
 class _Setup(ctypes.Structure):
-    """`Setup` of native/program.h."""
+    """Structure `Setup` of native/program.h."""
 
     _fields_ = [
         *((name, _integer) for name in (
@@ -63,8 +62,8 @@ class _Setup(ctypes.Structure):
             "samples",
         )),
         *((name, _pointer) for name in ("ball_rows", "one_sided", "scale", "unit", "stage")),
-        ("reach", type(_REACH)),
-        ("descent", type(_DESCENT)),
+        ("reach", type(_REACH_SETTINGS)),
+        ("descent", type(_DESCENT_SETTINGS)),
         ("closest", type(_CLOSEST_SETTINGS)),
         ("least_effort", type(_EFFORT)),
         ("most_effort", type(_EFFORT)),
@@ -81,13 +80,13 @@ class _Setup(ctypes.Structure):
 
 
 class _OneTask(ctypes.Structure):
-    """`OneTask` of native/solver.c."""
+    """Structure `OneTask` of native/solver.c."""
 
     _fields_ = [(name, _pointer) for name in ("setup", "task", "answer", "stop")]
 
 
 class CompiledAnswer(NamedTuple):
-    """What the compiled solver found.
+    """An answer of the compiled solver.
 
     Attributes
     ----------
@@ -95,12 +94,12 @@ class CompiledAnswer(NamedTuple):
         In Pa.
     confidence : Confidence
     counts : dict of str to int
-        Work that was done.
+        Work done.
     judged : tuple
-        What `Judgement.of` takes: residuals, tip pose, compliance and values at the pressures.
+        Arguments of `Judgement.of`: residuals, tip pose, compliance and values at the pressures.
     slope : ndarray (n,)
-        Of the closest configuration: that of the Lagrangian of its error, limits left out, per
-        share of a pressure's range.
+        For the closest configuration: gradient of its error's Lagrangian without limits, per share
+        of a pressure's range.
     """
 
     pressures: Vector
@@ -113,28 +112,30 @@ class CompiledAnswer(NamedTuple):
 class FastSolver:
     """Compiled solver of tasks of one structure and one set of limits on one arm.
 
+    Each task is a row of numbers: its parameters, radii, limits, floors and guess.
+
     Parameters
     ----------
     library : Library
         Functions of the structure, with the compiled solver.
     robot : Manipulator
     program : Program
-        Any of that structure; of one with obstacles see `among`.
+        Any of that structure; for one with obstacles see `among`.
     table : SampleTable
-        Where searches start; that of a loaded arm has the arm in machine code.
+        Starts of searches; that of a loaded arm includes the arm in machine code.
 
     Attributes
     ----------
     table : SampleTable
-        Where searches start.
+        Starts of searches.
     targets, guess : slice
-        Where the target's parameters and a guess are in a row.
+        Places of the target's parameters and of the guess in a row.
     """
 
     def __init__(
         self, library: Library, robot: Manipulator, program: Program, table: SampleTable
     ) -> None:
-        self._library, self.table = library, table  # what pointers below lead to
+        self._library, self.table = library, table  # own the memory behind the pointers below
         arm = table.arm
         size = library.cdll.stiffopt_setup_size
         size.restype = _integer
@@ -177,8 +178,8 @@ class FastSolver:
             scale=scale,
             unit=unit,
             stage=stage,
-            reach=_REACH,
-            descent=_DESCENT,
+            reach=_REACH_SETTINGS,
+            descent=_DESCENT_SETTINGS,
             closest=_CLOSEST_SETTINGS,
             least_effort=type(_EFFORT)(*least),
             most_effort=type(_EFFORT)(*most),
@@ -213,7 +214,7 @@ class FastSolver:
         self._pressures = slice(self._width + _COUNTS, self._width + _COUNTS + n)
 
     def among(self, obstacles: Obstacles, robot: Manipulator) -> "FastSolver":
-        """The same solver around which is another scene, of as many rows."""
+        """Return the same solver with another scene that has as many rows."""
         other = copy(self)
         other._obstacles = in_c = ObstaclesInC(obstacles, robot, self.table.arm)
         other._setup = type(self._setup).from_buffer_copy(self._setup)
@@ -222,7 +223,7 @@ class FastSolver:
         return other
 
     def row(self, program: Program, lower: Vector, upper: Vector, floors: Vector) -> Vector:
-        """Numbers of a task, its target and guess left out."""
+        """Return the row of a task without its target and guess."""
         row = np.zeros(self._width)
         row[: self.targets.start] = self._numbers
         start = self.targets.stop
@@ -231,7 +232,7 @@ class FastSolver:
         return row
 
     def with_target(self, row: Vector, program: Program, guess: Vector | None) -> Vector:
-        """The same task with a target and, if there is one, a guess (Pa) to begin with."""
+        """Return a copy of a row with a target and, if given, a guess (Pa) to try first."""
         row = row.copy()
         row[self.targets] = program.target_parameters
         row[self._radii] = program.radii
@@ -245,11 +246,11 @@ class FastSolver:
         return row
 
     def limit(self, row: Vector, lower: Vector, upper: Vector) -> None:
-        """Have the row of a task keep other limits (n,), in Pa, within those it was made for."""
+        """Set other limits (n,) in a row, in Pa, within those that it was made for."""
         row[self._radii.stop : self._radii.stop + 2 * len(lower)] = np.concatenate([lower, upper])
 
     def next_to(self, row: Vector, guess: Vector, lower: Vector, upper: Vector) -> Vector:
-        """The row of a task that asks for the answer next to a guess (n,), within limits (n,)."""
+        """Return a row that requests the answer next to a guess (n,), within limits (n,)."""
         row = row.copy()
         row[self._asked] = _GUESS_ALONE
         row[self.guess] = guess
@@ -257,14 +258,14 @@ class FastSolver:
         return row
 
     def judging(self, row: Vector, pressures: Vector) -> Vector:
-        """The row of a task that asks for the judgement of pressures (n,)."""
+        """Return a row that requests the judgement of pressures (n,)."""
         row = row.copy()
         row[self._asked] = _JUDGE
         row[self.guess] = pressures
         return row
 
     def optima(self, rows: Vector, threads: int | None = None) -> tuple[Vector, Vector]:
-        """Answers to rows of `next_to`, not judged: pressures (N, n), and objectives (N,).
+        """Return the answers to rows of `next_to`, not judged: pressures (N, n), objectives (N,).
 
         An objective is infinite where there is no answer.
         """
@@ -274,37 +275,39 @@ class FastSolver:
         return numbers[:, _COUNTS : _COUNTS + n], values
 
     def solve(self, row: Vector) -> CompiledAnswer | None:
-        """Answer to one task; None if the general method is needed.
+        """Return the answer to one task; None if the general method is needed.
 
-        Of a stiffness that is demanded and was not found, the nearest to it: judge the answer.
+        If no answer meets a demanded stiffness, this is the one nearest to it: judge the answer.
         """
         return self.answer(self._run_one(row))
 
     def closest(self, row: Vector, start: Vector | None = None) -> CompiledAnswer | None:
-        """Configuration closest to a target out of reach; None if the general method is needed.
+        """Return the configuration closest to an unreachable target.
 
-        It is sought from samples and, first of all, from a start (n,) in Pa, if there is one.
+        The search starts from samples and first from a start (n,) in Pa, if given.  None if the
+        general method is needed.
         """
         if start is None:
             return self.answer(self._run_one(row, _CLOSEST))
         row[self.guess] = start
         return self.answer(self._run_one(row, _CLOSEST_FROM))
 
-    def comes(self, row: Vector) -> bool:
-        """Whether one of the configurations nearest to the target is brought to it."""
-        return bool(self._run_one(row, _COME)[0] == _CAME)
+    def can_reach(self, row: Vector) -> bool:
+        """Return whether a configuration nearest to the target is brought to it."""
+        return bool(self._run_one(row, _REACH_ONLY)[0] == _REACHED)
 
     def block(self, row: Vector) -> Vector:
-        """A row that asks for the answer next to its guess, and behind it room for the numbers."""
+        """Return a row that requests the answer next to its guess, followed by memory for it."""
         block = np.concatenate([row, np.zeros(self._answer_width)])
         block[self._asked] = _GUESS_ALONE
         return block
 
     def call(self, block: Vector) -> tuple[Callable[[], int], ctypes.Structure]:
-        """What fills in the numbers of a block, which stays where it is, and says what came of it.
+        """Return a function that solves a block in place, and the structure that it works on.
 
-        They are not judged.  A single argument, as each takes longer to convert than to use; its
-        field `stop` may be set to the address of a `StopFlag`.
+        The function returns the outcome; the answer is not judged.  The block must not move.  The
+        function takes a single structure, as converting arguments costs more than using them.  The
+        structure's field `stop` may be set to the address of a `StopFlag`.
         """
         row = block.ctypes.data
         task = _OneTask(self._address, row, row + block.itemsize * self._width, None)
@@ -313,7 +316,7 @@ class FastSolver:
         return partial(solve_one, ctypes.addressof(task)), task
 
     def judged(self, block: Vector) -> CompiledAnswer | None:
-        """The answer in a block, judged by the model."""
+        """Return the answer in a block, judged by the model."""
         row, numbers = block[: self._width].copy(), block[self._width :]
         row[self.guess] = self.pressures(block)
         judged = self._run_one(row, _JUDGE)
@@ -321,13 +324,13 @@ class FastSolver:
         return self.answer(judged)
 
     def pressures(self, block: Vector) -> Vector:
-        """Pressures (n,) of the answer in a block, in Pa."""
+        """Return the pressures (n,) of the answer in a block, in Pa."""
         return block[self._pressures]
 
     def point(self, parameters: Vector, radii: Vector, pressures: Vector) -> list[Vector] | None:
-        """Parts of a point of a loaded arm's program, from rest; None for no equilibrium.
+        """Evaluate a loaded arm's program from rest; None without an equilibrium.
 
-        Pressures are (n,) in Pa.  The parts are residuals (m,), those of obstacles zero, their
+        Pressures are (n,) in Pa.  Returns residuals (m,), with those of obstacles zero, their
         Jacobian (m, n) per share of a range, terms (t,), their gradients (t, n), floors (f,) and
         theirs (f, n).
         """
@@ -351,11 +354,11 @@ class FastSolver:
         return numbers
 
     def solve_all(self, rows: Vector, threads: int | None = None) -> list[CompiledAnswer | None]:
-        """Answers to many tasks, a row each, on all cores unless `threads` says otherwise."""
+        """Answer many tasks, one row each, on `threads` threads (default: all cores)."""
         return [self.answer(each) for each in self._numbers_of(np.ascontiguousarray(rows), threads)]
 
     def _numbers_of(self, rows: Vector, threads: int | None) -> Vector:
-        """Numbers (N, w) of the answers to rows."""
+        """Return the numbers (N, w) of the answers to rows."""
         chunk = 1 if self._setup.state else KEPT.chunk  # Ctrl-C waits for a chunk
         numbers = np.empty((len(rows), self._answer_width))
 
@@ -376,7 +379,7 @@ class FastSolver:
             raise MemoryError("no memory is left for the compiled solver")
 
     def answer(self, numbers: Vector) -> CompiledAnswer | None:
-        """Answer from the numbers of a call, which become its own; None if there is none."""
+        """Return the answer from the numbers of a call, which it keeps; None if there is none."""
         if numbers[0] not in (ANSWERED, _GLOBAL, _JUDGED, _NEAREST, _TOO_SOFT):
             return None
         slope, residuals, pose, compliance, values = self._parts

@@ -1,4 +1,4 @@
-"""The functions of a task's structure on one arm: machine code where there is some, else the VM."""
+"""The functions of a task's structure on one arm: machine code, or the CasADi VM without it."""
 
 from collections.abc import Hashable
 from dataclasses import replace
@@ -22,9 +22,9 @@ _NATIVE = Path(__file__).with_name("native")
 
 
 class Functions:
-    """Those of `Program`, of the inputs of the tip's shape and `Arm.parameters` of the program's.
+    """The functions of `Program`, of the tip's inputs and of `Arm.parameters` of the program's.
 
-    Each is made when it is first asked for: in machine code or, without, in the CasADi VM.
+    Each is made at its first use: in machine code or, without a compiler, in the CasADi VM.
     """
 
     def __init__(self, robot: Manipulator, program: Program) -> None:
@@ -35,32 +35,32 @@ class Functions:
 
     @property
     def library(self) -> Library | None:
-        """Machine code with the compiled solver; None where the general method has to serve.
+        """Machine code with the compiled solver; None if the general method must be used.
 
-        The integrator in C, for arms under gravity or loads, knows of the tip alone.
+        With gravity or loads, the integrator in C supports terms of the tip only.
         """
         robot, program = self._robot, self._program
         if self._library is not None:
             return self._library
-        among = program.obstacles is not None
-        if among and scene_library() is None:
+        with_body = program.obstacles is not None
+        if with_body and scene_library() is None:
             return None
-        make, source = _free_functions, "scene_solver.c" if among else "solver.c"
+        make, source = _free_functions, "scene_solver.c" if with_body else "solver.c"
         if robot.is_loaded:
             if program.has_stations or rod_functions(robot.layout) is None:
                 return None
             make, source = _loaded_functions, f"loaded_{source}"
         elif len(program.measures) > KEPT.most_measures:
             return None
-        plain = replace(program, obstacles=None)  # scenes are data
+        plain = replace(program, obstacles=None)  # a scene is data, not code
         self._library = library(
             (robot.layout.skeleton, program.structure, source),
-            partial(make, robot.layout, plain, among), (str(_NATIVE / source),), daqp=True,
+            partial(make, robot.layout, plain, with_body), (str(_NATIVE / source),), daqp=True,
         )  # fmt: skip
         return self._library
 
     def __getitem__(self, name: str) -> BatchFunction:
-        """``pose``, ``point`` or ``judge``, as `Program` has them."""
+        """Return ``pose``, ``point`` or ``judge`` of `Program`."""
         if name not in self._made:
             compiled = None if self._robot.is_loaded else self.library
             self._made[name] = compiled.function(name) if compiled else self._interpreted(name)
@@ -68,11 +68,11 @@ class Functions:
 
     @cached_property
     def worth(self) -> BatchFunction | None:
-        """See `Program.worth`; None where `point` takes hardly longer than a call."""
+        """See `Program.worth`; None where `point` is hardly slower."""
         return None if self._robot.is_loaded or self.library else self._interpreted("worth")
 
     def _interpreted(self, name: str) -> InterpretedFunction:
-        """One of the functions in the CasADi VM; free arms of one layout share it."""
+        """Return a function in the CasADi VM; free arms of one layout share it."""
         robot, program = self._robot, self._program
         if robot.is_loaded:
             outputs = getattr(program, name)
@@ -92,20 +92,20 @@ def _free_function(layout: Layout, program: Program, name: str) -> ca.Function:
     return free_tip_function(layout, name, getattr(program, name), program.n_parameters)
 
 
-def _free_functions(layout: Layout, program: Program, among: bool) -> list[ca.Function]:
-    """Functions of a free arm; `among`: those of its body too."""
+def _free_functions(layout: Layout, program: Program, with_body: bool) -> list[ca.Function]:
+    """Return the functions of a free arm's tip, and of its body for a scene."""
     own = [_free_function(layout, program, name) for name in ("pose", "point", "judge")]
-    return [*own, *free_moving_functions(layout)] if among else own
+    return [*own, *free_moving_functions(layout)] if with_body else own
 
 
-def _loaded_functions(layout: Layout, program: Program, among: bool) -> list[ca.Function]:
+def _loaded_functions(layout: Layout, program: Program, with_body: bool) -> list[ca.Function]:
     equations = rod_functions(layout)
     assert equations is not None  # see `Functions.library`
     own = [*equations.functions, *tip_functions(program, layout)]
-    return [*own, *loaded_body_functions(layout)] if among else own
+    return [*own, *loaded_body_functions(layout)] if with_body else own
 
 
 def functions(robot: Manipulator, program: Program) -> Functions:
-    """Functions of the program's structure; made once and kept by the robot."""
+    """Return the functions of the program's structure; the robot caches them."""
     key = ("functions", robot.is_loaded, program.structure, program.obstacles is not None)
     return robot.kept(key, lambda: Functions(robot, program))

@@ -1,4 +1,7 @@
-"""The general method, without machine code: global search by Python, also for all it cannot do."""
+"""Global search in Python: the general method, for tasks without machine code.
+
+It also takes the tasks that the compiled search does not support or cannot solve.
+"""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,12 +24,12 @@ _ONE = Effort(1, 1, 1)
 
 
 class GeneralSearch:
-    """Solves any task, more slowly than `CompiledSearch`.
+    """Solve any task, more slowly than `CompiledSearch`.
 
     Parameters
     ----------
     answers :
-        Of the solver.
+        The solver's factory of solutions.
     """
 
     def __init__(self, answers: Answers) -> None:
@@ -34,7 +37,7 @@ class GeneralSearch:
         self._robot = answers.robot
 
     def solve(self, task: Task, guess: Vector | None) -> PressureSolution:
-        """Answer, next to a guess (n,) in Pa if there is one there."""
+        """Solve a task; prefer the local optimum next to a guess, (n,) in Pa."""
         try:
             return self._solve(PressureProblem(self._robot, task), guess)
         except EquilibriumError as error:
@@ -71,7 +74,7 @@ class GeneralSearch:
     def _judged(
         self, problem: PressureProblem, result: LocalResult, confidence: Confidence
     ) -> PressureSolution | None:
-        """Solution of an arm without loads, if it holds; it is explained when that is asked for."""
+        """Return the solution of an arm without loads if it holds; it is explained lazily."""
         if self._robot.is_loaded:
             return None
         p = np.clip(result.point.x * problem.unit, self._prepared.lower, self._prepared.upper)
@@ -79,7 +82,7 @@ class GeneralSearch:
         return self._answers.if_it_holds(problem.task, problem.program, answer)
 
     def _first_that_holds(self, problem: PressureProblem, found: Search) -> PressureSolution:
-        """Best local optimum that the model confirms from rest."""
+        """Return the best local optimum that the model confirms when it is approached from rest."""
         best: PressureSolution | None = None
         for result in found.results[: ANSWER.tried]:
             try:
@@ -97,7 +100,7 @@ class GeneralSearch:
         return best
 
     def _closest(self, problem: PressureProblem, found: Search) -> PressureSolution:
-        """Closest configuration to a pose that no start came to."""
+        """Return the configuration closest to a pose that no start reached."""
         near = sorted(found.nearest, key=_beyond)
         table = self._prepared.samples
         order = table.nearest_first(
@@ -117,7 +120,7 @@ class GeneralSearch:
             clearest = table.pressures[: CLOSEST.samples]
             clearest = clearest[np.argmax(self._robot.clearance(clearest, scene))]
             results = [diagnosis.unimproved(problem, clearest / problem.unit)]
-        if self._robot.is_loaded:  # what is found need not be what is reached from rest
+        if self._robot.is_loaded:  # an equilibrium that was found may not be reached from rest
             as_they_are = (diagnosis.unimproved(problem, x) for x in candidates[: ANSWER.tried])
             results = [*results[: ANSWER.tried], *as_they_are]
         judged = []
@@ -125,13 +128,13 @@ class GeneralSearch:
             try:
                 judged.append(self._answers.of(problem, result, found.confidence))
             except EquilibriumError:
-                continue  # not reached from rest
+                continue
         if not judged:
             raise EquilibriumError("no stable equilibrium was found near the target")
         return min(judged, key=_distance)
 
     def _without_floors(self, problem: PressureProblem, found: Search) -> PressureSolution:
-        """Best that can be had where a stiffness that is demanded was not found."""
+        """Return the closest answer where no search result meets the demanded stiffnesses."""
         nearest = problem.changed(problem.best_floors(), floors=False)
         candidates = (result.point.x for result in found.results)
         best = search(nearest, candidates)
@@ -143,19 +146,19 @@ class GeneralSearch:
 
 
 def _reaches(problem: PressureProblem, result: LocalResult) -> bool:
-    """Whether a result of another program lies within the tolerances of this one."""
+    """Return whether a result of another program meets the tolerances of this one."""
     pairs = zip(result.point.errors, problem.constraints, strict=True)
     return all(error <= constraint.radius for error, constraint in pairs)
 
 
 def _beyond(point: ProgramPoint) -> float:
-    """Sum by which constraints are missed, each over its scale."""
+    """Return the sum of constraint violations, each divided by its scale."""
     pairs = zip(point.errors, point.constraints, strict=True)
     return sum(max(0.0, error - c.radius * c.one_sided) / c.scale for error, c in pairs)
 
 
 def _distance(solution: PressureSolution) -> list[float]:
-    """Rank of a closest configuration: how far each term is missed, the position last."""
+    """Rank a closest configuration: the violation of each term, the position last."""
     terms = sorted(solution.task.target.terms, key=lambda t: (not t.is_inequality, -t.order))
     rank = []
     for term in terms:

@@ -1,6 +1,6 @@
-"""`StiffnessGoal`, the part ``stiffness`` of a task file: what the tip's stiffness should be.
+"""`StiffnessGoal`, the key ``stiffness`` of a task file: what the tip's stiffness should be.
 
-It is made of the measures in `stiffopt.optimise.measures`.
+It combines the measures in `stiffopt.optimise.measures`.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ MIXED = "mixes translation (N/m) and rotation (N*m/rad), whose smallest has no m
 
 
 def _as_items(value: Any, info: ValidationInfo) -> Any:
-    """Let one mapping stand for a list of one; refuse an empty list in a file."""
+    """Convert one mapping to a list of one; reject an empty list in a file."""
     if isinstance(value, Mapping | Measure):
         return (value,)
     if read_from_file(info) and not value:
@@ -36,7 +36,7 @@ def _as_items(value: Any, info: ValidationInfo) -> Any:
 
 
 def _either(role: Role) -> Any:
-    """Type of any of the measures that may stand in one place."""
+    """Return the type of the measures that may have this role."""
     kinds = measures_of(role)
     if len(kinds) == 1:
         return kinds[0]
@@ -62,7 +62,7 @@ OneOrMore = Annotated[
     BeforeValidator(_as_items),
     JsonSchemaOfFile(lambda listed: {"anyOf": [listed["items"], listed]}),
 ]
-"""A list; in a file one mapping stands for a list of one."""
+"""A list; a file may have one mapping instead of a list of one."""
 
 
 class StiffnessGoal(Schema):
@@ -70,9 +70,9 @@ class StiffnessGoal(Schema):
 
     Attributes
     ----------
-    maximise : the smallest of these is maximised.
-    at_least : none of these may be less than its value.
-    match : stiffness to have, instead of one to maximise.
+    maximise : measures; the smallest of these stiffnesses is maximised.
+    at_least : measures with a lower bound each.
+    match : a stiffness to attain, instead of maximising one.
     """
 
     maximise: OneOrMore[_Maximised] = ()
@@ -89,7 +89,7 @@ class StiffnessGoal(Schema):
 
     @property
     def first(self) -> tuple[Measure, ...]:
-        """What is maximised or matched."""
+        """The maximised measures, or the matched one."""
         return (*self.maximise, *(() if self.match is None else (self.match,)))
 
     @model_validator(mode="after")

@@ -1,10 +1,10 @@
-"""The nonlinear program of a task whose arm leans on objects: `PressureProblem` in contact.
+"""`BracedProblem`: the nonlinear program of a task whose arm leans on objects.
 
-What a task asks for is evaluated at the equilibrium in contact. After the rows of the terms, and
-those of the objects that the body keeps clear of, there are for each object that it may lean on:
-the largest contact force, ``|f| <= max_force``, and for each direction that is maximised and both
-signs the normal force that is left under a push of the margin, ``f(push) >= 0``; with sticking
-contacts also the push by which one slips. Derivatives are differences of equilibria with the same
+All quantities are evaluated at the equilibrium in contact. The rows of the terms, and of the
+objects that the body keeps clear of, are followed by these rows for each object that it may lean
+on: the largest contact force, ``|f| <= max_force``; and, for both signs of each direction that is
+maximised, the normal force that remains under a push of the margin, ``f(push) >= 0``, with sticking
+contacts also the push at which one slips. Derivatives are differences of equilibria with the same
 contacts.
 """
 
@@ -40,13 +40,13 @@ from stiffopt.optimise.task import Task
 Vector = NDArray[np.float64]
 
 FORCE_ON, MARGIN_ON = "force on ", "margin on "
-"""Begin the names of constraints of contacts."""
+"""Prefixes of the names of constraints of contacts."""
 _GRIPS: tuple[Grip, ...] = ("sliding", "sticking")
 
 
 @dataclass(frozen=True)
 class PlacedTip:
-    """A tip, as `stiffopt.model.shape.Shape` has it, whose pose and compliance are symbols."""
+    """A tip whose pose and compliance are symbols; implements `stiffopt.model.shape.Shape`."""
 
     pressures: ca.SX
     position: ca.SX
@@ -56,7 +56,7 @@ class PlacedTip:
 
     @classmethod
     def of(cls, n: int) -> PlacedTip:
-        """For n pressures."""
+        """Return a tip for n pressures."""
         p, C = ca.SX.sym("p", n), ca.SX.sym("C", 6, 6)
         return cls(p, ca.SX.sym("position", 3), ca.SX.sym("rotation", 3, 3), C, {})
 
@@ -66,11 +66,11 @@ class PlacedTip:
         return ca.vertcat(ca.horzcat(self.rotation, self.position), ca.DM([[0.0, 0.0, 0.0, 1.0]]))
 
     def flexibility(self, wrench: ca.SX) -> ca.SX:
-        """``w' C w`` of a wrench (6,), in tip axes."""
+        """Return ``w' C w`` of a wrench (6,), in tip axes."""
         return ca.bilin(self.compliance, wrench, wrench)
 
     def station(self, at: float) -> PointOfArm:
-        """Another point of the arm, a further input."""
+        """Return another point of the arm, a further input."""
         if at not in self.stations:
             name = f"at{len(self.stations)}"
             self.stations[at] = PointOfArm(ca.SX.sym(name, 3), ca.SX.sym(f"{name}r", 3, 3))
@@ -78,7 +78,7 @@ class PlacedTip:
 
 
 class PlacedProgram:
-    """Residuals and measures of a program, of an arm whose poses and compliance are known."""
+    """Residuals and measures of a program, for an arm with given poses and compliance."""
 
     def __init__(self, program: Program, n: int) -> None:
         tip, parameters = PlacedTip.of(n), ca.SX.sym("parameters", program.n_parameters)
@@ -92,7 +92,7 @@ class PlacedProgram:
         self._parameters = program.parameters
 
     def __call__(self, eq: ContactEquilibrium, C: Vector) -> tuple[Vector, Vector]:
-        """Residuals (m,) of the terms and values (k,) of the measures; C (6, 6) in tip axes."""
+        """Return residuals (m,) of the terms and measures (k,); C is (6, 6), in tip axes."""
         tip = eq.tip_pose
         poses = eq.poses(self.at) if len(self.at) else ()
         places = [part for T in poses for part in (T[:3, 3], T[:3, :3])]
@@ -100,8 +100,8 @@ class PlacedProgram:
         return found[0][:, 0], found[1][:, 0]
 
 
-class Seen(NamedTuple):
-    """What the program's rows and values are made of, at one equilibrium."""
+class Quantities(NamedTuple):
+    """Quantities at one equilibrium from which the program's rows and values are computed."""
 
     residuals: Vector
     values: Vector
@@ -119,8 +119,8 @@ class BracedProblem(PressureProblem):
     brace : Brace
     scene : the objects that the arm may lean on.
     here : equilibrium from which the next one is sought, or None: from rest.
-    only_target : whether what contacts have to hold does not matter.
-    missed : points at the target where contacts do not hold what they have to.
+    only_target : whether the demands on contacts are ignored.
+    missed : points at the target at which contacts do not meet their demands.
     """
 
     def __init__(self, robot: Manipulator, task: Task) -> None:
@@ -142,7 +142,7 @@ class BracedProblem(PressureProblem):
         self._kept: tuple[bytes, ContactEquilibrium] | None = None
 
     def _all_constraints(self) -> tuple[Constraint, ...]:
-        inside = 1 - BRACE.spare  # from rest, other steps of the integration may be taken
+        inside = 1 - BRACE.spare  # from rest, the integration may take other steps
         own = [c._replace(radius=inside * c.radius) for c in super()._all_constraints()]
         for row, name in enumerate(self._row_names, start=own[-1].end if own else 0):
             own.append(Constraint(name, row, row + 1, BRACE.force, BRACE.scale, one_sided=True))
@@ -150,7 +150,7 @@ class BracedProblem(PressureProblem):
 
     @property
     def _row_names(self) -> Iterator[str]:
-        """A row for the force on each object, and one for each push of each object."""
+        """Names of the rows: for each object, one for its force and one for each push."""
         per_object = len(self.directions) * (2 if self.brace.contacts == "sliding" else 4)
         for item in self.scene.objects:
             yield f"{FORCE_ON}{item.name}"
@@ -161,7 +161,7 @@ class BracedProblem(PressureProblem):
 
     @property
     def directions(self) -> list[StiffnessMeasure]:
-        """What is maximised."""
+        """The measures that are maximised."""
         goal = self.task.stiffness
         assert goal is not None
         return list(goal.maximise)
@@ -169,11 +169,17 @@ class BracedProblem(PressureProblem):
     # -- evaluation -------------------------------------------------------------------------
 
     def restart(self) -> None:
-        """Begin the next equilibrium from rest."""
+        """Find the next equilibrium from rest."""
         self.here = self._kept = None
 
     def equilibrium(self, x: Vector) -> ContactEquilibrium:
-        """The equilibrium at pressures x, from `here`; an error if it has no contact."""
+        """Return the equilibrium at pressures x, found from `here`.
+
+        Raises
+        ------
+        EquilibriumError
+            If there is none, or none with contact.
+        """
         if self._kept is not None and self._kept[0] == x.tobytes():
             return self._kept[1]
         eq = self.robot.contact_equilibrium(
@@ -202,13 +208,15 @@ class BracedProblem(PressureProblem):
         pushes = [] if self.only_target else list(self.pushes(eq))
         near = self._nearest(eq, quickly=True)
         base = self._seen(eq, pushes, near, full)
-        beside = []
+        differences = []
         for k, inwards in enumerate(x > (self.lower + self.upper) / 2):
             step = (-1.0 if inwards else 1.0) * BRACE.step
             change = step * self.unit[k] * np.eye(len(x))[k]
             seen = self._seen(eq.shifted(change), pushes, near, full)
-            beside.append([(b - a) / step for a, b in zip(base, seen, strict=True)])
-        slopes = Seen(*(np.stack(columns, axis=-1) for columns in zip(*beside, strict=True)))
+            differences.append([(b - a) / step for a, b in zip(base, seen, strict=True)])
+        slopes = Quantities(
+            *(np.stack(columns, axis=-1) for columns in zip(*differences, strict=True))
+        )
         residual = np.concatenate([base.residuals, self._rows(eq, base, near)])
         jacobian = np.vstack([slopes.residuals, self._slopes(eq, base, slopes)])
         first = len(self.program.measures) - self.program.n_floors
@@ -220,7 +228,7 @@ class BracedProblem(PressureProblem):
         )  # fmt: skip
 
     def pushes(self, eq: ContactEquilibrium) -> Iterator[Vector]:
-        """Unit vectors (3,) of pushes at the tip, both ways along each direction, in base axes."""
+        """Yield unit vectors (3,) of pushes at the tip, both ways per direction, in base axes."""
         R = eq.tip_pose[:3, :3]
         for measure, sign in product(self.directions, (1.0, -1.0)):
             d = np.array(measure.direction)
@@ -232,7 +240,7 @@ class BracedProblem(PressureProblem):
         pushes: list[Vector],
         near: list[Nearest],
         full: bool,
-    ) -> Seen:
+    ) -> Quantities:
         C = eq.compliance(self.brace.contacts) if full else np.eye(6)
         residuals, values = self.judged_by(eq, C)
         margin = (1 + BRACE.spare) * self.brace.margin
@@ -246,14 +254,14 @@ class BracedProblem(PressureProblem):
             [each.normal @ x - each.radius_share * r
              for each, x, r in zip(near, points, radii, strict=True)]
         )  # fmt: skip
-        return Seen(residuals, values, distances, eq.normal_forces, pushed, slips)
+        return Quantities(residuals, values, distances, eq.normal_forces, pushed, slips)
 
     def _slip(self, eq: ContactEquilibrium, push: Vector) -> float:
-        """Push, of up to twice the margin, by which a sticking contact is lost."""
-        most = 2 * self.brace.margin
-        return min(most, eq.lift_off(push, most, "sticking").force)
+        """Return the push at which a sticking contact is lost, at most twice the margin."""
+        largest = 2 * self.brace.margin
+        return min(largest, eq.lift_off(push, largest, "sticking").force)
 
-    def _rows(self, eq: ContactEquilibrium, seen: Seen, near: list[Nearest]) -> Vector:
+    def _rows(self, eq: ContactEquilibrium, seen: Quantities, near: list[Nearest]) -> Vector:
         rows = self.obstacle_rows(near)
         if self.only_target:
             return np.array([*rows, *(0.0 for _ in self._row_names)])
@@ -262,23 +270,23 @@ class BracedProblem(PressureProblem):
             if not own:
                 rows += [0.0] * (1 + len(seen.pushed) + len(seen.slips))
                 continue
-            most = _most_force(item)
-            force = float(seen.forces[own].max()) - (1 - BRACE.spare) * (most or np.inf)
-            rows.append(BRACE.force + force if most else 0.0)
+            limit = _max_force(item)
+            force = float(seen.forces[own].max()) - (1 - BRACE.spare) * (limit or np.inf)
+            rows.append(BRACE.force + force if limit else 0.0)
             rows += (BRACE.force - seen.pushed[:, own].min(axis=1)).tolist()
             margin = (1 + BRACE.spare) * self.brace.margin
             rows += (BRACE.force + margin - seen.slips).tolist()
         return np.array(rows)
 
     def obstacle_rows(self, near: list[Nearest]) -> list[float]:
-        """Rows for the objects that the body keeps clear of; see `Obstacles`."""
+        """Return rows for the objects that the body keeps clear of; see `Obstacles`."""
         if self.program.obstacles is None:
             return []
         asked = self.program.obstacles.scene.clearance
         return [OBSTACLES.margin - (each.distance - asked) for each in near]
 
-    def _slopes(self, eq: ContactEquilibrium, base: Seen, slopes: Seen) -> Vector:
-        """Derivatives (rows, n) of `_rows`; of several contacts on an object those of the worst."""
+    def _slopes(self, eq: ContactEquilibrium, base: Quantities, slopes: Quantities) -> Vector:
+        """Return derivatives (rows, n) of `_rows`; of several contacts on an object, the worst."""
         rows = list(-slopes.distances)
         none = np.zeros(len(self.unit))
         if self.only_target:
@@ -289,7 +297,7 @@ class BracedProblem(PressureProblem):
                 rows += [none] * (1 + len(base.pushed) + len(base.slips))
                 continue
             first = own[int(base.forces[own].argmax())]
-            rows.append(slopes.forces[first] if _most_force(item) else none)
+            rows.append(slopes.forces[first] if _max_force(item) else none)
             for at_push, slope in zip(base.pushed, slopes.pushed, strict=True):
                 rows.append(-slope[own[int(at_push[own].argmin())]])
             rows += list(-slopes.slips)
@@ -297,11 +305,11 @@ class BracedProblem(PressureProblem):
 
     @staticmethod
     def _of(eq: ContactEquilibrium, name: str) -> list[int]:
-        """Which contacts are on an object."""
+        """Return the indices of the contacts on an object."""
         return [j for j, each in enumerate(eq.contacts) if each.object == name]
 
     def _nearest(self, eq: ContactEquilibrium, *, quickly: bool) -> list[Nearest]:
-        """Where the body is nearest to the objects that it keeps clear of, a row each."""
+        """Return the body's nearest point to each object that it keeps clear of, by rows."""
         obstacles = self.program.obstacles
         if obstacles is None:
             return []
@@ -310,7 +318,7 @@ class BracedProblem(PressureProblem):
     # -- judgement --------------------------------------------------------------------------
 
     def judgement(self, eq: ContactEquilibrium) -> Judgement:
-        """What of the task holds at an equilibrium."""
+        """Judge an equilibrium by the task."""
         C = eq.compliance(self.brace.contacts)
         residuals, values = self.judged_by(eq, C)
         rows = [*residuals.tolist(), *self.obstacle_rows(self._nearest(eq, quickly=False))]
@@ -319,7 +327,7 @@ class BracedProblem(PressureProblem):
         return found._replace(shortfalls=(*found.shortfalls, *self.refusals(eq)))
 
     def refusals(self, eq: ContactEquilibrium) -> Iterator[str]:
-        """Why an equilibrium does not do as a brace."""
+        """Yield the reasons why an equilibrium is not acceptable."""
         unit = display_units().force
         for each in eq.contacts:
             force = float(np.linalg.norm(each.force))
@@ -340,9 +348,9 @@ class BracedProblem(PressureProblem):
             )
 
     def preloads(self, eq: ContactEquilibrium) -> Iterator[Preload]:
-        """What the first contact is lost by, both ways along each direction.
+        """Yield the push by which the first contact is lost, both ways along each direction.
 
-        Of contacts that slide and, where there is friction, of those that stick.
+        For contacts that slide and, where there is friction, for contacts that stick.
         """
         has_friction = any(item.contact and item.contact.friction for item in self.scene.objects)
         for d in self.pushes(eq):
@@ -350,7 +358,7 @@ class BracedProblem(PressureProblem):
                 yield Preload(d, grip, eq.lift_off(d, BRACE.largest_push, grip))
 
 
-def _most_force(item: SceneObject) -> float | None:
+def _max_force(item: SceneObject) -> float | None:
     return None if item.contact is None else item.contact.max_force
 
 

@@ -1,10 +1,10 @@
-"""Least distances of a body from the objects of a scene, followed one by one as pressures change.
+"""Local minima of a body's distance from objects, tracked one by one as pressures change.
 
-Searches take the nearest point of each object.  Derivatives of an answer need functions that are
-smooth in the pressures: each local minimum along the body is a condition of its own,
-``d(p) = min d(x(s, p)) - r(p)`` for s about where it was.  Its gradient is that with s held (the
-envelope theorem).  Where the distance has a kink along the body, between cubes of a mesh's grid or
-the straight pieces of a tube, it is that of the mean of both sides that does not change along it.
+Searches use the nearest point of each object.  Derivatives of an answer need functions that are
+smooth in the pressures, so each local minimum along the body is its own constraint: ``d(p) = min
+d(x(s, p)) - r(p)`` for s near its former value.  Its gradient is that at fixed s (the envelope
+theorem).  Where the distance has a kink along the body, between cubes of a mesh's grid or straight
+pieces of a tube, the gradient is the mean of both sides whose slope along the body is zero.
 """
 
 from collections.abc import Iterator
@@ -25,10 +25,10 @@ from stiffopt.optimise.settings import OBSTACLES
 
 Vector = NDArray[np.float64]
 
-_SPACING = 1 / 200  # of stations among which minima are seen, as a share of the arm's length
-_AROUND = 1e-3  # m of arc length, within which a minimum is looked for first
-_STATIONS = 33  # of each look
-_EXACT = 1e-13  # m of arc length
+_SPACING = 1 / 200  # of stations for finding minima, as a share of the arm's length
+_AROUND = 1e-3  # half width of the first interval searched for a minimum, m of arc length
+_STATIONS = 33  # in each interval
+_EXACT = 1e-13  # precision of a minimum, m of arc length
 
 
 class LeastDistance(NamedTuple):
@@ -36,9 +36,9 @@ class LeastDistance(NamedTuple):
 
     Attributes
     ----------
-    which : number of the object.
+    which : index of the object.
     s : arc length at rest, in m.
-    low, high : ends of the range of the body that it is in.
+    low, high : ends of the range of the body that contains it.
     """
 
     which: int
@@ -49,14 +49,14 @@ class LeastDistance(NamedTuple):
 
 @dataclass(frozen=True)
 class FollowedObstacles(Obstacles):
-    """The objects around one arm, by the least distances that are less than a margin too large.
+    """The objects around one arm, with one row for each local minimum near the clearance.
 
     Attributes
     ----------
     pressures : ndarray (n,)
-        At which these were found, in Pa.
+        Pressures at which the minima were found, in Pa.
     least : tuple of LeastDistance
-        One for each row.
+        The minimum of each row.
     """
 
     arm: Manipulator = field(repr=False, compare=False)
@@ -75,8 +75,8 @@ class FollowedObstacles(Obstacles):
         positions, _, radii = ArmBody(self.arm, self.pressures)(s)
         for index, item in enumerate(self.measured.items):
             values = item.distances(positions).values - radii
-            beside = np.concatenate([[np.inf], values, [np.inf]])
-            least = (values <= beside[:-2]) & (values < beside[2:])
+            padded = np.concatenate([[np.inf], values, [np.inf]])
+            least = (values <= padded[:-2]) & (values < padded[2:])
             least &= values < self.scene.clearance + OBSTACLES.margin
             for i in np.flatnonzero(least).tolist():
                 yield LeastDistance(index, float(s[i]), *ends[i].tolist())
@@ -93,8 +93,8 @@ class FollowedObstacles(Obstacles):
         return rows, -gradients(arm, p, found)
 
 
-class _Look:
-    """Stations of a body with their distances, and how these change along it."""
+class _Profile:
+    """Stations of a body with their distances, and the slopes of these along it."""
 
     def __init__(self, body: ArmBody, item: MeasuredObject, at: Vector) -> None:
         self.at = at
@@ -103,13 +103,13 @@ class _Look:
         self.values, self.normals = seen.values - radii, seen.normals
         self.slopes = np.einsum("ij,ij->i", self.normals, tangents)
 
-    def valley(self, s: float) -> int | None:
-        """After which station the distance no longer falls, next to s; None if nowhere."""
+    def minimum(self, s: float) -> int | None:
+        """Return the station before the minimum that is nearest to s; None without one."""
         turns = np.flatnonzero((self.slopes[:-1] < 0) & (self.slopes[1:] >= 0))
         return int(turns[np.abs(self.at[turns] - s).argmin()]) if len(turns) else None
 
     def end(self, least: LeastDistance) -> int | None:
-        """Which end of the range the distance falls to, as far as is seen here."""
+        """Return the end of the range towards which the distance falls; None if not included."""
         ends = (0, len(self.at) - 1)
         falls_to = (
             self.at[0] == least.low and self.slopes[0] >= 0,
@@ -119,7 +119,7 @@ class _Look:
         return min(found, key=lambda i: abs(float(self.at[i]) - least.s), default=None)
 
     def nearest(self, i: int, share: float = 0.0) -> Nearest:
-        """At a station, or at a share of the way to the next."""
+        """Return the nearest point at a station, or at a share of the way to the next."""
         parts = (self.values, self.at, self.positions, self.normals)
         value, s, position, normal = (
             of[i] + share * (of[i + 1] - of[i]) if share else of[i] for of in parts
@@ -128,21 +128,21 @@ class _Look:
 
 
 def _followed(body: ArmBody, item: MeasuredObject, least: LeastDistance) -> Nearest:
-    """A local minimum at the pressures of a body."""
+    """Return a local minimum at the pressures of a body, searching from its former place."""
     around = _AROUND
     while True:
         low, high = max(least.low, least.s - around), min(least.high, least.s + around)
-        look = _Look(body, item, np.linspace(low, high, _STATIONS))
-        i = look.valley(least.s)
-        end = look.end(least)
+        profile = _Profile(body, item, np.linspace(low, high, _STATIONS))
+        i = profile.minimum(least.s)
+        end = profile.end(least)
         if i is not None:
             break
         if end is not None:
-            return look.nearest(end)
+            return profile.nearest(end)
         if low == least.low and high == least.high:
             raise DerivativeError("the place of the arm that is nearest to an object is not clear")
         around *= 4
-    while look.at[i + 1] - look.at[i] > _EXACT:
-        look = _Look(body, item, np.linspace(look.at[i], look.at[i + 1], _STATIONS))
-        i = look.valley(least.s) or 0
-    return look.nearest(i, look.slopes[i] / (look.slopes[i] - look.slopes[i + 1]))
+    while profile.at[i + 1] - profile.at[i] > _EXACT:
+        profile = _Profile(body, item, np.linspace(profile.at[i], profile.at[i + 1], _STATIONS))
+        i = profile.minimum(least.s) or 0
+    return profile.nearest(i, profile.slopes[i] / (profile.slopes[i] - profile.slopes[i + 1]))

@@ -1,6 +1,6 @@
-"""Pose terms and measures of an arm under gravity or loads, as functions of its tip.
+"""Terms and measures of an arm under gravity or loads, as functions of its tip.
 
-The compiled solver finds the tip itself by the integrator in C, see `stiffopt.model.loaded_arm`.
+The compiled solver finds the tip by the integrator in C, see `stiffopt.model.loaded_arm`.
 """
 
 from typing import Any
@@ -14,7 +14,7 @@ from stiffopt.optimise.program import Program
 
 
 class Tip:
-    """A tip as symbols of its own: a `Shape` of which all quantities are independent."""
+    """A tip as independent symbols; implements `Shape`."""
 
     def __init__(self, n_pressures: int) -> None:
         self.position = ca.SX.sym("r", 3)
@@ -34,7 +34,7 @@ class Tip:
 
     @property
     def jacobian(self) -> ca.SX:
-        """Not a symbol of its own."""
+        """Not available: the tip's symbols do not depend on the pressures."""
         raise NotImplementedError
 
     @property
@@ -44,20 +44,20 @@ class Tip:
         return X.T @ self.base_compliance @ X
 
     def station(self, at: float) -> PointOfArm:
-        """Not known of the tip alone."""
+        """Not available: only the tip is known."""
         raise NotImplementedError
 
     def flexibility(self, wrench: ca.SX) -> ca.SX:
-        """``w' C w`` of a wrench (6,) in the tip's axes."""
+        """Return ``w' C w`` of a wrench (6,) in the tip's axes."""
         moved = ca.vertcat(self.rotation @ wrench[:3], self.rotation @ wrench[3:])
         return moved.T @ self.base_compliance @ moved
 
     def total_jacobian(self, values: ca.SX) -> ca.SX:
-        """Not known of the tip alone: zeros (k, n)."""
+        """Return zeros (k, n): the tip's symbols do not depend on the pressures."""
         return ca.SX.zeros(values.numel(), self.pressures.numel())
 
     def by_twist(self, values: ca.SX) -> ca.SX:
-        """Derivative (k, 6) of values by a twist of the tip in its own axes, the rest held."""
+        """Return the derivative (k, 6) of values by a twist of the tip in its own axes."""
         by_turn = [
             ca.jtimes(values, ca.vec(self.rotation), ca.vec(self.rotation @ lie.hat(axis)))
             for axis in ca.DM.eye(3).full()
@@ -66,7 +66,7 @@ class Tip:
 
 
 def tip_functions(program: Program, layout: Layout) -> list[ca.Function]:
-    """Functions of a tip (see `Tip`) and of parameters: the arm's numbers, then the program's own.
+    """Return functions of a tip (see `Tip`) and parameters: the arm's, then the program's.
 
     ``residuals``: values (m,) and derivative by a twist (m, 6); ``terms``: terms and floors
     (k,), derivatives by a twist (k, 6), by the compliance (k, 36) and by pressures (k, n);

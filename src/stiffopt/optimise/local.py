@@ -1,13 +1,13 @@
 """Local optimisation that stays on the pose: a feasible-path SQP method.
 
-From a point on the pose (`stiffopt.optimise.reach`) `descend` goes down the objective.  Each
-step solves a convex quadratic program within a trust region and is then pulled back into the
-pose's balls, so that every iterate reaches the target and progress is judged by the objective
-alone: no merit function between pose and stiffness is needed.
+`descend` starts at a point on the pose (`stiffopt.optimise.reach`) and minimises the objective.
+Each step solves a convex quadratic program within a trust region.  It is then pulled back into the
+pose's balls, so that every iterate reaches the target and progress is measured by the objective
+alone; no merit function has to weigh pose against stiffness.
 
-A ball |r| <= rho enters the quadratic program as a box around it whose first axis points where
-the multiplier pulls, together with the curvature mu/rho J'J of the sphere; both are exact to
-second order at the solution.  The rest of the Lagrangian's Hessian is a damped BFGS model.
+In the quadratic program, a ball |r| <= rho becomes a box around it whose first axis points along
+the multiplier, plus the curvature mu/rho J'J of the sphere; both are exact to second order at the
+solution.  The rest of the Lagrangian's Hessian is a damped BFGS estimate.
 
 The folder ``native`` holds the same method in C.
 """
@@ -28,7 +28,7 @@ from stiffopt.optimise.settings import DESCENT
 
 Vector = NDArray[np.float64]
 
-_CURVED = 2.0  # second-order error of a correction, for the squared first order over a scale
+_CURVED = 2.0  # estimated second-order error of a correction e, in units of e^2 / scale
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,15 +38,15 @@ class LocalResult:
     Attributes
     ----------
     problem : PressureProblem
-        What was solved.
+        The program that was solved.
     point : ProgramPoint
     value : float
         Objective there.
     violation : float
-        Sum by which floors are missed, in logarithms of stiffness.
+        Sum of the violations of floors, in logarithms of stiffness.
     converged : bool
     is_optimum : bool
-        False: the point is no more than a candidate, and has no prices.
+        False: the point is only a candidate, without prices.
     """
 
     problem: PressureProblem
@@ -58,18 +58,18 @@ class LocalResult:
 
     @classmethod
     def at(cls, problem: PressureProblem, point: ProgramPoint) -> "LocalResult":
-        """A solution that is known already."""
+        """Return the result for a known solution."""
         value, missed = problem.objective.value(point), violation(problem, point)
         return cls(problem, point, value, missed, converged=True)
 
     @property
     def objective(self) -> Objective:
-        """What was minimised."""
+        """The objective of the program."""
         return self.problem.objective
 
     @cached_property
     def multipliers(self) -> Multipliers | None:
-        """Prices of the constraints; None where they cannot be had."""
+        """Prices of the constraints; None where they cannot be computed."""
         if not self.is_optimum:
             return None
         self.problem.restart()
@@ -77,12 +77,12 @@ class LocalResult:
 
     @property
     def holds_floors(self) -> bool:
-        """Whether no floor is missed by more than the margin that is aimed above it."""
+        """Whether the floors hold; the method aims at `floor_margin` above them."""
         return self.violation < 0.5 * DESCENT.floor_margin
 
 
 def violation(problem: PressureProblem, point: ProgramPoint) -> float:
-    """Sum by which floors are missed, in logarithms of stiffness."""
+    """Return the sum of the violations of floors, in logarithms of stiffness."""
     if not len(problem.floors):
         return 0.0
     return float(np.maximum(problem.floors - point.floors, 0.0).sum())
@@ -97,10 +97,10 @@ class _Place:
     values : ndarray (t,)
         Terms of the objective.
     value, missed : float
-        The largest of them, and by how much floors are missed.
+        The largest term, and the violation of floors.
     slopes : ndarray (t + f + m, n)
-        Gradients of the terms, of the floors with their signs changed, and of the residuals in
-        finite balls: what multipliers weigh.
+        Gradients of the terms, of the negative floors, and of the residuals in finite balls, in the
+        order of the multipliers.
     """
 
     __slots__ = ("missed", "point", "slopes", "value", "values")
@@ -124,8 +124,8 @@ def descend(
 ) -> LocalResult:
     """Minimise the problem's objective from a point that reaches the pose.
 
-    A descent that comes next to a known optimum, with the same value but for `same`, ends there:
-    the result is that optimum.
+    A descent that comes close to a known optimum, with values that differ by at most `same`, ends
+    there: the result is that optimum.
     """
     point: ProgramPoint | None = start
     if not len(start.terms):
@@ -182,16 +182,17 @@ def descend(
 
 
 def _pushed_back(problem: PressureProblem, x: Vector, rise: Vector) -> NDArray[np.bool_]:
-    """Which steps off a limit, if they gained nothing, met a slope back to it.
+    """Return which steps off a limit met a slope back to it.
 
-    There is a kink at the limit then, as in the norm law where a segment is unpressurised.
+    If such a step gained nothing, there is a kink at the limit, as in the norm law where a segment
+    is unpressurised.
     """
     pushed: NDArray[np.bool_] = (rise > 0) & ((x <= problem.lower) | (x >= problem.upper))
     return pushed
 
 
 def _last_step(problem: PressureProblem, here: _Place, d: Vector, price: float) -> _Place:
-    """The place after a step that gains next to nothing, if it gains at all."""
+    """Return the place after a step of negligible gain, if it gains at all."""
     trial = _pulled_back(problem, here.point, d, problem.lower, problem.upper)
     if trial is None:
         return here
@@ -201,7 +202,7 @@ def _last_step(problem: PressureProblem, here: _Place, d: Vector, price: float) 
 
 
 def _next_to(here: _Place, known: Sequence[LocalResult], same: float) -> LocalResult | None:
-    """Known optimum that an iterate has all but come to."""
+    """Return a known optimum that an iterate has almost reached."""
     for result in known:
         same_value = abs(here.value - result.value) <= same
         if same_value and np.abs(here.point.x - result.point.x).max() < DESCENT.next_to:
@@ -226,7 +227,7 @@ def _update(B: Vector, s: Vector, y: Vector) -> None:
 def _pulled_back(
     problem: PressureProblem, point: ProgramPoint, d: Vector, lower: Vector, upper: Vector
 ) -> ProgramPoint | None:
-    """Point near x + d within all balls, evaluated as needed; None if there is none near."""
+    """Return a point near x + d within all balls, evaluated as needed; None if there is none."""
     bounding = problem.bounding
     x = within(lower, point.x + d, upper)
     if not bounding.constraints:
@@ -246,7 +247,7 @@ def _pulled_back(
         for index, c in zip(bounding.indices, bounding.constraints, strict=True):
             beyond = trial.errors[index] - c.radius * DESCENT.inside
             if beyond > 0:
-                # while steps are long, further in by as much as the correction may be wrong
+                # overshoot long corrections by their estimated second-order error
                 wrong = min(_CURVED * beyond**2 / c.scale, 0.3 * c.radius)
                 wrong = wrong if beyond > c.radius else 0.0
                 wanted[c.first : c.end] *= -(beyond + wrong) / trial.errors[index]
@@ -262,13 +263,13 @@ def _pulled_back(
         if not np.abs(back).max() <= allowed:
             return None
         x = within(lower, x + back, upper)
-        # one correction is enough most of the time, so the rest is evaluated at once
+        # one correction is mostly enough, so evaluate the rest at once
         trial, complete = attempt(problem.needed, x), True
     return None
 
 
 def _snapped(problem: PressureProblem, here: _Place) -> _Place:
-    """The same place with pressures that all but touch a limit put onto it, if that holds."""
+    """Return the place with pressures that almost touch a limit moved onto it, if that holds."""
     x = here.point.x
     low = x < problem.lower + DESCENT.touching
     high = x > problem.upper - DESCENT.touching
@@ -287,10 +288,11 @@ def _snapped(problem: PressureProblem, here: _Place) -> _Place:
 
 
 class _Subproblem:
-    """The quadratic program of each step of one descent; its arrays are used again and again.
+    """The quadratic program of each step of one descent; its arrays are reused.
 
     Its variables are the step d (n,), the largest term t (if there are several) and the floors'
-    slack s (if there are any).  Its rows are those of `_Place.slopes`, less a single term.
+    slack s (if there are any).  Its rows are those of `_Place.slopes`, except that a single term
+    goes into the linear objective.
     """
 
     def __init__(self, problem: PressureProblem, n_terms: int) -> None:
@@ -323,7 +325,7 @@ class _Subproblem:
         self._one_sided = [c.first for c in problem.bounding.constraints if c.one_sided]
 
     def dearest_floor(self, weights: Vector) -> float:
-        """Largest multiplier of a floor."""
+        """Return the largest multiplier of a floor."""
         return float(weights[self._floors].max()) if self._floored else 0.0
 
     def step(
@@ -335,10 +337,10 @@ class _Subproblem:
         price: float,
         weights: Vector | None,
     ) -> tuple[Vector, float, Vector] | None:
-        """Step (n,), promised decrease of the merit, and multipliers of the slopes.
+        """Return a step (n,), its promised decrease of the merit, and multipliers of the slopes.
 
-        Pressures that are held (n,) stay as they are.  What holds the step back is the box around
-        a ball and the ball's curvature; both are in the multipliers.
+        Pressures that are held (n,) do not change.  The multipliers of a ball combine those of the
+        box around it and of its curvature.
         """
         problem, point, n, size = self._problem, here.point, self._n, self._size
         H, g, A, low, high = self._H, self._g, self._A, self._low, self._high
@@ -378,7 +380,7 @@ class _Subproblem:
     def _turn_boxes(
         self, here: _Place, weights: Vector | None, residual: Vector, jacobian: Vector
     ) -> None:
-        """Set the axes of the box around each ball, the first one where it will bind."""
+        """Set the axes of the box around each ball; the first is where the ball will be active."""
         bounding = self._problem.bounding
         residuals = residual.tolist()
         pulls = None if weights is None else weights[self._balls :].tolist()
@@ -399,7 +401,7 @@ class _Subproblem:
 
 
 def _least_squares(rows: Vector, wanted: Vector) -> list[float]:
-    """Weights of rows (k, n) that sum up to a vector (n,) as nearly as can be."""
+    """Return the weights of rows (k, n) whose sum is nearest to a vector (n,)."""
     square = rows @ rows.T
     square += 1e-10 * np.trace(square) * np.eye(len(square))
     try:
@@ -410,7 +412,7 @@ def _least_squares(rows: Vector, wanted: Vector) -> list[float]:
 
 
 def axes_along(vector: list[float]) -> Vector:
-    """Orthonormal axes (k, k) by rows, the first along a vector (k,); any if it is zero."""
+    """Return orthonormal axes (k, k) by rows, the first along a vector (k,); any if it is zero."""
     length = math.hypot(*vector)
     axes = np.eye(len(vector))
     if not length > 0:

@@ -1,8 +1,8 @@
 """`Measure`, the base class of scalars of the tip's compliance that a task bounds or optimises.
 
-Each kind has a file of its own in `stiffopt.optimise.measures`.  A measure is an entry of the task
-file and a symbolic formula in one.  It splits into its *structure*, for which functions are
-compiled, and its *parameters*, which are arguments of them.
+Each kind has its own file in `stiffopt.optimise.measures`.  A measure is both an entry of the task
+file and a symbolic formula.  It splits into its *structure*, for which functions are compiled, and
+its *parameters*, which are arguments of them.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ Role = Literal["maximise", "at_least", "match"]
 
 
 class Measure(Schema):
-    """A measure in one of the places of a task's ``stiffness``.
+    """A stiffness measure in one role of a task's ``stiffness``.
 
     Attributes
     ----------
     key : str
-        By which a task file tells it from others in the same place.
+        Key by which a task file distinguishes it from others of the same role.
     role : {"maximise", "at_least", "match"}
-        The place; a measure that can be in several of them has a class for each.
+        A measure that can have several roles has a class for each.
     unit : str
-        Of the stiffness, ``"N/m"`` or ``"N*m/rad"``: a property or a field of each kind.
+        Unit of the stiffness, ``"N/m"`` or ``"N*m/rad"``: a property or a field of each kind.
     """
 
     key: ClassVar[str]
@@ -48,44 +48,44 @@ class Measure(Schema):
     @property
     @abstractmethod
     def parameters(self) -> tuple[float, ...]:
-        """Arguments (k,) of the formula, always as many for one structure."""
+        """Arguments (k,) of the formula; their number is fixed by the structure."""
 
     @abstractmethod
     def formula(self, tip: Any, parameters: Any) -> Any:
-        """Symbolic value of a `stiffopt.model.shape.Shape`: logarithm of a positive stiffness."""
+        """Return the symbolic value for a `stiffopt.model.shape.Shape`: the log of a stiffness."""
 
     def formula_gradient(self, tip: Any, parameters: Any) -> Any:
-        """Symbolic derivative (1, n) of the formula by the pressures."""
+        """Return the symbolic derivative (1, n) of the formula by the pressures."""
         return tip.total_jacobian(self.formula(tip, parameters))
 
     def mismatch(self, value: Any, parameters: Any) -> tuple[Any, Any]:
-        """What a match minimises, as a function of the formula's value, and its derivative."""
+        """Return a match's objective as a function of the formula's value, and its derivative."""
         raise NotImplementedError
 
     # -- in reports -------------------------------------------------------------------------
 
     @property
     def is_stiffness(self) -> bool:
-        """Whether the formula is the logarithm of a stiffness; else it is a squared distance."""
+        """Whether the formula is the log of a stiffness; otherwise it is a squared distance."""
         return True
 
     def holds(self, value: float) -> bool:
-        """Whether a stiffness, or a distance, is as the task requires."""
+        """Return whether a stiffness, or a distance, meets the task's demand."""
         return True
 
     def shortfall(self, value: float) -> str:
-        """Message for a value that does not hold: what was required, and the best there is."""
+        """Return the message for a value that does not hold: the demand and the best value."""
         return ""
 
     def said(self) -> dict[str, Any]:
-        """Its keys and values in the task file, without the required value and tolerance."""
+        """Return its keys and values in the task file, without the required value and tolerance."""
         said = self.model_dump(exclude={"value", "tolerance"})
         return {key: list(v) if isinstance(v, tuple) else v for key, v in said.items()}
 
     def words(self) -> str:
-        """What it measures: ``against translation along (1, 0, 0), base axes, free``."""
+        """Describe the measure: ``against translation along (1, 0, 0), base axes, free``."""
         return self.key
 
     def stiffness_gradient(self, robot: Manipulator, pressures: Vector) -> Vector | None:
-        """Derivative (n,) of the stiffness by the pressures (n,), if it is one."""
+        """Return the derivative (n,) of the stiffness by pressures (n,); None for a distance."""
         return None

@@ -1,11 +1,10 @@
-"""The objects of a task's scene as rows of its program: how far the body is from each.
+"""`Obstacles`: the objects of a task's scene as rows of its program.
 
-After the rows of the terms there is one for each object and segment (with its connector), of a
-ring one for the whole arm: ``margin - (distance - clearance) <= margin``, with the derivatives of
-the nearest point.  In machine code that is the exact minimum along the body wherever it is near;
-without, steps of a search find it by a few stations, and an answer is judged by the exact one
-(`stiffopt.model.clearance`).
-Scenes are data of these rows, so that no object compiles anything.
+The rows follow those of the terms: one for each object and segment (with its connector); a ring has
+a single one for the whole arm.  A row is ``margin - (distance - clearance) <= margin``, with the
+derivatives of the nearest point.  Machine code finds the exact minimum along the body if it is
+near. Without it, search steps use a few stations, and only answers are judged by the exact minimum
+(`stiffopt.model.clearance`).  A scene is data of these rows, so a new scene needs no compilation.
 """
 
 import ctypes
@@ -37,13 +36,13 @@ from stiffopt.optimise.settings import OBSTACLES
 Vector = NDArray[np.float64]
 
 CLEARANCE_OF = "clearance of "
-"""Begins the names of constraints of obstacles."""
+"""Prefix of the names of constraints of obstacles."""
 
 _integer, _double, _pointer = ctypes.c_int64, ctypes.c_double, ctypes.c_void_p
 
 
 class _Obstacles(ctypes.Structure):
-    """`Obstacles` of native/obstacles.h."""
+    """Structure `Obstacles` of native/obstacles.h."""
 
     _fields_ = [
         ("body", _pointer),
@@ -58,7 +57,7 @@ class _Obstacles(ctypes.Structure):
 def _quickly_nearest(
     body: StationOf, item: MeasuredObject, ranges: Sequence[tuple[float, float, int]]
 ) -> Nearest:
-    """The nearest point of a stretch of the body: around the best of some stations, ever closer."""
+    """Return the nearest point of ranges of the body, by repeatedly refining the best station."""
     s = np.concatenate(
         [np.linspace(max(start, item.begin), end, 2 * count) for start, end, count in ranges]
     )
@@ -75,7 +74,7 @@ def _quickly_nearest(
 
 
 class ObstaclesInC:
-    """Obstacles around an arm as C takes them; this object holds the memory.
+    """Obstacles around an arm as a structure in C; this object owns the memory.
 
     Attributes
     ----------
@@ -110,7 +109,7 @@ class ObstaclesInC:
 
 
 def _body_in_c(arm: Manipulator, rod: LoadedArm | None, groups: tuple[int, ...]) -> tuple[Any, ...]:
-    """The arm's body, and what is known of its ranges: ends of segments, bounds and stations."""
+    """Return the arm's body, the ends of its segments, and bounds and stations of its ranges."""
     ranges = Ranges.of(range_ends(arm.description))
     return ModelInC(arm, rod), np.array(groups, dtype=np.int64), ranges.bounds, ranges.counts
 
@@ -127,7 +126,7 @@ class Obstacles:
     range_groups : tuple of int
         Number of ranges (soft or rigid pieces of the body) up to the end of each segment.
     row_objects : tuple of int
-        Which object each row is of.
+        Index of each row's object.
     """
 
     scene: Scene
@@ -150,11 +149,11 @@ class Obstacles:
 
     @property
     def row_names(self) -> tuple[str, ...]:
-        """Names of the constraints, a row each."""
+        """Names of the constraints, one for each row."""
         return tuple(f"{CLEARANCE_OF}{self.measured.names[index]}" for index in self.row_objects)
 
     def rows(self, arm: Manipulator, p: Vector) -> tuple[Vector, Vector]:
-        """Rows (k,) and derivatives (k, n) per Pa at pressures (n,), without machine code."""
+        """Return rows (k,) and derivatives (k, n) per Pa at pressures (n,), not in machine code."""
         checkpoint()
         found = self.nearest(ArmBody(arm, p))
         distances = np.array([nearest.distance for nearest in found])
@@ -162,7 +161,7 @@ class Obstacles:
         return rows, -gradients(arm, p, found)
 
     def nearest(self, body: StationOf) -> list[Nearest]:
-        """Where a body is nearest to the objects, a row each, by a few stations."""
+        """Return the body's nearest point to the object of each row, approximately."""
         ranges = range_ends(self.description)
         groups = [ranges[begin:end] for begin, end in pairwise((0, *self.range_groups))]
         return [
@@ -176,19 +175,19 @@ class Obstacles:
         ]
 
     def exactly_nearest(self, body: StationOf) -> list[Nearest]:
-        """Where all of a body is exactly nearest to each row's object."""
+        """Return the nearest point of the whole body to each row's object, exactly."""
         ranges = survey(body, range_ends(self.description))
         found = [nearest_point(body, item, ranges) for item in self.measured.items]
         return [found[index] for index in self.row_objects]
 
     def exact_rows(self, arm: Manipulator, p: Vector) -> list[float]:
-        """Rows (k,) to judge by; each has the exact least distance of the whole arm."""
+        """Return rows (k,) for judging, each with the exact least distance of the whole arm."""
         distances = arm.clearances(p, self.scene).distances[list(self.row_objects)]
         found: list[float] = (OBSTACLES.margin - (distances - self.scene.clearance)).tolist()
         return found
 
     def touched(self, rows: list[float]) -> list[str]:
-        """Names of objects that rows say the body is next to, but for the clearance."""
+        """Return the names of objects within `OBSTACLES.touching` of the clearance."""
         near = (
             self.measured.names[index]
             for index, row in zip(self.row_objects, rows, strict=True)
@@ -197,7 +196,7 @@ class Obstacles:
         return list(dict.fromkeys(near))
 
     def intruders(self, rows: list[float]) -> dict[str, float]:
-        """Names of objects whose rows say that the body is too near, and by how much, in m."""
+        """Return the names of objects that are too near, with the missing distance in m."""
         found: dict[str, float] = {}
         for index, row in zip(self.row_objects, rows, strict=True):
             missing = row - OBSTACLES.margin

@@ -1,4 +1,4 @@
-"""The trade-off between tip error and stiffness."""
+"""`pareto_front`: the trade-off between tip error and stiffness."""
 
 from math import pi
 
@@ -24,18 +24,18 @@ def pareto_front(
     timeout: float | None = None,
     cancel: Cancel | None = None,
 ) -> list[PressureSolution]:
-    """Stiffest solutions at `n` growing tolerances, from the task's own to a quarter of the arm.
+    """Return the stiffest solutions at `n` growing tolerances, up to a quarter of the arm.
 
-    The tolerance that grows is the position's; of a task without position the angle's, up to
-    half a turn.  Only solutions that are stiffer than all with less error are returned, so there
-    may be fewer than `n`; none if the task's own target is out of reach at every tolerance.
+    The tolerance of the position grows, starting at the task's own.  For a task without position it
+    is the angle's, up to half a turn.  Only solutions that are stiffer than all with less error are
+    returned, so there may be fewer than `n`; none if the target is out of reach at every tolerance.
 
     Raises
     ------
     InputError
         If the task maximises no stiffness, or `n` is less than 2.
     OutOfTimeError, CancelledError
-        If it was given up, see `PressureSolver.solve`; `found` of the error is the front so far.
+        If it was stopped, see `PressureSolver.solve`; `found` of the error is the front so far.
     """
     if not isinstance(task, Task):
         raise InputError(f"task must be a Task, see load_task; got {shown(task)}")
@@ -65,7 +65,7 @@ def pareto_front(
 def _extend(front: list[PressureSolution], solver: PressureSolver, target: Target) -> None:
     """Add the stiffest solution of a target, if it is stiffer than those before."""
     candidates = [solver.solve(target)]
-    if front:  # what was found for a smaller tolerance is a start for this one
+    if front:  # the answer for a smaller tolerance is a start for this one
         candidates.append(solver.solve(target, guess=front[-1].pressures))
     found = [solution for solution in candidates if solution.found]
     if not found:
@@ -76,7 +76,7 @@ def _extend(front: list[PressureSolution], solver: PressureSolver, target: Targe
 
 
 def _smallest(solution: PressureSolution) -> float:
-    """Smallest of the maximised stiffnesses."""
+    """Return the smallest of the maximised stiffnesses."""
     goal = solution.task.stiffness
     count = len(goal.maximise) if goal is not None else 0
     return min(solution.stiffnesses[:count])

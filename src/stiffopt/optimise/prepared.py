@@ -1,4 +1,4 @@
-"""What tasks that differ in their target alone share: limits, samples and compiled solvers."""
+"""`Prepared`: limits, samples and compiled solvers that tasks with different targets share."""
 
 from collections.abc import Callable, Hashable
 from functools import cached_property
@@ -26,7 +26,7 @@ Made = TypeVar("Made")
 
 
 class Prepared:
-    """Limits, starts and compiled solvers of similar tasks on one arm.
+    """Limits, samples and compiled solvers of similar tasks on one arm.
 
     Attributes
     ----------
@@ -35,7 +35,7 @@ class Prepared:
     lower, upper : ndarray (n,)
         Pressure limits in Pa.
     unit : str or None
-        Of the first stiffness.
+        Unit of the task's first stiffness.
     """
 
     def __init__(self, robot: Manipulator, task: Task, seed: int) -> None:
@@ -53,16 +53,16 @@ class Prepared:
         self._rows: dict[tuple[Hashable, ...], tuple[FastSolver, Vector] | None] = {}
 
     def program(self, target: Target) -> Program:
-        """Program of a task with this target."""
+        """Return the program of a task with this target."""
         return self._program.at(target)
 
     def fast(self, program: Program) -> tuple[FastSolver, Vector] | None:
-        """Compiled solver and the row of a task without its target; None if there is none."""
-        terms = tuple(term.structure for term in program.terms)  # all that differs
+        """Return the compiled solver and a task's row without its target; None if there is none."""
+        terms = tuple(term.structure for term in program.terms)  # the rest is the same for all
         if terms not in self._rows:
             library = functions(self.robot, program).library
             if library is None:
-                return None  # not remembered: another thread may be compiling
+                return None  # not cached: another thread may be compiling
             solver = self._solver(library, program)
             found = None
             if solver is not None:
@@ -71,7 +71,7 @@ class Prepared:
         return self._rows[terms]
 
     def _solver(self, library: Library, program: Program) -> FastSolver | None:
-        """Compiled solver; None for a loaded arm that does not stand at rest."""
+        """Return the compiled solver; None for a loaded arm without equilibrium at rest."""
         if not self.robot.is_loaded:
             return _recent(
                 self.robot, "fast solvers", (program.structure, self._key, self._scene),
@@ -84,7 +84,7 @@ class Prepared:
         return solver.among(program.obstacles, self.robot) if program.obstacles else solver
 
     def _among(self, library: Library, program: Program) -> FastSolver:
-        """Compiled solver of a free arm: all scenes of as many rows share what they can."""
+        """Return the compiled solver of a free arm; scenes with as many rows share most of it."""
         obstacles = program.obstacles
         rows = 0 if obstacles is None else len(obstacles.row_objects)
         solver = _recent(
@@ -94,7 +94,7 @@ class Prepared:
         return solver if obstacles is None else solver.among(obstacles, self.robot)
 
     def _loaded_samples(self, library: Library) -> SampleTable | None:
-        """Samples of the arm under its load in machine code; None if it does not stand at rest."""
+        """Sample the arm under its load in machine code; None without an equilibrium at rest."""
         try:
             arm = LoadedArm(library, self.robot)
             table = SampleTable(self.robot, self.lower, self.upper, self._seed, arm)
@@ -104,7 +104,7 @@ class Prepared:
 
     @cached_property
     def samples(self) -> SampleTable:
-        """Configurations that searches of the general method, or of a free arm, start from."""
+        """Configurations from which the general method starts, or any search for a free arm."""
         return _recent(
             self.robot, "samples", self._key,
             lambda: SampleTable(self.robot, self.lower, self.upper, self._seed),
@@ -112,7 +112,7 @@ class Prepared:
 
 
 def prepared(robot: Manipulator, task: Task, seed: int) -> Prepared:
-    """Preparation for a task; one of the most recent if it will do.
+    """Return the preparation for a task; recent ones are reused.
 
     Raises
     ------
@@ -125,9 +125,10 @@ def prepared(robot: Manipulator, task: Task, seed: int) -> Prepared:
 
 
 def _recent(robot: Manipulator, group: str, key: Hashable, make: Callable[[], Made]) -> Made:
-    """One of the things that were made last for this arm, or a new one.
+    """Return a recently made item of a group, or make it.
 
-    A planner that varies limits, loads or directions must not fill the memory.
+    The cache is bounded: a planner that varies limits, loads or directions must not fill the
+    memory.
     """
     kept: dict[Hashable, tuple[Made]] = robot.kept(group, dict)
     found = kept.get(key)

@@ -1,4 +1,4 @@
-"""`Press`, the part ``press`` of a task file: to press on something with a given force."""
+"""`Press`, the key ``press`` of a task file: the tip presses with a given force."""
 
 from __future__ import annotations
 
@@ -16,26 +16,26 @@ from stiffopt.units import Force, Length, Speed, within
 Array = NDArray[np.float64]
 
 SOFT_SHARE = 0.15
-"""Compliance, as a share of the largest, below which a direction is too stiff to feel in."""
+"""Compliance, as a share of the largest, below which a direction is too stiff to feel forces."""
 LEAST_SHARE = 0.5
-"""Share of a force, squared, that must act in the directions in which the tip is soft."""
+"""Squared share of a force that must act in the directions in which the tip is soft."""
 POSITION_ERROR = 5e-4
-"""m; error of the model's tip that develops on the short way of an approach."""
+"""Change of the model's tip error along the short path of an approach, in m."""
 FELT_SHARE, FELT_FORCE = 0.2, 3e-3
-"""How well a force must be felt: as a share of it, and in N."""
+"""Allowed error of a felt force: a share of it, plus a part in N."""
 
 
 class Press(Schema):
-    """A force with which the tip presses, from the target on along a direction.
+    """A force with which the tip presses, starting at the target along a direction.
 
     Attributes
     ----------
     force : in N.
     direction : unit vector in which the tip pushes.
-    frame : base, or tip: the axes of the tip at the target.
-    tolerance : by how much the estimated force may be off, in N.
+    frame : "base", or "tip": the axes of the tip at the target.
+    tolerance : largest error of the estimated force, in N.
     speed : greatest speed of the approach, in m/s.
-    travel : greatest way of the tip along the direction, in m.
+    travel : greatest travel of the tip along the direction, in m.
     """
 
     force: Annotated[Force, Field(gt=0), within(1e6, "N")]
@@ -55,17 +55,19 @@ class Press(Schema):
         return f"Press({1e3 * self.force:g} mN along ({_numbers(self.direction)}){axes})"
 
     def refusal(self, rotation: Array, compliance: Array) -> str:
-        """Say why a force along the direction could not be felt; empty if it could.
+        """Return why a force along the direction could not be felt, or "".
 
         Parameters
         ----------
-        rotation, compliance :
-            Of the tip in base axes (3, 3), and of its position by a force, in m/N.
+        rotation : (3, 3)
+            Axes of the tip in the base frame.
+        compliance : (3, 3)
+            Displacement of the tip per force in base axes, in m/N.
         """
         felt = Feeling.of(self.direction_in_base(rotation), compliance)
-        most = FELT_SHARE * self.force + FELT_FORCE
+        allowed = FELT_SHARE * self.force + FELT_FORCE
         deviation = felt.deviation(POSITION_ERROR)
-        if felt.share >= LEAST_SHARE and deviation <= most:
+        if felt.share >= LEAST_SHARE and deviation <= allowed:
             return ""
         return (
             f"the arm cannot feel how hard it presses along ({_numbers(self.direction)})"
@@ -77,12 +79,12 @@ class Press(Schema):
 
 @dataclass(frozen=True)
 class Feeling:
-    """How a force along a direction shows at the tip.
+    """How well a force along a direction shows as a displacement of the tip.
 
     Attributes
     ----------
-    share : of the force that acts in the directions in which the tip is soft, squared.
-    compliance : displacement along the direction by a force along it, in m/N.
+    share : squared share of the force that acts in the directions in which the tip is soft.
+    compliance : displacement along the direction per force along it, in m/N.
     """
 
     share: float
@@ -90,12 +92,12 @@ class Feeling:
 
     @classmethod
     def of(cls, direction: Array, compliance: Array) -> Feeling:
-        """Along a unit vector (3,), with the compliance (3, 3) of the tip's position."""
+        """Return how well a force along a unit vector (3,) is felt, for a compliance (3, 3)."""
         felt = soft_directions(compliance)
         return cls(float(direction @ felt @ direction), float(direction @ compliance @ direction))
 
     def deviation(self, error: float) -> float:
-        """Return the deviation of a felt force, in N, from that of the tip's position, in m."""
+        """Return the error of a felt force, in N, due to an error of the tip's position, in m."""
         return error / max(self.compliance, 1e-12)
 
 
@@ -104,7 +106,7 @@ def _numbers(direction: tuple[float, ...]) -> str:
 
 
 def soft_directions(compliance: Array) -> Array:
-    """Projection (3, 3) on the directions in which a tip of compliance (3, 3) is soft."""
+    """Return the projection (3, 3) on the directions in which a tip of this compliance is soft."""
     sizes, axes = np.linalg.eigh(compliance)
     soft = axes[:, sizes > SOFT_SHARE * sizes[-1]]
     projection: Array = soft @ soft.T

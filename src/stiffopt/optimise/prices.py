@@ -1,8 +1,8 @@
 """Prices of the constraints at a solution: its Lagrange multipliers.
 
-A solution is exact to the optimiser's precision only, so that a constraint that binds may be off by
-a little.  Whether it binds is therefore not tested: all that nearly hold are weighed, and each the
-less the more it is off.
+A solution is exact only to the optimiser's precision, so an active constraint may be slightly off
+its bound.  There is no sharp test for activity: all constraints that nearly hold are weighed, with
+a penalty that grows with their distance from the bound.
 """
 
 from dataclasses import dataclass
@@ -20,13 +20,12 @@ Vector = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Multipliers:
-    """Lagrange multipliers: what the objective would gain per unit of each constraint.
+    """Lagrange multipliers: gain of the objective per unit of each constraint.
 
     Attributes
     ----------
     bounds : ndarray (n,)
-        Per unit of the variables; positive where the upper bound holds back, negative where the
-        lower does.
+        Per unit of the variables; positive at an active upper bound, negative at a lower one.
     balls : tuple of ndarray
         Vector for each of the point's `bounded` constraints, per unit of the term; its length is
         the price of the radius.
@@ -43,11 +42,11 @@ class Multipliers:
 
 
 def prices_at(problem: PressureProblem, point: ProgramPoint) -> Multipliers | None:
-    """Multipliers at a solution: those that leave the least of the Lagrangian's gradient.
+    """Return the multipliers at a solution that minimise the Lagrangian's gradient.
 
-    With gradients c_i, each times the size of its constraint, and shares s_i of that size by which
-    the constraints are off, the weights w_i >= 0 minimise
-    ``|sum w_i c_i|^2 + sum (slack s_i w_i |c_i|)^2``; those of the objective's terms sum to one.
+    The weights w_i >= 0 minimise ``|sum w_i c_i|^2 + sum (slack s_i w_i |c_i|)^2``.  The c_i are
+    the constraints' gradients, each times the size of its constraint; s_i is the distance from the
+    bound as a share of that size.  The weights of the objective's terms sum to one.
     """
     values, gradients = problem.objective.terms(point)
     n = len(point.x)
@@ -80,7 +79,7 @@ def prices_at(problem: PressureProblem, point: ProgramPoint) -> Multipliers | No
     prices = Multipliers(bounds, tuple(pulls), terms, floors)
     for (kind, number), weight in named.items():
         if kind == "bound":
-            # a little beyond the limit: the norm law has a kink where a segment is unpressurised
+            # slightly beyond the limit, as the norm law has a kink at zero pressure of a segment
             i, side = abs(number) - 1, np.sign(number)
             moved = attempt(problem.needed, point.x + side * PRICES.beyond * np.eye(n)[i])
             slope = -side * weight
@@ -91,7 +90,7 @@ def prices_at(problem: PressureProblem, point: ProgramPoint) -> Multipliers | No
 
 
 class _Weights:
-    """Gradients of constraints that are weighed against each other."""
+    """Gradients of constraints, and the least-squares problem for their weights."""
 
     def __init__(self) -> None:
         self.names: list[tuple[str, int]] = []
@@ -102,7 +101,7 @@ class _Weights:
     def add(
         self, gradient: Vector, off: float, size: float = 1.0, name: tuple[str, int] = ("term", 0)
     ) -> None:
-        """One more gradient, of a constraint of some size that is off by a share of it."""
+        """Add the gradient of a constraint of some size that is off its bound by a share of it."""
         if off < PRICES.near:
             self._columns.append(gradient * size)
             self._slacks.append(max(off, 0.0))
@@ -110,11 +109,11 @@ class _Weights:
             self.names.append(name)
 
     def solved(self, terms: int) -> Vector | None:
-        """Weights per unit of each constraint; those of the first ones sum to one."""
+        """Return weights per unit of each constraint; those of the first `terms` sum to one."""
         count = len(self._columns)
         A = np.array(self._columns).T
         peak = float(np.abs(A[:, :terms]).max())
-        A /= peak if peak > 1e-150 else 1.0  # least pressure, where there is none: no slope
+        A /= peak if peak > 1e-150 else 1.0  # the least pressure has no slope at zero
         lengths = np.linalg.norm(A, axis=0)
         scale = np.where(np.arange(count) < terms, 1.0, 1 / np.maximum(lengths, 1e-300))
         A = A * scale
@@ -134,7 +133,7 @@ class _Weights:
 def _slope(
     problem: PressureProblem, point: ProgramPoint, moved: ProgramPoint, multipliers: Multipliers
 ) -> Vector:
-    """Gradient of the Lagrangian at a moved point, multipliers held, bounds left out."""
+    """Return the Lagrangian's gradient at a moved point, multipliers fixed, bounds left out."""
     objective = problem.objective
     gradients = objective.held(point, moved) if objective.held else objective.terms(moved)[1]
     slope: Vector = multipliers.terms @ gradients

@@ -1,10 +1,9 @@
-"""From a task and an arm to a nonlinear program over the pressures.
+"""`PressureProblem`: the nonlinear program of a task on an arm, evaluated at pressures.
 
 Variables are the pressures x (n,), each as a share of its channel's range (`pressure_ranges`).
-Terms of the task bound rows of a residual: ``|r(x)| <= radius``, which is how tolerances are used
-and not ignored, or ``r(x) <= radius`` for an inequality.  What is sought is the lowest value of an
-objective, with some stiffnesses bounded from below.  The functions behind it belong to the
-structure of the task (`stiffopt.optimise.program`) and stay with the robot.
+The program minimises an objective.  Tolerances bound rows of a residual, ``|r(x)| <= radius``, and
+inequalities ``r(x) <= radius``; some stiffnesses have lower bounds (floors).  Functions belong to
+the structure of the task (`stiffopt.optimise.program`) and are cached by the robot.
 """
 
 import math
@@ -31,7 +30,7 @@ Vector = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Ball:
-    """A constraint with its residual at a point: ``|r| <= radius``.
+    """A constraint with its residual at a point.
 
     Attributes
     ----------
@@ -47,24 +46,24 @@ class Ball:
 
     @property
     def name(self) -> str:
-        """Of the term."""
+        """Name of the term."""
         return self.constraint.name
 
     @property
     def radius(self) -> float:
-        """Largest error."""
+        """Largest error that is allowed."""
         return self.constraint.radius
 
     @property
     def error(self) -> float:
-        """Length of the residual, or the residual itself if it is bounded on one side."""
+        """Length of the residual; the residual itself if it is bounded on one side."""
         if self.constraint.one_sided:
             return float(self.residual[0])
         return math.sqrt(self.residual @ self.residual)
 
     @property
     def pull(self) -> Vector:
-        """Gradient (n,) of the error, which is not zero."""
+        """Gradient (n,) of the error; the error must not be zero."""
         if self.constraint.one_sided:
             row: Vector = self.jacobian[0]
             return row
@@ -73,26 +72,26 @@ class Ball:
 
 
 class ProgramPoint:
-    """The program at one set of pressures.
+    """The program's values at one set of pressures.
 
     Attributes
     ----------
     x : ndarray (n,)
-        Pressures, as shares of the channels' ranges; all derivatives are by them.
+        Pressures, as shares of the channels' ranges; all derivatives are with respect to them.
     residual : ndarray (m,)
-        Of all terms, in their units.
+        Residuals of all terms, in their units.
     jacobian : ndarray (m, n)
     constraints : tuple of Constraint
-        How the rows are bounded.
+        Bounds on the rows.
     errors : tuple of float
-        Of each constraint, see `Ball.error`.
+        Error of each constraint, see `Ball.error`.
     reached : bool
         Whether every constraint holds.
     terms : ndarray (t,)
-        Of the task's objective; empty where only the pose was evaluated.
+        Terms of the task's objective; empty where only the pose was evaluated.
     term_gradients : ndarray (t, n)
     floors : ndarray (f,)
-        Logarithms of the stiffnesses that are bounded from below.
+        Logarithms of the stiffnesses that have a lower bound.
     floor_gradients : ndarray (f, n)
     """
 
@@ -127,7 +126,7 @@ class ProgramPoint:
 
     @property
     def balls(self) -> tuple[Ball, ...]:
-        """The constraints one by one."""
+        """All constraints with their residuals."""
         return tuple(
             Ball(c, self.residual[c.first : c.end], self.jacobian[c.first : c.end])
             for c in self.constraints
@@ -135,13 +134,13 @@ class ProgramPoint:
 
     @property
     def bounded(self) -> tuple[Ball, ...]:
-        """Those of them that are not infinitely wide."""
+        """The constraints of finite radius."""
         return tuple(ball for ball in self.balls if ball.radius < math.inf)
 
     @property
     def is_finite(self) -> bool:
         """Whether all numbers are finite."""
-        # a sum is as good as a look at each, and several times as fast
+        # a sum is finite if all summands are, and several times faster than checking each
         total = sum(self.errors) + _total(self.jacobian, None)
         if self.terms.size:
             total += _total(self.terms) + _total(self.term_gradients, None)
@@ -152,24 +151,24 @@ class ProgramPoint:
 
 @dataclass(frozen=True)
 class Objective:
-    """A function of a point that is minimised.
+    """A function to minimise.
 
-    The value is the largest of `terms` (t,); several terms are minimised together (the smallest
-    of several stiffnesses maximised).  `curvature` is a convex guess of the Hessian.  With
-    `of_pose` the residuals are all that it needs.
+    Its value is the largest of `terms` (t,), so that the smallest of several stiffnesses can be
+    maximised.  `curvature` is a convex estimate of the Hessian.  With `of_pose`, the objective
+    depends on the residuals alone.
     """
 
     terms: Callable[[ProgramPoint], tuple[Vector, Vector]]  # values (t,), gradients (t, n)
     curvature: Callable[[ProgramPoint], Vector]  # (n, n)
     precision: float  # decrease that no longer matters
-    unit: str  # of what a decrease gains, for prices
-    gain: Callable[[ProgramPoint], float]  # that gain per unit of decrease
+    unit: str  # unit of `gain`, for prices
+    gain: Callable[[ProgramPoint], float]  # stiffness or error gained per unit of decrease
     of_pose: bool = False
     held: Callable[[ProgramPoint, ProgramPoint], Vector] | None = None
-    """Gradients (t, n) at the second point with weights that depend on x held at the first."""
+    """Gradients (t, n) at the second point, with their weights frozen at the first."""
 
     def value(self, point: ProgramPoint) -> float:
-        """Value at a point."""
+        """Return the value at a point."""
         return float(self.terms(point)[0].max())
 
 
@@ -184,11 +183,11 @@ class PressureProblem:
         Pressures in Pa that are one unit of the variables.
     objective : Objective
     floors : ndarray (f,)
-        What `ProgramPoint.floors` may not fall below; empty where they do not matter.
+        Lower bounds on `ProgramPoint.floors`; empty where floors are ignored.
     constraints : tuple of Constraint
-        How the residual is bounded.
+        Bounds on the residual.
     radii : dict of str to float
-        Radii by name of the term, other than the target's.
+        Radii that replace the target's, by name of the term.
     """
 
     def __init__(self, robot: Manipulator, task: Task) -> None:
@@ -229,7 +228,7 @@ class PressureProblem:
         self._pose.restart()
 
     def pose(self, x: Vector) -> ProgramPoint:
-        """The balls alone at pressures x; cheaper than `point`."""
+        """Return the constraints alone at pressures x; cheaper than `point`."""
         checkpoint()
         if self._is_loaded:
             residual, jacobian = self._pose(x * self.unit, self.parameters)
@@ -241,16 +240,16 @@ class PressureProblem:
     def with_obstacles(
         self, x: Vector, residual: Vector, jacobian: Vector
     ) -> tuple[Vector, Vector]:
-        """Rows of the terms (m,), (m, n) at pressures x, and those of obstacles after them."""
+        """Append the rows of obstacles at pressures x to those of the terms, (m,) and (m, n)."""
         if self.program.obstacles is None:
             return residual, jacobian
         rows, slopes = self.program.obstacles.rows(self.robot, x * self.unit)
         return np.append(residual, rows), np.vstack([jacobian, slopes * self.unit])
 
     def poses(self, x: Vector) -> tuple[Vector, Vector]:
-        """Residuals (N, m) and Jacobians (N, m, n) at pressures (N, n) of an arm without loads.
+        """Return residuals (N, m) and Jacobians (N, m, n) of an arm without loads.
 
-        These are the terms' own: obstacles are not looked at.
+        Rows of obstacles are not included.  Pressures are x (N, n).
         """
         checkpoint()
         residuals, jacobians = self._functions["pose"].many(
@@ -259,7 +258,7 @@ class PressureProblem:
         return residuals[:, :, 0], jacobians.swapaxes(1, 2) * self.unit
 
     def point(self, x: Vector) -> ProgramPoint:
-        """Everything at pressures x."""
+        """Return all values and derivatives at pressures x."""
         checkpoint()
         if self._is_loaded:
             self._full.restart(self._pose.state)
@@ -281,12 +280,12 @@ class PressureProblem:
         )
 
     def needed(self, x: Vector) -> ProgramPoint:
-        """As much as objective and floors take at pressures x."""
+        """Return as much as objective and floors need at pressures x."""
         of_pose = self.objective.of_pose and not len(self.floors)
         return self.pose(x) if of_pose else self.point(x)
 
     def worth(self, x: Vector) -> ProgramPoint:
-        """Enough of a point at pressures x that reach the pose to rank it by its objective."""
+        """Return the objective and floors at pressures x that reach the pose, for ranking."""
         worth = self._functions.worth
         if self.objective.of_pose or worth is None:
             return self.needed(x)
@@ -297,7 +296,7 @@ class PressureProblem:
         return ProgramPoint(x, at_target, none, self.constraints, terms[:, 0], none, floors, none)
 
     def judged(self, pressures: Vector) -> tuple[list[float], Vector, Vector, list[float]]:
-        """What `Judgement.of` takes, at pressures (n,) in Pa of an arm without loads."""
+        """Return the arguments of `Judgement.of` at (n,) in Pa, for an arm without loads."""
         residuals, pose, compliance, values = self._functions["judge"](pressures, self.parameters)
         found = residuals.ravel().tolist()
         if self.program.obstacles is not None:
@@ -325,7 +324,7 @@ class PressureProblem:
         )
 
     def closest(self, name: str) -> Objective:
-        """Half the squared error of one term over a scale: what brings the arm closest to it."""
+        """Return the objective ``|error / scale|^2 / 2`` of one term, to approach it."""
         own = [c for c in self.constraints if c.name == name]
         rows, one_sided, scale = slice(own[0].first, own[-1].end), own[0].one_sided, own[0].scale
         (radius,) = {term.radius for term in self.program.terms if term.name == name}
@@ -353,7 +352,7 @@ class PressureProblem:
         return Objective(terms, curvature, CLOSEST.precision, unit, gain, of_pose=True, held=held)
 
     def best_floors(self) -> Objective:
-        """The most by which a floor is missed: what brings all floors as close as they come."""
+        """Return the objective that minimises the largest violation of a floor."""
         return Objective(
             lambda point: (self.floors - point.floors, -point.floor_gradients),
             lambda point: DESCENT.curvature * np.eye(len(point.x)),
@@ -365,7 +364,7 @@ class PressureProblem:
     # -- similar programs -------------------------------------------------------------------
 
     def among(self, obstacles: Obstacles) -> "PressureProblem":
-        """The same program with these rows for the objects of a scene."""
+        """Return the same program with these rows for the objects of a scene."""
         other = copy(self)
         other.program = replace(self.program, obstacles=obstacles)
         other._set_constraints()
@@ -374,7 +373,7 @@ class PressureProblem:
     def changed(
         self, objective: Objective, radii: Mapping[str, float] | None = None, floors: bool = True
     ) -> "PressureProblem":
-        """The same program with another objective, without floors, or with other radii by name.
+        """Return the same program with another objective, other radii by name, or no floors.
 
         An infinite radius frees a term.
         """
@@ -393,13 +392,13 @@ class Bounding:
     Attributes
     ----------
     constraints : tuple of Constraint
-        Rows are counted within `rows`.
+        With rows numbered within `rows`.
     indices : tuple of int
-        Which of all constraints they are.
+        Their indices among all constraints.
     rows : slice or ndarray of int
         Their rows of the residual.
     radius, scale : ndarray (m,)
-        Of each row's constraint.
+        Values of each row's constraint.
     """
 
     def __init__(self, constraints: tuple[Constraint, ...]) -> None:
@@ -422,18 +421,19 @@ class Bounding:
 
     @cached_property
     def far_damping(self) -> Vector:
-        """Squared scales (m, m), on the diagonal."""
+        """Diagonal matrix (m, m) of squared scales."""
         return np.diag(self.scale**2)
 
     @cached_property
     def near_damping(self) -> Vector:
-        """Squared radii (m, m), on the diagonal."""
+        """Diagonal matrix (m, m) of squared radii."""
         return np.diag(self.radius**2)
 
     def missing(self, residual: Vector, jacobian: Vector) -> tuple[Vector, Vector]:
-        """What residuals (..., m) lack of their middle, or of a bound on one side, and slopes.
+        """Return the violations of residuals (..., m), and their Jacobian.
 
-        Rows (..., m, n) of the Jacobian are zero where a bound on one side holds.
+        A two-sided residual is returned as it is; a one-sided one by how much it exceeds its bound,
+        with rows (..., m, n) of the Jacobian zero where the bound holds.
         """
         if not self._is_one_sided:
             return residual, jacobian
@@ -443,7 +443,7 @@ class Bounding:
         return lacks, np.where(holds[..., np.newaxis], 0.0, jacobian)
 
     def errors(self, residuals: Vector) -> Vector:
-        """Largest ratio (N,) of a constraint's error to its radius, of residuals (N, m)."""
+        """Return the largest ratio (N,) of an error to its radius, for residuals (N, m)."""
         worst = np.zeros(len(residuals))
         for c in self.constraints:
             part = residuals[:, c.first : c.end]
@@ -453,7 +453,7 @@ class Bounding:
 
 
 def floor_bounds(goal: StiffnessGoal | None) -> Vector:
-    """Logarithms (f,) that the floors of a goal may not fall below, with some margin."""
+    """Return the lower bounds (f,) on the logarithms of a goal's floors, with some margin."""
     values = [floor.value for floor in goal.at_least] if goal is not None else []
     bounds: Vector = np.log(np.array(values)) + DESCENT.floor_margin
     return bounds

@@ -1,9 +1,9 @@
-"""The symbolic functions of a task's nonlinear program: residuals, objective, floors.
+"""`Program`: a task as symbolic functions: residuals, objective and floors.
 
 A task splits into its *structure* (which axes, which kinds of stiffness), for which functions are
-made once, and its *parameters* (positions, directions, values), which are arguments of them.
-Variables are the pressures; all stiffnesses enter by their logarithm, so that a tenth of a newton
-per metre weighs the same wherever it is a tenth.
+compiled once, and its *parameters* (positions, directions, values), which are arguments of them.
+Variables are the pressures.  Stiffnesses enter by their logarithm, so that steps and precision are
+relative.
 """
 
 import math
@@ -27,16 +27,15 @@ from stiffopt.optimise.term import Term
 
 Vector = NDArray[np.float64]
 
-BAR = 1e5
-"""In Pa."""
+BAR = 1e5  # Pa
 
 Aim = Literal["maximise", "match", "least pressure"]
 
 
 def pressure_ranges(description: RobotDescription) -> Vector:
-    """Units (n,) of the optimiser's variables in Pa: the range of each channel.
+    """Return the units (n,) of the optimiser's variables in Pa: the range of each channel.
 
-    A channel of no range has the largest range of the others.
+    A channel without a range takes the largest range of the others.
     """
     ranges = np.array(description.pressure_max) - np.array(description.pressure_min)
     largest = ranges.max()
@@ -44,17 +43,17 @@ def pressure_ranges(description: RobotDescription) -> Vector:
 
 
 class Constraint(NamedTuple):
-    """Rows of the residual, first to end - 1, that are bounded together.
+    """A bound on the rows first to end - 1 of the residual.
 
     Attributes
     ----------
     name : str
-        Of the term.
+        Name of the term.
     radius : float
-        Of the ball that the rows may not leave, ``|r| <= radius``; or the largest value of a
-        single row, ``r <= radius``, if `one_sided`.
+        Bound on the length of the rows, ``|r| <= radius``; if `one_sided`, bound on the single row,
+        ``r <= radius``.
     scale : float
-        What the residual is compared with while the target is far.
+        Typical size of the residual far from the target, in its unit.
     """
 
     name: str
@@ -66,7 +65,7 @@ class Constraint(NamedTuple):
 
 
 class ProgramStructure(NamedTuple):
-    """What compiled functions depend on; equal for tasks that share them."""
+    """What compiled functions depend on; tasks with equal structures share them."""
 
     terms: tuple[Hashable, ...]
     measures: tuple[Hashable, ...]
@@ -82,13 +81,14 @@ class Program:
     ----------
     terms : tuple of Term
     measures : tuple of Measure
-        What is maximised, or matched, then the floors.
-    aim : whether the first ones are maximised or matched; without any, pressure is minimised.
+        The maximised or matched ones, then the floors.
+    aim : whether the first measures are maximised or matched; without any, pressure is minimised.
     n_floors : int
+        Number of stiffnesses with a lower bound.
     reference : float
         Pressure in Pa that is one unit of mean square pressure.
     obstacles : Obstacles or None
-        What is around the arm: rows of the residual after those of the terms.
+        Objects around the arm; their rows of the residual follow those of the terms.
     """
 
     terms: tuple[Term, ...]
@@ -100,7 +100,7 @@ class Program:
 
     @classmethod
     def of(cls, task: Task, description: RobotDescription) -> "Program":
-        """Program of a task on a robot."""
+        """Return the program of a task on a robot."""
         terms, goal = task.target.terms, task.stiffness
         reference = float(pressure_ranges(description).max())
         obstacles = None if task.scene is None else Obstacles(task.scene, description)
@@ -127,7 +127,7 @@ class Program:
 
     @cached_property
     def target_parameters(self) -> tuple[float, ...]:
-        """Parameters of the terms, which come first."""
+        """Parameters of the terms; they come first."""
         found: tuple[float, ...] = ()
         for term in self.terms:
             found += term.parameters
@@ -143,7 +143,7 @@ class Program:
 
     @property
     def parameters(self) -> Vector:
-        """All parameters, as the functions take them."""
+        """All parameters, in the order of the functions' arguments."""
         return np.array((*self.target_parameters, *self.measure_parameters))
 
     @property
@@ -162,7 +162,7 @@ class Program:
         return found
 
     def constraints(self, length: float) -> tuple[Constraint, ...]:
-        """How the residual is bounded, for an arm of this length."""
+        """Return the bounds on the residual, for an arm of this length in m."""
         found: list[Constraint] = []
         first = 0
         for term in self.terms:
@@ -179,9 +179,9 @@ class Program:
 
     @property
     def in_order_of_approach(self) -> tuple[Term, ...]:
-        """The terms, in the order in which what cannot be reached is approached.
+        """The terms in the order in which an unreachable target is approached.
 
-        First inequalities, then others, the position last.
+        Inequalities come first and the position last.
         """
         return tuple(sorted(self.terms, key=lambda term: (not term.is_inequality, -term.order)))
 
@@ -197,16 +197,16 @@ class Program:
 
     @property
     def n_equal(self) -> int:
-        """Number of them that a target wants to be zero, but for its tolerance."""
+        """Number of rows that must be zero within a tolerance."""
         return sum(term.size for term in self.terms if not term.is_inequality)
 
     @property
     def has_stations(self) -> bool:
-        """Whether a term is one of stations along the body, not of the tip alone."""
+        """Whether a term depends on stations along the body, not on the tip alone."""
         return any(term.has_stations for term in self.terms)
 
     def errors(self, residuals: list[float]) -> dict[str, float]:
-        """Length of the residual of each term, or least margin of an inequality, from (m,)."""
+        """Return each term's error, or least margin of an inequality, from residuals (m,)."""
         found, start = {}, 0
         for term in self.terms:
             own = residuals[start : start + term.size]
@@ -215,35 +215,35 @@ class Program:
         return found
 
     def intruders(self, residuals: list[float]) -> dict[str, float]:
-        """Objects that are nearer than the clearance, with what is missing in m, from (m,)."""
+        """Return the objects nearer than the clearance, with what is missing in m, from (m,)."""
         if self.obstacles is None:
             return {}
         return self.obstacles.intruders(residuals[self.n_own_rows :])
 
     def touched(self, residuals: list[float]) -> list[str]:
-        """Objects that the body is next to, but for the clearance, from (m,)."""
+        """Return the objects at the clearance, from residuals (m,)."""
         return self.obstacles.touched(residuals[self.n_own_rows :]) if self.obstacles else []
 
     def at(self, target: Target) -> "Program":
-        """The same program for another target."""
+        """Return the same program for another target."""
         return Program(
             target.terms, self.measures, self.aim, self.n_floors, self.reference, self.obstacles
         )
 
     @property
     def n_terms(self) -> int:
-        """Number of terms of the objective, the largest of which is minimised."""
+        """Number t of terms of the objective; it is their maximum."""
         return len(self.measures) - self.n_floors if self.aim == "maximise" else 1
 
-    # -- symbolic: outputs of functions of the tip's shape and the parameters ---------------
+    # -- symbolic outputs, for the tip's shape and the parameters -----------------------------
 
     def pose(self, tip: Shape, parameters: Any) -> list[Any]:
-        """Residuals (m,) and, transposed, their Jacobian (n, m) per Pa."""
+        """Return the residuals (m,) and the transpose (n, m) of their Jacobian per Pa."""
         residual = self._residuals(tip, parameters)
         return [residual, ca.densify(tip.total_jacobian(residual)).T]
 
     def point(self, tip: Shape, parameters: Any) -> list[Any]:
-        """Those of `pose`, the objective's terms (t,), the floors' values (f,), their gradients.
+        """Return the outputs of `pose`, then objective terms (t,) and floors (f,) with gradients.
 
         Each gradient follows its values, transposed, per Pa.
         """
@@ -254,7 +254,7 @@ class Program:
         return [*self.pose(tip, parameters), *(ca.densify(part) for part in parts)]
 
     def worth(self, tip: Shape, parameters: Any) -> list[Any]:
-        """The objective's terms (t,) and the floors' values (f,) alone."""
+        """Return the objective's terms (t,) and the floors (f,) alone."""
         values = self._values(tip, parameters)
         first = len(self.measures) - self.n_floors
         none = type(tip.pressures)(first, tip.pressures.numel())
@@ -262,7 +262,7 @@ class Program:
         return [ca.densify(terms), ca.densify(values[first:])]
 
     def judge(self, tip: Shape, parameters: Any) -> list[Any]:
-        """Residuals, pose (4, 4) and compliance (6, 6), transposed, and values of the measures."""
+        """Return residuals, transposes of pose (4, 4) and compliance (6, 6), and measures (k,)."""
         return [
             self._residuals(tip, parameters),
             ca.densify(tip.transform).T,
@@ -275,7 +275,7 @@ class Program:
         for term in self.terms:
             end = start + len(term.parameters)
             residual = term.residual(tip, parameters[start:end])
-            # g >= 0 as r = radius - g <= radius, as balls are bounded
+            # write g >= 0 as r = radius - g <= radius, the form of all constraints
             found.append(term.radius - residual if term.is_inequality else residual)
             start = end
         return ca.densify(ca.vertcat(*found))
@@ -296,7 +296,7 @@ class Program:
             start = end
 
     def _terms(self, values: Any, gradients: Any, tip: Shape, parameters: Any) -> tuple[Any, Any]:
-        """Terms of the objective and their gradients."""
+        """Return the terms of the objective and their gradients."""
         if self.aim == "maximise":
             return -values, -gradients
         reference = parameters[-1]

@@ -1,4 +1,4 @@
-"""Convex quadratic programs of a few variables, by daqp."""
+"""Solve small convex quadratic programs with daqp."""
 
 import math
 
@@ -9,16 +9,16 @@ from numpy.typing import NDArray
 Vector = NDArray[np.float64]
 
 FAR = 1e6
-"""Stands for no bound."""
+"""Value of a bound that is absent."""
 
 
 def solve_qp(
     H: Vector, g: Vector, A: Vector, low: Vector, high: Vector
 ) -> tuple[Vector, Vector] | None:
-    """Minimise ``z'Hz/2 + g'z`` with ``low <= (z, Az) <= high``: solution and multipliers.
+    """Minimise ``z'Hz/2 + g'z`` subject to ``low <= (z, Az) <= high``.
 
-    The arrays are contiguous.  None where the solver's answer is not finite or not marked as
-    optimal.
+    Arrays must be contiguous.  Returns the solution and the multipliers; None if the solver's
+    answer is not finite or not marked as optimal.
     """
     sense = np.zeros(len(low), dtype=np.int32)
     z, _, flag, info = daqp.solve(H, g, A, high, low, sense, primal_tol=1e-9)

@@ -1,4 +1,4 @@
-"""From any pressures to ones that meet the target: Levenberg-Marquardt within the limits."""
+"""Bring pressures to the target: Levenberg-Marquardt method within the pressure limits."""
 
 import math
 from collections.abc import Callable
@@ -17,9 +17,9 @@ Vector = NDArray[np.float64]
 def reach(
     problem: PressureProblem, x: Vector, most_iterations: int = REACH.iterations
 ) -> ProgramPoint | None:
-    """Bring pressures to the pose; the point nearest to it that was found otherwise.
+    """Bring pressures to the pose, or as near to it as possible.
 
-    None if the arm has no equilibrium at the start.
+    Returns the last point; None if the arm has no equilibrium at the start.
     """
     point = attempt(problem.pose, x)
     if point is None:
@@ -59,8 +59,8 @@ def reach(
     return point
 
 
-def comes(problem: PressureProblem, candidates: list[Vector]) -> bool:
-    """Whether one of some pressures (n,) is brought to the pose."""
+def can_reach(problem: PressureProblem, candidates: list[Vector]) -> bool:
+    """Return whether one of these pressures (n,) can be brought to the pose."""
     if not problem.robot.is_loaded:
         return bool((reach_all(problem, np.array(candidates))[1] <= 1).any())
     for x in candidates:
@@ -76,8 +76,8 @@ def reach_all(
 ) -> tuple[Vector, Vector]:
     """Bring pressures (N, n) of an arm without loads to the pose, all at once.
 
-    Returns where they came to, and by how much (N,) the worst residual there exceeds its radius,
-    as a ratio: at most one where the pose was reached.  Obstacles are not looked at.
+    Returns the final pressures, and the largest ratio (N,) of a residual to its radius: at most one
+    where the pose was reached.  Obstacles are ignored.
     """
     bounding = problem.terms_bounding
     x = within(problem.lower, x, problem.upper)
@@ -121,10 +121,10 @@ def reach_all(
 
 
 def bounded_steps(J: Vector, wanted: Vector, D: Vector, low: Vector, high: Vector) -> Vector:
-    """Steps d (..., n) within [low, high] that make ``|W (J d - wanted)|^2 + |d|^2`` small.
+    """Return steps d (..., n) within [low, high] that make ``|W (J d - wanted)|^2 + |d|^2`` small.
 
-    J (..., m, n), wanted (..., m), and D (..., m, m), the inverse of ``W^2``.  Components that
-    would leave their range are put on its end and the rest is solved again.
+    J is (..., m, n), wanted (..., m), and D (..., m, m) the inverse of ``W^2``.  Components that
+    leave their range are fixed at its end, and the others are solved for again.
     """
     Jt = J.swapaxes(-1, -2)
     y = _solved(J @ Jt + D, wanted[..., np.newaxis])
@@ -143,9 +143,9 @@ def bounded_steps(J: Vector, wanted: Vector, D: Vector, low: Vector, high: Vecto
 
 
 def bounded_step(J: Vector, wanted: Vector, D: Vector, low: Vector, high: Vector) -> Vector:
-    """The same for one row, which is most of the cost of small steps.
+    """Return a single step of `bounded_steps`, with less overhead.
 
-    Rows without a slope, as those of obstacles far away, have no part in it.
+    Rows of J that are zero, as those of distant obstacles, are skipped.
     """
     used = J.any(axis=1)
     if not used.all():
@@ -156,7 +156,7 @@ def bounded_step(J: Vector, wanted: Vector, D: Vector, low: Vector, high: Vector
 
 
 def _solved(A: Vector, b: Vector) -> Vector:
-    """Solution of A y = b with A positive definite, but for rounding: then that of least length."""
+    """Solve A y = b for positive definite A; if rounding makes it singular, with least norm."""
     try:
         return np.asarray(np.linalg.solve(A, b), dtype=float)
     except np.linalg.LinAlgError:
@@ -168,18 +168,18 @@ def _misfit(residual: Vector) -> float:
 
 
 def _misfits(residuals: Vector) -> Vector:
-    """Squared lengths (N,) of residuals (N, m), infinite where anything is not finite."""
+    """Return squared lengths (N,) of residuals (N, m), infinite where any is not finite."""
     squares = np.einsum("ij,ij->i", residuals, residuals)
     return np.where(np.isfinite(squares), squares, np.inf)
 
 
 def within(low: Vector, x: Vector, high: Vector) -> Vector:
-    """The nearest to x within [low, high]."""
+    """Clip x to [low, high]."""
     return np.minimum(np.maximum(x, low), high)
 
 
 def attempt(evaluate: Callable[[Vector], ProgramPoint], x: Vector) -> ProgramPoint | None:
-    """Evaluate; None where the arm has no stable equilibrium or anything is not finite."""
+    """Evaluate; return None without a stable equilibrium or with non-finite numbers."""
     try:
         point = evaluate(x)
     except EquilibriumError:

@@ -1,4 +1,4 @@
-"""Sampled configurations of an arm, from which searches start."""
+"""`SampleTable`: sampled configurations of an arm, from which searches start."""
 
 from functools import cached_property
 
@@ -26,7 +26,7 @@ class SampleTable:
     seed : int
         Shifts the low-discrepancy sequence.
     arm : LoadedArm, optional
-        A loaded robot in machine code, which finds the equilibria then.
+        The robot in machine code, to find equilibria under load.
 
     Attributes
     ----------
@@ -34,7 +34,7 @@ class SampleTable:
         In Pa.
     poses : ndarray (N, 4, 4)
     states : ndarray (N, s)
-        Of the equilibria, if there is such an arm.
+        States of the equilibria; only with `arm`.
     """
 
     def __init__(
@@ -51,7 +51,7 @@ class SampleTable:
             count = SAMPLES.loaded if arm is None else SAMPLES.compiled
         x = lower + (upper - lower) * _spread_with_edges(count, len(lower), seed)
         if robot.is_loaded:
-            # under load little pressure can do much: every other sample is scaled down
+            # under load small pressures can have a large effect: scale down every other sample
             scale = 10 ** (-2.5 * np.arange(count) / count)
             scale[::2] = 1.0
             x = lower + (x - lower) * scale[:, np.newaxis]
@@ -72,26 +72,26 @@ class SampleTable:
 
     @cached_property
     def flat_poses(self) -> Vector:
-        """Position and rotation, this by columns, (N, 12)."""
+        """Positions and rotations (by columns), (N, 12)."""
         return _flattened(self.poses)
 
     def distances(self, terms: tuple[Term, ...], length: float) -> Vector:
-        """How far (N,) the samples' tips are from meeting all terms, roughly (see `Nearness`)."""
+        """Return rough distances (N,) of the tips from meeting all terms (see `Nearness`)."""
         return _distances(self.flat_poses, terms, length)
 
-    def nearest_first(self, distances: Vector, most: int | None = None) -> NDArray[np.intp]:
-        """Indices of the samples with the smallest distances (N,), in order."""
-        if most is None or most >= len(distances):
+    def nearest_first(self, distances: Vector, count: int | None = None) -> NDArray[np.intp]:
+        """Return the indices of `count` samples (default: all) by increasing distance (N,)."""
+        if count is None or count >= len(distances):
             return np.argsort(distances, kind="stable")
-        nearest = np.sort(np.argpartition(distances, most)[:most])
+        nearest = np.sort(np.argpartition(distances, count)[:count])
         return nearest[np.argsort(distances[nearest], kind="stable")]
 
 
 def _spread_with_edges(count: int, n: int, seed: int) -> Vector:
-    """Points (count, n) of the unit cube, a part of them on its faces and edges.
+    """Return points (count, n) of the unit cube, a part of them on its faces and edges.
 
-    Additive recurrence with the generalised golden ratio (M. Roberts, 2018); optima often lie
-    at limits, so the cube is stretched by a quarter and clipped.
+    Additive recurrence with the generalised golden ratio (M. Roberts, 2018).  Optima often lie at
+    limits, so the cube is stretched by a quarter and clipped.
     """
     ratio = 2.0
     for _ in range(60):
@@ -103,7 +103,7 @@ def _spread_with_edges(count: int, n: int, seed: int) -> Vector:
 
 
 def distances(poses: Vector, terms: tuple[Term, ...], length: float) -> Vector:
-    """How far (N,) tips at poses (N, 4, 4) are from meeting all terms; see `Nearness`."""
+    """Return rough distances (N,) of poses (N, 4, 4) from meeting all terms; see `Nearness`."""
     return _distances(_flattened(poses), terms, length)
 
 
@@ -126,7 +126,7 @@ def _flattened(poses: Vector) -> Vector:
 
 
 def _unflattened(flat: Vector) -> Vector:
-    """Poses (N, 4, 4) from position and rotation by columns (N, 12)."""
+    """Return poses (N, 4, 4) from positions and rotations by columns (N, 12)."""
     poses = np.tile(np.eye(4), (len(flat), 1, 1))
     poses[:, :3, 3] = flat[:, :3]
     poses[:, :3, :3] = flat[:, 3:].reshape(-1, 3, 3).swapaxes(1, 2)
@@ -134,12 +134,12 @@ def _unflattened(flat: Vector) -> Vector:
 
 
 def _settled(robot: Manipulator, x: Vector) -> tuple[Vector, Vector]:
-    """Those configurations of a loaded arm that have an equilibrium, and their poses."""
+    """Return the configurations of a loaded arm that have an equilibrium, and their poses."""
     evaluator = robot.evaluator("pose", lambda shape, _: [shape.transform])
     kept: list[int] = []
     poses: list[Vector] = []
     for index in range(len(x)):
-        evaluator.restart()  # each from rest, so that local searches start on the right branch
+        evaluator.restart()  # from rest, so that local searches start on the right branch
         try:
             (pose,) = evaluator(x[index])
         except EquilibriumError:

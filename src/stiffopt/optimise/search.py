@@ -1,10 +1,10 @@
-"""Global search: where to start local optimisations, and when to stop.
+"""Global search: where local optimisations start, and when to stop.
 
-Samples whose tip is nearest to the target are brought to the pose and ranked by the objective
-there.  Descents start from the best, those unlike each other first; one that comes next to an
-optimum that is known already ends there.  The search ends when so many descents in a row have
-found no new local optimum: those with a basin of some size have been seen then, but nothing is
-proved.  How many is a matter of how much the target leaves open (`effort`).
+The samples whose tips are nearest to the target are brought to the pose and ranked by the objective
+there.  Descents start from the best, those unlike each other first.  A descent that comes close to
+a known optimum ends there.  The search ends when enough descents in a row have found no new local
+optimum: all optima with a large basin have then probably been seen, but nothing is proved.  The
+number required depends on how many configurations meet the target (`effort`).
 
 The folder ``native`` holds the same method in C.
 """
@@ -27,24 +27,24 @@ from stiffopt.optimise.solution import Confidence
 
 Vector = NDArray[np.float64]
 Places = Callable[[Any, Iterable[Vector]], Iterator[tuple[int, ProgramPoint | None]]]
-"""Brings candidates to the target: points to descend from, and how many were tried by then."""
+"""Brings candidates to the target: yields points to descend from, with the number tried so far."""
 
 
 def effort(rows: int, covered: float, loaded: bool = False) -> Effort:
-    """Effort of a search.
+    """Return the effort of a search.
 
-    A target of fewer components than a position, or of a large tolerance, is reached in very
-    different ways, of which the best is easily overlooked.  The numbers were tuned against hundreds
-    of descents a task, see benchmarks/quality.py.
+    A target with fewer components than a position, or with a large tolerance, is reached in very
+    different ways, and the best is easily missed.  The numbers were tuned against hundreds of
+    descents a task, see benchmarks/quality.py.
 
     Parameters
     ----------
     rows : int
-        Components of the residuals that are to be zero.
+        Components of the residuals that must be zero.
     covered : float
         Share of the sampled configurations that meet the target.
     loaded : bool
-        Whether it is that of machine code for an arm under gravity or a load.
+        Whether machine code searches for an arm under gravity or a load.
     """
     placed, loose = SEARCH.placed, SEARCH.loose
     if loaded:
@@ -56,12 +56,12 @@ def effort(rows: int, covered: float, loaded: bool = False) -> Effort:
 
 
 def starts(problem: PressureProblem, table: SampleTable) -> tuple[Iterator[Vector], Effort]:
-    """Variables (n,) to start from, those near the target first, and how hard to try.
+    """Return variables (n,) to start from, near the target first, and the effort of the search.
 
-    Less hard than compiled code does for an arm without loads, since all takes longer here: one
-    descent less must agree and, with up to six pressures, where there are few optima, half of the
-    samples.  Under load, where few are tried, near ones and any are given in turn, unlike each
-    other.
+    Evaluations are slower than in compiled code, so the effort is smaller.  Without loads, one
+    descent less must agree, and half of the samples suffice for up to six pressures, where there
+    are few optima. Under load few starts are tried: samples near the target and arbitrary ones
+    alternate, unlike each other first.
     """
     distances = table.distances(problem.program.terms, problem.robot.length)
     full = effort(problem.program.n_equal, float((distances == 0).mean()))
@@ -86,10 +86,9 @@ class Search:
     Attributes
     ----------
     results : tuple of LocalResult
-        Where descents ended, the best first; one that stopped next to an optimum that was known
-        already is left out.
+        Ends of descents, the best first, without those that stopped next to a known optimum.
     nearest : tuple of ProgramPoint
-        Where starts that did not reach the pose ended, if none reached it.
+        Ends of starts that did not reach the pose, if none reached it.
     confidence : Confidence
     """
 
@@ -105,7 +104,7 @@ def search(
     same: float = SEARCH.same_optimum,
     places: Places | None = None,
 ) -> Search:
-    """Run local optimisations from candidates until so many in a row find nothing new.
+    """Run local optimisations from candidates until enough of them in a row find nothing new.
 
     `same` is the difference of values below which optima count as one; `places` brings candidates
     to the target.
@@ -115,7 +114,7 @@ def search(
         _descend_from(problem, (places or _places)(problem, candidates), tries, trail)
     except StoppedError:
         if problem.robot.is_loaded or not trail.optima:
-            raise  # to judge what there is takes long as well, or there is nothing
+            raise  # nothing was found, or judging it would take long as well
     return trail.outcome()
 
 
@@ -125,7 +124,7 @@ def _descend_from(
     tries: Effort,
     trail: "_Trail",
 ) -> None:
-    """Descend from places, until enough has been seen; the trail keeps what is found."""
+    """Descend from points at the target until enough has been seen; record ends in the trail."""
     ends: dict[int, LocalResult] = {}
     for tried, point in places:
         trail.starts = tried
@@ -153,7 +152,7 @@ class _Trail:
         self._converged: list[LocalResult] = []
 
     def add(self, result: LocalResult) -> None:
-        """Take note of where a descent ended."""
+        """Record the end of a descent."""
         self.descents += 1
         if not np.isfinite(result.value):
             return
@@ -170,14 +169,14 @@ class _Trail:
 
     @property
     def is_complete(self) -> bool:
-        """Whether the last descents have found nothing new."""
+        """Whether enough descents in a row have found nothing new."""
         return self._nothing_new >= self._agreeing
 
     def _agree(self, a: LocalResult, b: LocalResult) -> bool:
         return abs(a.value - b.value) < self.same and abs(a.violation - b.violation) < self.same
 
     def outcome(self) -> Search:
-        """All of it, the best first."""
+        """Return the outcome, the best results first."""
         results = sorted(self._results, key=_rank)
         best = min(self._converged, key=_rank, default=None)
         agreeing = sum(best is not None and self._agree(result, best) for result in self._converged)
@@ -197,9 +196,9 @@ def _rank(result: LocalResult) -> tuple[float, float]:
 def _places(
     problem: PressureProblem, candidates: Iterable[Vector]
 ) -> Iterator[tuple[int, ProgramPoint | None]]:
-    """Points to descend from, each with the number of candidates that were tried until then.
+    """Yield points to descend from, each with the number of candidates tried so far.
 
-    None or points that have not reached the pose where a candidate led nowhere.
+    Yield None, or a point off the pose, for a candidate that did not arrive.
     """
     if problem.robot.is_loaded:
         for tried, x in enumerate(candidates, 1):
@@ -210,25 +209,25 @@ def _places(
     if not len(x):
         return
     x, excess = reach_all(problem, x)
-    come = x[excess <= 1]
-    if not len(come):
+    arrived = x[excess <= 1]
+    if not len(arrived):
         points = [problem.pose(row) for row in x[np.argsort(excess, kind="stable")]]
         yield from ((len(x), point) for point in points)
         return
-    place = _first_at_same_place(come)
-    promise = {i: _promise(problem, come[i]) for i in set(place)}
-    ranked = sorted(range(len(come)), key=lambda i: promise[place[i]])
+    place = _first_at_same_place(arrived)
+    rank = {i: _rank_of_start(problem, arrived[i]) for i in set(place)}
+    ranked = sorted(range(len(arrived)), key=lambda i: rank[place[i]])
     points_at: dict[int, ProgramPoint] = {}
-    for i in unlike_first(problem, come[ranked]):
+    for i in unlike_first(problem, arrived[ranked]):
         at = place[ranked[i]]
         if at not in points_at:
-            points_at[at] = _past_obstacles(problem, come[at])
+            points_at[at] = _past_obstacles(problem, arrived[at])
         point = points_at[at]
         yield len(x), point if point.is_finite and point.reached else None
 
 
 def _past_obstacles(problem: PressureProblem, x: Vector) -> ProgramPoint:
-    """All that is needed at pressures (n,) at the target or, past obstacles, near them."""
+    """Evaluate pressures (n,) at the target; if the body hits obstacles, move it clear first."""
     point = problem.needed(x)
     if problem.program.obstacles is None or point.reached:
         return point
@@ -237,21 +236,21 @@ def _past_obstacles(problem: PressureProblem, x: Vector) -> ProgramPoint:
 
 
 def _intrusion(problem: PressureProblem, x: Vector) -> float:
-    """Sum by which the body lacks clearance at pressures (n,), over the arm's length."""
+    """Return the sum of missing clearances at pressures (n,), over the arm's length."""
     own = problem.program.n_own_rows
     missing = problem.pose(x).residual[own:] - OBSTACLES.margin
     return float(np.maximum(missing, 0.0).sum()) / problem.robot.length
 
 
 def _first_at_same_place(x: Vector) -> list[int]:
-    """For each of some pressures (N, n) the first that are the same but for little."""
+    """Return for each of the pressures (N, n) the index of the first that is nearly equal."""
     same_place = np.abs(x[:, np.newaxis] - x).max(axis=2) < DESCENT.next_to
     first: list[int] = same_place.argmax(axis=1).tolist()
     return first
 
 
-def _promise(problem: PressureProblem, x: Vector) -> float:
-    """Objective at pressures (n,) with a penalty on floors that are missed; less is better."""
+def _rank_of_start(problem: PressureProblem, x: Vector) -> float:
+    """Return the objective at pressures (n,), with penalties on missed floors and clearances."""
     point = problem.worth(x)
     value = problem.objective.value(point) + SEARCH.price_of_floors * violation(problem, point)
     if problem.program.obstacles is not None:
@@ -260,11 +259,11 @@ def _promise(problem: PressureProblem, x: Vector) -> float:
 
 
 def unlike_first(problem: PressureProblem, x: Vector) -> Iterator[int]:
-    """Indices of pressures (N, n), in order: those far from all before, then the others."""
+    """Yield the indices of pressures (N, n): those far from all before first, then the rest."""
     range_ = problem.upper - problem.lower
-    apart = SEARCH.unlike**2 * float(range_ @ range_)
+    spacing = SEARCH.unlike**2 * float(range_ @ range_)
     squares = np.einsum("ij,ij->i", x, x)
-    close = squares[:, np.newaxis] + squares - 2 * x @ x.T <= apart
+    close = squares[:, np.newaxis] + squares - 2 * x @ x.T <= spacing
     passed_over = np.zeros(len(x), dtype=bool)
     later: list[int] = []
     for i in range(len(x)):

@@ -1,8 +1,8 @@
-"""Tuning values of the optimiser, grouped by the method that they belong to.
+"""Tuning values of the optimiser, grouped by method.
 
-Variables of all methods are the pressures as shares of each channel's range, so that steps and
-distances mean the same for a channel of 0.2 bar and for one of 10 bar.  The methods written in C
-(folder ``native``) are given the same values.
+The variables of all methods are pressures as shares of each channel's range, so that steps and
+distances mean the same for a channel of 0.2 bar and for one of 10 bar.  The methods in C (folder
+``native``) take the same values.
 """
 
 from dataclasses import dataclass, field
@@ -16,10 +16,10 @@ class ReachSettings:
     Attributes
     ----------
     longest_step : of a pressure, as a share of its range.
-    damping : at the start, and the range in which it is adapted.
+    damping, least_damping, most_damping : initial value, and range of its adaptation.
     least_progress : share of the misfit that a step must promise.
-    iterations : of a start that is followed alone, as a guess is.
-    iterations_of_many : of each of many starts.
+    iterations : for a single start, such as a guess.
+    iterations_of_many : for each of many starts.
     """
 
     longest_step: float = 2 / 3
@@ -39,13 +39,13 @@ class DescentSettings:
     ----------
     iterations : at most.
     first_radius, largest_radius, last_radius : of the trust region.
-    curvature : first guess of the objective's second derivative.
-    inside : share of a tolerance that is used, so that rounding stays within it.
-    touching : a pressure that near to a limit is meant to be at it.
-    next_to : a descent that near to an optimum of the same value is on its way there.
-    floor_margin : how far above a stiffness that must be kept the method aims, relatively.
+    curvature : initial estimate of the objective's second derivative.
+    inside : share of a tolerance that is used, so that rounding errors stay within it.
+    touching : distance from a limit below which a pressure is put on the limit.
+    next_to : distance from a known optimum of the same value at which a descent ends there.
+    floor_margin : relative margin above a floor that the method aims at.
     pull_back_damping : of the corrections back into the tolerances.
-    shortest_pull_back : correction that is allowed after however short a step.
+    shortest_pull_back : correction that is allowed however short the step.
     """
 
     iterations: int = 80
@@ -66,9 +66,9 @@ class Effort(NamedTuple):
 
     Attributes
     ----------
-    screened : samples that are brought to the target and ranked by what they are worth there.
+    screened : samples that are brought to the target and ranked there by their objective.
     agreeing : descents in a row that must find nothing new before the search ends.
-    most_descents : after which it ends anyway.
+    most_descents : largest number of descents.
     """
 
     screened: int
@@ -82,17 +82,18 @@ class SearchSettings:
 
     Attributes
     ----------
-    placed, loose : effort for a target of at least a position, and of less than that: what is
-        loosely asked for is reached in very different ways.  `loose` is also the effort for any
-        target whose tolerances cover the share `covered` of the sampled configurations.
-    loaded_placed, loaded_loose : the same in machine code for an arm under gravity or a load, of
-        which an evaluation takes a hundred times longer.
+    placed, loose : effort for a target with at least a position, and with less: a loose target is
+        reached in very different ways.  `loose` is also the effort for any target whose tolerances
+        cover the share `covered` of the sampled configurations.
+    loaded_placed, loaded_loose : the same in machine code for an arm under gravity or a load, whose
+        evaluations take a hundred times longer.
     covered : share of the configurations, see above; the effort grows with the share up to it.
-    same_optimum : difference of two objectives (0.1 % of a stiffness) that count as one optimum.
-    unlike : share of the diagonal of the pressure range that first starts lie apart.
-    price_of_floors : weight of a stiffness that is missed, when starts are ranked.
-    price_of_obstacles : weight of what a body lacks of its clearance, over the arm's length, when
-        starts that are at the target but not clear yet are ranked.
+    same_optimum : difference of two objectives (0.1 % of a stiffness) below which optima are the
+        same.
+    unlike : spacing of the first starts, as a share of the diagonal of the pressure range.
+    price_of_floors : weight of missed stiffness in the ranking of starts.
+    price_of_obstacles : weight of missing clearance, over the arm's length, in the ranking of
+        starts that are at the target but not clear yet.
     general_starts_loaded : starts of the general method for an arm under gravity or a load.
     """
 
@@ -110,14 +111,14 @@ class SearchSettings:
 
 @dataclass(frozen=True)
 class ClosestSettings:
-    """Search for the configuration closest to what cannot be reached (`diagnosis`).
+    """Search for the configuration closest to an unreachable target (`diagnosis`).
 
     Attributes
     ----------
     most_descents, agreeing : as those of `Effort`.
     compiled_descents, compiled_agreeing : the same in machine code.
-    samples : that descents start from, the nearest to the target; twice as many are any.
-    same : difference of two objectives (half a squared error over a scale) that count as one.
+    samples : number of starts that are nearest to the target; twice as many are arbitrary.
+    same : difference of two objectives (half a squared error over a scale) of the same optimum.
     precision : decrease of an objective that no longer matters.
     """
 
@@ -136,14 +137,14 @@ class ObstacleSettings:
 
     Attributes
     ----------
-    margin : width of a row's bound in m, the scale on which the method sees it.
-    cutoff : distance beyond the clearance, in m, from which an object has no part in a step.
-    touching : how near to the clearance an object counts as one that holds the arm back, in m.
-    turns, closer : without machine code, how often it is looked closer, and at how many stations.
-    clearest : samples of which a clear one is sought to start from, where none near the target
-        comes clear, and of which the clearest is shown where nothing is.
-    starts : of the clearest of them, from which descents start in turn where none is clear.
-    allowed : by how much an answer may be nearer than the clearance, in m: the precision of least
+    margin : width of a row's bound in m, its scale in the method.
+    cutoff : distance beyond the clearance, in m, from which an object does not affect a step.
+    touching : distance beyond the clearance, in m, within which an object holds the arm back.
+    turns, closer : refinements of the nearest point without machine code, and stations of each.
+    clearest : samples among which a clear start is sought if none near the target arrives clear;
+        the clearest of them is shown if none is clear.
+    starts : number of the clearest samples from which descents start if none is clear.
+    allowed : violation of the clearance that is allowed in an answer, in m: the precision of least
         distances.
     """
 
@@ -163,19 +164,19 @@ class BraceSettings:
 
     Attributes
     ----------
-    force : width of a row's bound on a contact force in N, the scale on which the method sees it.
-    scale : what a force is compared with while the target is far, in N.
-    step : of a pressure, as a share of its range, in differences of equilibria.
-    precision : decrease of the objective that no longer matters, which differences can tell.
-    spare : share of tolerances, forces and margins that is left.
-    stations : along the body, at which samples are looked at for what they would lean on.
+    force : width of a row's bound on a contact force in N, its scale in the method.
+    scale : typical violation of a force far from the target, in N.
+    step : step of a pressure, as a share of its range, in differences of equilibria.
+    precision : decrease of the objective that no longer matters, resolved by these differences.
+    spare : share of tolerances, forces and margins that is not used.
+    stations : stations along the body at which samples are tested for contact.
     screened : samples whose contact is estimated.
     effort : starts that are brought to the target in contact, descents in a row that must find
         nothing new, and most descents.
-    iterations : of a start, to the target and to what contacts have to hold.
+    iterations : iterations of a start, to the target and to the contacts' demands.
     tried : local optima that are judged in turn, from rest.
-    least_price : of a whole tolerance or limit, as a share of the stiffness, that is worth telling.
-    largest_push : up to which pushes are looked at, in N.
+    least_price : gain from a whole tolerance or limit, as a share of the stiffness, to be reported.
+    largest_push : largest push that is tested, in N.
     """
 
     force: float = 5e-3
@@ -199,9 +200,9 @@ class SampleSettings:
     Attributes
     ----------
     free : number for an arm without loads.
-    loaded : for one under gravity or a load, whose equilibria take a thousand times longer.
-    compiled : the same in machine code; each load has its own.
-    hopeless : if none of so many first ones has an equilibrium, the arm has none.
+    loaded : number under gravity or a load, where equilibria take a thousand times longer.
+    compiled : the same in machine code; each load has its own samples.
+    hopeless : if none of the first samples up to this number has an equilibrium, the arm has none.
     """
 
     free: int = 4096
@@ -216,11 +217,11 @@ class PriceSettings:
 
     Attributes
     ----------
-    near : how nearly, relatively, a constraint must hold to be weighed at all.
-    slack : how much less a constraint that is off by a share of itself explains: the price of one
-        that binds is not found to be zero since the solution is not exact.
-    beyond : how far outside a pressure limit its price is taken, as a share of the range.
-    least : below which a price is rounding.
+    near : relative distance from its bound up to which a constraint is considered.
+    slack : penalty on constraints away from their bound, so that the price of an active one is not
+        lost to the solution's inexactness.
+    beyond : distance outside a pressure limit at which its price is taken, as a share of the range.
+    least : price below which it is rounding error.
     """
 
     near: float = 0.01
@@ -236,16 +237,16 @@ class DerivativeSettings:
     Attributes
     ----------
     step : of a pressure, as a share of its range, in differences of gradients.
-    step_of_parameters : of a target (m, rad) or a direction.
-    least : multiplier below which a constraint does not bind.
-    near, touching : error, as a share less than the tolerance, and distance from a limit at which a
-        constraint is taken to bind at first: the answer is only nearly the optimum.
-    rounds : in which what binds is found out.
+    step_of_parameters : of a target (m, rad) or a direction, in differences.
+    least : multiplier below which a constraint is inactive.
+    near, touching : relative distance from a tolerance, and distance from a limit, within which a
+        constraint is first assumed to be active: the answer is only nearly the optimum.
+    rounds : updates of the active constraints.
     iterations, longest_step, small_step : of Newton's method to the optimum.
-    tiny : relative violation, or wrong push, that is rounding.
-    weak : multiplier, or relative distance, below which a constraint is about to let go, or bind.
-    largest_condition : of the system, above which an answer is not alone.
-    edge : share by which the change of a distance's slope may differ between two sides.
+    tiny : relative violation, or multiplier of the wrong sign, that is rounding error.
+    weak : multiplier, or relative distance, below which a constraint is weakly active.
+    largest_condition : condition number above which the answer is not isolated.
+    edge : relative difference between the two one-sided derivatives of a distance's slope.
     """
 
     step: float = 1e-4
@@ -270,8 +271,8 @@ class ProgramSettings:
     Attributes
     ----------
     maximise, match, least_pressure : decrease of each objective that no longer matters.
-    some_pressure : weight of the mean square pressure where a stiffness is matched: of all
-        pressures that match as well, the least are wanted.
+    some_pressure : weight of the mean square pressure where a stiffness is matched, to choose the
+        lowest of the pressures that match equally well.
     """
 
     maximise: float = 1e-7
@@ -282,12 +283,12 @@ class ProgramSettings:
 
 @dataclass(frozen=True)
 class AnswerSettings:
-    """Answers and what is reported of them.
+    """Answers and their reports.
 
     Attributes
     ----------
     tried : local optima that are judged in turn if the best is not reached from rest.
-    at_limit : how far from a limit a pressure still counts as at it, in Pa.
+    at_limit : distance from a limit, in Pa, within which a pressure is at the limit.
     largest_tolerance : of the trade-off between error and stiffness, as a share of the arm.
     """
 
@@ -298,12 +299,12 @@ class AnswerSettings:
 
 @dataclass(frozen=True)
 class KeptSettings:
-    """What is compiled and kept for later tasks, and how work is shared out.
+    """Limits of caches and compilation, and the division of work.
 
     Attributes
     ----------
-    most_measures : stiffnesses of a task on a free arm; of more, code takes too long to compile.
-    per_arm : of each kind of thing that varies from task to task.
+    most_measures : stiffnesses of a task on a free arm; with more, compilation takes too long.
+    per_arm : cached items of each kind that varies from task to task.
     in_vm : functions in the CasADi VM, of all arms.
     chunk : tasks, or equilibria, that a thread takes at a time.
     """

@@ -1,4 +1,4 @@
-"""The answer to a task, and its judgement by the model alone."""
+"""`PressureSolution`: the answer to a task, judged by the model alone."""
 
 import math
 import threading
@@ -30,11 +30,11 @@ Vector = NDArray[np.float64]
 Status = Literal["solved", "unreachable", "failed"]
 
 _explaining = threading.RLock()
-_NOT_KEPT = ("_derivatives", "equilibrium")  # in copies
+_NOT_KEPT = ("_derivatives", "equilibrium")  # in copies and pickles
 
 
 def _protect(owner: object, *names: str) -> None:
-    """Replace arrays of a frozen dataclass by copies that cannot be written to."""
+    """Replace arrays of a frozen dataclass by read-only copies."""
     for name in names:
         value = getattr(owner, name)
         if value is not None:
@@ -52,13 +52,13 @@ class Confidence:
     starts : int
         Configurations that were brought towards the pose.
     reached : int
-        Descents from such as reached it that converged.
+        Converged descents from starts that reached the pose.
     agreeing : int
-        Those that ended within 0.1 % of the best.
+        Converged descents that ended within 0.1 % of the best.
     optima : int
         Distinct local optima among them.
     complete : bool
-        Whether the search ended because so many descents in a row found nothing new (see
+        Whether the search ended because enough descents in a row found nothing new (see
         `stiffopt.optimise.search.effort`).  False: it ran out of starts.
     """
 
@@ -92,17 +92,16 @@ class Sensitivities:
     stiffness_gradient : ndarray (n,) or None
         First stiffness of the task per Pa, in N/m/Pa or N m/rad/Pa.
     per_bound : dict of str to float
-        For each active pressure limit what moving it outwards is worth, in `objective_unit`
-        per Pa.
+        Gain from moving each active pressure limit outwards, in `objective_unit` per Pa.
     per_tolerance : dict of str to float
-        The same for each term of the target by its name, per m or rad of tolerance or, of an
-        inequality, of margin; and per m less clearance of each object, see `per_clearance`.
+        Gain by name of each term of the target, per m or rad of tolerance or, for an inequality, of
+        margin; and per m less clearance of each object, see `per_clearance`.
     per_position_tolerance, per_angle_tolerance : float or None
-        Those of position and angle; None where not asked for.
+        Gains for position and angle; None where the target has none.
     objective_unit : str
-        What is gained: "N/m" or "N*m/rad" of the (smallest) stiffness that is maximised; "m" or
-        "rad" of the error of an unreachable pose; "bar^2" of mean square pressure where no
-        stiffness is asked for; "1", the squared relative mismatch, where one is matched.
+        Unit of the gain: "N/m" or "N*m/rad" of the (smallest) stiffness that is maximised; "m" or
+        "rad" of the error of an unreachable pose; "bar^2" of mean square pressure for a task
+        without a stiffness; "1", the squared relative mismatch, where one is matched.
     """
 
     tip_jacobian: Vector
@@ -135,14 +134,14 @@ class Sensitivities:
 
 
 class NearestObject(NamedTuple):
-    """The object that a body is nearest to, and how far that is in m."""
+    """The object nearest to the body, and its distance in m."""
 
     distance: float
     name: str
 
 
 class Preload(NamedTuple):
-    """What the contacts of a brace hold against a push at the tip.
+    """The push at the tip that the contacts of a brace withstand.
 
     Attributes
     ----------
@@ -172,51 +171,52 @@ class PressureSolution(ShownInNotebook):
     Attributes
     ----------
     status : {"solved", "unreachable", "failed"}
-        "unreachable": no pressures do all that was asked; the closest are given.  "failed": there
-        is no answer, and all that follows is None or empty.
+        "unreachable": no pressures meet the whole task; the closest are given.  "failed": there is
+        no answer, and all other fields are None or empty.
     message : str
         One or two sentences for people.
     pressures : ndarray (n,) or None
         In Pa.
     tip_pose : ndarray (4, 4) or None
     position_error : float or None
-        Over the axes that were asked for, in m; None where none was.
+        Over the target's axes that are not free, in m; None without a position.
     angle_error : float or None
-        Between axes or of the rotation, in rad; None where none was asked for.
+        Between axes or of the rotation, in rad; None without an angular target.
     compliance : ndarray (6, 6) or None
         Of the tip, in tip axes, linear first.
     stiffness : float or None
-        The first that the task names (the matched one too), in `stiffness_unit`.
+        The first stiffness that the task names (a matched one too), in `stiffness_unit`.
     stiffness_unit : str or None
     stiffnesses : tuple of float
-        All that the task names: maximised or matched ones first, then floors.
+        All stiffnesses that the task names: maximised or matched ones first, then floors.
     matrix_distance : float or None
         Relative Frobenius distance from the stiffness matrix to match.
     active_bounds : tuple of str
         Pressure limits at which the solution lies.
     freedom : int
-        Directions in pressure space in which the pose stays what it is.
+        Number of independent pressure changes that keep the pose.
     confidence : Confidence or None
     sensitivities : Sensitivities or None
     counts : dict of str to int
-        Work that was done: starts, descents, iterations, evaluations of the pose and of everything
-        with gradients, quadratic programs.
+        Work done: starts, descents, iterations, evaluations of the pose and of everything with
+        gradients, quadratic programs.
     timings : dict of str to float
         Seconds: ``total`` and, where machine code was made first, the further ``compilation``.
     errors : dict of str to float
-        By name of each term of the target: the length of its residual or, of an inequality, the
-        margin by which it holds, in the term's unit.
+        By name of each term of the target: the length of its residual or, for an inequality, its
+        margin, in the term's unit.
     robot : Manipulator or None
         The arm, which carries the task's load.
     contacts : tuple of Contact
-        Of a task with a brace: where the arm leans; empty if it does best to keep clear. Pose,
-        errors, compliance and stiffness are those of the equilibrium in contact then.
+        For a task with a brace: where the arm leans; empty if keeping clear is better.  If there
+        are contacts, pose, errors, compliance and stiffness are those of the equilibrium in
+        contact.
     free : PressureSolution or None
-        Of a task with a brace: the best answer that keeps clear of all objects.
+        For a task with a brace: the best answer that keeps clear of all objects.
     preloads : tuple of Preload
-        What the contacts hold, for each direction that is maximised, both ways.
+        What the contacts withstand, both ways along each direction that is maximised.
     limited_by : tuple of str
-        Of a braced answer: what keeps it from being stiffer, by name.
+        For a braced answer: names of what keeps it from being stiffer.
     """
 
     status: Status
@@ -249,14 +249,14 @@ class PressureSolution(ShownInNotebook):
 
     @classmethod
     def explained_later(cls, explain: Callable[[], "Explanation"], fields: dict[str, Any]) -> Self:
-        """A solution whose `Explanation` is computed when one of its fields is first read."""
+        """Return a solution whose `Explanation` is computed when first needed."""
         solution = cls.__new__(cls)
         solution.__dict__.update(fields, _explain=explain)
         for name in ("pressures", "tip_pose", "compliance"):
             fields[name].flags.writeable = False
         return solution
 
-    def __getattr__(self, name: str) -> Any:  # of what is not in __dict__
+    def __getattr__(self, name: str) -> Any:  # only called for names that are not in __dict__
         if name in Explanation._fields:
             with _explaining:  # several threads may ask at once
                 own = self.__dict__
@@ -269,7 +269,7 @@ class PressureSolution(ShownInNotebook):
         raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
 
     def __getstate__(self) -> dict[str, Any]:
-        """Support pickling and copying: explain now."""
+        """Support pickling and copying: compute the explanation now."""
         _ = self.sensitivities
         return {key: value for key, value in self.__dict__.items() if key not in _NOT_KEPT}
 
@@ -297,35 +297,33 @@ class PressureSolution(ShownInNotebook):
         of: Literal["stiffness", "pressures"],
         by: Literal["target", "direction", "limits", "clearance"],
     ) -> Vector:
-        """Derivative of the optimum at this answer by what was asked for.
+        """Return the derivative of the optimum at this answer with respect to the task's data.
 
         Parameters
         ----------
         of : {"stiffness", "pressures"}
-            The stiffness that is maximised (of several the smallest), in N/m or N m/rad, or the
+            The stiffness that is maximised (the smallest of several), in N/m or N m/rad, or the
             pressures (n,) in Pa.
         by : {"target", "direction", "limits", "clearance"}
-            What is moved, the rest held:
+            What varies, the rest held:
 
             - the target, in base axes: (3,), per m; with a pointing or an orientation (6,), the
               last three per rad of turning it about the axes;
-            - the direction that is maximised (3,), along which its length does not change; of m
-              directions (m, 3);
-            - the limits of pressure (2, n), lower and upper, per Pa: zero by those that are off;
+            - the direction that is maximised (3,), zero along itself; for m directions (m, 3);
+            - the pressure limits (2, n), lower and upper, per Pa: zero for inactive ones;
             - the clearance that the scene asks for (), per m.
 
         Returns
         -------
         ndarray
-            Of the shape of `by`, for pressures with a leading axis n.
+            Of the shape of `by`; for pressures, with a leading axis n.
 
         Raises
         ------
         DerivativeError
-            If other pressures next to the answer are as good, it is no optimum, or the distance of
-            an object that holds it back has an edge there.
+            If the answer is not an isolated optimum, or an object's distance has an edge there.
         InputError
-            If the task maximises nothing along a direction, or has no scene, where that is needed.
+            If the task maximises no directional stiffness, or has no scene, where that is needed.
 
         Notes
         -----
@@ -336,16 +334,16 @@ class PressureSolution(ShownInNotebook):
 
     @property
     def weakly_active(self) -> tuple[str, ...]:
-        """Constraints just about to bind or to let go: `gradient` then holds on one side only.
+        """Constraints that are about to become active or inactive.
 
-        That is where the same constraints go on to bind.
+        `gradient` then holds only on the side on which the active constraints stay the same.
         """
         weak: tuple[str, ...] = self._derivatives.weak
         return weak
 
     @cached_property
     def _derivatives(self) -> Any:
-        from stiffopt.optimise.derivatives import AnswerDerivatives  # which needs this module
+        from stiffopt.optimise.derivatives import AnswerDerivatives  # avoid a circular import
 
         if self.robot is None or self.pressures is None or not self.found:
             raise DerivativeError("only a solution that was found has derivatives")
@@ -357,24 +355,24 @@ class PressureSolution(ShownInNotebook):
     def clearance(self) -> float | None:
         """Least distance between the body and the objects of the task's scene, in m.
 
-        Of an answer that leans on objects: those that its brace does not name.
+        For an answer that leans on objects, those that its brace names are left out.
         """
         near = self._clearances
         return None if near is None else near.distance
 
     @property
     def nearest_object(self) -> str | None:
-        """Name of the object of the scene that the body is nearest to."""
+        """Name of the scene's object nearest to the body."""
         near = self._clearances
         return None if near is None else near.name
 
     @property
     def mesh_error(self) -> float | None:
-        """By how much the clearance may be too small, in m, since the nearest object is a mesh.
+        """How much too small the clearance may be, in m, if the nearest object is a mesh.
 
-        None where that does not matter: less than a tenth of the clearance asked, or no mesh.
+        None without a mesh, or where it is less than a tenth of the clearance asked for.
         """
-        from stiffopt.optimise.diagnosis import mesh_error  # which needs this module
+        from stiffopt.optimise.diagnosis import mesh_error  # avoid a circular import
 
         if self.robot is None or self.task.scene is None:
             return None
@@ -392,7 +390,7 @@ class PressureSolution(ShownInNotebook):
     def _clearances_in_contact(
         self, eq: ContactEquilibrium, robot: Manipulator, scene: Scene
     ) -> NearestObject | None:
-        """Of the objects that the arm may not lean on."""
+        """Return the nearest of the objects that the arm may not lean on."""
         assert self.task.brace is not None
         others = kept_clear_of(scene, self.task.brace)
         if others is None:
@@ -404,15 +402,15 @@ class PressureSolution(ShownInNotebook):
 
     @property
     def stiffness_free(self) -> float | None:
-        """The first stiffness that the task names, of the answer that keeps clear of all objects.
+        """The task's first stiffness, for the answer that keeps clear of all objects.
 
-        None for a task without a brace, or where the target cannot be had without leaning.
+        None for a task without a brace, or where the target needs leaning.
         """
         return None if self.free is None or not self.free.found else self.free.stiffness
 
     @cached_property
     def equilibrium(self) -> ContactEquilibrium | None:
-        """Of a braced answer: the equilibrium in contact, reached from rest; else None."""
+        """For a braced answer, the equilibrium in contact, reached from rest; otherwise None."""
         brace, scene = self.task.brace, self.task.scene
         p, robot = self.pressures, self.robot
         if not self.contacts or brace is None or scene is None or robot is None or p is None:
@@ -454,7 +452,7 @@ class Judgement(NamedTuple):
 
     @property
     def holds(self) -> bool:
-        """Whether everything that the task asks for is so."""
+        """Whether the task is met in every respect."""
         return self.is_clear and self.pose_holds and self.limits_hold and not self.shortfalls
 
     @property
@@ -469,7 +467,7 @@ class Judgement(NamedTuple):
         numbers: tuple[list[float], Vector, Vector, list[float]],
         within: bool,
     ) -> "Judgement":
-        """Judgement from what `Program.judge` gives.
+        """Return the judgement from the outputs of `Program.judge`.
 
         Parameters
         ----------
@@ -506,7 +504,7 @@ class Judgement(NamedTuple):
 
 
 def are_within(pressures: Vector, lower: Vector, upper: Vector) -> bool:
-    """Whether all pressures (n,) are within their limits."""
+    """Return whether all pressures (n,) are within their limits."""
     limits = zip(lower.tolist(), pressures.tolist(), upper.tolist(), strict=True)
     return all(low <= p <= high for low, p, high in limits)
 
@@ -517,7 +515,7 @@ def judge(robot: Manipulator, task: Task, pressures: Vector) -> Judgement:
     Raises
     ------
     EquilibriumError
-        If the arm has no equilibrium at these pressures that is reached from rest.
+        If no equilibrium at these pressures is reached from rest.
     """
     program = Program.of(task, robot.description)
     found = Evaluator(robot, functions(robot, program)["judge"])
@@ -532,7 +530,7 @@ def judge(robot: Manipulator, task: Task, pressures: Vector) -> Judgement:
 
 
 def active_bounds(robot: Manipulator, task: Task, pressures: Vector) -> dict[str, tuple[int, int]]:
-    """Names of the limits that pressures lie at, with channel and side (-1: lower, 1: upper)."""
+    """Return the names of active limits, with channel and side (-1: lower, 1: upper)."""
     lower, upper = task.pressure_bounds(robot.description)
     found = {}
     for index in range(robot.n_pressures):

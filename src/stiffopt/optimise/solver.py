@@ -1,4 +1,8 @@
-"""From a task to the stiffest pressures: the calls, and which search answers them."""
+"""`PressureSolver`: find the stiffest pressures for a task.
+
+It tries `compiled_search.CompiledSearch` first and, without machine code or without an answer,
+`general_search.GeneralSearch`.
+"""
 
 from collections.abc import Iterable
 from dataclasses import replace
@@ -29,7 +33,7 @@ from stiffopt.optimise.leaning import BracedProblem
 from stiffopt.optimise.prepared import prepared
 from stiffopt.optimise.problem import PressureProblem
 from stiffopt.optimise.program import Program
-from stiffopt.optimise.reach import comes
+from stiffopt.optimise.reach import can_reach
 from stiffopt.optimise.search import starts
 from stiffopt.optimise.solution import Judgement, PressureSolution, are_within
 from stiffopt.optimise.target import Target
@@ -40,7 +44,7 @@ Vector = NDArray[np.float64]
 
 
 class PressureSolver:
-    """Solver of one kind of task on one arm; what can be prepared is prepared once.
+    """Solver for one kind of task on one arm; reusable work is done once.
 
     Parameters
     ----------
@@ -48,7 +52,7 @@ class PressureSolver:
         The arm; a load of the task is put on it.
     task : Task
     seed : int
-        Of the global search.  The same seed gives the same answer.
+        Seed of the global search.  The same seed gives the same answer.
 
     Raises
     ------
@@ -83,17 +87,17 @@ class PressureSolver:
         Parameters
         ----------
         target : Target, optional
-            Instead of the task's.
+            Replaces the task's target.
         guess : (n,), optional
-            Pressures in Pa near the answer, for example the previous one: the answer is then
-            the local optimum next to it.  If none is found there, the search is global.
+            Pressures in Pa near the answer, for example the previous one.  The answer is then the
+            local optimum next to it.  If none is found there, the search is global.
         timeout : float, optional
-            Seconds after which to give up.  The answer is then the best that was found and holds,
-            with a confidence that is not complete, or its status is "failed" if there is none.
-            What is made once for a kind of task (formulas, machine code) is made to the end.
+            Seconds after which to give up.  The answer is then the best one found that holds, with
+            ``confidence.complete`` false; without one its status is "failed".  Work that is done
+            once for a kind of task (formulas, machine code) is always completed.
         cancel : threading.Event or callable, optional
-            Give up in the same way as soon as it is set, or says true; it is asked every 10 ms,
-            maybe by another thread.
+            Gives up in the same way as soon as the event is set or the callable returns true.  It
+            is polled every 10 ms, maybe from another thread.
         """
         if target is not None and not isinstance(target, Target):
             raise InputError(f"target must be a Target; got {shown(target)}")
@@ -116,28 +120,28 @@ class PressureSolver:
         timeout: float | None = None,
         cancel: Cancel | None = None,
     ) -> WarmAnswer:
-        """The answer next to a guess, with as little as possible around the search for it.
+        """Find the answer next to a guess with as little overhead as possible.
 
         Parameters
         ----------
         position : (3,) or None
-            Instead of the position in the task's target, in m; axes that are free there stay so.
+            Replaces the position of the task's target, in m; axes that are free there stay free.
         guess : (n,)
             Pressures in Pa near the answer.  If there is none next to them, the search is global.
         pointing : (3,), optional
-            Instead of the direction in the task's target.
+            Replaces the direction of the task's target.
         orientation : (4,), optional
-            Instead of the unit quaternion (w, x, y, z) in the task's target.
+            Replaces the unit quaternion (w, x, y, z) of the task's target.
         limits : two (n,), optional
-            Lowest and highest pressures in Pa, where they are narrower than the task's.
+            Lowest and highest pressures in Pa; they can only narrow the task's limits.
         timeout, cancel : optional
-            When to give up, see `solve`; what is not `found` by then has no pressures, or some
-            that do not hold.
+            When to give up, see `solve`.  An answer that is not `found` by then has no pressures,
+            or pressures that do not hold.
 
         Raises
         ------
         InputError
-            If an argument is wrong, or not a part of the task's target.
+            If an argument is wrong, or replaces a part that the task's target does not have.
         """
         if timeout is not None or cancel is not None:
             with giving_up(timeout, cancel), stop_flag() as stop:
@@ -147,7 +151,7 @@ class PressureSolver:
     def _warm(
         self, position: Any, guess: Any, pointing: Any, orientation: Any, limits: Any, stop: int = 0
     ) -> WarmAnswer:
-        """See `warm`; `stop` is the address of a `StopFlag`."""
+        """Implement `warm`; `stop` is the address of a `StopFlag`, or 0."""
         calls = self._warm_calls or self._prepare_warm_calls()
         if calls is not None and limits is None:
             block = calls.next_to(guess, position, pointing, orientation, stop)
@@ -164,17 +168,17 @@ class PressureSolver:
         timeout: float | None = None,
         cancel: Cancel | None = None,
     ) -> bool:
-        """Whether the arm comes to a target (the task's, or another one); stiffness left aside.
+        """Return whether the arm can meet a target (default: the task's), whatever its stiffness.
 
-        The configurations nearest to the target, of those that were sampled over the range of
-        pressures, are brought to it one by one.  True: one of them came, so pressures within the
-        limits are known that meet all tolerances.  False: none did, which is no proof, but rare
-        for a target that can be had; `solve` says how far the arm is from it.
+        The samples whose tips are nearest to the target are brought to it one by one.  True: one
+        arrived, so pressures within the limits are known to meet all tolerances.  False: none
+        arrived.  That is no proof, but such a target is rarely reachable; `solve` reports how far
+        the arm stays from it.
 
         Raises
         ------
         OutOfTimeError, CancelledError
-            Where `timeout` or `cancel`, as those of `solve`, ended it before it was known.
+            If `timeout` or `cancel` (see `solve`) ended the search before it was decided.
         """
         if target is not None and not isinstance(target, Target):
             raise InputError(f"target must be a Target; got {shown(target)}")
@@ -182,11 +186,11 @@ class PressureSolver:
         with giving_up(timeout, cancel):
             fast = self._search.fast(task.unbraced, None)
             if fast is not None:
-                found = fast[0].comes(fast[1])
+                found = fast[0].can_reach(fast[1])
             else:
                 problem = PressureProblem(self.robot, task)
                 candidates, effort = starts(problem, self._prepared.samples)
-                found = comes(problem, list(islice(candidates, effort.screened)))
+                found = can_reach(problem, list(islice(candidates, effort.screened)))
             if not found and task.brace is not None:
                 found = self._found(task, None).found
             if not found:
@@ -194,10 +198,10 @@ class PressureSolver:
             return found
 
     def follow(self, guess: ArrayLike, *, timeout: float | None = None) -> PressureSolution:
-        """The answer for a picture that follows a hand: sooner than `solve`, out of reach too.
+        """Return an answer for interactive display: sooner than `solve`, even where out of reach.
 
-        Where none is found next to the guess, (n,) in Pa, it is the closest configuration that is
-        found at once; only for a pose that can be had it is searched for everywhere.  See `solve`.
+        If there is none next to the guess, (n,) in Pa, this is the closest configuration found from
+        there.  Only for a pose that can be reached does a global search follow.  See `solve`.
         """
         start = self._checked(guess)
         with giving_up(timeout, None):
@@ -216,7 +220,7 @@ class PressureSolver:
         guess: ArrayLike | None = None,
         limits: tuple[Vector, Vector] | None = None,
     ) -> PressureSolution | None:
-        """Solve by the compiled search alone, in a millisecond or so; for control loops.
+        """Solve by the compiled search alone, in about a millisecond; for control loops.
 
         Parameters
         ----------
@@ -227,8 +231,9 @@ class PressureSolver:
 
         Returns
         -------
-        None where that search finds no answer that holds, or is not to be had; `solve` would then
-        go on by its general method, which may take minutes for an arm under gravity.
+        PressureSolution or None
+            None if that search has no machine code, or finds no answer that holds.  `solve` would
+            go on with the general method, which may take minutes for an arm under gravity.
         """
         task = self.task if target is None else self.task.model_copy(update={"target": target})
         return self._search.solve(task, self._checked(guess), limits)
@@ -238,24 +243,24 @@ class PressureSolver:
 
     @property
     def is_compiled(self) -> bool:
-        """Whether there is compiled code for the task; if not, it is made in the background."""
+        """Whether there is machine code for the task; if not, it is compiled in the background."""
         return self._search.fast(self.task.unbraced, None) is not None
 
     def compile(self) -> bool:
-        """Wait for compiled code for the task, unless an arm is armed; return `is_compiled`."""
+        """Wait for the task's machine code, unless an arm is armed; return `is_compiled`."""
         if not compilation_is_held_off():
             with compiling_at_once():
                 return self.is_compiled
         return self.is_compiled
 
     def __reduce__(self) -> tuple[object, ...]:
-        """Support pickling: the arm and the task are kept, and what was prepared is made anew."""
+        """Support pickling: keep the arm and the task, and prepare the rest again."""
         return partial(PressureSolver, seed=self.seed), (self._given, self.task)
 
     # -- warm calls -------------------------------------------------------------------------
 
     def _prepare_warm_calls(self) -> WarmCalls | None:
-        """Memory for warm calls, once there is compiled code; none for a task with a brace."""
+        """Return memory for warm calls; None until code is compiled, or for a task with a brace."""
         if self.task.brace is not None:
             return None
         program = self._prepared.program(self.task.target)
@@ -267,7 +272,7 @@ class PressureSolver:
     def _warm_otherwise(
         self, task: Task, guess: Vector, limits: tuple[ArrayLike, ArrayLike] | None
     ) -> WarmAnswer:
-        """Answer where the leanest call has none; all but the limits is checked."""
+        """Answer a warm call that `WarmCalls` cannot; all arguments but the limits are checked."""
         narrow = None
         if limits is not None:
             n, own = self.robot.n_pressures, self._prepared
@@ -287,7 +292,7 @@ class PressureSolver:
         return WarmAnswer.judged(None if solution is None else solution.pressures, solution)
 
     def _confirms(self, block: Vector) -> bool:
-        """Whether the model confirms an answer of a warm call."""
+        """Return whether the model confirms an answer of a warm call."""
         calls = self._warm_calls
         assert calls is not None  # or there would be no block
         answer = calls.fast.judged(block)
@@ -297,7 +302,7 @@ class PressureSolver:
         return Judgement.of(calls.program, answer.judged, within).holds
 
     def _solution_of(self, block: Vector) -> PressureSolution | None:
-        """Solution from an answer of a warm call; None if it does not hold."""
+        """Return the solution for an answer of a warm call; None if it does not hold."""
         calls = self._warm_calls
         assert calls is not None
         task = calls.task_of(block, self.task)
@@ -313,7 +318,7 @@ class PressureSolver:
         return self._search.solve(task, guess) or self._otherwise(task, guess)
 
     def _leaning(self, task: Task, guess: Vector | None) -> PressureSolution:
-        """The better of the best answer that leans on objects and the best that does not."""
+        """Return the better of the best answer that leans on objects and the best that does not."""
         plain = task.unbraced
         free = self._found(plain, guess)
         if free.status == "failed":
@@ -323,7 +328,7 @@ class PressureSolver:
         return lean(BracedProblem(self.robot, task), table, free, guess)
 
     def _otherwise(self, task: Task, guess: Vector | None) -> PressureSolution:
-        """Answer where the compiled search has none."""
+        """Answer a task for which the compiled search found no solution."""
         try:
             checkpoint()
             found = self._search.nearest(task)
@@ -334,7 +339,7 @@ class PressureSolver:
             return PressureSolution("failed", str(error), task)
 
     def _general(self, task: Task, guess: Vector | None) -> PressureSolution:
-        """Answer of the general method, or of the compiled solver if its code comes meanwhile."""
+        """Answer by the general method, or by the compiled search once its code is ready."""
         awaited = self._search.fast(task, None) is None
         try:
             with until_ready(lambda: awaited and self._search.fast(task, None) is not None):
@@ -358,10 +363,10 @@ def solve_pressure(
     timeout: float | None = None,
     cancel: Cancel | None = None,
 ) -> PressureSolution:
-    """Find the pressures that reach a task's pose and do best by its stiffness.
+    """Find the pressures that reach a task's pose and best meet its stiffness goal.
 
-    Nothing is raised for a target that cannot be reached: the solution says so and holds the
-    closest configuration.  See `PressureSolver` for many similar tasks, and for the arguments.
+    An unreachable target raises nothing: the solution reports it and holds the closest
+    configuration.  See `PressureSolver` for many similar tasks, and for the arguments.
     """
     solver = PressureSolver(robot, task, seed=seed)
     return solver.solve(guess=guess, timeout=timeout, cancel=cancel)
@@ -377,27 +382,27 @@ def solve_batch(
     timeout: float | None = None,
     cancel: Cancel | None = None,
 ) -> list[PressureSolution]:
-    """Solve many tasks on one arm, on all cores: the solutions of `solve_pressure` one by one.
+    """Solve many tasks on one arm, on all cores; the solutions are those of `solve_pressure`.
 
     Parameters
     ----------
     robot : Manipulator
     tasks : iterable of Task
-        They may differ in anything; those of the same structure share what is compiled.
+        They may differ in anything; tasks of the same structure share machine code.
     guesses : iterable, optional
         Pressures (n,) in Pa or None for each task, see `PressureSolver.solve`.
     seed : int
-        Of the global search.
+        Seed of the global search.
     threads : int, optional
-        Instead of one for each core.  The solutions do not depend on it.
+        Default: one for each core.  The solutions do not depend on it.
     timeout, cancel : optional
-        For all tasks together, see `PressureSolver.solve`: what was solved by then is kept, and
-        the status of the others is "failed".
+        For all tasks together, see `PressureSolver.solve`.  Tasks solved by then keep their
+        solutions; the status of the others is "failed".
 
     Raises
     ------
     InputError
-        If an argument is wrong or a task's pressure limits do not suit the robot; nothing is
+        If an argument is wrong or a task's pressure limits do not suit the robot.  No task is
         solved then.
     """
     watch = Stopwatch()
@@ -424,7 +429,7 @@ def _solved(
     threads: int | None,
     watch: Stopwatch,
 ) -> list[PressureSolution]:
-    """Solutions of checked tasks, those of one structure together."""
+    """Solve checked tasks; tasks of one structure are solved together."""
     found: dict[int, PressureSolution | None] = {}
     groups: dict[FastSolver, list[tuple[int, Vector, Program]]] = {}
     for index, (solver, task, guess) in enumerate(asked):
@@ -441,7 +446,7 @@ def _solved(
     for index, (solver, task, guess) in enumerate(asked):
         watch = Stopwatch()
         solution = found.get(index)
-        if index not in found:  # there was no code then; there may be now
+        if index not in found:  # machine code may have become ready meanwhile
             solution = solver._found(task, guess)
         solution = solution or solver._otherwise(task, guess)
         solution.timings.update(shares)
@@ -456,7 +461,7 @@ def _at_once(robot: Manipulator, seed: int, task: Task) -> PressureSolution | No
 
 
 def _felt(solution: PressureSolution) -> PressureSolution:
-    """The solution, which is none if the arm could not feel there how hard it presses."""
+    """Mark a solution unreachable if the arm could not feel there how hard it presses."""
     press, pose, compliance = solution.task.press, solution.tip_pose, solution.compliance
     if press is None or not solution.found or pose is None or compliance is None:
         return solution
@@ -466,7 +471,7 @@ def _felt(solution: PressureSolution) -> PressureSolution:
 
 
 def stiffness_blind(solver: PressureSolver, solution: PressureSolution) -> PressureSolution:
-    """The pose of a solution with the least pressure: what a plain solver would answer."""
+    """Return the plain solution: the pose of a solution with the least pressure."""
     plain = {"stiffness": None, "load": None, "press": None, "brace": None}
     blind = PressureSolver(solver.robot, solution.task.model_copy(update=plain), seed=solver.seed)
     return blind.solve(guess=solution.pressures)

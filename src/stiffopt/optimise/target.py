@@ -1,4 +1,4 @@
-"""`Target`, the part ``target`` of a task file: conditions on the arm's configuration.
+"""`Target`, the key ``target`` of a task file: conditions on the arm's configuration.
 
 Its keys are those of the terms in `stiffopt.optimise.terms`.
 """
@@ -36,7 +36,7 @@ else:
 class Target(_Keys):
     """Conditions on the arm's tip and body, in the base frame.
 
-    A subclass may have further terms: fields with the class of the term in their annotation,
+    A subclass may add terms: fields with the term's class in their annotation,
     ``Annotated[MyValue | None, MyTerm]``, and None as default.
 
     Attributes
@@ -52,12 +52,12 @@ class Target(_Keys):
 
     @property
     def terms(self) -> tuple[Term, ...]:
-        """The conditions that it has: the position first, then the angle, then others."""
+        """The target's conditions: the position first, then the angle, then others."""
         given = ((kind, getattr(self, key)) for key, kind in _kinds(type(self)))
         return tuple(kind(value, self.tolerance) for kind, value in given if value is not None)
 
     def moved_back(self, offset: NDArray[np.float64]) -> Target:
-        """The target for the model such that an arm off by an offset meets this one.
+        """Return the target for the model with which an arm off by an offset meets this target.
 
         Parameters
         ----------
@@ -90,14 +90,14 @@ class Target(_Keys):
                 raise BadKeyError(key, f"cannot be combined with {other}; remove one of the two")
             known[kind.name] = key
         if not known:
-            *most, last = (key for key, kind in _kinds(type(self)) if not kind.is_inequality)
-            raise ValueError(f"asks for nothing; expected a {', '.join(most)} or {last}")
+            *keys, last = (key for key, kind in _kinds(type(self)) if not kind.is_inequality)
+            raise ValueError(f"asks for nothing; expected a {', '.join(keys)} or {last}")
         return self
 
 
 @cache
 def _kinds(model: type[Target]) -> tuple[tuple[str, type[Term]], ...]:
-    """Keys of a target with the terms that they make, in their order."""
+    """Return the keys of a target class with their kinds of terms, in the terms' order."""
     found = [
         (key, kind)
         for key, field in model.model_fields.items()

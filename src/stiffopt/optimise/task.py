@@ -1,6 +1,6 @@
-"""`Task`: target, stiffness goal, load and limits; the schema of the task file and a class in code.
+"""`Task`: target, stiffness goal, load and limits.  It is also the schema of the task file.
 
-Everything is in SI: m, rad, Pa, N, N m. Built in code::
+All values are in SI: m, rad, Pa, N, N m.  In code::
 
     Task(
         target=Target(position=(0, 0, 0.18)),
@@ -48,7 +48,7 @@ class Load(Schema):
     ----------
     force : in N.
     moment : in N m.
-    frame : base, it keeps its direction; tip, it follows the tip.
+    frame : "base": the load keeps its direction; "tip": it follows the tip.
     """
 
     force: Vector[Annotated[Force, within(1e6, "N")]] = (0.0, 0.0, 0.0)
@@ -63,11 +63,11 @@ PerChannelLimit = Annotated[
 
 
 class PressureRange(Schema):
-    """Limits that tighten the robot's; one for all channels or one per channel.
+    """Pressure limits that tighten the robot's: one for all channels, or one per channel.
 
     Attributes
     ----------
-    min, max : in Pa, gauge; None, for all or in the list, for the robot's.
+    min, max : in Pa, gauge; None (for all channels or in a list) leaves the robot's limit.
     """
 
     min: PerChannelLimit | None = None
@@ -75,22 +75,22 @@ class PressureRange(Schema):
 
 
 def _robot_name(value: Any, info: ValidationInfo) -> Any:
-    """Let a path stand for its text; refuse a file that names no robot."""
+    """Convert a `Path` to text; reject a file without a robot."""
     if value is None and read_from_file(info):
         raise PydanticKnownError("missing")
     return os.fspath(value) if isinstance(value, Path) else value
 
 
 class ForRobot(Schema, ShownInNotebook):
-    """What tasks and paths have in common: the robot, its load and limits, and what is around it.
+    """Base of tasks and paths: the robot, its load, its pressure limits and its surroundings.
 
     Attributes
     ----------
     robot : name of a built-in robot, or path of a robot file relative to this file.  In code it may
-        be left out: the robot is the one that a solver is given.
+        be None: the solver's robot is used then.
     load : load at the tip, or None.
     pressure : limits that tighten the robot's.
-    scene : what is around the arm, or None.
+    scene : objects around the arm, or None.
     source : the file that this was read from, or None.
     """
 
@@ -105,7 +105,7 @@ class ForRobot(Schema, ShownInNotebook):
     source: SourceFile = None
 
     def _conditions(self) -> list[str]:
-        """Return in words what makes it harder: load, limits and scene."""
+        """Describe the load, limits and scene, for `repr`."""
         parts = []
         if self.load is not None:
             parts.append("with a load")
@@ -121,7 +121,7 @@ class ForRobot(Schema, ShownInNotebook):
         Raises
         ------
         InputError
-            There is no such robot, or its file is wrong; or none is named.
+            No robot is named, it does not exist, or its file is wrong.
         """
         if self.robot is None:
             name = type(self).__name__
@@ -139,7 +139,7 @@ class ForRobot(Schema, ShownInNotebook):
             raise self.error_at("robot", str(error)) from None
 
     def check_scene(self, description: RobotDescription) -> None:
-        """Refuse a scene that makes no sense for a robot.
+        """Reject a scene that does not suit a robot.
 
         Raises
         ------
@@ -152,7 +152,7 @@ class ForRobot(Schema, ShownInNotebook):
     def pressure_bounds(
         self, description: RobotDescription
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the limits that hold: the robot's, tightened by those in `pressure`.
+        """Return the pressure limits of each channel: the robot's, tightened by `pressure`.
 
         Parameters
         ----------
@@ -189,26 +189,26 @@ class ForRobot(Schema, ShownInNotebook):
         return lower, upper
 
     def error_at(self, key: str, reason: str) -> InputError:
-        """Return the error that blames a key, in the file if this was read from one."""
+        """Return an error about a key, with file and line if this was read from a file."""
         if self.source is None:
             return InputError(f"{type(self).__name__}.{key}: {reason}")
         return FileError(self.source, reason, line=line_of(self.source, *key.split(".")), key=key)
 
 
 class Task(ForRobot):
-    """Where an arm's tip should be, and how stiff.
+    """Where the arm's tip should be, and how stiff.
 
     Attributes
     ----------
     robot : name of a built-in robot, or path of a robot file relative to the task file.  In code it
-        may be left out: the robot is the one that the task is given to a solver with.
-    target : tip pose.
-    stiffness : stiffness goal, or None: the pose with the least pressure.
+        may be None: the solver's robot is used then.
+    target : conditions on the tip pose.
+    stiffness : stiffness goal.  None: the pose with the least pressure.
     load : load at the tip, or None.
-    press : what the tip presses with at the target, in place of a load, or None.
-    brace : objects of the scene that the arm may lean on to be stiff, or None.
+    press : force with which the tip presses at the target, instead of a load, or None.
+    brace : objects of the scene that the arm may lean on to be stiffer, or None.
     pressure : limits that tighten the robot's.
-    scene : what is around the arm, or None.
+    scene : objects around the arm, or None.
     source : the file that the task was read from, or None.
     """
 
@@ -240,12 +240,12 @@ class Task(ForRobot):
 
     @property
     def unbraced(self) -> Task:
-        """The same task for an arm that keeps clear of all objects."""
+        """The same task without its brace: the arm keeps clear of all objects."""
         return self if self.brace is None else self.model_copy(update={"brace": None})
 
     @property
     def tip_load(self) -> Load | None:
-        """The load at the tip in the wanted state: what was given, or the reaction of a press."""
+        """The load at the tip in the wanted state: the given one, or the reaction to a press."""
         press = self.press
         if press is None:
             return self.load
@@ -267,7 +267,7 @@ class Task(ForRobot):
 
     @property
     def measures(self) -> tuple[StiffnessMeasure, ...]:
-        """All stiffnesses that are named: maximised, then matched, then floors."""
+        """All stiffness measures of the task: maximised ones, then the matched one, then floors."""
         goal = self.stiffness
         if goal is None:
             return ()

@@ -1,9 +1,9 @@
-"""`Term`, the base class of all conditions of a task on the configured arm.
+"""`Term`, the base class of a task's conditions on the arm's configuration.
 
 A term is a smooth function of the tip, or of stations along the body: a residual r whose length
 must not exceed a tolerance, ``|r| <= tolerance``, or inequalities ``g >= 0``.  Each kind of term
-has a file of its own in `stiffopt.optimise.terms`, with all that is known of it: its key in task
-files, its formula, its words.
+has its own file in `stiffopt.optimise.terms` with all that concerns it: its key in task files, its
+formula and its texts.
 
 The formula is symbolic.  A term splits into its *structure*, for which functions are compiled, and
 its *parameters*, which are arguments of them.
@@ -28,8 +28,6 @@ from stiffopt.units import Angle, Length
 
 Vector = NDArray[np.float64]
 
-"""Units in which people read lengths and angles, factors to them, and digits."""
-
 
 class Tolerance(Schema):
     """Largest errors of the tip.
@@ -45,12 +43,12 @@ class Tolerance(Schema):
 
 
 class Nearness(NamedTuple):
-    """How far a tip is from meeting a term, roughly: ``max(0, d - limit)``, d = v or sqrt(v).
+    """A rough distance of a tip from meeting a term: ``max(0, d - limit)``, with d = v or sqrt(v).
 
-    ``v = offset + linear . r + square . r^2 + turn . R`` of the tip's position r and rotation R (by
-    columns), but at least 0; d is its root if `root` is 1, v itself if it is 0.  A search starts
-    from the samples for which the sum over all terms is least; so d counts in lengths of the arm,
-    or in half turns.
+    ``v = max(0, offset + linear . r + square . r^2 + turn . R)`` for the tip's position r and
+    rotation R (by columns); d is its root if `root` is 1, v itself if it is 0.  A search starts
+    from the samples with the smallest sum over all terms.  To be comparable, d is in lengths of the
+    arm or in half turns.
     """
 
     offset: float = 0.0
@@ -62,7 +60,7 @@ class Nearness(NamedTuple):
 
     @property
     def numbers(self) -> tuple[float, ...]:
-        """All 18 in order."""
+        """All 18 numbers in order."""
         return (self.offset, *self.linear, *self.square, *self.turn, self.root, self.limit)
 
 
@@ -72,34 +70,34 @@ class Term(ABC):
     Parameters
     ----------
     value :
-        What the task file says under `key`, read and in SI.
+        Value of `key` in the task file, in SI.
     tolerance : Tolerance
-        Of the target; a term that is named like one of its fields has that as radius.
+        The target's tolerance.  A field of the term's name is its radius.
 
     Attributes
     ----------
     key : str
-        In task files, under ``target``.
+        Key in task files, under ``target``.
     annotation :
         Pydantic type of the value there: a `Schema`, or one of the types of `stiffopt.units` and
-        `stiffopt.directions`.  Those define how it is written in files and messages too.
+        `stiffopt.directions`, which also define its form in files and messages.
     example :
         A value as in a task file that the built-in arm stiff-flop-2 can meet, for tests.
     name : str
-        In results: ``<name>_error`` or, of an inequality, ``<name>_margin``.  A task has one term
-        of a name at most.
+        Name in results: ``<name>_error`` or, for an inequality, ``<name>_margin``.  A task has at
+        most one term of a name.
     unit : str
         SI unit of the residual or margin.
     has_stations : bool
-        Whether the formula asks for stations.
+        Whether the formula depends on stations.
     is_inequality : bool
-        Whether `residual` must not be negative, component by component, instead of small.
+        Whether each component of `residual` must be nonnegative, instead of small.
     order : int
-        Terms are listed by it.
+        Sort key of the terms.
     size : int
         Number k of components of the residual.
     radius : float
-        The tolerance; of an inequality a size (in `unit`) by which it is scaled.
+        The tolerance; for an inequality, a scale in `unit`.
     """
 
     key: ClassVar[str]
@@ -121,7 +119,7 @@ class Term(ABC):
 
     @abstractmethod
     def residual(self, tip: Any, parameters: Any) -> Any:
-        """Symbolic residual (k,) for symbolic parameters.
+        """Return the symbolic residual (k,) for symbolic parameters.
 
         `tip` is a `stiffopt.model.shape.Shape`: ``tip.position`` (3,) and ``tip.rotation`` (3, 3),
         in base axes; ``tip.station(s)`` has the same at arc length s (m, at rest, from the base).
@@ -129,67 +127,67 @@ class Term(ABC):
 
     @property
     def parameters(self) -> tuple[float, ...]:
-        """Arguments of the formula, always as many for one structure."""
+        """Arguments of the formula; their number is fixed by the structure."""
         return ()
 
     @property
     def variant(self) -> Hashable:
-        """What else the formula depends on, such as numbers of components or arc lengths."""
+        """Further dependencies of the formula, such as numbers of components or arc lengths."""
         return ()
 
     @property
     def structure(self) -> Hashable:
-        """All that the compiled function depends on."""
+        """Everything that the compiled function depends on."""
         return (self.key, self.variant, self.is_inequality, self.radius * self.is_inequality,
                 _version(type(self)))  # fmt: skip
 
     def like(self, value: Any) -> "Term":
-        """The same term with another value."""
+        """Return the same term with another value."""
         other = copy(self)
         other.value = value
         return other
 
-    # -- how searches and controllers see it --------------------------------------------------
+    # -- for searches and controllers ---------------------------------------------------------
 
     def nearness(self, length: float) -> Nearness:
-        """How far a tip is from meeting the term, for an arm of this length; default: unknown."""
+        """Return a rough distance from meeting the term, for an arm of this length; default: 0."""
         return Nearness()
 
     @classmethod
     def moved_back(cls, value: Any, offset: Vector) -> Any:
-        """Value for the model such that an arm off by an offset (6,) meets `value`.
+        """Return the value for the model with which an arm off by an offset (6,) meets `value`.
 
         `offset` is a displacement in m and a rotation vector in rad, in base axes.
         """
         return value
 
-    # -- words ------------------------------------------------------------------------------
+    # -- texts ------------------------------------------------------------------------------
 
     @property
     def result_name(self) -> str:
-        """Of its value in results: ``position_error``."""
+        """Name of the error or margin in results: ``position_error``."""
         return f"{self.name}_{'margin' if self.is_inequality else 'error'}"
 
     def holds(self, value: float) -> bool:
-        """Whether an error, or a margin, is as it has to be."""
+        """Return whether an error or a margin meets the term."""
         return value >= 0 if self.is_inequality else value <= self.radius
 
     def shown(self, value: float) -> tuple[float, str]:
-        """A value in the unit in which people read it, and that unit."""
+        """Return a value in its display unit, and that unit."""
         unit = display_units().of_si(self.unit)
         return unit.of(value), unit.name
 
     def asked(self) -> str:
-        """What is asked for, as people read it: ``(-30, free, 190) mm within 0.1 mm``."""
+        """Describe the condition: ``(-30, free, 190) mm within 0.1 mm``."""
         return f"{numbers_shown(self.value)} within {self.words(self.radius)}"
 
     def words(self, value: float) -> str:
-        """An error or margin as people read it: ``0.35 mm``."""
+        """Format an error or margin for display: ``0.35 mm``."""
         return display_units().of_si(self.unit).text(value, ".3g" if self.unit == "rad" else ".4g")
 
 
 def numbers_shown(values: Any, unit: DisplayUnit = PLAIN) -> str:
-    """Some numbers in a unit, as people read them: ``(-30, free, 190)``; None is free."""
+    """Format numbers in a display unit: ``(-30, free, 190)``; None is free."""
     digits = 3 + unit.more_decimals
     shown = ("free" if x is None else f"{round(unit.of(x), digits) + 0.0:g}" for x in values)
     return f"({', '.join(shown)})"
@@ -197,8 +195,8 @@ def numbers_shown(values: Any, unit: DisplayUnit = PLAIN) -> str:
 
 @cache
 def _version(kind: type[Term]) -> str:
-    """Name of a class of terms, with a hash of its text if it is not stiffopt's own."""
+    """Return the name of a class of terms, with a hash of the source of one not in stiffopt."""
     name = f"{kind.__module__}.{kind.__qualname__}"
-    if kind.__module__.startswith("stiffopt."):  # whose text is part of all keys
+    if kind.__module__.startswith("stiffopt."):  # cache keys already include its source
         return name
     return f"{name} {hashlib.sha256(inspect.getsource(kind).encode()).hexdigest()[:16]}"

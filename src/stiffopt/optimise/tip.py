@@ -1,7 +1,7 @@
-"""Tip pose, Jacobian and compliance from tick to tick, fast enough for a control loop.
+"""`TipModel`: tip pose, Jacobian and compliance, fast enough for a control loop.
 
-`Manipulator` gives the same from rest each time and in the CasADi VM, which takes milliseconds
-under gravity or loads.  Here an equilibrium is found from the one before, in machine code.
+`Manipulator` computes the same from rest in the CasADi VM, which takes milliseconds under gravity
+or loads.  Here machine code finds each equilibrium from the one before.
 """
 
 import ctypes
@@ -24,7 +24,7 @@ from stiffopt.model.tip_functions import tip_formulas
 Vector = NDArray[np.float64]
 
 _SOURCES = (str(Path(__file__).with_name("native") / "tip.c"),)
-_FOUND, _BEYOND_LAW, _NO_EQUILIBRIUM = range(3)  # as tip.c has them
+_FOUND, _BEYOND_LAW, _NO_EQUILIBRIUM = range(3)  # as in tip.c
 
 _integer, _pointer = ctypes.c_int64, ctypes.c_void_p
 
@@ -37,7 +37,7 @@ class TipAt(NamedTuple):
     pose : ndarray (4, 4)
         In the base frame.
     jacobian : ndarray (6, n)
-        Twist of the tip in tip axes per pressure: m/Pa above, rad/Pa below.
+        Twist of the tip in tip axes per pressure: three rows in m/Pa, then three in rad/Pa.
     compliance : ndarray (6, 6)
         In tip axes, linear first, as `Manipulator.tip_compliance`.
     """
@@ -48,13 +48,13 @@ class TipAt(NamedTuple):
 
 
 class TipModel:
-    """Pose, Jacobian and compliance of an arm's tip, one set of pressures after the other.
+    """Pose, Jacobian and compliance of an arm's tip at successive pressures.
 
-    With gravity or a load the equilibrium is followed from that of the call before, by the
-    straight way between the pressures as long as the arm is stable on it, and otherwise from
-    rest.  An arm with several equilibria at the same pressures thus stays in its own.
+    With gravity or a load, each call follows the equilibrium from that of the call before, along
+    the straight line between the pressures.  If the arm becomes unstable on it, the call starts
+    from rest.  An arm with several equilibria at the same pressures thus stays on its branch.
 
-    An instance belongs to one thread; see `copy`.  Calls free the interpreter lock.
+    An instance belongs to one thread; see `copy`.  Calls release the interpreter lock.
 
     Parameters
     ----------
@@ -64,9 +64,8 @@ class TipModel:
     Attributes
     ----------
     is_fast : bool
-        Whether machine code serves the calls, which is compiled when an instance is made; without
-        a compiler the model itself does, from rest each time, which takes milliseconds for a
-        loaded arm.
+        Whether calls run in machine code, which is compiled when an instance is made.  Without a
+        compiler the model is used, from rest each time, which takes milliseconds for a loaded arm.
 
     Raises
     ------
@@ -77,29 +76,29 @@ class TipModel:
     def __init__(self, robot: Manipulator) -> None:
         self._robot = robot
         with compiling_at_once():
-            self._way = _loaded_way(robot) if robot.is_loaded else _free_way(robot)
-        self.is_fast = self._way is not None
+            self._code = _loaded_tip(robot) if robot.is_loaded else _free_tip(robot)
+        self.is_fast = self._code is not None
 
     def copy(self) -> "TipModel":
-        """The same arm, from rest, for use in another thread."""
+        """Return a model of the same arm, from rest, for another thread."""
         return TipModel(self._robot)
 
     def change(self, robot: Manipulator) -> None:
-        """Go on with an arm that differs in moduli, corrections and tip mass only; from rest.
+        """Switch to an arm that differs only in moduli, corrections and tip mass; start from rest.
 
-        It takes much less time than another instance.
+        This takes much less time than a new instance.
 
         Raises
         ------
         EquilibriumError
-            If the unpressurised arm falls over under its weight; it is no arm then.
+            If the unpressurised arm falls over under its weight; the instance is unusable then.
         """
         self._robot = robot
-        if self._way is not None:
-            self._way.change(robot)
+        if self._code is not None:
+            self._code.change(robot)
 
     def at(self, pressures: ArrayLike) -> TipAt:
-        """The tip at pressures (n,) in Pa.
+        """Return the tip at pressures (n,) in Pa.
 
         Raises
         ------
@@ -109,12 +108,12 @@ class TipModel:
             The loaded arm has no stable equilibrium there.
         """
         robot, p = self._robot, self._robot.checked_pressures(pressures)
-        found = None if self._way is None else self._way(p)
+        found = None if self._code is None else self._code(p)
         return found or TipAt(robot.tip_pose(p), robot.tip_jacobian(p), robot.tip_compliance(p))
 
 
 class _LoadedTip:
-    """Equilibria in machine code, each from the one before."""
+    """The tip of a loaded arm in machine code, each equilibrium found from the one before."""
 
     def __init__(self, code: Library, robot: Manipulator) -> None:
         self._arm = LoadedArm(code, robot)
@@ -152,7 +151,7 @@ class _LoadedTip:
 
 
 class _FreeTip:
-    """Closed form, in machine code."""
+    """The tip of a free arm in machine code, in closed form."""
 
     def __init__(self, code: Library, robot: Manipulator) -> None:
         self._function, self._numbers = code.function("tip_at"), robot.numbers
@@ -166,12 +165,7 @@ class _FreeTip:
         return TipAt(pose, jacobian, compliance) if margin[0, 0] > 0 else None
 
 
-_Way = _LoadedTip | _FreeTip
-"""From checked pressures (n,) to the tip; None where the model has to say why not."""
-
-
-def _free_way(robot: Manipulator) -> _Way | None:
-    """Machine code of a free arm; None without a compiler."""
+def _free_tip(robot: Manipulator) -> _FreeTip | None:
     code = library(("free tip", robot.layout.skeleton), partial(_free_function, robot.layout))
     return None if code is None else _FreeTip(code, robot)
 
@@ -180,7 +174,7 @@ def _free_function(layout: Layout) -> list[ca.Function]:
     return [tip_formulas(layout).function("tip_at")]
 
 
-def _loaded_way(robot: Manipulator) -> _Way | None:
+def _loaded_tip(robot: Manipulator) -> _LoadedTip | None:
     if rod_functions(robot.layout) is None:
         return None
     content, make = ("loaded tip", robot.layout.skeleton), partial(_loaded_functions, robot.layout)
@@ -190,5 +184,5 @@ def _loaded_way(robot: Manipulator) -> _Way | None:
 
 def _loaded_functions(layout: Layout) -> list[ca.Function]:
     equations = rod_functions(layout)
-    assert equations is not None  # or nobody would ask
+    assert equations is not None  # checked in `_loaded_tip`
     return [each for each in equations.functions if "adjoint" not in each.name()]

@@ -1,8 +1,8 @@
-"""The lean call of planners: from one answer to the next, arrays in and arrays out.
+"""Warm calls of planners, with little overhead: arrays in, arrays out.
 
-A row of numbers and the memory of an answer are made once; a call writes the target and the guess
-into them, calls machine code and copies what it found.  All else waits until it is asked for: a
-call whose memory is no longer in the processor's caches pays for each line of Python it runs.
+A row of numbers and memory for the answer are allocated once.  A call writes the target and the
+guess into them, calls machine code and copies the result.  Everything else is lazy, since each line
+of Python costs time once its memory has left the processor's caches.
 """
 
 from collections.abc import Callable
@@ -32,7 +32,7 @@ def asked_task(
     pointing: ArrayLike | None,
     orientation: ArrayLike | None,
 ) -> Task:
-    """The task with other parts of its target, which are checked."""
+    """Return the task with other parts of its target, after checking them."""
     parts: dict[str, Any] = {}
     if position is not None:
         given, own = checked_vector("position", position), task.target.position or (0, 0, 0)
@@ -50,9 +50,9 @@ def asked_task(
 
 
 class WarmAnswer:
-    """Answer of `PressureSolver.warm`: its pressures; the rest is computed when it is looked at.
+    """Answer of `PressureSolver.warm`: its pressures; everything else is computed lazily.
 
-    It has the attributes of its `solution` too.
+    It also has the attributes of its `solution`.
 
     Attributes
     ----------
@@ -71,7 +71,7 @@ class WarmAnswer:
 
     @classmethod
     def judged(cls, pressures: Vector | None, solution: PressureSolution | None) -> "WarmAnswer":
-        """Answer of which the solution is known."""
+        """Return an answer whose solution is known."""
         answer = cls.__new__(cls)
         answer.pressures, answer._solved = pressures, solution
         return answer
@@ -98,7 +98,7 @@ class WarmAnswer:
         return getattr(self.solution, name)
 
     def __reduce__(self) -> tuple[object, ...]:
-        """Support pickling: it is judged now."""
+        """Support pickling: judge the answer now."""
         return WarmAnswer.judged, (self.pressures, self.solution)
 
     def __repr__(self) -> str:
@@ -106,7 +106,7 @@ class WarmAnswer:
 
 
 class _WarmMemory(NamedTuple):
-    """A block of numbers, its parts for a position and a guess, and the call that answers it."""
+    """A block of numbers, its views for position and guess, and the call that solves it."""
 
     block: Vector
     place: Vector | None
@@ -116,7 +116,7 @@ class _WarmMemory(NamedTuple):
 
 
 class WarmCalls:
-    """Warm calls for one task, whose memory is used again and again.
+    """Warm calls for one task; their memory is reused.
 
     Attributes
     ----------
@@ -143,7 +143,7 @@ class WarmCalls:
         self._spare = [self._memory()]
 
     def _memory(self) -> _WarmMemory:
-        """A block of numbers and the call that answers it."""
+        """Return a new block with its views and call."""
         block = self.like.copy()
         place = None if self._place is None else block[self._place]
         return _WarmMemory(block, place, block[self.fast.guess], *self.fast.call(block))
@@ -151,11 +151,11 @@ class WarmCalls:
     def next_to(
         self, guess: Any, position: Any, pointing: Any, orientation: Any, stop: int = 0
     ) -> Vector | None:
-        """Block with the answer next to a guess; None if there is none, or an argument is wrong.
+        """Return a block with the answer next to a guess; None without one, or for bad arguments.
 
         `stop` is the address of a `StopFlag`.
         """
-        if not self._spare:  # other threads have them all
+        if not self._spare:  # all in use by other threads
             self._spare.append(self._memory())
         memory = self._spare.pop()
         block, place, start, call, task = memory
@@ -195,7 +195,7 @@ class WarmCalls:
             block[where] = unit_quaternion(tuple(map(float, orientation)))
 
     def task_of(self, block: Vector, task: Task) -> Task:
-        """The task that a block asks for."""
+        """Return the task that a block describes."""
         parts: dict[str, Any] = {}
         for key, (where, _) in self._parts.items():
             values = tuple(block[where].tolist())

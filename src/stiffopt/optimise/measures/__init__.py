@@ -1,4 +1,4 @@
-"""The kinds of stiffness measures that a task may name: one file each, found by scanning."""
+"""The kinds of stiffness measures: one file each, found by scanning this folder."""
 
 from stiffopt.model.kinds import kinds_in
 from stiffopt.optimise.measure import Measure, Role
@@ -9,5 +9,5 @@ MEASURES = tuple(kind for kind in _FOUND if "role" in vars(kind))
 
 
 def measures_of(role: Role) -> tuple[type[Measure], ...]:
-    """Those that may stand in one place of a task."""
+    """Return the kinds of measures that may have a role."""
     return tuple(kind for kind in MEASURES if kind.role == role)

@@ -1,4 +1,4 @@
-"""Stiffness along, or about, a direction."""
+"""Stiffness along a direction, or about it."""
 
 from __future__ import annotations
 
@@ -38,8 +38,8 @@ class StiffnessMeasure(Measure):
     direction : unit vector of the force or, for a rotation, axis of the moment.
     frame : the axes in which `direction` is given.
     kind : stiffness against translation or rotation.
-    boundary : free, the rest of the tip may move; guided, it may not translate (for a rotation:
-        not rotate) otherwise; clamped, it may not move otherwise at all.
+    boundary : "free": the tip may also move in other ways; "guided": it may not translate (for a
+        rotation: not rotate) otherwise; "clamped": it may not move otherwise at all.
     """
 
     key: ClassVar[str] = "direction"
@@ -66,16 +66,16 @@ class StiffnessMeasure(Measure):
         return self.direction
 
     def formula(self, tip: Any, parameters: Any) -> Any:
-        """``log k``; see `stiffopt.model.compliance.directional_stiffness`."""
+        """Return ``log k``; see `stiffopt.model.compliance.directional_stiffness`."""
         k = stiffness_along(tip, parameters[:3], self.frame, self.kind, self.boundary)
         return ca.log(k)
 
     def formula_gradient(self, tip: Any, parameters: Any) -> Any:
-        """Derivative of the value; see `Measure.formula_gradient`.
+        """Return the derivative of the value; see `Measure.formula_gradient`.
 
-        Where other motions are held, ``k = d' K d`` and W is the wrench that moves the tip by d:
-        then ``dk = -W' dC W``, in axes in which d does not turn.  That is the derivative of a
-        flexibility, of a third of the operations.
+        For a guided or clamped tip, ``k = d' K d``, and the wrench W moves the tip by d.  Then
+        ``dk = -W' dC W``, in axes in which d does not turn: the derivative of a flexibility, which
+        takes a third of the operations.
         """
         if self.boundary == "free" or not isinstance(tip, FreeShape):
             return super().formula_gradient(tip, parameters)
@@ -125,7 +125,7 @@ class _ValuedMeasure(StiffnessMeasure):
 
 
 class AtLeast(_ValuedMeasure):
-    """A stiffness that shall not be less than `value` (N/m, for a rotation N m/rad)."""
+    """A stiffness with a lower bound `value` (N/m, for a rotation N m/rad)."""
 
     role: ClassVar[Role] = "at_least"
 
@@ -144,7 +144,7 @@ class MatchValue(_ValuedMeasure):
 
     Attributes
     ----------
-    tolerance : relative deviation that is near enough.
+    tolerance : largest relative deviation.
     """
 
     role: ClassVar[Role] = "match"
@@ -162,7 +162,7 @@ class MatchValue(_ValuedMeasure):
         return ("match", *super().structure)
 
     def mismatch(self, value: Any, parameters: Any) -> tuple[Any, Any]:
-        """``(log k - log value)^2``."""
+        """Return ``(log k - log value)^2`` and its derivative."""
         return (value - parameters[3]) ** 2, 2 * (value - parameters[3])
 
     def holds(self, value: float) -> bool:

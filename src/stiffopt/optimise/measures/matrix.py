@@ -1,4 +1,4 @@
-"""Distance of the translational stiffness from a given matrix."""
+"""Match of the tip's translational stiffness matrix."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ class MatchMatrix(Measure):
 
     Attributes
     ----------
-    matrix : 3x3, symmetric and positive definite, in N/m whatever unit it was given in.
+    matrix : 3x3, symmetric and positive definite, in N/m (converted from the unit in a file).
     unit : N/m.
     frame : the axes in which the matrix is given.
-    boundary : guided, rotation is free; clamped, it is held.
-    tolerance : relative Frobenius distance that is near enough.
+    boundary : "guided": rotation is free; "clamped": it is held.
+    tolerance : largest relative Frobenius distance.
     """
 
     key: ClassVar[str] = "matrix"
@@ -78,19 +78,19 @@ class MatchMatrix(Measure):
         return tuple(entry for row in self.matrix for entry in row)
 
     def formula(self, tip: Any, parameters: Any) -> Any:
-        """Squared relative Frobenius distance ``|K - K_wanted|^2 / |K_wanted|^2``."""
+        """Return the squared relative Frobenius distance ``|K - K_wanted|^2 / |K_wanted|^2``."""
         K = stiffness_block(tip.compliance, "translation", self.boundary)
         if self.frame == "base":
             K = tip.rotation @ K @ tip.rotation.T
         return ca.sumsqr(ca.vec(K) - parameters) / ca.sumsqr(parameters)
 
     def mismatch(self, value: Any, parameters: Any) -> tuple[Any, Any]:
-        """The squared distance itself."""
+        """Return the squared distance itself."""
         return value, 1
 
     @property
     def is_stiffness(self) -> bool:
-        """No: a distance."""
+        """False: the value is a distance."""
         return False
 
     def holds(self, value: float) -> bool:
@@ -106,7 +106,7 @@ class MatchMatrix(Measure):
 
 
 def _scaled(matrix: Any, factor: float) -> Any:
-    """Return numbers in nested lists times a factor; leave alone what is no number."""
+    """Multiply the numbers in nested lists by a factor; leave other values alone."""
     if isinstance(matrix, np.ndarray):
         matrix = matrix.tolist()
     if isinstance(matrix, Sequence) and not isinstance(matrix, str):

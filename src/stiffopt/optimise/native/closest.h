@@ -1,17 +1,17 @@
-/* As near to the target as the arm comes: the method of diagnosis.py.
+/* Find the configuration closest to the target, by the method of diagnosis.py.
  *
- * Terms of the target are approached one stage after the other, each within the tolerances of the
- * stages before or, where these cannot be had, at their least errors.
+ * Terms of the target are approached in stages.  Each stage keeps the terms of those before within
+ * their tolerances or, if these cannot be met, at their least errors.
  */
 #ifndef STIFFOPT_CLOSEST_H
 #define STIFFOPT_CLOSEST_H
 
 #include "search.h"
 
-#define FREE 1e6 /* radius of a term whose stage has not come yet */
+#define FREE 1e6 /* radius of the terms of later stages */
 
-/* A start of a stage, to p: the best of the stage before, then in turn the nearest samples and any;
- * 0 where there are no more. */
+/* Set p to a start of a stage: first the best of the stage before, then alternately a sample near
+ * the target and an arbitrary one.  Return 0 when there are no more. */
 static int closest_start(Program *P, int64_t number, const double *last, const Ranked *nearest,
                          int64_t count, Point *p) {
     const Setup *s = P->setup;
@@ -25,7 +25,7 @@ static int closest_start(Program *P, int64_t number, const double *last, const R
     return 1;
 }
 
-/* Optima x (known->count, n) of a stage, from the start `last` and samples. */
+/* Find the optima x (known->count, n) of a stage, from the start `last` and samples. */
 static void closest_optima(Program *P, const double *last, const Ranked *nearest, int64_t count,
                            const ClosestSettings *set, Known *known, Found *found) {
     const Setup *s = P->setup;
@@ -42,7 +42,7 @@ static void closest_optima(Program *P, const double *last, const Ranked *nearest
         for (int64_t k = 0; k < known->count; k++) is_new = is_new && !same(s, &now, known->ends + k);
         nothing_new = is_new ? 0 : nothing_new + 1;
         if (!is_new) continue;
-        int64_t k = known->count++; /* kept in order, the best first */
+        int64_t k = known->count++; /* insert in order, the best first */
         for (; k > 0 && known->ends[k - 1].value > now.value; k--) {
             known->ends[k] = known->ends[k - 1];
             memcpy(known->x + k * s->n, known->x + (k - 1) * s->n, (size_t)s->n * sizeof(double));
@@ -52,15 +52,15 @@ static void closest_optima(Program *P, const double *last, const Ranked *nearest
     }
 }
 
-/* Whether pressures have the same errors from rest as next to where they were found: p. */
-static int stands(Program *P, const double *x, Point *p) {
+/* Evaluate pressures from rest, as p; return 0 without an equilibrium. */
+static int evaluate_from_rest(Program *P, const double *x, Point *p) {
     memcpy(p->x, x, (size_t)P->setup->n * sizeof(double));
     forget_state(P->setup, p);
     return evaluate(P, p, 1);
 }
 
-/* Pressures x (n) that come nearest to the target, their slope of the Lagrangian; 0 if none do or
- * they are not to be trusted, 1 otherwise.  A first start (n), in Pa, is taken unless it is NULL. */
+/* Find the pressures x (n) nearest to the target, and the Lagrangian's gradient there.  Return 0 if
+ * none are found, or are not confirmed from rest.  A first start (n) is in Pa, or NULL. */
 static int closest(Program *P, const double *from, double *x, double *slope, Found *found) {
     const Setup *s = P->setup;
     for (int64_t i = 0; from && i < s->n; i++)
@@ -77,7 +77,7 @@ static int closest(Program *P, const double *from, double *x, double *slope, Fou
     int64_t count = nearest_samples(P, nearest, &effort);
     memset(found, 0, sizeof *found);
     for (int64_t k = 0; k < balls; k++) {
-        radius[k] = own.stage[k] < 0 ? asked[k] : FREE; /* obstacles are in every stage */
+        radius[k] = own.stage[k] < 0 ? asked[k] : FREE; /* obstacles hold in every stage */
         stages = own.stage[k] + 1 > stages ? own.stage[k] + 1 : stages;
     }
     Stage stage = {0, asked};
@@ -87,7 +87,7 @@ static int closest(Program *P, const double *from, double *x, double *slope, Fou
         Known known = {0, ends, optima};
         closest_optima(P, stage.number || from ? x : NULL, nearest, count, set, &known, found);
         for (int64_t k = good = 0; !good && k < known.count; k++)
-            good = stands(P, optima + k * n, &p) && p.f[0] < ends[k].value + set->same;
+            good = evaluate_from_rest(P, optima + k * n, &p) && p.f[0] < ends[k].value + set->same;
         if (!good) break;
         memcpy(x, p.x, (size_t)n * sizeof(double));
         double least = 0;
@@ -96,11 +96,11 @@ static int closest(Program *P, const double *from, double *x, double *slope, Fou
         for (int64_t k = 0; k < balls && stage.number + 1 < stages; k++)
             if (own.stage[k] == stage.number) radius[k] = fmax(asked[k], least * (1 + 1e-6) + 1e-7);
     }
-    if (good) { /* once more from where it ended, for its multipliers */
+    if (good) { /* descend once more from the end, for its multipliers */
         stage.number = stages - 1;
         P->slope = slope;
         descend(P, &p, NULL);
-        good = stands(P, p.x, &p);
+        good = evaluate_from_rest(P, p.x, &p);
         memcpy(x, p.x, (size_t)n * sizeof(double));
         P->slope = NULL;
     }

@@ -1,4 +1,4 @@
-/* Down the objective along the pose: the feasible-path SQP method of local.py. */
+/* Minimise the objective along the pose: the feasible-path SQP method of local.py. */
 #ifndef STIFFOPT_DESCEND_H
 #define STIFFOPT_DESCEND_H
 
@@ -6,9 +6,9 @@
 
 #include "reach.h"
 
-#define FAR 1e6 /* stands for no bound in the quadratic program */
+#define FAR 1e6 /* value of an absent bound in the quadratic program */
 
-/* Prices of the constraints at a step: of the balls, the terms and the floors. */
+/* Multipliers of balls (rows), terms and floors at a step. */
 typedef struct {
     double *balls, *terms, *floors;
     int known;
@@ -20,7 +20,7 @@ typedef struct {
     int64_t iterations;
 } Descent;
 
-/* Orthonormal axes (k, k) by rows, the first along a vector; any if that is zero. */
+/* Compute orthonormal axes (k, k) by rows, the first along a vector; any if that is zero. */
 static void axes_along(const double *vector, int64_t k, double *axes) {
     double length = sqrt(dot(vector, vector, k)), first[k], mirror[k];
     memset(axes, 0, (size_t)(k * k) * sizeof(double));
@@ -34,7 +34,8 @@ static void axes_along(const double *vector, int64_t k, double *axes) {
     memcpy(axes, first, sizeof first);
 }
 
-/* Axes of the box around a ball, the first where it will bind, and the length of its pull. */
+/* Compute the axes of the box around a ball, the first where the ball will be active; return the
+ * length of its multiplier. */
 static double box_axes(const Program *P, const Point *p, int64_t ball, int64_t row,
                        const Multipliers *prices, const double *gradient, double *axes) {
     int64_t n = P->setup->n, k = P->setup->ball_rows[ball];
@@ -58,7 +59,7 @@ static double box_axes(const Program *P, const Point *p, int64_t ball, int64_t r
     return sqrt(dot(pull, pull, k));
 }
 
-/* Minimise z'Hz/2 + g'z with low <= (z, Az) <= high; 0 where there is no finite answer. */
+/* Minimise z'Hz/2 + g'z subject to low <= (z, Az) <= high; return 0 without a finite answer. */
 static int solve_qp(Program *P, int size, int constraints, double *H, double *g, double *A,
                     double *low, double *high, double *z, double *dual) {
     int sense[constraints];
@@ -76,18 +77,17 @@ static int solve_qp(Program *P, int size, int constraints, double *H, double *g,
     return result.exitflag > 0 && all_finite(z, size) && all_finite(dual, constraints);
 }
 
-/* Whether nothing moves a row, as that of an obstacle far away: it has no part in the program. */
+/* Whether a row has no slope, as that of a distant obstacle; it is left out of the program. */
 static int is_idle(const Program *P, const Point *p, int64_t ball, int64_t row) {
     const Setup *s = P->setup;
     return s->one_sided[ball] && !(largest(p->J + row * s->n, s->n) > 0);
 }
 
-/* One step of the method: d (n), the promised decrease of the merit, and new multipliers.
+/* Compute a step d (n), the promised decrease of the merit, and new multipliers.
  *
- * The variables are the step d, the largest term t (if there are several) and the floors' slack
- * (if there are any); each ball is a box whose curvature enters the Hessian.  What holds the step
- * back is the box and that curvature, and both are in the new multipliers.  Pressures that are
- * held stay as they are.
+ * The variables are the step d, the largest term t (if there are several) and the floors' slack (if
+ * there are any); each ball is a box, and its curvature enters the Hessian.  The new multipliers
+ * combine those of the box and of the curvature.  Pressures that are held do not change.
  */
 static int quadratic_step(Program *P, const Point *p, const double *B, const int64_t *held,
                           double radius, double price, Multipliers *prices, double *d, double *promised) {
@@ -184,7 +184,7 @@ static int quadratic_step(Program *P, const Point *p, const double *B, const int
     return 1;
 }
 
-/* Gradient of the Lagrangian with the multipliers held, bounds left out. */
+/* Gradient of the Lagrangian for fixed multipliers, bounds left out. */
 static void lagrangian_slope(const Setup *s, const Point *p, const Multipliers *prices,
                              double *slope) {
     int64_t n = s->n;
@@ -196,8 +196,8 @@ static void lagrangian_slope(const Setup *s, const Point *p, const Multipliers *
     }
 }
 
-/* Whether a step off a pressure limit that gained nothing met a slope back to it: there is a kink
- * at the limit, as in the norm law where a segment is unpressurised. */
+/* Whether a step off a pressure limit met a slope back to it.  If the step gained nothing, there is
+ * a kink at the limit, as in the norm law where a segment is unpressurised. */
 static int is_pushed_back(const Program *P, const Point *p, int64_t i, double rise) {
     return rise > 0 && (p->x[i] <= P->lower[i] || p->x[i] >= P->upper[i]);
 }
@@ -218,7 +218,7 @@ static void update_hessian(double *B, const double *step, double *y, int64_t n) 
             B[i * n + j] += y[i] * y[j] / sy - Bs[i] * Bs[j] / sBs;
 }
 
-/* The same point with pressures that all but touch a limit put onto it, if that holds. */
+/* Move pressures that almost touch a limit onto it, if the point then still holds. */
 static void snap(Program *P, Point *p) {
     const Setup *s = P->setup;
     int64_t n = s->n, moved = 0;
@@ -239,14 +239,14 @@ static void snap(Program *P, Point *p) {
         copy_point(s, &other, p);
 }
 
-/* Optima that are known already: a descent that comes next to one of them need not go on. */
+/* Known optima; a descent that comes close to one of them ends there. */
 typedef struct {
     int64_t count;
     Descent *ends;
     double *x; /* (count, n) */
 } Known;
 
-static const Descent *arrives(const Setup *s, const Point *p, const Known *known) {
+static const Descent *close_known(const Setup *s, const Point *p, const Known *known) {
     double value = objective(s, p);
     for (int64_t k = 0; k < known->count; k++) {
         const double *x = known->x + k * s->n;
@@ -258,7 +258,7 @@ static const Descent *arrives(const Setup *s, const Point *p, const Known *known
     return NULL;
 }
 
-/* First guess B (n, n) of the second derivative: of a stage that of Gauss and Newton. */
+/* Initial estimate B (n, n) of the Hessian; for a stage, the Gauss-Newton matrix. */
 static void first_curvature(const Program *P, const Point *p, double *B) {
     const Setup *s = P->setup;
     int64_t n = s->n;
@@ -318,7 +318,7 @@ static Descent descend(Program *P, Point *p, const Known *known) {
             radius = fmin(2.5 * radius, set->largest_radius);
         if (gained > 0) {
             copy_point(s, &trial, p);
-            const Descent *same = known ? arrives(s, p, known) : NULL;
+            const Descent *same = known ? close_known(s, p, known) : NULL;
             if (same) {
                 int64_t iterations = end.iterations;
                 end = *same, end.iterations = iterations;

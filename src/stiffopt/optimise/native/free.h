@@ -1,17 +1,17 @@
-/* A point of the program of an arm without loads, in closed form. */
+/* Evaluate the program of an arm without loads, in closed form. */
 #ifndef STIFFOPT_FREE_H
 #define STIFFOPT_FREE_H
 
 #include "obstacles.h"
 #include "program.h"
 
-/* Derivatives (rows, n) by pressures become those by x. */
+/* Convert derivatives (rows, n) by pressures to those by x. */
 static void per_share(const Setup *s, double *J, int64_t rows) {
     for (int64_t k = 0; k < rows; k++)
         for (int64_t i = 0; i < s->n; i++) J[k * s->n + i] *= s->unit[i];
 }
 
-/* Residuals at p->x and, if full, terms and floors too; 0 where anything is not finite. */
+/* Compute residuals at p->x and, if full, terms and floors; return 0 if anything is not finite. */
 static int evaluate(Program *P, Point *p, int full) {
     const Setup *s = P->setup;
     int staged = full && P->stage;
@@ -54,7 +54,7 @@ static int judge_at(Program *P, const double *pressures, double *answer) {
     return !judge(P->arg, P->res, P->iw, P->w, 0) && put_obstacles(P, pressures, NULL, rows, NULL);
 }
 
-/* What an evaluation needs beside the stack; 0 where there is no memory. */
+/* Allocate the memory of evaluations; return 0 if there is none. */
 static int add_memory(Program *P) { return add_surroundings(P); }
 
 static void free_memory(Program *P) { free(P->around); }

@@ -1,4 +1,4 @@
-/* A point of the program of an arm under gravity or loads: its equilibrium and what follows. */
+/* Evaluate the program of an arm under gravity or loads, at its equilibrium. */
 #ifndef STIFFOPT_LOADED_H
 #define STIFFOPT_LOADED_H
 
@@ -6,8 +6,8 @@
 #include "program.h"
 #include "rod.h"
 
-/* Residuals and terms are generated functions of the tip: position (3), rotation (3, 3), twist
- * per wrench in base axes (6, 6), pressures and parameters, matrices by columns. */
+/* Set the inputs of the generated functions of the tip: position (3), rotation (3, 3), twist per
+ * wrench in base axes (6, 6), pressures and parameters; matrices are stored by columns. */
 static void tip_inputs(const Program *P, const Linear *l, double *R, double *C) {
     for (int i = 0; i < 3; i++)
         for (int j = 0; j < 3; j++) R[3 * j + i] = l->R[3 * i + j];
@@ -18,10 +18,10 @@ static void tip_inputs(const Program *P, const Linear *l, double *R, double *C) 
 
 static Work work_of(const Program *P) { return (Work){P->arg, P->res, P->iw, P->w}; }
 
-/* Gradient by the pressures (n) of a value with these derivatives by C (6, 6, by columns).
+/* Add the gradient by the pressures (n) of a value with derivatives G by C (6, 6, by columns).
  *
- * The derivative G is taken apart into products y z' (as many as its rank, one for a directional
- * stiffness) by its largest entries, each of which takes one sweep back along the arm.
+ * Full pivoting splits G into products y z' (as many as its rank, one for a directional stiffness).
+ * Each product takes one backward sweep along the arm.
  */
 static int add_by_compliance(const Program *P, const Linear *l, double *G, double *gradient) {
     Work work = work_of(P);
@@ -41,8 +41,8 @@ static int add_by_compliance(const Program *P, const Linear *l, double *G, doubl
     return 1;
 }
 
-/* Residuals at p->x and, if full, terms and floors too; 0 where there is no equilibrium next to
- * p->state, which is moved to it, or anything is not finite. */
+/* Compute residuals at p->x and, if full, terms and floors; p->state moves to the new equilibrium.
+ * Return 0 if there is none next to it, or if anything is not finite. */
 static int evaluate(Program *P, Point *p, int full) {
     const Setup *s = P->setup;
     const Rod *rod = s->rod;
@@ -121,12 +121,12 @@ static int judge_at(Program *P, const double *pressures, double *answer) {
     return !judge(P->arg, P->res, P->iw, P->w, 0) && put_obstacles(P, pressures, state, rows, NULL);
 }
 
-/* Where an evaluation keeps the last equilibrium; 0 where there is no memory. */
+/* Allocate the memory of evaluations, with the last equilibrium; return 0 if there is none. */
 static int add_memory(Program *P) {
     const Rod *rod = P->setup->rod;
     size_t numbers = (size_t)linear_size(rod) * sizeof(double);
     if (!add_surroundings(P)) return 0;
-    if (P->linear) return 1; /* that of the body among obstacles */
+    if (P->linear) return 1; /* shared with the body among obstacles */
     Linear *l = malloc(sizeof(Linear) + numbers);
     if (l) *l = linear_in(rod, (double *)(l + 1));
     P->linear = l;

@@ -2,8 +2,8 @@
 #define STIFFOPT_LOADED
 #include "solver.c"
 
-/* A point of a task's program at pressures (n), from rest: all that evaluate gives, in order, but
- * for obstacles, whose rows are zero; 0 where there is no equilibrium. */
+/* Evaluate a task's program at pressures (n), from rest: all values of a point in order, with rows
+ * of obstacles zero.  Return 0 without an equilibrium. */
 int stiffopt_point(const Setup *setup, const double *parameters, const double *radii,
                    const double *pressures, double *values) {
     const double *arg[WORK_ARG];

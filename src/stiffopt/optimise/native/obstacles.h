@@ -1,9 +1,8 @@
-/* Rows of a task's program for the objects of a scene: how far the body is from each of them.
+/* Rows of a task's program for the objects of a scene: the body's distance from each of them.
  *
- * After the rows of the generated functions there is one for each object and segment (with its
- * connector), of a ring one for the whole arm: margin - (distance - clearance), bounded on one side
- * by `margin`.  Where the body is further away than `cutoff`, a row says no more than that, and has
- * no slope.
+ * They follow the rows of the generated functions: one for each object and segment (with its
+ * connector), for a ring one for the whole arm.  A row is margin - (distance - clearance) <=
+ * margin. Distances are cut off at `cutoff`; beyond it a row has no slope.
  */
 #ifndef STIFFOPT_OBSTACLES_H
 #define STIFFOPT_OBSTACLES_H
@@ -17,8 +16,8 @@
 #include "body.h"
 #include "scene.h"
 
-#define ROUGH_ERROR 1e-2 /* m of a least distance, where starts are ranked */
-#define FAR_ERROR 0.3   /* of what a least distance is above the clearance */
+#define ROUGH_ERROR 1e-2 /* error in m of a least distance in the ranking of starts */
+#define FAR_ERROR 0.3   /* allowed error, as a share of the distance beyond the clearance */
 
 /* Mirrored by `_Obstacles` in obstacles.py. */
 typedef struct {
@@ -52,7 +51,7 @@ static int station_of_body(const void *of, double s, double *position, double *t
     return 1;
 }
 
-/* Memory for the body; 0 where there is none. */
+/* Allocate memory for the body; return 0 if there is none. */
 static int add_surroundings(Program *P) {
     const Obstacles *o = P->setup->obstacles;
     const BodyModel *model = o->body;
@@ -79,7 +78,7 @@ static int add_surroundings(Program *P) {
     return 1;
 }
 
-/* Bring the body to pressures (Pa) and, under loads, their equilibrium. */
+/* Move the body to pressures (Pa) and, under loads, their equilibrium. */
 static int move_body(const Program *P, const double *pressures, const double *state, int moving) {
     Surroundings *around = P->around;
     const Obstacles *o = P->setup->obstacles;
@@ -90,7 +89,7 @@ static int move_body(const Program *P, const double *pressures, const double *st
     return 1;
 }
 
-/* One row and, unless J is NULL, its derivatives (n) by x. */
+/* Compute one row and, unless J is NULL, its derivatives (n) by x. */
 static int obstacle_row(const Program *P, const SceneObject *object, int64_t begin, int64_t end,
                         double *r, double *J) {
     const Setup *s = P->setup;
@@ -115,8 +114,8 @@ static int obstacle_row(const Program *P, const SceneObject *object, int64_t beg
     return 1;
 }
 
-/* Rows r and, unless J is NULL, their derivatives by x, at pressures (Pa) and, under loads, their
- * equilibrium. */
+/* Compute rows r and, unless J is NULL, their derivatives by x, at pressures (Pa) and, under loads,
+ * their equilibrium. */
 static int put_obstacles(const Program *P, const double *pressures, const double *state,
                          double *r, double *J) {
     const Obstacles *o = P->setup->obstacles;

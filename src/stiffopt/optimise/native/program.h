@@ -2,7 +2,7 @@
  *
  * Minimise the largest of the terms over the pressures x, each as a share of its channel's range,
  * with floors g(x) >= bound, balls |r(x)| <= radius (one-sided ones: r(x) <= radius, of one row)
- * and lower <= x <= upper.  The model itself is generated code, which takes Pa.
+ * and lower <= x <= upper.  The model is generated code, which takes pressures in Pa.
  * All matrices are stored row by row.
  */
 #ifndef STIFFOPT_PROGRAM_H
@@ -13,7 +13,7 @@
 #include <string.h>
 #include <time.h>
 
-/* Settings as in settings.py, which explains them. */
+/* Settings; documented in settings.py. */
 typedef struct {
     double longest_step, damping, least_damping, most_damping, least_progress;
     int64_t iterations, iterations_of_many;
@@ -38,16 +38,16 @@ typedef struct {
 typedef struct {
     int64_t n;     /* pressures */
     int64_t rows;  /* of all residuals */
-    int64_t own_rows; /* those of generated functions: the first, before those of obstacles */
-    int64_t balls; /* constraints on them */
+    int64_t own_rows; /* of generated functions, which come before those of obstacles */
+    int64_t balls; /* constraints on the rows */
     int64_t terms, floors, values;
     int64_t parameters;
-    int64_t near;    /* terms of the target that say how near a sample is */
+    int64_t near;    /* terms of the target, each with a `Nearness` */
     int64_t samples; /* in the table */
     const int64_t *ball_rows, *one_sided; /* (balls) */
-    const double *scale;                  /* (balls) of residuals while the target is far */
+    const double *scale;                  /* (balls) of residuals far from the target */
     const double *unit;                   /* (n) Pa per unit of x */
-    const int64_t *stage;                 /* (balls) of closest.h */
+    const int64_t *stage;                 /* (balls) in the search of closest.h */
     ReachSettings reach;
     DescentSettings descent;
     ClosestSettings closest;
@@ -55,18 +55,18 @@ typedef struct {
     double covered, same_optimum, unlike, price_of_floors, price_of_obstacles, precision;
     const double *sample_x;     /* (samples, n) */
     const double *sample_poses; /* (samples, 12): position, rotation by columns */
-    /* of an arm under gravity or loads: */
-    int64_t state;               /* numbers of an equilibrium's state, else 0 */
+    /* for an arm under gravity or loads: */
+    int64_t state;               /* size of an equilibrium's state, otherwise 0 */
     const double *sample_states; /* (samples, state) */
     const void *rod;             /* Rod */
-    /* of a task with a scene: */
-    const void *obstacles; /* Obstacles, else NULL */
+    /* for a task with a scene: */
+    const void *obstacles; /* Obstacles, otherwise NULL */
 } Setup;
 
-/* When to give up; mirrors `StopFlag` in stopping.py. */
+/* When to stop; mirrors `StopFlag` in stopping.py. */
 typedef struct {
     double seconds;          /* from the start of the call; infinite: no limit */
-    volatile int64_t cancel; /* not 0: at once */
+    volatile int64_t cancel; /* nonzero: at once */
 } Stop;
 
 /* One stage of the search for the closest configuration: the error of its balls is minimised. */
@@ -75,8 +75,8 @@ typedef struct {
     const double *radius; /* (balls) of the target */
 } Stage;
 
-/* How obstacles are seen: as they were at the same pressures a moment ago, roughly and without
- * slopes, exactly where they are near, or exactly. */
+/* How distances of obstacles are evaluated: KNOWN keeps the rows, whose pressures have not changed;
+ * ROUGH computes no slopes; NEAR is exact for near obstacles; EXACT for all. */
 enum { KNOWN, ROUGH, NEAR, EXACT };
 
 typedef struct {
@@ -88,8 +88,8 @@ typedef struct {
     double **res;
     casadi_int *iw;
     double *w;
-    const Stage *stage; /* of the search for the closest configuration, else NULL */
-    double *slope;      /* (n) of the Lagrangian where a descent ended, if wanted, else NULL */
+    const Stage *stage; /* of the search for the closest configuration, otherwise NULL */
+    double *slope;      /* (n) output: the Lagrangian's gradient at a descent's end, or NULL */
     int64_t poses, points, programs; /* evaluations and quadratic programs so far */
     void *linear; /* Linear: the last equilibrium with its derivatives */
     void *around; /* Surroundings: the body among obstacles */
@@ -101,12 +101,12 @@ typedef struct {
     double *r, *J;          /* (rows), (rows, n) */
     double *f, *df;         /* terms (terms), (terms, n) */
     double *g, *dg;         /* floors (floors), (floors, n) */
-    double *state;          /* of the equilibrium (setup->state); NaN where none is known */
-    double *error;          /* (balls): length of the residual, or itself if one-sided */
+    double *state;          /* of the equilibrium (setup->state); begins with NaN if unknown */
+    double *error;          /* (balls): length of the residual; if one-sided, the residual */
     int reached;
 } Point;
 
-/* Numbers of a point that an evaluation gives, and all. */
+/* Number of values of a point that an evaluation computes; point_size is that of all. */
 static int64_t value_count(const Setup *s) {
     return s->n + (s->rows + s->terms + s->floors) * (1 + s->n);
 }
@@ -164,9 +164,9 @@ static double dot(const double *a, const double *b, int64_t n) {
 }
 
 static double largest(const double *a, int64_t n) {
-    double most = 0;
-    for (int64_t i = 0; i < n; i++) most = fmax(most, fabs(a[i]));
-    return most;
+    double found = 0;
+    for (int64_t i = 0; i < n; i++) found = fmax(found, fabs(a[i]));
+    return found;
 }
 
 static double clip(double x, double low, double high) { return fmin(fmax(x, low), high); }
@@ -177,7 +177,7 @@ static int all_finite(const double *a, int64_t n) {
     return 1;
 }
 
-/* Solve A y = b with A (m, m) symmetric positive definite, in place; 0 if it is not. */
+/* Solve A y = b in place for symmetric positive definite A (m, m); return 0 if A is not. */
 static int cholesky_solve(double *A, double *b, int64_t m) {
     for (int64_t j = 0; j < m; j++) {
         double d = A[j * m + j] - dot(A + j * m, A + j * m, j);
@@ -194,7 +194,7 @@ static int cholesky_solve(double *A, double *b, int64_t m) {
     return 1;
 }
 
-/* Errors of the constraints, and whether each holds. */
+/* Compute the errors of the constraints, and whether all hold. */
 static void measure_balls(const Program *P, Point *p) {
     const Setup *s = P->setup;
     const double *r = p->r;
@@ -205,14 +205,14 @@ static void measure_balls(const Program *P, Point *p) {
     }
 }
 
-/* Weights (rows) of residuals: one over a number for each constraint. */
+/* Set the weight (rows) of each residual to the reciprocal of its constraint's number. */
 static void row_weights(const Setup *s, const double *of_ball, double *weight) {
     for (int64_t k = 0, i = 0; k < s->balls; k++)
         for (int64_t end = i + s->ball_rows[k]; i < end; i++) weight[i] = 1 / of_ball[k];
 }
 
-/* What residuals (rows) lack of their middle, or of a bound on one side.  Returns their Jacobian,
- * in which rows are zero where a bound on one side holds; J is memory for it. */
+/* Compute the violations of residuals (rows); a one-sided residual counts only beyond its bound.
+ * Return their Jacobian, whose rows are zero where a one-sided bound holds; J is memory for it. */
 static const double *lacking(const Program *P, const Point *p, double *lacks, double *J) {
     const Setup *s = P->setup;
     const double *found = p->J;
@@ -230,7 +230,7 @@ static const double *lacking(const Program *P, const Point *p, double *lacks, do
     return found;
 }
 
-/* Instead of the task's own terms, that of a stage: half the squared error, over its scale. */
+/* Replace the objective by that of a stage: half the squared error over its scale. */
 static void stage_term(const Program *P, Point *p) {
     const Setup *s = P->setup;
     int64_t n = s->n;
@@ -246,14 +246,14 @@ static void stage_term(const Program *P, Point *p) {
     }
 }
 
-/* Largest term, and the sum by which floors are missed. */
+/* Largest term. */
 static double objective(const Setup *s, const Point *p) {
-    double most = p->f[0];
-    for (int64_t i = 1; i < s->terms; i++) most = fmax(most, p->f[i]);
-    return most;
+    double found = p->f[0];
+    for (int64_t i = 1; i < s->terms; i++) found = fmax(found, p->f[i]);
+    return found;
 }
 
-/* Sum by which rows of obstacles are missed, over their scale. */
+/* Sum of the violations of obstacles' rows, over their scales. */
 static double intrusion(const Program *P, const Point *p) {
     const Setup *s = P->setup;
     double sum = 0;
@@ -262,6 +262,7 @@ static double intrusion(const Program *P, const Point *p) {
     return sum;
 }
 
+/* Sum of the violations of floors. */
 static double violation(const Program *P, const Point *p) {
     double sum = 0;
     for (int64_t i = 0; i < P->setup->floors; i++) sum += fmax(0, P->floor[i] - p->g[i]);

@@ -1,4 +1,4 @@
-/* To the target: Gauss-Newton steps that mind the pressure limits. */
+/* Bring pressures to the target: damped Gauss-Newton steps within the pressure limits. */
 #ifndef STIFFOPT_REACH_H
 #define STIFFOPT_REACH_H
 
@@ -8,7 +8,7 @@
 #include "free.h"
 #endif
 
-/* Components of d that are not held, by a system of as many equations as there are rows. */
+/* Compute the components of d that are not held, from a system of size (rows, rows). */
 static int steps_of_few_rows(const Setup *s, const double *J, const int64_t *row, int64_t m,
                              const double *rest, const double *weight, double damping,
                              const int64_t *held, double *d) {
@@ -33,7 +33,7 @@ static int steps_of_few_rows(const Setup *s, const double *J, const int64_t *row
     return 1;
 }
 
-/* The same by as many equations as there are pressures; the two agree by Woodbury's identity. */
+/* The same from a system of size (n, n); the two agree by Woodbury's identity. */
 static int steps_of_many_rows(const Setup *s, const double *J, const int64_t *row, int64_t m,
                               const double *rest, const double *weight, double damping,
                               const int64_t *held, double *d) {
@@ -55,10 +55,10 @@ static int steps_of_many_rows(const Setup *s, const double *J, const int64_t *ro
     return 1;
 }
 
-/* Step d within [low, high] with |W (J d - wanted)|^2 + damping |d|^2 small.
+/* Compute a step d within [low, high] that makes |W (J d - wanted)|^2 + damping |d|^2 small.
  *
- * Components that would leave their range are put on its end and the rest is solved again.  Rows
- * without a slope, as those of constraints on one side that hold, have no part in it.
+ * Components that leave their range are fixed at its end and the others are solved for again.  Rows
+ * of J that are zero, as those of one-sided constraints that hold, are skipped.
  */
 static int bounded_step(const Setup *s, const double *J, const double *wanted,
                         const double *weight, double damping, const double *low,
@@ -94,12 +94,12 @@ static double misfit(const Setup *s, const double *lacks, const double *weight) 
     return sum;
 }
 
-/* Bring a point, of which p->x is given, to where all constraints hold; 0 if that fails. */
+/* Move a point, starting at p->x, to where all constraints hold; return 0 if that fails. */
 static int approach(Program *P, Point *p, int64_t most) {
     const Setup *s = P->setup;
     const ReachSettings *set = &s->reach;
     double weight[s->rows], lacks[s->rows], memory[s->rows * s->n], damping = set->damping;
-    double scale[s->balls]; /* what is left free does not pull */
+    double scale[s->balls]; /* large for a free ball, so that it does not pull */
     for (int64_t k = 0; k < s->balls; k++) scale[k] = fmax(s->scale[k], P->radius[k]);
     row_weights(s, scale, weight);
     if (!evaluate(P, p, 0)) return 0;
@@ -143,7 +143,7 @@ static int approach(Program *P, Point *p, int64_t most) {
     return p->reached;
 }
 
-/* The same without a look at obstacles, whose rows are not evaluated. */
+/* The same without obstacles, whose rows are not evaluated. */
 static int reach_blindly(Program *P, Point *p, int64_t most) {
     const Setup *s = P->setup;
     if (!s->obstacles) return approach(P, p, most);
@@ -153,14 +153,14 @@ static int reach_blindly(Program *P, Point *p, int64_t most) {
     NEW_POINT(alone, &own);
     memcpy(alone.x, p->x, (size_t)s->n * sizeof(double));
     inherit_state(s, p, &alone);
-    int come = approach(P, &alone, most);
+    int reached = approach(P, &alone, most);
     memcpy(p->x, alone.x, (size_t)s->n * sizeof(double));
     inherit_state(s, &alone, p);
     P->setup = s;
-    return come;
+    return reached;
 }
 
-/* Evaluate in full what obstacles are seen of by a sight. */
+/* Evaluate in full, with obstacles at the given sight. */
 static int evaluate_by_sight(Program *P, Point *p, int sight) {
     int before = P->sight;
     P->sight = sight;
@@ -169,12 +169,12 @@ static int evaluate_by_sight(Program *P, Point *p, int sight) {
     return good;
 }
 
-/* The same past obstacles, at which it looks when the target is reached. */
+/* Move a point to where all constraints hold; obstacles are considered from the target on. */
 static int reach(Program *P, Point *p, int64_t most) {
     return reach_blindly(P, p, most) && (!P->around || approach(P, p, most));
 }
 
-/* Point near from->x + d where all constraints hold, evaluated in full; 0 if there is none. */
+/* Find a point near from->x + d where all constraints hold, evaluated in full; 0 without one. */
 static int pulled_back(Program *P, const Point *from, const double *d, const double *lower,
                        const double *upper, Point *to) {
     const Setup *s = P->setup;

@@ -1,4 +1,4 @@
-/* The global search: samples near the target, brought to the pose, and down from the best. */
+/* The global search: bring samples near the target to the pose, then descend from the best. */
 #ifndef STIFFOPT_SEARCH_H
 #define STIFFOPT_SEARCH_H
 
@@ -6,10 +6,10 @@
 
 typedef struct {
     int64_t tried;    /* samples that were brought towards the pose */
-    int64_t reached;  /* of them came to it */
-    int64_t descents; /* that converged */
-    int64_t agreeing; /* of them ended at the best */
-    int64_t optima;   /* distinct ones */
+    int64_t reached;  /* samples that reached it */
+    int64_t descents; /* descents that converged */
+    int64_t agreeing; /* descents that ended at the best optimum */
+    int64_t optima;   /* distinct optima */
     int64_t complete; /* whether the last descents found nothing new */
     int64_t iterations;
 } Found;
@@ -19,18 +19,18 @@ typedef struct {
     int64_t index;
 } Ranked;
 
-/* Keep the smallest of many values in a heap whose root is the largest of them. */
-static void keep_smallest(Ranked *heap, int64_t *count, int64_t most, Ranked item) {
+/* Keep the smallest `capacity` of many values, in a heap whose root is the largest of them. */
+static void keep_smallest(Ranked *heap, int64_t *count, int64_t capacity, Ranked item) {
     int64_t hole;
-    if (*count < most) {
+    if (*count < capacity) {
         for (hole = (*count)++; hole > 0 && heap[(hole - 1) / 2].value < item.value;
              hole = (hole - 1) / 2)
             heap[hole] = heap[(hole - 1) / 2];
     } else {
         if (!(item.value < heap[0].value)) return;
-        for (hole = 0; 2 * hole + 1 < most;) {
+        for (hole = 0; 2 * hole + 1 < capacity;) {
             int64_t child = 2 * hole + 1;
-            if (child + 1 < most && heap[child + 1].value > heap[child].value) child++;
+            if (child + 1 < capacity && heap[child + 1].value > heap[child].value) child++;
             if (heap[child].value <= item.value) break;
             heap[hole] = heap[child];
             hole = child;
@@ -51,8 +51,8 @@ static void sort_ranked(Ranked *items, int64_t count) {
     }
 }
 
-/* How far the tips of all samples are from meeting a term, roughly, in addition to what `total` has;
- * see `Nearness` in term.py. */
+/* Add to `total` how far the tips of all samples are from meeting a term; see `Nearness` in
+ * term.py. */
 static void add_nearness(const Setup *s, const double *near, double *total) {
     const double a = near[0], bx = near[1], by = near[2], bz = near[3];
     const double cx = near[4], cy = near[5], cz = near[6], limit = near[17];
@@ -62,14 +62,14 @@ static void add_nearness(const Setup *s, const double *near, double *total) {
         const double x = pose[0], y = pose[1], z = pose[2];
         double value = a + x * (bx + cx * x) + y * (by + cy * y) + z * (bz + cz * z);
         if (turns) value += dot(near + 7, pose + 3, 9);
-        if (value < 0) value = 0; /* fmax is a call, once for each sample */
+        if (value < 0) value = 0; /* faster than a call of fmax for each sample */
         value = (is_root ? sqrt(value) : value) - limit;
         if (value > 0) total[i] += value;
     }
 }
 
-/* Samples nearest to the target, the nearest first, and how hard to search: the more, the more of
- * the samples meet the target. */
+/* Find the samples nearest to the target, in order, and the effort of the search, which grows with
+ * the share of samples that meet the target. */
 static int64_t nearest_samples(Program *P, Ranked *nearest, Effort *effort) {
     const Setup *s = P->setup;
     const Effort *least = &s->least_effort, *most = &s->most_effort;
@@ -91,7 +91,7 @@ static int64_t nearest_samples(Program *P, Ranked *nearest, Effort *effort) {
     return count;
 }
 
-/* Pressures, and the equilibrium, of a sample. */
+/* Set a point to the pressures and the equilibrium of a sample. */
 static void start_from_sample(const Program *P, int64_t index, Point *p) {
     const Setup *s = P->setup;
     const double *x = s->sample_x + index * s->n;
@@ -109,20 +109,20 @@ static int better(const Setup *s, const Descent *a, const Descent *b) {
     return a->value < b->value;
 }
 
-/* Whether one of the samples nearest to the target, at most so many, comes to it: to p. */
-static int can_come(Program *P, Point *p, int64_t most) {
+/* Return whether one of the `tries` samples nearest to the target can be brought to it, as p. */
+static int can_reach(Program *P, Point *p, int64_t tries) {
     const Setup *s = P->setup;
     Effort effort;
     Ranked nearest[2 * s->most_effort.screened];
     int64_t count = nearest_samples(P, nearest, &effort);
-    for (int64_t i = 0; i < count && i < most; i++) {
+    for (int64_t i = 0; i < count && i < tries; i++) {
         start_from_sample(P, nearest[i].index, p);
         if (reach(P, p, s->reach.iterations_of_many)) return 1;
     }
     return 0;
 }
 
-/* Best local optimum; 0 where no sample came to the pose or no descent converged. */
+/* Find the best local optimum; return 0 if no sample reached the pose or no descent converged. */
 static int search(Program *P, Point *best, Descent *end, Found *found) {
     const Setup *s = P->setup;
     int64_t size = point_size(s), ranked = 0;
@@ -145,12 +145,12 @@ static int search(Program *P, Point *best, Descent *end, Found *found) {
     }
     found->reached = ranked;
     sort_ranked(screened, ranked);
-    double apart = 0;
+    double spacing = 0; /* squared */
     for (int64_t k = 0; k < s->n; k++) {
         double range = P->upper[k] - P->lower[k];
-        apart += s->unlike * s->unlike * range * range;
+        spacing += s->unlike * s->unlike * range * range;
     }
-    /* in the order of their rank, first those unlike each other, then the others */
+    /* sort by rank, those unlike each other first */
     int64_t used[effort.screened], order[effort.screened], given = 0;
     memset(used, 0, sizeof used);
     for (int pass = 0; pass < 2; pass++)
@@ -162,7 +162,7 @@ static int search(Program *P, Point *best, Descent *end, Found *found) {
                 const double *other = memory + screened[order[j]].index * size;
                 double sum = 0;
                 for (int64_t k = 0; k < s->n; k++) sum += (x[k] - other[k]) * (x[k] - other[k]);
-                alone = sum > apart;
+                alone = sum > spacing;
             }
             if (alone) used[i] = 1, order[given++] = i;
         }
@@ -174,12 +174,12 @@ static int search(Program *P, Point *best, Descent *end, Found *found) {
     for (int64_t i = 0; i < given && i < effort.most_descents && !(i && stopped(P)); i++) {
         Point from = point_in(s, memory + screened[order[i]].index * size);
         copy_point(s, &from, &p);
-        if (s->obstacles && !evaluate(P, &p, 1)) continue; /* which was but roughly seen */
+        if (s->obstacles && !evaluate(P, &p, 1)) continue; /* its obstacles were evaluated roughly */
         measure_balls(P, &p);
         if (!p.reached && !(reach(P, &p, s->reach.iterations_of_many) && evaluate(P, &p, 1))) continue;
         Descent now = descend(P, &p, &known);
         found->iterations += now.iterations;
-        /* a descent that is stopped is at the pose: better than nothing */
+        /* a stopped descent is at the pose, so its end can be used */
         if (!(now.converged || stopped(P)) || !isfinite(now.value)) continue;
         int is_new = 1;
         for (int64_t k = 0; k < found->descents && is_new; k++) is_new = !same(s, &now, ends + k);

@@ -1,25 +1,26 @@
-/* Tasks of one structure on one arm, solved row by row.
+/* Compiled solver: solve tasks of one structure on one arm, given as rows of numbers.
  *
- * A task is a row of numbers: parameters of its functions, radii of the balls, lower and upper
- * pressure limits (Pa), floors, the `Nearness` of each term, what is asked for and a guess (Pa).
- * An answer is a row of numbers too, see `solve_row`.
+ * The row of a task has the parameters of its functions, radii of the balls, lower and upper
+ * pressure limits (Pa), floors, the `Nearness` of each term, the request and a guess (Pa).
+ * For the row of an answer see `solve_row`.
  */
 #include "functions.h"
 
 #include "closest.h"
 
 #ifndef STIFFOPT_LOADED
-void point_rows(void); /* follows the code of `point` */
+void point_rows(void); /* marks the end of the code of `point` */
 #endif
 
 #define CACHE_LINE 64    /* bytes */
 #define MOST_CODE 400000 /* bytes */
 
-/* What is asked for, and what came of it; as fast.py has them. */
-enum { SEARCH, GUESS_FIRST, GUESS_ALONE, JUDGE, COME, CLOSEST, CLOSEST_FROM };
-enum { NEEDS_GENERAL_METHOD, LOCAL, GLOBAL, JUDGED, CAME, NEAREST, NOT_FINITE, TOO_SOFT };
+/* Requests and outcomes, as in fast.py. */
+enum { SEARCH, GUESS_FIRST, GUESS_ALONE, JUDGE, REACH_ONLY, CLOSEST, CLOSEST_FROM };
+enum { NEEDS_GENERAL_METHOD, LOCAL, GLOBAL, JUDGED, REACHED, NEAREST, NOT_FINITE, TOO_SOFT };
 
-/* From a guess (n) in Pa; whether the descent from there ended at an optimum, or was stopped. */
+/* Descend from a guess (n) in Pa; return whether the end meets the floors and is an optimum, or was
+ * stopped. */
 static int from_guess(Program *P, const double *guess, Point *p, Descent *end, Found *found) {
     const Setup *s = P->setup;
     for (int64_t i = 0; i < s->n; i++)
@@ -31,18 +32,20 @@ static int from_guess(Program *P, const double *guess, Point *p, Descent *end, F
     return (end->converged || stopped(P)) && end->violation < 0.5 * s->descent.floor_margin;
 }
 
-/* Row of an answer: outcome, value, violation, converged, the seven numbers of Found, three
- * counts of evaluations, pressures (n) in Pa, slope (n) per unit of x of the error of the closest
- * configuration, then what judge_at writes: not of a guess alone, which is judged when it is
- * looked at, but where there are obstacles.
+/* Solve one row.
+ *
+ * The answer's row has: outcome, value, violation, converged, the seven numbers of Found, three
+ * counts of evaluations, pressures (n) in Pa, for the closest configuration the slope (n) of its
+ * error per unit of x, then the output of judge_at.  The answer to GUESS_ALONE is judged only among
+ * obstacles; otherwise the caller judges it when needed.
  */
 static void solve_row(Program *P, const double *task, double *answer) {
     const Setup *s = P->setup;
     P->parameters = task, task += s->parameters;
     P->radius = task, task += s->balls;
-    const double *least = task, *most = task + s->n;
+    const double *low = task, *high = task + s->n;
     double lower[s->n], upper[s->n];
-    for (int64_t i = 0; i < s->n; i++) lower[i] = least[i] / s->unit[i], upper[i] = most[i] / s->unit[i];
+    for (int64_t i = 0; i < s->n; i++) lower[i] = low[i] / s->unit[i], upper[i] = high[i] / s->unit[i];
     P->lower = lower, P->upper = upper, task += 2 * s->n;
     P->floor = task, task += s->floors;
     P->near = task, task += 18 * s->near;
@@ -59,8 +62,8 @@ static void solve_row(Program *P, const double *task, double *answer) {
         outcome = NOT_FINITE;
     else if (asked == JUDGE)
         outcome = JUDGED;
-    else if (asked == COME)
-        outcome = can_come(P, &p, s->least_effort.screened) ? CAME : NEEDS_GENERAL_METHOD;
+    else if (asked == REACH_ONLY)
+        outcome = can_reach(P, &p, s->least_effort.screened) ? REACHED : NEEDS_GENERAL_METHOD;
     else if (asked == CLOSEST || asked == CLOSEST_FROM)
         outcome = closest(P, asked == CLOSEST ? NULL : task, p.x, slope, &found)
             ? NEAREST : NEEDS_GENERAL_METHOD;
@@ -76,26 +79,26 @@ static void solve_row(Program *P, const double *task, double *answer) {
     *out++ = (double)P->poses, *out++ = (double)P->points, *out++ = (double)P->programs;
     double *pressures = out;
     for (int64_t i = 0; i < s->n; i++)
-        *out++ = outcome == JUDGED ? task[i] : clip(p.x[i] * s->unit[i], least[i], most[i]);
+        *out++ = outcome == JUDGED ? task[i] : clip(p.x[i] * s->unit[i], low[i], high[i]);
     memcpy(out, slope, sizeof slope), out += s->n;
     int judged = outcome == GLOBAL || outcome == NEAREST || outcome == JUDGED || outcome == TOO_SOFT ||
                  (outcome == LOCAL && (asked != GUESS_ALONE || P->around));
     if (judged && !judge_at(P, pressures, out)) answer[0] = NEEDS_GENERAL_METHOD;
 }
 
-/* Fetch code ahead, many lines of the cache at once; a processor that follows code which is not in
- * its caches, since much else was done, waits for it line by line.  Functions are linked in the
- * order of their files; were they not, this would be of no use, and no harm. */
+/* Prefetch machine code, many cache lines at once.  Without this, a processor whose caches have
+ * lost the code waits for each line in turn.  This relies on functions being linked in the order of
+ * their files; in another order it is useless but harmless. */
 static void fetch(uintptr_t begin, uintptr_t end) {
     for (uintptr_t at = begin; at < end && at < begin + MOST_CODE; at += CACHE_LINE)
         __builtin_prefetch((const void *)at, 0, 2);
-    __asm__ volatile(""); /* or a function without effects is left out */
+    __asm__ volatile(""); /* keep the compiler from removing a function without effects */
 }
 
-/* For the caller to check that it has the same idea of a Setup. */
+/* Size of a Setup, for the caller to check that it has the same fields. */
 int64_t stiffopt_setup_size(void) { return sizeof(Setup); }
 
-/* Solve tasks begin to end - 1 of rows of the given widths; not 0 if memory is short. */
+/* Solve tasks begin to end - 1 of rows of the given widths; return nonzero if out of memory. */
 int stiffopt_solve(const Setup *setup, const double *tasks, int64_t task_width, double *answers,
                    int64_t answer_width, int64_t begin, int64_t end, const Stop *stop) {
     const double *arg[WORK_ARG];
@@ -114,7 +117,7 @@ int stiffopt_solve(const Setup *setup, const double *tasks, int64_t task_width, 
     return 0;
 }
 
-/* A task of its own; mirrors `_OneTask` in fast.py. */
+/* A single task; mirrors `_OneTask` in fast.py. */
 typedef struct {
     const Setup *setup;
     const double *task;
@@ -122,7 +125,7 @@ typedef struct {
     const Stop *stop;
 } OneTask;
 
-/* Solve it: what came of it, -1 if memory is short. */
+/* Solve it; return the outcome, -1 if out of memory. */
 int stiffopt_solve_one(const OneTask *one) {
     if (stiffopt_solve(one->setup, one->task, 0, one->answer, 0, 0, 1, one->stop)) return -1;
     return (int)one->answer[0];

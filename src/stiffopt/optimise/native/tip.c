@@ -1,4 +1,4 @@
-/* The tip of an arm under gravity or loads, one set of pressures after the other. */
+/* The tip of an arm under gravity or loads at successive pressures. */
 #include <stdint.h>
 
 #include "functions.h"
@@ -6,11 +6,11 @@
 
 enum { FOUND, BEYOND_LAW, NO_EQUILIBRIUM };
 
-/* Numbers of memory that stiffopt_tip needs. */
+/* Number of doubles that stiffopt_tip needs as memory. */
 int64_t stiffopt_tip_memory(const Rod *rod) { return linear_size(rod); }
 
-/* A matrix (3, 3) in the tip's axes: R' B R; all row by row but B, which is four blocks of a
- * matrix (6, 6) by columns. */
+/* Compute a block (3, 3) in the tip's axes: R' B R.  B is a block of a matrix (6, 6) stored by
+ * columns, `to` one of a matrix (6, 6) stored by rows. */
 static void block_in_tip(const double *R, const double *B, double *to) {
     double turned[9];
     for (int i = 0; i < 3; i++)
@@ -27,7 +27,7 @@ static void block_in_tip(const double *R, const double *B, double *to) {
         }
 }
 
-/* Pose (4, 4), Jacobian (6, n) and compliance (6, 6) in the tip's axes, row by row. */
+/* Write pose (4, 4), Jacobian (6, n) and compliance (6, 6) in the tip's axes, row by row. */
 static void write_tip(const Rod *rod, const Linear *l, double *pose) {
     int64_t n = rod->n;
     double *jacobian = pose + 16, *compliance = jacobian + 6 * n;
@@ -46,16 +46,16 @@ static void write_tip(const Rod *rod, const Linear *l, double *pose) {
             block_in_tip(l->R, l->twist + 18 * j + 3 * i, compliance + 18 * i + 3 * j);
     for (int i = 3; i < 12; i++)
         if (rod->load[i] != 0) return;
-    /* dead forces only: symmetric but for the integrator's error of about 1e-6 */
+    /* with dead forces only, it is symmetric up to the integrator's error of about 1e-6 */
     for (int i = 0; i < 6; i++)
         for (int j = 0; j < i; j++)
             compliance[6 * i + j] = compliance[6 * j + i] =
                 (compliance[6 * i + j] + compliance[6 * j + i]) / 2;
 }
 
-/* The tip at pressures (n): pose, Jacobian and compliance, from a state's equilibrium or, where
- * the state begins with NaN or that leads nowhere, from rest.  The state is moved along; without
- * an equilibrium it begins with NaN. */
+/* Compute the tip at pressures (n): pose, Jacobian and compliance.  The equilibrium is followed
+ * from `state`; if that begins with NaN or fails, from rest.  `state` is updated; without an
+ * equilibrium it begins with NaN. */
 int stiffopt_tip(const Rod *rod, const double *pressures, double *state, double *memory,
                  double *found) {
     NEW_WORK(work);

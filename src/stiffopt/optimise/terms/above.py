@@ -1,4 +1,4 @@
-"""The tip stays above a plane, that is, on the side to which the plane's normal points."""
+"""Term `above`: the tip stays on the side of a plane to which its normal points."""
 
 from typing import Annotated, Any, ClassVar
 
@@ -17,8 +17,8 @@ class Plane(Schema):
 
     Attributes
     ----------
-    point : of the plane, in m.
-    normal : unit vector across it, to the side where the tip stays.
+    point : a point of the plane, in m.
+    normal : unit normal, towards the side where the tip stays.
     """
 
     point: Three[Annotated[Length, within(1e3, "m")]]
@@ -26,7 +26,7 @@ class Plane(Schema):
 
 
 class AboveTerm(Term):
-    """Height of the tip above a plane, which must not be negative."""
+    """Height of the tip above a plane; must be nonnegative."""
 
     key = name = "above"
     annotation = Plane
@@ -35,7 +35,7 @@ class AboveTerm(Term):
 
     @property
     def parameters(self) -> tuple[float, ...]:
-        """Normal, and height of the plane along it."""
+        """Normal, and the plane's height along it."""
         return (*self.value.normal, self._height)
 
     @property
@@ -44,16 +44,16 @@ class AboveTerm(Term):
         return float(sum(n * p for n, p in pairs))
 
     def residual(self, tip: Any, parameters: Any) -> Any:
-        """``n . (r - point)``; see `Term.residual`."""
+        """Return ``n . (r - point)``; see `Term.residual`."""
         return ca.dot(parameters[:3], tip.position) - parameters[3]
 
     def nearness(self, length: float) -> Nearness:
-        """Depth below the plane over the arm's length."""
+        """Return the depth below the plane over the arm's length."""
         x, y, z = self.value.normal
         return Nearness(self._height / length, (-x / length, -y / length, -z / length))
 
     def words(self, value: float) -> str:
-        """Height above or depth below the plane."""
+        """Describe the height above or depth below the plane."""
         height = display_units().length.text(abs(value))
         return f"{height} {'above' if value >= 0 else 'below'} the plane"
 

@@ -1,4 +1,4 @@
-"""Orientation of the tip: the rotation from the wanted one."""
+"""Term `orientation`: rotation of the tip relative to the wanted orientation."""
 
 import math
 from typing import Any, ClassVar
@@ -26,7 +26,7 @@ class OrientationTerm(Term):
         return tuple(self.value)
 
     def residual(self, tip: Any, parameters: Any) -> Any:
-        """Rotation vector (3,); see `Term.residual`."""
+        """Return the rotation vector (3,); see `Term.residual`."""
         wanted = lie.rotation_from_quaternion(parameters)
         turn = lie.quaternion_from_rotation(wanted.T @ tip.rotation)
         return lie.rotation_vector_from_quaternion(turn)

@@ -1,4 +1,4 @@
-"""Direction of the tip's z axis: its angle to a unit vector."""
+"""Term `pointing`: angle between the tip's z axis and a unit vector."""
 
 import math
 from typing import Any, ClassVar
@@ -16,8 +16,8 @@ _ALIGNED = 1e-8  # squared sine of an angle below which its series is used
 class PointingTerm(Term):
     """Angle between the tip's z axis and a direction.
 
-    The axis is unrolled from the sphere onto the plane that touches it at the wanted direction
-    (azimuthal equidistant projection), so that the residual's length is the angle.
+    The azimuthal equidistant projection maps the axis from the sphere to the plane that touches it
+    at the wanted direction, so that the residual's length is the angle.
     """
 
     key = "pointing"
@@ -38,7 +38,7 @@ class PointingTerm(Term):
         return (x, y, z, 1.0 + sign * x * x * a, sign * b, -sign * x, b, sign + y * y * a, -y)
 
     def residual(self, tip: Any, parameters: Any) -> Any:
-        """Unrolled axis (2,); see `Term.residual`."""
+        """Return the projected axis (2,); see `Term.residual`."""
         axis = tip.rotation[:, 2]
         cosine = ca.dot(parameters[:3], axis)
         flat = ca.vertcat(ca.dot(parameters[3:6], axis), ca.dot(parameters[6:], axis))
@@ -46,12 +46,12 @@ class PointingTerm(Term):
         aligned = square < _ALIGNED
         sine = ca.sqrt(ca.if_else(aligned, _ALIGNED, square))
         factor = ca.if_else(aligned, 1 + square / 6, ca.atan2(sine, cosine) / sine)
-        # exactly opposite every way round is as good: take one
+        # exactly opposite, all directions of the residual are equivalent: choose one
         opposite = ca.logic_and(aligned, cosine < 0)
         return factor * flat + ca.vertcat(ca.if_else(opposite, np.pi, 0), 0)
 
     def nearness(self, length: float) -> Nearness:
-        """Chord ``|z - d| / pi``, of which the square is ``(2 - 2 z . d) / pi^2``."""
+        """Return the chord ``|z - d| / pi``, whose square is ``(2 - 2 z . d) / pi^2``."""
         turn = (0.0,) * 6 + tuple(-2 * value / math.pi**2 for value in self.value)
         limit = 2 * math.sin(min(self.radius, math.pi) / 2) / math.pi
         return Nearness(offset=2 / math.pi**2, turn=turn, root=1.0, limit=limit)

@@ -1,4 +1,4 @@
-"""The tip's position, along the base axes that are not free."""
+"""Term `position`: the tip's position along the base axes that are not free."""
 
 from collections.abc import Hashable
 from typing import Annotated, Any, ClassVar
@@ -13,7 +13,7 @@ from stiffopt.units import Length, format_quantity, within
 
 
 def _coordinate(value: Any) -> Any:
-    """Let `free` (None in code) stand for an axis that does not matter."""
+    """Convert `free` (None in code), for an axis that does not matter."""
     return None if isinstance(value, str) and value.strip() == "free" else value
 
 
@@ -57,11 +57,11 @@ class PositionTerm(Term):
         return tuple(self.value[axis] for axis in self.axes)
 
     def residual(self, tip: Any, parameters: Any) -> Any:
-        """``r - r_wanted`` along these axes; see `Term.residual`."""
+        """Return ``r - r_wanted`` along these axes; see `Term.residual`."""
         return tip.position[list(self.axes)] - parameters
 
     def nearness(self, length: float) -> Nearness:
-        """Distance over the arm's length."""
+        """Return the distance over the arm's length."""
         x, y, z = self.value
         u, v, w = (x or 0.0) / length, (y or 0.0) / length, (z or 0.0) / length
         one = 1 / length**2
