@@ -1,1 +1,1 @@
-"""What an arm is and does: description, kinematics, compliance, equilibrium."""
+"""The model of an arm: description, kinematics, compliance, equilibrium, clearance, contact."""

@@ -1,7 +1,7 @@
-"""From channel pressures to the strain and the compliance of a section (eqs 8-10).
+"""Strain laws: from channel pressures to the strain and compliance of a section (eqs 8-10).
 
 A strain law maps the pressures of a segment to the strain of its unloaded backbone and to the
-compliance of its section, both constant along the segment.  Publications count them per length at
+compliance of its section, both constant along the segment.  Publications give them per length at
 rest or per deformed length; here both are **per length at rest**.  The laws themselves are in
 `stiffopt.model.laws`, one file each.
 """
@@ -45,14 +45,14 @@ class SectionGeometry:
 
     Attributes
     ----------
-    area : silicone area A, wall less core less chambers, in m^2.
+    area : silicone area A, without core and chambers, in m^2.
     centroid : centroid (2,) in section axes, in m; zero for symmetric layouts.
     second_moment : ``int r r^T dA`` (2, 2) about the centroid, in m^4; its [1, 1] entry is I_x of
         eq. 10.
     channel_force : chamber area of each channel (c,), in m^2: axial force per unit pressure.
     channel_moment : ``int r dA`` over each channel's chambers (c, 2), in m^3.
 
-    All may be symbols too, see `stiffopt.model.layout`.
+    All may also be symbols, see `stiffopt.model.layout`.
     """
 
     area: Any
@@ -67,7 +67,7 @@ class SectionGeometry:
         return not ca.SX(self.centroid).is_zero()
 
     def turned(self, azimuth: NDArray[np.float64]) -> SectionGeometry:
-        """The same section with the lever arms of its channels turned about the axis.
+        """Return the same section with the lever arms of its channels turned about the axis.
 
         Parameters
         ----------
@@ -108,26 +108,26 @@ def _without_rounding(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def smooth_norm(p: ca.SX) -> ca.SX:
-    """``sqrt(p.p + e^2) - e``: the norm of the pressures without its kink at p = 0."""
+    """Return ``sqrt(p.p + e^2) - e``: the norm of the pressures without its kink at p = 0."""
     return ca.sqrt(ca.sumsqr(p) + NORM_SMOOTHING**2) - NORM_SMOOTHING
 
 
 def onset(p: ca.SX, dead_band: ca.SX | float) -> ca.SX:
-    """Pressure less a dead band: ``w ln((1 + e^((p - b) / w)) / (1 + e^(-b / w)))``.
+    """Return the pressure less a dead band: ``w ln((1 + e^((p - b) / w)) / (1 + e^(-b / w)))``.
 
-    Smooth, monotone, zero at p = 0, and its slope rises from 0.12 to 1; the width w is half the
+    Smooth, monotone, zero at p = 0; its slope rises from 0.12 to 1.  The width w is half the
     band b.  Far above the band it is ``p - 1.06 b``.  It is meant for positive pressures: below
-    zero hardly anything comes through.
+    zero it is almost flat.
     """
     w = dead_band / 2
     z = (p - dead_band) / w
-    # ln(1 + e^z) without overflow, in which the exponential is lost to rounding from 30 on
+    # ln(1 + e^z) without overflow; from z = 30 on it equals z up to rounding
     logarithm = ca.if_else(z > 30, z, ca.log1p(ca.exp(ca.fmin(z, 40))))
     return w * (logarithm - np.log1p(np.exp(-2.0)))
 
 
 def bending_matrix(second_moment: ca.SX) -> ca.SX:
-    """Turn ``int r r^T dA`` (2, 2) into the matrix that maps (kappa_x, kappa_y) to (M_x, M_y) / E.
+    """Return the matrix from (kappa_x, kappa_y) to (M_x, M_y) / E, given ``int r r^T dA`` (2, 2).
 
     The strain of a fibre at (x, y) is ``y kappa_x - x kappa_y`` and it adds ``(y, -x)`` to
     the moment.
@@ -137,7 +137,7 @@ def bending_matrix(second_moment: ca.SX) -> ca.SX:
 
 
 def _limited(kappa: ca.SX, radius: ca.SX | float) -> tuple[ca.SX, ca.SX]:
-    """Curvature (2,) that approaches 1 / radius, and the root (2, 2) of its slope by the old one.
+    """Return the curvature (2,) limited to 1 / radius, and the square root (2, 2) of its slope.
 
     The slope is ``((1 - n n') / (1 + z)^(1/2) + n n' / (1 + z)^(3/2))`` with z = R^2 |kappa|^2
     and n along kappa; its root, applied from both sides, keeps a flexibility symmetric.
@@ -150,25 +150,25 @@ def _limited(kappa: ca.SX, radius: ca.SX | float) -> tuple[ca.SX, ca.SX]:
 class StrainLaw(ABC):
     """Free strain and compliance of one segment's section as a function of its pressures.
 
-    A subclass that has a `name` is a law that robot files can name; it is registered where it is
-    defined.
+    A subclass with a `name` is registered when it is defined, and robot files can name it.
 
     Attributes
     ----------
     name : str
-        In robot files, ``strain_law: NAME``.
+        Name in robot files, ``strain_law: NAME``.
     words : str
-        What the law assumes, in a few words, for reports.
+        The law's assumptions, in a few words, for reports.
     limit : str
-        What goes wrong where `margin` is not positive, as the end of a sentence.
+        What fails where `margin` is not positive, as the end of a sentence.
     Keys : type of Schema or None
         Keys of the robot file that only this law has, as ``law: {...}`` of a segment. Those whose
-        annotation holds a `FittedNumber` may be fitted by calibration, which begins at their
-        defaults where it tries the law on an arm whose file names another.
+        annotation holds a `FittedNumber` may be fitted by calibration. It starts at their defaults
+        when it tries the law on an arm whose file names another.
     fitted_keys : tuple of str
-        Which keys of a segment's `material` and `compensation` calibration may fit under this law.
+        Keys of a segment's `material` and `compensation` that calibration may fit under this law.
     complexity : int
-        Calibration tries simple laws first, and of laws that predict alike takes the simplest.
+        Calibration tries simple laws first, and of laws that predict equally well takes the
+        simplest.
     """
 
     name: ClassVar[str]
@@ -185,7 +185,7 @@ class StrainLaw(ABC):
     )
     complexity: ClassVar[int] = 3
     registered: ClassVar[dict[str, type[StrainLaw]]] = {}
-    """Laws that were defined so far, by name; `stiffopt.model.laws.strain_laws` returns all."""
+    """Laws defined so far, by name; `stiffopt.model.laws.strain_laws` returns all."""
 
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
@@ -193,7 +193,7 @@ class StrainLaw(ABC):
             return
         for other in cls.registered.values():
             if other.__qualname__ == cls.__qualname__ and other.__module__ == cls.__module__:
-                continue  # the module is read again
+                continue  # the module was reloaded
             if other.name == cls.name:
                 raise TypeError(f"there are two strain laws of the name {cls.name!r}")
             for key, number in cls.fitted_numbers().items():
@@ -209,7 +209,7 @@ class StrainLaw(ABC):
 
     @classmethod
     def fitted_numbers(cls) -> dict[str, FittedNumber]:
-        """Return what calibration must know of the law's own keys that it may fit, by key."""
+        """Return the `FittedNumber`s of the law's own keys, by key."""
         fields = cls.Keys.model_fields if cls.Keys is not None else {}
         return {
             f"law.{key}": number
@@ -220,12 +220,12 @@ class StrainLaw(ABC):
 
     @classmethod
     def check(cls, segment: Segment) -> None:
-        """Refuse a segment that the law cannot describe, when its description is made.
+        """Reject a segment that the law cannot describe, when its description is made.
 
         Raises
         ------
         BadKeyError
-            It names the key of the segment that is to blame.
+            With the key of the segment.
         """
         if cls.Keys is not None and segment.law is None:
             fields = cls.Keys.model_fields.items()
@@ -237,21 +237,21 @@ class StrainLaw(ABC):
 
     @abstractmethod
     def section(self, p: ca.SX) -> Section:
-        """Section for the channel pressures p (c,) of this segment, in Pa."""
+        """Return the section for the channel pressures p (c,) of this segment, in Pa."""
 
     @abstractmethod
     def margin(self, p: ca.SX) -> ca.SX:
-        """Scalar that is positive where the law holds at pressures p (c,)."""
+        """Return a scalar that is positive where the law holds at pressures p (c,)."""
 
     def radius(self, p: ca.SX) -> ca.SX | float:
-        """Outer radius of the free section at pressures p (c,), in m: that at rest.
+        """Return the outer radius of the free section at pressures p (c,), in m; default: at rest.
 
-        A law that knows how the section swells or thins says so.
+        A law that models swelling or thinning overrides it.
         """
         return self.segment.outer_radius
 
     def _acting(self, p: ca.SX) -> ca.SX:
-        """Pressures (c,) that act in the chambers: ``gain onset(p) + offset``."""
+        """Return the pressures (c,) that act in the chambers: ``gain onset(p) + offset``."""
         corrections = self.segment.corrections
         if corrections is None:
             return p
@@ -264,7 +264,7 @@ class StrainLaw(ABC):
         return p
 
     def _modulus(self, acting: ca.SX, softening: Any = 1.0) -> ca.SX:
-        """Compensated modulus ``E + softening slope |p|``, or its exponential, in Pa."""
+        """Return the compensated modulus ``E + softening slope |p|``, or its exponential, in Pa."""
         modulus = self.segment.material.youngs_modulus
         slope = ca.SX(softening * self.compensation.modulus_per_pressure)
         if slope.is_zero():
@@ -274,15 +274,15 @@ class StrainLaw(ABC):
         return modulus + slope * smooth_norm(acting)
 
     def _loaded_modulus(self, acting: ca.SX) -> ca.SX:
-        """Modulus with which the section gives way to loads, in Pa."""
+        """Return the section's modulus against loads, in Pa."""
         return self.compensation.stiffness * self._modulus(acting, self.compensation.softening)
 
     def _modulus_margin(self, p: ca.SX) -> ca.SX:
-        """Compensated modulus over a thousandth of the nominal one, less one."""
+        """Return the compensated modulus over a thousandth of the nominal one, less one."""
         return self._modulus(self._acting(p)) / (1e-3 * self.segment.material.youngs_modulus) - 1
 
     def _bent(self, omega: ca.SX, flexibility: ca.SX) -> tuple[ca.SX, ca.SX]:
-        """Curvature (2,) and flexibility (2, 2) by which the least bending radius lets it bend."""
+        """Return curvature (2,) and flexibility (2, 2), limited by the least bending radius."""
         radius = self.compensation.bending_radius
         if ca.SX(radius).is_zero():
             return omega, flexibility
@@ -290,18 +290,18 @@ class StrainLaw(ABC):
         return omega, less @ flexibility @ less
 
     def _lengthened(self, stretch: ca.SX, omega: ca.SX) -> ca.SX:
-        """Stretch of the line of centroids with what bending by omega (2,) adds to it."""
+        """Return the stretch of the line of centroids with that due to bending by omega (2,)."""
         lengthening = self.compensation.lengthening
         if ca.SX(lengthening).is_zero():
             return stretch
         return stretch + lengthening * self.segment.outer_radius**2 * ca.sumsqr(omega)
 
     def _axial_force(self, acting: ca.SX) -> ca.SX:
-        """Force of the acting pressures on the section, ``f_z = sum P A_c``, in N."""
+        """Return the force of the acting pressures on the section, ``f_z = sum P A_c``, in N."""
         return ca.dot(ca.SX(self.geometry.channel_force), acting)
 
     def _moment_about_centroid(self, acting: ca.SX) -> ca.SX:
-        """Moment (M_x, M_y) of the acting pressures about the section's centroid, in N m."""
+        """Return the moment (M_x, M_y) of the acting pressures about the centroid, in N m."""
         geometry, corrections = self.geometry, self.segment.corrections
         lever = ca.sparsify(ca.SX(geometry.channel_moment.T))  # (2, c): int r dA
         if corrections is not None and len(corrections.azimuth):
@@ -316,7 +316,7 @@ class StrainLaw(ABC):
     def _compliance_about_centroid(
         self, shear: ca.SX, axial: ca.SX, flexibility: ca.SX, torsion: ca.SX
     ) -> ca.SX:
-        """``diag(GA, GA, EA, EI_x, EI_y, GJ)^-1`` with a full block (2, 2) of flexibility."""
+        """Return ``diag(GA, GA, EA, EI_x, EI_y, GJ)^-1`` with a full flexibility block (2, 2)."""
         return ca.diagcat(1 / shear, 1 / shear, 1 / axial, flexibility, 1 / torsion)
 
     def _about_axis(self, compliance: ca.SX, centroid: ca.SX) -> ca.SX:

@@ -1,4 +1,4 @@
-"""Checks of what callers of the model pass in, and lengths that neither over- nor underflow."""
+"""Check arguments of the model's functions; normalise vectors without over- or underflow."""
 
 import operator
 from typing import Any, NamedTuple, get_args
@@ -13,7 +13,7 @@ Vector = NDArray[np.float64]
 
 
 class DirectionalMeasure(NamedTuple):
-    """A directional stiffness that was checked; `direction` is of unit length."""
+    """A checked directional stiffness; `direction` is of unit length."""
 
     direction: tuple[float, ...]
     kind: Kind
@@ -24,7 +24,7 @@ class DirectionalMeasure(NamedTuple):
 def checked_measure(
     direction: ArrayLike, kind: Kind, boundary: Boundary, frame: Frame
 ) -> DirectionalMeasure:
-    """Directional stiffness from arguments; the direction need not be of unit length."""
+    """Return a checked directional stiffness; the direction need not be of unit length."""
     vector = checked_vector("direction", direction)
     if not vector.any():
         raise InputError("direction must not be zero")
@@ -35,13 +35,13 @@ def checked_measure(
 
 
 def check_choice(name: str, value: object, choices: tuple[str, ...]) -> None:
-    """Raise unless a value is one of the choices."""
+    """Raise `InputError` unless a value is one of the choices."""
     if not isinstance(value, str) or value not in choices:
         raise InputError(f"unknown {name} {value!r}; choose one of {', '.join(choices)}")
 
 
 def real_numbers(value: ArrayLike) -> Vector:
-    """Array of an argument's numbers; text, truth values and complex numbers are none.
+    """Return an array of real numbers; reject text, booleans and complex numbers.
 
     Raises
     ------
@@ -55,7 +55,7 @@ def real_numbers(value: ArrayLike) -> Vector:
 
 
 def checked_number(name: str, value: ArrayLike) -> float:
-    """Finite number from an argument."""
+    """Return an argument as a finite number."""
     try:
         number = real_numbers(value)
     except ValueError as error:
@@ -66,7 +66,7 @@ def checked_number(name: str, value: ArrayLike) -> float:
 
 
 def checked_integer(name: str, value: Any, least: int) -> int:
-    """Integer, Python's or NumPy's, from an argument."""
+    """Return an argument as an integer, Python's or NumPy's, of at least `least`."""
     try:
         number = None if isinstance(value, bool | np.bool_) else operator.index(value)
     except TypeError:
@@ -77,7 +77,7 @@ def checked_integer(name: str, value: Any, least: int) -> int:
 
 
 def checked_vector(name: str, value: ArrayLike, size: int = 3) -> Vector:
-    """Finite vector (size,) from an argument."""
+    """Return an argument as a finite vector (size,)."""
     try:
         vector = real_numbers(value)
     except ValueError as error:
@@ -88,7 +88,7 @@ def checked_vector(name: str, value: ArrayLike, size: int = 3) -> Vector:
 
 
 def checked_motion(name: str, value: ArrayLike) -> Vector:
-    """Rigid motion (4, 4) from an argument."""
+    """Return an argument as a rigid motion (4, 4)."""
     problem = f"{name} must be a rigid motion (4, 4), a rotation and a position over 0 0 0 1"
     try:
         T = real_numbers(value)
@@ -105,7 +105,7 @@ def checked_motion(name: str, value: ArrayLike) -> Vector:
 
 
 def length_and_unit(vector: Vector) -> tuple[float, Vector]:
-    """Length of a vector and the unit vector along it; zero for zero."""
+    """Return the length of a vector and the unit vector along it; zero for zero."""
     largest = float(np.abs(vector).max())
     if largest == 0:
         return 0.0, np.zeros_like(vector)

@@ -1,6 +1,6 @@
-"""Evaluation of functions of an arm's shape, free or in equilibrium under loads.
+"""`Arm`: evaluate functions of an arm's shape, free or in equilibrium under loads.
 
-`Arm` checks pressures, finds equilibria and keeps the functions that were made of the arm;
+It checks pressures, finds equilibria and caches compiled functions.
 `stiffopt.model.manipulator.Manipulator` adds pose, Jacobian, compliance and stiffness.
 """
 
@@ -63,7 +63,7 @@ class Arm:
         for corner in (low, high, np.where(np.abs(low) > np.abs(high), low, high)):
             self._check_margin(corner[np.newaxis], " within the robot's pressure limits")
 
-    # -- what the arm is --------------------------------------------------------------------
+    # -- properties -------------------------------------------------------------------------
 
     @property
     def n_pressures(self) -> int:
@@ -103,14 +103,14 @@ class Arm:
     def with_load(
         self, force: ArrayLike, moment: ArrayLike = (0.0, 0.0, 0.0), frame: Frame = "base"
     ) -> Self:
-        """The same arm with this load at its tip, instead of any that it carries now."""
+        """Return the same arm with this load at its tip, in place of its present load."""
         other = self.__copy__()
         other._tip_load = _tip_load(force, moment, frame)
         other.__dict__.pop("_body", None)
         return other
 
     def __copy__(self) -> Self:
-        """The same arm; what is compiled is shared, since loads are arguments of it."""
+        """Return a copy that shares compiled functions; loads are arguments of these."""
         other = object.__new__(type(self))
         other.__dict__.update(self.__dict__)
         return other
@@ -124,7 +124,7 @@ class Arm:
         )
 
     def __reduce__(self) -> tuple[object, ...]:
-        """Support pickling: compiled functions are left behind and made anew."""
+        """Support pickling: compiled functions are not stored."""
         dead, follower = self._tip_load[:6], self._tip_load[6:]
         frame = "tip" if follower.any() else "base"
         wrench = tuple((follower if follower.any() else dead).tolist())
@@ -135,7 +135,7 @@ class Arm:
     def tip_function(
         self, name: str, outputs: Callable[[Shape, Any], list[Any]], n_parameters: int = 0
     ) -> ca.Function:
-        """Symbolic function of the inputs of the tip's shape and of parameters, dense.
+        """Return a dense symbolic function of the inputs of the tip's shape and of parameters.
 
         The parameters are those of `parameters`: the arm's numbers, then the caller's own.
         """
@@ -148,7 +148,7 @@ class Arm:
         return dense(ca.Function(name, [*tip.inputs, parameters], found))
 
     def parameters(self, own: ArrayLike = ()) -> Vector:
-        """Parameters of a `tip_function`: the numbers of the arm, then the caller's own."""
+        """Return the parameters of a `tip_function`: the arm's numbers, then the caller's own."""
         return np.concatenate([self.numbers, np.asarray(own, dtype=float)])
 
     def evaluator(
@@ -157,7 +157,7 @@ class Arm:
         outputs: Callable[[Shape, Any], list[Any]],
         n_parameters: int = 0,
     ) -> "Evaluator":
-        """Outputs of the tip's shape and of `parameters`; `key` names them in the cache."""
+        """Return an evaluator of outputs of the tip's shape and `parameters`, cached by `key`."""
         return Evaluator(
             self,
             self.kept(
@@ -167,7 +167,7 @@ class Arm:
         )
 
     def kept(self, key: Hashable, make: Callable[[], Kept]) -> Kept:
-        """Something made of this arm once: whatever the load, it is kept under its key."""
+        """Return the cached item of this key, or make it; the cache is shared by all loads."""
         if key not in self._kept:
             self._kept[key] = make()
         found: Kept = self._kept[key]
@@ -184,7 +184,7 @@ class Arm:
         return Loads(np.array(self.description.gravity), self._tip_load, np.zeros(12))
 
     def _equilibrium(self, at: float | None = None) -> Equilibrium:
-        """Equilibria with an additional load at a station."""
+        """Return the equilibria with an additional load at a station."""
         shooting = self.kept(
             "shooting", lambda: Shooting(self.description, self._actuation, self.resolution)
         )
@@ -200,7 +200,7 @@ class Arm:
         )
 
     def _symbolic(self, at: float | None) -> Shape:
-        """Shape of a station, without or with loads."""
+        """Return the shape of a station, without or with loads."""
         if self.is_loaded:
             return self._equilibrium().shooting.chain(at)
         return FreeShape.of(self.description, self._actuation, at)
@@ -219,7 +219,7 @@ class Arm:
     def _evaluate(
         self, key: Hashable, value: Values, p: ArrayLike, at: float | None = None
     ) -> Vector:
-        """Value of a shape for one or many pressures, as (..., rows, columns)."""
+        """Evaluate a value of a shape for one or many pressures, as (..., rows, columns)."""
         batch, single = self._pressures(p)
         function = self._function(key, lambda shape: [value(shape)], at)
         if not self.is_loaded:
@@ -231,9 +231,9 @@ class Arm:
         return results[0] if single else results
 
     def _checked_tip(self, evaluate: Callable[[Vector], list[Vector]], p: ArrayLike) -> Vector:
-        """Value (..., rows, columns) of something of the arm without loads.
+        """Evaluate a quantity (..., rows, columns) of the arm without loads, and check margins.
 
-        `evaluate` gives it with the margins of the strain laws, which are looked at here.
+        `evaluate` returns the quantity and the margins of the strain laws.
         """
         values = self._checked(p)
         result, margins = evaluate(values)
@@ -247,14 +247,14 @@ class Arm:
         return result
 
     def settle(self, p: Vector, nearby: EquilibriumState | None = None) -> EquilibriumState:
-        """Equilibrium of the loaded arm at pressures (n,), from rest or from a nearby one.
+        """Find the equilibrium of the loaded arm at pressures (n,), from rest or from a nearby one.
 
-        What is found from a nearby one is not checked for stability.
+        Stability is not checked when starting from a nearby one.
 
         Raises
         ------
         EquilibriumError
-            If there is none that is reached continuously (and, from rest, stable).
+            If none is reached continuously (and, from rest, stable).
         """
         if nearby is None:
             return self._equilibrium().settle(p, self._loads)
@@ -271,9 +271,9 @@ class Arm:
     def _at_stations(
         self, of_body: Callable[[Vector, Vector], Vector], p: ArrayLike, at: Vector
     ) -> Vector:
-        """Something of stations at arc lengths () or (k,), for one or many pressures.
+        """Evaluate a quantity at arc lengths () or (k,), for one or many pressures.
 
-        Results have axes for pressures (N,) and stations (k,) where there are several.
+        Results have leading axes for pressures (N,) and stations (k,) if there are several.
         """
         values = self._checked(p)
         single = values.ndim == 1
@@ -285,14 +285,14 @@ class Arm:
     # -- checks -----------------------------------------------------------------------------
 
     def _pressures(self, p: ArrayLike) -> tuple[Vector, bool]:
-        """Checked pressures (N, n), and whether a single set was given."""
+        """Return checked pressures (N, n), and whether a single set was given."""
         values = self._checked(p)
         batch = np.atleast_2d(values)
         self._check_margin(batch, "")
         return batch, values.ndim == 1
 
     def _checked(self, p: ArrayLike) -> Vector:
-        """Finite pressures (n,) or (N, n), which the strain law may not allow.
+        """Return finite pressures (n,) or (N, n); the strain law's limits are not checked.
 
         An array of the right kind is returned as it is.
         """
@@ -320,7 +320,7 @@ class Arm:
         return values
 
     def checked_pressures(self, p: ArrayLike) -> Vector:
-        """Finite pressures (n,), one set of them, which the strain law may not allow.
+        """Return one set of finite pressures (n,); the strain law's limits are not checked.
 
         Raises
         ------
@@ -360,11 +360,11 @@ class Arm:
         return None if value == self.length else value
 
     def _arc_lengths(self, at: ArrayLike, base_too: bool = False) -> Vector:
-        """Arc lengths (), or (k,) of several stations."""
+        """Return arc lengths (), or (k,) of several stations."""
         try:
             values = real_numbers(at)
         except ValueError:
-            return np.array(self._arc_length(at, base_too))  # says what is wrong
+            return np.array(self._arc_length(at, base_too))  # raises the error
         if values.ndim > 1:
             raise InputError(f"arc lengths must be a number or (k,) numbers; got {shown(at)}")
         slack = SAME_STATION * self.length
@@ -385,10 +385,9 @@ class Arm:
 
 
 class Evaluator:
-    """A function of the tip's shape that starts each equilibrium from the previous one.
+    """A function of the tip's shape that finds each equilibrium from the previous one.
 
-    With loads the equilibrium at new pressures is found from the previous one; `restart`
-    forgets it, and the next is found from rest.
+    After `restart` the next equilibrium is found from rest.
     """
 
     def __init__(self, arm: Arm, function: BatchFunction) -> None:
@@ -406,11 +405,11 @@ class Evaluator:
         return self._state
 
     def many(self, batch: Vector, *parameters: Vector) -> list[Vector]:
-        """Outputs at checked pressures (N, n) of an arm without loads, each (N, rows, columns)."""
+        """Return outputs at checked pressures (N, n), without loads, each (N, rows, columns)."""
         return self._function.many(batch, *(parameters or (self._arm.numbers,)))
 
     def __call__(self, p: Vector, *parameters: Vector) -> list[Vector]:
-        """Outputs at checked pressures (n,) and parameters, as 2-D arrays."""
+        """Return outputs at checked pressures (n,) and parameters, as 2-D arrays."""
         checkpoint()
         parameters = parameters or (self._arm.numbers,)
         if self._arm.is_loaded:
@@ -422,7 +421,7 @@ class Evaluator:
 
 
 def _stacked(results: list[Vector], shape: tuple[int, ...]) -> Vector:
-    """Results of this shape as one array (N, ...), N may be 0."""
+    """Stack results of this shape into one array (N, ...); N may be 0."""
     return np.array(results).reshape(len(results), *shape)
 
 
@@ -438,6 +437,6 @@ def _rebuild(
     frame: Frame,
     resolution: int,
 ) -> Arm:
-    """The arm that was pickled."""
+    """Unpickle an arm."""
     force, moment = wrench[:3], wrench[3:]
     return kind(description, force=force, moment=moment, load_frame=frame, resolution=resolution)

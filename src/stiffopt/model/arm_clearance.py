@@ -1,4 +1,4 @@
-"""The clearance of one arm to a scene, in machine code where it is there."""
+"""Clearance of one arm in a scene, by machine code if there is any."""
 
 from __future__ import annotations
 
@@ -26,25 +26,25 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 _CHUNK = 64  # poses that a thread takes at a time
-_DEGREE = 22  # of polynomials along a range, which are exact to a nanometre
-_STEP = 10.0  # Pa, of differences of radii
+_DEGREE = 22  # of polynomials along a range; their error is a nanometre
+_STEP = 10.0  # Pa, step of the differences of radii
 
 _integer, _pointer = ctypes.c_int64, ctypes.c_void_p
 
 
 @dataclass(frozen=True)
 class Clearances:
-    """How far the body of an arm is from each of k objects, for one pose or N.
+    """Distances of an arm's body from each of k objects, for one pose or N.
 
     Attributes
     ----------
     names : of the objects, (k,).
     distances : of the body's surface, negative where it is within an object, (k,) or (N, k), in m.
-    at : arc lengths at rest of the nearest points of the body, alike, in m.
+    at : arc lengths at rest of the nearest points of the body, same shape, in m.
     positions : these points of the centre line, (k, 3) or (N, k, 3), in m.
-    normals : unit vectors in which the body gets away, alike.
+    normals : unit vectors that point away from the object, same shape.
     gradients : of the distances by the pressures, (k, n) or (N, k, n), in m/Pa; where a distance
-        has a kink, one of its sides.
+        has a kink, of one side.
     """
 
     names: tuple[str, ...]
@@ -60,13 +60,13 @@ class Clearances:
         return self.names[int(np.argmin(self.distances)) % len(self.names)]
 
     def only(self) -> Clearances:
-        """Those of a single pose, without the leading axis."""
+        """Return those of a single pose, without the leading axis."""
         arrays = (self.distances, self.at, self.positions, self.normals, self.gradients)
         return Clearances(self.names, *(array[0] for array in arrays))
 
 
 class SceneKey:
-    """A scene as a key: that very one, whatever it is equal to."""
+    """A scene as a key, compared by identity."""
 
     def __init__(self, scene: Scene) -> None:
         self.scene = scene
@@ -79,7 +79,7 @@ class SceneKey:
 
 
 class MeasuredScene:
-    """The objects of a scene with their numbers, for arms whose base has a radius in m."""
+    """The objects of a scene as numbers, for arms whose base has a radius in m."""
 
     def __init__(self, scene: Scene, base_radius: float) -> None:
         self.names = tuple(item.name for item in scene.objects)
@@ -90,7 +90,7 @@ class MeasuredScene:
         self._in_c: tuple[Library, ctypes.Array[SceneObjectInC]] | None = None
 
     def in_c(self, code: Library) -> ctypes.Array[SceneObjectInC]:
-        """The objects as structures for C, which point into these objects' memory."""
+        """Return the objects as structures for C, which point into these objects' memory."""
         if self._in_c is None or self._in_c[0] is not code:
             objects = (SceneObjectInC * len(self.items))(*(item.in_c(code) for item in self.items))
             self._in_c = code, objects
@@ -98,7 +98,7 @@ class MeasuredScene:
 
 
 def measured_scene(scene: Scene, robot: RobotDescription) -> MeasuredScene:
-    """The objects of a scene with their numbers for an arm, made once."""
+    """Return the objects of a scene as numbers for an arm; cached."""
     return _measured(SceneKey(scene), robot.segments[0].outer_radius)
 
 
@@ -116,27 +116,27 @@ class Ranges(NamedTuple):
 
     @classmethod
     def of(cls, ends: tuple[tuple[float, float, int], ...]) -> Ranges:
-        """Beside them as tuples, arrays for C."""
+        """Return the ranges with their arrays for C."""
         bounds = np.array([[start, end] for start, end, _ in ends])
         return cls(ends, bounds, np.array([count for *_, count in ends], dtype=np.int64))
 
 
 class ArmClearance:
-    """Distances of an arm's body from a scene, at pressures (N, n) in Pa that are finite."""
+    """Distances of an arm's body from a scene, at finite pressures (N, n) in Pa."""
 
     def __init__(self, arm: Manipulator, scene: Scene) -> None:
         self._arm, self.scene = arm, measured_scene(scene, arm.description)
         self.ranges = arm.kept("ranges", lambda: Ranges.of(range_ends(arm.description)))
 
     def least(self, p: Array) -> Array:
-        """The least of all distances, (N,)."""
+        """Return the least of all distances, (N,)."""
         found, missing = self._in_c(p, None)
         for row in missing:
             found[row, 0, 0] = min(each.distance for each in self._of(p[row]))
         return found[:, 0, 0]
 
     def each(self, p: Array) -> Clearances:
-        """The distances of all objects."""
+        """Return the distances of all objects."""
         slopes = np.empty((len(p), len(self.scene.names), self._arm.n_pressures))
         found, missing = self._in_c(p, slopes)
         for row in missing:
@@ -152,7 +152,7 @@ class ArmClearance:
     # -- without machine code ---------------------------------------------------------------
 
     def _of(self, p: Array) -> list[Nearest]:
-        """Nearest points of all objects at pressures (n,)."""
+        """Return the nearest points of all objects at pressures (n,)."""
         line = _CentreLine(self._arm, p, self.ranges.bounds)
         ranges = survey(line, self.ranges.ends)
         return [nearest_point(line, item, ranges) for item in self.scene.items]
@@ -160,10 +160,10 @@ class ArmClearance:
     # -- in machine code --------------------------------------------------------------------
 
     def _in_c(self, p: Array, gradients: Array | None) -> tuple[Array, NDArray[np.intp]]:
-        """Least distances (N, 1, 9), or with gradients those of all objects (N, k, 9).
+        """Return least distances (N, 1, 9), or with gradients those of all objects (N, k, 9).
 
-        And which rows are missing: all without machine code, and those at whose pressures the arm
-        has no shape, of which the other way says why.
+        The second result lists rows without a result: all without machine code, and those at whose
+        pressures the arm has no shape, for which the interpreted way raises an error.
         """
         width = 1 if gradients is None else len(self.scene.names)
         found = np.full((len(p), width, 9), np.nan)
@@ -194,7 +194,7 @@ def _clearances(body: NativeBody) -> Callable[..., int]:
 
 
 def _in_chunks(call: Callable[[int, int], int], count: int) -> None:
-    """Have threads work on rows of a batch."""
+    """Process the rows of a batch in threads."""
     failed: list[int] = []
 
     def work(starts: Iterator[int]) -> None:
@@ -206,12 +206,12 @@ def _in_chunks(call: Callable[[int, int], int], count: int) -> None:
 
 
 def gradients(arm: Manipulator, p: Array, nearest: Sequence[Nearest]) -> Array:
-    """Derivatives (k, n) of k distances by the pressures (n,)."""
+    """Return derivatives (k, n) of k distances by the pressures (n,)."""
     at = np.array([each.s for each in nearest])
     axes = arm._body.poses(p[None], at)[0, :, :3, :3]
     moves = axes @ arm._body.jacobians(p[None], at)[0, :, :3]  # (k, 3, n)
-    aside = _STEP * np.eye(len(p))
-    widening = arm._body.radii(p + aside, at) - arm._body.radii(p - aside, at)  # (n, k)
+    steps = _STEP * np.eye(len(p))
+    widening = arm._body.radii(p + steps, at) - arm._body.radii(p - steps, at)  # (n, k)
     normals = np.array([each.normal for each in nearest])
     shares = np.array([each.radius_share for each in nearest])
     found: Array = (normals[:, None] @ moves)[:, 0]
@@ -231,7 +231,7 @@ class ArmBody:
 
 
 class _CentreLine:
-    """The body of an arm at pressures (n,), by polynomials along each range."""
+    """The body of an arm at pressures (n,), interpolated by polynomials along each range."""
 
     def __init__(self, arm: Manipulator, p: Array, bounds: Array) -> None:
         self._bounds = bounds

@@ -1,4 +1,4 @@
-"""Calls of functions on NumPy arrays: of machine code, or of the CasADi VM in the same way."""
+"""Call functions on NumPy arrays, row by row: machine code or the CasADi VM."""
 
 import ctypes
 import os
@@ -18,11 +18,11 @@ Array = NDArray[np.float64]
 
 _CHUNK = 4096  # rows that a thread takes at a time
 _BLOCK = 256  # rows that the VM evaluates at a time
-_SMALL_BLOCK = 16  # where there are fewer
+_SMALL_BLOCK = 16  # for fewer rows
 
 
 class BatchFunction(ABC):
-    """A function of matrices that is called once, or for many rows.
+    """A function of matrices, called for one row or for many.
 
     Arguments and results are arrays (r, c), but an argument that is a column (k, 1) is given as
     (k,).  Every function may be called from several threads at once.
@@ -33,13 +33,13 @@ class BatchFunction(ABC):
 
     @abstractmethod
     def __call__(self, *arguments: Any) -> list[Array]:
-        """Results, each (r, c), for one set of arguments."""
+        """Return the results, each (r, c), for one set of arguments."""
 
     def many(self, *arguments: Array, threads: int | None = None) -> list[Array]:
-        """Results, each (N, r, c), for N rows, on all cores unless `threads` says otherwise.
+        """Return the results, each (N, r, c), for N rows, on `threads` threads or all cores.
 
-        An argument is (N, ...) or, where it is the same for all rows, without the leading axis;
-        the first one has it.
+        An argument is (N, ...) or, if it is the same for all rows, without the leading axis;
+        the first one must have it.
         """
         count = len(arguments[0])
         inputs: list[Array] = []
@@ -92,7 +92,7 @@ class CompiledFunction(BatchFunction):
         self._lock = threading.Lock()
 
     def __call__(self, *arguments: Any) -> list[Array]:
-        """Results, each (r, c), for one set of arguments."""
+        """Return the results, each (r, c), for one set of arguments."""
         with self._lock:
             for target, argument in zip(self._targets, arguments, strict=True):
                 target[...] = argument
@@ -134,7 +134,7 @@ class InterpretedFunction(BatchFunction):
         self._lock = threading.Lock()
 
     def __call__(self, *arguments: Any) -> list[Array]:
-        """Results, each (r, c), for one set of arguments."""
+        """Return the results, each (r, c), for one set of arguments."""
         single = self._single
         with self._lock:
             for target, argument in zip(single.targets, arguments, strict=True):
@@ -171,12 +171,12 @@ class InterpretedFunction(BatchFunction):
 
 
 class Buffer:
-    """A CasADi function, mapped over a number of rows, with memory of its own.
+    """A CasADi function, mapped over a number of rows, with its own memory.
 
     Attributes
     ----------
-    targets, results : views (rows, r, c) of what goes in and comes out; no leading axis for one
-        row, no last one for a column that goes in.
+    targets, results : views (rows, r, c) of arguments and results, without the leading axis for one
+        row; arguments that are columns lack the last axis.
     evaluate : callable
     """
 
@@ -194,7 +194,7 @@ class Buffer:
     def _memory(
         self, rows: int, shape: tuple[int, int], register: Callable[..., None], index: int
     ) -> Array:
-        memory = np.zeros((rows, shape[1], shape[0]))  # CasADi goes by columns
+        memory = np.zeros((rows, shape[1], shape[0]))  # CasADi stores matrices by columns
         if memory.size:
             register(index, memory.reshape(-1).data)
         self._keep.append(memory)
@@ -203,7 +203,7 @@ class Buffer:
 
 
 class _Pointers:
-    """Arrays as the loops in C take them."""
+    """Addresses of arrays and their strides, as the loops in C take them."""
 
     def __init__(
         self, inputs: Sequence[Array], strides: Sequence[int], outputs: Sequence[Array]
@@ -227,10 +227,10 @@ class _Work:
 def in_parallel(
     work: Callable[[Iterator[int]], None], items: Sequence[int], threads: int | None = None
 ) -> None:
-    """Have threads take items, one by one, from an iterator that they share.
+    """Run `work` in several threads, which take items one by one from a shared iterator.
 
-    The calling thread is one of them.  An exception in any of them is raised here, and the
-    others stop after the item that they are at.
+    The calling thread is one of them.  An exception in any thread is raised here; the others then
+    stop after their current item.
     """
     count = min(available_cores() if threads is None else max(1, threads), len(items))
     if count <= 1:
@@ -261,14 +261,14 @@ def in_parallel(
 
 
 def available_cores() -> int:
-    """Number of cores that this process may use."""
+    """Return the number of cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
 
 
 def is_shared(argument: Array, shape: tuple[int, int]) -> bool:
-    """Whether an argument of `BatchFunction.many` is the same for all rows."""
+    """Return whether an argument of `BatchFunction.many` is the same for all rows."""
     return argument.ndim <= (1 if shape[1] == 1 else 2)
 
 

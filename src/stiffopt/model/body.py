@@ -1,13 +1,14 @@
-"""Stations along an arm, free or loaded: poses, Jacobians, compliances and radii.
+"""Poses, Jacobians, compliances and radii of stations along an arm, free or loaded.
 
-Machine code (``native/body.h``) serves where it is there, and `stiffopt.model.stations` where not.
+They are computed by machine code (``native/body.h``) if there is any, otherwise by
+`stiffopt.model.stations`.
 
-The compliance between two stations is the twist at s per wrench at t, both in base axes.  Of a
-free arm it is ``X_s A(min(s, t)) X_t'`` with X the adjoint from the base to a station and
-``A(m) = int_0^m Ad_T C Ad_T' du`` (eq. 17, about the base).  Of a loaded arm it is read off the
-equations of the rod, linear about the equilibrium: what is carried from the tip along three turns
-and a wrench of it spans their solutions, so a wrench at t is a sum of them from t on towards the
-base, and a turn of the tip that keeps the base upright.
+The compliance between two stations is the twist at s per wrench at t, both in base axes.  For a
+free arm it is ``X_s A(min(s, t)) X_t'`` with X the adjoint from the base to a station and ``A(m) =
+int_0^m Ad_T C Ad_T' du`` (eq. 17, about the base).  For a loaded arm it follows from the rod's
+equations, linearised about the equilibrium.  Their solutions are spanned by those propagated from
+the tip, for three turns of it and a wrench on it.  A wrench at t is a combination of these from t
+towards the base, plus a turn of the tip that keeps the base fixed.
 """
 
 from __future__ import annotations
@@ -38,16 +39,16 @@ if TYPE_CHECKING:
 Vector = NDArray[np.float64]
 
 LOOKED_UP_FROM = 8
-"""Poses of one arm from which machine code is used if there is any."""
+"""Number of poses of one arm after which machine code is used, if it is in the cache."""
 
 COMPILED_FREE_FROM, COMPILED_LOADED_FROM = 2000, 64
-"""Poses from which it is made if there is none: they have taken about a second in the VM."""
+"""Number of poses after which machine code is made; these take about a second in the VM."""
 
-_LOOKED_FOR_AGAIN = 32  # poses, while it is being made
+_LOOKED_FOR_AGAIN = 32  # poses between looks at the cache, while code is being made
 
 _CHUNK = 16  # poses that a thread takes at a time
 _KEPT = 16  # numbers of stations for which memory is kept
-_POSES, _JACOBIANS, _RESPONSES, _LINE = range(4)  # as body.c has them
+_POSES, _JACOBIANS, _RESPONSES, _LINE = range(4)  # as in body.c
 
 _integer, _pointer = ctypes.c_int64, ctypes.c_void_p
 
@@ -69,19 +70,19 @@ class BodyShape:
         self._lock = threading.Lock()
 
     def poses(self, p: Vector, at: Vector) -> Vector:
-        """Poses (N, k, 4, 4) in the base frame."""
+        """Return poses (N, k, 4, 4) in the base frame."""
         return self._evaluate(_POSES, p, at).reshape(len(p), len(at), 4, 4)
 
     def jacobians(self, p: Vector, at: Vector) -> Vector:
-        """Twists per Pa (N, k, 6, n), each in the axes of its station."""
+        """Return twists per Pa (N, k, 6, n), each in the axes of its station."""
         return self._evaluate(_JACOBIANS, p, at).reshape(len(p), len(at), 6, p.shape[1])
 
     def line(self, p: Vector, at: Vector) -> Vector:
-        """Positions, unit tangents of the centre line and outer radii, (N, k, 7) side by side."""
+        """Return positions, unit tangents of the centre line and outer radii, (N, k, 7)."""
         return self._evaluate(_LINE, p, at).reshape(len(p), len(at), 7)
 
     def compliances(self, p: Vector, s: Vector, t: Vector) -> Vector:
-        """Twists at s (k,) per wrench at t (k,), (N, k, 6, 6), in base axes."""
+        """Return twists at s (k,) per wrench at t (k,), (N, k, 6, 6), in base axes."""
         at, place = np.unique(np.concatenate([[0.0], s, t]), return_inverse=True)
         first, second = place[1 : 1 + len(s)], place[1 + len(s) :]
         if isinstance(self._stations, FreeStations):
@@ -94,7 +95,7 @@ class BodyShape:
         return response(carried, found[:, -27:].reshape(-1, 9, 3).swapaxes(1, 2), first, second)
 
     def radii(self, p: Vector, at: Vector) -> Vector:
-        """Outer radii (N, k) of the free sections, in m."""
+        """Return outer radii (N, k) of the free sections, in m."""
         self._arm._check_margin(p, "")
         return self._radii(p, at)
 
@@ -104,7 +105,7 @@ class BodyShape:
         return found
 
     def _evaluate(self, what: int, p: Vector, at: Vector) -> Vector:
-        """Numbers (N, ...) of stations, by machine code if there is any."""
+        """Return numbers (N, ...) of stations, by machine code if there is any."""
         checkpoint()
         native = self.machine_code(len(p))
         if native is None:
@@ -112,7 +113,7 @@ class BodyShape:
         found, outcome = native.stations(what, p, at)
         if outcome.any():
             self._arm._check_margin(p, "")
-            for row in np.flatnonzero(outcome):  # says why, or finds what C did not
+            for row in np.flatnonzero(outcome):  # raises an error, or succeeds where C failed
                 found[row] = self._interpreted(what, p[row : row + 1], at).ravel()
         return found
 
@@ -128,7 +129,7 @@ class BodyShape:
         return self._stations.responses(p, at)
 
     def machine_code(self, rows: int) -> NativeBody | None:
-        """Machine code for a number of rows more; None where there is none, or not yet."""
+        """Return machine code, counting further rows; None without it, or not yet."""
         if self._native is not None:
             return self._native
         with self._lock:
@@ -142,7 +143,7 @@ class BodyShape:
 
 
 def native_body(arm: Arm, build_missing: bool = True) -> NativeBody | None:
-    """Machine code of an arm's body; None where there is none."""
+    """Return machine code of an arm's body; None without it."""
     kind, make, source = "body", free_body_functions, "clearance.c"
     if arm.is_loaded:
         if rod_functions(arm.layout) is None:
@@ -156,19 +157,19 @@ def native_body(arm: Arm, build_missing: bool = True) -> NativeBody | None:
         return None
     try:
         return NativeBody(code, arm)
-    except EquilibriumError:  # the VM says more
+    except EquilibriumError:  # the VM will raise an error with more detail
         return None
 
 
 def _loaded_functions(layout: Layout) -> list[ca.Function]:
     equations = rod_functions(layout)
-    assert equations is not None  # or nobody would ask
+    assert equations is not None  # checked in `native_body`
     used = [each for each in equations.functions if "adjoint" not in each.name()]
     return [*used, *loaded_body_functions(layout)]
 
 
 class BodyModel(ctypes.Structure):
-    """`BodyModel` of native/body.h."""
+    """Structure `BodyModel` of native/body.h."""
 
     _fields_ = [
         *((name, _integer) for name in ("n", "pieces", "strains")),
@@ -177,7 +178,7 @@ class BodyModel(ctypes.Structure):
 
 
 class ModelInC:
-    """An arm's `BodyModel`, and what it refers to.
+    """An arm's `BodyModel`; this object owns the memory.
 
     Attributes
     ----------
@@ -212,7 +213,7 @@ class NativeBody:
     address : int
         Of the `BodyModel`.
     code : Library
-        What it was made of, with what clearance.c adds.
+        The library, with the functions of clearance.c.
 
     Raises
     ------
@@ -236,7 +237,7 @@ class NativeBody:
         self._kept: dict[tuple[int, int], Any] = {}
 
     def stations(self, what: int, p: Vector, at: Vector) -> tuple[Vector, NDArray[np.int64]]:
-        """Numbers (N, ...) of stations (k,) at pressures (N, n), and outcomes (N,): 0 is good."""
+        """Return numbers (N, ...) of stations (k,) at (N, n), and outcomes (N,): 0 is good."""
         if len(p) == 1:
             with self._one_at_a_time:
                 return self._of_one(what, p, at)
@@ -252,7 +253,7 @@ class NativeBody:
         return found, outcome
 
     def _of_one(self, what: int, p: Vector, at: Vector) -> tuple[Vector, NDArray[np.int64]]:
-        """The same for one row, by way of memory whose addresses are known."""
+        """Do the same for one row, in reused memory."""
         kept = self._kept.get((what, len(at)))
         if kept is None:
             own = (np.empty((1, self._n)), np.empty(len(at)), *self._results(what, 1, len(at)))

@@ -1,24 +1,24 @@
-"""The body of an arm, from its base to its tip: small functions for the loops over stations.
+"""Small symbolic functions of an arm's body, for loops over stations in C or NumPy.
 
-A piece is a soft segment or a rigid connector, from the base; its strain is constant, and that of
-a connector is that of a straight line.  So one function leads along either.  Strains are the rows
-(m,) of a strain that are not zero in the layout (`strain_rows`).  A pose (15,) is the position,
-the axes by columns and the unit tangent of a station, in the base frame.
+A piece is a soft segment or a rigid connector, counted from the base.  Its strain is constant, and
+a connector has that of a straight line, so the same functions serve both.  Strains are the rows
+(m,) of a strain that are not zero in the layout (`strain_rows`).  A pose (15,) is the position, the
+axes by columns and the unit tangent of a station, in the base frame.
 
-Of arms without loads, with p the pressures (n,):
+For arms without loads, with p the pressures (n,):
 
 * ``frames``: (p, numbers) to the least margin of the strain laws and, a column for each piece,
   strains (m, k), starts (12, k) and radii (k,);
 * ``moving_frames``: the same, and for each pressure the change of its piece's strain (m, n), the
-  twist that all beyond that piece takes part in, about the base and in its axes (6, n), and the
+  twist of everything beyond that piece, about the base and in its axes (6, n), and the
   change of the radius (n,);
 * ``along``: (start, strain, s) to the pose at s from the start of a piece;
 * ``moving_along``: the same, and the twist of that station in base axes per strain (6, m);
-* ``gathering``: (p, numbers) to section compliances (36, k) and the compliances of all before each
+* ``gathering``: (p, numbers) to section compliances (36, k) and the sums of compliances before each
   piece (36, k), which are integrals about the base in its axes, see `stiffopt.model.body`;
 * ``gathered``: (start, strain, section compliance, s) to that of the first s of a piece (6, 6).
 
-Of arms under loads, beside the functions of `stiffopt.model.rod`:
+For arms under loads, in addition to the functions of `stiffopt.model.rod`:
 
 * ``radii``: (p, numbers) to radii (k,) and their changes (n,);
 * ``between``: share of a step to the weights of its slopes (5,) and their derivatives, see `DENSE`;
@@ -39,7 +39,7 @@ from stiffopt.model.shooting import LOBATTO
 
 
 def _dense_output() -> np.ndarray:
-    """Coefficients (5, 6), the constant first, of the integrals of Lagrange's polynomials."""
+    """Return coefficients (5, 6), constants first, of the integrals of Lagrange's polynomials."""
     rows = []
     for node in LOBATTO:
         others = np.array([other for other in LOBATTO if other != node])
@@ -51,19 +51,19 @@ def _dense_output() -> np.ndarray:
 DENSE = _dense_output()
 """The integrator's dense output: a state at the share x of a step of length h is
 ``y + h sum_i b_i(x) y'_i``, where row i holds the coefficients of ``b_i`` and the slopes are those
-at the Lobatto points.  It is of order five: tenths of a micrometre off where the arm bends most."""
+at the Lobatto points.  It is of order five: errors are tenths of a micrometre at most."""
 
 
 def strain_rows(layout: Layout) -> list[int]:
-    """Rows of a strain (6,) that are not zero in all segments of a layout."""
-    found = {2}  # that of a connector
+    """Return the rows of a strain (6,) that are not zero in all segments of a layout."""
+    found = {2}  # the row of a connector
     for section in symbolic_arm(layout).actuation.sections:
         found |= set(ca.sparsify(section.strain).sparsity().row())
     return sorted(found)
 
 
 def free_body_functions(layout: Layout) -> list[ca.Function]:
-    """Functions of the body of all free arms of a layout."""
+    """Return the functions of the body of all free arms of a layout."""
     arm, rows = symbolic_arm(layout), strain_rows(layout)
     p, numbers = arm.tip.pressures, arm.numbers
     strains, starts = _pieces(arm, rows)
@@ -102,13 +102,13 @@ def free_body_functions(layout: Layout) -> list[ca.Function]:
 
 
 def free_moving_functions(layout: Layout) -> list[ca.Function]:
-    """Those of them that native/body.h takes."""
+    """Return those that native/body.h uses."""
     names = ("frames", "moving_frames", "along", "moving_along")
     return [each for each in free_body_functions(layout) if each.name() in names]
 
 
 def loaded_body_functions(layout: Layout) -> list[ca.Function]:
-    """Functions of the body of all arms of a layout under loads."""
+    """Return the functions of the body of all arms of a layout under loads."""
     arm = symbolic_arm(layout)
     x, q = ca.SX.sym("x"), ca.SX.sym("q", 4)
     weights = ca.vertcat(*(ca.polyval(ca.SX(row[::-1]), x) for row in DENSE))
@@ -133,7 +133,7 @@ def _transform(start: ca.SX) -> ca.SX:
 
 
 def _pieces(arm: SymbolicArm, rows: list[int]) -> tuple[ca.SX, ca.SX]:
-    """Strains (m, k) and starts (12, k) of the pieces."""
+    """Return strains (m, k) and starts (12, k) of the pieces."""
     straight = ca.SX([0, 0, 1, 0, 0, 0])
     strains, starts, T = [], [], ca.SX.eye(4)
     for piece in arm.tip.pieces:
@@ -145,7 +145,7 @@ def _pieces(arm: SymbolicArm, rows: list[int]) -> tuple[ca.SX, ca.SX]:
 
 
 def _radii(arm: SymbolicArm) -> tuple[ca.SX, ca.SX]:
-    """Radius of each piece (k,), and the change (n,) of that of its own piece by each pressure."""
+    """Return the radius (k,) of each piece, and the change (n,) by each pressure of its own."""
     segment, radii, slopes = -1, [], []
     for piece in arm.tip.pieces:
         if piece.section is not None:
@@ -156,7 +156,7 @@ def _radii(arm: SymbolicArm) -> tuple[ca.SX, ca.SX]:
 
 
 def _gathering(arm: SymbolicArm) -> list[ca.SX]:
-    """Compliances of the sections and of all before each piece (36, k)."""
+    """Return compliances of the sections, and sums of those before each piece (36, k)."""
     sections, before = [], []
     T, C = ca.SX.eye(4), ca.SX.zeros(6, 6)
     for piece in arm.tip.pieces:

@@ -1,4 +1,4 @@
-"""What is known of stations as CasADi functions, for optimisations that others write."""
+"""Poses, Jacobians and compliances of stations as CasADi functions, for users' optimisations."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def _free(arm: Arm, name: Along, at: tuple[float, ...]) -> ca.Function:
 
 
 def _loaded(arm: Arm, name: Along, at: tuple[float, ...]) -> ca.Function:
-    """Of pressures and the tip's quaternion, with what is zero in equilibrium."""
+    """Return the function of pressures and the tip's quaternion, with the residual."""
     chain = arm._equilibrium().shooting.chain(at[-1])
     if name == "compliance_between":
         point = chain.station(at[0])

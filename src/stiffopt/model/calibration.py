@@ -1,4 +1,4 @@
-"""Covariance of the numbers of a calibrated robot file, and what a calibration may fit."""
+"""Results of a calibration in a robot file: covariance of its numbers, and model of its errors."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from stiffopt.units import Angle, Length, Number, Pressure, Ratio
 Array = NDArray[np.float64]
 _POSITIVE = Field(ge=0)
 _ROUNDING = 1e-3  # of correlations, which are written with few digits
-_NEAR = 0.1  # of the range of recorded pressures: so near to one counts as recorded
-_SLACK = 0.02  # of the highest recorded pressure, by which others may exceed what was recorded
+_NEAR = 0.1  # distance within which a pressure counts as recorded, over the recorded range
+_SLACK = 0.02  # allowed excess over recorded pressures, as a share of the highest
 
 
 SIUnit = Literal["", "m", "rad", "Pa", "s"]
@@ -28,20 +28,20 @@ SIUnit = Literal["", "m", "rad", "Pa", "s"]
 
 @dataclass(frozen=True)
 class FittedNumber:
-    """What calibration must know of a kind of number in robot files to fit it.
+    """Properties of a kind of number in robot files that calibration needs to fit it.
 
-    The fit moves a *coordinate* that is zero at the value of the robot file: the logarithm of the
-    ratio for what must stay positive, else the difference.
+    The fit varies a *coordinate* that is zero at the robot file's value: the logarithm of the
+    ratio for a positive number, otherwise the difference.
 
     Attributes
     ----------
-    words : what people call it.
+    words : readable name.
     unit : of the value, in SI; empty for a plain number.
-    tolerance : standard deviation of the coordinate before the fit: relative for what is positive,
-        else in the unit of the value. Text is the key of a robot file's `tolerances` that has it.
-    positive : whether the coordinate is a logarithm; the fit must then begin above zero.
-    low, high : bounds of the value; of what is positive they have no effect.
-    experiment : what recordings would tell the number, as the end of a sentence.
+    tolerance : standard deviation of the coordinate before the fit: relative for a positive number,
+        otherwise in the unit of the value. Text is a key of the robot file's `tolerances`.
+    positive : whether the coordinate is a logarithm; the fit must then start above zero.
+    low, high : bounds of the value; ignored if `positive`.
+    experiment : recordings that would determine the number, as the end of a sentence.
     """
 
     words: str
@@ -54,13 +54,13 @@ class FittedNumber:
 
 
 class FittedParameter(Schema):
-    """A number of the robot file that was fitted, and how well it is known.
+    """A fitted number of the robot file, and its uncertainty.
 
     Attributes
     ----------
-    key : where it is in the file, for example ``segments[0].material.youngs_modulus``.
-    deviation : standard deviation of its coordinate: relative for what must be positive
-        (modulus, length, gain, area, ...), else in SI units.
+    key : its place in the file, for example ``segments[0].material.youngs_modulus``.
+    deviation : standard deviation of its coordinate: relative for a positive number
+        (modulus, length, gain, area, ...), otherwise in SI units.
     prior : the same before the calibration.
     """
 
@@ -70,25 +70,25 @@ class FittedParameter(Schema):
 
 
 class ErrorModel(Schema):
-    """How far the tip may be from a prediction, near recorded pressures and far from them.
+    """Model of the tip's prediction errors, near recorded pressures and far from them.
 
-    An arm behaves as if its effective pressures were wrong by a discrepancy, a Gaussian process in
-    the pressures of each segment: at a distance d from the nearest recorded pressure the variance
+    The arm behaves as if its effective pressures were off by a discrepancy, a Gaussian process in
+    the pressures of each segment.  At a distance d from the nearest recorded pressure, the variance
     of each channel is ``discrepancy^2 (1 - exp(-2 d / reach)) + (gain d_u)^2``.  Here d_u is the
-    part of the way x there that leads in directions in which nothing was recorded:
-    ``d_u^2 = x' (I - S (S + e I)^-1) x`` with the mean square S of the ways from the nearest to
-    the other recorded pressures about it, and ``e = (reach / 4)^2``.
+    part of the displacement x from there in directions that were not recorded: ``d_u^2 = x' (I - S
+    (S + e I)^-1) x``, with S the mean square of the displacements from the nearest to the other
+    recorded pressures about it, and ``e = (reach / 4)^2``.
 
     Attributes
     ----------
-    residual : standard deviation of each axis of the tip where such pressures were recorded, in m.
-    discrepancy : of an effective pressure far from what was recorded, in Pa.
+    residual : standard deviation of each axis of the tip at recorded pressures, in m.
+    discrepancy : standard deviation of an effective pressure far from recorded ones, in Pa.
     reach : distance over which the discrepancy grows, in Pa.
-    gain : relative error of what pressures do in directions that were not recorded.
+    gain : relative error of the effect of pressures in directions that were not recorded.
     degrees_of_freedom : of the multivariate t-distribution of the errors.
     settled, moving : root mean square of effective minus commanded pressure of each channel, in Pa,
-        while pressures were held and while they changed; empty where that was not recorded.
-    recorded : pressures that stand for all that were recorded, in Pa, a row for each.
+        while pressures were held and while they changed; empty if that was not recorded.
+    recorded : representative recorded pressures, in Pa, a row for each.
     spacing : largest distance of a recorded pressure from the nearest of these, in Pa.
     """
 
@@ -103,7 +103,7 @@ class ErrorModel(Schema):
     spacing: Annotated[Pressure, _POSITIVE] = 0.0
 
     def distances(self, channels: Sequence[int], pressures: Array) -> Array:
-        """Distance (N, segments) of each segment's pressures from the nearest recorded, in Pa.
+        """Return the distance (N, segments) of pressures from the nearest recorded ones, in Pa.
 
         Parameters
         ----------
@@ -115,7 +115,7 @@ class ErrorModel(Schema):
         return np.asarray(np.maximum(found - self.spacing, 0.0))
 
     def variances(self, channels: Sequence[int], pressures: Array) -> Array:
-        """Variance (N, n) of the discrepancy of each channel at pressures (N, n), in Pa^2."""
+        """Return the discrepancy's variance (N, n) by channel at pressures (N, n), in Pa^2."""
         recorded = np.array(self.recorded)
         nearest, ways = nearest_recorded(channels, pressures, recorded)
         ends = np.cumsum([0, *channels])
@@ -131,7 +131,7 @@ class ErrorModel(Schema):
         return found
 
     def _untested(self, recorded: Array) -> Array:
-        """Share (K, c, c) of the directions about recorded pressures (K, c) that was not tested."""
+        """Return the matrices (K, c, c) of untested directions about recorded pressures (K, c)."""
         between = recorded - recorded[:, np.newaxis]
         weight = np.exp(-((between**2).sum(axis=2)) / (2 * self.reach**2))
         spread = np.einsum("kl,kli,klj->kij", weight, between, between)
@@ -147,12 +147,12 @@ class ErrorModel(Schema):
 
 
 def growth(distances: Array, reach: float | Array) -> Array:
-    """Share of the discrepancy's variance at distances from what was recorded, all in Pa."""
+    """Return the share of the discrepancy's variance at distances from recorded pressures."""
     return np.asarray(-np.expm1(-2 * distances / reach))
 
 
 def distances_from(channels: Sequence[int], pressures: Array, recorded: Array) -> Array:
-    """Distance (N, segments) in Pa of each segment's pressures; see `nearest_recorded`."""
+    """Return the distances (N, segments) in Pa of each segment; see `nearest_recorded`."""
     _, ways = nearest_recorded(channels, pressures, recorded)
     return np.stack([np.linalg.norm(way, axis=1) for way in ways], axis=1)
 
@@ -160,7 +160,7 @@ def distances_from(channels: Sequence[int], pressures: Array, recorded: Array) -
 def nearest_recorded(
     channels: Sequence[int], pressures: Array, recorded: Array
 ) -> tuple[NDArray[np.intp], list[Array]]:
-    """Of each segment's pressures the nearest recorded, and the way from there, in Pa.
+    """Return each segment's nearest recorded pressures, and the displacements from them, in Pa.
 
     Parameters
     ----------
@@ -169,7 +169,7 @@ def nearest_recorded(
 
     Returns
     -------
-    Indices (N, segments) of the rows that were recorded, and for each segment ways (N, c).
+    Indices (N, segments) of recorded rows, and for each segment displacements (N, c).
     """
     ends = np.cumsum([0, *channels])
     nearest = np.zeros((len(pressures), len(channels)), dtype=np.intp)
@@ -186,7 +186,7 @@ def nearest_recorded(
 
 
 class Calibration(Schema):
-    """How well a calibration knows the arm.
+    """Results of a calibration and their uncertainty.
 
     Attributes
     ----------
@@ -200,9 +200,9 @@ class Calibration(Schema):
     pressure_min, pressure_max : lowest and highest recorded pressure of each channel, in Pa.
     pressure_norm : largest recorded norm of each segment's pressures, in Pa.
         Where these three and `errors` are missing, all pressures count as recorded.
-    errors : how far the tip may be from a prediction; None in files from before it was known.
+    errors : model of the tip's prediction errors; None in files from before it existed.
     unfit : whether the fit missed its own recordings by so much that nothing that is computed with
-        the robot can be relied on. Whoever reads such a file is warned.
+        the robot can be relied on. Reading such a file gives a warning.
     """
 
     logs: Items[str] = ()
@@ -219,16 +219,16 @@ class Calibration(Schema):
 
     @property
     def covariance(self) -> Array:
-        """Covariance (k, k) of the coordinates of parameters and frames; no negative variances."""
+        """Covariance (k, k) of the coordinates of parameters and frames; positive semidefinite."""
         deviations = np.array([*(each.deviation for each in self.parameters), *self.frames])
         matrix = np.array(self.correlation, dtype=float).reshape(len(deviations), len(deviations))
-        # the file's few digits may leave what is as good as known slightly below zero
+        # rounding in the file may make the variance of a well-known number negative
         values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
         root = deviations[:, np.newaxis] * vectors * np.sqrt(np.maximum(values, 0.0))
         return np.asarray(root @ root.T)
 
     def covers(self, channels: Sequence[int], pressures: Array) -> NDArray[np.bool_]:
-        """Say which pressures (N, n) lie within what was recorded.
+        """Return which pressures (N, n) count as recorded.
 
         Parameters
         ----------
@@ -252,7 +252,7 @@ class Calibration(Schema):
         return np.asarray(inside)
 
     def extrapolation(self, channels: Sequence[int], pressures: Array) -> str:
-        """Say that the model extrapolates at pressures (n,) in Pa; empty where it does not."""
+        """Return a warning if the model extrapolates at pressures (n,) in Pa, otherwise ""."""
         p = pressures[np.newaxis]
         if self.covers(channels, p)[0]:
             return ""

@@ -1,8 +1,8 @@
-"""How near the body of an arm comes to the objects of a scene: exact minima along it.
+"""Least distances of an arm's body from the objects of a scene: exact minima along it.
 
-The body is the union of spheres of the outer radius about the centre line, from base to tip; for
-what the arm is mounted on, from where `Obstacle.begin` says. This is native/scene.h a second time,
-for where there is no machine code; a test proves them equal.
+The body is the union of spheres of the outer radius about the centre line, from base to tip; for an
+object on which the arm is mounted, it begins at `Obstacle.begin`. This module implements the method
+of native/scene.h in Python, for use without machine code; a test proves that both agree.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ from stiffopt.model.distances import MeasuredObject
 
 Array = NDArray[np.float64]
 
-CLEARANCE_ERROR = 4e-6  # m, of a least distance at most
-_SHORTEST = 1e-6  # m of arc length, which is not divided again
-_FINE = 3e-4  # m of arc length, on which any object is as a convex one
-_IN_PLANE = 1e-9  # m above a ring's plane that are none
+CLEARANCE_ERROR = 4e-6  # m, largest error of a least distance
+_SHORTEST = 1e-6  # m of arc length; shorter intervals are not divided
+_FINE = 3e-4  # m of arc length, below which any object is treated as convex
+_IN_PLANE = 1e-9  # m; heights above a ring's plane below this count as zero
 _SHARPENED = 1e-4  # m of arc length, over which a slope's change is measured
-_STEEPEST = 1.5  # change of an interpolated distance with the way
-_MORE_CURVED = 1.35  # than the curvature that coarse stations show
+_STEEPEST = 1.5  # largest gradient of an interpolated distance
+_MORE_CURVED = 1.35  # bound on the curvature, over that of the coarse stations
 _SPACING = 1 / 8  # of coarse stations, as a share of the arm's length
-_INSET = 1e-9  # m, by which a range ends before the next begins
+_INSET = 1e-9  # m between the end of a range and the beginning of the next
 
 StationOf = Callable[[Array], tuple[Array, Array, Array]]
-"""From arc lengths (k,) to positions (k, 3), unit tangents (k, 3) and radii (k,)."""
+"""Function from arc lengths (k,) to positions (k, 3), unit tangents (k, 3) and radii (k,)."""
 
 
 class BodyPoint(NamedTuple):
@@ -45,13 +45,13 @@ class BodyPoint(NamedTuple):
 
 
 class Nearest(NamedTuple):
-    """Where a body is nearest to an object.
+    """The point of a body that is nearest to an object.
 
     Attributes
     ----------
     distance : of the body's surface, in m.
     s : arc length at rest, in m.
-    radius_share : 1 if the distance is less by the body's radius, else 0.
+    radius_share : 1 if the body's radius was subtracted from the distance, otherwise 0.
     position : of the centre line (3,), in m.
     normal : gradient (3,) of the distance by this position.
     """
@@ -64,7 +64,7 @@ class Nearest(NamedTuple):
 
 
 class Probe(NamedTuple):
-    """A station with its distance from an object, and how that changes along the body."""
+    """A station with its distance from an object, and the distance's slope along the body."""
 
     point: BodyPoint
     value: float
@@ -75,13 +75,13 @@ class Probe(NamedTuple):
 
 @dataclass(frozen=True)
 class BodyRange:
-    """A stretch of the body on which the radius is constant and the tangent smooth.
+    """A range of the body on which the radius is constant and the tangent smooth.
 
     Attributes
     ----------
-    points : coarse stations, from its one end to the other.
-    speed : arc length per arc length at rest, at most.
-    turn : change of the tangent per arc length at rest, at most, in rad/m.
+    points : coarse stations, from one end to the other.
+    speed : largest arc length per arc length at rest.
+    turn : largest change of the tangent per arc length at rest, in rad/m.
     """
 
     points: tuple[BodyPoint, ...]
@@ -92,7 +92,7 @@ class BodyRange:
 def range_ends(
     robot: RobotDescription, spacing: float = _SPACING
 ) -> tuple[tuple[float, float, int], ...]:
-    """Arc lengths at rest at which ranges begin and end, and their numbers of coarse stations."""
+    """Return the ranges' ends in arc length at rest, and their numbers of coarse stations."""
     ends, start = [], 0.0
     for segment in robot.segments:
         for length in (segment.length, segment.connector):
@@ -107,7 +107,7 @@ def range_ends(
 
 
 def survey(station: StationOf, ends: Sequence[tuple[float, float, int]]) -> list[BodyRange]:
-    """Coarse stations of all ranges, and how fast they advance and turn."""
+    """Return the coarse stations of all ranges, with bounds on their speed and turn."""
     arcs = [np.linspace(start, end, count) for start, end, count in ends]
     found = station(np.concatenate(arcs))
     points = [
@@ -130,14 +130,14 @@ def survey(station: StationOf, ends: Sequence[tuple[float, float, int]]) -> list
 def nearest_point(
     station: StationOf, item: MeasuredObject, ranges: Sequence[BodyRange], cutoff: float = inf
 ) -> Nearest:
-    """The nearest point of an object on a body.
+    """Return the point of a body that is nearest to an object.
 
     Parameters
     ----------
     station :
         The body.
     ranges :
-        All of it; of objects that are no rings also a part of it.
+        All of it; for objects other than rings, a part of it is allowed.
     cutoff :
         A distance above this, in m, is only known to be above it.
     """
@@ -151,7 +151,7 @@ def nearest_point(
 
 
 class _Search:
-    """For the least distance of one object."""
+    """Search for the least distance of one object."""
 
     def __init__(self, station: StationOf, item: MeasuredObject, cutoff: float) -> None:
         self.station, self.item, self.cutoff = station, item, cutoff
@@ -161,12 +161,12 @@ class _Search:
         self._steepness = _STEEPEST if item.is_interpolated else 1.0
 
     def point_at(self, s: float) -> BodyPoint:
-        """A station of the body."""
+        """Return a station of the body."""
         position, tangent, radius = self.station(np.array([s]))
         return BodyPoint(s, position[0], tangent[0], float(radius[0]))
 
     def counted(self, stretch: BodyRange) -> BodyRange:
-        """A range from where the object counts the body on."""
+        """Return the part of a range from `MeasuredObject.begin` on."""
         points = stretch.points
         if points[0].s >= self.item.begin:
             return stretch
@@ -174,7 +174,7 @@ class _Search:
         return replace(stretch, points=(first, *(each for each in points if each.s > first.s)))
 
     def look_at(self, stretch: BodyRange) -> None:
-        """The least distance of a range, if it is less than what the search has."""
+        """Search a range for a distance less than the best so far."""
         points = stretch.points
         probes = [self._probe(points[0], stretch)]
         for index, point in enumerate(points[1:], start=1):
@@ -201,7 +201,7 @@ class _Search:
         return Probe(point, value, slope, normal, int(pieces[0]))
 
     def _least_between(self, a: Probe, b: Probe, stretch: BodyRange) -> float:
-        """What the distance between two probes is at least; scene.h says why."""
+        """Return a lower bound of the distance between two probes; derived in scene.h."""
         h = b.point.s - a.point.s
         least = (a.value + b.value - self._steepness * stretch.speed * h) / 2
         m = _MORE_CURVED * stretch.speed * stretch.turn
@@ -225,7 +225,7 @@ class _Search:
         return max(least, a.value + down * min(max(u, 0.0), h))
 
     def _least_of_pieces(self, a: Probe, b: Probe) -> float:
-        """The least, along straight lines, of the larger of the pieces' distances at the probes."""
+        """Return the least, along straight lines, of the larger of the pieces' distances."""
         if a.piece == b.piece:
             return min(a.value, b.value)
         of_a_at_b = self.item.piece_distance(a.piece, b.point.position) - b.point.radius
@@ -235,7 +235,7 @@ class _Search:
         return min(a.value, b.value, a.value + (of_a_at_b - a.value) * share)
 
     def _refine(self, a: Probe, b: Probe, stretch: BodyRange) -> None:
-        """Look closer between two probes for as long as there may be something nearer."""
+        """Divide the interval between two probes as long as it may contain a smaller distance."""
         h, share = b.point.s - a.point.s, 0.5
         if h < _SHORTEST or self._least_between(a, b, stretch) >= self._to_beat:
             return
@@ -246,7 +246,7 @@ class _Search:
         self._refine(middle, b, stretch)
 
     def sharpen(self) -> None:
-        """Bring the best to where the slope is zero, so that its normal is right too."""
+        """Move the best point to where the slope is zero, so that its normal is accurate too."""
         stretch, best = self._within, self.best
         if stretch is None or best is None or best.distance >= self.cutoff:
             return
@@ -263,7 +263,7 @@ class _Search:
 
 
 def _outside_spheres(chord: float, first: float, second: float) -> float:
-    """How near to a chord something is at least that is outside of spheres about its ends."""
+    """Return a lower bound of the distance from a chord to points outside two end spheres."""
     x = (chord**2 + first**2 - second**2) / (2 * chord)
     if x <= 0:
         return first
@@ -271,7 +271,7 @@ def _outside_spheres(chord: float, first: float, second: float) -> float:
 
 
 def _of_ring(search: _Search, ranges: Sequence[BodyRange]) -> Nearest:
-    """A ring's distance is that of its circle; negative where the centre line is beside it."""
+    """Return a ring's distance, that of its circle; negative if the centre line passes outside."""
     assert search.best is not None
     points = [point for stretch in ranges for point in stretch.points]
     seen = search.item.passages(np.stack([point.position for point in points]))
@@ -297,7 +297,7 @@ def _of_ring(search: _Search, ranges: Sequence[BodyRange]) -> Nearest:
 
 
 def _passes_between(search: _Search, a: BodyPoint, b: BodyPoint, low: float, high: float) -> bool:
-    """Whether the centre line passes the disc where it crosses its plane between two points."""
+    """Return whether the centre line crosses the disc between two points."""
     s0, s1, beyond, from_below = a.s, b.s, 0.0, low <= 0
     for turn in range(60):
         if s1 - s0 <= _SHORTEST:

@@ -1,7 +1,7 @@
-"""C code of CasADi functions, and what a caller must know to use it without CasADi.
+"""Generate C code of CasADi functions, and the information needed to call it without CasADi.
 
-Beside each function ``NAME`` as CasADi generates it (dense matrices, column by column) there is
-``NAME_rows``, which evaluates it for rows of NumPy arrays (matrices row by row).
+Each function ``NAME`` as CasADi generates it (dense matrices, by columns) is accompanied by
+``NAME_rows``, which evaluates it for rows of NumPy arrays (matrices by rows).
 """
 
 from collections.abc import Sequence
@@ -26,7 +26,7 @@ _HEADER = """\
 _ROWS = """
 #include <stdint.h>
 
-/* Rows begin to end - 1 of arrays that advance by stride numbers from row to row. */
+/* Evaluate rows begin to end - 1 of arrays; `stride` numbers separate the rows of each. */
 int {name}_rows(const double* const* in, const int64_t* stride, double* const* out,
                 int64_t begin, int64_t end, double* w, casadi_int* iw) {{
   const double* arg[{sz_arg}];
@@ -44,7 +44,7 @@ int {name}_rows(const double* const* in, const int64_t* stride, double* const* o
 
 @dataclass(frozen=True)
 class Signature:
-    """Shapes of a function's arguments and results, and the work memory that it needs."""
+    """Shapes of a function's arguments and results, and the sizes of its work memory."""
 
     inputs: tuple[tuple[int, int], ...]
     outputs: tuple[tuple[int, int], ...]
@@ -55,7 +55,7 @@ class Signature:
 
     @classmethod
     def of(cls, function: ca.Function) -> Self:
-        """Signature of a CasADi function."""
+        """Return the signature of a CasADi function."""
         return cls(
             tuple(function.size_in(k) for k in range(function.n_in())),
             tuple(function.size_out(k) for k in range(function.n_out())),
@@ -67,7 +67,7 @@ class Signature:
 
     @classmethod
     def from_mapping(cls, mapping: dict[str, Any]) -> Self:
-        """Signature from its fields, after a passage through JSON."""
+        """Return the signature from its fields, as read from JSON."""
 
         def shapes(key: str) -> tuple[tuple[int, int], ...]:
             return tuple((int(rows), int(columns)) for rows, columns in mapping[key])
@@ -77,7 +77,7 @@ class Signature:
 
 
 def dense(function: ca.Function) -> ca.Function:
-    """The same function, all of whose arguments and results are dense."""
+    """Return the same function with dense arguments and results."""
     ends = [function.sparsity_in(k) for k in range(function.n_in())]
     ends += [function.sparsity_out(k) for k in range(function.n_out())]
     if all(sparsity.is_dense() for sparsity in ends):
@@ -89,7 +89,7 @@ def dense(function: ca.Function) -> ca.Function:
 
 
 def c_code(function: ca.Function) -> str:
-    """One C file with a dense function ``NAME`` and its ``NAME_rows``."""
+    """Return the text of a C file with a dense function ``NAME`` and its ``NAME_rows``."""
     generator = ca.CodeGenerator(f"{function.name()}.c", {"with_header": False})
     generator.add(function)
     text = str(generator.dump()).replace(
@@ -99,11 +99,11 @@ def c_code(function: ca.Function) -> str:
 
 
 def header(signatures: dict[str, Signature]) -> str:
-    """``functions.h``: prototypes and sizes for hand-written C.
+    """Return ``functions.h``: prototypes and sizes for hand-written C.
 
-    For a function NAME: ``NAME_N_IN``, ``NAME_N_OUT``, ``NAME_SZ_ARG``, ``NAME_SZ_RES``,
+    For a function NAME it has ``NAME_N_IN``, ``NAME_N_OUT``, ``NAME_SZ_ARG``, ``NAME_SZ_RES``,
     ``NAME_SZ_IW``, ``NAME_SZ_W`` with the name in capitals.  ``WORK_ARG``, ``WORK_RES``,
-    ``WORK_IW`` and ``WORK_W`` are enough for any of them, and at least one.
+    ``WORK_IW`` and ``WORK_W`` are large enough for all functions, and at least one.
     """
     lines = []
     for name, signature in signatures.items():

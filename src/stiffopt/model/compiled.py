@@ -1,12 +1,12 @@
-"""CasADi functions as machine code, kept on disk by content.
+"""Compile CasADi functions to machine code, cached on disk by content.
 
-`library` finds or makes a shared library; without a compiler, or a place to keep the code, it
-gives a notice once and returns None, and `interpreted` serves the same calls from the CasADi VM.
-Values are those of the VM to the last bit.
+`library` finds or makes a shared library.  Without a compiler, or a place for the cache, it warns
+once and returns None; `interpreted` then serves the same calls in the CasADi VM.  Values equal
+those of the VM to the last bit.
 
-The cache (``STIFFOPT_CACHE_DIR``, else ``stiffopt`` in the user's cache directory) may be shared
-by processes and removed at any time.  A library is entered by writing ``KEY-HASH.so`` and then
-``KEY.json``, which holds the hash of the former, so that code which is not whole is never loaded.
+The cache (``STIFFOPT_CACHE_DIR``, by default ``stiffopt`` in the user's cache directory) may be
+shared by processes and removed at any time.  A library is entered by writing ``KEY-HASH.so`` and
+then ``KEY.json``, which holds the hash of the former, so that incomplete code is never loaded.
 """
 
 import ctypes
@@ -37,7 +37,7 @@ from stiffopt.model.codegen import HEADER_NAME, Signature, c_code, dense, header
 Make = Callable[[], Sequence[ca.Function]]
 
 _ENVIRONMENT = ("STIFFOPT_CACHE_DIR", "STIFFOPT_COMPILER", "CC", "XDG_CACHE_HOME", "HOME", "PATH")
-_TRIED_AGAIN_AFTER = 600.0  # s after a compilation in the background has failed
+_TRIED_AGAIN_AFTER = 600.0  # s after a failed compilation in the background
 
 
 class Library:
@@ -46,7 +46,7 @@ class Library:
     Attributes
     ----------
     path : its file, for messages.
-    cdll : for what hand-written sources add; calls through it free the interpreter lock.
+    cdll : gives access to functions of hand-written sources; calls release the interpreter lock.
     """
 
     def __init__(self, path: Path, signatures: dict[str, Signature]) -> None:
@@ -59,13 +59,13 @@ class Library:
         }
 
     def function(self, name: str) -> CompiledFunction:
-        """One of the CasADi functions in it."""
+        """Return one of the CasADi functions in it."""
         return self._functions[name]
 
 
 @dataclass(frozen=True)
 class _Wanted:
-    """Functions of which machine code is wanted; see `library` for the fields."""
+    """A request for machine code; see `library` for the fields."""
 
     text: str
     make: Make
@@ -73,7 +73,7 @@ class _Wanted:
     daqp: bool
 
     def key(self, compiler: build.Compiler) -> str:
-        """What the code depends on, as a name of files."""
+        """Return a hash of everything that the code depends on, for file names."""
         files = [Path(source) for source in self.sources]
         folders = {folder for file in files for folder in (file.parent, build.NATIVE)}
         headers = {found for folder in folders for found in folder.glob("*.[ch]")}
@@ -92,7 +92,7 @@ class _Wanted:
 
 @lru_cache(maxsize=1)
 def _own_code() -> str:
-    """Hash of the code that functions come from; the version is part of it."""
+    """Return a hash of the source that defines the functions."""
     root = Path(__file__).parent.parent
     files = list(root.glob("*.py"))
     for folder in ("model", "optimise"):
@@ -106,10 +106,10 @@ def _own_code() -> str:
 
 _lock = threading.RLock()
 _loaded: dict[tuple[Path, str], Library | None] = {}
-_awaited: dict[Hashable, float] = {}  # code that another process makes, and when to look again
+_awaited: dict[Hashable, float] = {}  # requests compiled elsewhere, with the time of the next look
 _LOOK_AGAIN = 0.2  # s
 _begun: dict[tuple[Path, str], float] = {}  # when a process was started to make code
-_BEGUN_AGAIN_AFTER = 30.0  # s: such a process takes a second to start before it takes the lock
+_BEGUN_AGAIN_AFTER = 30.0  # s; a process takes about a second to start and take the lock
 _notified: set[str] = set()
 _in_foreground: ContextVar[bool] = ContextVar("in_foreground", default=False)
 _only_cached: ContextVar[bool] = ContextVar("only_cached", default=False)
@@ -117,12 +117,12 @@ _watch: ContextVar[Callable[[], None] | None] = ContextVar("watch", default=None
 
 
 class CodeReadyError(Exception):
-    """Machine code that was awaited is there; see `until_ready`."""
+    """Awaited machine code is ready; see `until_ready`."""
 
 
 @contextmanager
 def compiling_at_once() -> Iterator[None]:
-    """While this context lasts, `library` waits for the compiler.
+    """Make `library` wait for the compiler within this context.
 
     ``STIFFOPT_COMPILE=wait`` in the environment does so everywhere.
     """
@@ -135,7 +135,7 @@ def compiling_at_once() -> Iterator[None]:
 
 @contextmanager
 def compiling_nothing() -> Iterator[None]:
-    """While this context lasts, `library` only looks into the cache."""
+    """Make `library` only look into the cache within this context."""
     token = _only_cached.set(True)
     try:
         yield
@@ -145,16 +145,16 @@ def compiling_nothing() -> Iterator[None]:
 
 @contextmanager
 def until_ready(is_ready: Callable[[], bool]) -> Iterator[None]:
-    """Interrupt evaluations in here by a `CodeReadyError` as soon as code is ready.
+    """Interrupt evaluations in this context with `CodeReadyError` as soon as code is ready.
 
-    What an answer would take minutes for without machine code is begun anew with it.
+    An answer that takes minutes without machine code can then be restarted with it.
     """
     next_look = time.monotonic() + _LOOK_AGAIN
 
     def look() -> None:
         nonlocal next_look
         if time.monotonic() > next_look:
-            next_look = math.inf  # what is evaluated to find out is not interrupted
+            next_look = math.inf  # do not interrupt evaluations of `is_ready` itself
             if is_ready():
                 raise CodeReadyError
             next_look = time.monotonic() + _LOOK_AGAIN
@@ -167,7 +167,7 @@ def until_ready(is_ready: Callable[[], bool]) -> Iterator[None]:
 
 
 def checkpoint() -> None:
-    """Raise `CodeReadyError` if code that `until_ready` waits for is there, or give up.
+    """Raise `CodeReadyError` if code awaited by `until_ready` is ready; raise if told to stop.
 
     See `stiffopt.model.stopping`.
     """
@@ -184,29 +184,30 @@ def library(
     daqp: bool = False,
     build_missing: bool = True,
 ) -> Library | None:
-    """Machine code of CasADi functions, from the cache or newly compiled.
+    """Return machine code of CasADi functions, from the cache or newly compiled.
 
-    Code that is not in the cache is made by a process in the background
-    (`make_in_background`), and None is returned until it is there.  The process outlives
-    this one, and there is one for each library, however many processes ask for it.
+    Code that is not in the cache is compiled by a background process
+    (`make_in_background`), and None is returned until it is ready.  The process outlives
+    this one, and there is one for each library, however many processes request it.
 
     Parameters
     ----------
     content : str or sequence
-        What identifies the functions, in addition to stiffopt's own code: text, or values
+        Identifies the functions, in addition to stiffopt's own code: text, or values
         whose `repr` is complete.
-    make : makes the functions; called only if they are not in the cache.  Their names are the names
-        in C and must be told apart in capitals too.  What cannot be pickled is compiled at once.
+    make : returns the functions; called only if they are not in the cache.  Their names are the
+        names in C and must differ in more than capitals.  If it cannot be pickled, it is compiled
+        at once.
     sources : paths of C files compiled with them, which find prototypes and sizes in
         ``functions.h`` (see `codegen.header`) and headers in their own folders and in ``native``.
-    daqp : whether those need the DAQP that comes with CasADi.
-    build_missing : false: only look into the cache.
+    daqp : whether the sources need the DAQP that comes with CasADi.
+    build_missing : False: only look into the cache.
 
     Returns
     -------
     Library or None
-        None where code is not there yet or cannot be had; the first time in a process a
-        `SlowWarning` says why.
+        None if code is not ready or cannot be made; a `SlowWarning` gives the reason, once for each
+        process.
     """
     text = content if isinstance(content, str) else repr(tuple(content))
     build_missing = build_missing and not _only_cached.get()
@@ -251,7 +252,7 @@ def _at_once() -> bool:
 
 
 def _is_made_in_background(cache: Path, key: str, wanted: _Wanted) -> bool:
-    """Begin to compile in another process, unless one does already; False where it has failed."""
+    """Start a background compilation, unless one is running; return False if it has failed."""
     failure = cache / f"{key}.failed"
     with suppress(OSError, ValueError):
         reason = failure.read_text(encoding="utf-8")
@@ -266,7 +267,7 @@ def _is_made_in_background(cache: Path, key: str, wanted: _Wanted) -> bool:
         return True
     try:
         request = pickle.dumps(wanted)
-    except Exception:  # made of what only this process knows
+    except Exception:  # not picklable, so no other process can do it
         with compiling_at_once():
             return library(wanted.text, wanted.make, wanted.sources, wanted.daqp) is not None
     try:
@@ -280,16 +281,16 @@ def _is_made_in_background(cache: Path, key: str, wanted: _Wanted) -> bool:
 
 
 def compilation_is_held_off() -> bool:
-    """Whether an arm is armed somewhere, so that no code is made in the background."""
+    """Return whether an arm is armed somewhere, which forbids background compilation."""
     with suppress(build.BuildError):
         return build.is_held_off(build.cache_directory())
     return False
 
 
 def make_in_background() -> None:
-    """Compile what another process asks for on standard input, at low priority.
+    """Compile a request from standard input, at low priority.
 
-    One process at a time does so for one library.
+    Only one process at a time does so for one library.
     """
     with suppress(OSError):
         os.nice(10)
@@ -308,7 +309,7 @@ def make_in_background() -> None:
 
 
 class Stopwatch:
-    """The time that an answer takes, apart from machine code that is made once before it."""
+    """Measure the time of an answer, apart from one-time compilation."""
 
     compilation = 0.0  # s, of this process so far
 
@@ -324,7 +325,7 @@ class Stopwatch:
 
 
 def interpreted(make: Make) -> dict[str, InterpretedFunction]:
-    """The same functions in the CasADi VM, by name."""
+    """Return the same functions in the CasADi VM, by name."""
     return {function.name(): InterpretedFunction(dense(function)) for function in make()}
 
 
@@ -332,7 +333,7 @@ def interpreted(make: Make) -> dict[str, InterpretedFunction]:
 
 
 def _from_cache(cache: Path, key: str) -> Library | None:
-    """The library if it is in the cache and whole."""
+    """Return the library if it is in the cache and complete."""
     try:
         entry = json.loads((cache / f"{key}.json").read_bytes())
         digest = str(entry["sha256"])
@@ -353,10 +354,10 @@ def _code_path(cache: Path, key: str, digest: str) -> Path:
 
 
 def _make(cache: Path, key: str, compiler: build.Compiler, wanted: _Wanted) -> Library:
-    """Compile, enter into the cache and load, while others who want the same wait."""
+    """Compile, enter into the cache and load; other processes with the same request wait."""
     try:
         with build.locked(cache / f"{key}.lock"):
-            found = _from_cache(cache, key)  # another process may have come first
+            found = _from_cache(cache, key)  # another process may have been faster
             if found is not None:
                 return found
             functions = [dense(function) for function in wanted.make()]
@@ -386,7 +387,7 @@ def _make(cache: Path, key: str, compiler: build.Compiler, wanted: _Wanted) -> L
 
 
 def _notify(error: build.BuildError) -> None:
-    """Say once per process why there is no machine code."""
+    """Warn once per process why there is no machine code."""
     if not error.expected:
         _warn_once(
             f"slower without compiled code: {error} "

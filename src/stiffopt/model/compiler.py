@@ -1,6 +1,6 @@
-"""Compiler and cache directory: C code in, a shared library in its place out.
+"""Run the C compiler and manage the cache directory: C code in, shared library out.
 
-Everything that fails here fails with a `BuildError` whose text a user can act on.
+Every failure is a `BuildError` with a text that a user can act on.
 """
 
 import os
@@ -19,10 +19,10 @@ from pathlib import Path
 import casadi as ca
 
 NATIVE = Path(__file__).with_name("native")
-"""Headers that all C files find."""
+"""Folder of headers, on the include path of all C files."""
 
 FLAGS = ("-O1", "-fPIC", "-ffp-contract=off", "-fno-math-errno", "-w")
-"""No flag that changes results: they are those of the CasADi VM to the last bit."""
+"""These flags do not change results, which equal those of the CasADi VM to the last bit."""
 
 _TIMEOUT = 120.0  # s, for one call of the compiler
 _ABANDONED_AFTER = 86400.0  # s
@@ -33,7 +33,7 @@ _DEFAULT_COMPILERS = ("cc", "gcc", "clang")
 
 
 class BuildError(Exception):
-    """No machine code, and why; `expected` if the user wants none."""
+    """There is no machine code, for this reason; `expected` if the user disabled it."""
 
     def __init__(self, reason: str, *, expected: bool = False) -> None:
         super().__init__(reason)
@@ -42,14 +42,14 @@ class BuildError(Exception):
 
 @dataclass(frozen=True)
 class Compiler:
-    """A C compiler as it is called, and what tells it from others."""
+    """A C compiler: its command, and its identity for cache keys."""
 
     command: tuple[str, ...]
     identity: tuple[str, ...]
 
 
 def cache_directory() -> Path:
-    """Directory of compiled code; it need not exist.
+    """Return the directory of compiled code; it may not exist yet.
 
     Raises
     ------
@@ -74,7 +74,7 @@ def cache_directory() -> Path:
 
 
 def find_compiler() -> Compiler:
-    """The compiler that ``STIFFOPT_COMPILER`` or ``CC`` names, or the first in ``PATH``."""
+    """Return the compiler in ``STIFFOPT_COMPILER`` or ``CC``, or the first one in ``PATH``."""
     if os.name != "posix":
         raise BuildError("code is compiled on Linux and macOS only")
     for variable in ("STIFFOPT_COMPILER", "CC"):
@@ -105,7 +105,7 @@ def _words(variable: str) -> list[str]:
 
 
 def _identified(command: list[str]) -> Compiler:
-    """A compiler told from others, and from its other versions, by its file."""
+    """Return a compiler whose identity includes its file, which changes with the version."""
     command[0] = os.path.abspath(command[0])
     stat = os.stat(command[0])
     file = (os.path.realpath(command[0]), str(stat.st_mtime_ns), str(stat.st_size))
@@ -113,7 +113,7 @@ def _identified(command: list[str]) -> Compiler:
 
 
 def _run(commands: Sequence[Sequence[str]], directory: Path, timeout: float = _TIMEOUT) -> None:
-    """Run commands side by side; none outlives this call."""
+    """Run commands in parallel; all have ended when this returns."""
     processes = []
     end = time.monotonic() + timeout
     try:
@@ -147,7 +147,7 @@ def _started(command: Sequence[str], directory: Path) -> "subprocess.Popen[str]"
 
 
 def _check(name: str, process: "subprocess.Popen[str]", end: float, timeout: float) -> None:
-    """Raise unless a compiler ends well, and before its time is over."""
+    """Raise an error if a compiler fails or exceeds its time."""
     try:
         output, complaint = process.communicate(timeout=max(0.0, end - time.monotonic()))
     except subprocess.TimeoutExpired as error:
@@ -164,7 +164,7 @@ def _check(name: str, process: "subprocess.Popen[str]", end: float, timeout: flo
 
 
 def daqp_parts() -> tuple[Path, Path]:
-    """Include directory and shared library of the DAQP that comes with CasADi."""
+    """Return include directory and shared library of the DAQP that comes with CasADi."""
     home = Path(ca.__file__).parent
     include = home / "include"
     for suffix in (".so", ".dylib"):
@@ -180,7 +180,7 @@ def daqp_parts() -> tuple[Path, Path]:
 def compile_library(
     compiler: Compiler, texts: dict[str, str], sources: Sequence[str], daqp: bool, cache: Path
 ) -> bytes:
-    """Machine code of C files given by name and text, and of further source files."""
+    """Return the machine code of C files, given by name and text, and of further sources."""
     cache.mkdir(mode=0o700, parents=True, exist_ok=True)
     _sweep(cache)
     directory = Path(tempfile.mkdtemp(prefix="build-", dir=cache))
@@ -197,13 +197,13 @@ def compile_library(
         inputs = [name for name in texts if name.endswith(".c")] + list(sources)
         objects = [f"{k}.o" for k in range(len(inputs))]
         level = [word for word in compiler.command if word.startswith("-O")]
-        command = [*compiler.command, *FLAGS, *level]  # a level that the user names wins
+        command = [*compiler.command, *FLAGS, *level]  # the user's level overrides FLAGS
         calls = [
             [*command, *includes, "-c", source, "-o", target]
             for source, target in zip(inputs, objects, strict=True)
         ]
         _run(calls, directory)
-        # a name of ours must not be taken for one of the same name elsewhere in the process
+        # bind our symbols locally: others in the process may have the same names
         symbols = ["-Wl,-Bsymbolic"] if sys.platform.startswith("linux") else []
         target = "library.so"
         link = ["-shared", *symbols, *objects, *libraries, "-o", target]
@@ -214,7 +214,7 @@ def compile_library(
 
 
 def _sweep(cache: Path) -> None:
-    """Remove what builds left behind that were killed."""
+    """Remove leftovers of builds that were killed."""
     oldest = time.time() - _ABANDONED_AFTER
     for pattern in ("build-*", "*.lock", "*.part"):
         for path in cache.glob(pattern):
@@ -224,7 +224,7 @@ def _sweep(cache: Path) -> None:
 
 
 def write_atomically(path: Path, content: bytes) -> None:
-    """Write a file that is there whole or not at all."""
+    """Write a file so that it is complete or absent."""
     path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     handle, name = tempfile.mkstemp(prefix="file-", suffix=".part", dir=path.parent)
     try:
@@ -240,10 +240,10 @@ def write_atomically(path: Path, content: bytes) -> None:
 
 @contextmanager
 def locked(path: Path, longest: float = _TIMEOUT) -> Iterator[None]:
-    """Wait while another process holds this lock file, but no longer than that.
+    """Hold a lock file; wait for another process that holds it, at most `longest` seconds.
 
-    The system frees the lock of a process that ends in whatever way.  It only saves work done
-    twice: without it, or after the wait, everything is still correct.
+    The system frees the lock of a process that ends in any way.  The lock only avoids duplicate
+    work: without it, or after a timeout, everything is still correct.
     """
     import fcntl
 
@@ -270,7 +270,7 @@ def locked(path: Path, longest: float = _TIMEOUT) -> Iterator[None]:
 
 
 def is_locked(path: Path) -> bool:
-    """Whether a process holds this lock file now."""
+    """Return whether a process holds this lock file."""
     import fcntl
 
     try:
@@ -290,7 +290,7 @@ def is_locked(path: Path) -> bool:
 
 @contextmanager
 def held_off() -> Iterator[None]:
-    """Have no compilation begin in the background, in any process: an arm is armed."""
+    """Forbid background compilation in all processes within this context: an arm is armed."""
     descriptor = None
     with suppress(OSError, BuildError, ImportError):
         import fcntl
@@ -307,7 +307,7 @@ def held_off() -> Iterator[None]:
 
 
 def is_held_off(cache: Path) -> bool:
-    """Whether some process has an arm armed; see `held_off`."""
+    """Return whether some process has an arm armed; see `held_off`."""
     return is_locked(cache / _HELD_OFF)
 
 
@@ -331,7 +331,7 @@ def start_background(request: bytes, cache: Path) -> None:
             (os.POSIX_SPAWN_DUP2, nowhere.fileno(), 1),
             (os.POSIX_SPAWN_DUP2, nowhere.fileno(), 2),
         ]
-        for child in list(_children):  # no zombies but the last
+        for child in list(_children):  # reap ended processes
             with suppress(OSError):
                 if os.waitpid(child, os.WNOHANG) == (0, 0):
                     continue

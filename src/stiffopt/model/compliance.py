@@ -1,7 +1,7 @@
-"""Compliance of the unloaded arm and what is read from it (eqs 11 to 17).
+"""Compliance of the unloaded arm, and stiffnesses derived from it (eqs 11 to 17).
 
-A compliance is 6x6, linear part first: twist = C wrench, both in the axes of the frame where
-it is meant.  `C_a = X C_b X^T` with ``X = adjoint(T_ab)`` is eq. 16, since
+A compliance is 6x6, linear part first: twist = C wrench, both in the axes of the frame to which
+it refers.  `C_a = X C_b X^T` with ``X = adjoint(T_ab)`` is eq. 16, since
 ``adjoint = coadjoint^-T``.
 """
 
@@ -34,13 +34,13 @@ class NodePair:
     The motion from the middle to them is ``(even +- odd)``, in rotation and in position.
     """
 
-    weight: float  # of each, times the length
+    weight: float  # of each point, times the length
     rotation: tuple[ca.SX, ca.SX]  # (3, 3), even and odd in s
     position: tuple[ca.SX, ca.SX]  # (3,)
 
 
 def node_pairs(section: Section, arc_length: float) -> list[NodePair]:
-    """Gauss points of a segment of constant strain and this length."""
+    """Return the Gauss points of a segment of constant strain and this length."""
     nodes, weights = np.polynomial.legendre.leggauss(QUADRATURE_POINTS)
     pairs = []
     for node, weight in zip(nodes, weights, strict=True):
@@ -62,10 +62,10 @@ def node_pairs(section: Section, arc_length: float) -> list[NodePair]:
 
 
 def segment_compliance(section: Section, arc_length: float, half: ca.SX) -> ca.SX:
-    """Compliance (6, 6) of the first `arc_length` of a segment, in its far end's frame.
+    """Return the compliance (6, 6) of a segment's first `arc_length`, in its far end's frame.
 
-    ``int X C_S X^T dS`` with X the adjoint from the far end to S (eq. 17), taken about the
-    middle, from where `half` (4, 4) leads to the far end.
+    It is ``int X C_S X^T dS`` with X the adjoint from the far end to S (eq. 17), taken about the
+    middle; `half` (4, 4) is the motion from there to the far end.
     """
     C = ca.SX.zeros(6, 6)
     for pair in node_pairs(section, arc_length):
@@ -79,9 +79,9 @@ def segment_compliance(section: Section, arc_length: float, half: ca.SX) -> ca.S
 
 
 def segment_flexibility(section: Section, arc_length: float, wrench: ca.SX) -> ca.SX:
-    """Twice the strain energy of a wrench (6,) at the middle of a segment, in axes of that.
+    """Return twice the strain energy of a wrench (6,) at the middle of a segment, in its axes.
 
-    ``int w' C_S w dS`` with w the wrench that the section at S carries.
+    It is ``int w' C_S w dS`` with w the wrench that the section at S carries.
     """
     force, moment = wrench[:3], wrench[3:]
     total = ca.SX(0)
@@ -89,10 +89,10 @@ def segment_flexibility(section: Section, arc_length: float, wrench: ca.SX) -> c
         R, odd_R = pair.rotation
         p, odd_p = pair.position
         here, odd = moment - ca.cross(p, force), ca.cross(odd_p, force)
-        # (R + odd_R)' (here - odd), of which R is symmetric and odd_R skew
+        # (R + odd_R)' (here - odd), with R symmetric and odd_R skew
         parts = (
             ca.vertcat(R @ force, R @ here + odd_R @ odd),
-            ca.vertcat(odd_R @ force, odd_R @ here + R @ odd),  # but for the sign
+            ca.vertcat(odd_R @ force, odd_R @ here + R @ odd),  # up to the sign
         )
         energies = (part.T @ section.compliance @ part for part in parts)
         total += (2 * pair.weight) * sum(energies)
@@ -104,12 +104,12 @@ def _upper_triangular(diagonal: ca.SX, corner: ca.SX) -> ca.SX:
 
 
 def carry_compliance(C: ca.SX, T: ca.SX) -> ca.SX:
-    """Compliance C of frame b as seen in frame a, with ``T = T_ab`` (eq. 16)."""
+    """Return compliance C of frame b as seen in frame a, with ``T = T_ab`` (eq. 16)."""
     return _congruent(lie.adjoint(T), C)
 
 
 def _congruent(X: ca.SX, C: ca.SX) -> ca.SX:
-    """``X C X'`` of a symmetric C, half of which is worked out."""
+    """Return ``X C X'`` of a symmetric C, computing only half of it."""
     XC = X @ C
     upper = ca.SX(*C.shape)
     for row in range(C.shape[0]):
@@ -126,12 +126,12 @@ def directional_stiffness(
     kind: Kind,
     boundary: Boundary,
 ) -> ca.SX:
-    """Stiffness along (or about) a unit direction, in N/m (or N m/rad).
+    """Return the stiffness along (or about) a unit direction, in N/m (or N m/rad).
 
     Parameters
     ----------
     compliance : (6, 6)
-        Compliance in the frame of the point that is loaded.
+        Compliance in the frame of the loaded point.
     rotation : (3, 3)
         Axes of that frame in the base frame.
     direction : (3,)
@@ -151,10 +151,10 @@ def directional_stiffness(
 def held_stiffness(
     compliance: ca.SX, direction: ca.SX, is_rotation: ca.SX, is_clamped: ca.SX
 ) -> tuple[ca.SX, ca.SX]:
-    """Stiffness along a unit direction (3,) in axes of the compliance, "guided" or "clamped".
+    """Return the "guided" or "clamped" stiffness along a unit direction (3,).
 
-    The conditions are symbols, 0 or 1.  The second result is the wrench (6,) that moves the held
-    point by one unit in this direction.
+    The direction is in the axes of the compliance.  The conditions are symbols, 0 or 1.  The second
+    result is the wrench (6,) that moves the held point by one unit in this direction.
     """
     vv, vw = compliance[:3, :3], compliance[:3, 3:]
     wv, ww = compliance[3:, :3], compliance[3:, 3:]
@@ -169,7 +169,7 @@ def held_stiffness(
 
 
 def stiffness_block(compliance: ca.SX, kind: Kind, boundary: Boundary) -> ca.SX:
-    """3x3 stiffness of translation or rotation, the other part free or held ("clamped")."""
+    """Return the 3x3 stiffness of translation or rotation, the other free or held ("clamped")."""
     vv, vw = compliance[:3, :3], compliance[:3, 3:]
     wv, ww = compliance[3:, :3], compliance[3:, 3:]
     if kind == "rotation":
@@ -180,7 +180,7 @@ def stiffness_block(compliance: ca.SX, kind: Kind, boundary: Boundary) -> ca.SX:
 
 
 def inverse_3x3(matrix: ca.SX | ca.MX) -> ca.SX | ca.MX:
-    """Inverse by cofactors, which CasADi has for SX alone."""
+    """Return the inverse by cofactors, which CasADi has only for SX."""
     if isinstance(matrix, ca.MX):
         A = ca.SX.sym("A", 3, 3)
         return ca.Function("inverse", [A], [ca.inv_minor(A)])(matrix)

@@ -1,6 +1,6 @@
-"""What an arm is: the schema of the robot file and the description in code, in one.
+"""The description of an arm: the schema of the robot file, and classes for Python code.
 
-Everything is in SI: m, rad, Pa, kg. Built in code::
+All values are in SI: m, rad, Pa, kg. In code::
 
     Segment(length=0.09, outer_radius=0.015, inner_radius=0.0045, ...)
 """
@@ -59,7 +59,7 @@ def _index(value: Any) -> Any:
 
 
 def one_or_list(value: Any) -> str:
-    """Tell one value for all channels from a list of one per channel."""
+    """Distinguish one value for all channels from a list of one per channel."""
     listed = isinstance(value, Sequence) or hasattr(value, "tolist")
     scalar = isinstance(value, str) or getattr(value, "ndim", None) == 0
     return "<list>" if listed and not scalar else "<one>"
@@ -126,19 +126,18 @@ class Compensation(Schema):
     ----------
     modulus_per_pressure : change of E per norm of a segment's pressures, Pa/Pa.
     modulus_law : ``linear``, as in the paper: E + modulus_per_pressure |p|; or ``exponential``,
-        E exp(modulus_per_pressure |p| / E), which begins alike and stays positive.
+        E exp(modulus_per_pressure |p| / E), which has the same slope at zero and stays positive.
     area : factor on A.
     inertia : factor on I.
-    stiffness : factor on E where the arm gives way to loads. Free shapes depend on pressure over
-        E alone: 1.4 means an arm that is 1.4 times as stiff as E and on which pressure acts 1.4
-        times as strongly as drawn. 1 in the paper.
-    softening : share of `modulus_per_pressure` by which the arm gives way to loads more easily;
-        the rest is pressure that acts ever more strongly, as in chambers that swell. 1 in the
-        paper.
-    bending_radius : least radius that pressure bends to, in m, of the axis per length as the strain
-        law counts it: the silicone stiffens towards it. 0 in the paper, which knows no limit.
+    stiffness : factor on E against loads. Free shapes depend on pressure over E alone: with 1.4,
+        the arm is 1.4 times as stiff as E and pressure acts 1.4 times as strongly as drawn. 1 in
+        the paper.
+    softening : share of `modulus_per_pressure` that makes the arm softer against loads; the rest
+        makes pressure act more strongly, as in chambers that swell. 1 in the paper.
+    bending_radius : least radius to which pressure can bend, in m, of the axis per length as the
+        strain law counts it; the silicone stiffens towards it. 0 in the paper: no limit.
     lengthening : stretch of the axis per squared strain ``(outer_radius / bending radius)^2`` of
-        the wall that bending stretches most. Loads do not lengthen. 0 in the paper.
+        the outermost wall under bending. Loads do not lengthen. 0 in the paper.
     """
 
     modulus_per_pressure: Number = 0.0
@@ -158,8 +157,8 @@ class Corrections(Schema):
     ----------
     gain : acting pressure per pressure.
     offset : pressure that acts in addition, in Pa.
-    dead_band : pressure up to which hardly anything moves, of all channels, in Pa. It is applied
-        before gain and offset, and is for pressures that are never negative.
+    dead_band : pressure up to which the segment hardly moves, for all channels, in Pa. It is
+        applied before gain and offset, and needs pressures that are never negative.
     azimuth : turn of the channel's chambers about the axis, from x towards y, in rad.
     """
 
@@ -175,11 +174,11 @@ class Segment(Schema):
     Attributes
     ----------
     length, outer_radius, inner_radius : of the tube at rest, in m.
-    chambers : where the chambers are.
+    chambers : positions of the chambers.
     channels : for each regulator the chambers it feeds, counted from 1.
-    material : what the tube is made of.
-    compensation : the paper's lambda, or None for none.
-    corrections : of the channels, or None for none.
+    material : of the tube.
+    compensation : the paper's lambda, or None.
+    corrections : of the channels, or None.
     history : how the shape lags behind the pressures, or None if it does not.
     connector : rigid length after the segment, in m.
     strain_law : how pressures strain the segment, by the name of a law of `stiffopt.model.laws`:
@@ -217,9 +216,9 @@ class Segment(Schema):
     @field_validator("law", mode="plain")
     @classmethod
     def _read_law(cls, value: Any, info: ValidationInfo) -> Schema | None:
-        """Read the keys of the law by the schema that the law has for them."""
+        """Read the keys of the law by the law's own schema."""
         name = info.data.get("strain_law")
-        if name is None:  # there is no such law, which is told at that key
+        if name is None:  # there is no such law; the error is reported at that key
             return None
         keys = _law_class(name).Keys
         if value is None:
@@ -232,8 +231,8 @@ class Segment(Schema):
             return keys.model_validate(value, context=info.context)
         except ValidationError as error:
             loc, reason = explain(keys, error.errors()[0], None)
-            told = BadKeyError(".".join(map(str, loc)), reason) if loc else InputError(reason)
-            raise told from None
+            wrong = BadKeyError(".".join(map(str, loc)), reason) if loc else InputError(reason)
+            raise wrong from None
 
     @model_validator(mode="after")
     def _check(self) -> Segment:
@@ -303,7 +302,7 @@ class Segment(Schema):
 
 
 def _law_class(name: str) -> type[StrainLaw]:
-    from stiffopt.model.laws import law_class  # laws are made for segments
+    from stiffopt.model.laws import law_class  # avoid a circular import
 
     return law_class(name)
 
@@ -340,7 +339,7 @@ class Recordings(Schema):
 
     Attributes
     ----------
-    channels : for each channel of the robot the pressure column of a log, counted from 1.
+    channels : pressure column of a log for each channel of the robot, counted from 1.
     frame : tracked body in whose frame poses are expressed; None for the tracker's own frame.
     registration : pose of that frame in the base frame, and of the tip in the sensor's.
     bodies : other tracked bodies, by name.
@@ -363,14 +362,14 @@ class Recordings(Schema):
 
 
 class Tolerances(Schema):
-    """How well a robot file knows the arm: what a calibration takes for one standard deviation.
+    """Uncertainty of a robot file before calibration: one standard deviation of each number.
 
     Attributes
     ----------
     length : of a segment, relative.
     youngs_modulus, area, stiffness, gain : relative.
     modulus_per_pressure : in Pa/Pa.
-    softening, lengthening : as they are.
+    softening, lengthening : absolute.
     bending_radius, dead_band : relative.
     offset : of a channel, in Pa.
     azimuth : of a channel, in rad.
@@ -378,7 +377,7 @@ class Tolerances(Schema):
         axis and its turn about that.
     sensor_position, sensor_angle : of the tracked sensor on the tip.
     body_position, body_angle : of other tracked bodies.
-    zero : of the position from log to log, where logs are zeroed anew, in m.
+    zero : of the position's zero from log to log, where it is set anew for each, in m.
     lag, memory : of a history, relative; dead_time : in s; share, creep_share : of its operators.
     """
 
@@ -414,14 +413,14 @@ class RobotDescription(Schema):
 
     Attributes
     ----------
-    name : what people call the arm.
+    name : of the arm.
     segments : proximal segment first.
     tip_mass : mass fixed at the tip, in kg.
     gravity : acceleration in the base frame, in m/s^2; z runs along the straight arm.
     pressure : limits of the regulators.
     recordings : how logs of this arm are read.
-    tolerances : how well the numbers are known before a calibration.
-    calibration : how well they are known after one, or None.
+    tolerances : uncertainty of the numbers before a calibration.
+    calibration : results and uncertainty of a calibration, or None.
     """
 
     name: Annotated[str, Field(min_length=1)]
@@ -473,7 +472,7 @@ class RobotDescription(Schema):
         )
 
     def extrapolation(self, pressures: NDArray[np.float64]) -> str:
-        """Say that the calibration saw nothing like pressures (n,) in Pa; else an empty text."""
+        """Return a warning if pressures (n,) in Pa are far from the calibration's, otherwise ""."""
         if self.calibration is None:
             return ""
         return self.calibration.extrapolation([s.n_channels for s in self.segments], pressures)
@@ -487,7 +486,7 @@ class RobotDescription(Schema):
         raise InputError(f"there is no such channel; this robot has {self.n_pressures}")
 
     def check_per_channel(self, key: str, value: object) -> None:
-        """Raise `BadKeyError` if a list of one value per channel has not one per channel."""
+        """Raise `BadKeyError` if a list does not have one value for each channel."""
         n = self.n_pressures
         if isinstance(value, tuple) and len(value) != n:
             raise BadKeyError(
@@ -524,7 +523,7 @@ class RobotDescription(Schema):
         return self
 
     def _check_dead_bands(self) -> None:
-        """Refuse a dead band where a pressure may be negative: it would hardly act there at all."""
+        """Reject a dead band where a pressure may be negative: it would hardly act there at all."""
         lowest = iter(self.pressure_min)
         for index, segment in enumerate(self.segments):
             low = min(itertools.islice(lowest, segment.n_channels))
@@ -586,7 +585,7 @@ class RobotDescription(Schema):
                 )
 
     def _has_number(self, key: str) -> bool:
-        """Whether a key such as ``segments[0].corrections.gain[2]`` names a number of a segment."""
+        """Return whether a key like ``segments[0].corrections.gain[2]`` is a segment's number."""
         found: Any = self
         for step in key.replace("[", ".[").split("."):
             index = _INDEX.fullmatch(step)

@@ -1,7 +1,7 @@
-"""Closed surfaces of triangles, and grids of the signed distances from them.
+"""Read closed triangle meshes and compute grids of signed distances from them.
 
-trimesh reads the files, libigl measures: the distance of the nearest triangle, with the sign of
-the fast winding number, which small faults of a surface do not turn over far from it.
+trimesh reads the files and libigl computes distances: that of the nearest triangle, with the sign
+of the fast winding number, which is robust against small faults of the mesh.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from stiffopt.model.compiler import BuildError, cache_directory, write_atomicall
 
 Array = NDArray[np.float64]
 
-_NEAR = 0.025  # m about the surface that the fine grid covers
-_FAR = 0.15  # m, or the largest extent, that the coarse grid covers
+_NEAR = 0.025  # m, margin of the fine grid about the surface
+_FAR = 0.15  # m, least margin of the coarse grid; at least the largest extent
 _CELLS, _COARSE_CELLS = 64, 48  # along the largest extent of the grids
 _MOST_POINTS = 4_000_000
 
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """A closed surface of triangles, wound so that their normals point outside.
+    """A closed surface of triangles, wound so that their normals point outwards.
 
     Attributes
     ----------
@@ -46,10 +46,10 @@ class Surface:
         return np.asarray(np.ptp(self.vertices, axis=0))
 
     def distances(self, points: Array) -> Array:
-        """Signed distances (N,) of points (N, 3), negative inside."""
+        """Return signed distances (N,) of points (N, 3), negative inside."""
         import igl
 
-        # not igl.signed_distance, whose distances with this sign are off by up to 0.1 mm
+        # igl.signed_distance is inexact with this sign: errors are up to 0.1 mm
         far = np.sqrt(igl.point_mesh_squared_distance(points, self.vertices, self.faces)[0])
         inside = igl.fast_winding_number(self.vertices, self.faces, points) > 0.5
         return np.asarray(np.where(inside, -far, far))
@@ -57,7 +57,7 @@ class Surface:
 
 @lru_cache(maxsize=256)
 def distance_of(surface: Surface, point: tuple[float, ...]) -> float:
-    """Signed distance of one point (3,), for which igl looks at all triangles first."""
+    """Return the signed distance of one point (3,), cached: igl reads all triangles first."""
     return float(surface.distances(np.array([point]))[0])
 
 
@@ -88,8 +88,8 @@ def read_surface(path: Path, changed: int, scale: float) -> Surface:
 
     Parameters
     ----------
-    changed : when the file was changed, so that a changed file is read again.
-    scale : how many m a unit of the file is.
+    changed : modification time of the file; part of the cache key.
+    scale : length of one unit of the file, in m.
 
     Raises
     ------
@@ -120,7 +120,7 @@ def read_surface(path: Path, changed: int, scale: float) -> Surface:
 
 
 def _check(mesh: object, path: Path) -> None:
-    """Refuse what is no closed surface."""
+    """Reject a mesh that is not a closed surface."""
     faces, vertices = np.asarray(mesh.faces), np.asarray(mesh.vertices)  # type: ignore[attr-defined]
     if not len(faces):
         raise InputError(f"'{path}' is empty: it has no triangles with an area")
@@ -151,12 +151,12 @@ def grids_about(surface: Surface, spacing: float) -> tuple[DistanceGrid, Distanc
 
 
 def usual_spacing(surface: Surface) -> float:
-    """Edge of the fine grid's cubes, in m, unless another is asked for."""
+    """Return the default edge of the fine grid's cubes, in m."""
     return (float(surface.extent.max()) + 2 * _NEAR) / _CELLS
 
 
 def _kept_grid(surface: Surface, spacing: float, reach: float) -> DistanceGrid:
-    """The grid from the cache folder, or made and put there if that can be."""
+    """Return the grid from the cache folder, or compute it and store it there if possible."""
     low = surface.vertices.min(axis=0) - reach
     shape = np.ceil((surface.extent + 2 * reach) / spacing).astype(int) + 2
     path = None
@@ -174,7 +174,7 @@ def _kept_grid(surface: Surface, spacing: float, reach: float) -> DistanceGrid:
 
 
 def _content(surface: Surface, spacing: float, reach: float) -> str:
-    """What a grid depends on, as a name of a file."""
+    """Return a hash of everything that a grid depends on, for a file name."""
     total = hashlib.sha256(surface.vertices.tobytes())
     total.update(surface.faces.tobytes())
     total.update(f"{spacing!r} {reach!r}".encode())

@@ -1,11 +1,11 @@
 """Distances of points from the objects of a scene, in the CasADi VM and for C.
 
-There is one library of machine code for all kinds of objects. What a scene says are arguments of
-its functions, so that scenes never compile:
+One library of machine code serves all kinds of objects. A scene's numbers are arguments of
+its functions, so a new scene needs no compilation:
 
 * ``distance_KEY``: (point, parameters of a piece) to the distance and its gradient (3,);
-* ``cell_KEY``, of kinds that interpolate in a grid: to the cube (3,) of a point;
-* ``passage_KEY``, of rings: to height, how far beyond the circle, distance of the disc, and the
+* ``cell_KEY``, for kinds that interpolate in a grid: to the cube (3,) of a point;
+* ``passage_KEY``, for rings: to height, distance beyond the circle, distance of the disc, and the
   gradient (3,) of that.
 """
 
@@ -30,8 +30,8 @@ from stiffopt.model.obstacles import OBSTACLES
 Array = NDArray[np.float64]
 
 _SOURCES = (str(Path(__file__).with_name("native") / "scene.c"),)
-_COURSES = {"convex": 0, "concave": 1, "any": 2}  # as scene.h has them
-_MEMORY, _MOST_PARAMETERS = 64, 32  # as scene.h has them
+_COURSES = {"convex": 0, "concave": 1, "any": 2}  # as in scene.h
+_MEMORY, _MAX_PARAMETERS = 64, 32  # as in scene.h
 
 _integer, _pointer = ctypes.c_int64, ctypes.c_void_p
 
@@ -40,7 +40,7 @@ _kept: list[Library] = []
 
 
 def scene_library() -> Library | None:
-    """Machine code of all distances; None where it is not there (yet). Once found it is kept."""
+    """Return machine code of all distances; None if it is not ready. Once found it is cached."""
     if not _kept:
         found = library("distances of scenes", distance_functions, _SOURCES)
         _kept.extend([] if found is None else [found])
@@ -48,7 +48,7 @@ def scene_library() -> Library | None:
 
 
 def distance_functions() -> list[ca.Function]:
-    """The functions of all kinds of objects."""
+    """Return the functions of all kinds of objects."""
     found = []
     for key, kind in OBSTACLES.items():
         point, q = ca.SX.sym("point", 3), ca.SX.sym("parameters", kind.n_parameters)
@@ -62,7 +62,7 @@ def distance_functions() -> list[ca.Function]:
             passage.append(ca.gradient(passage[-1], point))
             found.append(_function(f"passage_{key}", point, q, passage))
     for function in found:
-        if function.sz_w() > _MEMORY or function.sz_iw() or function.size1_in(1) > _MOST_PARAMETERS:
+        if function.sz_w() > _MEMORY or function.sz_iw() or function.size1_in(1) > _MAX_PARAMETERS:
             raise NotImplementedError(f"{function.name()} needs more memory than scene.h has")
     return found
 
@@ -78,13 +78,13 @@ def _interpreted() -> dict[str, BatchFunction]:
 
 
 class Distances(NamedTuple):
-    """Of points from an object.
+    """Distances of points from an object.
 
     Attributes
     ----------
     values : (k,), in m.
     normals : their gradients (k, 3).
-    pieces : which piece of the object is the nearest, (k,).
+    pieces : index of the nearest piece of the object, (k,).
     """
 
     values: Array
@@ -93,12 +93,12 @@ class Distances(NamedTuple):
 
 
 class Passages(NamedTuple):
-    """Where points are beside a ring.
+    """Positions of points relative to a ring.
 
     Attributes
     ----------
     heights : above its plane, (k,), in m.
-    beyond : how far beyond its circle, (k,), in m.
+    beyond : distances beyond its circle, (k,), in m.
     from_disc : distances of the disc (k,), in m.
     normals : their gradients (k, 3).
     """
@@ -110,7 +110,7 @@ class Passages(NamedTuple):
 
 
 class SceneObjectInC(ctypes.Structure):
-    """`SceneObject` of native/scene.h."""
+    """Structure `SceneObject` of native/scene.h."""
 
     _fields_ = [
         *((name, _pointer) for name in ("distance", "cell", "passage")),
@@ -121,7 +121,7 @@ class SceneObjectInC(ctypes.Structure):
 
 
 class MeasuredObject:
-    """An object with its numbers, from which distances are measured.
+    """An object as numbers, from which distances are computed.
 
     Attributes
     ----------
@@ -142,7 +142,7 @@ class MeasuredObject:
         self._shapes = np.array([grid.shape for grid in self._grids], dtype=np.int64)
 
     def distances(self, points: Array) -> Distances:
-        """Distances of points (k, 3)."""
+        """Return the distances of points (k, 3)."""
         found = [self._of_piece(index, points) for index in range(len(self._parameters))]
         values = np.stack([value for value, _ in found])  # (pieces, k)
         normals = np.stack([normal for _, normal in found])  # (pieces, k, 3)
@@ -150,7 +150,7 @@ class MeasuredObject:
         return Distances(values[pieces, rows], normals[pieces, rows], pieces)
 
     def piece_distance(self, index: int, point: Array) -> float:
-        """Distance of a point (3,) from one piece."""
+        """Return the distance of a point (3,) from one piece."""
         return float(self._of_piece(index, point[None])[0][0])
 
     def _of_piece(self, index: int, points: Array) -> tuple[Array, Array]:
@@ -161,7 +161,7 @@ class MeasuredObject:
         return value[:, 0, 0], normal[:, :, 0]
 
     def _with_corners(self, index: int, points: Array) -> Array:
-        """Parameters (k, size) with the values at the corners of the points' cubes."""
+        """Return parameters (k, size) with the grid values at the corners of the points' cubes."""
         (cells,) = self._call("cell", points, self._parameters[index])
         i, j, k = cells[:, :, 0].astype(int).T
         rows = np.repeat(self._parameters[index][None], len(points), axis=0)
@@ -170,7 +170,7 @@ class MeasuredObject:
         return rows
 
     def passages(self, points: Array) -> Passages:
-        """Where points (k, 3) are beside a ring."""
+        """Return the positions of points (k, 3) relative to a ring."""
         height, beyond, disc, normal = self._call("passage", points, self._parameters[0])
         return Passages(height[:, 0, 0], beyond[:, 0, 0], disc[:, 0, 0], normal[:, :, 0])
 
@@ -178,7 +178,7 @@ class MeasuredObject:
         return _interpreted()[f"{what}_{self.key}"].many(points, parameters)
 
     def in_c(self, code: Library) -> SceneObjectInC:
-        """The object as a structure for C, which points into this object's memory."""
+        """Return the object as a structure for C, which points into this object's memory."""
         return SceneObjectInC(
             distance=_address(code, f"distance_{self.key}"),
             cell=_address(code, f"cell_{self.key}") if self.is_interpolated else None,

@@ -1,16 +1,16 @@
-"""The arm under gravity and loads: the stable equilibrium reached continuously from rest.
+"""`Equilibrium`: the stable equilibrium under gravity and loads, reached continuously from rest.
 
-Newton's method on the shooting problem (`stiffopt.model.shooting`), along a path: first the
-weight grows on the unpressurised arm, then pressures and loads grow together.  Steps are halved
-where Newton's method does not contract at once or stability is lost, and where that no longer
-helps the path has ended: the arm buckles or falls over there.
+Newton's method solves the shooting problem (`stiffopt.model.shooting`) along a path: first the
+weight grows on the unpressurised arm, then pressures and loads grow together.  A step is halved
+if Newton's method does not contract at once or if stability is lost.  If that no longer helps, the
+path has ended: the arm buckles or falls over there.
 
-Integrating a long hanging arm from its tip magnifies the smallest turn there by many orders, and
-plain shooting then converges only from very near.  So the states after every step (orientation
-and moment) are unknowns of their own, and each step's defect (its end less the state meant to be
-there) is driven to zero together with the turn of the base: multiple shooting.  The linear
-system is solved at the cost of single shooting by carrying the changes per turn of the tip and
-the defects along (the lifted Newton method, J. Albersmeyer and M. Diehl, SIAM J. Optim. 20, 2010).
+Integrating a long hanging arm from its tip magnifies the smallest turn there by many orders of
+magnitude, so plain shooting converges only from very near.  Therefore the states after every step
+(orientation and moment) are unknowns too, and each step's defect (its end less the next unknown
+state) is driven to zero together with the turn of the base: multiple shooting.  The linear
+system is solved at the cost of single shooting by propagating the changes per turn of the tip and
+the defects (the lifted Newton method, J. Albersmeyer and M. Diehl, SIAM J. Optim. 20, 2010).
 """
 
 from functools import cached_property
@@ -29,15 +29,15 @@ from stiffopt.model.shooting import SAME_STATION, Shooting
 Vector = NDArray[np.float64]
 
 _LARGEST_TURN = 1.0  # rad of tip rotation in one continuation step; a longer one is halved
-_SHORTEST_STEP = 1e-3  # of the way from rest; less means that the path has ended
-_QUADRATIC = 1e-6  # rad; after a correction this small, convergence being quadratic, 1e-12 is left
+_SHORTEST_STEP = 1e-3  # share of the path from rest; below it the path has ended
+_QUADRATIC = 1e-6  # rad; convergence is quadratic: after such a correction the error is 1e-12
 _MOST_ITERATIONS = 12
 
 
 class Loads(NamedTuple):
-    """Loads on the arm, each as CasADi or NumPy column.
+    """Loads on the arm, as CasADi or NumPy columns.
 
-    `tip` and `station` hold a dead wrench in base axes (6,) over a follower wrench in the axes
+    `tip` and `station` hold a dead wrench in base axes (6,), then a follower wrench in the axes
     of the loaded point (6,); `gravity` (3,) is in base axes.
     """
 
@@ -47,22 +47,22 @@ class Loads(NamedTuple):
 
     @property
     def are_conservative(self) -> bool:
-        """Whether all are dead forces, which have a potential."""
+        """Whether all loads are dead forces, which have a potential."""
         return not (self.tip[3:].any() or self.station[3:].any())
 
 
 def dead_and_follower(wrench: Vector, frame: Frame) -> Vector:
-    """Wrench (6,) as `Loads` has it (12,): dead where its frame is the base, else follower."""
+    """Return a wrench (6,) as `Loads` has it (12,): dead in frame "base", otherwise follower."""
     check_choice("frame", frame, get_args(Frame))
     none = np.zeros(6)
     return np.concatenate([wrench, none] if frame == "base" else [none, wrench])
 
 
 class EquilibriumState(NamedTuple):
-    """An equilibrium: the tip's orientation (w, x, y, z), from which all else follows.
+    """An equilibrium: the tip's orientation (w, x, y, z), which determines the rest.
 
-    `states` (7, k) hold orientation and moment after each integration step, which Newton's
-    method starts from.
+    `states` (7, k) hold orientation and moment after each integration step, as starts of Newton's
+    method.
     """
 
     pressures: Vector
@@ -72,12 +72,12 @@ class EquilibriumState(NamedTuple):
 
 
 class Continuation(NamedTuple):
-    """How far an equilibrium could be followed.
+    """The end of a path of equilibria.
 
     Attributes
     ----------
-    state : the last one that was found.
-    share : of the way that it is at; 1.0 means arrived.
+    state : the last equilibrium that was found.
+    share : share of the path at which it is; 1.0 is the end.
     unstable : whether the path ends because stability is lost there.
     """
 
@@ -92,7 +92,7 @@ class Equilibrium:
     Parameters
     ----------
     shooting : the arm.
-    at : arc length of the station that the loads of `Loads.station` act at; None is the tip.
+    at : arc length of the station on which `Loads.station` acts; None is the tip.
     """
 
     def __init__(self, shooting: Shooting, at: float | None = None) -> None:
@@ -101,7 +101,7 @@ class Equilibrium:
         self._rest: dict[bytes, Continuation] = {}
 
     def arguments(self, state: EquilibriumState) -> tuple[Vector, ...]:
-        """Numbers for the inputs of a `Chain` at an equilibrium."""
+        """Return the numerical inputs of a `Chain` at an equilibrium."""
         x = np.concatenate([np.zeros(3), state.pressures, np.zeros(6)])
         return (state.quaternion, x, *state.loads)
 
@@ -117,10 +117,10 @@ class Equilibrium:
         )
 
     def correct(self, guess: EquilibriumState) -> EquilibriumState | None:
-        """Newton's method from a nearby state; None if that is not near.
+        """Run Newton's method from a nearby state; return None if it is not near.
 
         "Near" means that the first correction turns no part of the arm by more than a radian
-        and later ones shrink: then the path from the guess to the answer has no fold in between.
+        and later ones shrink, so there is no fold between the guess and the answer.
         """
         state, previous = guess, _LARGEST_TURN
         for iteration in range(_MOST_ITERATIONS):
@@ -138,11 +138,11 @@ class Equilibrium:
         return None
 
     def is_stable(self, state: EquilibriumState) -> bool:
-        """Whether an equilibrium is a minimum of the energy (Jacobi's condition).
+        """Return whether an equilibrium is a minimum of the energy (Jacobi's condition).
 
-        Follower loads and moments have no energy.  There what counts is that the arm has not
-        passed a divergence, where turns of the tip leave the base unturned and beyond which they
-        turn it the wrong way round.  Flutter is not looked for.
+        Follower loads and moments have no energy.  For these, the arm must not have passed a
+        divergence, where turns of the tip leave the base unturned, and beyond which they turn it
+        the opposite way. Flutter is not detected.
         """
         blocks, base_turn = (part.full() for part in self._stability(*self.arguments(state)))
         if not (np.isfinite(blocks).all() and np.isfinite(base_turn).all()):
@@ -161,9 +161,9 @@ class Equilibrium:
         shortest: float = _SHORTEST_STEP,
         stable: bool = True,
     ) -> "Continuation":
-        """Equilibrium reached continuously between two sets of pressures and loads.
+        """Follow the equilibrium continuously between two sets of pressures and loads.
 
-        Goes the straight way from `start` to `end` (whose shape is not used) in steps no shorter
+        The path is straight from `start` to `end` (whose shape is not used), in steps no shorter
         than the share `shortest`; stability is checked if `stable`.
         """
         state, share, step = start, 0.0, 1.0
@@ -183,7 +183,7 @@ class Equilibrium:
         return Continuation(state, 1.0, False)
 
     def settle(self, pressures: Vector, loads: Loads) -> EquilibriumState:
-        """Equilibrium reached from rest: first the arm's weight, then pressures and loads.
+        """Find the equilibrium reached from rest: first the arm's weight, then pressures and loads.
 
         Raises
         ------
@@ -206,7 +206,7 @@ class Equilibrium:
         return state
 
     def _at_rest(self, gravity: Vector) -> EquilibriumState:
-        """The unpressurised arm under its own weight and payload."""
+        """Return the unpressurised arm under its own weight and payload."""
         key = gravity.tobytes()
         if key not in self._rest:
             none = Loads(np.zeros(3), np.zeros(12), np.zeros(12))
@@ -229,7 +229,7 @@ class Equilibrium:
         return path.state
 
     def shape(self, state: EquilibriumState, stations: Vector) -> Vector:
-        """Poses (k, 4, 4) at arc lengths (k,) of an equilibrium."""
+        """Return the poses (k, 4, 4) at arc lengths (k,) of an equilibrium."""
         sections = [np.asarray(part) for part in self.shooting.sections(state.pressures)]
         length = self.shooting.description.length
         station_at = length if self.at is None else self.at
@@ -280,7 +280,7 @@ def _lost(share: float, what: str) -> str:
 
 
 def _between(start: EquilibriumState, end: EquilibriumState, share: float) -> tuple[Vector, Loads]:
-    """Pressures and loads at a share of the straight way between two states."""
+    """Return the pressures and loads at a share of the straight path between two states."""
 
     def mix(a: Vector, b: Vector) -> Vector:
         return (1 - share) * a + share * b
@@ -291,11 +291,11 @@ def _between(start: EquilibriumState, end: EquilibriumState, share: float) -> tu
 
 # Newton's method --------------------------------------------------------------------------------
 
-_CARRIED = 4  # changes carried along: three turns of the tip, and the defects
+_CARRIED = 4  # propagated changes: three turns of the tip, and the defects
 
 
 class _Carried:
-    """A value with its changes (k, 4) along the carried directions."""
+    """A value with its changes (k, 4) along the propagated directions."""
 
     def __init__(self, value: ca.MX, changes: ca.MX) -> None:
         self.value = value
@@ -312,7 +312,7 @@ def _constant(value: ca.MX) -> _Carried:
 
 
 def _apply(function: ca.Function, *arguments: _Carried) -> list[_Carried]:
-    """Outputs of a function with their changes, by forward differentiation."""
+    """Return the outputs of a function with their changes, by forward differentiation."""
     values = [argument.value for argument in arguments]
     outputs = function.call(values)
     seeds = [argument.changes for argument in arguments]
@@ -321,7 +321,7 @@ def _apply(function: ca.Function, *arguments: _Carried) -> list[_Carried]:
 
 
 def _applied_wrench() -> ca.Function:
-    """Force and moment in base axes of a dead and a follower wrench (12,) at orientation q."""
+    """Return the function of q and a load (12,) to its force and moment in base axes."""
     q, load = ca.SX.sym("q", 4), ca.SX.sym("load", 12)
     R = lie.rotation_from_quaternion(q)
     force, moment = load[:3] + R @ load[6:9], load[3:6] + R @ load[9:]
@@ -329,16 +329,16 @@ def _applied_wrench() -> ca.Function:
 
 
 def _rigid_step() -> ca.Function:
-    """Moment added by a rigid connector of a length at orientation q under a force."""
+    """Return the function of q, force and length to the moment that a rigid connector adds."""
     q, force, length = ca.SX.sym("q", 4), ca.SX.sym("n", 3), ca.SX.sym("c")
     axis = lie.rotation_from_quaternion(q)[:, 2]
     return ca.Function("rigid", [q, force, length], [length * ca.cross(axis, force)])
 
 
 def newton_step(shooting: Shooting, at: float | None = None) -> ca.Function:
-    """One step of the lifted Newton method, with the load's station at `at` (None: the tip).
+    """Return one step of the lifted Newton method, with the load's station at `at` (None: the tip).
 
-    Maps (tip quaternion (4,), states (7, k), pressures, gravity, tip load, station load) to
+    It maps (tip quaternion (4,), states (7, k), pressures, gravity, tip load, station load) to
     (quaternion, states, largest turn of the tip or a state in rad).
     """
     pieces = shooting.pieces([] if at is None else [at])
@@ -355,7 +355,7 @@ def newton_step(shooting: Shooting, at: float | None = None) -> ca.Function:
     force, moment = _apply(applied, orientation, _constant(tip))
     force = force + shooting.description.tip_mass * gravity
     length = shooting.description.length
-    met: list[ca.MX] = []  # changes of the states after each step
+    met: list[ca.MX] = []  # changes of the state after each step
     for piece in pieces:
         if abs(piece.distal - (length if at is None else at)) <= SAME_STATION * length:
             added_force, added_moment = _apply(applied, orientation, _constant(station))
@@ -392,11 +392,11 @@ def newton_step(shooting: Shooting, at: float | None = None) -> ca.Function:
 
 
 def _lifted_step(step: ca.Function) -> ca.Function:
-    """Integration step with changes carried along and the lifted state in place of its end.
+    """Return an integration step that propagates changes to the lifted state at its end.
 
-    Maps orientation, moment and force, each followed by its changes, the section (strain,
-    compliance), weight, length and lifted state (7,) to the changes of the latter: those of the
-    step's end, the defect added to the last of them.
+    It maps orientation, moment and force, each followed by its changes, the section (strain,
+    compliance), weight, length and lifted state (7,) to the changes of the lifted state: those of
+    the step's end, with the defect added to the last column.
     """
     q, m, n = ca.SX.sym("q", 4), ca.SX.sym("m", 3), ca.SX.sym("n", 3)
     dq, dm, dn = (ca.SX.sym("d", size, _CARRIED) for size in (4, 3, 3))

@@ -1,7 +1,7 @@
-"""How the shape of a soft arm lags behind its pressures, and remembers them.
+"""Lag, hysteresis and creep: how the shape of a soft arm depends on past pressures.
 
-Between a channel's commanded pressure p and the pressure u that an arm in equilibrium would need
-for the shape that it has are, in this order,
+The effective pressure u is the pressure at which an arm in equilibrium would have the present
+shape. It follows from a channel's commanded pressure p by, in this order,
 
 * a dead time and a first-order lag of regulator, tubes and silicone:
   ``lag x' = p(t - dead_time) - x``;
@@ -12,20 +12,20 @@ for the shape that it has are, in this order,
 
 and ``u = x + sum_j share_j (y_j - x) + sum_k share_k (z_k - x)``.
 
-Silicone holds on to its stretch rather than to pressures, and to its elongation more than to its
-bending, so that chambers stay stretched after they were deflated.  A segment's elongation goes with
-the mean of its pressures and its bending with how far each is from that.  So an operator may act on
-one of these parts instead of each channel by itself: with the projection A on that part (of all
-channels: 1/c in every place; of bending: 1 less that), y_j follows ``A x``, z_k follows it too, and
-what acts is ``share A (y_j - x)``, which neither moves nor knows of the other part.
+Silicone remembers its stretch rather than pressures, and its elongation more than its bending, so
+chambers stay stretched after they were deflated.  A segment's elongation depends on the mean of its
+pressures, and its bending on their deviations from it.  So an operator may act on one of these
+parts instead of on each channel.  With the projection A on that part (elongation: 1/c everywhere
+for c channels; bending: identity minus that), y_j and z_k follow ``A x``, and the operator adds
+``share A (y_j - x)``, which does not affect or depend on the other part.
 
-Settled, and in the middle between loading and unloading, ``u = p``: a history says nothing about
-equilibrium, which the strain law describes.  After a long monotone way of all pressures u differs
-from p by ``sum_j share_j width_j`` (of what does not act on bending), the most that it can; by
-bending up to twice that.
+Settled, and in the middle between loading and unloading, ``u = p``: a history does not change the
+equilibrium, which the strain law describes.  After a long monotone change of all pressures u
+differs from p by ``sum_j share_j width_j`` (without operators of bending), the most that it can;
+operators of bending contribute up to twice as much.
 
-This module knows nothing of the rest of the model, so that a simulated plant, an estimator and a
-calibration can run the same operators.
+This module does not depend on the rest of the model, so that a simulated plant, an estimator and a
+calibration can use the same operators.
 """
 
 from __future__ import annotations
@@ -46,12 +46,12 @@ from stiffopt.units import Duration, Pressure, Ratio
 Array = NDArray[np.float64]
 
 Part = Literal["pressure", "elongation", "bending"]
-"""What an operator acts on: each channel's pressure, their mean, or how far they are from it."""
+"""What an operator acts on: each channel's pressure, their mean, or deviations from the mean."""
 
 _Share = Annotated[Ratio, Field(ge=0, lt=1)]
 
-_SAME = 1e-9  # s; moments that are closer are one, whatever was lost by rounding
-_CLOSE = 1e-3  # below it, a series is better than a difference of exponentials
+_SAME = 1e-9  # s; times that differ by less are equal up to rounding
+_CLOSE = 1e-3  # below it, a series is more accurate than a difference of exponentials
 
 
 class Play(Schema):
@@ -59,9 +59,9 @@ class Play(Schema):
 
     Attributes
     ----------
-    width : half of the way that a pressure must go back before the operator follows, in Pa.
+    width : half of the pressure change after a reversal before the operator follows, in Pa.
     share : share of the pressure that acts through the operator.
-    of : what of the segment's pressures it acts on.
+    of : part of the segment's pressures on which it acts.
     """
 
     width: Annotated[Pressure, Field(gt=0)]
@@ -76,7 +76,7 @@ class Creep(Schema):
     ----------
     time : its time constant, in s.
     share : share of the pressure that acts through the operator.
-    of : what of the segment's pressures it acts on.
+    of : part of the segment's pressures on which it acts.
     """
 
     time: Annotated[Duration, Field(gt=0)]
@@ -87,15 +87,16 @@ class Creep(Schema):
 class History(Schema):
     """How the shape of a segment follows the pressures of its channels, all in the same way.
 
-    Operators of pressure know one channel only, those of elongation and bending all of the segment.
+    Operators of pressure act on each channel alone, those of elongation and bending on all channels
+    of the segment.
 
     Attributes
     ----------
-    dead_time : until a pressure has any effect, in s.
-    lag : time constant with which it then has its effect, in s.
-    lag_falling : the same while the pressure falls, in s, as chambers empty otherwise than they
-        fill; 0: the same.
-    memory : of each channel, factor on the shares of play and creep; one for all if empty.
+    dead_time : delay before a pressure has any effect, in s.
+    lag : time constant of its effect after that, in s.
+    lag_falling : the same while the pressure falls, in s, as chambers empty at another rate than
+        they fill; 0: the same.
+    memory : factor on the shares of play and creep for each channel; one for all if empty.
     play : hysteresis.
     creep : slow effects.
     """
@@ -124,7 +125,7 @@ class History(Schema):
 
     @property
     def shares(self) -> tuple[float, float]:
-        """Shares of elongation and of bending that act through operators, without the memory."""
+        """Shares of elongation and of bending that act through operators, without `memory`."""
         of_elongation, of_bending = (
             sum(part.share for part in self.parts if part.of != other)
             for other in ("bending", "elongation")
@@ -133,20 +134,20 @@ class History(Schema):
 
     @property
     def largest_memory(self) -> float:
-        """How far hysteresis can take the shape from equilibrium, as a pressure, in Pa.
+        """Largest effect of hysteresis on the shape, as a pressure, in Pa.
 
-        Of a channel with another `memory` it is that many times as far.
+        For a channel with another `memory` it is multiplied by that.
         """
         # |A v| <= 2 (1 - 1/c) max |v| for the projection A on bending
         return sum(part.share * part.width * (1 + (part.of == "bending")) for part in self.play)
 
     @property
     def quick_share(self) -> float:
-        """Share of a small, quick change that has its effect at once, of all channels together.
+        """Share of a small, quick change that has its effect at once, over all channels.
 
-        Play and creep hold on to the rest; what holds against pressure holds against a push too,
-        so that such a push meets an arm that is 1 / quick_share times as stiff as in equilibrium.
-        That is a mean over the axis and the two directions across where these are not alike.
+        Play and creep delay the rest.  What resists pressure also resists a push, so a quick small
+        push meets an arm that is 1 / quick_share times as stiff as in equilibrium. This is a mean
+        over the axis and the two directions across, where these differ.
         """
         memory = sum(self.memory) / len(self.memory) if self.memory else 1.0
         of_elongation, of_bending = self.shares
@@ -158,15 +159,15 @@ class History(Schema):
         return 1 + len(self.parts)
 
     def next_state(self, state: ca.SX, before: ca.SX, now: ca.SX, step: ca.SX) -> ca.SX:
-        """State (m, c) of a segment's channels after (delayed) pressures have changed linearly.
+        """Return the state (m, c) of a segment after a linear change of (delayed) pressures.
 
-        Lag and creep are exact however long the step.  So is play while what it follows runs one
-        way, which it does under constant pressures where lags do not depend on the direction.
+        Lag and creep are exact for any step.  Play is exact while its input is monotone, as under
+        constant pressures where lags do not depend on the direction.
 
         Parameters
         ----------
         state : (m, c)
-            Before the step, of each channel: x, every y_j, every z_k.
+            Before the step, for each channel: x, every y_j, every z_k.
         before, now : (c,)
             Delayed pressures before and after the step, in Pa.
         step : scalar
@@ -196,7 +197,7 @@ class History(Schema):
         return ca.vertcat(*end)
 
     def effective(self, state: Any, first: int = 0) -> Any:
-        """Pressures u (1, c) at which an arm in equilibrium has the shape of this state (m, c).
+        """Return the effective pressures u (1, c) of a state (m, c).
 
         `first` is the index of the first of these channels within its segment, from 0.
         """
@@ -209,19 +210,19 @@ class History(Schema):
         return x + memory * slow
 
     def memory_of(self, channel: int) -> float:
-        """Factor on the shares of a channel of the segment, from 0."""
+        """Return the factor on the shares of a channel of the segment, from 0."""
         return self.memory[channel] if len(self.memory) else 1.0
 
     def settled(self, pressures: Array, sides: Array) -> Array:
-        """State (m, c) of channels long after pressures (c,) were reached.
+        """Return the state (m, c) of channels long after pressures (c,) were reached.
 
         Parameters
         ----------
         pressures :
             In Pa.
         sides :
-            Where in its play each channel is (c,): -1 after a long rise, 1 after a long fall, 0 in
-            the middle. Operators of elongation are where the channels are on an average.
+            Position of each channel within its play (c,): -1 after a long rise, 1 after a long
+            fall, 0 in the middle. Operators of elongation take the mean of the channels.
         """
         rows = [pressures]
         rows += [part_of(pressures + sides * play.width, play.of) for play in self.play]
@@ -229,7 +230,7 @@ class History(Schema):
         return np.array(rows)
 
     def from_rest(self, pressures: Array) -> Array:
-        """State (m, c) long after a rise from no pressure, on an arm that knew none before."""
+        """Return the state (m, c) long after the first rise from zero pressure."""
         rows = [pressures]
         for play in self.play:
             x = part_of(pressures, play.of)
@@ -242,7 +243,7 @@ NO_HISTORY = History()
 
 
 def part_of(pressures: Any, of: Part) -> Any:
-    """What an operator acts on of the pressures (..., c) of a segment, as many."""
+    """Return the part of a segment's pressures (..., c) on which an operator acts, same shape."""
     if of == "pressure":
         return pressures
     if isinstance(pressures, np.ndarray):
@@ -253,26 +254,26 @@ def part_of(pressures: Any, of: Part) -> Any:
 
 
 def _convolution(a: ca.SX, b: ca.SX) -> ca.SX:
-    """``int_0^1 a exp(-a (1 - t)) exp(-b t) dt``, also where the rates a and b are the same."""
-    apart = ca.fabs(a - b)
-    far = ca.fmax(apart, _CLOSE)
-    series = 1 - apart / 2 * (1 - apart / 3 * (1 - apart / 4))
-    mean = ca.if_else(apart < _CLOSE, series, (1 - ca.exp(-far)) / far)
+    """Return ``int_0^1 a exp(-a (1 - t)) exp(-b t) dt``, also for equal rates a and b."""
+    gap = ca.fabs(a - b)
+    far = ca.fmax(gap, _CLOSE)
+    series = 1 - gap / 2 * (1 - gap / 3 * (1 - gap / 4))
+    mean = ca.if_else(gap < _CLOSE, series, (1 - ca.exp(-far)) / far)
     return a * ca.exp(-ca.fmin(a, b)) * mean
 
 
 class Memory:
     """State of the histories of all channels of an arm, advanced in time.
 
-    A ``copy.copy`` of it is independent of it.
+    A ``copy.copy`` of it is independent.
 
     Parameters
     ----------
     histories : sequence
-        One per channel; None for a channel whose shape follows at once.
+        One per channel; None for a channel without delay or memory.
     places : sequence of int, optional
-        Index of each channel within its segment, from 0: channels with the same history are of one
-        segment where their places go on. By default each is a segment of its own.
+        Index of each channel within its segment, from 0: channels with the same history and
+        consecutive places form a segment. By default each is a segment of its own.
 
     Attributes
     ----------
@@ -298,7 +299,7 @@ class Memory:
         self.start(np.zeros(len(self._histories)))
 
     def start(self, pressures: ArrayLike) -> None:
-        """Set the state of an arm that was brought from no pressure to these (n,), in Pa."""
+        """Set the state of an arm that was brought from zero pressure to these (n,), in Pa."""
         p = self._checked(pressures)
         self._begin([h.from_rest(p[own]) for h, own in self._groups], p)
 
@@ -308,7 +309,7 @@ class Memory:
         self._begin([h.settled(p[own], np.full(len(p[own]), side)) for h, own in self._groups], p)
 
     def advance(self, step: float, pressures: ArrayLike) -> Array:
-        """Let time pass at constant commanded pressures (n,) and return the effective ones (n,).
+        """Advance time at constant commanded pressures (n,); return the effective ones (n,).
 
         Parameters
         ----------
@@ -323,7 +324,7 @@ class Memory:
     def run(self, step: float, pressures: ArrayLike) -> Array:
         """Take one step at each row of commanded pressures.
 
-        The result does not depend on how a time of constant pressures is cut into steps.
+        The result does not depend on how a time of constant pressures is divided into steps.
 
         Parameters
         ----------
@@ -346,7 +347,7 @@ class Memory:
         return effective
 
     def _segments(self) -> list[tuple[History, slice]]:
-        """Histories of the segments and where their channels are among all."""
+        """Return the histories of the segments, each with the slice of its channels."""
         starts = [
             c
             for c, place in enumerate(self._places)
@@ -360,7 +361,7 @@ class Memory:
     def _begin(self, states: list[Array], pressures: Array) -> None:
         self._state = np.concatenate([state.ravel(order="F") for state in states])
         self._time = 0.0
-        self._times = np.array([-np.inf])  # from when on each of the commands (k, n) was given
+        self._times = np.array([-np.inf])  # start times of the commands (k, n)
         self._commands = pressures[None, :]
         effective = [
             h.effective(x, self._places[own.start])[0]
@@ -369,7 +370,7 @@ class Memory:
         self.effective = np.concatenate(effective)
 
     def _follow_late(self, step: float, pressures: Array) -> Array:
-        """Effective pressures (m, n) after equal steps at pressures (m, n), dead times included."""
+        """Return effective pressures (m, n) after equal steps at (m, n), with dead times."""
         ends: Array = self._time + step * np.arange(len(pressures) + 1, dtype=np.float64)
         times = np.concatenate([self._times, ends[:-1]])
         commands = np.concatenate([self._commands, pressures])
@@ -385,19 +386,19 @@ class Memory:
         return effective
 
     def _marks(self, times: Array, ends: Array) -> Array:
-        """Ends of steps (m + 1,) and, between them, moments at which a command begins to act."""
+        """Return the ends of steps (m + 1,) and the times between when commands take effect."""
         acting = (times[1:, None] + self._delays).ravel()
         acting = acting[(acting > ends[0] + _SAME) & (acting < ends[-1] - _SAME)]
         if not len(acting):
             return ends
         after = np.searchsorted(ends, acting)
-        apart = np.minimum(acting - ends[after - 1], ends[after] - acting)
-        acting = np.sort(acting[apart > _SAME])
+        gap = np.minimum(acting - ends[after - 1], ends[after] - acting)
+        acting = np.sort(acting[gap > _SAME])
         acting = acting[np.diff(acting, prepend=-np.inf) > _SAME]
         return np.sort(np.concatenate([ends, acting]))
 
     def _follow(self, steps: float | Array, delayed: Array) -> Array:
-        """Effective pressures (k, n) after steps (k,) at constant delayed pressures (k, n)."""
+        """Return effective pressures (k, n) after steps (k,) at delayed pressures (k, n)."""
         state, end = self._state.copy(), np.empty_like(self._state)
         p, step, u = np.empty(delayed.shape[1]), np.empty(1), np.empty(delayed.shape[1])
         # A call with arrays costs ten times as much as one in place.

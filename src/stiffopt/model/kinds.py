@@ -1,4 +1,4 @@
-"""Discovery of the kinds of things of which each file of a package defines one."""
+"""Find the classes that the files of a package define, one kind of thing each."""
 
 from importlib import import_module
 from pkgutil import iter_modules

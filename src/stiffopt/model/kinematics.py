@@ -1,7 +1,7 @@
-"""From section strains to poses along the unloaded arm (eqs 6 and 7).
+"""Poses along the unloaded arm from the strains of its sections (eqs 6 and 7).
 
-A segment of constant strain is one exponential; the paper's product of five exponentials
-(eq. 7) is the same motion, but is undefined at zero curvature where this one is smooth.
+A segment of constant strain is one exponential.  The paper's product of five exponentials
+(eq. 7) is the same motion, but is undefined at zero curvature, where this one is smooth.
 """
 
 from collections.abc import Sequence
@@ -17,13 +17,13 @@ from stiffopt.model.laws import strain_law
 
 @dataclass(frozen=True)
 class Actuation:
-    """Pressures of the whole arm and what they make of each segment.
+    """Sections of an arm's segments as symbolic functions of its pressures.
 
     Attributes
     ----------
     pressures : all channel pressures (n,), proximal segment first, in Pa.
     sections : one per segment, proximal first.
-    margin : one positive number per segment while its strain law holds.
+    margin : a number per segment, positive while its strain law holds.
     radii : outer radius of each segment's section, in m.
     """
 
@@ -36,7 +36,7 @@ class Actuation:
     def of(
         cls, description: RobotDescription, laws: Sequence[StrainLaw] | None = None
     ) -> "Actuation":
-        """Symbolic actuation of a robot, by the strain laws of its segments or by given ones."""
+        """Return the actuation of a robot, by the strain laws of its segments or by given ones."""
         pressures = ca.SX.sym("p", description.n_pressures)
         if laws is None:
             laws = [strain_law(segment) for segment in description.segments]
@@ -51,20 +51,20 @@ class Actuation:
 
 
 def connector(length: ca.SX | float) -> ca.SX:
-    """Pose of the far end of a rigid connector in its near end."""
+    """Return the pose of the far end of a rigid connector in its near end."""
     return lie.transform(ca.SX.eye(3), ca.vertcat(0, 0, ca.SX(length)))
 
 
 def segment_pose(section: Section, arc_length: ca.SX | float) -> ca.SX:
-    """Pose (4, 4) at a reference arc length along a segment, in the segment's base."""
+    """Return the pose (4, 4) at a reference arc length along a segment, in the segment's base."""
     return lie.exp(section.strain * arc_length)
 
 
 def segment_jacobian(section: Section, arc_length: float, pressures: ca.SX) -> ca.SX:
-    """Body twist (6, c) of the far end of a segment per unit of its pressures (c,).
+    """Return the body twist (6, c) of a segment's far end per unit of its pressures (c,).
 
-    The derivative of the exponential in closed form; that of `segment_pose` by
-    `body_jacobian` is the same at several times the cost.
+    The derivative of the exponential in closed form; `body_jacobian` of `segment_pose`
+    gives the same at several times the cost.
     """
     twist = section.strain * arc_length
     change = ca.jacobian(section.strain, pressures) * arc_length  # (6, c)
@@ -91,7 +91,7 @@ def segment_jacobian(section: Section, arc_length: float, pressures: ca.SX) -> c
 
 
 def _coefficients_and_slopes(squared_angle: ca.SX) -> tuple[ca.SX, ...]:
-    """Coefficients of the exponential, and the slopes of the latter two by the squared angle."""
+    """Return the exponential's coefficients, and slopes of the last two by the squared angle."""
     x = ca.SX.sym("x")
     first, second, third = lie.exponential_coefficients(x)
     slopes = [ca.jacobian(second, x), ca.jacobian(third, x)]
@@ -100,7 +100,7 @@ def _coefficients_and_slopes(squared_angle: ca.SX) -> tuple[ca.SX, ...]:
 
 
 def body_jacobian(T: ca.SX, variables: ca.SX) -> ca.SX:
-    """Body twist of a moving frame per unit variable: (4, 4), (n,) -> (6, n).
+    """Return the body twist (6, n) of a moving frame (4, 4) per unit of variables (n,).
 
     ``J_i = (T^-1 dT/dx_i)^v``, in the axes of the moving frame, linear part first.
     """

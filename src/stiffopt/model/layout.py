@@ -1,13 +1,13 @@
-"""The layout of an arm, for which formulas and machine code are made, and the arm's numbers.
+"""`Layout`: what formulas and machine code of an arm depend on, apart from its numbers.
 
-Two arms have the same layout if they differ in numbers only: lengths, radii, moduli, compensation
+Two arms have the same layout if they differ only in numbers: lengths, radii, moduli, compensation
 and corrections.  These numbers are arguments of the formulas of the unloaded shape and of the
-section functions of the loaded rod, so that one compiled library serves every arm of a layout.
+section functions of the loaded rod, so one compiled library serves every arm of a layout.
 
-Some formulas are left out where an arm does not need them: a connector, a dead band, a centroid
-off the axis, an inclined section; and, together, gains and offsets of channels and the limits
-of bending that a calibration finds.  What is left out belongs to the layout.  So a layout has one
-library for arms as drawn and one for calibrated arms, which are about a tenth slower.
+Formulas that an arm does not need are left out, which is part of the layout: a connector, a dead
+band, a centroid off the axis, an inclined section; and, together, gains and offsets of channels and
+the limits of bending that a calibration finds.  So there is one library for arms as drawn and one
+for calibrated arms, which is about a tenth slower.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ from stiffopt.schema import Schema
 Vector = NDArray[np.float64]
 
 _NOT_IN_FORMULAS = {"chambers", "channels", "density", "history", "inner_radius"}
-"""Keys of a segment that act through its section's geometry, or not on statics at all."""
+"""Keys of a segment that act through its section's geometry, or do not affect statics."""
 _SWITCHES = {"connector", "dead_band"}
-"""Keys that leave formulas out where they are zero."""
+"""Keys whose formulas are left out where they are zero."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class Layout:
 
     Attributes
     ----------
-    skeleton : the arm's segments with their numbers left out; equal for arms of the same layout.
+    skeleton : the arm's segments without their numbers; equal for arms of the same layout.
     example : some arm of this layout.
     """
 
@@ -61,7 +61,7 @@ class SymbolicArm:
     ----------
     numbers : the arm's numbers (k,), see `numbers_of`.
     actuation : sections and margins as functions of the pressures and these numbers.
-    centroids : of each segment's section (2,), in m; sparse where it lies on the axis.
+    centroids : centroid (2,) of each segment's section, in m; sparse if it lies on the axis.
     tip : the unloaded arm up to its tip.
     """
 
@@ -89,7 +89,7 @@ def layout_of(description: RobotDescription) -> Layout:
 
 
 def numbers_of(description: RobotDescription) -> Vector:
-    """Return the numbers (k,) of an arm, in SI, in the order in which its layout takes them."""
+    """Return the numbers (k,) of an arm, in SI, in the order of its layout."""
     found: list[float] = []
     drawn = is_as_drawn(description)
     for segment, geometry in _parts(description):
@@ -101,7 +101,7 @@ def numbers_of(description: RobotDescription) -> Vector:
 
 @lru_cache(maxsize=64)
 def symbolic_arm(layout: Layout) -> SymbolicArm:
-    """Return the formulas of a layout; made once in a process."""
+    """Return the formulas of a layout; cached."""
     symbols: list[ca.SX] = []
 
     def symbol(name: str, *shape: int) -> ca.SX:
@@ -131,7 +131,7 @@ def free_tip_function(
 
     Parameters
     ----------
-    outputs : makes them from the shape of the tip and the symbols of the caller's own parameters.
+    outputs : function from the tip's shape and the symbols of the caller's parameters to outputs.
     """
     arm = symbolic_arm(layout)
     own = ca.SX.sym("own", n_parameters)
@@ -141,7 +141,7 @@ def free_tip_function(
 
 
 def is_as_drawn(description: RobotDescription) -> bool:
-    """Whether no channel has a gain or an offset, and nothing limits or lengthens by bending."""
+    """Return whether there are no gains and offsets, and no bending limits or lengthening."""
     for segment in description.segments:
         corrections = segment.corrections or Corrections()
         compensation = segment.compensation or Compensation()
@@ -153,7 +153,7 @@ def is_as_drawn(description: RobotDescription) -> bool:
 
 
 def _parts(description: RobotDescription) -> Iterator[tuple[Segment, SectionGeometry]]:
-    """Segments with what their formulas need written out, and their geometry as it acts."""
+    """Yield the segments with all needed defaults written out, and their effective geometry."""
     drawn = is_as_drawn(description)
     for segment in explicit(description).segments:
         corrections = segment.corrections or Corrections()
@@ -178,7 +178,7 @@ def _fields(schema: Schema) -> Iterator[tuple[str, Any]]:
 
 
 def _leaves(node: Any, drawn: bool, path: str = "") -> Iterator[tuple[str, Any, bool]]:
-    """What stands in a segment at each path, and whether it is a number of the arm."""
+    """Yield path and value of each entry of a segment, and whether it is a number of the arm."""
     if isinstance(node, Schema):
         for name, value in _fields(node):
             yield from _leaves(value, drawn, f"{path}.{name}")
@@ -191,7 +191,7 @@ def _leaves(node: Any, drawn: bool, path: str = "") -> Iterator[tuple[str, Any, 
 
 
 def _with_symbols(node: Any, symbol: Any, drawn: bool, key: str = "") -> Any:
-    """Copy with a symbol for each number, in the order of `_leaves`; not validated."""
+    """Copy a node with a symbol for each number, in the order of `_leaves`; not validated."""
     if isinstance(node, Schema):
         update = {name: _with_symbols(value, symbol, drawn, name) for name, value in _fields(node)}
         return node.model_copy(update=update)
@@ -201,7 +201,7 @@ def _with_symbols(node: Any, symbol: Any, drawn: bool, key: str = "") -> Any:
 
 
 def _geometry_numbers(geometry: SectionGeometry) -> Iterator[tuple[str, Any]]:
-    """Arrays of a geometry by name; what is zero in its kind of section is left out."""
+    """Yield the arrays of a geometry by name, without those that its kind of section lacks."""
     yield "area", geometry.area
     if geometry.centroid.any():
         yield "centroid", geometry.centroid

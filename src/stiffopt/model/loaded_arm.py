@@ -1,6 +1,6 @@
-"""An arm under gravity or loads in machine code: its rod, and equilibria from rest.
+"""`LoadedArm`: an arm under gravity or loads in machine code, and its equilibria from rest.
 
-The rod is integrated in C (``native/rod.h``) around the small functions of `stiffopt.model.rod`.
+The rod is integrated in C (``native/rod.h``) with the small functions of `stiffopt.model.rod`.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _integer, _double, _pointer = ctypes.c_int64, ctypes.c_double, ctypes.c_void_p
 
 
 class _Piece(ctypes.Structure):
-    """`RodPiece` of native/rod.h."""
+    """Structure `RodPiece` of native/rod.h."""
 
     _fields_ = [
         *((name, _integer) for name in ("kind", "parts", "slopes", "channel", "channels", "steps")),
@@ -38,7 +38,7 @@ class _Piece(ctypes.Structure):
 
 
 class _Rod(ctypes.Structure):
-    """`Rod` of native/rod.h."""
+    """Structure `Rod` of native/rod.h."""
 
     _fields_ = [
         *((name, _integer) for name in ("n", "pieces", "steps", "parts", "slopes")),
@@ -59,7 +59,7 @@ class LoadedArm:
     address : int
         Of its `Rod`.
     state_size : int
-        Numbers of an equilibrium's state.
+        Number of doubles of an equilibrium's state.
 
     Raises
     ------
@@ -71,7 +71,7 @@ class LoadedArm:
         equations = rod_functions(robot.layout)
         if equations is None:
             raise EquilibriumError("this arm has no compiled equations")
-        self._library, self._numbers = code, robot.numbers  # what pointers below lead to
+        self._library, self._numbers = code, robot.numbers  # own the memory of pointers below
         found = rod_pieces(robot.description, robot.resolution, equations)
         pieces = (_Piece * len(found))(*(_Piece(*piece) for piece in found))
         steps = sum(piece.steps for piece in found)
@@ -103,14 +103,14 @@ class LoadedArm:
             raise EquilibriumError("the unpressurised arm falls over")
 
     def change(self, robot: Arm) -> None:
-        """Become an arm that differs in moduli, corrections and tip mass only."""
+        """Switch to an arm that differs only in moduli, corrections and tip mass."""
         self._numbers = robot.numbers
         self._rod.numbers = self._numbers.ctypes.data
         self._rod.tip_mass = robot.description.tip_mass
         self._rest()
 
     def settled(self, pressures: Vector) -> tuple[NDArray[np.bool_], Vector, Vector]:
-        """Which pressures (N, n) have an equilibrium, their states and poses (N, 12)."""
+        """Return which pressures (N, n) have an equilibrium, their states and poses (N, 12)."""
         pressures = np.ascontiguousarray(pressures)
         count = len(pressures)
         states, poses = np.zeros((count, self.state_size)), np.zeros((count, 12))

@@ -1,4 +1,4 @@
-"""Manipulator: the numerical functions of one arm, single and batched, that everyone calls."""
+"""`Manipulator`: pose, Jacobian, compliance and stiffness of an arm, single and batched."""
 
 import os
 from collections.abc import Sequence
@@ -45,15 +45,15 @@ _ELEMENTS_PER_SEGMENT = 64  # of eq. 19
 class Manipulator(Arm, ShownInNotebook):
     """An arm as functions of its channel pressures, in SI units.
 
-    Pressures p are (n,) or, for a batch, (N, n) gauge pressures in Pa, proximal segment first;
-    a batch gives results with a leading axis N.  Without gravity and load everything is in
-    closed form (eqs 5-17).  With gravity or a tip load every quantity means the loaded arm: its
+    Pressures p are (n,) or, for a batch, (N, n) gauge pressures in Pa, proximal segment first; a
+    batch gives results with a leading axis N.  Without gravity and load everything is in closed
+    form (eqs 5-17).  With gravity or a tip load every quantity is that of the loaded arm: its
     static equilibrium reached continuously from rest, and the tangent compliance there.
 
     Parameters
     ----------
     description : RobotDescription
-        What the arm is.
+        The arm.
     force, moment : array_like, optional
         Load (3,) at the tip, in N and N m.
     load_frame : {"base", "tip"}
@@ -73,22 +73,22 @@ class Manipulator(Arm, ShownInNotebook):
     # -- shape ------------------------------------------------------------------------------
 
     def tip_pose(self, p: ArrayLike) -> Vector:
-        """Pose of the tip in the base frame (eq. 7), (4, 4) or (N, 4, 4)."""
+        """Return the pose of the tip in the base frame (eq. 7), (4, 4) or (N, 4, 4)."""
         if not self.is_loaded:
             return self._checked_tip(lambda q: self._tip.evaluate("tip_pose", q), p)
         return self._evaluate("pose", lambda tip: tip.transform, p)
 
     def tip_jacobian(self, p: ArrayLike) -> Vector:
-        """Twist of the tip in tip axes per pressure, (6, n): m/Pa above, rad/Pa below."""
+        """Return the tip's twist in tip axes per pressure, (6, n): in m/Pa, then in rad/Pa."""
         if not self.is_loaded:
             return self._checked_tip(lambda q: self._tip.evaluate("tip_jacobian", q), p)
         return self._evaluate("jacobian", lambda tip: tip.jacobian, p)
 
     def tip_jacobian_derivative(self, p: ArrayLike) -> Vector:
-        """Derivative of `tip_jacobian` by the pressures, (6, n, n); the last axis is the new.
+        """Return the derivative of `tip_jacobian` by the pressures, (6, n, n), on the last axis.
 
         With the paper's compensation it does not exist at exactly p = 0 (slip 6 of the model's
-        norm law), where the value returned belongs to the rounded cone.
+        norm law); there the value is that of the rounded cone.
         """
         n = self.n_pressures
         flat = self._evaluate(
@@ -97,32 +97,33 @@ class Manipulator(Arm, ShownInNotebook):
         return np.swapaxes(flat.reshape(*flat.shape[:-2], n, 6, n), -3, -2)
 
     def backbone(self, p: ArrayLike, n: int = 50) -> Vector:
-        """Poses (n, 4, 4) along the arm, equally spaced at rest from the base to the tip."""
+        """Return poses (n, 4, 4) along the arm, equally spaced at rest from base to tip."""
         n = checked_integer("n, the number of poses of a backbone,", n, 2)
         stations = self.kept(("backbone", n), lambda: np.linspace(0.0, self.length, n))
         return self._at_stations(self._body.poses, p, stations)
 
     def pose(self, p: ArrayLike, at: ArrayLike) -> Vector:
-        """Pose (4, 4) or (N, 4, 4) at arc length `at` (m, at rest, from the base), above 0.
+        """Return the pose (4, 4) or (N, 4, 4) at arc length `at` (m, at rest), above 0.
 
         Several arc lengths (k,) give poses (k, 4, 4) or (N, k, 4, 4).
         """
         return self._at_stations(self._body.poses, p, self._arc_lengths(at))
 
     def body_jacobian(self, p: ArrayLike, at: ArrayLike) -> Vector:
-        """Twist of a station in its own axes per pressure, (6, n) or (N, 6, n).
+        """Return the twist of a station in its own axes per pressure, (6, n) or (N, 6, n).
 
-        Linear first: m/Pa above, rad/Pa below.  `at` is an arc length in m at rest, from the base
-        on; several (k,) give (k, 6, n) or (N, k, 6, n).  Under loads it is that of the equilibrium.
+        Linear first: three rows in m/Pa, then three in rad/Pa.  `at` is an arc length in m at rest,
+        from 0 at the base; several (k,) give (k, 6, n) or (N, k, 6, n).  Under loads it is that of
+        the equilibrium.
         """
         return self._at_stations(self._body.jacobians, p, self._arc_lengths(at, base_too=True))
 
     def body_radius(self, p: ArrayLike, at: ArrayLike) -> Any:
-        """Outer radius in m of the section at arc length `at` (m, at rest), as pressure leaves it.
+        """Return the outer radius in m of the pressurised section at arc length `at` (m, at rest).
 
         The strain law `neo-hookean` has ``r lambda^-1/2`` (see `NeoHookeanLaw`), the linear ones
-        the radius at rest; a rigid connector is as wide as the segment before it.  What a load
-        does to the section is left out.
+        the radius at rest; a rigid connector is as wide as the segment before it.  The effect of
+        loads on the section is neglected.
 
         Returns
         -------
@@ -134,7 +135,7 @@ class Manipulator(Arm, ShownInNotebook):
     # -- clearance --------------------------------------------------------------------------
 
     def clearance(self, p: ArrayLike, scene: Scene) -> Any:
-        """Least distance in m between the arm's body and the objects of a scene; negative within.
+        """Return the least distance in m between the body and a scene's objects; negative inside.
 
         The body is the union of spheres of the outer radius about the centre line, from base to
         tip; the least distance along it is exact to 0.004 mm.
@@ -148,7 +149,7 @@ class Manipulator(Arm, ShownInNotebook):
         return float(found[0]) if values.ndim == 1 else found
 
     def clearances(self, p: ArrayLike, scene: Scene) -> Clearances:
-        """Distances from each object of a scene, where they are, and how pressures change them."""
+        """Return each object's least distance, its place, and its slopes by the pressures."""
         values = self._checked(p)
         found = ArmClearance(self, _checked_scene(scene)).each(np.atleast_2d(values))
         return found.only() if values.ndim == 1 else found
@@ -163,10 +164,10 @@ class Manipulator(Arm, ShownInNotebook):
         approach: Approach = "pressures",
         nearby: ContactEquilibrium | None = None,
     ) -> ContactEquilibrium:
-        """Equilibrium of the arm leaning on those objects of a scene that allow contact.
+        """Return the equilibrium of the arm in contact with the objects that allow it.
 
-        Surfaces only push, along their normals; the body is that of `clearance`. What objects
-        that allow no contact would do is left out: see `clearances`.
+        Surfaces only push, along their normals; the body is that of `clearance`. Objects that allow
+        no contact are ignored: see `clearances`.
 
         Parameters
         ----------
@@ -176,11 +177,12 @@ class Manipulator(Arm, ShownInNotebook):
         load : (6,), optional
             A further dead force and moment at the tip, in base axes, in N and N m.
         approach : {"pressures", "objects"}
-            How the equilibrium is reached from rest, where there are several: the objects are in
-            place and pressures and loads grow together, or the objects come, each along its
-            normals, to the arm that is already under pressure and load.
+            How the equilibrium is reached from rest, which selects one if there are several.
+            "pressures": pressures and loads grow together with the objects in place.  "objects":
+            the objects come, each along its normals, to the arm under full pressure and load.
         nearby : ContactEquilibrium, optional
-            Instead: the straight way from this one, of the same arm and scene.
+            Equilibrium of the same arm and scene from which to start instead, along the straight
+            line.
 
         Raises
         ------
@@ -193,7 +195,7 @@ class Manipulator(Arm, ShownInNotebook):
     # -- compliance -------------------------------------------------------------------------
 
     def tip_compliance(self, p: ArrayLike) -> Vector:
-        """Compliance of the tip in tip axes (eq. 17, or tangent), (6, 6), linear first."""
+        """Return the tip's compliance in tip axes (eq. 17, or tangent), (6, 6), linear first."""
         return self._compliance(p, None)
 
     def _compliance(self, p: ArrayLike, at: float | None) -> Vector:
@@ -201,22 +203,22 @@ class Manipulator(Arm, ShownInNotebook):
             return self._checked_tip(lambda q: self._tip.evaluate("tip_compliance", q), p)
         C = self._evaluate("compliance", lambda point: point.compliance, p, at=at)
         if self.is_loaded and self._loads.are_conservative:
-            # symmetric but for the integrator's error of about 1e-6
+            # symmetric up to the integrator's error of about 1e-6
             C = (C + np.swapaxes(C, -1, -2)) / 2
         return C
 
     def compliance(self, p: ArrayLike, at: float) -> Vector:
-        """Compliance (6, 6) at arc length `at` (m, at rest), in the axes of that point."""
+        """Return the compliance (6, 6) at arc length `at` (m, at rest), in that point's axes."""
         return self._compliance(p, self._station(self._arc_length(at)))
 
     def compliance_between(self, p: ArrayLike, s: ArrayLike, t: ArrayLike) -> Vector:
-        """Twist of the station at s per wrench on the one at t, (6, 6) or (N, 6, 6), in base axes.
+        """Return the twist at s per wrench at t, (6, 6) or (N, 6, 6), in base axes.
 
-        The twist is that of the section at s: how its centre moves and how it turns; the wrench is
-        a force on the centre of the section at t and a moment, both dead.  Arc lengths are in m at
-        rest, from the base on; arrays (k,) give (k, 6, 6) or (N, k, 6, 6).  Free arms: eq. 17,
-        between two points.  Under loads: the tangent about the equilibrium, with the stiffness
-        that the loads add; ``C(s, t) = C(t, s)'`` where all loads are dead forces.
+        The twist is the motion of the centre of the section at s, and its rotation; the wrench is a
+        dead force on the centre of the section at t and a dead moment.  Arc lengths are in m at
+        rest, from 0 at the base; arrays (k,) give (k, 6, 6) or (N, k, 6, 6).  Free arms: eq. 17,
+        between two points.  Under loads: the tangent about the equilibrium, with the geometric
+        stiffness of the loads; ``C(s, t) = C(t, s)'`` if all loads are dead forces.
         """
         first, second = self._arc_lengths(s, True), self._arc_lengths(t, True)
         try:
@@ -230,23 +232,23 @@ class Manipulator(Arm, ShownInNotebook):
         return self._at_stations(lambda q, at: self._body.compliances(q, at, ends), p, first)
 
     def body_function(self, name: Along, *at: float) -> ca.Function:
-        """CasADi function of a station or two, for an optimisation of one's own.
+        """Return a CasADi function of one or two stations, for a user's own optimisation.
 
         Parameters
         ----------
         name : {"pose", "body_jacobian", "compliance_between"}
-            What the method of this name gives, as a matrix.
+            The method whose result the function returns, as a matrix.
         at : float
-            Arc length in m at rest, above 0; of "compliance_between" two, s and t.
+            Arc length in m at rest, above 0; for "compliance_between" two, s and t.
 
         Returns
         -------
         casadi.Function
             Of the pressures p (n,) in Pa.  With gravity or a load it is a function of p and the
-            tip's quaternion q (4,), w first, and has a second output, `residual` (3,): it is zero
-            in equilibrium only, so q is a variable more (of any length but 0, start it at the
-            quaternion of `tip_pose`) and ``residual == 0`` a constraint.  All can be
-            differentiated; Jacobians and compliances are meant where the residual is zero.
+            tip's quaternion q (4,), w first, and has a second output, `residual` (3,), which is
+            zero only in equilibrium.  Treat q as another variable (of any length but 0; start at
+            the quaternion of `tip_pose`) and ``residual == 0`` as a constraint.  All outputs can be
+            differentiated; Jacobians and compliances are valid where the residual is zero.
         """
         check_choice("name", name, get_args(Along))
         wanted = 2 if name == "compliance_between" else 1
@@ -264,7 +266,7 @@ class Manipulator(Arm, ShownInNotebook):
         at: float | None = None,
         quick: bool = False,
     ) -> Any:
-        """Stiffness along a direction (N/m), or about it for `kind` "rotation" (N m/rad).
+        """Return the stiffness along a direction (N/m), or for a rotation about it (N m/rad).
 
         Parameters
         ----------
@@ -279,9 +281,9 @@ class Manipulator(Arm, ShownInNotebook):
         at : float, optional
             Arc length of another point than the tip, in m at rest; "tip" then means its axes.
         quick : bool
-            Against a push that is too quick for the arm's creep and too small for its hysteresis,
-            as a probe's is: both then hold against it (`History.quick_share`).  Without gravity
-            and load only, whose shapes are those of equilibrium.
+            Stiffness against a push, such as a probe's, that is too quick for the arm's creep and
+            too small for its hysteresis, so that both resist it (`History.quick_share`).  Only
+            without gravity and load.
 
         Returns
         -------
@@ -302,7 +304,7 @@ class Manipulator(Arm, ShownInNotebook):
         return float(result) if result.ndim == 0 else result
 
     def _quick(self) -> "Manipulator":
-        """The same free arm with the stiffness that its memory adds."""
+        """Return the free arm with the additional stiffness of its history."""
         if self.is_loaded:
             raise InputError(
                 "the stiffness against quick pushes is for the arm without gravity and load, whose "
@@ -318,7 +320,7 @@ class Manipulator(Arm, ShownInNotebook):
         boundary: Boundary = "free",
         frame: Frame = "base",
     ) -> Vector:
-        """Derivative of `stiffness` at the tip by the pressures, (n,) or (N, n)."""
+        """Return the derivative of `stiffness` at the tip by the pressures, (n,) or (N, n)."""
         measure = _measure(direction, kind, boundary, frame)
         if not self.is_loaded:
             gradient = self._checked_tip(lambda q: self._tip.stiffness_gradient(q, measure), p)
@@ -329,12 +331,12 @@ class Manipulator(Arm, ShownInNotebook):
         )[..., 0, :]
 
     def tip_uncertainty(self, p: ArrayLike, *, moving: bool = False) -> TipUncertainty:
-        """How well a calibration knows the tip at pressures p (n,), and its stiffness.
+        """Return the uncertainty of the tip and its stiffness after a calibration.
 
         Parameters
         ----------
-        p : commanded pressures (n,) in Pa; what was commanded before is not known.
-        moving : whether the pressures change, as they did in the recordings; else they are held.
+        p : commanded pressures (n,) in Pa; earlier commands are unknown.
+        moving : whether the pressures change, as in the recordings, or are held.
 
         Raises
         ------
@@ -350,7 +352,7 @@ class Manipulator(Arm, ShownInNotebook):
     # -- screws and loads -------------------------------------------------------------------
 
     def tip_twist(self, p: ArrayLike, channel: int) -> Twist:
-        """Screw of the tip's motion per Pa in one channel (counted from 0), in tip axes."""
+        """Return the screw of the tip per Pa in a channel (counted from 0), in tip axes."""
         channel = checked_integer("channel", channel, 0)
         if channel >= self.n_pressures:
             raise InputError(
@@ -359,7 +361,7 @@ class Manipulator(Arm, ShownInNotebook):
         return Twist(self.tip_jacobian(self._single(p))[:, channel])
 
     def deflection(self, p: ArrayLike, wrench: ArrayLike | Wrench, frame: Frame = "base") -> Twist:
-        """Screw of the tip's first-order motion under an added wrench (eq. 17), in tip axes.
+        """Return the screw of the tip's first-order motion under a wrench (eq. 17), in tip axes.
 
         The wrench (6,) acts at the tip; `frame` names the axes of its components.
         """
@@ -370,7 +372,7 @@ class Manipulator(Arm, ShownInNotebook):
     def internal_wrench(
         self, p: ArrayLike, wrench: ArrayLike | Wrench, at: float, frame: Frame = "base"
     ) -> Wrench:
-        """Wrench that a wrench at the tip causes in the section at `at` (eq. 11), in its axes."""
+        """Return the wrench in the section at `at` due to one at the tip (eq. 11), in its axes."""
         p, at = self._single(p), self._arc_length(at, base_too=True)
         T_tip = self.tip_pose(p)
         local = _in_local_axes(wrench, T_tip, frame)
@@ -385,7 +387,7 @@ class Manipulator(Arm, ShownInNotebook):
         frame: Frame = "base",
         method: Method = "equilibrium",
     ) -> Vector:
-        """Pose (4, 4) of the tip with one more load on the arm.
+        """Return the pose (4, 4) of the tip with one more load on the arm.
 
         Parameters
         ----------
@@ -394,13 +396,15 @@ class Manipulator(Arm, ShownInNotebook):
         wrench : (6,)
             Force and moment at the loaded point, in N and N m.
         at : float, optional
-            Arc length of the loaded point in m at rest; the tip if absent.
+            Arc length of the loaded point in m at rest; default: the tip.
         frame : {"base", "tip"}
-            Axes of the wrench: the base's (a dead load) or the loaded point's own (it follows).
+            Axes of the wrench: the base's (a dead load) or the loaded point's own (a follower
+            load).
         method : {"equilibrium", "first-order", "elementwise"}
-            Exact; or as the paper has it, about the shape without this load: eq. 18, the loaded
-            point moves by ``exp(C W)`` and all beyond it rigidly; or eq. 19, each element of the
-            arm gives way to its own share of the wrench.
+            "equilibrium" is exact.  The others are the paper's, about the shape without this load.
+            "first-order" (eq. 18): the loaded point moves by ``exp(C W)`` and everything beyond it
+            rigidly.  "elementwise" (eq. 19): each element of the arm deforms under its own share of
+            the wrench.
         """
         p, at = self._single(p), self._station(at)
         check_choice("frame", frame, get_args(Frame))
@@ -432,14 +436,14 @@ class Manipulator(Arm, ShownInNotebook):
         return np.asarray(tip)
 
     def _elementwise(self, p: Vector, local: Vector, at: float) -> Vector:
-        """Eq. 19 with elements at whose middle wrench and compliance are taken."""
+        """Evaluate eq. 19, with wrench and compliance taken at the middle of each element."""
         ends = [0.0]
         soft: list[int | None] = []
         for index, segment in enumerate(self.description.segments):
             start = ends[-1]
             cuts = start + np.linspace(0.0, segment.length, _ELEMENTS_PER_SEGMENT + 1)[1:]
             if start < at < cuts[-1]:
-                cuts = np.union1d(cuts, at)  # elements end where the load is
+                cuts = np.union1d(cuts, at)  # no element spans the load
             ends.extend(cuts)
             soft.extend([index] * len(cuts))
             if segment.connector:
@@ -465,7 +469,7 @@ class Manipulator(Arm, ShownInNotebook):
 
 
 def quick_description(description: RobotDescription) -> RobotDescription:
-    """The robot that gives way to loads as to a quick small push; free shapes are the same."""
+    """Return a robot with the stiffness against a quick small push, and the same free shapes."""
     segments = []
     for segment in description.segments:
         share = (segment.history or NO_HISTORY).quick_share
@@ -478,7 +482,7 @@ def quick_description(description: RobotDescription) -> RobotDescription:
 def load_robot(
     name_or_path: str | os.PathLike[str] | RobotDescription, *, resolution: int = 1
 ) -> Manipulator:
-    """Manipulator of a built-in robot (``"stiff-flop-2"``), a robot file or a description."""
+    """Load a built-in robot (``"stiff-flop-2"``), a robot file or a description."""
     if isinstance(name_or_path, RobotDescription):
         return Manipulator(name_or_path, resolution=resolution)
     return Manipulator(load_description(name_or_path), resolution=resolution)
@@ -491,9 +495,9 @@ def _checked_scene(scene: Scene) -> Scene:
 
 
 def _is_table(direction: ArrayLike) -> TypeGuard[Sequence[ArrayLike]]:
-    """Whether several directions are given, at least one."""
+    """Return whether several directions are given, at least one."""
     if isinstance(direction, list | tuple) and direction and isinstance(direction[0], float | int):
-        return False  # the usual case, at once
+        return False  # shortcut for the usual case
     try:
         shape = np.shape(direction)
     except ValueError:  # rows of different lengths
@@ -504,17 +508,17 @@ def _is_table(direction: ArrayLike) -> TypeGuard[Sequence[ArrayLike]]:
 def _measure(
     direction: ArrayLike, kind: Kind, boundary: Boundary, frame: Frame
 ) -> DirectionalMeasure:
-    """Checked directional stiffness; what was checked before is remembered."""
+    """Check a directional stiffness; checked ones are cached."""
     values = direction.tolist() if isinstance(direction, np.ndarray) else direction
     if isinstance(values, list | tuple) and all(type(value) in (float, int) for value in values):
         try:
-            return _checked_before(tuple(values), kind, boundary, frame)
-        except TypeError:  # a name that is none, and of a kind that cannot be remembered
+            return _cached_measure(tuple(values), kind, boundary, frame)
+        except TypeError:  # an invalid argument that cannot be hashed
             pass
     return checked_measure(direction, kind, boundary, frame)
 
 
-_checked_before = lru_cache(maxsize=256)(checked_measure)
+_cached_measure = lru_cache(maxsize=256)(checked_measure)
 
 
 def _stiffness_of(measure: DirectionalMeasure) -> Values:
@@ -531,7 +535,7 @@ def _stiffness_of(measure: DirectionalMeasure) -> Values:
 
 
 def _in_local_axes(wrench: "ArrayLike | Wrench", T: Vector, frame: Frame) -> Vector:
-    """Wrench (6,) in the axes of the pose T that it acts at."""
+    """Return a wrench (6,) in the axes of the pose T at which it acts."""
     check_choice("frame", frame, get_args(Frame))
     values = checked_wrench(wrench)
     return values if frame == "tip" else np.asarray(lie.rotate_blocks(T[:3, :3].T) @ values)

@@ -1,10 +1,10 @@
-"""Whether an arm's body stays clear of a scene while its pressures change, at all times.
+"""Check whether an arm's body stays clear of a scene along a motion, at all times.
 
-Between two rows of pressures these change linearly.  Poses on the way are looked at as closely as
-it takes to know of all between them (see native/motion.h, of which this is the same in Python).
-Two bounds on how the body moves stand behind that; both are sampled for each arm, with a margin:
-the most that any of its points moves per change of a segment's pressures, and how much such ways
-bend.  An arm under gravity must not snap from one equilibrium to another on the way.
+Pressures change linearly between rows.  Poses in between are evaluated as densely as needed to
+guarantee the clearance of all others (this is the method of native/motion.h in Python).  The
+guarantee rests on two bounds on the body's motion, sampled for each arm and enlarged by a margin:
+the largest motion of any point per change of a segment's pressures, and the largest curvature of
+such a motion.  An arm under gravity must not snap from one equilibrium to another on the way.
 """
 
 from __future__ import annotations
@@ -32,31 +32,31 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 MOTION_ERROR = 3e-5
-"""m, by which the distance of a motion that is clear may be less than was asked, at most."""
+"""Largest amount by which a clear motion may fall short of the clearance asked for, in m."""
 
-_ALLOWED = 2e-5  # m, by which poses that are looked at may be too near
-_SAG, _MOST_POSES, _STEEPEST = 1e-5, 512, 1.5  # as motion.h has them, but for the poses
-_CLEAR, _BLOCKED, _NO_SHAPE = range(3)  # as motion.h has them
-_SAMPLES = {False: 256, True: 64}  # of the bounds, by whether the arm is loaded
-_STATIONS = 4  # of each part of the body, at which bounds are sampled
+_ALLOWED = 2e-5  # m, allowed violation of the clearance at evaluated poses
+_SAG, _MAX_POSES, _STEEPEST = 1e-5, 512, 1.5  # as in motion.h, except the number of poses
+_CLEAR, _BLOCKED, _NO_SHAPE = range(3)  # as in motion.h
+_SAMPLES = {False: 256, True: 64}  # number for the bounds, by whether the arm is loaded
+_STATIONS = 4  # on each part of the body, at which bounds are sampled
 _INTERVALS = 2  # between coarse stations, of each part
 _CORNERS = 512  # of the pressures' range, at most
 _SPEED_MARGIN, _BEND_MARGIN = 1.1, 1.5
-_EXPECTED = 500  # poses for each motion, while there is no machine code
-_STEP = 0.02  # of the pressures' range, of second differences
+_EXPECTED = 500  # poses of a motion, estimated for deciding on machine code
+_STEP = 0.02  # step of second differences, as a share of the pressures' range
 
 _integer, _double, _pointer = ctypes.c_int64, ctypes.c_double, ctypes.c_void_p
 
 
 class MotionBounds(NamedTuple):
-    """How the body of an arm moves at most, over the range of its pressures.
+    """Bounds on the motion of an arm's body over the range of its pressures.
 
     Attributes
     ----------
     ranges : parts of the body, to which these belong.
-    speeds : (ranges, pieces), way of any point of a range per change (Euclidean) of a piece's
-        pressures, in m/Pa.
-    bends : (ranges,), in m; along a straight way in pressures, second derivatives of positions are
+    speeds : (ranges, pieces), largest motion of a point of a range per (Euclidean) change of a
+        piece's pressures, in m/Pa.
+    bends : (ranges,), in m; on a straight line in pressures, second derivatives of positions are
         at most the square of the speed, by `speeds`, over this.
     """
 
@@ -67,14 +67,14 @@ class MotionBounds(NamedTuple):
 
 @dataclass(frozen=True)
 class MotionClearance:
-    """What was found on the way along pressures.
+    """Result of a check of a motion.
 
     Attributes
     ----------
-    clear : whether the body keeps what was asked for, to `MOTION_ERROR`.
-    least : the least distance of the poses that were looked at, in m.
+    clear : whether the body keeps the clearance asked for, to `MOTION_ERROR`.
+    least : least distance of the evaluated poses, in m.
     poses : their number.
-    blocked_at : pressures (n,) on the way at which it is blocked, or None.
+    blocked_at : pressures (n,) at which the motion is blocked, or None.
     """
 
     clear: bool
@@ -84,12 +84,12 @@ class MotionClearance:
 
 
 class ClearMotions:
-    """Judges motions of one arm in one scene; for one thread at a time.
+    """Check motions of one arm in one scene; for one thread at a time.
 
     Parameters
     ----------
     arm : with its load.
-    scene : its own clearance is left aside.
+    scene : its own `clearance` is ignored.
     """
 
     def __init__(self, arm: Manipulator, scene: Scene) -> None:
@@ -102,7 +102,7 @@ class ClearMotions:
         self._function: Callable[..., int] | None = None
 
     def along(self, p: Array, asked: float) -> MotionClearance:
-        """Judge the way along rows of pressures (N, n) in Pa, by the clearance asked of it in m."""
+        """Check the motion along rows of pressures (N, n) in Pa, for a clearance in m."""
         p = np.ascontiguousarray(p, dtype=float)
         function = self._function or self._prepare(len(p))
         if function is None:
@@ -118,7 +118,7 @@ class ClearMotions:
     # -- in machine code --------------------------------------------------------------------
 
     def _prepare(self, rows: int) -> Callable[..., int] | None:
-        """The function in C, with all that it needs; None where it is not there (yet)."""
+        """Return the function in C, after setting up its arguments; None without it, or not yet."""
         body = self._arm._body.machine_code(rows + _EXPECTED)
         code = scene_library() if body is not None else None
         if body is None or code is None:
@@ -157,12 +157,12 @@ class ClearMotions:
         return MotionClearance(True, least, poses)
 
     def _stretch(self, a: Array, b: Array, asked: float) -> MotionClearance:
-        """All poses of a row of halves at a time."""
+        """Check the motion between two rows by repeated halving."""
         steep = (
             _STEEPEST if any(item.is_interpolated for item in self._clearance.scene.items) else 1
         )
         change = np.bincount(self.piece_of, (b - a) ** 2, self.bounds.speeds.shape[1])
-        way = steep * float((self.bounds.speeds @ np.sqrt(change)).max())
+        path = steep * float((self.bounds.speeds @ np.sqrt(change)).max())
         shares, spare, least = np.empty(0), np.empty(0), np.inf
         new = np.array([0.0, 1.0])
         while len(new):
@@ -174,14 +174,14 @@ class ClearMotions:
             order = np.argsort(np.concatenate([shares, new]))
             shares = np.concatenate([shares, new])[order]
             spare = np.concatenate([spare, np.minimum(values - asked, tip_clear)])[order]
-            open_ = spare[1:] + spare[:-1] - way * np.diff(shares) < -2 * _SAG
+            open_ = spare[1:] + spare[:-1] - path * np.diff(shares) < -2 * _SAG
             new = ((shares[1:] + shares[:-1]) / 2)[open_]
-            if len(shares) + len(new) > _MOST_POSES:
+            if len(shares) + len(new) > _MAX_POSES:
                 return MotionClearance(False, least, len(shares), a + new[0] * (b - a))
         return MotionClearance(True, least, len(shares))
 
     def _look(self, p: Array) -> tuple[Array, Array]:
-        """Distances (N,), and how far (N,) the tip is from rings that it is through."""
+        """Return the least distances (N,), and the tip's distances (N,) from discs of rings."""
         try:
             values = self._clearance.least(p)
         except (PressureError, EquilibriumError):
@@ -195,7 +195,7 @@ class ClearMotions:
 
 
 class _Motions(ctypes.Structure):
-    """`Motions` of native/motion.h."""
+    """Structure `Motions` of native/motion.h."""
 
     _fields_ = [
         *((name, _pointer) for name in ("model", "objects")),
@@ -212,10 +212,10 @@ class _Motions(ctypes.Structure):
 
 
 def motion_bounds(arm: Manipulator) -> MotionBounds:
-    """The bounds of an arm, sampled at corners of its pressures' range and within it."""
+    """Return the bounds of an arm, sampled at corners of its pressures' range and inside it."""
     pieces, ranges = Pieces(arm), _parts(arm)
     low, high = ranges.bounds.T
-    at = np.linspace(low, high, _STATIONS, axis=1).ravel()  # of one part after the other
+    at = np.linspace(low, high, _STATIONS, axis=1).ravel()  # part by part
     p = _that_settle(arm, _spread(arm))
     moves = _moves(arm, p, at)  # (N, k, 4, n)
     speeds = np.zeros((len(at), len(pieces.ends)))
@@ -227,7 +227,7 @@ def motion_bounds(arm: Manipulator) -> MotionBounds:
 
 
 def _parts(arm: Manipulator) -> Ranges:
-    """The ranges of an arm's body, divided: what is near to the base moves less."""
+    """Return the ranges of an arm's body, divided: parts near the base move less."""
     parts: list[tuple[float, float, int]] = []
     for start, end, count in range_ends(arm.description):
         number = -(-(count - 1) // _INTERVALS)
@@ -238,7 +238,7 @@ def _parts(arm: Manipulator) -> Ranges:
 
 
 def _spread(arm: Manipulator) -> Array:
-    """Pressures (N, n) at corners of the range, and within it."""
+    """Return pressures (N, n) at corners of the range, and inside it."""
     rng = np.random.default_rng(0)
     n, low, high = arm.n_pressures, arm.pressure_min, arm.pressure_max
     count = _SAMPLES[arm.is_loaded]
@@ -252,7 +252,7 @@ def _spread(arm: Manipulator) -> Array:
 
 
 def _that_settle(arm: Manipulator, p: Array) -> Array:
-    """Those of pressures (N, n) at which the arm has a shape."""
+    """Return the pressures, of (N, n), at which the arm has an equilibrium."""
     if not arm.is_loaded:
         return p
     kept = []
@@ -268,7 +268,7 @@ def _that_settle(arm: Manipulator, p: Array) -> Array:
 
 
 def _moves(arm: Manipulator, p: Array, at: Array) -> Array:
-    """Derivatives of positions and radii (N, k, 4, n) by the pressures, in m/Pa."""
+    """Return derivatives of positions and radii (N, k, 4, n) by the pressures, in m/Pa."""
     moves = arm._body.jacobians(p, at)[:, :, :3]  # their length is the same in all axes
     step = 1e-4 * (arm.pressure_max - arm.pressure_min)
     slopes = [
@@ -281,7 +281,7 @@ def _moves(arm: Manipulator, p: Array, at: Array) -> Array:
 def _bends(
     arm: Manipulator, p: Array, at: Array, speeds: Array, piece_of: NDArray[np.int64]
 ) -> Array:
-    """The square of speeds over second derivatives, at least, from second differences."""
+    """Return the least ratio of squared speeds to second derivatives, from second differences."""
     rng = np.random.default_rng(1)
     low, high = arm.pressure_min, arm.pressure_max
     shares = rng.choice([-1.0, 0.0, 1.0], p.shape) * rng.random(p.shape)

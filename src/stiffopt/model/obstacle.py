@@ -1,8 +1,8 @@
-"""What an obstacle is: a shape in the base frame with a formula of its distance.
+"""`Obstacle`: base class of shapes in the base frame, each with a formula of its distance.
 
-The formula of a kind stands once, in CasADi, with the shape's numbers as arguments; machine code
-for all kinds is made from it once (`stiffopt.model.distances`), so that moving or adding an
-object compiles nothing.
+Each kind has one formula, in CasADi, with the shape's numbers as arguments.  Machine code
+for all kinds is compiled from it once (`stiffopt.model.distances`), so that moving or adding an
+object needs no compilation.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ Point = Vector[Annotated[Length, within(1e3, "m")]]
 Radius = Annotated[Length, Field(gt=0, le=1e3)]
 """In m."""
 
-_RISEN = 1.25  # of the arc length at which a straight arm is clear of what it is mounted on
-_FLUSH = 1e-9  # m that an object may rise above the plane of the base
-_ABOVE = 1e-4  # m above the base, over which the direction to an object shows
-_STRAIGHT = 1e-9  # share by which a distance may grow less than the height: 0.05 mrad
-_TINY = 1e-24  # m^2 under roots, so that a gradient exists where a distance is zero
+_RISEN = 1.25  # factor on the arc length at which a straight arm is clear of its mount
+_FLUSH = 1e-9  # m, allowed height of an object above the plane of the base
+_ABOVE = 1e-4  # m above the base, at which the direction of an object is determined
+_STRAIGHT = 1e-9  # allowed relative lag of the distance behind the height: 0.05 mrad
+_TINY = 1e-24  # m^2, added under roots so that gradients exist at zero distance
 
 
 class Obstacle(Schema, ABC):
@@ -45,11 +45,12 @@ class Obstacle(Schema, ABC):
     Attributes
     ----------
     key : its name in files.
-    along : what the distance is along a straight line: convex (that to any convex shape),
-        concave in each piece (that inside a tube), or any. Exact minima along an arm rest on it.
-    wrong_side : of it, for the arm.
-    amiss : where a body is that lacks the clearance, in words before the object's name.
-    n_parameters : how many numbers the formula takes for a piece.
+    along : the distance as a function along a straight line: "convex" (that from any convex shape),
+        "concave" in each piece (that inside a tube), or "any". Exact minima along an arm rely on
+        it.
+    wrong_side : where the arm must not be, in words before "it".
+    amiss : how a body violates the clearance, in words before the object's name.
+    n_parameters : number of parameters of the formula for a piece.
     is_interpolated : whether distances come from grids; the last eight parameters are then the
         values at the corners of a point's cube.
     is_ring : whether the arm passes through it.
@@ -68,16 +69,16 @@ class Obstacle(Schema, ABC):
     @staticmethod
     @abstractmethod
     def formula(point: ca.SX, parameters: ca.SX) -> ca.SX:
-        """Signed distance of a point (3,) in m, negative where the arm must not be."""
+        """Return the signed distance of a point (3,) in m, negative where the arm must not be."""
 
     @staticmethod
     def cell(point: ca.SX, parameters: ca.SX) -> ca.SX:
-        """Which cube (3,) of a grid has a point, for kinds that are interpolated."""
+        """Return the cube (3,) of a grid that contains a point, for interpolated kinds."""
         raise NotImplementedError
 
     @staticmethod
     def passage(point: ca.SX, parameters: ca.SX) -> list[ca.SX]:
-        """Of a ring: height above its plane, how far beyond the circle, distance of the disc."""
+        """Return a ring's height to a point, and distances beyond its circle and of its disc."""
         raise NotImplementedError
 
     @property
@@ -91,20 +92,20 @@ class Obstacle(Schema, ABC):
         return ()
 
     def error_at(self, distance: float) -> float:
-        """By how much a distance in m is too small at most, since it is interpolated."""
+        """Return how much too small an interpolated distance in m can be."""
         return 0.0
 
     @abstractmethod
     def outline(self, size: float) -> list[Array]:
-        """Surfaces (3, rows, columns) in m that show it, cut off at a size where it has no end."""
+        """Return surfaces (3, rows, columns) in m for drawing, cut off at a size if infinite."""
 
     def check_against(self, robot: RobotDescription, clearance: float) -> None:
-        """Refuse what makes no sense for an arm.
+        """Reject a shape that does not suit an arm.
 
         Parameters
         ----------
         clearance :
-            What is asked of the arm's body, in m.
+            Clearance asked of the arm's body, in m.
 
         Raises
         ------
@@ -131,22 +132,22 @@ class Obstacle(Schema, ABC):
         )
 
     def begin(self, base_radius: float, clearance: float) -> float:
-        """Arc length at rest from which an arm's body counts: 0 but for what it is mounted on.
+        """Return the arc length at rest from which an arm's body counts: 0 except for its mount.
 
-        An arm is mounted on a convex object of which the point nearest to its base lies straight
-        behind that, so that all of it is behind a plane that the base does not cross, but the round
-        end of a body there would be nearer than the clearance. The straight arm is clear of it from
-        radius plus clearance on, less the distance; a quarter is added, as a bent arm rises less.
-        What is left out needs no judging: along an arc that leaves the plane at a right angle, the
-        disc of a section at arc length s is (1/k - radius) sin(k s) above it for a curvature k,
-        which is no less anywhere than at both ends.
+        An arm is mounted on a convex object if the object's point nearest to the base lies straight
+        behind the base.  The object is then behind a plane that the base does not cross, but the
+        round end of the body there would be nearer than the clearance.  The straight arm is clear
+        of it from radius plus clearance on, less the distance; a quarter is added, as a bent arm
+        rises less. The part before that needs no check: along an arc that leaves the plane at a
+        right angle, the disc of a section at arc length s is (1/k - radius) sin(k s) above it for a
+        curvature k, which is nowhere less than at both ends.
 
         Parameters
         ----------
         base_radius :
             Of the arm, in m.
         clearance :
-            That is asked for, in m.
+            Clearance asked for, in m.
         """
         missing = base_radius + clearance - self.from_base
         return _RISEN * missing if missing > 0 and self._is_behind_base else 0.0
@@ -164,7 +165,7 @@ class Obstacle(Schema, ABC):
         return self.distance_of((0.0, 0.0, 0.0))
 
     def distance_of(self, point: Any) -> float:
-        """Signed distance of one point (3,), from the formula itself, in m."""
+        """Return the signed distance of one point (3,), from the formula itself, in m."""
         formula = _function(type(self))
         return max(float(formula(point, piece)[0][0, 0]) for piece in self.pieces)
 
@@ -176,7 +177,7 @@ def _function(kind: type[Obstacle]) -> InterpretedFunction:
 
 
 class BetweenEnds(Obstacle):
-    """What has a radius about the straight line between two points.
+    """A shape with a radius about the straight line between two points.
 
     Attributes
     ----------
@@ -203,19 +204,19 @@ class BetweenEnds(Obstacle):
 
 
 def norm(vector: ca.SX) -> ca.SX:
-    """Length of a vector whose gradient exists at zero too; exact to 1e-12."""
+    """Return the length of a vector, with a gradient at zero too; exact to 1e-12."""
     return ca.sqrt(ca.sumsqr(vector) + _TINY)
 
 
 def from_segment(point: ca.SX, start: ca.SX, end: ca.SX) -> ca.SX:
-    """Vector (3,) to a point from the nearest point of the straight line between two."""
+    """Return the vector (3,) to a point from the nearest point of a line segment."""
     way = end - start
     share = ca.fmin(ca.fmax(ca.dot(point - start, way) / ca.sumsqr(way), 0), 1)
     return point - start - share * way
 
 
 def from_box(excess: ca.SX) -> ca.SX:
-    """Signed distance of a box from how far a point is beyond its faces, (k,)."""
+    """Return the signed distance of a box, given a point's excess (k,) beyond its faces."""
     outside = norm(ca.fmax(excess, 0))
     return outside + ca.fmin(ca.mmax(excess), 0)
 
@@ -224,14 +225,14 @@ def from_box(excess: ca.SX) -> ca.SX:
 
 
 def across(axis: Array) -> tuple[Array, Array]:
-    """Two unit vectors that make a right-handed frame with a unit vector."""
+    """Return two unit vectors that form a right-handed frame with a unit vector."""
     first = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
     first /= np.linalg.norm(first)
     return first, np.cross(axis, first)
 
 
 def revolved(origin: Any, axis: Any, heights: Any, radii: Any, sides: int = 24) -> Array:
-    """Surface (3, rows, sides + 1) of revolution with these heights along its axis and radii."""
+    """Return a surface (3, rows, sides + 1) of revolution, given heights and radii."""
     axis = np.asarray(axis, dtype=float)
     first, second = across(axis)
     angle = np.linspace(0.0, 2 * np.pi, sides + 1)
@@ -243,7 +244,7 @@ def revolved(origin: Any, axis: Any, heights: Any, radii: Any, sides: int = 24) 
 
 
 def rounded(start: Any, end: Any, radius: float) -> Array:
-    """Surface of a capsule; of a sphere where both ends are one."""
+    """Return the surface of a capsule, or of a sphere if both ends coincide."""
     way = np.subtract(end, start).astype(float)
     length = float(np.linalg.norm(way))
     angle = np.linspace(-np.pi / 2, np.pi / 2, 14)

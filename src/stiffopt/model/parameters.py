@@ -1,9 +1,8 @@
-"""Parameters of an arm: numbers of its robot file by name, which may be varied symbolically.
+"""Parameters of an arm: named numbers of its robot file that can be varied, also symbolically.
 
 A parameter is named by its key in the robot file, ``segments[0].material.youngs_modulus``.  Its
-*coordinate* is zero at the value that the description has: the difference for an angle or an
-offset, the logarithm of the ratio for what must stay positive.  Coordinates are what derivatives
-are taken by and what a covariance is in.
+*coordinate* is zero at the description's value: the difference for an angle or an offset, the
+logarithm of the ratio for a positive number.  Derivatives and covariances are in coordinates.
 """
 
 from __future__ import annotations
@@ -40,7 +39,7 @@ _Path = tuple[str | int, ...]
 _STEP = re.compile(r"([a-z_]+)|\[(\d{1,4})\]")
 
 
-_LARGEST_SHARE = 0.9  # of one operator of a history, that a fit may reach
+_LARGEST_SHARE = 0.9  # bound of a fit on the share of one operator of a history
 _ALONE = "each channel alone, to its highest pressure"
 _PUSHED = "'stiffopt experiment stiffness', whose table is fitted too"
 _STEPS = "steps of pressure, logged at 10 Hz or more"
@@ -118,7 +117,7 @@ class Parameter:
 
     Attributes
     ----------
-    key : where it is in the file, for example ``segments[0].corrections.gain[2]``.
+    key : its place in the file, for example ``segments[0].corrections.gain[2]``.
     """
 
     key: str
@@ -138,7 +137,7 @@ class Parameter:
 
     @property
     def number(self) -> FittedNumber:
-        """What calibration knows of numbers of this kind."""
+        """Properties of this kind of number for calibration."""
         name = ".".join(step for step in self._path[2:] if isinstance(step, str))
         numbers = fitted_numbers() if name.startswith("law.") else _NUMBERS
         if name not in numbers:
@@ -157,12 +156,12 @@ class Parameter:
 
     @property
     def is_history(self) -> bool:
-        """Whether it concerns the way to an equilibrium only."""
+        """Whether it affects only the way to an equilibrium."""
         return self._path[2] == "history"
 
     @property
     def name(self) -> str:
-        """What people call it: ``gain, segment 1 channel 3``."""
+        """Readable name: ``gain, segment 1 channel 3``."""
         place = f"segment {self.segment + 1}"
         last = self._path[-1]
         if isinstance(last, int):
@@ -182,7 +181,7 @@ class Parameter:
         return self._read(explicit(description))
 
     def _read(self, robot: RobotDescription) -> float:
-        """Value in a robot whose defaults are written out."""
+        """Return the value in a robot whose defaults are written out."""
         found: Any = robot
         for step in self._path:
             try:
@@ -194,19 +193,19 @@ class Parameter:
         return float(found)
 
     def at(self, nominal: float, coordinate: Any) -> Any:
-        """Value of a coordinate, both numbers or both symbols."""
+        """Return the value at a coordinate, number or symbol."""
         if self.number.positive:
             factor = ca.exp(coordinate) if isinstance(coordinate, ca.SX) else np.exp(coordinate)
             return nominal * factor
         return nominal + coordinate
 
     def coordinate(self, nominal: float, value: float) -> float:
-        """Coordinate of a value.
+        """Return the coordinate of a value.
 
         Raises
         ------
         InputError
-            Only what is positive has a logarithm.
+            If a value whose coordinate is a logarithm is not positive.
         """
         if not self.number.positive:
             return value - nominal
@@ -221,12 +220,12 @@ class Parameter:
         return value
 
     def per_coordinate(self, value: float) -> float:
-        """Change of the value per change of the coordinate."""
+        """Return the change of the value per change of the coordinate."""
         return value if self.number.positive else 1.0
 
 
 def explicit(description: RobotDescription) -> RobotDescription:
-    """The same robot with every default that can be a parameter written out."""
+    """Return the same robot with every default that can be a parameter written out."""
 
     def spelled(segment: Segment) -> Segment:
         count = segment.n_channels
@@ -254,12 +253,12 @@ def explicit(description: RobotDescription) -> RobotDescription:
 def with_values(
     description: RobotDescription, values: Mapping[Parameter, float]
 ) -> RobotDescription:
-    """Robot with other values of some parameters, checked as if read from a file.
+    """Return the robot with other values of some parameters, validated like a file.
 
     Raises
     ------
     InputError
-        The robot has no such number, or it may not have such a value.
+        The robot has no such number, or the value is not allowed.
     """
     changed = _replaced(explicit(description), {p._path: value for p, value in values.items()})
     return RobotDescription(**changed.model_dump())
@@ -268,7 +267,7 @@ def with_values(
 def varied(
     description: RobotDescription, parameters: Sequence[Parameter], coordinates: Any
 ) -> RobotDescription:
-    """Robot, not validated, with its parameters at coordinates (k,), numbers or symbols.
+    """Return the robot, not validated, with parameters at coordinates (k,), numbers or symbols.
 
     Raises
     ------
@@ -288,10 +287,10 @@ def varied(
 def parametric(
     description: RobotDescription, parameters: Sequence[Parameter]
 ) -> tuple[Actuation, ca.SX]:
-    """Actuation of a robot whose parameters may vary, and their coordinates (k,).
+    """Return the actuation of a robot with variable parameters, and their coordinates (k,).
 
-    Rest lengths act by stretching the section, which is the same: all stays per length at rest
-    *in the description*, and so does the segment's mass.
+    A variable rest length stretches the section instead, which is equivalent: lengths and the
+    segment's mass stay per length at rest *in the description*.
     """
     coordinates = ca.SX.sym("coordinates", len(parameters))
     robot = varied(description, parameters, coordinates)

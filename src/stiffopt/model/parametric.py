@@ -1,4 +1,4 @@
-"""An arm as a function of its parameters too: poses and stiffnesses with their derivatives."""
+"""`ParametricArm`: poses and stiffnesses of an arm, with derivatives by its parameters."""
 
 from __future__ import annotations
 
@@ -39,12 +39,12 @@ class Poses:
 
 
 class ParametricArm:
-    """A robot of which some parameters may vary.
+    """A robot with variable parameters.
 
     Parameters
     ----------
-    description : where the parameters have the coordinate zero.
-    parameters : what varies, k in number; those of histories have no effect here.
+    description : the robot at coordinate zero of all parameters.
+    parameters : k variable parameters; those of histories have no effect here.
     tip_load : dead and follower wrench (12,) on the tip, see `stiffopt.model.equilibrium.Loads`.
     """
 
@@ -56,7 +56,7 @@ class ParametricArm:
     ) -> None:
         self.description = description
         actuation, coordinates = parametric(description, parameters)
-        # the parameters travel with the pressures: derivatives are taken by both
+        # append the parameters to the pressures: derivatives are taken by both
         variables = ca.vertcat(actuation.pressures, coordinates)
         self._actuation = replace(actuation, pressures=variables)
         self._functions: dict[Hashable, InterpretedFunction] = {}
@@ -67,11 +67,11 @@ class ParametricArm:
             self._equilibrium = Equilibrium(Shooting(description, self._actuation))
 
     def set_tip_load(self, tip_load: Sequence[float]) -> None:
-        """Put another load (12,) on the tip; the arm must have gravity or a load already."""
+        """Replace the load (12,) on the tip; the arm must have gravity or a load already."""
         self._loads = self._loads._replace(tip=np.array(tip_load))
 
     def poses(self, pressures: Vector, coordinates: Vector, at: float | None = None) -> Poses:
-        """Poses at pressures (N, n) and coordinates (k,), of the tip or at an arc length in m.
+        """Return poses at pressures (N, n), coordinates (k,), of the tip or at an arc length in m.
 
         Raises
         ------
@@ -91,7 +91,7 @@ class ParametricArm:
     def stiffnesses(
         self, pressures: Vector, coordinates: Vector, measure: DirectionalMeasure
     ) -> tuple[Vector, Vector, Vector]:
-        """Stiffness of the tip (N,), its derivatives by pressures (N, n) and coordinates (N, k)."""
+        """Return tip stiffness (N,), its slopes by pressures (N, n) and coordinates (N, k)."""
 
         def outputs(shape: Shape) -> list[ca.SX | ca.MX]:
             k = stiffness_along(
@@ -138,7 +138,7 @@ class ParametricArm:
         return FreeShape.of(self.description, self._actuation, at)
 
     def _states(self, equilibrium: Equilibrium, variables: Vector) -> list[EquilibriumState]:
-        """Equilibria (N,), each found from the one that this row had the last time."""
+        """Return equilibria (N,), each found from the last one of the same row."""
         near = self._near.get(len(variables), [])
         states: list[EquilibriumState] = []
         for row, own in enumerate(variables):

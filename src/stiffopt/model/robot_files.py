@@ -1,4 +1,4 @@
-"""Robots by name or path: those that come with stiffopt and those in a user's files."""
+"""Load robots by name or path: built-in ones and users' files."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def load_description(
 
 
 def save_robot(path: str | os.PathLike[str], robot: RobotDescription) -> None:
-    """Write a robot file, in the place of what is there; it reads back as its equal.
+    """Write a robot file, replacing any that exists; it reads back as its equal.
 
     Raises
     ------
@@ -83,7 +83,7 @@ def save_robot(path: str | os.PathLike[str], robot: RobotDescription) -> None:
 
 
 def robot_path(name_or_path: str, base: str | os.PathLike[str]) -> str:
-    """Return what names the same robot in a file of any folder: its name, or an absolute path."""
+    """Return a built-in robot's name, or an absolute path, valid in a file of any folder."""
     return str((Path(base) / name_or_path).resolve()) if _is_path(name_or_path) else name_or_path
 
 

@@ -1,8 +1,8 @@
-"""The rod's equations as small functions, for the integrator that is written in C.
+"""The rod's equations as small symbolic functions, for the integrator in C.
 
-`stiffopt.model.shooting` writes whole chains of integration steps, which a compiler takes a minute
-for.  Here the equations at one point of the rod are functions of their own, one set for each kind
-of section; the steps, and what is carried along them, are loops in ``rod.h``.
+`stiffopt.model.shooting` writes out whole chains of integration steps, which takes a compiler a
+minute.  Here the equations at one point of the rod are separate functions, one set for each kind
+of section; ``rod.h`` loops over the steps and propagates derivatives along them.
 
 Orientation and moment are y = (q, m) (7,), padded to eight rows; position, which does not feed
 back, and a zero are four more.  Functions of kind k:
@@ -14,8 +14,8 @@ back, and a zero are four more.  Functions of kind k:
 * ``adjoint{k}``: (y, n, f, a, da, dy, dn, l, dl) to the derivatives of ``l'y' + dl'(y', r')_dot``
   by y (8,), n (3,), pressures (c,) and dy (8,), dn (3,), the dot along (dy, dn).
 
-`a` holds what of the section is not zero: strain, compliance and centroid; `da` is its derivative
-by the section's own pressures.
+`a` holds the nonzero entries of the section's strain, compliance and centroid; `da` is its
+derivative by the section's own pressures.
 """
 
 from collections.abc import Hashable
@@ -32,11 +32,11 @@ from stiffopt.model.layout import Layout, symbolic_arm
 from stiffopt.model.shooting import mass_per_length, pieces_of, slopes
 
 MOST_KINDS = 4
-"""Kinds of sections that the integrator in C tells apart; mirrors ``rod.h``."""
+"""Largest number of kinds of sections in the integrator in C; mirrors ``rod.h``."""
 
 
 class RodPiece(NamedTuple):
-    """A stretch of arm, as ``rod.h`` has it; see there."""
+    """A piece of the arm; mirrors ``rod.h``, which documents it."""
 
     kind: int
     parts: int
@@ -49,7 +49,7 @@ class RodPiece(NamedTuple):
 
 
 class _SectionPlace(NamedTuple):
-    """Where a segment's section is: its kind, and where it begins in a, in da and in p."""
+    """Kind of a segment's section, and where it begins in a, in da and in p."""
 
     kind: int
     parts: int
@@ -59,7 +59,7 @@ class _SectionPlace(NamedTuple):
 
 
 class RodFunctions(NamedTuple):
-    """Functions of a layout for the integrator, and where each segment's section is."""
+    """Functions of a layout for the integrator, and the place of each segment's section."""
 
     functions: list[ca.Function]
     places: list[_SectionPlace]
@@ -69,9 +69,9 @@ class RodFunctions(NamedTuple):
 
 @lru_cache(maxsize=64)
 def rod_functions(layout: Layout) -> RodFunctions | None:
-    """Equations of the arms of a layout; None if it has more kinds of sections than C tells apart.
+    """Return the equations of the arms of a layout; None if it has more than `MOST_KINDS` sections.
 
-    Functions of the pressures take the arm's numbers next.
+    The arm's numbers follow the pressures in the functions' inputs.
     """
     arm = symbolic_arm(layout)
     kinds: dict[Hashable, int] = {}
@@ -108,7 +108,7 @@ def rod_functions(layout: Layout) -> RodFunctions | None:
 def rod_pieces(
     description: RobotDescription, resolution: int, functions: RodFunctions
 ) -> list[RodPiece]:
-    """Pieces of an arm from its tip to its base."""
+    """Return the pieces of an arm from its tip to its base."""
     pieces = []
     for piece in pieces_of(description, resolution):
         if piece.rigid:
@@ -125,7 +125,7 @@ def _function(name: str, inputs: list[ca.SX], outputs: list[ca.SX]) -> ca.Functi
 
 
 def _kind(kind: int, patterns: list[ca.Sparsity], channels: int) -> list[ca.Function]:
-    """Functions of one kind of section, by the sparsity of its strain, compliance and centroid."""
+    """Return the functions of a kind of section: of a sparsity of strain, compliance, centroid."""
     y, n, f = ca.SX.sym("y", 7), ca.SX.sym("n", 3), ca.SX.sym("f", 3)
     ends = np.cumsum([0, *(pattern.nnz() for pattern in patterns)])
     a, da = ca.SX.sym("a", ends[-1]), ca.SX.sym("da", ends[-1], channels)
@@ -155,14 +155,14 @@ def _kind(kind: int, patterns: list[ca.Sparsity], channels: int) -> list[ca.Func
 
 
 def _ends() -> list[ca.Function]:
-    """Functions of the loaded tip and of rigid connectors.
+    """Return the functions of the loaded tip and of rigid connectors.
 
     * ``tip``: (q, load, weight) to y (8,), n (3,), their derivatives by a turn of the tip (8, 3)
       and (3, 3), and the rotation (3, 3);
     * ``tip_adjoint``: (q, load, turn, wrench, l, ln, dl, dln, left) to the derivative by a turn
       of the tip (3,) of ``l'y + ln'n + dl'y_dot + dln'n_dot + left'(0, R turn)``, the dot along
       the turn (in body axes) and the added wrench;
-    * ``rigid``: (y, n, length) to what (y, r) gain (12,), and the derivatives (12, 7), (12, 3);
+    * ``rigid``: (y, n, length) to the increments of (y, r) (12,), and derivatives (12, 7), (12, 3);
     * ``rigid_adjoint``: (y, n, length, dy, dn, l, dl) to derivatives as in ``adjoint``.
     """
     q, load, weight, delta = (ca.SX.sym("x", size) for size in (4, 12, 3, 3))

@@ -1,6 +1,6 @@
-"""Scenes: what is around an arm, as the key ``scene`` of a file, a file of its own, or in code.
+"""`Scene`: objects around an arm, as the key ``scene`` of a file, a file of its own, or in code.
 
-Built in code::
+In code::
 
     post = SceneObject(name="post", sphere={"centre": (0, 0.04, 0.12), "radius": 0.005})
     scene = Scene(clearance=0.002, objects=[post])
@@ -36,10 +36,10 @@ class AllowedContact(Schema):
 
     Attributes
     ----------
-    allowed : whether the arm may lean on it, and tasks may brace it there or press it.
+    allowed : whether the arm may lean on it; tasks may then brace against it or press it.
     max_force : largest force on it, in N, or None for no limit.
     friction : coefficient of friction.
-    stiffness : force per depth with which a soft object gives way, in N/m, or None: it is rigid.
+    stiffness : force per depth of a soft object, in N/m, or None: it is rigid.
     """
 
     allowed: bool = False
@@ -89,7 +89,7 @@ class SceneObject(_Shapes):
 
     @property
     def shape(self) -> Obstacle:
-        """Whichever shape it has."""
+        """The shape that it has."""
         (found,) = self._given().values()
         return found
 
@@ -101,8 +101,8 @@ class SceneObject(_Shapes):
     def _check(self) -> SceneObject:
         given = list(self._given())
         if not given:
-            *most, last = OBSTACLES
-            raise ValueError(f"has no shape; expected the key {', '.join(most)} or {last}")
+            *keys, last = OBSTACLES
+            raise ValueError(f"has no shape; expected the key {', '.join(keys)} or {last}")
         if len(given) > 1:
             raise BadKeyError(
                 given[1], f"is the object's second shape, beside {given[0]}; expected one"
@@ -140,7 +140,7 @@ class Scene(Schema):
     def check_against(
         self, robot: RobotDescription, path: str | os.PathLike[str] | None = None
     ) -> None:
-        """Refuse a scene that makes no sense for an arm.
+        """Reject a scene that does not suit an arm.
 
         Parameters
         ----------
@@ -154,7 +154,7 @@ class Scene(Schema):
         InputError
             The arm's base lies within an object or is nearer to it than the clearance, and is not
             mounted on it (see `Obstacle.begin`); a ring or a tube is narrower than the arm; a mesh
-            is of another scale. With file, line and key where the scene is from a file.
+            is of another scale. With file, line and key if the scene is from a file.
         """
         for index, item in enumerate(self.objects):
             try:
@@ -178,7 +178,7 @@ class Scene(Schema):
 
 
 class _SceneFile(Schema):
-    """A file whose scene is under the key that it has in other files."""
+    """A file with its scene under the key ``scene``."""
 
     scene: Scene
 
@@ -191,7 +191,7 @@ def load_scene(path: str | os.PathLike[str]) -> Scene:
     FileError
         With the line and the key of the first mistake.
     MissingExtraError
-        It has a mesh, for which packages are missing.
+        It has a mesh, and packages for meshes are missing.
     """
     document = read_document(path)
     if "scene" in document.data:
@@ -202,7 +202,7 @@ def load_scene(path: str | os.PathLike[str]) -> Scene:
 
 
 def _from_file(value: Any, info: ValidationInfo) -> Any:
-    """Let the path of a scene file stand for the scene."""
+    """Load a scene that is given as a path."""
     if isinstance(value, str | Path):
         folder = info.context.get("folder") if isinstance(info.context, Mapping) else None
         return load_scene(Path(folder or "") / value)

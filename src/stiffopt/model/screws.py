@@ -21,7 +21,7 @@ Vector = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class _Screw:
-    """Six coordinates in some frame; subclasses say which half turns about the axis."""
+    """Six coordinates in some frame; subclasses define which half is along the axis."""
 
     coordinates: Vector
 
@@ -45,12 +45,12 @@ class _Screw:
         return hash((type(self), *self.coordinates.tolist()))
 
     def _along_and_about(self) -> tuple[Vector, Vector]:
-        """The vector along the axis, and the other half of the coordinates."""
+        """Return the vector along the axis, and the other half of the coordinates."""
         raise NotImplementedError
 
     @property
     def pitch(self) -> float:
-        """Advance along the axis per unit about it, in m; infinite without the latter."""
+        """Advance along the axis per unit about it, in m; infinite if there is none about it."""
         along, other = self._along_and_about()
         length, unit = length_and_unit(along)
         return float(unit @ other / length) if length > 0 else inf
@@ -98,12 +98,12 @@ class Twist(_Screw):
 
     @classmethod
     def from_axis(cls, point: ArrayLike, direction: ArrayLike, pitch: float = 0.0) -> Self:
-        """Twist about an axis through `point`; rotation as long as `direction`, `pitch` in m."""
+        """Return the twist about an axis through `point`, |direction| rad; `pitch` is in m."""
         omega, v = cls._from_axis(point, direction, pitch)
         return cls(np.concatenate([v, omega]))
 
     def transformed(self, T_ab: Vector) -> Self:
-        """The same motion with coordinates in frame a, given in frame b (eq. 15)."""
+        """Return the same motion with coordinates in frame a, given in frame b (eq. 15)."""
         return type(self)(lie.adjoint(checked_motion("T_ab", T_ab)) @ self.coordinates)
 
     def _along_and_about(self) -> tuple[Vector, Vector]:
@@ -125,16 +125,16 @@ class Wrench(_Screw):
 
     @classmethod
     def from_axis(cls, point: ArrayLike, direction: ArrayLike, pitch: float = 0.0) -> Self:
-        """Wrench along an axis through `point`; force as long as `direction`, `pitch` in m."""
+        """Return the wrench along an axis through `point`, |direction| N; `pitch` is in m."""
         force, moment = cls._from_axis(point, direction, pitch)
         return cls(np.concatenate([force, moment]))
 
     def transformed(self, T_ab: Vector) -> Self:
-        """The same wrench with coordinates in frame a, given in frame b (eq. 5)."""
+        """Return the same wrench with coordinates in frame a, given in frame b (eq. 5)."""
         return type(self)(lie.coadjoint(checked_motion("T_ab", T_ab)) @ self.coordinates)
 
     def power(self, twist: Twist) -> float:
-        """Work done on a twist in the same frame: ``F.v + M.omega``."""
+        """Return the work done on a twist in the same frame: ``F.v + M.omega``."""
         if not isinstance(twist, Twist):
             raise InputError(f"a wrench does work on a Twist, not on {shown(twist)}")
         return float(self.coordinates @ twist.coordinates)
@@ -144,5 +144,5 @@ class Wrench(_Screw):
 
 
 def checked_wrench(value: ArrayLike | Wrench) -> Vector:
-    """Coordinates (6,) of a wrench, force first."""
+    """Return the coordinates (6,) of a wrench, force first."""
     return checked_vector("wrench", value.coordinates if isinstance(value, Wrench) else value, 6)

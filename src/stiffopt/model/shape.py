@@ -1,7 +1,7 @@
-"""What the model knows of a point of the arm, symbolically, in closed form.
+"""Symbolic pose, Jacobian and compliance of a point of the arm.
 
-`FreeShape` (here, no loads) and `Chain` (`stiffopt.model.shooting`, equilibrium under loads)
-offer the same things, so that whatever is computed from a shape works for both.
+`FreeShape` (here, closed form without loads) and `Chain` (`stiffopt.model.shooting`, equilibrium
+under loads) implement the interface `Shape`, so formulas of a shape work for both.
 """
 
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ from stiffopt.model.kinematics import Actuation, connector, segment_jacobian, se
 
 
 class Shape(Protocol):
-    """Pose of a station of the arm (its tip, or a point on the way) and how it gives way."""
+    """Symbolic pose, Jacobian and compliance of a station of the arm, its tip by default."""
 
     @property
     def inputs(self) -> tuple[ca.SX | ca.MX, ...]:
@@ -57,18 +57,18 @@ class Shape(Protocol):
         """Channel pressures (n,)."""
 
     def station(self, at: float) -> "PointOfArm":
-        """Another point of the same arm, at arc length `at` (m, at rest, from the base)."""
+        """Return another point of the same arm, at arc length `at` (m, at rest, from the base)."""
 
     def flexibility(self, wrench: ca.SX | ca.MX) -> ca.SX | ca.MX:
-        """``w' C w`` of a wrench (6,) at the station, in its own axes: what it does there."""
+        """Return ``w' C w`` of a wrench (6,) at the station, in its own axes."""
 
     def total_jacobian(self, values: ca.SX | ca.MX) -> ca.SX | ca.MX:
-        """Derivative (k, n) of values (k,) of this shape by the pressures."""
+        """Return the derivative (k, n) of values (k,) of this shape by the pressures."""
 
 
 @dataclass(frozen=True)
 class PointOfArm:
-    """Where a point of the arm is.
+    """Position and axes of a point of the arm.
 
     Attributes
     ----------
@@ -82,14 +82,14 @@ class PointOfArm:
 
 @dataclass(frozen=True)
 class ShapePiece:
-    """A soft stretch of constant strain, or a rigid one.
+    """A soft piece of constant strain, or a rigid one.
 
     Attributes
     ----------
     motion : pose (4, 4) of its far end in its near end.
     half : pose of its far end in its middle.
-    pressures : those (c,) that it depends on.
-    section : none if it is rigid.
+    pressures : pressures (c,) that it depends on.
+    section : None if it is rigid.
     length : at rest, in m.
     """
 
@@ -102,11 +102,11 @@ class ShapePiece:
 
 @dataclass(frozen=True)
 class FreeShape:
-    """The unloaded arm: a chain of exponentials (eq. 7) and its compliance (eq. 17).
+    """The unloaded arm: a product of exponentials (eq. 7) and its compliance (eq. 17).
 
     Attributes
     ----------
-    pressures : those (n,) of the whole arm.
+    pressures : pressures (n,) of the whole arm.
     pieces : from the base to the station.
     """
 
@@ -117,7 +117,7 @@ class FreeShape:
     def of(
         cls, description: RobotDescription, actuation: Actuation, at: float | None = None
     ) -> "FreeShape":
-        """Shape at arc length `at` at rest, from the base (None: the tip)."""
+        """Return the shape at arc length `at` at rest, from the base (None: the tip)."""
         left = at
         pieces, start = [], 0
         for segment, section in zip(description.segments, actuation.sections, strict=True):
@@ -195,7 +195,7 @@ class FreeShape:
         return PointOfArm(T[:3, 3], T[:3, :3])
 
     def flexibility(self, wrench: ca.SX) -> ca.SX:
-        """``w' C w`` of a wrench (6,) at the station: twice the strain energy that it stores."""
+        """Return ``w' C w`` of a wrench (6,) at the station: twice its strain energy."""
         total = ca.SX(0)
         for piece in reversed(self.pieces):
             wrench = _moved_back(piece.half, wrench)
@@ -205,7 +205,7 @@ class FreeShape:
         return total
 
     def total_jacobian(self, values: ca.SX) -> ca.SX:
-        """Derivative (k, n) of values (k,) by the pressures."""
+        """Return the derivative (k, n) of values (k,) by the pressures."""
         return ca.jacobian(values, self.pressures)
 
 
@@ -216,10 +216,10 @@ def stiffness_along(
     kind: Kind,
     boundary: Boundary,
 ) -> ca.SX | ca.MX:
-    """Stiffness of a shape along (or about) a unit direction; see `directional_stiffness`.
+    """Return the stiffness of a shape along (or about) a unit direction.
 
-    That of a free tip is read from the strain energy of a unit load, which is several times
-    cheaper than the 6x6 compliance.
+    See `directional_stiffness`.  For a free tip it is computed from the strain energy of a unit
+    load, which is several times cheaper than the 6x6 compliance.
     """
     if boundary == "free":
         d = shape.rotation.T @ direction if frame == "base" else direction
@@ -236,6 +236,6 @@ def _may_be_positive(length: ca.SX | float) -> bool:
 
 
 def _moved_back(T: ca.SX, wrench: ca.SX) -> ca.SX:
-    """Wrench (6,) of a frame in the one from which T leads to it, without zeros of `coadjoint`."""
+    """Transform a wrench (6,) by T to the frame of T, without the zeros of `coadjoint`."""
     force, moment = T[:3, :3] @ wrench[:3], T[:3, :3] @ wrench[3:]
     return ca.vertcat(force, moment + ca.cross(T[:3, 3], force))

@@ -1,23 +1,23 @@
-"""The rod under load as a shooting problem, symbolically.
+"""The rod under load as a symbolic shooting problem.
 
-Of a dead load the internal force is known everywhere in base axes, and at the tip the internal
-wrench is the applied one; all that is unknown there is the tip's orientation.  So the equations
-of a geometrically exact rod are integrated from the tip to the base,
+For dead loads the internal force is known everywhere in base axes, and at the tip the internal
+wrench equals the applied one; the only unknown there is the tip's orientation.  The equations
+of a geometrically exact rod are therefore integrated from the tip to the base,
 
     q' = -q (0, u) / 2,   r' = -R v,   m' = R v x n + R c x f,   n(tau) = n_tip + f tau,
     (v, u) = strain(p) + C(p) (R^T n, R^T m),
 
 (tau: reference length from the tip, n and m: force and moment that the distal part exerts,
-f: weight per length, c: centroid), and the right orientation is the one that brings the base
-out upright: **three** unknowns for any number of segments, for dead and follower loads alike.
-Everything else follows from the same map by the implicit function theorem.
+f: weight per length, c: centroid).  The correct orientation is the one for which the base does not
+rotate: **three** unknowns for any number of segments, for dead and follower loads alike.
+All derivatives follow from the same map by the implicit function theorem.
 
 The integrator is the eleven-stage Runge-Kutta method of order eight of Cooper and Verner
 (SIAM J. Numer. Anal. 9, 1972).
 
 Stability under conservative loads is Jacobi's condition: the energy is at a minimum if and only
 if no shorter arm, clamped anywhere between tip and base, is at the point of buckling.  At that
-point a moment at the tip turns it without bound, and beyond it turns it the wrong way round: so
+point a moment at the tip turns it without bound, and beyond it turns it the opposite way.  So
 the rotational compliance of every shorter arm must be positive definite.
 """
 
@@ -87,18 +87,18 @@ _STAGES: tuple[dict[int, float], ...] = (
 )
 _WEIGHTS: dict[int, float] = {0: 1 / 20, 7: 49 / 180, 8: 16 / 45, 9: 49 / 180, 10: 1 / 20}
 LOBATTO = (0.0, (7 - _ROOT) / 14, 0.5, (7 + _ROOT) / 14, 1.0)
-"""Where in a step the stages lie that have a weight."""
+"""Places within a step of the stages that have a weight."""
 
 STEP_LENGTH = 2.0
 """Longest integration step at resolution 1, in outer radii of the segment at rest."""
 
 SAME_STATION = 1e-12
-"""Arc lengths that differ by less than this share of the arm's length are one station."""
+"""Arc lengths that differ by less than this share of the arm's length are the same station."""
 
 
 @dataclass(frozen=True)
 class RodStretch:
-    """A stretch of arm between two stations, integrated in equal steps from tip to base."""
+    """A piece of arm between two stations, integrated in equal steps from tip to base."""
 
     segment: int
     rigid: bool
@@ -116,7 +116,7 @@ def slopes(
     compliance: ca.SX,
     centroid: ca.SX | Vector,
 ) -> tuple[ca.SX, ca.SX, ca.SX]:
-    """Right-hand sides q' and m' of the rod's equations and the tangent -r', per length."""
+    """Return the right-hand sides q', tangent -r', and m' of the rod's equations, per length."""
     R = lie.rotation_from_quaternion(q)
     xi = strain + compliance @ ca.vertcat(R.T @ force, R.T @ m)
     tangent = R @ xi[:3]
@@ -128,9 +128,9 @@ def slopes(
 
 
 def _step_functions(sparsity: ca.Sparsity, centroid: Vector) -> tuple[ca.Function, ca.Function]:
-    """One integration step of length h towards the base: state (10,) -> state (10,), and its notes.
+    """Return one integration step of length h towards the base, (10,) to (10,), and its notes.
 
-    See `Stretch` for the latter.
+    See `Stretch` for the notes.
     """
     start = ca.SX.sym("y", 10)  # q (4), r (3), m (3)
     strain = ca.SX.sym("strain", 6)
@@ -169,7 +169,7 @@ def _soft_point(step: Callable[[float], ca.MX], distance: float) -> tuple[ca.MX,
 
 
 def _turn_between(q: ca.MX, dq: ca.MX) -> ca.MX:
-    """Rotation vectors (3, k) in body axes of the changes dq (4, k) of a unit quaternion q."""
+    """Return rotation vectors (3, k) in body axes of changes dq (4, k) of a unit quaternion q."""
     w, x, y, z = q[0], q[1], q[2], q[3]
     left = ca.vertcat(  # vector part of conjugate(q) * dq
         ca.horzcat(-x, w, z, -y), ca.horzcat(-y, -z, w, x), ca.horzcat(-z, y, -x, w)
@@ -184,8 +184,8 @@ class Stretch:
     Attributes
     ----------
     proximal, distal : float
-    towards_base : quaternion and position, from the tip, at a distance from its distal end towards
-        the base.
+    towards_base : function of the distance from its distal end towards the base, to quaternion and
+        position (from the tip).
     notes : (10, 6) quaternion, position and moment at its distal end, and its length times their
         slopes at the `LOBATTO` points.
     """
@@ -198,18 +198,18 @@ class Stretch:
 
 @dataclass(frozen=True)
 class Chain:
-    """Symbolic integration from tip to base, with everything that is read off on the way.
+    """Symbolic integration from tip to base; implements `Shape` under loads.
 
-    The shape of the arm at a *station*: a point of the arm that may carry a load, by default
+    It is the shape of the arm at a *station*: a point of the arm that may carry a load, by default
     its tip.  ``inputs`` are the tip's quaternion (4,), ``x`` (see below), gravity (3,) and the
-    loads at tip and station (12,) of `Loads`; the variables ``x = (delta, p, w)`` hold an
+    loads at tip and station (12,) of `Loads`.  Derivatives are taken by ``x = (delta, p, w)``: an
     infinitesimal turn of the tip (3,), the pressures (n,) and a dead wrench (6,) that is added
-    at the station: what derivatives are taken by.
+    at the station.
     """
 
     inputs: tuple[ca.MX, ...]
-    residual: ca.MX  # (3,) rotation that the base comes out with
-    nodes: tuple[ca.MX, ...]  # quaternions met from the tip to the base
+    residual: ca.MX  # (3,) rotation of the base, zero in equilibrium
+    nodes: tuple[ca.MX, ...]  # quaternions after each step from the tip to the base
     quaternion: ca.MX  # of the station
     position: ca.MX  # of the station, from the base
     tip_quaternion: ca.MX
@@ -246,7 +246,7 @@ class Chain:
 
     @cached_property
     def _per_x(self) -> tuple[ca.MX, ca.MX]:
-        """Change of the residual and body twist of the station per x, the tip turning freely."""
+        """Change of the residual and body twist of the station per x, with a free tip."""
         change = ca.jacobian(ca.vertcat(self.residual, self.quaternion, self.position), self.x)
         twist = ca.vertcat(
             self.rotation.T @ change[7:, :], _turn_between(self.quaternion, change[3:7, :])
@@ -255,7 +255,7 @@ class Chain:
 
     @cached_property
     def _turn_per_rest(self) -> ca.MX:
-        """Turn of the tip (3, n + 6) that keeps the base upright, per pressure and wrench."""
+        """Turn of the tip (3, n + 6) that keeps the base fixed, per pressure and wrench."""
         residual, _ = self._per_x
         return -inverse_3x3(residual[:, :3]) @ residual[:, 3:]
 
@@ -275,15 +275,15 @@ class Chain:
         return self._twist_per_rest[:, -6:] @ ca.diagcat(self.rotation, self.rotation)
 
     def flexibility(self, wrench: ca.MX) -> ca.MX:
-        """``w' C w`` of a dead wrench (6,) at the station, in its axes."""
+        """Return ``w' C w`` of a dead wrench (6,) at the station, in its axes."""
         return wrench.T @ self.compliance @ wrench
 
     def total_jacobian(self, values: ca.MX) -> ca.MX:
-        """Derivative (k, n) of values (k,) by the pressures, along the equilibrium."""
+        """Return the derivative (k, n) of values (k,) by the pressures, along the equilibrium."""
         return self.per_rest(ca.jacobian(values, self.x))[:, :-6]
 
     def per_rest(self, change: ca.MX) -> ca.MX:
-        """Change (k, n + 6) per pressure and wrench in equilibrium, of a change (k, 3 + n + 6)."""
+        """Reduce a change (k, 3 + n + 6) to equilibrium: (k, n + 6) per pressure and wrench."""
         return change[:, 3:] + change[:, :3] @ self._turn_per_rest
 
     @property
@@ -296,7 +296,7 @@ class Chain:
     def rotational_compliances(self) -> ca.MX:
         """Rotation of the tip per moment at it, side by side (3, 3 k), in tip axes.
 
-        Each is that of the arm clamped at one of the k nodes instead of at the base.
+        Each block is for the arm clamped at one of the k nodes instead of at the base.
         """
         R = lie.rotation_from_quaternion(self.tip_quaternion)
         blocks = []
@@ -310,7 +310,7 @@ class Chain:
 def pieces_of(
     description: RobotDescription, resolution: int, cuts: Sequence[float] = ()
 ) -> list[RodStretch]:
-    """The arm from tip to base, cut at the given arc lengths."""
+    """Return the pieces of the arm from tip to base, cut at the given arc lengths."""
     pieces: list[RodStretch] = []
     start, slack = 0.0, SAME_STATION * description.length
     for index, segment in enumerate(description.segments):
@@ -327,7 +327,7 @@ def pieces_of(
 
 
 def mass_per_length(segment: Segment) -> float:
-    """Mass of a segment per length at rest, in kg/m."""
+    """Return the mass of a segment per length at rest, in kg/m."""
     return float((segment.material.density or 0.0) * SectionGeometry.of(segment).area)
 
 
@@ -365,15 +365,15 @@ class Shooting:
 
     @property
     def n_variables(self) -> int:
-        """Number of what the sections depend on: pressures, and parameters if there are any."""
+        """Number of inputs of the sections: pressures, and parameters if there are any."""
         return int(self.sections.numel_in(0))
 
     def pieces(self, cuts: Sequence[float]) -> list[RodStretch]:
-        """The arm from tip to base, cut at the given arc lengths."""
+        """Return the pieces of the arm from tip to base, cut at the given arc lengths."""
         return pieces_of(self.description, self.resolution, cuts)
 
     def chain(self, at: float | None = None) -> Chain:
-        """Symbolic shooting map with the station at arc length `at` (None: the tip)."""
+        """Return the symbolic shooting map with the station at arc length `at` (None: the tip)."""
         q, x = ca.MX.sym("q", 4), ca.MX.sym("x", 3 + self.n_variables + 6)
         gravity, tip, station = ca.MX.sym("g", 3), ca.MX.sym("tip", 12), ca.MX.sym("station", 12)
         delta, p, added = x[:3], x[3:-6], x[-6:]
@@ -431,5 +431,5 @@ class Shooting:
         )
 
     def weight(self, segment: int) -> float:
-        """Mass per reference length of a segment, in kg/m."""
+        """Return the mass per reference length of a segment, in kg/m."""
         return mass_per_length(self.description.segments[segment])

@@ -1,6 +1,6 @@
 """Stations along an arm in the CasADi VM, for rows of pressures; see `stiffopt.model.body`.
 
-The same functions as in machine code, called in blocks, with NumPy in place of the loops in C.
+The functions are those of the machine code, called in blocks, with NumPy instead of loops in C.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ class Pieces:
     Attributes
     ----------
     ends : arc lengths (k,) at rest.
-    section : (k,) the piece whose section it has: itself, or of a connector the one before.
-    piece_of : (n,) the piece that a pressure strains.
+    section : (k,) index of the segment whose section a piece has; for a connector the one before.
+    piece_of : (n,) index of the piece that each pressure strains.
     """
 
     def __init__(self, arm: Arm) -> None:
@@ -52,7 +52,7 @@ class Pieces:
         self.piece_of = np.array(piece_of, dtype=np.int64)
 
     def find(self, at: Vector) -> tuple[Places, Vector]:
-        """Pieces (k,) that stations lie on, and arc lengths from their starts."""
+        """Return the pieces (k,) of stations, and arc lengths from the pieces' starts."""
         piece = np.minimum(np.searchsorted(self.ends, at), len(self.ends) - 1)
         return piece, at - np.concatenate([[0.0], self.ends])[piece]
 
@@ -65,19 +65,19 @@ class FreeStations:
         self.interpreted: Functions = _free_functions(arm.layout).__getitem__
 
     def poses(self, p: Vector, at: Vector) -> Vector:
-        """See `stiffopt.model.body.BodyShape`, as for the other methods."""
+        """See `stiffopt.model.body.BodyShape`, also for the other methods."""
         _, strains, starts, _ = self.interpreted("frames").many(p, self._numbers)
         pose = self._along(self.interpreted("along"), strains, starts, at)[0]
         return _transforms(pose[..., 3:12], pose[..., :3])
 
     def line(self, p: Vector, at: Vector) -> Vector:
-        """Positions and tangents (N, k, 6)."""
+        """Return positions and tangents (N, k, 6)."""
         _, strains, starts, _ = self.interpreted("frames").many(p, self._numbers)
         pose = self._along(self.interpreted("along"), strains, starts, at)[0]
         return np.concatenate([pose[..., :3], pose[..., 12:]], -1)
 
     def jacobians(self, p: Vector, at: Vector) -> Vector:
-        """Twists beyond a pressure's piece are those of its end; on it they grow along it."""
+        """Return the Jacobians; twists grow along a pressure's piece and are constant beyond it."""
         _, strains, starts, _, slopes, twists, _ = self.interpreted("moving_frames").many(
             p, self._numbers
         )
@@ -94,7 +94,7 @@ class FreeStations:
     def compliances(
         self, function: Functions, p: Vector, at: Vector, s: Places, t: Places
     ) -> Vector:
-        """``X_s A(min(s, t)) X_t'``, with s and t places (k,) in `at`, which ascends."""
+        """Return ``X_s A(min(s, t)) X_t'``; s and t are indices (k,) into the ascending `at`."""
         count = len(p)
         _, strains, starts, _ = function("frames").many(p, self._numbers)
         sections, before = function("gathering").many(p, self._numbers)
@@ -112,13 +112,13 @@ class FreeStations:
         return found
 
     def radii(self, p: Vector) -> Vector:
-        """Of each piece, (N, pieces)."""
+        """Return the radius of each piece, (N, pieces)."""
         return self.interpreted("frames").many(p, self._numbers)[3][..., 0]
 
     def _along(
         self, function: BatchFunction, strains: Vector, starts: Vector, at: Vector
     ) -> list[Vector]:
-        """Poses (N, k, 15), and of ``moving_along`` twists per strain (N, k, 6, m)."""
+        """Return poses (N, k, 15), and for ``moving_along`` twists per strain (N, k, 6, m)."""
         count = len(strains)
         piece, local = self._pieces.find(at)
         lengths = np.tile(local, count)[:, np.newaxis]
@@ -128,14 +128,14 @@ class FreeStations:
 
 
 class Carried(NamedTuple):
-    """What is carried from the tip to stations, along directions.
+    """States at stations, and their changes along directions, propagated from the tip.
 
     Attributes
     ----------
     axes : (k, 9) by columns.
     positions, tangents : (k, 3)
-    changes : (k, 3, 3, d) turns, moments and ways from there to the tip, in base axes.
-    force : (3, d) change of the force, along the whole arm.
+    changes : (k, 3, 3, d) of rotation, moment and vector to the tip, in base axes.
+    force : (3, d) change of the force, the same along the whole arm.
     """
 
     axes: Vector
@@ -146,7 +146,7 @@ class Carried(NamedTuple):
 
 
 class LoadedStations:
-    """Stations of an arm in equilibrium, between the steps of the integration.
+    """Stations of an arm in equilibrium, interpolated between integration steps.
 
     Directions are three turns of the tip, the pressures and a wrench at the tip, see `Chain`.
     """
@@ -156,19 +156,19 @@ class LoadedStations:
         self._functions = _loaded_functions(arm.layout)
 
     def poses(self, p: Vector, at: Vector) -> Vector:
-        """See `stiffopt.model.body.BodyShape`, as for the other methods."""
+        """See `stiffopt.model.body.BodyShape`, also for the other methods."""
         rows = [self._carried(row, at, moving=False) for row in p]
         found = [_transforms(row.axes, row.positions) for row in rows]
         return np.array(found).reshape(len(p), len(at), 4, 4)
 
     def line(self, p: Vector, at: Vector) -> Vector:
-        """Positions and tangents (N, k, 6)."""
+        """Return positions and tangents (N, k, 6)."""
         rows = [self._carried(row, at, moving=False) for row in p]
         found = [np.hstack([row.positions, row.tangents]) for row in rows]
         return np.array(found).reshape(len(p), len(at), 6)
 
     def jacobians(self, p: Vector, at: Vector) -> Vector:
-        """By the turn of the tip that keeps the base upright."""
+        """Return the Jacobians, with the turn of the tip for which the base does not rotate."""
         n = self._arm.n_pressures
         found = []
         for row in p:
@@ -182,7 +182,7 @@ class LoadedStations:
         return np.array(found).reshape(len(p), len(at), 6, n)
 
     def responses(self, p: Vector, at: Vector) -> Vector:
-        """What C gives for these: turns, moments and ways along turns and wrenches, and force."""
+        """Return the changes along turns and wrenches in the layout of the machine code."""
         first = np.r_[:3, -6:0]
         found = []
         for row in p:
@@ -192,11 +192,11 @@ class LoadedStations:
         return np.array(found).reshape(len(p), 81 * len(at) + 27)
 
     def radii(self, p: Vector) -> Vector:
-        """Of each piece, (N, pieces)."""
+        """Return the radius of each piece, (N, pieces)."""
         return self._functions["radii"].many(p, self._arm.numbers)[0][..., 0]
 
     def _carried(self, p: Vector, at: Vector, *, moving: bool) -> Carried:
-        """At the equilibrium from rest; where it is moving, changes are those of the base first."""
+        """Evaluate the equilibrium from rest; if `moving`, changes begin with those at the base."""
         function, distal = self._notes(moving)
         notes, *changes = function(*self._arm._equilibrium().arguments(self._arm.settle(p)))
         at = np.concatenate([[0.0], at])
@@ -221,7 +221,7 @@ class LoadedStations:
         return Carried(*places, carried, force)
 
     def _notes(self, moving: bool) -> tuple[InterpretedFunction, Vector]:
-        """Notes (10, 6 stretches), their changes and those of the force; where stretches begin."""
+        """Return the function of notes (10, 6 stretches) and their changes; starts of stretches."""
         arm = self._arm
 
         def make() -> tuple[InterpretedFunction, Vector]:
@@ -248,21 +248,21 @@ def _loaded_functions(layout: Layout) -> dict[str, InterpretedFunction]:
 
 
 def response(carried: Vector, force: Vector, s: Places, t: Places) -> Vector:
-    """Twists at s per wrench at t of a loaded arm, (N, k, 6, 6), in base axes.
+    """Return twists at s per wrench at t of a loaded arm, (N, k, 6, 6), in base axes.
 
     Parameters
     ----------
     carried : (N, stations, 3, 3, 9)
-        Turns, changes of moment and of the way to the tip along turns of the tip and wrenches
+        Changes of rotation, moment and vector to the tip along turns of the tip and wrenches
         there; the first station is the base, and the others ascend.
     force : (N, 3, 9)
         Changes of the force.
     s, t : (k,)
-        Places of the stations.
+        Indices of the stations.
     """
     here, there, base = carried[:, s], carried[:, t], carried[:, :1]
     forces = np.broadcast_to(force[:, None], there[:, :, 0].shape)
-    # what is carried from the tip and is a jump of force and moment at t, without a turn
+    # combination of the propagated solutions with a jump of force and moment at t, no rotation
     jump = np.linalg.inv(np.concatenate([there[:, :, 0], there[:, :, 1], forces], -2))
     jump = jump[..., [6, 7, 8, 3, 4, 5]]
     turn = -np.linalg.solve(np.broadcast_to(base[:, :, 0, :, :3], (*jump.shape[:2], 3, 3)),
@@ -275,8 +275,8 @@ def response(carried: Vector, force: Vector, s: Places, t: Places) -> Vector:
 
 
 def in_axes(axes: Vector, twists: Vector) -> Vector:
-    """Twists (..., 6, n) in base axes, in axes that are given by columns (..., 9)."""
-    rows = axes.reshape(*axes.shape[:-1], 3, 3)  # those of R'
+    """Transform twists (..., 6, n) from base axes to axes given by columns (..., 9)."""
+    rows = axes.reshape(*axes.shape[:-1], 3, 3)  # R'
     return np.concatenate([rows @ twists[..., :3, :], rows @ twists[..., 3:, :]], -2)
 
 
@@ -289,11 +289,11 @@ def _transforms(axes: Vector, positions: Vector) -> Vector:
 
 
 def _at_pieces(values: Vector, piece: Places) -> Vector:
-    """Columns (N k, r) of values (N, r, pieces)."""
+    """Return columns (N k, r) of values (N, r, pieces)."""
     found: Vector = np.swapaxes(values[:, :, piece], 1, 2).reshape(-1, values.shape[1])
     return found
 
 
 def _hat(v: Vector) -> Vector:
-    """Skew matrices (..., 3, 3) of vectors (..., 3)."""
+    """Return skew matrices (..., 3, 3) of vectors (..., 3)."""
     return np.cross(v[..., None, :], np.eye(3), axisa=-1, axisb=-1, axisc=-1).swapaxes(-1, -2)

@@ -1,7 +1,7 @@
-"""Giving up on what takes long: after a time, or when somebody says so.
+"""Stop long computations: after a time, or when the caller cancels.
 
-`giving_up` sets it for all that is called in its context; `checkpoint` is where Python code gives
-up, and `stop_flag` tells machine code, which looks at it between two evaluations of the model.
+`giving_up` sets the limits of everything called in its context.  Python code checks them in
+`checkpoint`, machine code by the flag of `stop_flag`, between two evaluations of the model.
 """
 
 import ctypes
@@ -17,22 +17,22 @@ from typing import Protocol
 
 from stiffopt.errors import CancelledError, InputError, OutOfTimeError, shown
 
-_LOOK_AGAIN = 0.01  # s between two questions whether to go on
+_LOOK_AGAIN = 0.01  # s between two polls of `cancel`
 
 
 class Settable(Protocol):
-    """What a `threading.Event` and that of a process have in common."""
+    """Interface that `threading.Event` and `multiprocessing.Event` share."""
 
     def is_set(self) -> bool:
-        """Whether somebody has set it."""
+        """Return whether it is set."""
 
 
 Cancel = Callable[[], object] | Settable
-"""An event, or what is called and says true: that the answer is no longer wanted."""
+"""An event that is set, or a function that returns true, when the answer is no longer wanted."""
 
 
 class StopFlag(ctypes.Structure):
-    """`Stop` of optimise/native/program.h."""
+    """Structure `Stop` of optimise/native/program.h."""
 
     _fields_ = (("seconds", ctypes.c_double), ("cancel", ctypes.c_int64))
 
@@ -54,21 +54,21 @@ class _Limits:
             raise OutOfTimeError(f"no answer within the {self.timeout:g} s that it was given")
 
 
-_NO_LIMITS, _NO_FLAG = nullcontext(), nullcontext(0)  # most calls: as cheap as can be
+_NO_LIMITS, _NO_FLAG = nullcontext(), nullcontext(0)  # for most calls, which have no limits
 _limits: ContextVar[_Limits | None] = ContextVar("limits", default=None)
 
 
 def giving_up(
     timeout: float | None = None, cancel: Cancel | None = None
 ) -> AbstractContextManager[None]:
-    """Within this context, give up after a time (s) or as soon as `cancel` says so.
+    """Stop computations in this context after a time (s) or as soon as `cancel` asks for it.
 
-    An outer context of this kind goes on to hold.
+    An outer context of this kind remains in force.
 
     Raises
     ------
     InputError
-        If the timeout is no positive number, or `cancel` neither an event nor callable.
+        If the timeout is not a positive number, or `cancel` neither an event nor callable.
     """
     return _NO_LIMITS if timeout is None and cancel is None else _giving_up(timeout, cancel)
 
@@ -94,7 +94,7 @@ def _giving_up(timeout: float | None, cancel: Cancel | None) -> Iterator[None]:
 
 
 def checkpoint() -> None:
-    """Give up here if it is time to.
+    """Raise an error if the limits are exceeded.
 
     Raises
     ------
@@ -106,9 +106,9 @@ def checkpoint() -> None:
 
 
 def stop_flag() -> AbstractContextManager[int]:
-    """Address of the `StopFlag` for a call of machine code; 0 where nothing limits it.
+    """Provide the address of a `StopFlag` for a call of machine code; 0 without limits.
 
-    While the context lasts, another thread asks whether to go on, if there is anybody to ask.
+    If there is a `cancel`, another thread polls it during the context.
     """
     limits = _limits.get()
     return _NO_FLAG if limits is None else _stop_flag(limits)
@@ -127,7 +127,7 @@ def _stop_flag(limits: _Limits) -> Iterator[int]:
         while not flag.cancel:
             try:
                 flag.cancel = int(limits.is_cancelled)
-            except BaseException as error:  # the caller's own: it is raised where they wait
+            except BaseException as error:  # of the caller's function: raise it in their thread
                 failures.append(error)
                 flag.cancel = 1
             if ended.wait(_LOOK_AGAIN):

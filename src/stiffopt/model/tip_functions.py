@@ -1,8 +1,8 @@
-"""The functions of an unloaded arm's tip, in machine code where that pays.
+"""Functions of an unloaded arm's tip, in machine code where that pays.
 
-Arguments of these functions are the arm's numbers (see `stiffopt.model.layout`) and what varies
-from call to call (direction, kind and boundary of a stiffness), so that one library serves all
-arms of a layout.  Every function gives the margins of the strain laws with its value, so that no
+Their arguments are the arm's numbers (see `stiffopt.model.layout`) and what varies
+from call to call (direction, kind and boundary of a stiffness), so one library serves all
+arms of a layout.  Every function also returns the margins of the strain laws, so no
 second pass over a batch is needed to check them.
 """
 
@@ -24,11 +24,11 @@ from stiffopt.model.layout import Layout, symbolic_arm
 Vector = NDArray[np.float64]
 
 LOOKED_UP_FROM = 64
-"""Rows of a batch from which compiled code is used if there is any."""
+"""Number of rows of a batch from which compiled code is used, if it is in the cache."""
 
 COMPILED_FROM = 50_000
-"""Rows, of all batches so far, from which code is compiled if there is none: as long as that
-takes, about a second, has then been spent in the VM or is about to be."""
+"""Number of rows of all batches after which code is compiled: compiling takes about a second, as
+long as these rows take in the VM."""
 
 _BLOCK = 65_536  # rows
 
@@ -39,7 +39,7 @@ _Ends = tuple[list[ca.SX], list[ca.SX]]  # symbols and expressions
 class TipFunctions:
     """Functions of an arm's tip by name (see the methods of `TipFormulas`).
 
-    Values from machine code and from the VM are the same to the last bit.
+    Values from machine code and from the VM are equal to the last bit.
     """
 
     def __init__(self, layout: Layout, numbers: Vector) -> None:
@@ -51,17 +51,17 @@ class TipFunctions:
         self._lock = threading.Lock()
 
     def evaluate(self, name: str, p: Vector, *parameters: Vector) -> list[Vector]:
-        """Value (..., r, c) and margins (..., segments, 1) at pressures (n,) or (N, n)."""
+        """Return value (..., r, c) and margins (..., segments, 1) at pressures (n,) or (N, n)."""
         return self._in_blocks(lambda call, q: call(name, q, self._numbers, *parameters), p)
 
     def stiffness(self, p: Vector, measure: DirectionalMeasure) -> list[Vector]:
-        """A directional stiffness (..., 1, 1), and margins (..., segments, 1)."""
+        """Return a directional stiffness (..., 1, 1), and margins (..., segments, 1)."""
         if measure.boundary == "free":
             return self.evaluate("stiffness", p, _load(measure))
         return self._in_blocks(lambda call, q: self._held(call, q, measure), p)
 
     def stiffness_gradient(self, p: Vector, measure: DirectionalMeasure) -> list[Vector]:
-        """Its derivative (..., 1, n) by the pressures, and margins (..., segments, 1)."""
+        """Return its derivative (..., 1, n) by the pressures, and margins (..., segments, 1)."""
         if measure.boundary == "free":
             return self.evaluate("stiffness_gradient", p, _load(measure), np.ones(1))
         return self._in_blocks(lambda call, q: self._held_gradient(call, q, measure), p)
@@ -73,9 +73,10 @@ class TipFunctions:
         return [value, margins]
 
     def _held_gradient(self, call: _Call, p: Vector, measure: DirectionalMeasure) -> list[Vector]:
-        """``k = D' C_held^-1 D`` by way of the wrench ``W`` that moves the held tip by ``D``.
+        """Return the gradient of ``k = D' C_held^-1 D``.
 
-        Then ``dk = -W' dC W + 2 W' dD``, of which the former is that of a flexibility.
+        With the wrench ``W`` that moves the held tip by ``D``: ``dk = -W' dC W + 2 W' dD``, where
+        the first part is that of a flexibility.
         """
         held = _held(measure)
         compliance, margins = call("tip_compliance", p, self._numbers)
@@ -89,10 +90,10 @@ class TipFunctions:
     def _in_blocks(
         self, formula: Callable[[_Call, Vector], list[Vector]], p: Vector
     ) -> list[Vector]:
-        """A formula of several functions, for one set of pressures (n,) or blocks of rows (N, n).
+        """Evaluate a formula of several functions, for pressures (n,) or blocks of rows (N, n).
 
-        Blocks need little memory for what goes between the functions, and machine code that was
-        made in the background serves from the next block on.
+        Blocks need little memory for intermediate results, and machine code that becomes ready
+        in the background is used from the next block on.
         """
         if p.ndim == 1:
             return formula(self._one, p)
@@ -130,7 +131,7 @@ class TipFunctions:
 
 @lru_cache(maxsize=256)
 def _load(measure: DirectionalMeasure) -> Vector:
-    """Unit load (12,): a wrench in base axes and one in tip axes, of which one is zero."""
+    """Return a unit load (12,): a wrench in base axes and one in tip axes; one of them is zero."""
     start = (0 if measure.frame == "base" else 6) + (0 if measure.kind == "translation" else 3)
     load = np.zeros(12)
     load[start : start + 3] = measure.direction
@@ -140,7 +141,7 @@ def _load(measure: DirectionalMeasure) -> Vector:
 
 @lru_cache(maxsize=256)
 def _held(measure: DirectionalMeasure) -> Vector:
-    """Unit direction (3,) in base axes and in tip axes, one of them zero, and two conditions."""
+    """Return a unit direction (3,) in base or tip axes, the other zero, and two conditions."""
     own, none = measure.direction, (0.0, 0.0, 0.0)
     axes = (*own, *none) if measure.frame == "base" else (*none, *own)
     conditions = (measure.kind == "rotation", measure.boundary == "clamped")
@@ -156,14 +157,15 @@ def _tip_functions(layout: Layout) -> list[ca.Function]:
 
 @lru_cache(maxsize=64)
 def tip_formulas(layout: Layout) -> "TipFormulas":
-    """Return the functions of the tip of all arms of a layout; made once in a process."""
+    """Return the functions of the tip of all arms of a layout; cached."""
     return TipFormulas(layout)
 
 
 class TipFormulas:
-    """Functions of the tip, symbolically, each named as its method.
+    """Symbolic functions of the tip, each named like its method.
 
-    Those of the pressures take the arm's numbers next, and end with the margins of the strain laws.
+    Functions of the pressures take the arm's numbers next, and end with the margins of the strain
+    laws.
     """
 
     NAMES = (
@@ -183,7 +185,7 @@ class TipFormulas:
         self._interpreted: dict[str, InterpretedFunction] = {}
 
     def interpreted(self, name: str) -> InterpretedFunction:
-        """One of them in the CasADi VM, shared by all arms of the layout."""
+        """Return one of them in the CasADi VM, shared by all arms of the layout."""
         found = self._interpreted.get(name)
         if found is None:
             with self._lock:
@@ -193,40 +195,40 @@ class TipFormulas:
         return found
 
     def function(self, name: str) -> ca.Function:
-        """One of them, dense."""
+        """Return one of them as a dense CasADi function."""
         formula: Callable[[], _Ends] = getattr(self, name)
         inputs, outputs = formula()
         return dense(ca.Function(name, inputs, ca.cse([ca.densify(part) for part in outputs])))
 
     def tip_pose(self) -> _Ends:
-        """Pose (4, 4)."""
+        """Return the pose (4, 4)."""
         return self._of_pressures(self._tip.transform)
 
     def tip_jacobian(self) -> _Ends:
-        """Body twist (6, n) per pressure."""
+        """Return the body twist (6, n) per pressure."""
         return self._of_pressures(self._tip.jacobian)
 
     def tip_compliance(self) -> _Ends:
-        """Compliance (6, 6) in tip axes."""
+        """Return the compliance (6, 6) in tip axes."""
         return self._of_pressures(self._tip.compliance)
 
     def tip_at(self) -> _Ends:
-        """Pose, Jacobian, compliance and the smallest margin."""
+        """Return pose, Jacobian, compliance and the smallest margin."""
         tip, inputs = self._tip, [self._tip.pressures, self._arm.numbers]
         least = ca.mmin(self._arm.actuation.margin)
         return inputs, [tip.transform, tip.jacobian, tip.compliance, least]
 
     def margin(self) -> _Ends:
-        """Margins of the strain laws, one per segment."""
+        """Return the margins of the strain laws, one per segment."""
         return [self._tip.pressures, self._arm.numbers], [self._arm.actuation.margin]
 
     def stiffness(self) -> _Ends:
-        """Of the free tip along a load (12,), see `_load`."""
+        """Return the stiffness of the free tip along a load (12,), see `_load`."""
         load, flexibility = self._flexibility
         return self._of_pressures(1 / flexibility, load)
 
     def stiffness_gradient(self) -> _Ends:
-        """Gradient of it, or of minus the flexibility where the last argument is 0."""
+        """Return its gradient, or that of minus the flexibility if the last argument is 0."""
         load, flexibility = self._flexibility
         inverted = ca.SX.sym("inverted")
         factor = ca.if_else(inverted, 1 / flexibility**2, 1)
@@ -234,14 +236,14 @@ class TipFormulas:
         return self._of_pressures(-factor * gradient, load, inverted)
 
     def held_stiffness(self) -> _Ends:
-        """From the compliance, pose and arguments of `_held` to the stiffness and the load."""
+        """Return stiffness and load from the compliance, pose and arguments of `_held`."""
         compliance, pose, held = ca.SX.sym("C", 6, 6), ca.SX.sym("T", 4, 4), ca.SX.sym("held", 8)
         direction = pose[:3, :3].T @ held[:3] + held[3:6]
         value, wrench = held_stiffness(compliance, direction, held[6], held[7])
         return [compliance, pose, held], [value, ca.vertcat(ca.SX.zeros(6), wrench)]
 
     def held_stiffness_gradient(self) -> _Ends:
-        """Gradient of it from minus that of the flexibility for its load, and how axes turn."""
+        """Return its gradient from minus that of the flexibility, and the turn of the axes."""
         n = self._tip.pressures.numel()
         slope, jacobian, pose = ca.SX.sym("g", 1, n), ca.SX.sym("J", 6, n), ca.SX.sym("T", 4, 4)
         load, held = ca.SX.sym("load", 12), ca.SX.sym("held", 8)

@@ -1,14 +1,15 @@
-"""Uncertainty of the tip's position and stiffness of a calibrated arm.
+"""Uncertainty of a calibrated arm's tip position and stiffness.
 
-There are four independent sources: the parameters, whose covariance the calibration found; the
-hysteresis, since the same pressures hold the arm anywhere between where loading and unloading take
-it; the discrepancy between model and arm, which grows with the distance from what was recorded; and
-the residual that no parameter explained in the recordings.  All but the last are propagated to the
-tip by their Jacobians, to first order.  Together they follow a multivariate t-distribution.
+There are four independent sources: the parameters, whose covariance the calibration estimated; the
+hysteresis, since at the same pressures the arm may rest anywhere between its loading and unloading
+curves; the discrepancy between model and arm, which grows with the distance from recorded
+pressures; and the residual that no parameter explained in the recordings.  All but the last are
+propagated to the tip by their Jacobians, to first order.  Together they follow a multivariate
+t-distribution.
 
-What hysteresis does is bounded: no play operator was ever dragged beyond the robot's pressure
-limits, so that less hysteresis is possible near the limits than between them.  Its mean square is
-that of effective minus commanded pressures as recorded, and at most that of an even distribution
+Hysteresis is bounded: no play operator was ever dragged beyond the robot's pressure
+limits, so less hysteresis is possible near the limits than between them.  Its mean square is
+that of effective minus commanded pressures as recorded, and at most that of a uniform distribution
 between the bounds, about the equilibrium, which is what `tip_pose` returns.
 """
 
@@ -34,24 +35,24 @@ from stiffopt.model.parametric import ParametricArm
 Vector = NDArray[np.float64]
 Part = Literal["parameters", "hysteresis", "discrepancy", "residual"]
 
-_LEVEL = 0.95  # of the regions that are told everywhere
+_LEVEL = 0.95  # probability of the reported regions
 _NORMAL = 1.959963984540054  # 97.5 % quantile
 
 
 @dataclass(frozen=True, eq=False)
 class TipUncertainty:
-    """How well the tip's position and stiffness are known at some pressures.
+    """Uncertainty of the tip's position and stiffness at some pressures.
 
     Attributes
     ----------
     parameters, hysteresis, discrepancy, residual : ndarray
         Mean squares (3, 3) of the error of `Manipulator.tip_pose`'s position in base axes, in m^2,
-        that come from the parameters' errors, from hysteresis, from what the model gets wrong far
-        from recorded pressures, and from what the calibration left unexplained.
+        due to the parameters' errors, to hysteresis, to model errors far from recorded pressures,
+        and to what the calibration left unexplained.
     inside : bool
         Whether the calibration saw such pressures; outside, the model extrapolates.
     extrapolation : str
-        A sentence that says so, with the distance to the nearest recorded pressures; else empty.
+        A sentence about that, with the distance to the nearest recorded pressures, or "".
     """
 
     parameters: Vector
@@ -74,7 +75,7 @@ class TipUncertainty:
         return self.semi_axes_at(_LEVEL)
 
     def semi_axes_at(self, level: float) -> Vector:
-        """Half lengths (3,) in m of the ellipsoid that holds the tip with a probability."""
+        """Return half lengths (3,) in m of the ellipsoid that holds the tip with a probability."""
         if not 0 < level < 1:
             raise InputError(f"a probability lies between 0 and 1, both excluded; got {level!r}")
         values = np.linalg.eigvalsh(self.covariance)[::-1]
@@ -88,7 +89,7 @@ class TipUncertainty:
 
     @property
     def largest_part(self) -> Part:
-        """What most of the error's mean square comes from."""
+        """The source of most of the error's mean square."""
         parts: dict[Part, float] = {
             "parameters": float(np.trace(self.parameters)),
             "hysteresis": float(np.trace(self.hysteresis)),
@@ -104,10 +105,10 @@ class TipUncertainty:
         boundary: Boundary = "free",
         frame: Frame = "base",
     ) -> tuple[float, float]:
-        """95 % interval of a directional stiffness, in N/m or N m/rad; see `Manipulator.stiffness`.
+        """Return the 95 % interval of a directional stiffness, in N/m or N m/rad.
 
-        From the errors of the parameters and of the effective pressures, on a logarithmic scale, to
-        first order. It contains `Manipulator.stiffness`.
+        It is due to errors of the parameters and of the effective pressures, on a logarithmic
+        scale, to first order. It contains `Manipulator.stiffness`, which explains the arguments.
         """
         return self._source.stiffness_interval(self._pressures, direction, kind, boundary, frame)
 
@@ -131,7 +132,7 @@ class PositionErrors:
 
     @property
     def covariance(self) -> Vector:
-        """Of all sources (N, 3, 3)."""
+        """Sum of all sources (N, 3, 3)."""
         return np.asarray(self.parameters + self.hysteresis + self.discrepancy + self.residual)
 
 
@@ -170,12 +171,12 @@ class Uncertainty:
 
     @property
     def degrees_of_freedom(self) -> float:
-        """Of the t-distribution of the errors; infinite where it is normal."""
+        """Degrees of freedom of the errors' t-distribution; infinite if it is normal."""
         errors = self._calibration.errors
         return np.inf if errors is None else errors.degrees_of_freedom
 
     def at(self, pressures: Vector, *, moving: bool = False) -> TipUncertainty:
-        """Uncertainty at commanded pressures (n,), held or `moving`, of an unknown history."""
+        """Return the uncertainty at commanded pressures (n,), held or `moving`; history unknown."""
         p = pressures[np.newaxis]
         found = self.errors(p, moving=np.array([moving]))
         extrapolation = self._description.extrapolation(pressures)
@@ -197,14 +198,14 @@ class Uncertainty:
         effective: Vector | None = None,
         moving: NDArray[np.bool_] | None = None,
     ) -> PositionErrors:
-        """Errors of predictions.
+        """Return the errors of predictions.
 
         Parameters
         ----------
         pressures : commanded (N, n), in Pa.
-        effective : pressures (N, n) in Pa that a known history makes of them; without these the
+        effective : effective pressures (N, n) in Pa after a known history; without these the
             prediction is `tip_pose` at the commanded ones.
-        moving : which rows (N,) are not held; none if absent.
+        moving : which rows (N,) are not held; none by default.
         """
         u = pressures if effective is None else effective
         position, per_number, per_pressure = self._slopes.at(u)
@@ -224,7 +225,7 @@ class Uncertainty:
         )
 
     def levels(self, errors: Vector, covariance: Vector) -> Vector:
-        """Probability (N,) of the smallest regions that hold errors (N, 3) of the position."""
+        """Return the probability (N,) of the smallest regions that hold errors (N, 3)."""
         return levels(errors, covariance, self.degrees_of_freedom)
 
     def stiffness_interval(
@@ -244,14 +245,14 @@ class Uncertainty:
         return float(k[0] * np.exp(-_NORMAL * deviation)), float(k[0] * np.exp(_NORMAL * deviation))
 
     def _discrepancy(self, pressures: Vector) -> Vector:
-        """Variances (N, n) of the effective pressures far from what was recorded, in Pa^2."""
+        """Return variances (N, n) of the effective pressures due to the discrepancy, in Pa^2."""
         errors = self._calibration.errors
         if errors is None:
             return np.zeros_like(pressures)
         return errors.variances(self._channels, pressures)
 
     def _hysteresis(self, pressures: Vector, moving: NDArray[np.bool_]) -> Vector:
-        """Mean squares (N, n) of effective minus commanded pressures (N, n), in Pa^2."""
+        """Return mean squares (N, n) of effective minus commanded pressures (N, n), in Pa^2."""
         bounds = np.array([self._even(row) for row in pressures])
         errors = self._calibration.errors
         if errors is None:
@@ -263,20 +264,20 @@ class Uncertainty:
         return bounds
 
     def _even(self, pressures: Vector) -> Vector:
-        """Mean squares (n,) if every possible effective pressure is as likely, in Pa^2."""
+        """Return mean squares (n,) if all effective pressures are equally likely, in Pa^2."""
         robot, first, found = self._description, 0, []
         limits = np.array([robot.pressure_min, robot.pressure_max])
         for segment in robot.segments:
             own = slice(first, first := first + segment.n_channels)
             p = pressures[own]
             ends = settled_range(segment.history or NO_HISTORY, p, *limits[:, own])
-            least, most = np.subtract(ends, p)
-            found.append((least**2 + least * most + most**2) / 3)
+            low, high = np.subtract(ends, p)
+            found.append((low**2 + low * high + high**2) / 3)
         return np.concatenate(found)
 
 
 class ReadingSlopes:
-    """Where a tracker reads the tip, and what the numbers of a calibration move of it.
+    """Tip position and the derivatives of the tracker's reading by a calibration's numbers.
 
     Parameters
     ----------
@@ -302,9 +303,10 @@ class ReadingSlopes:
             self._sensor = given.registration.tip_in_sensor.inverse()[:3, 3]
 
     def at(self, pressures: Vector) -> tuple[Vector, Vector, Vector]:
-        """Positions (N, 3) of the tip at effective pressures (N, n), and slopes of the sensor's.
+        """Return tip positions (N, 3) at effective pressures (N, n), and slopes of the sensor's.
 
-        These are (N, 3, k + frames) by the numbers and (N, 3, n) per Pa; all in base axes and m.
+        The slopes are (N, 3, k + frames) by the numbers and (N, 3, n) per Pa; all in base axes and
+        m.
         """
         found = self.arm.poses(pressures, self.rest)
         rotation, tip = found.transforms[:, :3, :3], found.transforms[:, :3, 3]
@@ -322,7 +324,7 @@ class ReadingSlopes:
 
 
 def _skew(vectors: Vector) -> Vector:
-    """Matrices (..., 3, 3) of the cross products with vectors (..., 3)."""
+    """Return matrices (..., 3, 3) of the cross products with vectors (..., 3)."""
     x, y, z = np.moveaxis(vectors, -1, 0)
     o = np.zeros_like(x)
     rows = [np.stack(row, axis=-1) for row in ((o, -z, y), (z, o, -x), (-y, x, o))]
@@ -330,10 +332,10 @@ def _skew(vectors: Vector) -> Vector:
 
 
 def squared_radius(level: float, degrees_of_freedom: float) -> float:
-    """Squared Mahalanobis distance within which errors of a probability lie, in three dimensions.
+    """Return the squared Mahalanobis radius of a region of this probability, in 3D.
 
     The covariance of a t-distribution with v degrees of freedom is v / (v - 2) times its scale
-    matrix, so that the squared distance by the covariance is (v - 2) / v times 3 F(3, v).
+    matrix, so the squared distance by the covariance is (v - 2) / v times 3 F(3, v).
     """
     from scipy.special import chdtri, fdtri
 
@@ -344,7 +346,10 @@ def squared_radius(level: float, degrees_of_freedom: float) -> float:
 
 
 def levels(errors: Vector, covariance: Vector, degrees_of_freedom: float) -> Vector:
-    """Probability (N,) of the smallest regions of covariances (N, 3, 3) that hold errors (N, 3)."""
+    """Return the probability (N,) of the smallest regions that hold errors (N, 3).
+
+    Regions are ellipsoids of the covariances (N, 3, 3).
+    """
     from scipy.special import chdtr, fdtr
 
     v = degrees_of_freedom
@@ -359,10 +364,10 @@ def levels(errors: Vector, covariance: Vector, degrees_of_freedom: float) -> Vec
 def settled_range(
     history: History, pressures: Vector, low: Vector, high: Vector, first: int = 0
 ) -> tuple[Vector, Vector]:
-    """Least and largest effective pressures (c,) of channels that settled at pressures, in Pa.
+    """Return the least and largest possible effective pressures (c,) at rest, in Pa.
 
-    The arm began at rest without pressure; of what was commanded since then only the limits are
-    known.
+    The arm began at rest without pressure; commands since then are known only to lie within the
+    limits.
 
     Parameters
     ----------
@@ -374,7 +379,7 @@ def settled_range(
     low, high = np.minimum(low, np.minimum(pressures, 0)), np.maximum(high, pressures)
     high = np.maximum(high, 0)
     memory = np.array([history.memory_of(first + c) for c in range(len(pressures))])
-    least, most = pressures.astype(float), pressures.astype(float)
+    lowest, highest = pressures.astype(float), pressures.astype(float)
     for play in history.play:
         projection = part_of(np.eye(len(pressures)), play.of)
         forward, backward = np.maximum(projection, 0), np.minimum(projection, 0)
@@ -383,6 +388,6 @@ def settled_range(
         # the operator is dragged down to low + width and up to high - width; it began at zero
         under = np.maximum(x - play.width, np.minimum(nearest + play.width, 0)) - x
         over = np.minimum(x + play.width, np.maximum(farthest - play.width, 0)) - x
-        least = least + memory * play.share * (forward @ under + backward @ over)
-        most = most + memory * play.share * (forward @ over + backward @ under)
-    return least, most
+        lowest = lowest + memory * play.share * (forward @ under + backward @ over)
+        highest = highest + memory * play.share * (forward @ over + backward @ under)
+    return lowest, highest

@@ -1,1 +1,1 @@
-"""Arms that lean on objects: equilibria with unilateral contacts along the body."""
+"""Arms in contact: equilibria with unilateral contacts along the body."""

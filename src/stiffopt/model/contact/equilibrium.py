@@ -1,4 +1,4 @@
-"""The equilibrium of an arm that leans on objects, and what it can take."""
+"""`ContactEquilibrium`: an equilibrium in contact, its compliance, and pushes against it."""
 
 from __future__ import annotations
 
@@ -29,20 +29,20 @@ Vector = NDArray[np.float64]
 Approach = Literal["pressures", "objects"]
 Grip = Literal["sliding", "sticking"]
 
-_BESIDE = 1e-5  # m along the arm, over which tangents are taken
+_BESIDE = 1e-5  # m along the arm, step of the differences for tangents
 
 
 class Contact(NamedTuple):
-    """Where an arm leans on an object.
+    """A contact of an arm with an object.
 
     Attributes
     ----------
     object : its name.
-    at : arc length at rest of the station that is nearest to it, in m.
+    at : arc length at rest of the station nearest to it, in m.
     force : on the arm (3,), in base axes, in N.
     position : of the surface there (3,), in m.
     normal : unit vector (3,) from the surface to the arm.
-    max_force : that the scene allows, in N; infinite where it says nothing.
+    max_force : largest force that the scene allows, in N; infinite without a limit.
     """
 
     object: str
@@ -96,7 +96,7 @@ class ContactEquilibrium:
         return np.asarray(lie.transform(shape.rotation[0], shape.position[0]))
 
     def poses(self, at: ArrayLike) -> Vector:
-        """Poses (k, 4, 4) at arc lengths (k,) at rest, in m."""
+        """Return poses (k, 4, 4) at arc lengths (k,) at rest, in m."""
         wanted = np.asarray(at, dtype=float)
         shape, up = self._arm.shape, slice(None, None, -1)
         q = [np.interp(wanted, shape.mesh.at[up], row[up]) for row in shape.nodes.quaternion.T]
@@ -107,13 +107,13 @@ class ContactEquilibrium:
         return found
 
     def backbone(self, n: int = 50) -> Vector:
-        """Points (n, 3) of the centre line, equally spaced at rest from the base to the tip."""
+        """Return points (n, 3) of the centre line, equally spaced at rest from base to tip."""
         wanted = np.linspace(0.0, self._arm.problem.rod.arm.length, n)
         return self._arm.problem.body(self._arm, wanted)[0]
 
     @property
     def stable(self) -> bool:
-        """Whether it is a minimum of the energy (of loads without a potential: no divergence)."""
+        """Whether it is a minimum of the energy (for loads without a potential: no divergence)."""
         return self._arm.is_stable
 
     @property
@@ -127,7 +127,7 @@ class ContactEquilibrium:
         return np.array([touch.normal_force for touch in self._arm.state.touches])
 
     def line(self, at: Vector) -> tuple[Vector, Vector, Vector]:
-        """Centre line (k, 3), unit tangents (k, 3) and radii (k,) at arc lengths (k,)."""
+        """Return centre line (k, 3), unit tangents (k, 3) and radii (k,) at arc lengths (k,)."""
         body, length = self._arm.problem.body, self._arm.problem.rod.arm.length
         points, radii = body(self._arm, at)
         ends = [np.clip(at + step, 0.0, length) for step in (-_BESIDE, _BESIDE)]
@@ -140,19 +140,19 @@ class ContactEquilibrium:
     def tip_compliance(self) -> Vector:
         """Tangent compliance (6, 6) of the braced tip, in tip axes, linear first.
 
-        All contacts stay and slide without friction; see `compliance` for other bounds.
+        All contacts stay closed and slide without friction; see `compliance` for sticking ones.
         """
         return self.compliance("sliding")
 
     def compliance(self, contacts: Grip = "sliding") -> Vector:
-        """Tangent compliance (6, 6) of the tip, in tip axes, linear first.
+        """Return the tangent compliance (6, 6) of the tip, in tip axes, linear first.
 
         Parameters
         ----------
         contacts : {"sliding", "sticking"}
-            Whether contacts slide on their surfaces without resistance, or roll without slipping
-            on those that have friction. With friction the truth is in between; small pushes on an
-            arm whose contacts carry no tangential force leave them sticking.
+            Whether contacts slide on their surfaces without resistance, or roll without slipping on
+            those that have friction. With friction the real compliance lies between; small pushes
+            on an arm whose contacts carry no tangential force leave them sticking.
         """
         check_choice("contacts", contacts, get_args(Grip))
         per_wrench = self._per_wrench(self._with_friction() if contacts == "sticking" else ())
@@ -161,17 +161,17 @@ class ContactEquilibrium:
         turn[:3, :3] = turn[3:, 3:] = R
         found: Vector = turn.T @ per_wrench @ turn
         if self._arm.state.condition.is_conservative and contacts == "sliding":
-            found = (found + found.T) / 2  # symmetric but for the integrator's error
+            found = (found + found.T) / 2  # symmetric up to the integrator's error
         return found
 
     def _with_friction(self) -> list[int]:
-        """Which contacts are on surfaces with friction."""
+        """Return the indices of contacts on surfaces with friction."""
         surfaces = self._arm.problem.surfaces
         touches = enumerate(self._arm.state.touches)
         return [j for j, touch in touches if surfaces[touch.surface].friction > 0]
 
     def _per_wrench(self, sticking: Collection[int] = ()) -> Vector:
-        """Twist of the tip per wrench on it, (6, 6), in base axes."""
+        """Return the twist of the tip per wrench on it, (6, 6), in base axes."""
         system = self._system_for("tip wrench", sticking)
         changes, moves = system.along(system.solution())
         return np.concatenate([moves[0], changes[0, :3]])
@@ -188,7 +188,7 @@ class ContactEquilibrium:
         frame: Frame = "base",
         contacts: Grip = "sliding",
     ) -> float:
-        """Stiffness of the braced tip along a direction (N/m), or about it (N m/rad).
+        """Return the stiffness of the braced tip along a direction (N/m), or about it (N m/rad).
 
         See `Manipulator.stiffness` for the arguments and `compliance` for `contacts`.
         """
@@ -207,7 +207,7 @@ class ContactEquilibrium:
 
     @property
     def tip_jacobian(self) -> Vector:
-        """Twist of the tip in tip axes per pressure, (6, n), the same contacts staying closed."""
+        """Twist of the tip in tip axes per pressure, (6, n), while the contacts stay closed."""
         R = self._arm.shape.rotation[0]
         twist = self._per_pressure[0]
         return np.concatenate([R.T @ twist[:3], R.T @ twist[3:]])
@@ -231,9 +231,9 @@ class ContactEquilibrium:
         contacts: Grip = "sliding",
         step: float = 50.0,
     ) -> Vector:
-        """Derivative (n,) of `stiffness` by the pressures, the same contacts staying closed.
+        """Return the derivative (n,) of `stiffness` by the pressures, contacts staying closed.
 
-        By central differences over a step in Pa, of equilibria that are exact to rounding.
+        Central differences over a step in Pa, of equilibria that are exact to rounding.
         """
         measure = (direction, kind, boundary, frame, contacts)
         found = []
@@ -248,7 +248,7 @@ class ContactEquilibrium:
     def shifted(
         self, change: ArrayLike = 0.0, push: ArrayLike = (0.0, 0.0, 0.0)
     ) -> ContactEquilibrium:
-        """The equilibrium nearby with the same contacts, which stay closed even if they pull.
+        """Return the nearby equilibrium with the same contacts, closed even if they pull.
 
         Parameters
         ----------
@@ -277,17 +277,17 @@ class ContactEquilibrium:
     def lift_off(
         self, direction: ArrayLike, limit: float = 1.0, contacts: Grip = "sliding"
     ) -> ContactLoss:
-        """The push at the tip by which the first contact is lost.
+        """Return the push at the tip by which the first contact is lost.
 
         Parameters
         ----------
         direction : (3,)
             Of the push, in base axes; of any length.
         limit : float
-            Largest push that is looked at, in N.
+            Largest push that is tested, in N.
         contacts : {"sliding", "sticking"}
-            Without friction, and exact for large pushes; or with the friction that the scene
-            gives: contacts stick until one slips or lifts off, linear about this equilibrium.
+            "sliding": without friction, and exact for large pushes.  "sticking": with the scene's
+            friction; contacts stick until one slips or lifts off, linear about this equilibrium.
 
         Returns
         -------
@@ -352,7 +352,7 @@ def _arrived(arm: LeaningArm, share: float, what: str) -> ContactEquilibrium:
 
 
 def contact_problem(arm: Manipulator, scene: Scene) -> ContactProblem:
-    """The arm among the objects of a scene that it may lean on, made once."""
+    """Return the arm among the objects of a scene that allow contact; cached."""
     rod = arm.kept("contact rod", lambda: Rod(arm))
     return _problem(rod, SceneKey(scene))
 
@@ -372,7 +372,7 @@ def _problem(rod: Rod, key: SceneKey) -> ContactProblem:
 
 
 def _stiffness(C: Vector, R: Vector, measure: Any) -> float:
-    """Stiffness of a compliance (6, 6) in axes R; see `Manipulator.stiffness`."""
+    """Return the stiffness of a compliance (6, 6) in axes R; see `Manipulator.stiffness`."""
     d = np.asarray(measure.direction)
     d = R.T @ d if measure.frame == "base" else d
     own, other = slice(0, 3), slice(3, 6)

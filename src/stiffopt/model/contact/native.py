@@ -1,4 +1,4 @@
-"""Newton's method for contacts in machine code, see ``native/contact.c``."""
+"""Call Newton's method for contacts in machine code, see ``native/contact.c``."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from stiffopt.model.contact.system import ContactRow, Contacts
 Vector = NDArray[np.float64]
 
 MOST_CONTACTS = 8
-"""Contacts that there is room for, as contact.c has it."""
+"""Largest number of contacts, as in contact.c."""
 CONVERGED, LOST, REMESH = range(3)
-"""What comes out, as contact.c has it."""
+"""Outcomes, as in contact.c."""
 
 _integer, _double, _pointer = ctypes.c_int64, ctypes.c_double, ctypes.c_void_p
 
 
 class _Surface(ctypes.Structure):
-    """`Surface` of contact.c."""
+    """Structure `Surface` of contact.c."""
 
     _fields_ = [
         ("formula", _pointer),
@@ -37,7 +37,7 @@ class _Surface(ctypes.Structure):
 
 
 class _Touch(ctypes.Structure):
-    """`Touch` of contact.c."""
+    """Structure `Touch` of contact.c."""
 
     _fields_ = [
         *((name, _integer) for name in ("surface", "pinned", "segment", "rigid", "node")),
@@ -60,7 +60,7 @@ _RESULTS = ("at", "q", "m", "J", "near", "far", "position", "force_far", "moment
 
 
 class _Problem(ctypes.Structure):
-    """`Problem` of contact.c."""
+    """Structure `Problem` of contact.c."""
 
     _fields_ = [
         ("steps", _integer),
@@ -77,7 +77,7 @@ class _Problem(ctypes.Structure):
 
 
 class NativeContacts:
-    """Newton's method of one arm among surfaces, in machine code.
+    """Newton's method for one arm among surfaces, in machine code.
 
     Attributes
     ----------
@@ -107,9 +107,9 @@ class NativeContacts:
     def correct(
         self, state: Contacts, sections: RodSections
     ) -> tuple[int, Contacts, RodShape, list[ContactRow], bool]:
-        """What came out; the state that it came to, its shape, its contacts, if it is stable.
+        """Return the outcome, the new state, its shape, its contacts, and whether it is stable.
 
-        The last is meant for loads that have a potential.
+        Stability is valid only for loads that have a potential.
         """
         rod, mesh, condition = self._rod, state.mesh, state.condition
         count = len(mesh.segment)

@@ -1,4 +1,4 @@
-"""Pushes at the tip of an arm that leans on objects, and when they take contacts away."""
+"""Pushes at the tip of an arm in contact, and the loss of contacts under them."""
 
 from collections.abc import Collection
 from typing import NamedTuple
@@ -11,13 +11,13 @@ from stiffopt.model.contact.system import ContactSystem, LeaningArm
 
 Vector = NDArray[np.float64]
 
-_LARGEST_SWING = 0.2  # rad, that the tip turns by in a step of a push
-_FORCE_LEFT = 1e-7  # N, of a contact that lifts off
-_SHORTEST = 1e-6  # of the largest push; a shorter step means that the equilibrium is lost
+_LARGEST_SWING = 0.2  # rad, largest turn of the tip in a step of a push
+_FORCE_LEFT = 1e-7  # N; a contact with less force has lifted off
+_SHORTEST = 1e-6  # share of the largest push; with a shorter step the equilibrium is lost
 
 
 class ContactLoss(NamedTuple):
-    """When and how a push takes a contact away.
+    """When and how a push makes the arm lose a contact.
 
     Attributes
     ----------
@@ -26,7 +26,7 @@ class ContactLoss(NamedTuple):
     at : arc length of that contact at rest, in m, or None.
     how : "lifts off" or "slips", "snaps" where the equilibrium is lost instead, or "holds".
     stiffness : along the push just before, in N/m.
-    stiffness_after : and without the contact, or with it slipping.
+    stiffness_after : the same without the contact, or with it slipping.
     """
 
     force: float
@@ -38,17 +38,17 @@ class ContactLoss(NamedTuple):
 
 
 class GrowingPush:
-    """A push at the tip that grows from nothing, along a unit direction (3,) in base axes."""
+    """A push at the tip that grows from zero, along a unit direction (3,) in base axes."""
 
     def __init__(self, problem: ContactProblem, direction: Vector, limit: float) -> None:
         self._problem, self._direction, self._limit = problem, direction, limit
 
     def slip(self, arm: LeaningArm) -> ContactLoss:
-        """The first contact that slips or lifts off, linear about an equilibrium.
+        """Return the first contact that slips or lifts off, linear about an equilibrium.
 
-        Contacts whose friction is not zero stick, and carry no tangential force at first. One
-        slips where the tangential force has grown to the coefficient of friction times the normal
-        one.
+        Contacts with friction stick, and carry no tangential force at first. One
+        slips when the tangential force reaches the coefficient of friction times the normal
+        force.
         """
         touches = arm.state.touches
         friction = [self._problem.surfaces[touch.surface].friction for touch in touches]
@@ -65,11 +65,11 @@ class GrowingPush:
             across = float(np.linalg.norm(own - change * point.normal - turned))
             ways = [("lifts off", -change, touch.normal_force)]
             if friction[j] > 0:
-                least = friction[j] * touch.normal_force
-                ways.append(("slips", across - friction[j] * change, least))
-            for name, rate, until in ways:
-                if rate > 0 and until / rate < first:
-                    first, lost, how = until / rate, j, name
+                limit = friction[j] * touch.normal_force
+                ways.append(("slips", across - friction[j] * change, limit))
+            for name, rate, limit in ways:
+                if rate > 0 and limit / rate < first:
+                    first, lost, how = limit / rate, j, name
         if lost is None:
             return ContactLoss(np.inf, None, None, how, stiffness, stiffness)
         if how == "slips":
@@ -85,7 +85,7 @@ class GrowingPush:
     def _tangent(
         self, arm: LeaningArm, sticking: Collection[int] = ()
     ) -> tuple[ContactSystem, Vector, float]:
-        """Equations for forces at the tip, their solution (u, 6), and stiffness along the push."""
+        """Return the equations for forces at the tip, their solution (u, 6), and a stiffness."""
         sections = arm.shape.sections
         system = ContactSystem(self._problem, arm.state, sections, "tip wrench", sticking)
         solution = system.solution()
@@ -94,7 +94,7 @@ class GrowingPush:
         return system, solution, 1 / way
 
     def loss(self, arm: LeaningArm) -> ContactLoss:
-        """The first contact that is lost on the way from an equilibrium."""
+        """Return the first contact that is lost as the push grows from an equilibrium."""
         without, force, step = arm.state.condition.dead, 0.0, np.inf
         while True:
             own = _forces(arm)
@@ -124,7 +124,7 @@ class GrowingPush:
                 arm = self._problem.settle(arm.state) or arm
 
     def _rates(self, arm: LeaningArm) -> tuple[Vector, float, float]:
-        """Changes (k,) of the normal forces and of the tip's turn per push; stiffness along it."""
+        """Return changes (k,) of normal forces and of the tip's turn per push; a stiffness."""
         system, solution, stiffness = self._tangent(arm)
         changes, _ = system.along(solution)
         turn = float(np.linalg.norm(changes[0, :3, :3] @ self._direction))

@@ -1,9 +1,9 @@
-"""A rod with point forces on it, and how it changes with them: the lifted Newton method.
+"""A rod with point forces, linearised about a state: the lifted Newton method.
 
-The arm is integrated from its tip to its base, as in `stiffopt.model.shooting`, but cut where it
-is touched.  Unknown are the turn of the tip and, for each contact, force, moment and station; the
-orientation and moment at every node of the mesh are unknowns too, which are condensed at once
-(`stiffopt.model.equilibrium`).
+The arm is integrated from its tip to its base, as in `stiffopt.model.shooting`, with mesh nodes at
+the contacts.  The unknowns are the turn of the tip and, for each contact, force, moment and
+station. The orientation and moment at every node of the mesh are unknowns too, which are eliminated
+at once (`stiffopt.model.equilibrium`).
 """
 
 from dataclasses import dataclass
@@ -25,21 +25,21 @@ from stiffopt.model.shooting import mass_per_length
 
 Vector = NDArray[np.float64]
 
-_STRETCHED = 1.3  # times the longest step, which a step may be before the mesh is made anew
+_STRETCHED = 1.3  # largest step before the mesh is rebuilt, over the longest of a new mesh
 
 TURN, MOMENT, FORCE = slice(0, 3), slice(3, 6), slice(6, 9)
-"""Rows of what changes along the rod."""
+"""Rows of the changes along the rod."""
 
 
 class Condition(NamedTuple):
-    """What an equilibrium is for.
+    """Pressures, loads and surfaces of an equilibrium.
 
     Attributes
     ----------
     pressures : (n,), in Pa.
     dead, follower : wrenches (6,) at the tip, in base axes and in its own.
     gravity : (3,), in m/s^2.
-    retreat : by how much each surface is moved back, (objects,), in m.
+    retreat : distance by which each surface is moved back, (objects,), in m.
     """
 
     pressures: Vector
@@ -54,7 +54,7 @@ class Condition(NamedTuple):
         return not (self.follower.any() or self.dead[3:].any())
 
     def towards(self, other: "Condition", share: float) -> "Condition":
-        """What is at a share of the straight way to another one."""
+        """Return the condition at a share of the straight path to another one."""
         return Condition(*((1 - share) * a + share * b for a, b in zip(self, other, strict=True)))
 
 
@@ -69,15 +69,15 @@ class RodRange:
 
 
 class RodMesh(NamedTuple):
-    """Steps from the tip to the base.
+    """Integration steps from the tip to the base.
 
     Attributes
     ----------
     at : arc lengths (N + 1,) of the nodes, at rest.
-    segment : whose section each step has, (N,).
+    segment : index of each step's segment, (N,).
     rigid : which steps are rigid, (N,).
     per_station : change (N, k) of the steps' lengths by the stations of contacts.
-    node : where each contact is, (k,).
+    node : node of each contact, (k,).
     """
 
     at: Vector
@@ -105,7 +105,7 @@ class RodSections:
 
 
 class Rod:
-    """An arm as it is cut into steps."""
+    """An arm, ready to be divided into integration steps."""
 
     def __init__(self, arm: Arm) -> None:
         self.arm = arm
@@ -144,14 +144,14 @@ class Rod:
 
     @property
     def _symbols(self) -> tuple[ca.SX, ca.SX]:
-        """Pressures, and strains, compliances and radii of the segments below each other."""
+        """Pressures, and strains, compliances and radii of the segments in one column."""
         actuation = self.arm._actuation
         parts = [section.strain for section in actuation.sections]
         parts += [ca.vec(section.compliance) for section in actuation.sections]
         return actuation.pressures, ca.densify(ca.vertcat(*parts, actuation.radii))
 
     def sections(self, condition: Condition) -> RodSections:
-        """RodSections at a condition."""
+        """Return the sections at a condition."""
         count = self.arm.n_segments
         values = self._sections(condition.pressures)[0][:, 0]
         return RodSections(
@@ -162,7 +162,7 @@ class Rod:
         )
 
     def section_slopes(self, p: Vector) -> tuple[Vector, Vector, Vector]:
-        """Derivatives of the strains (S, 6, n), the compliances (S, 6, 6, n) and radii (S, n)."""
+        """Return derivatives of strains (S, 6, n), compliances (S, 6, 6, n) and radii (S, n)."""
         count = self.arm.n_segments
         found = self._section_slopes(p)[0]
         return (
@@ -172,11 +172,11 @@ class Rod:
         )
 
     def radius(self, index: int) -> float:
-        """Outer radius at rest of a range, in m."""
+        """Return the outer radius at rest of a range, in m."""
         return self.arm.description.segments[self.ranges[index].segment].outer_radius
 
     def free(self, condition: Condition, mesh: RodMesh) -> RodNodes:
-        """RodNodes of the arm that carries nothing."""
+        """Return the nodes of the unloaded arm."""
         strain = self.sections(condition).strain[mesh.segment, 3:]
         turns = np.where(mesh.rigid[:, None], 0.0, strain * (mesh.at[:-1] - mesh.at[1:])[:, None])
         q = np.empty((len(mesh.at), 4))
@@ -188,9 +188,10 @@ class Rod:
         return RodNodes(q, np.zeros((len(mesh.at), 3)))
 
     def moved(self, mesh: RodMesh, slides: Vector) -> RodMesh | None:
-        """A mesh after contacts (k,) have moved along the arm; None if it does not fit any more.
+        """Return the mesh after contacts (k,) have moved along the arm; None if it no longer fits.
 
-        Steps keep their number for as long as they can, lest it change with every correction.
+        The number of steps is kept as long as possible, so that it does not change at every
+        correction.
         """
         h = mesh.at[:-1] - mesh.at[1:] + mesh.per_station @ slides
         longest = np.where(mesh.rigid, np.inf, _STRETCHED * self.longest[mesh.segment])
@@ -200,7 +201,7 @@ class Rod:
         return mesh._replace(at=at)
 
     def mesh(self, stations: Vector) -> RodMesh:
-        """Steps with nodes at stations (k,)."""
+        """Return a mesh with nodes at stations (k,)."""
         at, segment, rigid, per_station = [self.arm.length], [], [], []
         node = np.zeros(len(stations), dtype=np.int64)
         slack = 1e-12
@@ -230,7 +231,7 @@ class Rod:
 
 
 def interpolated(nodes: RodNodes, old: RodMesh, new: RodMesh) -> RodNodes:
-    """RodNodes of a mesh from those of another, for Newton's method to start from."""
+    """Interpolate nodes from one mesh to another, as a start of Newton's method."""
     order = slice(None, None, -1)
     at = old.at[order]
 
@@ -249,7 +250,7 @@ class PointLoads(NamedTuple):
 
 
 class RodShape:
-    """Where a rod is.
+    """Positions, forces and moments of a rod.
 
     Attributes
     ----------
@@ -278,10 +279,10 @@ class RodShape:
 
 
 class LinearRod(RodShape):
-    """The rod about a state: where it is, and how that changes.
+    """The rod at a state, and its linear changes about it.
 
     Columns of changes are first the unknowns (turn of the tip; force, moment and station of each
-    contact), then the extras that were asked for.
+    contact), then the extras: "defects", "tip wrench" or "pressures".
 
     Attributes
     ----------
@@ -381,7 +382,7 @@ class LinearRod(RodShape):
         self.moves[:-1] = -np.cumsum(ways[::-1], axis=0)[::-1]
 
     def _steps(self, moment: Vector, weight: Vector) -> tuple[Vector, Vector, Vector, Vector]:
-        """Ends (N, 10), their changes (N, 9, 10), and tangents (N, 3) at starts and ends."""
+        """Return ends (N, 10), their changes (N, 9, 10), and tangents (N, 3) at starts and ends."""
         mesh, sections, q = self.mesh, self.sections, self.nodes.quaternion[:-1]
         count = len(mesh.segment)
         soft = ~mesh.rigid
@@ -410,10 +411,10 @@ class LinearRod(RodShape):
     def tangent_change(
         self, j: int, loads: PointLoads, segment: int, rigid: bool
     ) -> tuple[Vector, Vector]:
-        """The mean (3,) of the tangents on both sides of a contact, and its change (3, c).
+        """Return the mean (3,) of the tangents on both sides of a contact, and its change (3, c).
 
-        Shear kinks the centre line at a point force; the force does no work on a way along the
-        mean of both tangents.
+        Shear causes a kink of the centre line at a point force; the force does no work on a motion
+        along the mean of both tangents.
         """
         node = self.mesh.node[j]
         R, X = self.rotation[node], self.changes[node]
@@ -442,7 +443,7 @@ class LinearRod(RodShape):
         return mean, change
 
     def bending(self, j: int, loads: PointLoads, segment: int) -> Vector:
-        """Turn (3,) of the section per arc length towards the tip at a contact, in base axes."""
+        """Return the turn (3,) of the section per arc length at a contact, in base axes."""
         node = self.mesh.node[j]
         R, C = self.rotation[node], self.sections.compliance[segment]
         n = self.force_far[node] + loads.force[j] / 2
@@ -451,7 +452,7 @@ class LinearRod(RodShape):
         return turn
 
     def _per_pressure(self, condition: Condition, moment: Vector, weight: Vector) -> Vector:
-        """Changes (N, 9, n) of the steps' ends by the pressures, by differences of the sections."""
+        """Return changes (N, 9, n) of the steps' ends by pressures, by finite differences."""
         assert self.section_slopes is not None
         strain, compliance, _ = self.section_slopes
         soft = np.flatnonzero(~self.mesh.rigid)
@@ -482,12 +483,12 @@ class LinearRod(RodShape):
 
 
 def hat(v: Vector) -> Vector:
-    """Skew matrix of a vector (3,)."""
+    """Return the skew matrix of a vector (3,)."""
     return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
 
 
 def rotations(q: Vector) -> Vector:
-    """Rotations (k, 3, 3) of quaternions (k, 4) of any length."""
+    """Return the rotations (k, 3, 3) of quaternions (k, 4) of any length."""
     w, x, y, z = q.T / np.linalg.norm(q, axis=1)
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -499,7 +500,7 @@ def rotations(q: Vector) -> Vector:
 
 
 def turns_between(first: Vector, second: Vector) -> Vector:
-    """Rotation vectors (k, 3), in base axes, from quaternions (k, 4) to others that are near."""
+    """Return rotation vectors (k, 3), in base axes, between nearby quaternions (k, 4)."""
     w, v = first[:, :1], first[:, 1:]
     a, b = second[:, :1], second[:, 1:]
     real = (a * w)[:, 0] + (b * v).sum(1)
@@ -509,7 +510,7 @@ def turns_between(first: Vector, second: Vector) -> Vector:
 
 
 def turned(q: Vector, turn: Vector) -> Vector:
-    """Quaternions (k, 4) after rotation vectors (k, 3) in base axes, of unit length."""
+    """Return unit quaternions (k, 4) turned by rotation vectors (k, 3) in base axes."""
     half = turn / 2
     w, v = q[:, :1], q[:, 1:]
     real = w[:, 0] - (half * v).sum(1)

@@ -1,4 +1,4 @@
-"""Equilibria of an arm that touches surfaces: an active set, and continuation from rest."""
+"""`ContactProblem`: equilibria of an arm among surfaces, by an active set and continuation."""
 
 from __future__ import annotations
 
@@ -24,27 +24,27 @@ from stiffopt.model.contact.system import Contacts, ContactSystem, LeaningArm, T
 
 Vector = NDArray[np.float64]
 
-_LARGEST_TURN = 0.5  # rad, by which one correction may turn a part of the arm
-_LARGEST_SLIDE = 0.02  # m, by which one may move a contact along the arm
-_TURN_LEFT, _SLIDE_LEFT = 1e-6, 1e-7  # rad and m; convergence being quadratic, 1e-12 is left
-_MOST_ITERATIONS = 14
-_MOST_MESHES = 8  # that contacts are followed on from range to range
-_MOST_SETS = 10  # of contacts that are tried in a step
-_DEEPEST = 0.3  # of the body's radius, by which a step may enter a surface
-_ENTERED = 2e-3  # m, by which to enter a surface that was entered too deep
-_TILT = 0.5  # rad, by which a step may turn a normal
-_PENETRATION = 2e-6  # m, which no one minds
-_LOOKED_AT = 4e-3  # m along the arm between stations at which gaps are looked at
-_CLOSELY = 17  # stations about a local minimum of a gap
-_SEEN_FROM = 2e-4  # m of a gap there, above which there is no contact between two of them
-_SWEPT = 1.0  # of the body's radius, by which a station may move in a step anyhow
-_AS_NEAR = 1e-5  # m of penetration beside a contact, which its neighbourhood may have
-_BESIDE = 1e-3  # m along the arm from a contact that belong to it at least
-_ONE = 2e-4  # m between contacts of a surface that are one
-_INSET = 1e-5  # m that a contact is away from where a range ends, or more
-_MOST_CROSSINGS = 3  # of an end of a range, after which a contact is pinned there
+_LARGEST_TURN = 0.5  # rad, largest turn of a part of the arm in one correction
+_LARGEST_SLIDE = 0.02  # m, largest motion of a contact along the arm in one correction
+_TURN_LEFT, _SLIDE_LEFT = 1e-6, 1e-7  # rad and m; quadratic convergence: the error is 1e-12
+_MAX_ITERATIONS = 14
+_MAX_MESHES = 8  # rebuilt as contacts move from range to range
+_MAX_SETS = 10  # sets of contacts that are tried in a step
+_DEEPEST = 0.3  # largest penetration of a surface in a step, over the body's radius
+_ENTERED = 2e-3  # m, wanted penetration after a step that went too deep
+_TILT = 0.5  # rad, largest turn of a contact's normal in a step
+_PENETRATION = 2e-6  # m, allowed penetration
+_SPACING = 4e-3  # m along the arm between stations at which gaps are evaluated
+_FINE_STATIONS = 17  # stations about a local minimum of a gap
+_SEEN_FROM = 2e-4  # m; a larger gap at a coarse minimum excludes a contact
+_SWEPT = 1.0  # motion of a station in a step that is always allowed, over the body's radius
+_AS_NEAR = 1e-5  # m, allowed penetration next to a contact
+_BESIDE = 1e-3  # m along the arm, least neighbourhood of a contact
+_SAME_CONTACT = 2e-4  # m; closer contacts on a surface are merged
+_INSET = 1e-5  # m, least distance of a contact from the end of a range
+_MAX_CROSSINGS = 3  # of an end of a range, after which a contact is pinned there
 _APART = 1e-4  # m between an arm and surfaces that are moved back from it
-_SHORTEST_STEP = 1e-4  # of the way from rest; less means that it has ended
+_SHORTEST_STEP = 1e-4  # share of the path from rest; below it the path has ended
 
 
 class ContactProblem:
@@ -54,19 +54,19 @@ class ContactProblem:
         self.rod, self.surfaces = rod, surfaces
         self._in_c: NativeContacts | None = None
         self._deepest: tuple[int, float] | None = None  # surface and gap of a step that failed
-        count = int(np.ceil(rod.arm.length / _LOOKED_AT))
+        count = int(np.ceil(rod.arm.length / _SPACING))
         self.stations = np.linspace(0.0, rod.arm.length, count + 1)
 
     # -- Newton's method --------------------------------------------------------------------
 
     def correct(self, state: Contacts) -> LeaningArm | None:
-        """Equilibrium in which just the given contacts are closed; None if it is not near."""
+        """Find the equilibrium in which exactly the given contacts are closed; None if not near."""
         sections = self.rod.sections(state.condition)
         native = self._native
         if native is not None and len(state.touches) <= MOST_CONTACTS:
             return self._correct_in_c(native, state, sections)
         previous = np.inf
-        for iteration in range(_MOST_ITERATIONS):
+        for iteration in range(_MAX_ITERATIONS):
             system = ContactSystem(self, state, sections)
             try:
                 solution = system.solution()
@@ -108,7 +108,7 @@ class ContactProblem:
     def _correct_in_c(
         self, native: NativeContacts, state: Contacts, sections: RodSections
     ) -> LeaningArm | None:
-        for _ in range(_MOST_MESHES):
+        for _ in range(_MAX_MESHES):
             outcome, moved, shape, rows, stable = native.correct(state, sections)
             if outcome == CONVERGED:
                 found = LeaningArm(self, moved, shape, rows)
@@ -125,7 +125,7 @@ class ContactProblem:
     def _moved(
         self, state: Contacts, system: ContactSystem, solution: Vector
     ) -> tuple[tuple[Touch, ...], float]:
-        """Contacts after a correction, and how far along the arm they were to move."""
+        """Return the contacts after a correction, and how far along the arm they should move."""
         u = system.linear.unknowns
         touches, slides = [], [0.0]
         for j, touch in enumerate(state.touches):
@@ -141,7 +141,7 @@ class ContactProblem:
         return tuple(touches), float(np.abs(slides).max())
 
     def _within(self, touch: Touch) -> Touch:
-        """The contact in the range that it has come to, or pinned at an end of its own."""
+        """Return a contact in the range that it has reached, or pinned at an end of its own."""
         ranges = self.rod.ranges
         here = ranges[touch.range]
         if here.start < touch.station < here.end:
@@ -154,7 +154,7 @@ class ContactProblem:
         if other == len(ranges):
             return replace(touch, station=edge, pinned=True)
         radii = [self.rod.radius(index) for index in (touch.range, other)]
-        if touch.crossings >= _MOST_CROSSINGS or radii[1] < radii[0] - 1e-9:
+        if touch.crossings >= _MAX_CROSSINGS or radii[1] < radii[0] - 1e-9:
             return replace(touch, station=edge, pinned=True)
         station = edge + (_INSET if up else -_INSET)
         return replace(touch, range=other, station=station, crossings=touch.crossings + 1)
@@ -162,10 +162,13 @@ class ContactProblem:
     # -- active set -------------------------------------------------------------------------
 
     def settle(self, state: Contacts) -> LeaningArm | None:
-        """Equilibrium near a state where no contact pulls and none is missed; None if not near."""
+        """Find the equilibrium near a state, with the set of contacts that is consistent.
+
+        No contact pulls and none is missing.  None if it is not near.
+        """
         touches = tuple(replace(touch, crossings=0) for touch in state.touches)
         start = state = state._replace(touches=touches)
-        for _ in range(_MOST_SETS):
+        for _ in range(_MAX_SETS):
             found = self.correct(state)
             if found is None or self.is_far(start, found):
                 return None
@@ -181,22 +184,22 @@ class ContactProblem:
         return None
 
     def is_far(self, start: Contacts, arm: LeaningArm) -> bool:
-        """Whether the normal of a contact has turned too much for a step."""
+        """Return whether the normal of a contact has turned too much for a step."""
         for old, new, row in zip(start.touches, arm.state.touches, arm.rows, strict=False):
             if old.surface != new.surface:
-                return False  # another set of contacts: what is left of them was looked at
+                return False  # another set of contacts; those before were checked
             size = float(np.linalg.norm(old.force))
             if size > 1e-6 and old.force @ row.point.normal < np.cos(_TILT) * size:
                 return True
         return False
 
     def with_touches(self, state: Contacts, touches: tuple[Touch, ...]) -> Contacts:
-        """A state to begin at with other contacts."""
+        """Return a state with other contacts, to start from."""
         mesh = self.rod.mesh(np.array([touch.station for touch in touches]))
         return Contacts(state.condition, mesh, interpolated(state.nodes, state.mesh, mesh), touches)
 
     def _changed(self, arm: LeaningArm) -> tuple[Touch, ...] | None:
-        """Contacts without the one that pulls most, or with one that is set free or merged."""
+        """Return the contacts without the strongest pulling one, or with one freed or merged."""
         touches = list(arm.state.touches)
         pull = [touch.normal_force for touch in touches]
         if touches and min(pull) < 0:
@@ -206,13 +209,13 @@ class ContactProblem:
             here = self.rod.ranges[touch.range]
             up = touch.station > (here.start + here.end) / 2
             inwards = row.slope if up else -row.slope
-            if touch.pinned and touch.crossings < _MOST_CROSSINGS and inwards > 1e-9:
+            if touch.pinned and touch.crossings < _MAX_CROSSINGS and inwards > 1e-9:
                 station = here.end - 1e-4 if up else here.start + 1e-4
                 crossings = touch.crossings + 1
                 touches[j] = replace(touch, station=station, pinned=False, crossings=crossings)
                 return tuple(touches)
             for i, other in enumerate(touches[:j]):
-                near = abs(touch.station - other.station) < _ONE
+                near = abs(touch.station - other.station) < _SAME_CONTACT
                 if near and touch.surface == other.surface:
                     force = touch.force + other.force
                     normal_force = touch.normal_force + other.normal_force
@@ -222,7 +225,7 @@ class ContactProblem:
         return None
 
     def missed(self, arm: LeaningArm) -> list[Touch] | None:
-        """Contacts that are open and should not be; None if a surface is entered too deeply."""
+        """Return open contacts that should be closed; None if a surface is entered too deeply."""
         found = []
         arm.gaps = self.gaps(arm, self.stations) + arm.state.condition.retreat[:, None]
         for index, gaps in enumerate(arm.gaps):
@@ -233,7 +236,7 @@ class ContactProblem:
                 if gaps[i] > _SEEN_FROM:
                     continue
                 ends = self.stations[[i - 1, min(i + 1, len(gaps) - 1)]]
-                around = np.linspace(ends[0], ends[1], _CLOSELY)
+                around = np.linspace(ends[0], ends[1], _FINE_STATIONS)
                 closely = self.gaps(arm, around, index)[0] + arm.state.condition.retreat[index]
                 s, gap = float(around[closely.argmin()]), float(closely.min())
                 if gap > -_PENETRATION or any(self._is_of(arm, j, s, gap) for j in own):
@@ -245,7 +248,7 @@ class ContactProblem:
         return found
 
     def _is_of(self, arm: LeaningArm, j: int, s: float, gap: float) -> bool:
-        """Whether what seems to be a contact belongs to one that is closed."""
+        """Return whether a penetration belongs to a contact that is closed."""
         touch = arm.state.touches[j]
         if abs(s - touch.station) < _BESIDE and gap > -_AS_NEAR:
             return True
@@ -255,7 +258,7 @@ class ContactProblem:
         return abs(s - touch.station) < 1.5 * reach + _BESIDE and gap > -allowed
 
     def _touch(self, surface: int, s: float) -> Touch:
-        """An open contact at an arc length."""
+        """Return an open contact at an arc length."""
         index = next(i for i, each in enumerate(self.rod.ranges) if s <= each.end + _INSET)
         here, length = self.rod.ranges[index], self.rod.arm.length
         pinned = s >= length - 1e-6
@@ -264,7 +267,7 @@ class ContactProblem:
         return Touch(surface, index, length if pinned else inside, pinned, none, 0.0, none)
 
     def gaps(self, arm: LeaningArm, at: Vector, only: int | None = None) -> Vector:
-        """Gaps (surfaces, k) of all surfaces or of one at arc lengths (k,), in m."""
+        """Return gaps (surfaces, k) of all surfaces or of one at arc lengths (k,), in m."""
         points, radii = self.body(arm, at)
         code = None if self._native is None else self._native.code
         found = []
@@ -275,7 +278,7 @@ class ContactProblem:
         return np.array(found).reshape(len(found), len(at))
 
     def body(self, system: LeaningArm, at: Vector) -> tuple[Vector, Vector]:
-        """Points (k, 3) of the centre line at arc lengths (k,), and radii (k,) there."""
+        """Return points (k, 3) of the centre line at arc lengths (k,), and radii (k,) there."""
         shape, marks = system.shape, system.shape.mesh.at
         i = np.clip(np.searchsorted(-marks, -at, side="right") - 1, 0, len(marks) - 2)
         h = shape.h[i, None]
@@ -291,7 +294,7 @@ class ContactProblem:
     # -- continuation -----------------------------------------------------------------------
 
     def follow(self, start: LeaningArm, end: Condition) -> tuple[LeaningArm, float]:
-        """Equilibrium reached on the straight way to another condition, and at what share of it."""
+        """Follow the equilibrium straight to a condition; return the last and its share."""
         arm, share, step, halved = start, 0.0, 1.0, False
         while share < 1.0:
             target = min(1.0, share + step)
@@ -309,7 +312,7 @@ class ContactProblem:
         return arm, share
 
     def _share_to_touch(self, arm: LeaningArm) -> float:
-        """Which share of a step that has failed to try: half, or to where the body just touches."""
+        """Return the share of a failed step to try next: half, or up to a light touch."""
         if self._deepest is None:
             return 0.5
         index, gap = self._deepest
@@ -317,38 +320,38 @@ class ContactProblem:
         return float(np.clip((before + _ENTERED) / (before - gap), 0.1, 0.9))
 
     def _leaves(self, before: LeaningArm, after: LeaningArm) -> bool:
-        """Whether stability is lost, or the body may have passed through a surface in a step."""
+        """Return whether stability is lost, or the body may have passed through a surface."""
         if not after.is_stable:
             return True
         if not self.surfaces:
             return False
         (old, radii), (new, _) = (self.body(each, self.stations) for each in (before, after))
         ways = np.linalg.norm(new - old, axis=1)
-        # gaps change by no more than the way, which is not quite straight
+        # gaps change by no more than the path, which is nearly straight
         least = (before.gaps + after.gaps - 1.05 * ways) / 2
         least[:, ways < _SWEPT * radii] = np.inf
         least[[touch.surface for touch in before.state.touches]] = np.inf
         return bool((least < -_DEEPEST * radii).any())
 
     def _guess(self, state: Contacts, condition: Condition) -> Contacts:
-        """A state near which the equilibrium at a condition may be."""
+        """Return a state to start from at a condition."""
         loaded = (condition.dead, condition.follower, condition.gravity, state.nodes.moment)
         if state.touches or any(each.any() for each in loaded):
             return state._replace(condition=condition)
         return Contacts(condition, state.mesh, self.rod.free(condition, state.mesh), ())
 
     def straight(self, like: Condition) -> LeaningArm:
-        """The unpressurised arm without weight, clear of all surfaces."""
+        """Return the unpressurised arm without weight, clear of all surfaces."""
         mesh = self.rod.mesh(np.zeros(0))
         q = np.tile([1.0, 0.0, 0.0, 0.0], (len(mesh.at), 1))
         zero = Condition(*(np.zeros_like(each) for each in like))
         nodes = RodNodes(q, np.zeros((len(mesh.at), 3)))
         found = self.correct(Contacts(zero, mesh, nodes, ()))
-        assert found is not None  # it is there already
+        assert found is not None  # the state is already an equilibrium
         return self.clear(found)
 
     def clear(self, arm: LeaningArm) -> LeaningArm:
-        """The same arm without contacts, the surfaces moved back as far as they would touch it."""
+        """Return the arm without contacts, with surfaces that would touch it moved back."""
         least = (_APART - self.gaps(arm, self.stations)).max(axis=1, initial=0.0)
         retreat = np.where(least > _APART, least, 0.0)
         state = arm.state._replace(condition=arm.state.condition._replace(retreat=retreat))
@@ -358,7 +361,7 @@ class ContactProblem:
 
 
 def _is_same(touches: tuple[Touch, ...], before: tuple[Touch, ...]) -> bool:
-    """Whether contacts are on the ranges that they were on."""
+    """Return whether contacts are still on their former ranges."""
     return all(
         new.range == old.range and new.pinned == old.pinned
         for new, old in zip(touches, before, strict=True)
@@ -366,7 +369,7 @@ def _is_same(touches: tuple[Touch, ...], before: tuple[Touch, ...]) -> bool:
 
 
 def _at_moved(state: Contacts, touches: tuple[Touch, ...]) -> RodMesh:
-    """A state's mesh, its nodes moved with the contacts as far as that matters."""
+    """Return a state's mesh with the nodes of contacts moved, as far as neighbours allow."""
     at = state.mesh.at.copy()
     for node, touch in zip(state.mesh.node, touches, strict=True):
         at[node] = np.clip(touch.station, at[min(node + 1, len(at) - 1)], at[max(node - 1, 0)])
@@ -374,7 +377,7 @@ def _at_moved(state: Contacts, touches: tuple[Touch, ...]) -> RodMesh:
 
 
 def dips(gaps: Vector) -> list[int]:
-    """Where gaps along an arm have a local minimum, but for one at its base."""
+    """Return the local minima of gaps along an arm, except at its base."""
     low = np.isfinite(gaps[:-1]) & (gaps[:-1] > gaps[1:])
     low[:-1] &= gaps[1:-1] <= gaps[2:]
     return [int(i) for i in np.flatnonzero(low) + 1]

@@ -1,14 +1,14 @@
-"""Whether an arm in contact is at a minimum of its energy.
+"""Stability of an arm in contact: whether its energy is at a minimum.
 
-The steps of the rod are finite elements: with the changes of a step's end along turn, moment and
-force at its start, the wrenches at both ends follow from the poses of both.  The poses of the nodes
-then have a stiffness matrix, to which a contact adds what its force does with the curvature of the
-gap, less what the contact gains by moving along the arm,
+The steps of the rod serve as finite elements: from the changes of a step's end along turn, moment
+and force at its start, the wrenches at both ends follow from the poses of both.  This gives a
+stiffness matrix of the nodes' poses.  A contact adds the work of its force on the curvature of the
+gap, less the gain from moving along the arm,
 
     -f (dc' H dc - (d slope)^2 / bend),
 
-and poses are held where a rigid surface is touched.  The arm is stable if the matrix is positive
-definite on what is left.
+and rigid surfaces constrain the poses.  The arm is stable if the matrix is positive definite on the
+remaining motions.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ if TYPE_CHECKING:
 
 Vector = NDArray[np.float64]
 
-_RIGID = 1e-3  # compliance of what is rigid, as a share of that of its segment
-_FLATTEST = 1e-3  # 1/m: a gap that is bent less is a line
+_RIGID = 1e-3  # compliance of rigid pieces, as a share of that of their segment
+_FLATTEST = 1e-3  # 1/m, least second derivative of a gap along the arm
 
 
 def is_stable(arm: LeaningArm) -> bool:
-    """Whether the energy is at a minimum; of loads without a potential, whether none diverges."""
+    """Return whether the energy is at a minimum; without a potential, whether nothing diverges."""
     K = stiffness_left(arm)
     if arm.state.condition.is_conservative:
         try:
@@ -43,7 +43,10 @@ def is_stable(arm: LeaningArm) -> bool:
 
 
 def stiffness_left(arm: LeaningArm) -> Vector:
-    """Stiffness (k, k) in N/m of what contacts leave free; turns are motions at an arm's length."""
+    """Return the stiffness (k, k) in N/m of the motions that contacts leave free.
+
+    Turns are scaled by the arm's length.
+    """
     problem, state, linear = arm.problem, arm.state, arm.shape
     count, length = len(linear.h), problem.rod.arm.length
     size = 6 * count
@@ -59,7 +62,7 @@ def stiffness_left(arm: LeaningArm) -> Vector:
             turn[:3, :3] = R @ C[3:, 3:] @ R.T
             turn[3:, 3:] = R @ C[:3, :3] @ R.T
             by_wrench -= _RIGID * linear.h[i] * turn
-        # of both ends' turns and positions
+        # in terms of both ends' turns and positions
         known = np.zeros((6, 12))
         known[:3, 6:9] = np.eye(3)
         known[3:, 9:] = np.eye(3)
@@ -74,7 +77,7 @@ def stiffness_left(arm: LeaningArm) -> Vector:
         K[6 * i + 9 : 6 * i + 12, columns] -= start[3:]
         responses.append(start)
     K = K[:size, :size]
-    # loads at the tip that turn with it
+    # follower loads at the tip
     follower = state.condition.follower
     R0 = linear.rotation[0]
     K[:3, :3] += hat(R0 @ follower[3:])
@@ -108,7 +111,7 @@ def stiffness_left(arm: LeaningArm) -> Vector:
 
 
 def _slope_change(arm: LeaningArm, j: int, responses: list[Vector]) -> Vector:
-    """Change of the gap's slope at a contact by the poses of the nodes."""
+    """Return the change of the gap's slope at a contact by the poses of the nodes."""
     state, linear = arm.state, arm.shape
     node = int(state.mesh.node[j])
     size = 6 * len(linear.h)
@@ -130,6 +133,6 @@ def _slope_change(arm: LeaningArm, j: int, responses: list[Vector]) -> Vector:
     )
     near = responses[node]
     found[at : at + 12] += n @ (own @ near[3:] / 2 + crossed @ near[:3])
-    if node > 0:  # the force on the distal side is that at the start of the step before
+    if node > 0:  # the force on the distal side equals that at the start of the step before
         found[at - 6 : at + 6] += n @ own @ responses[node - 1][3:] / 2
     return found[:size]

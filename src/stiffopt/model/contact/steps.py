@@ -1,7 +1,7 @@
 """Integration steps of a rod with their derivatives, for meshes whose nodes move.
 
-The contact of an arm moves along it, so the steps between contacts change their lengths all the
-time.  The classical Runge-Kutta method of order four is enough for them: with steps of
+Contacts move along the arm, so the steps between them keep changing their lengths.  The classical
+Runge-Kutta method of order four is sufficient: with steps of
 `STEP_LENGTH` outer radii the tip is within some micrometres of that of `stiffopt.model.shooting`.
 """
 
@@ -27,16 +27,16 @@ STEP_LENGTH = 1.5
 
 _NAME = "contact_step"
 _SOURCES = (str(NATIVE / "contact.c"),)
-_LOOKED_FOR_AGAIN = 64  # calls, while machine code is being made
+_LOOKED_FOR_AGAIN = 64  # calls between looks at the cache, while machine code is being made
 _STAGES = ((0.0, 1 / 6), (0.5, 1 / 3), (0.5, 1 / 3), (1.0, 1 / 6))  # share of the step, weight
 
 
 class StepFunction:
-    """The step of the sections of one arm, in machine code as soon as there is any.
+    """The integration step for the sections of one arm, in machine code once there is any.
 
     Parameters
     ----------
-    sparsity : what of a section's compliance (6, 6) may not be zero.
+    sparsity : of a section's compliance (6, 6).
     weighted : whether the arm has a weight.
     eccentric : whether a centroid lies off the axis.
     """
@@ -49,7 +49,7 @@ class StepFunction:
 
     @property
     def code(self) -> Library | None:
-        """Machine code of the step, of all surfaces and of native/contact.c, if there is any."""
+        """Machine code of the step, of all surfaces and of native/contact.c; None without it."""
         if self._code is None and self._calls % _LOOKED_FOR_AGAIN == 0:
             self._code = library(
                 ("contacts of a rod", *self._key), partial(contact_functions, *self._key), _SOURCES
@@ -58,7 +58,7 @@ class StepFunction:
         return self._code
 
     def __call__(self, *arguments: Vector) -> list[Vector]:
-        """Many steps; the arguments are those of `step_function`, with a leading axis."""
+        """Take many steps; the arguments are those of `step_function`, with a leading axis."""
         if self.code is not None:
             return self.code.function(_NAME).many(*arguments, threads=1)
         if self._interpreted is None:
@@ -69,23 +69,23 @@ class StepFunction:
 def contact_functions(
     rows: tuple[int, ...], starts: tuple[int, ...], weighted: bool, eccentric: bool
 ) -> list[ca.Function]:
-    """The step of some sections, and the surfaces of all kinds of objects that have a formula."""
+    """Return the step of some sections, and the surfaces of all kinds of objects with a formula."""
     step = step_function(ca.Sparsity(6, 6, starts, rows), weighted, eccentric)
     kinds = [kind for kind in OBSTACLES.values() if not kind.is_interpolated]
     return [step, *(dense(surface_function(kind)) for kind in kinds)]
 
 
 def step_function(sparsity: ca.Sparsity, weighted: bool, eccentric: bool) -> ca.Function:
-    """One step towards the base.
+    """Return one integration step towards the base.
 
-    Maps quaternion (4,), moment (3,) and force (3,) that the distal part exerts, in base axes, the
-    section's strain (6,), compliance (6, 6) and centroid (2,), weight per length (3,) and the
+    It maps quaternion (4,), moment (3,) and force (3,) that the distal part exerts, in base axes,
+    the section's strain (6,), compliance (6, 6) and centroid (2,), weight per length (3,) and the
     step's length to
 
-    * the quaternion, the way (3,) and the moment at the end, (10,);
-    * the tangents (3, 2) of the centre line at start and end, per length at rest;
-    * changes (9, 10) of turn, way and moment at the end, along turn, moment and force at the start
-      and the length; turns are rotation vectors in base axes.
+    * the quaternion, the displacement (3,) and the moment at the end, (10,); * the tangents (3, 2)
+    of the centre line at start and end, per length at rest; * changes (9, 10) of turn, displacement
+    and moment at the end, along turn, moment and force at the
+      start and the length; turns are rotation vectors in base axes.
     """
     q, m, n = ca.SX.sym("q", 4), ca.SX.sym("m", 3), ca.SX.sym("n", 3)
     strain, C = ca.SX.sym("strain", 6), ca.SX.sym("C", 6, 6)
@@ -109,7 +109,7 @@ def step_function(sparsity: ca.Sparsity, weighted: bool, eccentric: bool) -> ca.
         end = end + by * h * slope
     assert first is not None
 
-    # turning all at the start turns all at the end, but for the weight, which does not turn
+    # without weight, turning everything at the start turns everything at the end
     turns = 3 if weighted else 0
     zero = partial(ca.SX.zeros)
     units = ca.SX.eye(3)
@@ -138,5 +138,5 @@ def step_function(sparsity: ca.Sparsity, weighted: bool, eccentric: bool) -> ca.
 
 
 def _turned(turn: ca.SX, q: ca.SX) -> ca.SX:
-    """Change of a quaternion by a rotation vector in base axes."""
+    """Return the change of a quaternion by a rotation vector in base axes."""
     return lie.quaternion_product(ca.vertcat(0, turn / 2), q)

@@ -1,4 +1,4 @@
-"""Surfaces that an arm may touch: distances with their first and second derivatives."""
+"""`ContactSurface`: distances from an object with their first and second derivatives."""
 
 from functools import cache, cached_property
 from itertools import product
@@ -18,11 +18,11 @@ from stiffopt.model.scene import SceneObject
 
 Vector = NDArray[np.float64]
 
-_STENCIL = 1.5  # cubes of a grid, over which its distances are smoothed
+_STENCIL = 1.5  # half width of the smoothing of a grid's distances, in cubes
 
 
 class SurfacePoint(NamedTuple):
-    """The distance of a point in m, its gradient (3,) and its second derivatives (3, 3)."""
+    """Distance of a point in m, its gradient (3,) and its second derivatives (3, 3)."""
 
     distance: float
     normal: Vector
@@ -37,10 +37,10 @@ class ContactSurface:
     name : of the object.
     max_force : largest force on it, in N; infinite where none is given.
     friction : coefficient.
-    softness : by how much it gives way, in m/N.
+    softness : depth per normal force, in m/N.
     begin : arc length at rest from which the arm's body counts, in m.
     key, pieces : kind of the object, and the numbers (k, size) of its formula.
-    is_interpolated : whether it has a grid instead.
+    is_interpolated : whether its distances come from a grid instead.
     """
 
     def __init__(self, item: SceneObject, begin: float) -> None:
@@ -60,7 +60,7 @@ class ContactSurface:
         return MeasuredObject(self._shape, self.begin)
 
     def distances(self, points: Vector, code: Library | None = None) -> Vector:
-        """Distances (k,) of points (k, 3), in m; by machine code of the formulas if it is given."""
+        """Return distances (k,) of points (k, 3), in m, by machine code if given."""
         if code is None or self.is_interpolated:
             return self._measured.distances(points).values
         formula = code.function(f"surface_{self.key}")
@@ -68,7 +68,7 @@ class ContactSurface:
         return np.asarray(np.max(found, axis=0))
 
     def at(self, point: Vector) -> SurfacePoint:
-        """Distance of one point (3,) with its derivatives."""
+        """Return the distance of one point (3,) with its derivatives."""
         if self._function is None:
             return self._smoothed(point)
         best = None
@@ -80,7 +80,7 @@ class ContactSurface:
         return best
 
     def _smoothed(self, point: Vector) -> SurfacePoint:
-        """A quadratic through distances about the point, which a grid's are not smooth for."""
+        """Fit a quadratic to a grid's distances about the point, as the grid is not smooth."""
         assert isinstance(self._shape, Mesh)
         size = _STENCIL * self._shape.spacing
         values = self.distances(point + size * _OFFSETS)
@@ -103,7 +103,7 @@ _FIT = np.linalg.pinv(
 
 
 def surface_function(kind: type[Obstacle]) -> ca.Function:
-    """Distance, gradient and second derivatives of a kind's formula, for a point and a piece."""
+    """Return the function of a point and a piece to distance, gradient and second derivatives."""
     point, q = ca.SX.sym("point", 3), ca.SX.sym("parameters", kind.n_parameters)
     hessian, gradient = ca.hessian(kind.formula(point, q), point)
     outputs = ca.cse([kind.formula(point, q), ca.densify(gradient), ca.densify(hessian)])

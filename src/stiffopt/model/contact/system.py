@@ -1,4 +1,4 @@
-"""The equations of an arm that touches surfaces, linear about a state."""
+"""The equations of an arm in contact with surfaces, linearised about a state."""
 
 from __future__ import annotations
 
@@ -28,23 +28,23 @@ if TYPE_CHECKING:
 
 Vector = NDArray[np.float64]
 
-_FLAT = 0.5  # 1/m: a gap that is bent less does not spread a contact further
+_FLAT = 0.5  # 1/m, least second derivative of a gap in the estimate of a contact's length
 
 
 @dataclass(frozen=True)
 class Touch:
-    """A contact.
+    """A contact while it is solved for.
 
     Attributes
     ----------
-    surface : which one is touched.
-    range : which of the rod's ranges the contact is on.
+    surface : index of the surface.
+    range : index of the rod's range on which it lies.
     station : arc length at rest, in m.
     pinned : whether it stays there: at the tip, or where two segments meet.
     force : on the arm (3,), in N.
     normal_force : in N.
-    drag : friction's force (3,) per normal force, of a contact that slides.
-    crossings : how often it went from one range to the next while it was looked for.
+    drag : friction's force (3,) per normal force, for a sliding contact.
+    crossings : how often it moved from one range to the next during the search.
     """
 
     surface: int
@@ -58,7 +58,7 @@ class Touch:
 
 
 class Contacts(NamedTuple):
-    """An equilibrium with its contacts."""
+    """A state with its contacts: an equilibrium, or a guess of one."""
 
     condition: Condition
     mesh: RodMesh
@@ -68,7 +68,7 @@ class Contacts(NamedTuple):
 
 @dataclass(frozen=True)
 class ContactRow:
-    """What of a contact the equations need."""
+    """Quantities of a contact in the equations."""
 
     point: SurfacePoint
     radius: float
@@ -78,12 +78,12 @@ class ContactRow:
 
 
 class LeaningArm:
-    """An arm in contact: where it is, and what is known of its contacts.
+    """An arm in contact: its state and shape, and quantities of its contacts.
 
     Attributes
     ----------
     rows : of each contact.
-    gaps : of the surfaces (surfaces, k) at stations of the body, once they were looked at, in m.
+    gaps : of the surfaces (surfaces, k) at stations of the body, in m; infinite before evaluation.
     """
 
     def __init__(
@@ -95,7 +95,7 @@ class LeaningArm:
     ) -> None:
         self.problem, self.state, self.shape, self.rows = problem, state, shape, rows
         self.gaps = np.full((len(problem.surfaces), 1), np.inf)
-        self.minimum: bool | None = None  # of the energy; None: not known yet
+        self.minimum: bool | None = None  # whether stable; None: unknown yet
 
     @property
     def is_stable(self) -> bool:
@@ -105,7 +105,7 @@ class LeaningArm:
         return self.minimum
 
     def bend(self, j: int) -> float:
-        """Second derivative of the gap along the arm at a contact, in 1/m."""
+        """Return the second derivative of the gap along the arm at a contact, in 1/m."""
         shape, touch, row = self.shape, self.state.touches[j], self.rows[j]
         here, n, t = self.problem.rod.ranges[touch.range], row.point.normal, row.mean
         own = float(t @ row.point.curvature @ t)
@@ -121,10 +121,10 @@ class LeaningArm:
         return own + float(n @ R @ (np.cross(u, v) + C[:3] @ slope))
 
     def kink(self, j: int) -> tuple[float, float]:
-        """How deep and how far, in m, the centre line's kink at a force enters a surface.
+        """Return depth and length, in m, of the centre line's kink at a point force.
 
-        Shear bends the line towards the surface on both sides of a point force; in truth the
-        force is spread over this length, along which the line follows the surface.
+        Shear bends the line into the surface on both sides of the force.  In reality the
+        force is distributed over this length, along which the line follows the surface.
         """
         shape, touch, row = self.shape, self.state.touches[j], self.rows[j]
         here = self.problem.rod.ranges[touch.range]
@@ -139,11 +139,11 @@ class LeaningArm:
 class ContactSystem(LeaningArm):
     """The linear equations about a state: of the rod and of its contacts.
 
-    Unknown are those of `LinearRod` and the normal forces.
+    The unknowns are those of `LinearRod` and the normal forces.
 
     Parameters
     ----------
-    sticking : which contacts roll without slipping, as those with friction do at first; the others
+    sticking : contacts that roll without slipping, as those with friction do at first; the others
         slide.
 
     Attributes
@@ -202,7 +202,7 @@ class ContactSystem(LeaningArm):
                 self._stick(j)
 
     def _row(self, j: int) -> tuple[ContactRow, Vector]:
-        """What the equations of a contact need, and the change (3, c) of the mean tangent."""
+        """Return a contact's quantities, and the change (3, c) of the mean tangent."""
         state, linear = self.state, self.linear
         touch = state.touches[j]
         here, surface = self.problem.rod.ranges[touch.range], self.problem.surfaces[touch.surface]
@@ -214,19 +214,19 @@ class ContactSystem(LeaningArm):
         return ContactRow(point, radius, gap, mean, float(point.normal @ mean)), change
 
     def _require(self, at: Any, change: Vector) -> None:
-        """Have a change (..., c) vanish."""
+        """Add equations that a change (..., c) is zero."""
         u = self.linear.unknowns
         self.matrix[at, :u] = change[..., :u]
         self.right[at] = -change[..., u:]
 
     def _stick(self, j: int) -> None:
-        """Force and moment of a contact whose point of the body stays where it is."""
+        """Replace the equations of a contact by those of a body point that does not slip."""
         linear, touch, row = self.linear, self.state.touches[j], self.rows[j]
         node, first, u = int(self.state.mesh.node[j]), 3 + 7 * j, linear.unknowns
         here = self.problem.rod.ranges[touch.range]
         n, H, lever = row.point.normal, row.point.curvature, -row.radius * row.point.normal
         dc, turn = linear.moves[node].copy(), linear.changes[node, TURN].copy()
-        # of the material section, which the station moves along
+        # changes of the material section, along which the station moves
         bending = np.zeros(3) if here.rigid else linear.bending(j, self.loads, here.segment)
         dc[:, first + 6] -= row.mean
         turn[:, first + 6] -= bending
@@ -234,7 +234,7 @@ class ContactSystem(LeaningArm):
         across = np.linalg.svd(n[None])[2][1:]
         force, moment = slice(first, first + 3), slice(first + 3, first + 6)
         self.matrix[force], self.matrix[moment] = 0, 0
-        # the normal force is that along the normal, which turns
+        # the normal force is the component along the normal, which turns
         along = touch.force @ H @ linear.moves[node]
         self._require(first, along)
         self.matrix[first, force] += n
@@ -247,11 +247,11 @@ class ContactSystem(LeaningArm):
         self.matrix[moment, force] -= hat(lever)
 
     def solution(self) -> Vector:
-        """Unknowns (u, e) of each extra."""
+        """Return the unknowns (u, e) for each extra."""
         return np.asarray(np.linalg.solve(self.matrix, self.right))
 
     def along(self, solution: Vector) -> tuple[Vector, Vector]:
-        """Changes (N + 1, 9, e) and moves (N + 1, 3, e) of the nodes."""
+        """Return changes (N + 1, 9, e) and moves (N + 1, 3, e) of the nodes."""
         linear, u = self.linear, self.linear.unknowns
         found = linear.changes[:, :, :u] @ solution[:u] + linear.changes[:, :, u:]
         moves = linear.moves[:, :, :u] @ solution[:u] + linear.moves[:, :, u:]

@@ -1,7 +1,7 @@
-"""Strain laws, one file each: whatever file stands in this package is found.
+"""Strain laws, one file each; every file in this package is found.
 
-A law is a subclass of `stiffopt.model.actuation.StrainLaw` with a `name`; docs/extending.md says
-how to write one.
+A law is a subclass of `stiffopt.model.actuation.StrainLaw` with a `name`; docs/extending.md
+explains how to write one.
 """
 
 from __future__ import annotations

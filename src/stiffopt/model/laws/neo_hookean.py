@@ -14,7 +14,7 @@ class NeoHookeanLaw(StrainLaw):
 
     With ``mu = E / 3`` and chambers of constant bore (fibre-reinforced), the pressure force N
     stretches the section by the positive root of ``lambda - lambda^-2 = N / (mu A)``.  The
-    section shrinks by ``a = lambda^-1/2``, the lever arms of the chambers with it.  About that
+    section shrinks by ``a = lambda^-1/2``, and the lever arms of the chambers with it.  About that
     state the section has (per reference length, in shrunk axes)
 
     * axial stiffness ``E_t A`` with the tangent modulus ``E_t = mu (1 + 2 lambda^-3)``,
@@ -22,11 +22,11 @@ class NeoHookeanLaw(StrainLaw):
     * shear stiffness ``mu A`` and torsional stiffness ``mu J a^2``,
 
     exact for the strain to first order in curvature, and for the compliance where the segment
-    is straight; the coupling of stretch and bending that grows with curvature is left out.
+    is straight; the coupling of stretch and bending that grows with curvature is neglected.
 
-    Compensation coefficients mean what they mean in `LinearLaw`: E, A and I are the compensated
-    ones, loads meet the stiffnesses above with mu of the loaded modulus, the bending radius limits
-    the curvature per reference length, and lengthening adds to the stretch of the shape alone.
+    Compensation coefficients are those of `LinearLaw`: E, A and I are the compensated
+    ones, the stiffnesses against loads use mu of the loaded modulus, the bending radius limits
+    the curvature per reference length, and lengthening affects only the stretch of the shape.
     """
 
     name = "neo-hookean"
@@ -37,7 +37,7 @@ class NeoHookeanLaw(StrainLaw):
 
     @classmethod
     def check(cls, segment: Segment) -> None:
-        """The material is incompressible; see `StrainLaw.check`."""
+        """Require an incompressible material; see `StrainLaw.check`."""
         super().check(segment)
         if segment.material.poisson_ratio != 0.5:
             raise BadKeyError(
@@ -47,23 +47,23 @@ class NeoHookeanLaw(StrainLaw):
             )
 
     def _load(self, acting: ca.SX) -> ca.SX:
-        """Axial load N / (mu A) of the acting pressures."""
+        """Return the axial load N / (mu A) of the acting pressures."""
         mu = self._modulus(acting) / 3
         return self._axial_force(acting) / (mu * (self.compensation.area * self.geometry.area))
 
     def margin(self, p: ca.SX) -> ca.SX:
-        """Distance of the axial load from the largest compression, or that of `LinearLaw`."""
+        """Return the distance of the load from the largest compression, or the modulus margin."""
         margin = self._load(self._acting(p)) - self._lowest_load
         if ca.SX(self.compensation.modulus_per_pressure).is_zero():
             return margin
         return ca.fmin(margin, self._modulus_margin(p))
 
     def radius(self, p: ca.SX) -> ca.SX:
-        """Outer radius ``r lambda^-1/2`` of the stretched section, in m."""
+        """Return the outer radius ``r lambda^-1/2`` of the stretched section, in m."""
         return self.segment.outer_radius / ca.sqrt(neo_hookean_stretch(self._load(self._acting(p))))
 
     def section(self, p: ca.SX) -> Section:
-        """Section about the stretched state; see `StrainLaw.section`."""
+        """Return the section about the stretched state; see `StrainLaw.section`."""
         geometry = self.geometry
         area = self.compensation.area * geometry.area
         inertia = self.compensation.inertia * ca.SX(geometry.second_moment)
@@ -92,7 +92,7 @@ class NeoHookeanLaw(StrainLaw):
 
 
 def neo_hookean_stretch(load: ca.SX) -> ca.SX:
-    """Stretch of an incompressible neo-Hookean bar: ``lambda - lambda^-2 = load``.
+    """Return the stretch of an incompressible neo-Hookean bar: ``lambda - lambda^-2 = load``.
 
     The one positive root of ``lambda^3 - load lambda^2 - 1 = 0`` by Cardano's formula, real
     for ``load > -3 / 2^(2/3)``.

@@ -14,13 +14,13 @@ class LinearLaw(StrainLaw):
 
     ``lambda_E = E + slope |p|``, ``lambda_A = a A``, ``lambda_I = i I``; elongation
     ``f_z l / (E A)``; curvature ``M / (E I)`` and compliance per the length that the subclass
-    names.  Where the centroid is off the axis, which the paper does not treat, all this holds for
+    names.  If the centroid is off the axis, which the paper does not treat, all this holds for
     the line of centroids, and the compensated second moment is that about the centroid.
 
-    Loads meet the modulus ``stiffness (E + softening slope |p|)``, the paper's own where both
-    factors are 1.  Where there is a least bending radius R, the curvature is
-    ``kappa / sqrt(1 + R^2 |kappa|^2)`` instead, and loads meet the derivative of that by the
-    moment.  See `stiffopt.model.description.Compensation`.
+    The modulus against loads is ``stiffness (E + softening slope |p|)``, the paper's own where both
+    factors are 1.  With a least bending radius R, the curvature is
+    ``kappa / sqrt(1 + R^2 |kappa|^2)`` instead, and its derivative by the moment is the flexibility
+    under loads.  See `stiffopt.model.description.Compensation`.
     """
 
     limit = "the pressure drives the compensated modulus of this segment to zero"
@@ -28,11 +28,11 @@ class LinearLaw(StrainLaw):
     """Whether curvature and compliance are per deformed length, or per length at rest."""
 
     def margin(self, p: ca.SX) -> ca.SX:
-        """Compensated modulus over a thousandth of the nominal one, less one."""
+        """Return the compensated modulus over a thousandth of the nominal one, less one."""
         return self._modulus_margin(p)
 
     def section(self, p: ca.SX) -> Section:
-        """Section of eqs 8-10; see `StrainLaw.section`."""
+        """Return the section of eqs 8-10; see `StrainLaw.section`."""
         geometry = self.geometry
         area = self.compensation.area * geometry.area
         inertia = self.compensation.inertia * ca.SX(geometry.second_moment)
@@ -66,8 +66,8 @@ class LinearLaw(StrainLaw):
 class PaperLaw(LinearLaw):
     """The paper's law: linear, per *deformed* length.
 
-    So are its curvature and, integrated over deformed length, the compliance of eq. 17 (slip 8 of
-    the notes); per length at rest both gain the stretch as a factor.
+    Curvature and, integrated over deformed length, the compliance of eq. 17 are per deformed length
+    (slip 8 of the notes); per length at rest both are multiplied by the stretch.
     """
 
     name = "paper"

@@ -4,10 +4,10 @@ from stiffopt.model.laws.paper import LinearLaw
 
 
 class RestLengthLaw(LinearLaw):
-    """The paper's formulas per length at *rest*, as linear fibres have it.
+    """The paper's formulas per length at *rest*, which is exact for linear fibres.
 
-    A fibre's stress follows its length over that at rest, whatever the others do; so stretch and
-    bending do not mix.
+    A fibre's stress depends on its own length over that at rest, so stretch and bending are
+    independent.
     """
 
     name = "rest-length"

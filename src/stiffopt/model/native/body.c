@@ -7,10 +7,10 @@
 enum { FOUND, BEYOND_LAW, NO_EQUILIBRIUM };
 enum { POSES, JACOBIANS, CARRIED, LINE };
 
-/* For the caller to check that it has the same idea of a BodyModel. */
+/* Size of a BodyModel, for the caller to check that it has the same fields. */
 int64_t stiffopt_body_model_size(void) { return sizeof(BodyModel); }
 
-/* Pose (4, 4), row by row. */
+/* Write the pose (4, 4), row by row. */
 static void put_pose(const Station *station, double *to) {
     for (int i = 0; i < 3; i++) {
         for (int j = 0; j < 3; j++) to[4 * i + j] = station->axes[3 * j + i];
@@ -19,7 +19,7 @@ static void put_pose(const Station *station, double *to) {
     to[15] = 1;
 }
 
-/* Jacobian (6, n) in the station's axes, row by row. */
+/* Write the Jacobian (6, n) in the station's axes, row by row. */
 static void put_jacobian(const Station *station, int64_t n, const double *twists, double *to) {
     for (int64_t k = 0; k < 2 * n; k++, twists += 3) {
         double *column = to + k / 2 + (k % 2) * 3 * n;
@@ -30,7 +30,7 @@ static void put_jacobian(const Station *station, int64_t n, const double *twists
 }
 
 #ifdef STIFFOPT_LOADED
-/* The equilibrium from rest, and the body there. */
+/* Find the equilibrium from rest, and prepare the body there. */
 static int settle_body(const Work *work, Body *b, const double *pressures, double *state,
                        int moving) {
     double least;
@@ -51,10 +51,10 @@ static int settle_body(const Work *work, Body *b, const double *pressures, doubl
 static int64_t state_size(const BodyModel *m) { return 0; }
 #endif
 
-/* Something of stations at arc lengths (count) for pressures begin to end - 1 of rows (n): poses
- * (count, 16), Jacobians (count, 6 n), positions, tangents and radii (count, 7) or, under loads,
- * (count, 81) of carried_to and (9, 3) changes of force; and how it went for each row.  Not 0 if
- * memory is short. */
+/* Compute a quantity of stations at arc lengths (count) for pressures begin to end - 1 of rows (n):
+ * poses (count, 16), Jacobians (count, 6 n), positions, tangents and radii (count, 7) or, under
+ * loads, outputs of carried_to (count, 81) and changes of force (9, 3); and an outcome for each
+ * row. Return nonzero if out of memory. */
 int stiffopt_stations(const BodyModel *model, int64_t what, const double *pressures,
                       const double *at, int64_t count, double *found, int64_t *outcome,
                       int64_t begin, int64_t end) {

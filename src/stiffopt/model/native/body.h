@@ -8,16 +8,16 @@
  *     station_at(&work, &body, s, &station);                         where it is
  *     moving_station(&work, &body, s, &station, twists, slopes);     and derivatives by pressures
  *
- * `s` is the arc length at rest from the base in m, and is brought onto the arm.  `twists` (n, 6),
+ * `s` is the arc length at rest from the base in m, and is clipped to the arm.  `twists` (n, 6),
  * row by row, has for each pressure the change of the station's position and its turn, in base
- * axes per Pa; `slopes` (n) the changes of its radius.  prepare_body with 0 at the end is quicker,
- * and serves station_at alone.
+ * axes per Pa; `slopes` (n) the changes of its radius.  prepare_body with 0 at the end is faster,
+ * but supports only station_at.
  *
- * With STIFFOPT_LOADED defined these are for an arm under gravity or loads, `state` being its
- * settled equilibrium (see rod.h); without, `state` is not looked at.  Under loads the derivatives
- * come from linearise, which does nothing if `body.linear` holds that state already: a solver that
- * needs the tip too lets both use the same Linear.  Functions are those of
- * `stiffopt.model.body_functions`, whose library must hold them.
+ * With STIFFOPT_LOADED defined these are for an arm under gravity or loads, and `state` is its
+ * settled equilibrium (see rod.h); otherwise `state` is ignored.  Under loads the derivatives
+ * come from linearise, which does nothing if `body.linear` already holds that state: a solver that
+ * also needs the tip shares one Linear.  The library must contain the functions of
+ * `stiffopt.model.body_functions`.
  */
 #ifndef STIFFOPT_BODY_H
 #define STIFFOPT_BODY_H
@@ -26,18 +26,18 @@
 #include <stdint.h>
 #include <string.h>
 
-/* An arm; mirrors `_BodyModel` in body.py. */
+/* An arm; mirrors `BodyModel` in body.py. */
 typedef struct {
     int64_t n, pieces;       /* pressures; segments and connectors, from the base */
     int64_t strains;         /* numbers of a piece's strain */
     const int64_t *piece_of; /* (n) the piece that a pressure strains */
-    const int64_t *section;  /* (pieces) itself, or of a connector the piece before */
+    const int64_t *section;  /* (pieces) the piece itself; for a connector the piece before */
     const double *ends;      /* (pieces) arc lengths at rest */
     const double *numbers;   /* of the arm, see `stiffopt.model.layout` */
-    const void *rod;         /* Rod, of an arm under loads */
+    const void *rod;         /* Rod, for an arm under loads */
 } BodyModel;
 
-typedef struct { /* as `along` gives it, up to the tangent */
+typedef struct { /* an output of `along`, up to the tangent */
     double position[3];
     double axes[9];    /* of the section, by columns */
     double tangent[3]; /* of unit length */
@@ -45,7 +45,7 @@ typedef struct { /* as `along` gives it, up to the tangent */
     int64_t piece;
 } Station;
 
-/* Arc length s on the arm, from the start of its piece, which is noted. */
+/* Set the piece of arc length s; return the arc length from the start of that piece. */
 static double in_piece(const BodyModel *model, double s, Station *station) {
     int64_t piece = 0;
     while (piece < model->pieces - 1 && s > model->ends[piece]) piece++;
@@ -55,7 +55,7 @@ static double in_piece(const BodyModel *model, double s, Station *station) {
     return (s < start ? start : s > end ? end : s) - start;
 }
 
-/* The radius of a station and, unless slopes is NULL, its changes by pressures. */
+/* Set the radius of a station and, unless slopes is NULL, its changes by pressures. */
 static void put_radius(const BodyModel *model, const double *radius, const double *changes,
                        Station *station, double *slopes) {
     int64_t section = model->section[station->piece];
@@ -70,7 +70,7 @@ static void put_radius(const BodyModel *model, const double *radius, const doubl
 #include "free_body.h"
 #endif
 
-/* A prepared body as scene.h wants its centre line. */
+/* A prepared body, as the argument of scene.h's callback. */
 typedef struct {
     const Work *work;
     const Body *body;

@@ -1,11 +1,11 @@
-/* The clearance of an arm to a scene, for rows of pressures, with all that body.c has. */
+/* The clearance of an arm in a scene, for rows of pressures; includes the functions of body.c. */
 #if defined(__GNUC__) && !defined(STIFFOPT_LOADED)
 #pragma GCC optimize("O2") /* small functions, called often; the results are the same */
 #endif
 #include "body.c"
 #include "scene.h"
 
-/* The change (n) of a distance with the pressures. */
+/* Compute the change (n) of a distance with the pressures. */
 static int put_gradient(const Work *work, const Body *body, const Nearest *nearest, double *to) {
     int64_t n = body->model->n;
     double twists[6 * n], slopes[n];
@@ -16,7 +16,7 @@ static int put_gradient(const Work *work, const Body *body, const Nearest *neare
     return 1;
 }
 
-/* The objects' nearest points on a body. */
+/* Find the point of a body nearest to each object. */
 static int nearest_of_each(const CentreLine *line, const SceneObject *objects, int64_t count,
                            const Range *ranges, int64_t n_ranges, Nearest *found) {
     for (int64_t i = 0; i < count; i++)
@@ -24,7 +24,7 @@ static int nearest_of_each(const CentreLine *line, const SceneObject *objects, i
     return 1;
 }
 
-/* A distance that the least is not above, from the ends of the ranges. */
+/* Compute an upper bound of the least distance, from the ends of the ranges. */
 static int not_above(const SceneObject *objects, int64_t count, const Range *ranges,
                      int64_t n_ranges, double *least) {
     double distance, normal[3];
@@ -42,7 +42,7 @@ static int not_above(const SceneObject *objects, int64_t count, const Range *ran
     return 1;
 }
 
-/* The least distance of all objects. */
+/* Find the least distance of all objects. */
 static int least_of_all(const CentreLine *line, const SceneObject *objects, int64_t count,
                         const Range *ranges, int64_t n_ranges, Nearest *found) {
     Nearest nearest;
@@ -55,7 +55,7 @@ static int least_of_all(const CentreLine *line, const SceneObject *objects, int6
     return 1;
 }
 
-/* All that finds the clearance of an arm's poses. */
+/* Body, ranges and memory for the clearances of an arm's poses. */
 typedef struct {
     const Work *work;
     Body body;
@@ -77,7 +77,7 @@ static int64_t scenery_size(const BodyModel *model, const int64_t *counts, int64
            total * (int64_t)(sizeof(BodyPoint) / sizeof(double)) + 1;
 }
 
-/* Places in memory, and what follows them there. */
+/* Assign memory to the parts; return the address after it. */
 static double *furnish(Scenery *a, const BodyModel *model, const int64_t *counts, double *memory) {
     double *body = memory + state_size(model);
     a->state = memory;
@@ -91,7 +91,7 @@ static double *furnish(Scenery *a, const BodyModel *model, const int64_t *counts
     return memory + scenery_size(model, counts, a->n_ranges);
 }
 
-/* The body at some pressures, with coarse stations on its ranges. */
+/* Prepare the body at some pressures, with coarse stations on its ranges. */
 static int survey_body(Scenery *a, const double *pressures, int moving) {
     int outcome = settle_body(a->work, &a->body, pressures, a->state, moving);
     for (int64_t r = 0; outcome == FOUND && r < a->n_ranges; r++)
@@ -100,10 +100,10 @@ static int survey_body(Scenery *a, const double *pressures, int moving) {
     return outcome;
 }
 
-/* For pressures begin to end - 1 of rows (n): the least distance, which alone of found (N) is then
- * valid; or, where gradients is not NULL, the nearest point of each object, found (N, objects), and
- * the changes of distances (N, objects, n).  And how it went for each row.  Ranges have ends
- * (ranges, 2) and numbers of coarse stations (ranges).  Not 0 if memory is short. */
+/* Compute for pressures begin to end - 1 of rows (n) the least distance, the only valid field of
+ * found (N); or, if gradients is not NULL, the nearest point of each object, found (N, objects),
+ * and the changes of distances (N, objects, n).  Set an outcome for each row.  Ranges have ends
+ * (ranges, 2) and numbers of coarse stations (ranges).  Return nonzero if out of memory. */
 int stiffopt_clearances(const BodyModel *model, const SceneObject *objects, int64_t n_objects,
                         const double *ends, const int64_t *counts, int64_t n_ranges,
                         const double *pressures, Nearest *found, double *gradients,

@@ -1,8 +1,9 @@
-/* Newton's method for an arm that touches surfaces, as `stiffopt.model.contact` has it.
+/* Newton's method for an arm in contact with surfaces, as in `stiffopt.model.contact`.
  *
- * The arm is cut into steps from its tip to its base.  Changes are carried along the unknowns: a
- * turn of the tip (3), and force (3) and station of each contact; the last column is what the
- * states at the nodes lack.  Matrices are stored by rows, but for those of generated functions.
+ * The arm is divided into steps from its tip to its base.  Changes are propagated along the
+ * unknowns: a turn of the tip (3), and force (3) and station of each contact; the last column holds
+ * the defects of the nodes' states.  Matrices are stored by rows, except those of generated
+ * functions.
  */
 #include <math.h>
 #include <stdint.h>
@@ -23,7 +24,7 @@
 #define STRETCHED 1.3
 #define RIGID 1e-3 /* and these stability.py */
 #define FLATTEST 1e-3
-#define HELD 1e8 /* N/m, of a rigid surface: far more than of any part of an arm */
+#define HELD 1e8 /* N/m, stiffness of a rigid surface: far above that of any part of an arm */
 
 enum { CONVERGED = 0, LOST = 1, REMESH = 2 };
 
@@ -42,7 +43,7 @@ typedef struct {
     int64_t surface, pinned, segment, rigid, node;
     double start, end; /* of its range */
     double station, force[3], normal_force;
-    double distance, normal[3], curvature[9], gap, mean[3], slope; /* found here */
+    double distance, normal[3], curvature[9], gap, mean[3], slope; /* output */
 } Touch;
 
 /* Mirrored by `_Problem`. */
@@ -56,8 +57,8 @@ typedef struct {
     double length, dead[6], follower[6], tip_load[3];
     const Surface *surfaces;
     Touch *touches;
-    double *at, *q, *m;                              /* (steps + 1, ...): what is improved */
-    double *J, *near, *far, *position, *force_far, *moment_far; /* found here */
+    double *at, *q, *m;                              /* (steps + 1, ...), updated in place */
+    double *J, *near, *far, *position, *force_far, *moment_far; /* output */
 } Problem;
 
 int64_t stiffopt_contact_sizes(int64_t which) {
@@ -87,7 +88,7 @@ static void transposed_times(const double *A, const double *v, double *to) {
     for (int i = 0; i < 3; i++) to[i] = A[i] * v[0] + A[3 + i] * v[1] + A[6 + i] * v[2];
 }
 
-/* Rotation vector in base axes from a quaternion to another one that is near. */
+/* Compute the rotation vector in base axes between two nearby quaternions. */
 static void turn_between(const double *a, const double *b, double *turn) {
     double real = b[0] * a[0] + dot(b + 1, a + 1), c[3];
     cross(b + 1, a + 1, c);
@@ -144,7 +145,7 @@ static int step_ahead(const Work *work, const Problem *p, int64_t i, const doubl
     return 1;
 }
 
-/* The rod about its state: positions, tangents, forces, and all changes. */
+/* Linearise the rod about its state: positions, tangents, forces, and all changes. */
 static int linearise(const Work *work, const Problem *p, Changes *c) {
     int64_t k = p->contacts, last = 3 + 4 * k, N = p->steps;
     double R[9], f[3], m[3], n[3], ways[MOST_STEPS][3];
@@ -206,7 +207,7 @@ static int linearise(const Work *work, const Problem *p, Changes *c) {
     return 1;
 }
 
-/* Distance, normal and curvature of a surface at a point. */
+/* Compute distance, normal and curvature of a surface at a point. */
 static int look_at(const Work *work, const Surface *surface, const double *point, Touch *to) {
     to->distance = -INFINITY;
     for (int64_t i = 0; i < surface->pieces; i++) {
@@ -221,7 +222,7 @@ static int look_at(const Work *work, const Surface *surface, const double *point
     return isfinite(to->distance);
 }
 
-/* The mean tangent at a contact, and its change. */
+/* Compute the mean tangent at a contact, and its change. */
 static void mean_tangent(const Problem *p, const Changes *c, int64_t j, const double *R, double *mean,
                          double change[3][MOST_COLUMNS]) {
     const Touch *touch = p->touches + j;
@@ -258,7 +259,7 @@ static void mean_tangent(const Problem *p, const Changes *c, int64_t j, const do
     }
 }
 
-/* Equations of the base and of the contacts, A (u, u) and b (u). */
+/* Assemble the equations of the base and of the contacts, A (u, u) and b (u). */
 static int assemble(const Work *work, const Problem *p, const Changes *c, double *A, double *b) {
     int64_t k = p->contacts, last = 3 + 4 * k, u = 3 + 5 * k;
     memset(A, 0, (size_t)(u * u) * sizeof(double));
@@ -305,7 +306,7 @@ static int assemble(const Work *work, const Problem *p, const Changes *c, double
     return 1;
 }
 
-/* Solve A X = B in place for columns (n, m) of B, by elimination with the largest pivots. */
+/* Solve A X = B in place for columns (n, m) of B, by elimination with row pivoting. */
 static int eliminate(double *A, double *B, int64_t n, int64_t m) {
     for (int64_t i = 0; i < n; i++) {
         int64_t best = i;
@@ -335,7 +336,7 @@ static int eliminate(double *A, double *B, int64_t n, int64_t m) {
     return 1;
 }
 
-/* Add a correction to nodes and contacts; the largest turn, and the largest slide. */
+/* Add a correction to nodes and contacts; return the largest turn. */
 static double correct_nodes(const Problem *p, const Changes *c, const double *x) {
     int64_t last = 3 + 4 * p->contacts;
     double largest = 0;
@@ -354,7 +355,7 @@ static double correct_nodes(const Problem *p, const Changes *c, const double *x)
     return largest;
 }
 
-/* Whether steps have lengths that they may have after contacts have slid. */
+/* Move nodes after contacts have slid; return 0 if steps would get an invalid length. */
 static int move_nodes(const Problem *p, const double *slides) {
     double h[MOST_STEPS];
     for (int64_t i = 0; i < p->steps; i++) {
@@ -366,8 +367,8 @@ static int move_nodes(const Problem *p, const double *slides) {
     return 1;
 }
 
-/* Newton's method from a state, in place.  REMESH: contacts have left their ranges or steps do not
- * fit; nodes and contacts are as far as they are, and the mesh is as before. */
+/* Run Newton's method from a state, in place.  REMESH: contacts have left their ranges or steps no
+ * longer fit; nodes and contacts are updated so far, and the mesh is unchanged. */
 int64_t stiffopt_contact_correct(const Problem *p) {
     static _Thread_local Changes changes;
     double A[MOST_UNKNOWNS * MOST_UNKNOWNS], x[MOST_UNKNOWNS], previous = INFINITY;
@@ -397,7 +398,7 @@ int64_t stiffopt_contact_correct(const Problem *p) {
 
 /* -- stability ------------------------------------------------------------------------------- */
 
-/* Moment and force (6) at the start of a step, by turns and positions of its start and end (12). */
+/* Compute moment and force (6) at the start of a step, by turns and positions of its ends (12). */
 static int wrench_at_start(const Problem *p, int64_t i, double *start) {
     const double *J = p->J + 90 * i;
     double by[36], R[9];
@@ -407,7 +408,7 @@ static int wrench_at_start(const Problem *p, int64_t i, double *start) {
         double h = p->at[i] - p->at[i + 1];
         const double *C = p->compliance + 36 * p->segment[i];
         rotation(p->q + 4 * i, R);
-        for (int half = 0; half < 2; half++) /* turns by moments, then ways by forces */
+        for (int half = 0; half < 2; half++) /* turns by moments, then displacements by forces */
             for (int r = 0; r < 3; r++)
                 for (int c = 0; c < 3; c++) {
                     double sum = 0;
@@ -426,8 +427,8 @@ static int wrench_at_start(const Problem *p, int64_t i, double *start) {
     return eliminate(by, start, 6, 12);
 }
 
-/* Change of the gap's slope at a contact by turns and positions of the nodes, to 6 + 12 numbers
- * that begin at the node before its own; and the second derivative of the gap along the arm. */
+/* Compute the change of the gap's slope at a contact by turns and positions of the nodes, 6 + 12
+ * numbers from the node before its own; return the gap's second derivative along the arm. */
 static double slope_change(const Problem *p, const Touch *touch, const double *starts, double *to) {
     const double *C = p->compliance + 36 * touch->segment, *n = touch->normal, *mean = touch->mean;
     int64_t node = touch->node;
@@ -489,8 +490,8 @@ static int is_definite(double *K, int64_t n, int64_t wide) {
     return 1;
 }
 
-/* Whether what `stiffopt_contact_correct` found under dead forces is a minimum of the energy; with
- * memory K ((6 steps + 6)^2) and starts (72 steps). */
+/* Whether the result of `stiffopt_contact_correct` under dead forces is a minimum of the energy;
+ * memory: K ((6 steps + 6)^2) and starts (72 steps). */
 int64_t stiffopt_contact_is_stable(const Problem *p, double *K, double *starts) {
     int64_t N = p->steps, n = 6 * N, wide = n + 6;
     memset(K, 0, (size_t)(wide * wide) * sizeof(double));

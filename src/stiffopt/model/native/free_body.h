@@ -4,12 +4,12 @@
 
 #include "work.h"
 
-/* What moving_frames gives, or frames the first three. */
+/* The outputs of moving_frames, or the first three of frames. */
 typedef struct {
     const BodyModel *model;
     double *strain, *start, *radius; /* of each piece */
-    double *slope, *twist, *change;  /* of a piece's strain, of all beyond it, of its radius: each
-                                        by a pressure */
+    double *slope, *twist, *change;  /* per pressure: of its piece's strain, of everything beyond
+                                        that piece, of its radius */
 } Body;
 
 static int64_t body_size(const BodyModel *m) {
@@ -40,7 +40,7 @@ static int prepare_body(const Work *work, Body *b, const double *pressures, cons
     return !failed && margin > 0;
 }
 
-/* One call of along or, with `moves` (strains, 6), of moving_along. */
+/* Call along or, with `moves` (strains, 6), moving_along. */
 static int find_station(const Work *work, const Body *b, double s, Station *station,
                         double *moves) {
     const BodyModel *m = b->model;

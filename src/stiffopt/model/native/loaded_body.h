@@ -1,7 +1,7 @@
 /* The body of an arm under gravity or loads, from its equilibrium; see body.h.
  *
- * States and their changes between the steps of the integration are interpolated as the method
- * integrates them (`stiffopt.model.body_functions.DENSE`), of which rod.h has noted all it takes.
+ * States and their changes are interpolated within integration steps by the method's dense output
+ * (`stiffopt.model.body_functions.DENSE`), from the notes that rod.h stores.
  */
 #ifndef STIFFOPT_LOADED_BODY_H
 #define STIFFOPT_LOADED_BODY_H
@@ -14,7 +14,7 @@ typedef struct {
     Linear *linear;           /* with derivatives; its notes are this body's */
     double pose[12];          /* of the tip: position, axes by columns */
     double *notes;
-    int64_t noted;            /* directions of the notes: none without derivatives */
+    int64_t noted;            /* directions of the notes: 0 without derivatives */
     double *radius, *change;  /* of each piece, by each pressure */
 } Body;
 
@@ -44,7 +44,7 @@ static int prepare_body(const Work *work, Body *b, const double *pressures, cons
     if (radii(work->arg, work->res, work->iw, work->w, 0)) return 0;
     b->noted = moving ? noted_directions(b->rod) : 0;
     if (!moving) {
-        b->linear->known = 0; /* its notes are overwritten */
+        b->linear->known = 0; /* its notes will be overwritten */
         return tip_pose(work, b->rod, state, b->pose, b->notes);
     }
     if (!linearise(work, b->rod, state, b->linear)) return 0;
@@ -56,7 +56,7 @@ static int prepare_body(const Work *work, Body *b, const double *pressures, cons
 typedef struct {
     const double *note;
     double weight[BLOCKS], slope[BLOCKS];
-    int64_t blocks, directions; /* that are carried there */
+    int64_t blocks, directions; /* propagated to there */
 } Place;
 
 static int find_place(const Work *work, const Body *b, double s, Station *station, Place *to) {
@@ -89,7 +89,7 @@ static int find_place(const Work *work, const Body *b, double s, Station *statio
     return 1;
 }
 
-/* Columns begin to end - 1 of a place, each (q, m, 0, r, 0), of its value or its slope. */
+/* Interpolate columns begin to end - 1 at a place, each (q, m, 0, r, 0): value or slope. */
 static void blend(const Body *b, const Place *at, const double *weight, int64_t begin, int64_t end,
                   double *to) {
     int64_t count = 12 * (end - begin), size = block_size(b->noted);
@@ -99,7 +99,7 @@ static void blend(const Body *b, const Place *at, const double *weight, int64_t 
         for (int64_t i = 0; i < count; i++) to[i] += weight[j] * from[j * size + i];
 }
 
-/* A station from its state, and its turn in base axes per change of the quaternion (3, 4). */
+/* Set a station from its state, and its turn in base axes per change of the quaternion (3, 4). */
 static int put_station(const Work *work, const Body *b, const Place *at, const double *value,
                        Station *station, double *turning) {
     double slope[12], *t = station->tangent;
@@ -147,8 +147,8 @@ static int moving_station(const Work *work, const Body *b, double s, Station *st
     return 1;
 }
 
-/* What is carried to a station along the first directions: turns (3, 9), changes of moment (3, 9)
- * and of the way from there to the tip (3, 9), in base axes, row by row. */
+/* Compute changes at a station along the first directions: of rotation (3, 9), moment (3, 9)
+ * and the vector from there to the tip (3, 9), in base axes, row by row. */
 static int carried_to(const Work *work, const Body *b, double s, Station *station,
                       double *carried) {
     Place at;

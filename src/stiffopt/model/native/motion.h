@@ -1,23 +1,23 @@
-/* Whether the body of an arm stays clear of a scene while its pressures go straight from one row to
- * the next: adaptive, and for all that is between the poses that are looked at.
+/* Check that the body of an arm stays clear of a scene while its pressures change linearly from one
+ * row to the next, also between the poses that are evaluated.
  *
- * Each range of the body is judged by itself, as what is near to the base moves little.  Between two
- * poses in which it has distances d0 and d1, of which no point of it is further apart than c and
- * leaves its chord by more than e on its way, its distance is at least (d0 + d1 - c) / 2 - e.  With
- * `way` the most that it moves (see speeds below) another bound is (d0 + d1 - way) / 2; and e <=
- * way^2 / (8 bend), as the second derivative along a way is at most its speed^2 / bend.
- * A stretch for which neither is enough is divided, the widest first, so that what is in the way is
- * soon seen.  Distances of grids change by STEEPEST as much as the body moves.  A ring's is lost at
- * once where the tip leaves the disc: until then the tip's distance from it counts too.
+ * Each range of the body is checked on its own, as parts near the base move little.  Take two poses
+ * at which a range has distances d0 and d1.  If none of its points moves further than c between
+ * them or leaves its chord by more than e, its distance is at least (d0 + d1 - c) / 2 - e.  With
+ * `way` the largest motion of a point (see speeds below), another bound is (d0 + d1 - way) / 2; and
+ * e <= way^2 / (8 bend), as second derivatives along the motion are at most its speed^2 / bend. An
+ * interval for which neither bound suffices is divided, the widest first, to find obstacles soon.
+ * Distances of grids change up to STEEPEST times as much as the body moves.  The distance of a ring
+ * is lost at once when the tip leaves its disc, so the tip's distance from the disc counts too.
  */
 #ifndef STIFFOPT_MOTION_H
 #define STIFFOPT_MOTION_H
 
 enum { MOTION_CLEAR, MOTION_BLOCKED, MOTION_NO_SHAPE };
 
-#define MOST_POSES 8192   /* of a stretch; what needs more is taken to be blocked */
-#define SAG 1e-5          /* m, by which the distance may be less between poses */
-#define BETWEEN 1.1       /* the most that stations move over what coarse ones do */
+#define MOST_POSES 8192   /* between two rows; a motion that needs more counts as blocked */
+#define SAG 1e-5          /* m, allowed decrease of the distance between poses */
+#define BETWEEN 1.1       /* bound on the motion of stations, over that of the coarse ones */
 
 typedef struct {
     int32_t from, to;
@@ -32,12 +32,12 @@ typedef struct {
     double *ways;            /* (ranges) */
     int64_t count, ends;
     double *shares;          /* (MOST_POSES) of the way */
-    double *spares;          /* (MOST_POSES, ranges), distances beyond what is asked */
+    double *spares;          /* (MOST_POSES, ranges), distances beyond the clearance asked for */
     double *places;          /* (MOST_POSES, stations, 4): positions and radii */
     Stretch *stretches;      /* (2 MOST_POSES) */
 } Way;
 
-/* What an object leaves each range to spare; of a ring, that the arm passes through. */
+/* Reduce each range's spare distance by that of an object; check that the arm is through a ring. */
 static int look_at(Way *w, const SceneObject *object, double *spares, double *least) {
     Scenery *a = w->scenery;
     Nearest nearest;
@@ -64,7 +64,7 @@ static int look_at(Way *w, const SceneObject *object, double *spares, double *le
     return 1;
 }
 
-/* Look at a share of the way, and note the pose; the least distance is exact if it matters. */
+/* Evaluate the pose at a share of the way and store it; the least distance is exact if needed. */
 static int look(Way *w, double share, double *least) {
     Scenery *a = w->scenery;
     double pressures[w->n], *place = w->places + 4 * w->stations * w->count;
@@ -87,7 +87,7 @@ static int look(Way *w, double share, double *least) {
     return here >= w->asked ? MOTION_CLEAR : MOTION_BLOCKED;
 }
 
-/* The most that a range with these stations is apart in two poses. */
+/* Largest motion of a range with these stations between two poses. */
 static double apart(const double *a, const double *b, int64_t count) {
     double most = 0;
     for (int64_t i = 0; i < count; i++, a += 4, b += 4)
@@ -95,7 +95,7 @@ static double apart(const double *a, const double *b, int64_t count) {
     return BETWEEN * most;
 }
 
-/* Note a stretch, unless it is clear as it is. */
+/* Store an interval, unless the bounds show that it is clear. */
 static void consider(Way *w, int32_t from, int32_t to) {
     const double *a = w->places + 4 * w->stations * from, *b = w->places + 4 * w->stations * to;
     const double *first = w->spares + w->ranges * from, *second = w->spares + w->ranges * to;
@@ -110,7 +110,7 @@ static void consider(Way *w, int32_t from, int32_t to) {
     }
 }
 
-/* Whether all is clear on the way; the last pose is the one that is not. */
+/* Return whether the whole way is clear; otherwise the last pose is the one that is not. */
 static int go(Way *w, double *least) {
     w->count = w->ends = 0;
     for (int k = 0; k < 2; k++) {
@@ -129,7 +129,7 @@ static int go(Way *w, double *least) {
     return MOTION_CLEAR;
 }
 
-/* What is judged, and memory for it; mirrored by `_Motions` in motion_clearance.py. */
+/* Arm and scene, and memory; mirrored by `_Motions` in motion_clearance.py. */
 typedef struct {
     const BodyModel *model;
     const SceneObject *objects;
@@ -137,7 +137,7 @@ typedef struct {
     const double *ends; /* (ranges, 2) of the ranges */
     const int64_t *counts;
     int64_t n_ranges;
-    const double *speeds; /* (ranges, pieces), the most that it moves per change of their pressures */
+    const double *speeds; /* (ranges, pieces), largest motion per change of a piece's pressures */
     const double *bends;  /* (ranges) */
     double *memory; /* (stiffopt_motion_memory) */
 } Motions;
@@ -148,16 +148,16 @@ static int64_t stations_of(const Motions *m) {
     return total;
 }
 
-/* How many numbers the memory holds. */
+/* Number of doubles of the memory. */
 int64_t stiffopt_motion_memory(const Motions *m) {
     return scenery_size(m->model, m->counts, m->n_ranges) +
            MOST_POSES * (1 + m->n_ranges + 4 * stations_of(m)) +
            MOST_POSES * 2 * (int64_t)sizeof(Stretch) / (int64_t)sizeof(double);
 }
 
-/* Whether all is clear along rows of pressures (rows, n), from one to the next.  found has (2 + n)
- * numbers: the least distance that was seen (of what matters), how many poses were looked at, and,
- * where the way is not clear, the pressures there.  Returns how it ended. */
+/* Check the motion along rows of pressures (rows, n).  found has (2 + n) numbers: the least
+ * distance found, the number of poses evaluated and, if the motion is blocked, the pressures there.
+ * Returns the outcome. */
 int stiffopt_motions(const Motions *m, const double *pressures, int64_t rows, double asked,
                      double *found) {
     NEW_WORK(work);

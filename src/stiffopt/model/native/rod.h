@@ -1,18 +1,18 @@
 /* The rod under gravity and loads, integrated from its tip to its base.
  *
- * State y = (q, m), orientation and moment (7), and position r, which does not feed back.  The
- * equations and their derivatives are generated (`stiffopt.model.rod`); here are the steps of
- * Cooper and Verner's Runge-Kutta method of order eight and what is carried along them:
+ * The state is y = (q, m), orientation and moment (7), and position r, which does not feed back.
+ * The equations and their derivatives are generated (`stiffopt.model.rod`).  This file has the
+ * steps of Cooper and Verner's Runge-Kutta method of order eight, and propagates along them:
  *
  *   newton_step    changes per turn of the tip, and the defects of the lifted Newton method; with
  *                  those per moment at the tip whether it is stable (Jacobi's condition),
  *   linearise      changes per turn, added wrench and pressures: pose, Jacobian and compliance,
  *   add_curvature  adjoint of a change: derivatives of the compliance by the pressures.
  *
- * What is noted of each piece (`Carried.notes`) gives all of it anywhere on the arm, see body.h.
+ * The notes of each piece (`Carried.notes`) allow interpolation anywhere on the arm, see body.h.
  *
- * A direction is one column of changes, of eight numbers (y and a zero); they are stored one
- * after the other.  A pressure is carried only from its own segment on towards the base.
+ * A direction is one column of changes, of eight numbers (y and a zero); columns are stored one
+ * after the other.  A pressure is propagated only from its own segment towards the base.
  */
 #ifndef STIFFOPT_ROD_H
 #define STIFFOPT_ROD_H
@@ -27,24 +27,24 @@
 #define TURNS 3
 #define WRENCHES 6
 #define FIRST (TURNS + WRENCHES) /* directions before the pressures */
-#define WITH_FORCE (TURNS + 3)   /* directions along which the force changes: they come first */
+#define WITH_FORCE (TURNS + 3)   /* the first directions, along which the force changes */
 #define ROD_INLINE static inline __attribute__((always_inline))
 
-/* Loops over directions are compiled for wider registers too, which are used where there are any;
- * the results are the same. */
+/* Compile loops over directions also for wider registers, for processors that have them; the
+ * results are the same. */
 #if defined(__GNUC__) && !defined(__clang__) && defined(__x86_64__) && defined(__GLIBC__)
 #define ROD_CLONES __attribute__((target_clones("avx2", "default"), optimize("O3")))
 #else
 #define ROD_CLONES
 #endif
 
-/* A stretch of arm: soft, or rigid (kind -1). */
+/* A piece of arm: soft, or rigid (kind -1). */
 typedef struct {
     int64_t kind;
     int64_t parts, slopes;     /* where its section begins in a and da */
     int64_t channel, channels; /* its pressures */
     int64_t steps;
-    double length; /* of a step, or of a rigid stretch */
+    double length; /* of a step, or of a rigid piece */
     double mass;   /* per length */
 } RodPiece;
 
@@ -56,16 +56,16 @@ typedef struct {
     const double *hanging; /* state (rod_state_size) of the unpressurised arm under its weight */
 } Rod;
 
-/* What an equilibrium is for: pressures (Pa), load and gravity. */
+/* The condition of an equilibrium: pressures (Pa), load and gravity. */
 typedef struct {
     const double *pressures;
     double load[12], gravity[3];
 } Condition;
 
-/* A state: pressures (n) it belongs to, quaternion of the tip (4), (q, m) after each step (7). */
+/* Size of a state: its pressures (n), the tip's quaternion (4), (q, m) after each step (7). */
 static int64_t rod_state_size(const Rod *rod) { return rod->n + 4 + 7 * rod->steps; }
 
-/* Row i of the method's table: the stages that its state is made of, and where it lies. */
+/* Row i of the method's table: coefficients of earlier stages, and its place in the step. */
 typedef struct {
     double at;
     int count, from[6];
@@ -98,7 +98,7 @@ static const double WEIGHT[STAGES] = {1. / 20, 0, 0, 0, 0, 0, 0,
                                       49. / 180, 16. / 45, 49. / 180, 1. / 20};
 #undef S
 
-/* A method of integration: rows, and weights of their slopes. */
+/* An integration method: rows, and weights of their slopes. */
 typedef struct {
     int stages;
     const Row *row;
@@ -107,7 +107,7 @@ typedef struct {
 
 static const Method EIGHTH_ORDER = {STAGES, TABLE, WEIGHT};
 
-/* Runge and Kutta's of order four, for Newton's first steps, which are larger than its errors. */
+/* Runge-Kutta of order four, for Newton's first steps, which are larger than its errors. */
 static const Method FOURTH_ORDER = {
     4,
     (const Row[4]){{0, 0, {0}, {0}}, {1. / 2, 1, {0}, {1. / 2}}, {1. / 2, 1, {1}, {1. / 2}},
@@ -116,7 +116,7 @@ static const Method FOURTH_ORDER = {
 
 /* -- generated functions, by kind of section ------------------------------------------------ */
 
-/* A kind that the layout does not have is never called for. */
+/* Kinds that the layout does not have are never called. */
 #ifndef NEWTON1_N_IN
 #define newton1 newton0
 #define slope1 slope0
@@ -155,7 +155,7 @@ SECTION_FUNCTION(adjoint)
 
 /* -- small algebra -------------------------------------------------------------------------- */
 
-static int invert_3x3(const double *a, double *b) { /* either storage: it is the same for both */
+static int invert_3x3(const double *a, double *b) { /* by rows or by columns, alike */
     b[0] = a[4] * a[8] - a[5] * a[7], b[1] = a[2] * a[7] - a[1] * a[8];
     b[2] = a[1] * a[5] - a[2] * a[4], b[3] = a[5] * a[6] - a[3] * a[8];
     b[4] = a[0] * a[8] - a[2] * a[6], b[5] = a[2] * a[3] - a[0] * a[5];
@@ -176,7 +176,8 @@ static void multiply_3x3(const double *A, const double *B, double *C) {
         }
 }
 
-/* Quaternion after a small turn (rotation vector, body axes), as `stiffopt.model.equilibrium` has it. */
+/* Turn a quaternion by a small rotation vector in body axes, as `stiffopt.model.equilibrium` does.
+ */
 static void turn_quaternion(double *q, const double *turn) {
     double x = turn[0] / 2, y = turn[1] / 2, z = turn[2] / 2;
     double p[4] = {q[0] - q[1] * x - q[2] * y - q[3] * z, q[0] * x + q[1] + q[2] * z - q[3] * y,
@@ -185,8 +186,8 @@ static void turn_quaternion(double *q, const double *turn) {
     for (int i = 0; i < 4; i++) q[i] = p[i] / size;
 }
 
-/* Rotation vectors in body axes of changes of a quaternion: `count` columns, eight apart, to a
- * matrix (3, count), row by row. */
+/* Convert changes of a quaternion (`count` columns, eight apart) to rotation vectors in body axes,
+ * a matrix (3, count) stored by rows. */
 static void turns_between(const double *q, const double *dq, int count, double *turns) {
     double w = q[0], x = q[1], y = q[2], z = q[3];
     for (int k = 0; k < count; k++, dq += 8) {
@@ -198,29 +199,29 @@ static void turns_between(const double *q, const double *dq, int count, double *
 
 /* -- steps ---------------------------------------------------------------------------------- */
 
-#define SLOT (8 + 4 + FIRST * 8) /* what the adjoint needs of a stage: y, n, first directions */
+#define SLOT (8 + 4 + FIRST * 8) /* record of a stage for the adjoint: y, n, first directions */
 
-/* What is carried from the tip to the base. */
+/* State and changes, propagated from the tip to the base. */
 typedef struct {
     double y[8], r[4], n[4];
-    int64_t directions;   /* so many */
-    int64_t forced;       /* the first so many with a change of force */
+    int64_t directions;   /* their number */
+    int64_t forced;       /* number of the first ones, along which the force changes */
     double *Y, *X;        /* changes of y (directions, 8) and r (directions, 4) */
     const double *dn;     /* (forced, 3) */
-    double *trace;        /* where stages are noted, or NULL */
-    double *notes;        /* where steps are noted, or NULL */
-    int64_t noted;        /* most directions of a note */
+    double *trace;        /* output: records of stages, or NULL */
+    double *notes;        /* output: notes of steps, or NULL */
+    int64_t noted;        /* largest number of directions of a note */
 } Carried;
 
-/* A note of a step or a rigid stretch is six blocks of (1 + noted) columns of 12 numbers: the value,
- * then the directions, each (q, m, 0, r, 0).  The first block is the start, the others are the
- * slopes at the stages with a weight, which are Lobatto's points; of a rigid stretch only the
- * second is used, and holds the whole gain. */
+/* The note of a step or a rigid piece has six blocks of (1 + noted) columns of 12 numbers: the
+ * value, then the directions, each (q, m, 0, r, 0).  The first block is the start, the others are
+ * the slopes at the stages with a weight, the Lobatto points.  For a rigid piece only the second is
+ * used; it holds the whole change. */
 #define BLOCKS 6
 
 static int64_t block_size(int64_t noted) { return 12 * (1 + noted); }
 
-/* Where the next note begins. */
+/* Address of the next note. */
 static double *next_note(double *notes, int64_t noted) { return notes + BLOCKS * block_size(noted); }
 
 static void note(double *block, int64_t directions, const double *y, const double *r,
@@ -232,15 +233,15 @@ static void note(double *block, int64_t directions, const double *y, const doubl
     }
 }
 
-/* Four numbers at once; compilers turn that into what the processor has. */
+/* A vector of four numbers, which compilers map to the processor's registers. */
 typedef double Four __attribute__((vector_size(32), aligned(8), may_alias));
 
 ROD_INLINE Four four(const double *from) { return *(const Four *)from; }
 ROD_INLINE void put(double *to, Four value) { *(Four *)to = value; }
 
-/* Changes of slopes: K = G y + Gn dn for each direction, and the columns of Gp for the last `own`
- * of them.  Matrices are stored by columns of 8 rows or, with position, 12; that part of K goes to
- * `moved` and is added to X at once, times a share (if it is not zero). */
+/* Compute changes of slopes: K = G y + Gn dn for each direction, plus the columns of Gp for the
+ * last `own` ones.  Matrices are stored by columns of 8 rows or, with position, 12; the position's
+ * part of K goes to `moved` and, times a share (if not zero), is added to X. */
 ROD_INLINE void change_slopes(int rows, const double *restrict G, const double *restrict Gn,
                               const double *restrict Gp, int64_t own, const Carried *c,
                               const double *restrict Y, double *restrict K,
@@ -282,8 +283,8 @@ ROD_INLINE void combine(int64_t numbers, const double *restrict from, int count,
     }
 }
 
-/* One step; with `rows` 12 position too, and without `da` no directions then.  The last `own`
- * directions are the section's own pressures. */
+/* Take one step; with `rows` 12 including position, then without directions if `da` is NULL.  The
+ * last `own` directions are the section's own pressures. */
 ROD_INLINE int rod_step(const Work *work, const Method *method, const RodPiece *piece,
                         const double *a, const double *da, const double *weight, int rows,
                         int64_t own, Carried *c) {
@@ -351,13 +352,13 @@ ROD_CLONES static int long_step(const Work *work, const RodPiece *piece, const d
     return rod_step(work, &EIGHTH_ORDER, piece, a, da, weight, 12, own, c);
 }
 
-/* A step of the shape alone. */
+/* Take a step without directions. */
 static int plain_step(const Work *work, const RodPiece *piece, const double *a,
                       const double *weight, Carried *c) {
     return rod_step(work, &EIGHTH_ORDER, piece, a, NULL, weight, 12, 0, c);
 }
 
-/* A rigid stretch moves the force that is carried. */
+/* Cross a rigid piece. */
 static int rigid_stretch(const Work *work, const RodPiece *piece, int rows, Carried *c) {
     int64_t D = c->directions;
     double gain[12], G[12 * 7], Gn[12 * 3], change[D * 8 + 4], none[D * 4 + 4], moved[D * 4 + 4];
@@ -384,14 +385,14 @@ static int rigid_stretch(const Work *work, const RodPiece *piece, int rows, Carr
     return 1;
 }
 
-/* Sections at a condition: a (parts) and its derivatives (slopes). */
+/* Compute the sections at a condition: a (parts) and its derivatives (slopes). */
 static int sections_at(const Work *work, const Rod *rod, const Condition *at, double *a,
                        double *da) {
     work->arg[0] = at->pressures, work->arg[1] = rod->numbers, work->res[0] = a, work->res[1] = da;
     return !sections(work->arg, work->res, work->iw, work->w, 0);
 }
 
-/* What is carried, as it is at a tip of orientation q: the first directions turn it. */
+/* Start propagation at a tip of orientation q; the first directions turn it. */
 static int start_at_tip(const Work *work, const Rod *rod, const Condition *at, const double *q,
                         double *dn, double *R, Carried *c) {
     double weight[3], dy[8 * 3];
@@ -446,8 +447,9 @@ static int turns_back(const double *A) {
     return -p / 2 - sqrt(square) <= 0;
 }
 
-/* Whether the changes of a state y per turn of the tip (3) and per moment at it (3) are those of a
- * stable arm from there on, as `Equilibrium.is_stable`; R of the tip is given by columns. */
+/* Whether the arm between a state y and the tip is stable, from the changes of y per turn of the
+ * tip (3) and per moment at it (3), as `Equilibrium.is_stable`; R of the tip is stored by columns.
+ */
 static int is_stable_to(const double *y, const double *by_turn, const double *by_moment,
                         const double *R, int conservative) {
     double per_turn[9], per_moment[9], inverse[9], here[9], turned[9], block[9], symmetric[9];
@@ -465,9 +467,9 @@ static int is_stable_to(const double *y, const double *by_turn, const double *by
     return is_positive(symmetric);
 }
 
-/* One step of the lifted Newton method (`stiffopt.model.equilibrium`) on a state, in place; the
- * largest turn of the tip or a state in rad, or NaN. And, unless stable is NULL, whether the state
- * was stable, if it was an equilibrium. */
+/* Take one step of the lifted Newton method (`stiffopt.model.equilibrium`) on a state, in place;
+ * return the largest turn of the tip or a state in rad, or NaN.  Unless stable is NULL, set it to
+ * whether the state was stable, provided that it was an equilibrium. */
 static double newton_step(const Work *work, const Rod *rod, const Condition *at, const double *a,
                           const Method *method, double *state, int *stable) {
     double *q = state + rod->n, *states = q + 4, *lifted = states;
@@ -524,12 +526,12 @@ static double newton_step(const Work *work, const Rod *rod, const Condition *at,
     return most;
 }
 
-#define QUADRATIC 1e-6 /* rad, after a step of which 1e-12 is left, convergence being quadratic */
-#define NEARLY 1e-3    /* rad, after a step of which the next is likely to be the last */
-#define ROUGHLY 0.03   /* rad, after a step of which errors of coarse ones do not count */
+#define QUADRATIC 1e-6 /* rad; after such a step the error is 1e-12, by quadratic convergence */
+#define NEARLY 1e-3    /* rad; after such a step the next is probably the last */
+#define ROUGHLY 0.03   /* rad; larger steps are integrated coarsely, with errors below this */
 
-/* Newton's method from a nearby state, or one far away, as `Equilibrium.correct`, to a stable
- * equilibrium if `stable` is not 0; the state is spoilt by failure. */
+/* Run Newton's method from a nearby or a `far` state, as `Equilibrium.correct`, to a stable
+ * equilibrium if `stable` is not 0; after a failure the state is invalid. */
 static int correct(const Work *work, const Rod *rod, const Condition *at, const double *a, int far,
                    int stable, double *state) {
     double before = 1, noise = QUADRATIC;
@@ -551,8 +553,8 @@ static int correct(const Work *work, const Rod *rod, const Condition *at, const 
 #define SHORTEST_FROM_REST 1e-3
 #define SHORTEST_NEARBY 0.1
 
-/* Equilibrium reached continuously from one condition to another, as `Equilibrium.follow`; the
- * state is the last one that was found, and the share of the way that it is at is returned. */
+/* Follow the equilibrium from one condition to another, as `Equilibrium.follow`; set the state to
+ * the last one found and return its share of the path. */
 static double follow(const Work *work, const Rod *rod, const Condition *start, const Condition *end,
                      double shortest, int stable, double *state) {
     int64_t size = rod_state_size(rod);
@@ -583,7 +585,7 @@ static double follow(const Work *work, const Rod *rod, const Condition *start, c
     return 1;
 }
 
-/* The unpressurised arm under its weight; 0 where it falls over. */
+/* Find the state of the unpressurised arm under its weight; return 0 if it falls over. */
 static int hang(const Work *work, const Rod *rod, double *state) {
     double none[rod->n];
     memset(none, 0, sizeof none);
@@ -602,7 +604,7 @@ static Condition condition_of(const Rod *rod, const double *pressures) {
     return at;
 }
 
-/* Stable equilibrium reached from rest, as `Equilibrium.settle`; 0 if there is none. */
+/* Find the stable equilibrium reached from rest, as `Equilibrium.settle`; return 0 without one. */
 static int settle(const Work *work, const Rod *rod, const double *pressures, double *state) {
     double none[rod->n];
     memset(none, 0, sizeof none);
@@ -612,8 +614,7 @@ static int settle(const Work *work, const Rod *rod, const double *pressures, dou
     return follow(work, rod, &start, &end, SHORTEST_FROM_REST, 1, state) == 1;
 }
 
-/* Equilibrium at pressures next to that of a state, which is moved there; a stable one if `stable`
- * is not 0. */
+/* Move a state to the equilibrium at nearby pressures; to a stable one if `stable` is not 0. */
 static int settle_nearby(const Work *work, const Rod *rod, const double *pressures, int stable,
                          double *state) {
     double from[rod->n];
@@ -623,8 +624,8 @@ static int settle_nearby(const Work *work, const Rod *rod, const double *pressur
     return follow(work, rod, &start, &end, SHORTEST_NEARBY, stable, state) == 1;
 }
 
-/* Pose of the tip of a state (12): position, rotation by columns; notes of all steps, without
- * directions, unless `notes` is NULL. */
+/* Compute the tip's pose (12) at a state: position, rotation by columns; unless `notes` is NULL,
+ * also the notes of all steps, without directions. */
 static int tip_pose(const Work *work, const Rod *rod, const double *state, double *pose,
                     double *notes) {
     double dn[9], Y[TURNS * 8], a[rod->parts], da[rod->slopes];
@@ -653,7 +654,7 @@ static int tip_pose(const Work *work, const Rod *rod, const double *state, doubl
 /* An equilibrium with its derivatives. */
 typedef struct {
     int known;
-    double *state;             /* that it is of (rod_state_size) */
+    double *state;             /* of the equilibrium (rod_state_size) */
     double *a, *da;            /* sections */
     double r[3], R[9];         /* of the tip; R row by row */
     double *turn;              /* of the tip, per wrench and pressure (6 + n, 3) */
@@ -665,10 +666,10 @@ typedef struct {
     double *notes; /* of all steps, if the caller sets it to memory (notes_size) */
 } Linear;
 
-/* Directions of the notes of linearise: the first, then pressures from the tip on. */
+/* Number of directions of the notes of linearise: the first, then pressures from the tip on. */
 static int64_t noted_directions(const Rod *rod) { return FIRST + rod->n; }
 
-/* The direction of a pressure. */
+/* Index of a pressure's direction. */
 static int64_t direction_of(const Rod *rod, int64_t pressure) {
     int64_t direction = FIRST;
     const RodPiece *piece = rod->piece;
@@ -697,7 +698,7 @@ static Linear linear_in(const Rod *rod, double *memory) {
     return l;
 }
 
-/* Derivatives of the rod at an equilibrium by the implicit function theorem. */
+/* Compute derivatives of the rod at an equilibrium by the implicit function theorem. */
 static int linearise(const Work *work, const Rod *rod, const double *state, Linear *l) {
     size_t size = (size_t)rod_state_size(rod) * sizeof(double);
     if (l->known && !memcmp(l->state, state, size)) return 1;
@@ -766,11 +767,11 @@ static void body_twist(const Linear *l, int64_t pressure, double *twist) {
 }
 
 #ifdef RIGID_ADJOINT_N_IN
-/* Adds d(y' C z)/dp to a gradient (n), C (6, 6) the compliance in base axes.
+/* Add d(y' C z)/dp to a gradient (n), with C (6, 6) the compliance in base axes.
  *
- * With S = y' (r_dot, R delta_dot) + mu' Phi_dot along (delta_dot, z), which is stationary in
- * delta_dot and in mu, that is the derivative of S with both held.  Changes along that direction
- * are combined from those that linearise noted, and one sweep back gives the derivatives.
+ * S = y' (r_dot, R delta_dot) + mu' Phi_dot along (delta_dot, z) is stationary in delta_dot and in
+ * mu, so this is the derivative of S with both fixed.  Changes along that direction are combined
+ * from those that linearise noted, and one backward sweep gives the derivatives.
  */
 static int add_curvature(const Work *work, const Rod *rod, const Linear *l, const double *y,
                          const double *z, double *gradient) {
@@ -858,15 +859,15 @@ static int add_curvature(const Work *work, const Rod *rod, const Linear *l, cons
 }
 #endif
 
-/* -- as `LoadedArm` calls for them ---------------------------------------------------------- */
+/* -- called by `LoadedArm` ------------------------------------------------------------------ */
 
-/* State of the unpressurised arm under its weight; 0 where it falls over. */
+/* Find the state of the unpressurised arm under its weight; return 0 if it falls over. */
 int stiffopt_hang(const Rod *rod, double *state) {
     NEW_WORK(work);
     return hang(&work, rod, state);
 }
 
-/* Equilibria from rest at pressures begin to end - 1 (n each, in Pa), and whether there are any:
+/* Find equilibria from rest at pressures begin to end - 1 (n each, in Pa), and whether each exists:
  * states, and poses (12): position, rotation by columns. */
 int stiffopt_settle(const Rod *rod, const double *pressures, double *states, double *poses,
                     int64_t *found, int64_t begin, int64_t end) {

@@ -1,12 +1,12 @@
-/* Nearest points on a body that is known by a callback, for callers outside C. */
+/* Nearest points on a body that is given by a callback, for callers outside C. */
 #include <stdlib.h>
 
 #include "scene.h"
 
-/* For the caller to check that it has the same idea of the structures. */
+/* Size of a SceneObject, for the caller to check that it has the same fields. */
 int64_t stiffopt_scene_object_size(void) { return sizeof(SceneObject); }
 
-/* The nearest point of each object on a body with ranges (count, 2) of stations (count). */
+/* Find the point nearest to each object on a body with ranges (count, 2) of stations (count). */
 int stiffopt_nearest(const SceneObject *objects, int64_t n_objects, StationOf station,
                      const void *body, const double *ends, const int64_t *stations, int64_t count,
                      double cutoff, Nearest *nearest) {

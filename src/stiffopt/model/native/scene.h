@@ -1,12 +1,12 @@
-/* How near a body comes to objects: exact minima along ranges of arc length.
+/* Least distances of a body from objects: exact minima along ranges of arc length.
  *
- * A body is the union of spheres about its centre line.  It is known by a callback,
+ * A body is the union of spheres about its centre line.  It is given by a callback,
  *
  *     int station(const void *body, double s, double *position, double *tangent, double *radius)
  *
- * for any arc length s at rest: position (3), unit tangent (3) and radius there; 0 where it fails.
- * A range is a stretch of the body on which the radius is constant and the tangent smooth: a
- * segment, or a connector.  For pressures, survey the ranges once, then ask for each object:
+ * which sets position (3), unit tangent (3) and radius at an arc length s at rest, or returns 0.
+ * A range is a part of the body on which the radius is constant and the tangent smooth: a
+ * segment, or a connector.  For each pose, survey the ranges once, then call for each object:
  *
  *     BodyPoint points[n];
  *     Range range = {n, points};
@@ -14,13 +14,13 @@
  *     Nearest nearest;
  *     if (!object_nearest(&line, &object, ranges, count, cutoff, &nearest)) ...
  *
- * Where the distance is above `cutoff` (m; INFINITY for never), nearest.distance is only known to be
- * above it.  object_nearest_by does the same with another precision.  A term with a row for each object and segment asks for one range at a time; a ring
- * (`passage` is not NULL) must be asked for all ranges of the arm.  The change of a distance with
- * the pressures is nearest.normal . d position - nearest.radius_share d radius at nearest.s, as
- * nearest.s is a minimum or an end.  Formulas are those of `stiffopt.model.obstacles`, whose
- * addresses the objects hold; this file has no library of its own. `stiffopt.model.clearance` is the
- * same in Python.
+ * Above `cutoff` (m; INFINITY for never), nearest.distance is only known to be above it.
+ * object_nearest_by does the same with another precision.  A call may be for one range (a task's
+ * program has a row for each object and segment), but for a ring (`passage` is not NULL) it must be
+ * for all ranges of the arm.  The change of a distance with the pressures is
+ * nearest.normal . d position - nearest.radius_share d radius at nearest.s, as nearest.s is a
+ * minimum or an end.  The objects hold the addresses of the formulas of `stiffopt.model.obstacles`;
+ * this file needs no library of its own.  `stiffopt.model.clearance` is the same in Python.
  */
 #ifndef STIFFOPT_SCENE_H
 #define STIFFOPT_SCENE_H
@@ -31,26 +31,26 @@
 enum { SCENE_MEMORY = 64, MOST_PARAMETERS = 32 };
 enum { CONVEX, CONCAVE, ANY_COURSE };
 
-#define CLEARANCE_ERROR 4e-6 /* m, of a least distance at most */
-#define SHORTEST 1e-6        /* m of arc length, which is not divided again */
-#define FINE 3e-4            /* m of arc length, on which any object is as a convex one */
-#define IN_PLANE 1e-9        /* m above a ring's plane that are none */
+#define CLEARANCE_ERROR 4e-6 /* m, largest error of a least distance */
+#define SHORTEST 1e-6        /* m of arc length; shorter intervals are not divided */
+#define FINE 3e-4            /* m of arc length, below which any object is treated as convex */
+#define IN_PLANE 1e-9        /* m; heights above a ring's plane below this count as zero */
 #define SHARPENED 1e-4       /* m of arc length, over which a slope's change is measured */
-#define LEVEL 1e-9           /* m, by which a minimum may be lower than what was found, */
-#define NOT_LEVEL 1e-3       /* and as a share of what is more than is asked */
-#define MOST_TURNS 8         /* of looking for it */
-#define STEEPEST 1.5         /* change of an interpolated distance with the way */
-#define MORE_CURVED 1.35     /* than the curvature that coarse stations show */
+#define LEVEL 1e-9           /* m, tolerance of settle_at_minimum, */
+#define NOT_LEVEL 1e-3       /* plus this share of the distance beyond what is asked */
+#define MOST_TURNS 8         /* iterations of settle_at_minimum */
+#define STEEPEST 1.5         /* largest gradient of an interpolated distance */
+#define MORE_CURVED 1.35     /* bound on the curvature, over that of the coarse stations */
 
 typedef int (*Formula)(const double **arg, double **res, long long int *iw, double *w, int mem);
 typedef int (*StationOf)(const void *body, double s, double *position, double *tangent,
                          double *radius);
 
-/* Mirrored by `_SceneObject` in distances.py. */
+/* Mirrored by `SceneObjectInC` in distances.py. */
 typedef struct {
     Formula distance; /* (point, parameters of a piece) to the distance and its gradient (3) */
-    Formula cell;     /* of a grid: to the cube of a point (3); NULL where there is no grid */
-    Formula passage;  /* of a ring: to height, how far beyond, distance of the disc, its gradient */
+    Formula cell;     /* for a grid: to the cube of a point (3); otherwise NULL */
+    Formula passage;  /* for a ring: to height, excess, distance of the disc, its gradient */
     int64_t course;   /* of the distance along a straight line */
     int64_t pieces, size;     /* the largest of the pieces' distances counts */
     double begin;             /* arc length at rest in the first range, from which the body counts */
@@ -63,7 +63,8 @@ typedef struct {
     double s, position[3], tangent[3], radius;
 } BodyPoint;
 
-/* `speed`: arc length per arc length at rest; `turn`: change of the tangent per that at most. */
+/* `speed`: largest arc length per arc length at rest; `turn`: largest change of the tangent per the
+ * same. */
 typedef struct {
     int64_t count;
     BodyPoint *points;
@@ -75,7 +76,7 @@ typedef struct {
     const void *body;
 } CentreLine;
 
-/* Mirrored by `_Nearest` in clearance.py. */
+/* Mirrored by `Nearest` in clearance.py. */
 typedef struct {
     double distance, s, radius_share, position[3], normal[3];
 } Nearest;
@@ -86,17 +87,18 @@ typedef struct {
     int64_t piece;
 } Probe;
 
-/* What the pieces' distances are at most at the point that was looked at last, most (pieces): a
- * distance changes by no more than the way.  `nearest` is the piece of the largest there. */
+/* Upper bounds `most` (pieces) on the pieces' distances at the last point, from which others
+ * follow, as a distance changes by no more than the path.  `nearest` is the piece of the largest
+ * there. */
 typedef struct {
     double point[3], *most;
     int64_t nearest;
 } PieceBounds;
 
-/* What a least distance may be too large by: `error`, and a share of what it is above `asked`. */
+/* Allowed error of a least distance: `error`, plus a share of the distance beyond `asked`. */
 typedef struct {
     double cutoff, error, share, asked;
-    int settled; /* whether the normal is to be what the least distance changes with */
+    int settled; /* whether the normal must be the gradient of the least distance */
 } Precision;
 
 typedef struct {
@@ -106,11 +108,11 @@ typedef struct {
     Precision to;
     Nearest *best;
     double slope;        /* at the best */
-    const Range *within; /* that has the best */
+    const Range *within; /* the range of the best */
     PieceBounds bounds;
 } NearestSearch;
 
-/* Not fmax and fmin, which are calls. */
+/* Faster than calls of fmax and fmin. */
 static double larger(double a, double b) { return a > b ? a : b; }
 static double smaller(double a, double b) { return a < b ? a : b; }
 
@@ -125,7 +127,7 @@ static double scene_far(const double *a, const double *b) {
 
 /* -- objects ------------------------------------------------------------------------------ */
 
-/* Put the values at the corners of a point's cube behind the other parameters. */
+/* Store the values at the corners of a point's cube after the other parameters. */
 static int put_corners(const SceneObject *o, int64_t piece, const double *point, double *q) {
     double cell[3], w[SCENE_MEMORY];
     const double *arg[2] = {point, q};
@@ -143,7 +145,7 @@ static int put_corners(const SceneObject *o, int64_t piece, const double *point,
     return 1;
 }
 
-/* Distance of a point from one piece, and its gradient. */
+/* Compute the distance of a point from one piece, and its gradient. */
 static int piece_distance(const SceneObject *o, int64_t piece, const double *point,
                           double *distance, double *gradient) {
     double w[SCENE_MEMORY], with_corners[MOST_PARAMETERS];
@@ -163,11 +165,11 @@ static PieceBounds no_bounds(const SceneObject *o, double *most) {
     return (PieceBounds){.most = most};
 }
 
-/* How much a distance changes with the way at most. */
+/* Largest gradient of a distance. */
 static double steepest(const SceneObject *o) { return o->cell ? STEEPEST : 1; }
 
-/* Distance of a point from an object, its gradient, and the piece that it is of; pieces that
- * cannot have the largest distance are passed over. */
+/* Compute the distance of a point from an object, its gradient, and its piece; pieces that cannot
+ * have the largest distance are skipped. */
 static int object_distance(const SceneObject *o, PieceBounds *bounds, const double *point,
                            double *distance, double *normal, int64_t *nearest) {
     if (o->pieces == 1) return *nearest = 0, piece_distance(o, 0, point, distance, normal);
@@ -196,7 +198,7 @@ static int body_point(const CentreLine *line, double s, BodyPoint *p) {
     return line->station(line->body, s, p->position, p->tangent, &p->radius);
 }
 
-/* Coarse stations of a range, and how fast they advance and turn. */
+/* Compute the coarse stations of a range, and bounds on its speed and turn. */
 static int survey(const CentreLine *line, double s0, double s1, Range *range) {
     BodyPoint *p = range->points;
     int64_t n = range->count;
@@ -213,7 +215,7 @@ static int survey(const CentreLine *line, double s0, double s1, Range *range) {
     return 1;
 }
 
-/* A range from where an object counts the body on; `points` is memory for as many as it has. */
+/* Restrict a range to arc lengths from object->begin on; `points` is memory for its stations. */
 static int counted_range(const CentreLine *line, const SceneObject *object, const Range *range,
                          BodyPoint *points, Range *counted) {
     const BodyPoint *p = range->points;
@@ -251,28 +253,28 @@ static double to_beat(const NearestSearch *search) {
     return least - larger(to->error, to->share * (least - to->asked));
 }
 
-/* By how much a distance changes with arc length at rest at most. */
+/* Largest slope of a distance along the arc length at rest. */
 static double steepness(const NearestSearch *search) {
     return search->range->speed * steepest(search->object);
 }
 
-/* How near to the chord between two points something is at least that is nowhere nearer to them than
- * these distances: the circle in which the two spheres meet. */
+/* Lower bound of the distance from the chord between two points to an object that has these
+ * distances from them: that of the circle in which the two spheres meet. */
 static double outside_spheres(double chord, double first, double second) {
     double x = (chord * chord + first * first - second * second) / (2 * chord);
     if (x <= 0) return first;
     return x >= chord ? second : sqrt(larger(first * first - x * x, 0));
 }
 
-/* Where the larger of two distances, each along a straight line, is least: of the one from a0 to
- * b0, of the other from a1 to b1, the first being the larger at the start, the other at the end. */
+/* Minimum of the larger of two linear functions: one from a0 to b0, the larger at the start, the
+ * other from a1 to b1, the larger at the end. */
 static double least_larger(double a0, double b0, double a1, double b1) {
     double crossing = a0 - a1 + b1 - b0;
     double there = crossing > 0 ? a0 + (b0 - a0) * (a0 - a1) / crossing : a0;
     return smaller(smaller(a0, b1), there);
 }
 
-/* The same between two probes, of the pieces that have the largest distances at either. */
+/* The same between two probes, for the pieces with the largest distance at each. */
 static double least_of_pieces(const NearestSearch *search, const Probe *a, const Probe *b) {
     double of_b_at_a, of_a_at_b, unused[3];
     if (a->piece == b->piece) return smaller(a->value, b->value);
@@ -282,14 +284,15 @@ static double least_of_pieces(const NearestSearch *search, const Probe *a, const
     return least_larger(a->value, of_a_at_b - b->point->radius, of_b_at_a - a->point->radius, b->value);
 }
 
-/* What the distance between two probes is at least.
+/* Lower bound of the distance between two probes, h apart in arc length.
  *
- * It changes by no more than the way, and between two points outside of an object by less, as none
- * of it is within either distance; a centre line is within m h^2 / 8 of its chord, see m here.  Along a centre line of speed v and curvature c, a distance
- * that is convex along straight lines has second derivatives of at least -m, m = v^2 c.  With
- * m u (h - u) / 2 taken away it is convex, the same at both ends, and above its tangents there; m
- * h^2 / 8 below its chord lies what is concave along straight lines, and of several pieces the
- * distance is the largest. */
+ * Several bounds hold; the largest is used.  The distance changes by no more than the path.
+ * Between two points outside an object it changes by less, as the object is outside the spheres
+ * about both (outside_spheres); with speed v and curvature c, the centre line is within m h^2 / 8
+ * of its chord, m = v^2 c.  If the distance is convex along straight lines, its second derivative
+ * along the centre line is at least -m: less m u (h - u) / 2, it is convex, equal at both ends, and
+ * above its tangents there.  If it is concave in each piece, each piece's distance is at most m h^2
+ * / 8 below its chord, and the object's is the largest of them. */
 static double least_between(const NearestSearch *search, const Probe *a, const Probe *b) {
     const Range *range = search->range;
     int64_t course = search->object->course;
@@ -312,7 +315,7 @@ static double least_between(const NearestSearch *search, const Probe *a, const P
     return larger(least, a->value + down * smaller(larger(u, 0), h));
 }
 
-/* Look closer between two probes for as long as there may be something nearer. */
+/* Divide the interval between two probes as long as it may contain a smaller distance. */
 static int refine_between(NearestSearch *search, const Probe *a, const Probe *b) {
     double h = b->point->s - a->point->s, share = 0.5;
     if (h < SHORTEST || least_between(search, a, b) >= to_beat(search)) return 1;
@@ -325,7 +328,7 @@ static int refine_between(NearestSearch *search, const Probe *a, const Probe *b)
         refine_between(search, &probe, b);
 }
 
-/* The least distance of a range, if it is less than what the search has. */
+/* Search a range for a distance less than the best so far. */
 static int search_range(NearestSearch *search, const Range *range) {
     int64_t n = range->count, used = 0;
     const BodyPoint *p = range->points;
@@ -342,7 +345,7 @@ static int search_range(NearestSearch *search, const Range *range) {
     return 1;
 }
 
-/* A probe next to the best where the slope has the other sign; 0 where there is none. */
+/* Find a probe near the best at which the slope has the other sign; return 0 without one. */
 static int probe_beyond(NearestSearch *search, const Probe *from, BodyPoint *point, Probe *probe) {
     const Range *range = search->range;
     double low = range->points[0].s, high = range->points[range->count - 1].s;
@@ -356,11 +359,11 @@ static int probe_beyond(NearestSearch *search, const Probe *from, BodyPoint *poi
     return 0;
 }
 
-/* Bring the best to its minimum along the body, a kink or not, and put what the distance changes
- * with when the body moves in place of its normal.
+/* Move the best to its minimum along the body, which may be a kink, and replace its normal by the
+ * gradient of the least distance when the body moves.
  *
- * Where the nearest piece, or cube of a grid, changes at the minimum s, two normals meet there.  As
- * s moves too, the least distance changes with the mean of them that has no slope along the body. */
+ * If the nearest piece, or cube of a grid, changes at the minimum s, two normals meet there.  As s
+ * moves too, the gradient is their weighted mean whose slope along the body is zero. */
 static int settle_at_minimum(NearestSearch *search) {
     Nearest *best = search->best;
     BodyPoint points[3];
@@ -388,7 +391,7 @@ static int settle_at_minimum(NearestSearch *search) {
     return 1;
 }
 
-/* Bring the best to where the slope is zero, so that its normal is right to first order too. */
+/* Move the best to where the slope is zero, so that its normal is accurate to first order too. */
 static int sharpen(NearestSearch *search) {
     if (search->to.settled) return settle_at_minimum(search);
     const Range *range = search->range = search->within;
@@ -418,7 +421,7 @@ static int passage_of(const SceneObject *o, const double *point, Passage *passag
     return 1;
 }
 
-/* Whether the centre line passes the disc where it crosses its plane between two points. */
+/* Find whether the centre line crosses the disc between two points. */
 static int passes_between(const CentreLine *line, const SceneObject *o, const BodyPoint *a,
                           const BodyPoint *b, Passage low, Passage high, int *inside) {
     double s0 = a->s, s1 = b->s;
@@ -436,7 +439,7 @@ static int passes_between(const CentreLine *line, const SceneObject *o, const Bo
     return 1;
 }
 
-/* Whether the centre line crosses the plane of a ring, and passes through it; `last` is its tip. */
+/* Find whether the centre line crosses the plane of a ring, and the ring; `last` is its tip. */
 static int passes(const CentreLine *line, const SceneObject *o, const Range *ranges, int64_t count,
                   int *crossed, int *passed, Passage *last) {
     const BodyPoint *before = NULL;
@@ -456,7 +459,7 @@ static int passes(const CentreLine *line, const SceneObject *o, const Range *ran
     return 1;
 }
 
-/* A ring's distance is that of its circle; negative where the centre line is beside it. */
+/* Compute a ring's distance, that of its circle; negative if the centre line passes outside. */
 static int ring_nearest(NearestSearch *search, const Range *ranges, int64_t count) {
     Nearest *best = search->best;
     int crossed, passed;
@@ -482,7 +485,7 @@ static int ring_nearest(NearestSearch *search, const Range *ranges, int64_t coun
     return 1;
 }
 
-/* The nearest point of an object along ranges that have been surveyed. */
+/* Find the point nearest to an object along surveyed ranges. */
 static int object_nearest_by(Precision to, const CentreLine *line, const SceneObject *object,
                              const Range *ranges, int64_t count, Nearest *nearest) {
     double most[object->pieces];

@@ -4,4 +4,4 @@ from stiffopt.model.kinds import kinds_in
 from stiffopt.model.obstacle import Obstacle
 
 OBSTACLES = {kind.key: kind for kind in kinds_in(__name__, Obstacle)}  # type: ignore[type-abstract]
-"""All kinds by their names in files."""
+"""All kinds, by their keys in files."""

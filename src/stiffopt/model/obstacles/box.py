@@ -1,4 +1,4 @@
-"""A box of any orientation."""
+"""Obstacle `box`: a box of any orientation."""
 
 from functools import cached_property
 
@@ -30,7 +30,7 @@ class Box(Obstacle):
 
     @staticmethod
     def formula(point: ca.SX, parameters: ca.SX) -> ca.SX:
-        """How far beyond the faces, in the box's own axes."""
+        """Return the distance, from the excess beyond the faces in the box's own axes."""
         seen = ca.reshape(parameters[6:15], 3, 3).T @ (point - parameters[:3])
         return from_box(ca.fabs(seen) - parameters[3:6] / 2)
 

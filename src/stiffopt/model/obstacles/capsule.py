@@ -1,4 +1,4 @@
-"""A capsule: all within a radius of a straight line."""
+"""Obstacle `capsule`: all points within a radius of a straight line."""
 
 import casadi as ca
 
@@ -12,7 +12,7 @@ class Capsule(BetweenEnds):
 
     @staticmethod
     def formula(point: ca.SX, parameters: ca.SX) -> ca.SX:
-        """Distance of the line between the ends, less the radius."""
+        """Return the distance of the line between the ends, less the radius."""
         return norm(from_segment(point, parameters[:3], parameters[3:6])) - parameters[6]
 
     def outline(self, size: float) -> list[Array]:

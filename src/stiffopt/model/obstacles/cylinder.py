@@ -1,4 +1,4 @@
-"""A cylinder with flat ends."""
+"""Obstacle `cylinder`: a cylinder with flat ends."""
 
 import casadi as ca
 import numpy as np
@@ -13,7 +13,7 @@ class Cylinder(BetweenEnds):
 
     @staticmethod
     def formula(point: ca.SX, parameters: ca.SX) -> ca.SX:
-        """Distance of the rectangle that makes the cylinder, in its half-plane."""
+        """Return the distance of the rectangle that generates the cylinder, in its half-plane."""
         way = parameters[3:6] - parameters[:3]
         length = ca.sqrt(ca.sumsqr(way))
         seen = point - parameters[:3]

@@ -1,4 +1,4 @@
-"""All that lies behind a plane."""
+"""Obstacle `half_space`: everything behind a plane."""
 
 import casadi as ca
 import numpy as np
@@ -8,12 +8,12 @@ from stiffopt.model.obstacle import Array, Obstacle, Point, across
 
 
 class HalfSpace(Obstacle):
-    """A table, a wall: all behind a plane.
+    """A table or a wall: everything behind a plane.
 
     Attributes
     ----------
-    point : of the plane, in m.
-    normal : unit vector across it, to the side where the arm may be.
+    point : a point of the plane, in m.
+    normal : unit normal, towards the side where the arm may be.
     """
 
     key = "half_space"
@@ -24,7 +24,7 @@ class HalfSpace(Obstacle):
 
     @staticmethod
     def formula(point: ca.SX, parameters: ca.SX) -> ca.SX:
-        """``n . (x - point)``."""
+        """Return ``n . (x - point)``."""
         return ca.dot(parameters[3:6], point - parameters[:3])
 
     @property
@@ -33,7 +33,7 @@ class HalfSpace(Obstacle):
         return [[*self.point, *self.normal]]
 
     def outline(self, size: float) -> list[Array]:
-        """A square below the base's projection on the plane; see `Obstacle.outline`."""
+        """Return a square about the base's projection on the plane; see `Obstacle.outline`."""
         normal = np.array(self.normal)
         middle = normal * float(normal @ np.array(self.point))
         first, second = across(normal)

@@ -1,4 +1,4 @@
-"""A tube that the arm stays inside."""
+"""Obstacle `inside_tube`: a tube that the arm stays inside."""
 
 from itertools import pairwise
 from typing import Annotated
@@ -27,7 +27,7 @@ class InsideTube(Obstacle):
     Attributes
     ----------
     points : of its centre line, at least 2, in m.
-    radius : within which the arm stays, in m.
+    radius : of the tube, in m.
     """
 
     key = "inside_tube"
@@ -41,7 +41,7 @@ class InsideTube(Obstacle):
 
     @staticmethod
     def formula(point: ca.SX, parameters: ca.SX) -> ca.SX:
-        """Radius less the distance of the straight piece."""
+        """Return the radius less the distance of the straight piece."""
         return parameters[6] - norm(from_segment(point, parameters[:3], parameters[3:6]))
 
     @property
@@ -51,7 +51,10 @@ class InsideTube(Obstacle):
         return [[*start, *end, self.radius] for start, end in pairs]
 
     def check_against(self, robot: RobotDescription, clearance: float) -> None:
-        """The tube is wider than the arm, whose base is inside; see `Obstacle.check_against`."""
+        """Require a tube that is wider than the arm and contains its base.
+
+        See `Obstacle.check_against`.
+        """
         widest = max(segment.outer_radius for segment in robot.segments)
         if self.radius < widest + clearance:
             asked = f" with {clearance * 1e3:g} mm of clearance" if clearance else ""

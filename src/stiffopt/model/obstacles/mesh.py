@@ -1,4 +1,4 @@
-"""A body whose surface a file has as triangles."""
+"""Obstacle `mesh`: a closed surface of triangles from a file."""
 
 from __future__ import annotations
 
@@ -26,23 +26,23 @@ from stiffopt.model.distance_grid import (
 from stiffopt.model.obstacle import Array, Obstacle, Point, Radius, norm
 from stiffopt.schema import BadKeyError
 
-_ODD = (0.02, 50.0)  # extents over the arm's length that no scene has
+_PLAUSIBLE = (0.02, 50.0)  # range of a mesh's extent over the arm's length
 
 
 class Mesh(Obstacle):
     """A closed surface of triangles from an STL or OBJ file.
 
-    Its distance is interpolated in a grid, and made smaller by as much as that may be too large:
-    at most by `grid_error`, and at a distance v by no more than about ``resolution^2 / (4 v)``.
-    Farther from the mesh than 150 mm and than its own size, a lower bound stands for its distance.
+    Its distance is interpolated in a grid and reduced by the largest possible excess: at most
+    `grid_error`, and at a distance v about ``resolution^2 / (4 v)``.
+    Farther from the mesh than 150 mm and than its own size, a lower bound replaces its distance.
 
     Attributes
     ----------
     file : path of the file; in files relative to these.
-    scale : how long one unit of the file is, in m.
-    centre : where the file's origin is, in m.
+    scale : length of one unit of the file, in m.
+    centre : position of the file's origin, in m.
     orientation : unit quaternion (w, x, y, z) of the file's axes in the base frame.
-    resolution : edge of the grid's cubes, in m, or None for the usual.
+    resolution : edge of the grid's cubes, in m, or None for the default.
     """
 
     key = "mesh"
@@ -90,16 +90,16 @@ class Mesh(Obstacle):
 
     @property
     def grid_error(self) -> float:
-        """By how much the interpolated distance may differ from the true one, in m."""
+        """Largest error of the interpolated distance, in m."""
         return _share_of_cube * self.spacing
 
     def error_at(self, distance: float) -> float:
-        """See `Obstacle.error_at`: what is subtracted from what is interpolated."""
-        return float(_most_too_large(ca.DM(distance), self.spacing))
+        """Return the amount subtracted from interpolated distances; see `Obstacle.error_at`."""
+        return float(_excess_bound(ca.DM(distance), self.spacing))
 
     @cached_property
     def grids(self) -> tuple[DistanceGrid, ...]:
-        """The distances, a grid for each piece; made and kept in the cache folder."""
+        """The distances, a grid for each piece; cached in the cache folder."""
         return grids_about(self.surface, self.spacing)
 
     @cached_property
@@ -108,9 +108,9 @@ class Mesh(Obstacle):
 
     @staticmethod
     def formula(point: ca.SX, parameters: ca.SX) -> ca.SX:
-        """Lower bound of the distance from the corners of the grid's cube.
+        """Return a lower bound of the distance from the corners of the grid's cube.
 
-        Beyond the grid, all of the mesh is beyond the nearest point b of the grid's box and at
+        Outside the grid, the whole mesh is beyond the nearest point b of the grid's box and at
         least ``d(b)`` from it: ``|x - y|^2 >= |x - b|^2 + |b - y|^2``.
         """
         seen, inside, cell = _located(point, parameters)
@@ -119,18 +119,18 @@ class Mesh(Obstacle):
         for axis in range(3):  # corners[4 i + 2 j + k]
             half = corners.numel() // 2
             corners = (1 - share[axis]) * corners[:half] + share[axis] * corners[half:]
-        low = corners - _most_too_large(corners, spacing)
+        low = corners - _excess_bound(corners, spacing)
         beyond = norm(seen - inside)
         return low + ca.sqrt(beyond**2 + low**2 + 1e-24) - ca.sqrt(low**2 + 1e-24)
 
     @staticmethod
     def cell(point: ca.SX, parameters: ca.SX) -> ca.SX:
-        """Which cube of the grid (3,) a point is in or nearest to."""
+        """Return the grid's cube (3,) that contains a point or is nearest to it."""
         return _located(point, parameters)[2]
 
     @property
     def pieces(self) -> list[list[float]]:
-        """Axes, centre, and of each grid origin, edge and numbers of cubes; corners are 0 here."""
+        """Axes, centre, and for each grid origin, edge and numbers of cubes; corners are 0 here."""
         placed = [*self._axes.ravel(order="F").tolist(), *self.centre]
         return [
             [*placed, *grid.origin.tolist(), grid.spacing, *grid.cells, *[0.0] * 8]
@@ -138,14 +138,14 @@ class Mesh(Obstacle):
         ]
 
     def distance_of(self, point: Any) -> float:
-        """Signed distance of one point (3,) from the triangles themselves, in m."""
+        """Return the signed distance of one point (3,) from the triangles themselves, in m."""
         seen = (np.asarray(point, dtype=float) - np.array(self.centre)) @ self._axes
         return distance_of(self.surface, tuple(seen.tolist()))
 
     def check_against(self, robot: RobotDescription, clearance: float) -> None:
-        """Its size is one that things about this arm have; see `Obstacle.check_against`."""
+        """Require a plausible size for this arm; see `Obstacle.check_against`."""
         extent = float(self.surface.extent.max())
-        low, high = _ODD
+        low, high = _PLAUSIBLE
         if not low * robot.length <= extent <= high * robot.length:
             raise BadKeyError(
                 f"{self.key}.scale",
@@ -154,7 +154,7 @@ class Mesh(Obstacle):
                 "1 mm for files in millimetres, 1 m for files in metres",
             )
         try:
-            self.grids  # noqa: B018 (made now, as it will be needed)
+            self.grids  # noqa: B018 (compute them now)
         except InputError as error:
             raise BadKeyError(f"{self.key}.resolution", str(error)) from None
         super().check_against(robot, clearance)
@@ -170,7 +170,7 @@ _share_of_cube = float(np.sqrt(3) / 2)
 
 
 def _located(point: ca.SX, parameters: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX]:
-    """A point in the file's axes, the nearest point of the grid, and the cube that has it."""
+    """Return a point in the file's axes, the grid's nearest point, and that point's cube."""
     seen = ca.reshape(parameters[:9], 3, 3).T @ (point - parameters[9:12])
     origin, spacing, cells = parameters[12:15], parameters[15], parameters[16:19]
     inside = ca.fmin(ca.fmax(seen, origin), origin + spacing * cells)
@@ -178,14 +178,14 @@ def _located(point: ca.SX, parameters: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX]:
     return seen, inside, cell
 
 
-def _most_too_large(value: ca.SX, spacing: ca.SX) -> ca.SX:
-    """By how much an interpolated distance is too large at most.
+def _excess_bound(value: ca.SX, spacing: ca.SX) -> ca.SX:
+    """Return an upper bound on the excess of an interpolated distance.
 
-    All distances change by no more than the way: by half the diagonal of a cube. Outside, they
-    are the least of distances |x - y| of points, each of which is convex, with second derivatives
-    along the three axes that sum up to 2 / |x - y|; linear interpolation over an edge h is too
-    large by h^2 / 8 of these. |x - y| is nowhere in the cube less than the value by more than the
-    diagonal. What is returned is no less, and falls by no more than half of what the value rises.
+    Distances change by no more than the path between points: by half the diagonal of a cube.
+    Outside, they are the least of distances |x - y| of points, each of which is convex, with second
+    derivatives along the three axes that sum to 2 / |x - y|; linear interpolation over an edge h is
+    too large by h^2 / 8 of these. Within the cube |x - y| is at least the value less the diagonal.
+    The bound returned decreases by at most half the increase of the value.
     """
     away = value / spacing - 2 * _share_of_cube
     smallest = 1 / (4 * ca.fmax(away, 1 / (4 * _share_of_cube)))

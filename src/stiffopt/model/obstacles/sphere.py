@@ -1,4 +1,4 @@
-"""A sphere."""
+"""Obstacle `sphere`."""
 
 import casadi as ca
 
@@ -22,7 +22,7 @@ class Sphere(Obstacle):
 
     @staticmethod
     def formula(point: ca.SX, parameters: ca.SX) -> ca.SX:
-        """``|x - c| - r``."""
+        """Return ``|x - c| - r``."""
         return norm(point - parameters[:3]) - parameters[3]
 
     @property

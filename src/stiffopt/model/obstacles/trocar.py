@@ -1,4 +1,4 @@
-"""A ring that the arm passes through, at whatever arc length."""
+"""Obstacle `trocar`: a ring that the arm passes through, at any arc length."""
 
 import casadi as ca
 
@@ -11,14 +11,14 @@ from stiffopt.schema import BadKeyError
 class Trocar(Obstacle):
     """A ring that the arm passes through.
 
-    Its distance from the arm's centre line, which crosses its disc, is that of the circle; of a
-    centre line that crosses its plane beside the disc, the negative of it; of one that does not
-    cross the plane, the negative of the tip's distance from the disc.
+    If the arm's centre line crosses its disc, its distance is that of the circle; if the line
+    crosses the plane outside the disc, the negative of that; if it does not cross the plane, the
+    negative of the tip's distance from the disc.
 
     Attributes
     ----------
     centre : in m.
-    axis : unit vector across the ring.
+    axis : unit normal of the ring's plane.
     radius : of its opening, in m.
     """
 
@@ -34,7 +34,7 @@ class Trocar(Obstacle):
 
     @staticmethod
     def formula(point: ca.SX, parameters: ca.SX) -> ca.SX:
-        """Distance of the circle."""
+        """Return the distance of the circle."""
         height, beyond = _seen(point, parameters)
         return norm(ca.vertcat(height, beyond))
 
@@ -50,7 +50,7 @@ class Trocar(Obstacle):
         return [[*self.centre, *self.axis, self.radius]]
 
     def check_against(self, robot: RobotDescription, clearance: float) -> None:
-        """The arm's end fits through; see `Obstacle.check_against`."""
+        """Require that the arm's end fits through; see `Obstacle.check_against`."""
         width = robot.segments[-1].outer_radius
         if self.radius < width + clearance:
             asked = f" with {clearance * 1e3:g} mm of clearance" if clearance else ""
@@ -61,13 +61,13 @@ class Trocar(Obstacle):
             )
 
     def outline(self, size: float) -> list[Array]:
-        """A flange about the opening; see `Obstacle.outline`."""
+        """Return a flange about the opening; see `Obstacle.outline`."""
         radii = (self.radius, 1.5 * self.radius)
         return [revolved(self.centre, self.axis, (0.0, 0.0), radii)]
 
 
 def _seen(point: ca.SX, parameters: ca.SX) -> tuple[ca.SX, ca.SX]:
-    """Height above the ring's plane, and how far beyond the circle."""
+    """Return the height above the ring's plane, and the distance beyond the circle."""
     seen = point - parameters[:3]
     height = ca.dot(parameters[3:6], seen)
     return height, norm(seen - height * parameters[3:6]) - parameters[6]
