@@ -1,6 +1,6 @@
-"""Baselines for the closed loop: the model alone, and integral feedback added to it.
+"""What the closed loop is compared with: the model alone, and plain integral feedback on top.
 
-Both get the same robot file and goals, and command the stiffest pressures by that file.
+Both are given the same robot file and goals, and command the stiffest pressures that it promises.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Describe the environment of a measurement: machine, versions, compiler, load."""
+"""Where it was measured: machine, versions, compiler, load."""
 
 import os
 import platform

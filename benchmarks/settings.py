@@ -1,4 +1,4 @@
-"""Amounts of measurement, and the bars to meet."""
+"""How much is measured, and the bars."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""Draw arms and random tasks from a seed."""
+"""Arms and random tasks; all of them follow from a seed."""
 
 from functools import cache
 

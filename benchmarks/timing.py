@@ -1,4 +1,4 @@
-"""Compare times fairly: interleaved calls, medians, paired ratios."""
+"""Times taken side by side: interleaved calls, medians, paired ratios."""
 
 from collections.abc import Callable, Mapping
 from time import perf_counter

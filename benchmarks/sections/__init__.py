@@ -1,1 +1,1 @@
-"""The sections of the report: each measures one thing and returns a `report.Section`."""
+"""The parts of the report: each measures one thing and says it in a `results.Section`."""

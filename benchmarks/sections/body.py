@@ -1,4 +1,4 @@
-"""Time poses of stations along the arm, single and in batches, free and hanging."""
+"""Stations along the arm, single and in batches, free and hanging."""
 
 from collections.abc import Callable
 from time import process_time

@@ -1,4 +1,4 @@
-"""Time the calls that motion planners make, separately for warm and cold caches."""
+"""The calls that motion planners make, hot and cold apart."""
 
 from collections.abc import Callable
 from functools import partial

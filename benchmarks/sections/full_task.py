@@ -1,4 +1,4 @@
-"""Time the full task, cold and warm, side by side with other solvers."""
+"""The full task, cold and warm, side by side with other solvers."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

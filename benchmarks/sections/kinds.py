@@ -1,4 +1,4 @@
-"""Time all kinds of tasks, and loaded arms, relative to the plain task."""
+"""All kinds of tasks, and loaded arms, against the time of the plain task."""
 
 from collections.abc import Callable
 

@@ -1,4 +1,4 @@
-"""Time evaluations of the model, single and in batches, against CasADi's VM and soromox."""
+"""Evaluations, one at a time and in batches, against CasADi's virtual machine and soromox."""
 
 from collections.abc import Callable
 

@@ -1,4 +1,4 @@
-"""Measure motions in cluttered scenes; independent distances check their clearance."""
+"""Motions in cluttered scenes, checked with distances of their own."""
 
 from __future__ import annotations
 

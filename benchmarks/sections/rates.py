@@ -1,4 +1,4 @@
-"""Measure rates: of many tasks at once, and of the simulated arm relative to real time."""
+"""Rates: many tasks at once, and the simulated arm against real time."""
 
 from time import perf_counter
 
