@@ -1,13 +1,13 @@
-"""The closed loop with and without adaptation of the arm's numbers, on simulated arms.
+"""Measure the closed loop with and without adaptation of the model, on simulated arms.
 
     python benchmarks/adaptation.py --arms 3 --seed 100 --out out/bench/adaptation.json
 
-Each arm differs from its robot file at random (`control_cases.py`), and more so by case: moduli far
-beyond the tolerances, a noisy tracker, a payload or a side load that nobody knows of, one posture
-only. The same controller goes to the same targets with adaptation and without it. Figures: steady
-error (mean of the last 2 s of each hold), settling to 1 mm for good, overshoot beyond the target,
-the offset that is left to the plan, and the stiffness as reported over that of the arm (pushed and
-pulled, without creep and hysteresis), with the share of reported intervals that hold it.
+Each arm differs from its robot file at random (`control_cases.py`), and further by case: moduli far
+beyond the tolerances, a noisy tracker, an unknown payload or side load, a single posture. The same
+controller goes to the same targets with and without adaptation. Metrics: steady error (mean of the
+last 2 s of each hold); time to settle within 1 mm for good; overshoot beyond the target; remaining
+offset from the model; and reported stiffness over that of the arm (pushed and pulled, without creep
+and hysteresis), with the share of reported intervals that contain it.
 """
 
 from __future__ import annotations

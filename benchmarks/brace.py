@@ -1,18 +1,18 @@
-"""Where to lean: answers to random tasks with a brace, against many random starts.
+"""Compare solutions of random tasks with a brace with a many-start reference.
 
     python benchmarks/brace.py --cases 50 --starts 200 --out out/brace
 
 Random targets of the two-segment arm, bent by up to 60 degrees, with a post, a ball or a wall
 beside the body where it bends, a contact force of at most 0.3 N, a margin of 20 mN and a random
-direction in which to be stiff. A case is kept in the folder, and its reference not computed again.
+direction of stiffness. Cases are stored in the folder, so that their reference is computed once.
 
-The reference shares nothing with the search: from random pressures at which the arm touches the
-object, SciPy's SLSQP maximises the stiffness of the model's equilibria in contact, with the
-target's tolerance as a ball, forces and the margin as constraints and differences as gradients.
-What it ends at counts only if the model confirms it from rest.
+The reference shares no code with the search: from random pressures at which the arm touches the
+object, SciPy's SLSQP maximises the stiffness of the model's equilibria in contact. The target's
+tolerance (a ball), forces and the margin are constraints; gradients are finite differences. Its
+result counts only if the model confirms it from rest.
 
-Metrics: the stiffness of the answer over that of the best that keeps clear of the object, which
-must not be less than 1; and over the best of the reference.
+Metrics: the stiffness of the solution over that of the best one clear of the object, which must
+be at least 1; and over the best of the reference.
 """
 
 from __future__ import annotations

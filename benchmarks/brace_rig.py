@@ -1,4 +1,4 @@
-"""Whether a braced arm is as stiff on the simulated rig as was promised, on calibrated arms.
+"""Compare the predicted stiffness of braced arms with that measured on the simulated rig.
 
     python benchmarks/brace_rig.py --arms 1 2 3 --keep out/calibrated --out out/brace_rig.json
 
@@ -6,18 +6,18 @@ Arms of two hanging segments differ from their robot file at random (`control_ca
 a robot file that `stiffopt calibrate` made of a recording of it (some minutes of simulated time,
 kept in a folder). For each, tasks are drawn like those of `brace.py`: a target that bends the arm
 by up to 60 degrees, a post, a ball or a wall beside the body, at most 0.3 N of contact force, a
-margin of 20 mN and a random direction. `solve_pressure` answers with the calibrated file; only
-answers that lean, and promise at least 1.5 times the free stiffness, are looked at. The pressures
-are then commanded along the approach (`stiffopt.paths.leaning`), open loop: nothing corrects them.
-The plant has inertia, creep, hysteresis and its own contact with friction.
+margin of 20 mN and a random direction. `solve_pressure` solves them with the calibrated file; only
+solutions that lean, and promise at least 1.5 times the free stiffness, count. The pressures are
+then commanded along the approach (`stiffopt.paths.leaning`) in open loop. The plant has inertia,
+creep, hysteresis and its own contact with friction.
 
-The stiffness is that of a settled push and pull at the tip, after which the arm is at rest with all
-creep done and no hysteresis or friction left (`Plant.settle`): half of what the answer says that
-the contacts hold, at most 0.1 N. The same is pushed for two seconds each, with all that silicone
-and friction do: contacts stick then, small pushes do not overcome the hysteresis, and the arm is
-stiffer. The reference is the free answer for the same target, on the same arm. Metrics: measured
-over promised stiffness, and the measured multiple over the promised one, for promises of contacts
-that slide.
+The stiffness is that of a push and a pull at the tip, each settled without remaining creep,
+hysteresis or friction (`Plant.settle`). Their force is half of what the solution says that the
+contacts hold, at most 0.1 N. The same pushes are also applied for two seconds each with all effects
+of silicone and friction: then contacts stick, small pushes do not overcome the hysteresis, and the
+arm is stiffer. The reference is the free solution for the same target, on the same arm. Metrics:
+measured over predicted stiffness, and the same for the multiple of the free stiffness; predictions
+are those for sliding contacts.
 """
 
 from __future__ import annotations

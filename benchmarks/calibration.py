@@ -1,19 +1,19 @@
-"""What a calibration is worth on the simulated rig, where the truth is known.
+"""Measure the accuracy of calibrated robot files on the simulated rig, where the truth is known.
 
     python benchmarks/calibration.py [--quick] [--arms NAME ...] [--seeds N] [--structure NAME]
 
-Each seed is another arm: it differs from its robot file by what the rig file's spread draws. One
-kinematics experiment is recorded, `calibrate` fits the robot file to it, and three robot files are
-compared: the one before (nominal), the fitted one (calibrated), and one with the true values as far
-as a robot file has keys for them, whose remaining error is that of the model:
+Each seed gives another arm, which differs from its robot file by a draw from the rig file's spread.
+One kinematics experiment is recorded, and `calibrate` fits the robot file to it. Three robot files
+are compared: the original (nominal), the fitted one (calibrated), and one with the true values of
+all its keys, whose remaining error is that of the model:
 
-- settled tip: error in % of length at random pressures that the calibration has not seen, held
-  until creep is done, without hysteresis;
-- stiffness: predicted over measured by the probe, less 1.
+- settled tip: error in % of length at random pressures that were not recorded, held until creep has
+  ended, without hysteresis;
+- stiffness: prediction over measurement by the probe, minus 1.
 
-Prints a table in Markdown for each arm, of all its seeds. What calibrated files do for targets is
-measured by ``control.py --robot-file``; whether true values lie inside their intervals, by
-tests/test_fit.py.
+Prints a table in Markdown for each arm, over all its seeds. ``control.py --robot-file`` measures
+the effect of calibrated files on targets; tests/test_fit.py checks whether true values lie inside
+their intervals.
 """
 
 from __future__ import annotations

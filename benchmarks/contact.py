@@ -1,17 +1,17 @@
-"""Equilibria of arms that lean on objects, against an independent rod (`pressed_rod.py`).
+"""Compare equilibria of arms that lean on objects with an independent rod (`pressed_rod.py`).
 
     python benchmarks/contact.py --cases 100 --out out/contact
 
 Random arms, with and without weight, at random pressures, half of them with a load, among one to
 three spheres, capsules and walls that the free arm would enter by up to 20 mm. With `--enclosed`
-the arms are in tubes, or pass through rings. A case is kept in the folder, and not computed again.
+the arms are in tubes, or pass through rings. Cases are stored in the folder and computed once.
 JAX is needed; a case takes half a minute.
 
-Metrics, each the largest of a case's objects or directions: how far the tip is off, over the arm's
-length; the contact forces, over the largest of them; the tip's stiffness along a random direction,
-against that between two pushes of 0.1 mN; contacts above 1 mN that only one of the two has. Where a
-contact of more than 2 mN is lost by a push below 0.3 N, whether the independent rod has it at
-0.9 of that push and has it no more at 1.1.
+Metrics, each the largest over a case's objects or directions: the error of the tip, over the arm's
+length; the error of the contact forces, over the largest force; the error of the tip's stiffness
+along a random direction, where the rod's stiffness is that between two pushes of 0.1 mN; contacts
+above 1 mN that only one of the two has. If a push below 0.3 N loses a contact of more than 2 mN:
+whether the independent rod still has the contact at 0.9 of that push and has lost it at 1.1.
 """
 
 from __future__ import annotations

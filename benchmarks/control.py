@@ -1,21 +1,21 @@
-"""The closed loop on the simulated rig, beside plain integral feedback and the model alone.
+"""Compare the closed loop on the simulated rig with integral feedback and the model alone.
 
     python benchmarks/control.py --cases 20 --seed 1 --jobs 2 --out out/bench/control.json
 
-Each case is another arm (see `control_cases.py`), another start and other targets, and all
-controllers get the same. The controllers see the rig through the interface of every rig; the truth
-is seen by who judges alone. Prints a table, side by side. ``--robot-file`` says which file they
-get: the nominal one; one that stiffopt's own calibration made of a recording of that arm (some
-minutes an arm; ``--keep`` keeps it, so that a run can be taken up again); or one with the arm's
-true values, for what of them it has words. With ``--payload`` the tip carries more than it says,
-with ``--loop`` the whole control loop with its safety gate runs and not the controller alone, with
-``--paths`` figures-of-eight are followed instead of targets reached.
+Each case has its own arm (see `control_cases.py`), start and targets, the same for all controllers.
+The controllers use the rig through its usual interface; only the evaluation uses the truth. Prints
+a table with the controllers side by side. ``--robot-file`` chooses their robot file: the nominal
+one; one that stiffopt's calibration made from a recording of that arm (some minutes per arm;
+``--keep`` stores it, so that a run can be resumed); or one with the arm's true values, as far as it
+has keys for them. With ``--payload`` the tip carries more than the robot file says; with ``--loop``
+the whole control loop with its safety gate runs, not the controller alone; with ``--paths``
+figures-of-eight are followed instead of targets.
 
-What the figures are: settling to 1 mm, for good, over the ideal: the settling time of an open-loop
-step to the arm's own stiffest pressures, without inertia, creep and hysteresis. Steady: mean error
-of the last 2 of 10 s. Kept: (k - k_least) / (k_most - k_least) of the stiffness along the task's
-direction, over all pressures that hold the tip where it is at the end: by the true model (linear
-silicone), and by pushing the simulated arm.
+Metrics: settling to 1 mm, for good, over the ideal: the settling time of an open-loop step to the
+arm's own stiffest pressures, without inertia, creep and hysteresis. Steady: mean error of the last
+2 of 10 s. Kept: (k - k_min) / (k_max - k_min) of the stiffness k along the task's direction, where
+k_min and k_max are over all pressures that hold the tip at its final place: by the true model
+(linear silicone), and by pushing the simulated arm.
 """
 
 from __future__ import annotations

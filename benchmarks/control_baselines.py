@@ -1,6 +1,6 @@
-"""What the closed loop is compared with: the model alone, and plain integral feedback on top.
+"""Baselines for the closed loop: the model alone, and integral feedback added to it.
 
-Both are given the same robot file and goals, and command the stiffest pressures that it promises.
+Both get the same robot file and goals, and command the stiffest pressures by that file.
 """
 
 from __future__ import annotations

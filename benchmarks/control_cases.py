@@ -1,8 +1,8 @@
-"""Arms, targets and paths for the closed loop, drawn from a seed; see `control.py`.
+"""Draw arms, targets and paths for the closed loop from a seed; see `control.py`.
 
-The arm differs from its robot file by what the issue's bars allow, uniformly: modulus by up to
-20 %, channels by up to 5 %, the base by 2 mm and 2 degrees in a random direction. Targets are
-where that very arm comes to rest, creep done and without hysteresis, so they can be reached.
+The arm differs from its robot file uniformly at random: modulus by up to 20 %, channels by up to
+5 %, the base by 2 mm and 2 degrees in a random direction. Targets are positions at which that arm
+settles, without remaining creep or hysteresis, so they are reachable.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Runs of a controller on a simulated arm, and what they are worth; see `control.py`."""
+"""Run a controller on a simulated arm, and evaluate the run; see `control.py`."""
 
 from __future__ import annotations
 

@@ -1,18 +1,18 @@
-"""Counts that do not depend on the machine, compared with those that are on record.
+"""Compare counts that do not depend on the machine with recorded ones.
 
     python benchmarks/counts.py            # compare; exit code 1 if something got worse
-    python benchmarks/counts.py --update   # write what was counted on record
+    python benchmarks/counts.py --update   # record the new counts
 
-instructions   of the functions that everything is computed with (`Function.n_instructions`)
+instructions   of the model's and the optimiser's functions (`Function.n_instructions`)
 c source       bytes of C that CasADi generates for them
-solutions      local searches of the optimiser, and what a solution's `counts` hold (iterations,
-               evaluations, quadratic programs), summed over a few fixed tasks; only where
-               there is a C compiler, since other paths are taken without
-compiled code  bytes of the shared libraries that one first solution leaves in the cache; counted by
-               `make bench` only, since it takes processes of their own
+solutions      local searches of the optimiser, and the `counts` of solutions (iterations,
+               evaluations, quadratic programs), summed over a few fixed tasks; only with a C
+               compiler, since the optimiser takes other paths without one
+compiled code  bytes of the shared libraries that a first solution leaves in the cache; counted only
+               by `make bench`, since it needs separate processes
 
-A count is worse if it exceeds the one on record by more than the tolerance of its group, or is on
-record and not found any more.  Smaller counts and new ones are told and are no failure.
+A count is worse if it exceeds the recorded one by more than the tolerance of its group, or if it is
+recorded and no longer found.  Smaller and new counts are reported and are not failures.
 """
 
 import argparse

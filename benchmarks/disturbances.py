@@ -1,13 +1,13 @@
-"""What the control loop notices: faults at run time on simulated arms, and pushes that are none.
+"""Measure which faults the control loop detects on simulated arms; pushes must not be detected.
 
     python benchmarks/disturbances.py --cases 4 --seed 500
 
-Arms and targets are those of `control_cases.py`; the controller has the nominal robot file. Each
-row goes to a first target, rests there, then something goes wrong, and four seconds later there is
-a second target. Columns: how many runs noticed it, and as what; how long after it began (or, for
-what only shows in motion, after the second target); how far the tip was off its way until it was
-let down, in mm, the largest of all runs; and how many arms were vented in the end. A push or a
-payload must not be noticed.
+Arms and targets are those of `control_cases.py`; the controller has the nominal robot file. In each
+run the arm goes to a first target and rests there; then a fault begins, and four seconds later a
+second target follows. Columns: number of runs that detected the fault, and as what; time from its
+beginning to detection (for faults that only show in motion, from the second target); largest
+distance of the tip from its way, until it was let down, over all runs, in mm; and number of arms
+that were vented in the end. A push or a payload must not be detected as a fault.
 """
 
 from __future__ import annotations

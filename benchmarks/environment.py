@@ -1,4 +1,4 @@
-"""Where it was measured: machine, versions, compiler, load."""
+"""Describe the environment of a measurement: machine, versions, compiler, load."""
 
 import os
 import platform

@@ -1,8 +1,8 @@
-"""How much stiffness is gained over plain pressures, by arm, law, freedom and load.
+"""Measure the gain in stiffness over the plain solution, by arm, strain law, freedom and load.
 
     python benchmarks/gains.py                     # all rows, some minutes, to results/gains.json
     python benchmarks/gains.py --tasks 5 --only 'position, 2 segments' --out /tmp/gains.json
-    python benchmarks/gains.py --table             # prints the table of what was measured
+    python benchmarks/gains.py --table             # print the table of the recorded results
 
 A task's target is the tip pose of random pressures (three in ten tasks with some channels at their
 limits) and its direction is random (`quality.random_task`).  Each row solves the same number of
@@ -10,15 +10,15 @@ tasks for each seed.  For each task
 
 plain   is the stiffness at the pressures of least norm that reach the target within its
         tolerances, found by the global search;
-gain    is the stiffness of the answer over that, less one.
+gain    is the stiffness of the solution over that, minus one.
 
 Printed are the median of the gains, their 90th percentile and their largest value, the share of
 tasks that gain less than 1 %, and, as the scatter between samples, the range of the medians of
-the seeds.  `freed` is the median gain over the *stiffest* answer to the exact position or pose of
-which the row is a relaxed form: what freeing an axis or a tolerance adds by itself.
+the seeds.  `freed` is the median gain over the *stiffest* solution for the exact position or pose
+that the row relaxes: the gain by freeing an axis or a tolerance alone.
 
-Limitations: targets are poses of random pressures, so places that few pressures reach are seldom
-asked for; the largest of n tasks grows with n; both answers come from the same search.
+Limitations: targets are poses of random pressures, so places that few pressures reach are rare;
+the largest of n tasks grows with n; both solutions come from the same search.
 """
 
 import argparse

@@ -1,16 +1,16 @@
-"""How fast the tip settles on an arm with inertia, and how near it stays to a path: side by side.
+"""Compare controllers on arms with inertia: settling of the tip, and error along paths.
 
     python benchmarks/motion.py --cases 12 --seed 7100 --jobs 2 --out out/bench/motion.json
 
 Arms, targets and the ideal step are those of `control.py`. *Settling* is the time until the tip
 stays within 1 mm of its target to the end of the step; *ideal* is that of an open-loop step to the
 arm's own stiffest pressures without inertia, creep and hysteresis: the regulators alone.
-*Overshoot* is how far the tip goes beyond the target along the step, and kept if it is at most the
-greater of 5 % of the step and 0.5 mm. *Doubts* are steps after which the motion watch doubts.
+*Overshoot* is the distance of the tip beyond the target along the step; it is acceptable up to the
+larger of 5 % of the step and 0.5 mm. *Doubts* are steps after which the motion watch doubts.
 
-``commissioned`` is the loop after ``stiffopt commission --quick`` of that very arm: with the
-frequency and the damping of its swing. ``--speeds`` follows figures-of-eight of 40 mm as well, at
-these speeds in m/s: root mean square error after the known latency of 70 ms, and after the best.
+``commissioned`` is the loop after ``stiffopt commission --quick`` of that arm, with the measured
+frequency and damping of its swing. ``--speeds`` also follows figures-of-eight of 40 mm at these
+speeds in m/s: root mean square error for the known latency of 70 ms, and for the best latency.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""References for paths that share nothing with `solve_path`.
+"""Reference solvers for paths that share no code with `solve_path`.
 
-`PathProgram` is the whole path as one nonlinear program on the functions of the model, for IPOPT.
-`lattice` is a dynamic programme over many configurations at each point, for two segments.
+`PathProgram` solves the whole path as one nonlinear program on the model's functions, with IPOPT.
+`lattice` is a dynamic program over many configurations at each point, for two segments.
 """
 
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Plot of the times of the full task, with logarithmic axes."""
+"""Plot the times of the full task, with logarithmic axes."""
 
 from pathlib import Path
 from typing import Any

@@ -1,9 +1,9 @@
-"""An arm pressed on objects, by other means: the energy of a discrete rod on fine stiff springs.
+"""An independent model of an arm pressed on objects: a discrete rod with penalty contact.
 
-Nothing here imports stiffopt. The rod has elements of constant strain; its body meets surfaces
-through springs so many and so stiff that tenths of newtons enter a surface by hundredths of a
-millimetre. The energy is differentiated by JAX and minimised by Newton's method while pressures and
-load grow from rest in small steps.
+It does not import stiffopt. The rod has elements of constant strain. Many stiff springs between its
+body and the surfaces model contact: tenths of newtons enter a surface by hundredths of a
+millimetre. JAX differentiates the energy; Newton's method minimises it while pressures and load
+grow from rest in small steps.
 """
 
 from __future__ import annotations

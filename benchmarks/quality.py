@@ -1,4 +1,4 @@
-"""How often stiffopt finds the pose, and the stiffest way to it.
+"""Measure how often stiffopt finds the target pose, and the stiffest configuration for it.
 
     python benchmarks/quality.py --segments 2 --tasks 100 --starts 40 --seed 1
     python benchmarks/quality.py --segments 3 --kind pose-5 --tasks 20
@@ -6,12 +6,12 @@
     python benchmarks/quality.py --segments 2 --seed 1 --only 17 --starts 200   # one case again
 
 Random tasks on the built-in arms are solved by `stiffopt.solve_pressure` and by the many-start
-reference of `reference.py`, which shares nothing with its optimiser.  Printed are the shares of
-tasks where
+reference of `reference.py`, which shares no code with its optimiser.  Printed are the shares of
+tasks for which
 
 found       the solution says that every tolerance, limit and demand holds;
-holds       the pose is within its tolerance and the pressures within their limits, recomputed
-            with `Manipulator.tip_pose`, of those that are found;
+holds       of those found, the pose is within its tolerance and the pressures within their limits,
+            recomputed with `Manipulator.tip_pose`;
 stiffest    the smallest of the maximised stiffnesses is not more than 0.5 % below the best that
             the reference finds (kind least-pressure: the mean square of the pressures not more
             than 0.5 % above; kinds match: near enough);
@@ -19,12 +19,12 @@ stiffest    the smallest of the maximised stiffnesses is not more than 0.5 % bel
 or, of unreachable targets,
 
 found       the solution says that the target cannot be reached;
-closest     its position error is within 0.1 mm, and its angle error (where an orientation is
-            asked) within 0.01 degrees, of the least that the reference finds.
+closest     its position error is within 0.1 mm, and its angle error (if an orientation is
+            prescribed) within 0.01 degrees, of the smallest that the reference finds.
 
-Each case that fails is printed with its number and its task.  Limitations: the reference is no
-proof, its best is the best of so many starts; targets are poses of random pressures, three in ten
-of them with some channels at their limits, so regions that few pressures reach are seldom visited.
+Each failed case is printed with its number and its task.  Limitations: the reference is not a
+proof, only the best of its starts; targets are poses of random pressures, three in ten of them with
+some channels at their limits, so regions that few pressures reach are rare.
 """
 
 import argparse

@@ -1,10 +1,10 @@
-"""Many-start reference for pressure tasks that shares nothing with stiffopt's optimiser.
+"""Many-start reference solver for pressure tasks; it shares no code with stiffopt's optimiser.
 
-The program is written anew on the functions of the model and given to SciPy: `least_squares`
-(trust-region reflective) brings random pressures to the pose, SLSQP goes on from there.
+The program is formulated anew on the model's functions and solved with SciPy: `least_squares`
+(trust-region reflective) brings random pressures to the pose, and SLSQP continues from there.
 Tolerances are balls as in the task: with a residual e and its radius rho the constraints are
-``e / rho = s`` and ``s.s <= 1``, with slack variables s.  Whatever SLSQP says of itself is
-disregarded: a point counts if the model's own methods confirm pose, limits and demands.
+``e / rho = s`` and ``s.s <= 1``, with slack variables s.  The status of SLSQP is ignored: a point
+counts if the model's own methods confirm pose, limits and demands.
 
 Angles are measured by chords (``|z - d|``, ``|R - R_d|``), not by logarithms as in stiffopt.
 """

@@ -1,4 +1,4 @@
-"""What a section of the benchmarks found, and the report of all sections in Markdown."""
+"""The results of a benchmark's section, and the report of all sections in Markdown."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field

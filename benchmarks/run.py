@@ -1,10 +1,10 @@
-"""All speed benchmarks, as `make bench` runs them.
+"""Run all speed benchmarks, as `make bench` does.
 
     python benchmarks/run.py [--quick] [--seed N] [--only NAME ...] [--keep] [--update]
 
-Writes `results.md`, `results.json` and a plot to out/bench/; `--keep` copies them to
-benchmarks/results/ too, which is committed.  Exit code 1 if a count got worse (see `counts.py`);
-missed bars are told and do not fail, since times are of the machine.
+Writes `results.md`, `results.json` and a plot to out/bench/; `--keep` also copies them to
+benchmarks/results/, which is committed.  Exit code 1 if a count got worse (see `counts.py`);
+missed bars are reported but are not failures, since times depend on the machine.
 """
 
 import argparse

@@ -1,4 +1,4 @@
-"""How much is measured, and the bars."""
+"""Amounts of measurement, and the bars to meet."""
 
 from dataclasses import dataclass
 

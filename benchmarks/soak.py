@@ -1,18 +1,18 @@
-"""A day of the control loop on the simulated arm, with random targets and faults.
+"""Run the control loop for a day on the simulated arm, with random targets and faults.
 
     python benchmarks/soak.py --hours 24 --out soak.jsonl
     python benchmarks/soak.py --report soak.jsonl
 
 The real controller, loop and safety gate steer two hanging segments without inertia on a simulated
-clock. Every ten seconds there is another target, and about once a minute a fault of a device, which
-ends after a while; then the loop is reset and armed again. One line is written for every ten
-simulated minutes: errors, faults, what they led to, and the memory of the process. A run that was
-stopped goes on where its file ends, with a new arm. It ends with 1 if anything was wrong:
+clock. Every ten seconds there is a new target, and about once a minute a temporary fault of a
+device; then the loop is reset and armed again. One line is written for every ten simulated minutes:
+errors, faults, their consequences, and the memory of the process. A stopped run resumes where its
+file ends, with a new arm. The exit code is 1 if any of these occurred:
 
 * a channel commanded above its limit, or a state `fault` under pressure;
-* a fault of a device that should be noticed and was not, or the other way round;
-* an error of the tip, at rest and without a fault, that grows from the first to the last quarter;
-* memory that does.
+* a fault of a device that should be detected and was not, or the other way round;
+* an error of the tip, at rest and without a fault, that grew from the first to the last quarter;
+* memory that grew likewise.
 """
 
 from __future__ import annotations

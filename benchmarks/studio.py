@@ -1,13 +1,13 @@
-"""How soon the studio answers a drag, and what its drawing costs.
+"""Measure the studio's response time to a drag, and the cost of its drawing.
 
     python benchmarks/studio.py [TASK ...] [--changes N] [--no-browser]
 
-Moves the target of a task round a circle, 30 times a second, while a page is open in a browser
-without a screen. In ms: `wall`, median and 95th percentile of the time from a change until its
-answer is drawn, which on a busy computer says little; `cpu`, that percentile of the processor's
-time for it. Of one answer, in the mean of 20 changes, the least of all twenties: `search`, of the
-solver; `drawing`, what makes the picture and the panel; `sending`, all else that the server's
-process does. `found` is the share of targets within reach.
+Moves the target of a task round a circle, 30 times a second, while a headless browser shows the
+page. In ms: `wall`, median and 95th percentile of the time from a change until its solution is
+drawn, which means little on a busy computer; `cpu`, the 95th percentile of the CPU time for it. Per
+solution, as the mean over 20 changes, smallest of all such means: `search`, of the solver;
+`drawing`, of picture and panel; `sending`, the rest of the server process. `found` is the share of
+reachable targets.
 """
 
 import argparse

@@ -1,4 +1,4 @@
-"""Arms and random tasks; all of them follow from a seed."""
+"""Draw arms and random tasks from a seed."""
 
 from functools import cache
 

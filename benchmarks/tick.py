@@ -1,10 +1,10 @@
-"""Time of a tick of the control loop, and of its quadratic program with DAQP and with OSQP.
+"""Time a tick of the control loop, and its quadratic program with DAQP and with OSQP.
 
     python benchmarks/tick.py
 
-Runs two hanging segments on the simulator, on a simulated clock, so that what the simulation itself
-costs is not in a tick; plans are made beside, as in the daemon. The quadratic programs that come up
-are recorded and solved again by both solvers in turns.
+Runs two hanging segments on the simulator with a simulated clock, so that a tick does not include
+the cost of the simulation. Plans are made in parallel, as in the daemon. The quadratic programs of
+the run are recorded and solved again by both solvers in turn.
 """
 
 import argparse

@@ -1,4 +1,4 @@
-"""Times taken side by side: interleaved calls, medians, paired ratios."""
+"""Compare times fairly: interleaved calls, medians, paired ratios."""
 
 from collections.abc import Callable, Mapping
 from time import perf_counter

@@ -1,13 +1,13 @@
-"""What the loop feels: pushes on the tip of simulated arms, false alarms, and presses.
+"""Measure the loop's force estimates on simulated arms: pushes, false alarms, and presses.
 
     python benchmarks/touch.py --arms 4 --seed 700
 
 Arms differ from their robot files at random (`control_cases.py`). Each goes to targets, rests for
-three seconds, and is pushed at the tip with 10 to 50 mN in a random lateral direction, all at once,
-for three seconds. A force is right if it misses the part of the push that can be felt by at most
-20 % + 3 mN a second after the push began. False alarms are counted where nothing touches: while the
-arm goes to targets, rests and follows circles. Presses of 15 to 40 mN, onto flat surfaces of 100 to
-1,000 N/m that are 2 to 8 mm away, are judged by the true force of the last three seconds.
+three seconds, and is pushed at the tip with a step of 10 to 50 mN in a random lateral direction for
+three seconds. An estimate is right if, one second after the push began, its error from the
+observable part of the push is at most 20 % + 3 mN. False alarms are counted while nothing touches
+the arm as it goes to targets, rests and follows circles. Presses of 15 to 40 mN, onto flat surfaces
+of 100 to 1,000 N/m at 2 to 8 mm distance, are judged by the true force of the last three seconds.
 """
 
 from __future__ import annotations

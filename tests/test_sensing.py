@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-from stiffopt.identify.sensing import Readings, readings, turned_by
+from stiffopt.identify.sensing import Readings, readings
 
 Array = NDArray[np.float64]
 
@@ -52,12 +52,6 @@ def test_turn_is_from_what_was_measured_to_what_is_read() -> None:
     assert turn is not None
     angle = np.linalg.norm(ERRORS, axis=1)
     assert turn == pytest.approx(ERRORS * (np.sin(angle) / angle)[:, None], abs=1e-12)
-    assert turned_by(turn) == pytest.approx(angle, rel=1e-9)
-
-
-def test_angles_saturate_at_a_quarter_turn() -> None:
-    assert turned_by(np.array([[1.0, 0, 0], [0, 1.0 + 1e-12, 0]])) == pytest.approx(np.pi / 2)
-    assert np.isnan(turned_by(np.full((1, 3), np.nan))).all()
 
 
 @pytest.mark.parametrize("i", range(18))

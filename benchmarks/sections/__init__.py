@@ -1,1 +1,1 @@
-"""The parts of the report: each measures one thing and says it in a `results.Section`."""
+"""The sections of the report: each measures one thing and returns a `report.Section`."""

@@ -1,4 +1,4 @@
-"""Stations along the arm, single and in batches, free and hanging."""
+"""Time poses of stations along the arm, single and in batches, free and hanging."""
 
 from collections.abc import Callable
 from time import process_time

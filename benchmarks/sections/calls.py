@@ -1,4 +1,4 @@
-"""The calls that motion planners make, hot and cold apart."""
+"""Time the calls that motion planners make, separately for warm and cold caches."""
 
 from collections.abc import Callable
 from functools import partial

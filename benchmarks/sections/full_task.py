@@ -1,4 +1,4 @@
-"""The full task, cold and warm, side by side with other solvers."""
+"""Time the full task, cold and warm, side by side with other solvers."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

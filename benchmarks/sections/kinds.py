@@ -1,4 +1,4 @@
-"""All kinds of tasks, and loaded arms, against the time of the plain task."""
+"""Time all kinds of tasks, and loaded arms, relative to the plain task."""
 
 from collections.abc import Callable
 

@@ -1,4 +1,4 @@
-"""Evaluations, one at a time and in batches, against CasADi's virtual machine and soromox."""
+"""Time evaluations of the model, single and in batches, against CasADi's VM and soromox."""
 
 from collections.abc import Callable
 

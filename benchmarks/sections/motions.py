@@ -1,4 +1,4 @@
-"""Motions in cluttered scenes, checked with distances of their own."""
+"""Measure motions in cluttered scenes; independent distances check their clearance."""
 
 from __future__ import annotations
 

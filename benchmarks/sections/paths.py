@@ -1,4 +1,4 @@
-"""Paths: how stiff, how clear, how fast, against warm starts and against two references."""
+"""Measure stiffness, clearance and time of paths, against warm starts and two references."""
 
 from dataclasses import dataclass, field
 from time import process_time

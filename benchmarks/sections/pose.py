@@ -1,4 +1,4 @@
-"""Reaching a position, without a word on stiffness: pink on an equivalent rigid chain."""
+"""Compare reaching a position, without stiffness, with pink on an equivalent rigid chain."""
 
 from collections.abc import Callable
 

@@ -1,4 +1,4 @@
-"""What needs a process of its own: first solutions, no compiler, the command line.
+"""Measure in separate processes: first solutions, no compiler, the command line.
 
 python -m sections.processes first|full SEGMENTS SETTINGS   # one of these processes
 """

@@ -1,4 +1,4 @@
-"""Rates: many tasks at once, and the simulated arm against real time."""
+"""Measure rates: of many tasks at once, and of the simulated arm relative to real time."""
 
 from time import perf_counter
 

@@ -1,8 +1,9 @@
 """The paper's experiments: protocols that run on any rig, and the evaluation of their data.
 
-`kinematics` and `coverage` record the tip while pressures change, `stiffness` and `probing` push on
-it; the `conductor` commands the rig for all of them, `folder` keeps their files. The modules with
-`result` in their names compare the data with a model. `arm_map` needs no rig.
+`kinematics` and `coverage` record the tip while pressures change; `stiffness` and `probing` push
+it; `poses` holds the poses of a file. The `conductor` commands the rig for all of them; `folder`
+manages their files. `kinematics_result` and `stiffness_result` compare the data with a model;
+`slope` fits stiffnesses. `arm_map` maps a model's stiffness and needs no rig.
 """
 
 from stiffopt.experiments.arm_map import ArmMap, TipMap, map_arm, map_tip

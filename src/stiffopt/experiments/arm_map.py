@@ -1,4 +1,4 @@
-"""Maps of a model's stiffness: along the arm (figure 6 of the paper), and over two pressures."""
+"""Map a model's stiffness along the arm (figure 6 of the paper), and over two pressures."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from stiffopt.model.manipulator import Manipulator
 Array = NDArray[np.float64]
 
 NEAREST_BASE = 0.2
-"""Share of the length from which on stiffness is mapped; it is infinite at the base."""
+"""Share of the length from which stiffness is mapped; at the base it is infinite."""
 Progress = Callable[[float, float], None]
 
 
@@ -28,8 +28,8 @@ class ArmMap:
     ----------
     robot : name.
     length : at rest, in m.
-    groups : the channels (counted from 1) that are pressurised together, G groups.
-    pressures : to which, (P,), in Pa.
+    groups : G groups of channels (from 1); the channels of a group are pressurised together.
+    pressures : of the group's channels, (P,), in Pa.
     at : arc lengths of the points at rest (S,), in m.
     directions : unit vectors (d, 3).
     boundary, frame : of the stiffness.
@@ -54,7 +54,7 @@ class ArmMap:
 
     @property
     def middle(self) -> int:
-        """Index of the point that is nearest to the middle of the arm."""
+        """Index of the point nearest to the middle of the arm."""
         return int(np.argmin(np.abs(self.at - self.length / 2)))
 
 
@@ -111,22 +111,22 @@ def map_arm(
     ----------
     robot : Manipulator
     groups :
-        Channels (counted from 1) that are pressurised together, one group after the other; by
-        default the first pair of each segment, then the first two.
+        Groups of channels (from 1) that are pressurised together; by default the first channel of
+        each segment, and the first two of each segment.
     pressures : (P,), optional
-        To which, in Pa; by default seven from the least to the greatest that all channels may have.
+        Of the group's channels, in Pa; by default seven up to the highest that all channels allow.
     points : int
-        Along the arm, the middle and the tip among them if the number is odd.
+        Number of points along the arm; the middle and the tip are among them.
     directions : (d, 3)
     boundary, frame :
         Of the stiffness; see `Manipulator.stiffness`.
     progress : callable
-        Is told how many points are done, and of how many.
+        Called with the number of points done and the total.
 
     Raises
     ------
     InputError
-        A channel or a pressure that the robot does not have.
+        The robot lacks a channel, or does not allow a pressure.
     EquilibriumError
         The arm has no stable equilibrium at one of the pressures.
     """
@@ -189,7 +189,7 @@ def map_tip(
     channels :
         The two, counted from 1.
     levels : int
-        Of each of them, from its lowest to its highest pressure.
+        Number of pressures of each, from its lowest to its highest.
     others : (n,), optional
         Pressures of the other channels, in Pa; by default their lowest.
     directions, boundary, frame, progress :
@@ -198,7 +198,7 @@ def map_tip(
     Raises
     ------
     InputError
-        Not two channels of the robot.
+        These are not two channels of the robot.
     EquilibriumError
         The arm has no stable equilibrium at one of the pressures.
     """
@@ -234,7 +234,7 @@ def map_tip(
 
 
 def _stations(length: float, points: int) -> Array:
-    """Arc lengths from near the base to the tip; the middle is among them."""
+    """Return arc lengths from near the base to the tip; the middle is among them."""
     lower = max(2, round(points * (0.5 - NEAREST_BASE) / (1 - NEAREST_BASE)) + 1)
     first = np.linspace(NEAREST_BASE * length, 0.5 * length, min(lower, points))
     return np.concatenate(

@@ -1,7 +1,7 @@
-"""The conductor runs an experiment on a rig: it commands pressures and records what is seen.
+"""`Conductor`: command the pressures of a rig during an experiment, and collect its readings.
 
 Commands are goals of the supply of `stiffopt.open_rig`: the safety gate limits them, and lets the
-arm down when the experiment stops commanding. The pressure monitor judges every reading.
+arm down when commands stop. The pressure monitor checks every reading.
 """
 
 from __future__ import annotations
@@ -25,23 +25,23 @@ from stiffopt.safety.monitors import PressureMonitor
 
 Array = NDArray[np.float64]
 
-_KEPT = 4096  # frames and ticks that are kept
-_RECENT = 200  # ticks among which that of a frame is looked for
+_KEPT = 4096  # number of frames and ticks in memory
+_RECENT = 200  # number of ticks searched for that of a frame
 
 
 @dataclass(frozen=True)
 class ConductorTuning:
-    """How the conductor moves the arm and judges what it sees."""
+    """Tuning of the conductor's motions and checks."""
 
-    gentle: float = 5e4  # rate at which pressures are brought to a new pose, in Pa/s
-    first_sight: float = 5.0  # time in which a tracker must see the tip for the first time, in s
-    near: float = 0.1  # greatest time between a frame and the readings that belong to it, in s
-    settle_look: float = 0.1  # time between two looks at whether something has settled, in s
-    # time constant, in s, up to which regulators count as healthy. The arm of an experiment need
-    # not be identified yet, so this is far above a usual `regulator_lag`
+    gentle: float = 5e4  # rate of pressures on the way to a new pose, in Pa/s
+    first_sight: float = 5.0  # time within which the tracker must first see the tip, in s
+    near: float = 0.1  # largest time between a frame and its readings, in s
+    settle_look: float = 0.1  # period of checks whether something has settled, in s
+    # largest time constant of a healthy regulator, in s; far above a usual `regulator_lag`, since
+    # the arm of an experiment may not be identified yet
     slowest_lag: float = 2.0
-    bad_readings: int = 3  # impossible readings in a row that end an experiment; fewer are ignored
-    # a ramp ends in an error if it takes so many times the expected number of ticks
+    bad_readings: int = 3  # consecutive impossible readings that end an experiment
+    # a ramp fails if it takes this many times the expected number of ticks
     ramp_patience: int = 10
 
 
@@ -52,13 +52,13 @@ CONDUCTOR = ConductorTuning()
 class TrackedFrame:
     """A frame of the tracker with the pressures and probe readings of that moment."""
 
-    time: float  # when the frame was captured, on the rig's clock, in s
+    time: float  # of capture, on the rig's clock, in s
     position: Array  # of the tip in the base frame (3,), in m; NaN if it was not seen
     quaternion: Array | None  # of the tip in the base frame (w, x, y, z); None if it is not tracked
-    commanded: Array  # set-points (n,) that held then, in Pa
-    measured: Array  # pressures (n,) that were measured nearest to then, in Pa; NaN if not near
-    force: float  # force in N and position in m of the probe; NaN while it is not in use
-    stage: float
+    commanded: Array  # set-points (n,) then, in Pa
+    measured: Array  # nearest measured pressures (n,), in Pa; NaN if none is near in time
+    force: float  # of the probe, in N; NaN while not in use
+    stage: float  # position of the probe, in m; NaN while not in use
 
     @property
     def visible(self) -> bool:
@@ -92,9 +92,9 @@ class TickRecord:
 class Conductor:
     """Steps a rig at a fixed rate: command, read all devices, wait for the next tick.
 
-    The safety gate limits every command; a loop that was held up makes no jump. The experiment ends
-    with `DeviceError` where a device fails, the tracker loses the tip, the pressure monitor finds a
-    fault, or the arm was let down because the loop had stood still; the caller then closes the rig,
+    The safety gate limits every command, so that a delayed loop makes no jump. The experiment ends
+    with `DeviceError` if a device fails, the tracker loses the tip, the pressure monitor finds a
+    fault, or the arm was let down because the loop had stopped. The caller must then close the rig,
     which vents it.
 
     Parameters
@@ -102,9 +102,9 @@ class Conductor:
     rig : Rig
         Open, with a tracker, from `stiffopt.open_rig`.
     rate : float
-        Ticks a second.
+        Ticks per second.
     check : callable, optional
-        Called in each tick; raises to stop the experiment.
+        Called in each tick; it may raise to stop the experiment.
     """
 
     def __init__(self, rig: Rig, rate: float, check: Callable[[], None] = lambda: None) -> None:
@@ -116,8 +116,8 @@ class Conductor:
         self.tracker = rig.tracker
         self.clock = rig.clock
         self.rows: deque[TrackedFrame] = deque(maxlen=_KEPT)  # the latest
-        self.sink: Callable[[TrackedFrame], None] | None = None  # is given every new frame
-        self.watch: Callable[[TickRecord], None] | None = None  # is given every tick; may raise
+        self.sink: Callable[[TrackedFrame], None] | None = None  # called with every new frame
+        self.watch: Callable[[TickRecord], None] | None = None  # called in every tick; may raise
         self.probing = False  # whether the probe is read in each tick
         self._period = 1.0 / rate
         self._check = check
@@ -128,12 +128,12 @@ class Conductor:
             rig.robot, control.model_copy(update={"regulator_lag": lag}), self.n
         )
         self._monitor = PressureMonitor(rig.supply.limits, safety, regulation, rig.slew)
-        self._impossible = 0  # readings in a row
+        self._impossible = 0  # consecutive impossible readings
         self._valid, self._lost = safety.command_timeout, safety.tracker_timeout
         self._target = self._commanded = np.array(rig.supply.commanded, dtype=float)
         self._ticks: deque[TickRecord] = deque(maxlen=_KEPT)
         self._last = self._deadline = self.clock.now()
-        self._hidden = False  # somebody may stand in front of the tracker
+        self._hidden = False  # whether a person may block the tracker's view
 
     @property
     def n(self) -> int:
@@ -155,7 +155,7 @@ class Conductor:
             self.tick(self._target)
 
     def tick(self, target: ArrayLike) -> None:
-        """Command pressures (n,), in Pa, which the gate approaches, and wait for the next tick.
+        """Command pressures (n,), in Pa, as the gate's goal, and wait for the next tick.
 
         `CommandError`: the pressures are outside the limits.
         """
@@ -170,7 +170,7 @@ class Conductor:
         self._last = now
         self._target = np.array(target, dtype=float)
         reading = self.rig.supply.exchange(PressureCommand(self._target, now, self._valid))
-        self._commanded = self.rig.supply.commanded  # as far as the gate has let it go
+        self._commanded = self.rig.supply.commanded  # after the gate's limits
         self._judge(now, reading)
         force, stage = np.nan, np.nan
         if self.probing and self.rig.probe is not None:
@@ -202,7 +202,7 @@ class Conductor:
     def _take(self, sample: PoseSample) -> None:
         """Combine a frame with the set-points and readings of the moment of its capture."""
         if self.rows and sample.time <= self.rows[-1].time:
-            return  # a frame that came twice
+            return  # a repeated frame
         held, nearest = self._ticks_at(sample.time)
         row = TrackedFrame(
             time=sample.time,
@@ -230,10 +230,10 @@ class Conductor:
     # -- longer manoeuvres ------------------------------------------------------------------
 
     def meanwhile(self, task: Callable[[], None]) -> None:
-        """Hold the pressures while a task, in a thread of its own, waits for a person.
+        """Hold the pressures while a task, in its own thread, waits for a person.
 
-        Commands go on, so that they do not expire; a hidden tip is no fault meanwhile. Whatever the
-        task raises is raised here.
+        Commands go on, so that they do not expire; meanwhile a hidden tip is not a fault. An
+        exception of the task is raised here.
         """
         failures: list[BaseException] = []
 
@@ -262,7 +262,7 @@ class Conductor:
             raise failures[0]
 
     def approach(self, target: ArrayLike, rate: ArrayLike = CONDUCTOR.gentle) -> None:
-        """Tick once, towards pressures (n,), in Pa, and no faster than a rate, in Pa/s."""
+        """Tick once towards pressures (n,), in Pa, at most at a rate in Pa/s."""
         limits, target = self.rig.supply.limits, np.asarray(target, dtype=float)
         reach = np.asarray(rate) * min(max(self.clock.now() - self._last, 0.0), 2 * self._period)
         near = np.clip(target, self._commanded - reach, self._commanded + reach)
@@ -270,7 +270,7 @@ class Conductor:
         self.tick(limits.clamp(np.where((target == 0) & outside, 0.0, near)))
 
     def ramp(self, target: ArrayLike) -> None:
-        """Bring the pressures (n,), in Pa, to a target gently, see `ConductorTuning`."""
+        """Ramp the pressures to a target (n,), in Pa, gently, see `ConductorTuning`."""
         limits = self.rig.supply.limits
         target = limits.clamp(np.asarray(target, dtype=float))
         span = np.maximum(limits.high, 0.0) - np.minimum(limits.low, 0.0)
@@ -284,7 +284,10 @@ class Conductor:
     def settle(
         self, target: ArrayLike, settled: Callable[[Sequence[TrackedFrame]], bool], timeout: float
     ) -> bool:
-        """Hold pressures (n,) until new frames satisfy a condition; return whether they did."""
+        """Hold pressures (n,) until new frames satisfy a condition, or for `timeout` s.
+
+        Return whether they did.
+        """
         begin = looked = self.clock.now()
         while (now := self.clock.now()) - begin < timeout:
             self.tick(target)
@@ -307,10 +310,10 @@ class Conductor:
 def at_rest(
     rows: Sequence[TrackedFrame], window: float = 1.0, tolerance: float = 5e-5, parts: int = 4
 ) -> bool:
-    """Return whether the tip has come to rest: the means of the parts of a window agree.
+    """Return whether the tip has come to rest: the means over the parts of a window agree.
 
-    Means, since the tracker's noise is of the size of the tolerance; four of them, so that a slow
-    swing shows.
+    Means are compared since the tracker's noise is about as large as the tolerance; four of them
+    reveal a slow swing.
     """
     groups = split_window([row for row in rows if row.visible], window, parts)
     if groups is None:
@@ -322,7 +325,7 @@ def at_rest(
 def split_window(
     rows: Sequence[TrackedFrame], window: float, parts: int
 ) -> list[list[TrackedFrame]] | None:
-    """Split the frames of the last `window` s into equal parts; None while there are too few."""
+    """Split the frames of the last `window` s into equal parts; None if there are too few."""
     if not rows or rows[-1].time - rows[0].time < 0.95 * window:
         return None
     begin = rows[-1].time - window
@@ -336,7 +339,7 @@ def split_window(
 
 
 def check_pressures(rig: Rig, pressures: ArrayLike, channels: Sequence[int]) -> None:
-    """Refuse pressures (any number) that channels (counted from 0) may not have, one at a time."""
+    """Raise `InputError` unless each channel (from 0) alone may have each of the pressures."""
     limits = rig.supply.limits
     for channel in channels:
         for p in np.ravel(pressures):
@@ -350,7 +353,7 @@ def check_pressures(rig: Rig, pressures: ArrayLike, channels: Sequence[int]) -> 
 
 
 def _check_force(rig: Rig, channel: int, pressure: float) -> None:
-    """Refuse a pressure of a channel, in Pa, that alone is above the limit of the total force."""
+    """Raise `InputError` if a channel's pressure, in Pa, alone exceeds the limit of force."""
     alone = np.zeros(rig.supply.n)
     alone[channel] = pressure
     force = rig.force(alone)

@@ -1,7 +1,7 @@
 """Combined poses: all channels pressurised at once, spread evenly over the rig's limits.
 
-The paper's sequence moves one channel at a time. It does not show how channels act together, nor
-what happens above its peaks; a model fitted to it alone would have to extrapolate.
+The paper's sequence moves one channel at a time. It shows neither how channels act together nor
+what happens above its peaks, so that a model fitted to it alone would have to extrapolate.
 """
 
 from __future__ import annotations
@@ -20,25 +20,25 @@ from stiffopt.rig.interface import Rig
 from stiffopt.safety.gate import effective_slew
 
 ROUND = 6
-"""Poses, at most, after which the arm returns to no pressure."""
+"""Largest number of poses in a round, after which the arm returns to the base pressures."""
 _BEFORE = 3.0  # s that the arm usually takes to come to rest before a round
-_SKIPPED = 12  # first Halton points, which rise together in all large bases
+_SKIPPED = 12  # first Halton points, which are correlated in large bases
 
 
 def spread_pressures(count: int, low: ArrayLike, high: ArrayLike) -> Array:
     """Return pressures (count, n) that fill a box evenly, in Pa.
 
-    In each channel they have equal distances, from one end to the other, in the order of a Halton
-    sequence: all ends are reached with any number of poses, and the channels are combined evenly.
-    From one to the next, about half of the channels rise and half fall. The same arguments give
-    the same pressures.
+    In each channel the pressures are equally spaced from one end to the other, ordered like a
+    Halton sequence: any number of poses reaches both ends, and combines the channels evenly. From
+    one pose to the next, about half of the channels rise and half fall. The result is
+    deterministic.
 
     Parameters
     ----------
     count :
-        How many.
+        Number of poses.
     low, high : (n,)
-        Ends of each channel, in Pa.
+        Ends of each channel's range, in Pa.
     """
     low, high = np.array(low, dtype=float), np.array(high, dtype=float)
     if count == 1:
@@ -63,7 +63,7 @@ class Coverage:
 
     @property
     def rounds(self) -> list[Array]:
-        """The poses (m, n) of each round between two returns to `base`, of about equal number."""
+        """The poses (m, n) of each round, about equally many; rounds begin and end at `base`."""
         count = round_count(len(self.poses))
         return np.array_split(self.poses, count) if count else []
 
@@ -72,7 +72,7 @@ class Coverage:
         return _BEFORE + sum(self._durations(self.rounds[number - 1]))
 
     def _durations(self, poses: Array) -> list[float]:
-        """Return the longest durations, in s, of moving to each pose and resting there."""
+        """Return the longest durations, in s, of moving to each pose and settling there."""
         knots = np.vstack([self.base, poses, self.base])
         ways = np.abs(np.diff(knots, axis=0)) / self.speed
         return [float(way) + self.settle for way in ways.max(axis=1)]
@@ -92,15 +92,15 @@ class Coverage:
         conductor :
             Has seen the tip; the arm is at `base`.
         folder, about :
-            As for `recorded`; the files have the name of the round, `round_name`.
+            As for `recorded`; the files are named by `round_name`.
         number :
-            Which round, counted from 1.
+            Of the round, from 1.
         tell :
-            Is told seconds done and what goes on.
+            Called with the seconds done and a description.
 
         Returns
         -------
-        In how many poses the arm was not at rest in time.
+        The number of poses in which the arm did not settle in time.
         """
         poses, before = self.rounds[number - 1], sum(map(len, self.rounds[: number - 1]))
         durations = self._durations(poses)
@@ -119,9 +119,9 @@ class Coverage:
 
 
 def coverage_for(rig: Rig, count: int, settle: float, highest: float | None = None) -> Coverage:
-    """Return combined poses that cover the limits of a rig, with a time to settle in each, in s.
+    """Return combined poses that cover the limits of a rig, with time in s to settle in each.
 
-    No channel goes above the `highest` pressure, in Pa; `InputError` if one cannot be as low.
+    No channel exceeds the `highest` pressure, in Pa; `InputError` if that is below its limits.
     """
     limits = rig.supply.limits
     high = limits.high if highest is None else np.minimum(limits.high, highest)
@@ -161,6 +161,6 @@ def round_count(poses: int) -> int:
 def round_name(number: int) -> str:
     """Return the name of a round's recording, without ending; rounds count from 1.
 
-    Sorted by name they come after the paper's sequence, as they were recorded.
+    Sorted by name, rounds follow the paper's sequence, in the order of recording.
     """
     return f"kinematics_poses_{number}"

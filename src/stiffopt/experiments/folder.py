@@ -1,4 +1,4 @@
-"""The folder of an experiment: its settings, its recordings, and which of them are complete."""
+"""The folder of an experiment: its settings and its recordings, complete or not."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from stiffopt.schema import Schema
 SETTINGS = "experiment.yaml"
 
 SchemaT = TypeVar("SchemaT", bound=Schema)
-_PAUSE = 1.0  # s between the times of two runs that share a file
+_PAUSE = 1.0  # s between two runs in one file
 
 Progress = Callable[[float, float, str], None]
-"""Called with the amount done, the total amount, and what goes on in words."""
+"""Called with the work done, the total and a description."""
 
 
 class ExperimentSettings(Schema):
@@ -31,7 +31,7 @@ class ExperimentSettings(Schema):
 
     Attributes
     ----------
-    rig, robot : their names, for people.
+    rig, robot : their names, for reports.
     channels : number of channels.
     repetitions : of the whole protocol.
     """
@@ -43,7 +43,7 @@ class ExperimentSettings(Schema):
 
 
 def create_folder(path: Path, settings: Schema) -> None:
-    """Make the folder of a new experiment and write its settings there."""
+    """Create the folder of a new experiment and write its settings there."""
     try:
         path.mkdir(parents=True, exist_ok=True)
         if (path / SETTINGS).exists():
@@ -56,7 +56,7 @@ def create_folder(path: Path, settings: Schema) -> None:
 
 
 def open_folder(path: Path, schema: type[SchemaT]) -> SchemaT:
-    """Return the settings of an experiment that was begun."""
+    """Return the settings of the experiment in a folder."""
     if not (path / SETTINGS).is_file():
         raise FileError(path, f"holds no experiment; expected a folder with {SETTINGS} in it")
     return read_file(path / SETTINGS, "experiment", schema)
@@ -64,7 +64,7 @@ def open_folder(path: Path, schema: type[SchemaT]) -> SchemaT:
 
 @contextmanager
 def alone_in(path: Path) -> Iterator[None]:
-    """Context in which no other process works in the folder; `InputError` if another one does."""
+    """Context with exclusive access to the folder; `InputError` if another process has it."""
     try:
         import fcntl
     except ImportError:  # Windows
@@ -79,7 +79,7 @@ def alone_in(path: Path) -> Iterator[None]:
 
 
 def remove_folder(path: Path) -> None:
-    """Remove the folder of an experiment in which nothing was recorded."""
+    """Remove the folder of an experiment if nothing was recorded in it."""
     with suppress(OSError):
         if [each.name for each in path.iterdir()] == [SETTINGS]:
             (path / SETTINGS).unlink()
@@ -87,7 +87,7 @@ def remove_folder(path: Path) -> None:
 
 
 def check_same(name: str, now: object, then: object) -> None:
-    """Refuse to resume an experiment with something that has changed."""
+    """Raise `InputError` if something has changed since the experiment was begun."""
     if now != then:
         raise InputError(f"the experiment was begun with {name} {then}, not {now}")
 
@@ -102,18 +102,18 @@ def recorded(
 ) -> Iterator[float]:
     """Context in which all frames are recorded, as CSV and MCAP.
 
-    The names of the files have ``.part`` in them until the end, unless something is raised.
+    The files' names contain ``.part`` until the context ends without an exception.
 
     Parameters
     ----------
     conductor : Conductor
-        Whose frames are recorded; it has seen the tip.
+        Source of the frames; it has seen the tip.
     folder, name :
         Folder, and name of the files without ending.
     about :
         Metadata for the MCAP file.
     longest :
-        Frames later than this are left out, in s.
+        Time in s after which frames are left out.
 
     Yields
     ------
@@ -125,7 +125,7 @@ def recorded(
     begin = conductor.clock.now()
     mcap, csv = (folder / f"{name}.part.{ending}" for ending in ("mcap", "csv"))
     for part in (mcap, csv):
-        part.unlink(missing_ok=True)  # of an interrupted run, which is repeated
+        part.unlink(missing_ok=True)  # left by an interrupted run
     with LogWriter(csv, layout) as to_csv, McapLogWriter(mcap, layout, about) as to_mcap:
 
         def keep(row: TrackedFrame) -> None:
@@ -138,12 +138,12 @@ def recorded(
             yield begin
         finally:
             conductor.sink = None
-    for part in (mcap, csv):  # the CSV file last: its name shows completeness
+    for part in (mcap, csv):  # the CSV file last: its name marks the recording as complete
         os.replace(part, folder / f"{name}{part.suffix}")
 
 
 class RawRecording:
-    """A recording of all frames from now on; a run that is resumed continues the CSV file.
+    """Records all frames from now on; a resumed run continues the CSV file.
 
     Parameters
     ----------
@@ -151,7 +151,7 @@ class RawRecording:
     repetition : int
         Counted from 1; part of the file names.
     conductor : Conductor
-        Whose frames are recorded; it has seen the tip.
+        Source of the frames; it has seen the tip.
     rig : str
         Name of the rig, for the MCAP file.
     """

@@ -1,8 +1,8 @@
-"""Experiment 1 of the paper: the tip while each channel in turn is ramped up and down.
+"""Experiment 1 of the paper: record the tip while each channel in turn is ramped up and down.
 
-The pressure sequence is that of figure 5a: pair after pair, three sawteeth each, to 0.4, 0.8 and
-1.0 bar, nine teeth in 40 s for one segment. The arm is at rest before each repetition. After all
-repetitions follow combined poses (`stiffopt.experiments.coverage`), which the paper does not have.
+The pressure sequence is that of figure 5a: for each pair of chambers in turn, three sawteeth to
+0.4, 0.8 and 1.0 bar, nine teeth in 40 s for one segment. The arm is at rest before each repetition.
+Combined poses (`stiffopt.experiments.coverage`), which are not in the paper, follow.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ from stiffopt.units import Duration, Pressure
 
 SETTLE = 20.0
 """Time, in s, that the arm may take to come to rest before a repetition."""
-_TAIL = 1.0  # s that the last frames may take to arrive
-_AFTER = 0.2  # s that are recorded after the last tooth
+_TAIL = 1.0  # s, longest delay of the last frames
+_AFTER = 0.2  # s recorded after the last tooth
 
 
 class KinematicsSettings(ExperimentSettings):
@@ -43,7 +43,7 @@ class KinematicsSettings(ExperimentSettings):
     period : duration of a tooth, up and down, in s.
     poses : number of combined poses that follow; 0 for the paper's sequence alone.
     settle : time that the arm may take to come to rest in each of these, in s.
-    max : pressure that no channel exceeds in these, in Pa, in addition to the rig's limits.
+    max : highest pressure of a channel in these, in Pa, besides the rig's limits.
     """
 
     experiment: Literal["kinematics"] = "kinematics"
@@ -60,7 +60,7 @@ class KinematicsSettings(ExperimentSettings):
 
 @dataclass(frozen=True, eq=False)
 class PressureSequence:
-    """Pressures that change linearly between moments.
+    """Pressures that change linearly between given times.
 
     Attributes
     ----------
@@ -84,9 +84,9 @@ class PressureSequence:
         peaks :
             Of the teeth of each channel, in Pa.
         period :
-            Of a tooth, in s; a tooth for which a channel is too slow takes longer.
+            Of a tooth, in s; a tooth takes longer if the channel is too slow.
         slew : (n,)
-            Greatest rate of change, in Pa/s.
+            Largest rate of change, in Pa/s.
         """
         base = np.asarray(base, dtype=float)
         slew = np.broadcast_to(np.asarray(slew, dtype=float), base.shape)
@@ -106,14 +106,14 @@ class PressureSequence:
         return float(self.times[-1])
 
     def at(self, times: ArrayLike) -> Array:
-        """Pressures (n,) at a time or (N, n) at times (N,), in Pa; the ends last for ever."""
+        """Return pressures (n,) at a time or (N, n) at times (N,), in Pa; constant past ends."""
         t = np.asarray(times, dtype=float)
         columns = [np.interp(t, self.times, column) for column in self.pressures.T]
         return np.stack(columns, axis=-1)
 
 
 def sequence_for(rig: Rig, settings: KinematicsSettings) -> PressureSequence:
-    """Return the sequence on a rig; `InputError` if a pressure is beyond its limits."""
+    """Return the sequence for a rig; `InputError` if a pressure is beyond its limits."""
     limits = rig.supply.limits
     check_pressures(rig, settings.pressures, range(limits.n))
     base = limits.clamp(np.clip(0.0, limits.low, limits.high))
@@ -141,7 +141,7 @@ def _is_whole(folder: Path, name: str) -> bool:
     """Return whether both files of a recording exist and the table can be read."""
     try:
         return (folder / f"{name}.mcap").exists() and len(read_log(folder / f"{name}.csv").time) > 1
-    except FileError:  # damaged or not there: it is done again
+    except FileError:  # damaged or absent
         return False
 
 
@@ -162,15 +162,14 @@ def run_kinematics(
         Open.
     folder : Path
         Gets ``kinematics_1.csv`` (log v1), ``kinematics_1.mcap`` and so on, and then
-        ``kinematics_poses_1.csv`` and so on; one that is not complete is called
-        ``kinematics_1.part.csv``.
+        ``kinematics_poses_1.csv`` and so on; an incomplete one is named ``kinematics_1.part.csv``.
     settings : KinematicsSettings
     rate : float
         Rate of the commands, in Hz.
     progress : callable
-        Called with the seconds done, all seconds, and what goes on.
+        Called with the seconds done, the total and a description.
     check : callable
-        Called often; raises to stop.
+        Called often; it may raise to stop.
 
     Returns
     -------

@@ -1,7 +1,7 @@
-"""Results of the kinematics experiment: errors of the model's tip, and doubts about recordings.
+"""Evaluate the kinematics experiment: errors of the model's tip, and doubts about recordings.
 
 `evaluate_kinematics` compares the paper's sequence with a model, `evaluate_coverage` the combined
-poses; `doubts` finds what is suspicious in a complete recording.
+poses; `doubts` finds suspicious properties of the recordings.
 """
 
 from __future__ import annotations
@@ -20,21 +20,20 @@ from stiffopt.experiments.kinematics import KinematicsSettings, recording_name
 from stiffopt.logs import Log, read_log
 from stiffopt.model.manipulator import Manipulator
 
-_GRID = 0.05  # s
-_EVERY = 2  # points of the grid at which a loaded arm is evaluated
+_GRID = 0.05  # s, spacing
+_EVERY = 2  # a loaded arm is evaluated at every second point of the grid
 
 
 @dataclass(frozen=True)
 class EvaluationRules:
-    """What counts as a pose, a gap and a doubt when recordings are evaluated."""
+    """Criteria for poses, gaps and doubts in recordings."""
 
-    gap: float = 0.3  # longest time between two samples, in s, across which the tip is interpolated
-    held: float = 0.9  # time for which a command must not change to be a pose, in s
+    gap: float = 0.3  # longest time between samples across which the tip is interpolated, in s
+    held: float = 0.9  # shortest time of a constant command that counts as a pose, in s
     window: float = 1.0  # time at the end of a pose over which tip and pressures are averaged, in s
-    regulator_time: float = 0.5  # time in which a regulator should have followed a command, in s
-    # error of the pressure after that time that gives rise to a doubt, in Pa
-    pressure_error: float = 5e3
-    worse_share: float = 0.01  # share of the samples that may have a greater error
+    regulator_time: float = 0.5  # time within which a regulator should follow a command, in s
+    pressure_error: float = 5e3  # pressure error after that time that raises a doubt, in Pa
+    worse_share: float = 0.01  # share of samples that may exceed it
     hidden: float = 0.5  # longest time for which the tip may be out of sight, in s
     lost_share: float = 0.1  # share of the tracker's frames that may be missing
 
@@ -69,16 +68,16 @@ class KinematicsResult(DistanceStatistics):
 
     Attributes
     ----------
-    repetitions : how many recordings there are.
+    repetitions : number of recordings.
     time : grid, in s.
-    pressures : mean over the repetitions (K, n), in Pa; measured, or commanded where not.
+    pressures : mean over the repetitions (K, n), in Pa; commanded where not measured.
     low, high : extremes of the measured tip over the repetitions (K, 3), in m.
-    model : tip that the model says, mean over the repetitions (K, 3), in m.
+    model : the model's tip, mean over the repetitions (K, 3), in m.
     error : largest distance between measured and modelled tip over the repetitions (K,), in m.
-    component_error : the mean of modelled less measured tip over the repetitions (K, 3), in m.
+    component_error : mean of modelled minus measured tip over the repetitions (K, 3), in m.
     errors : distances at all samples of all recordings (M,), in m.
     length : of the arm at rest, in m.
-    doubts : what is suspicious in the recordings, in sentences.
+    doubts : about the recordings, as sentences.
     """
 
     repetitions: int
@@ -108,9 +107,9 @@ def read_recordings(folder: Path, settings: KinematicsSettings) -> list[Log]:
 def evaluate_kinematics(logs: Sequence[Log], model: Manipulator) -> KinematicsResult:
     """Compare recordings of the same pressures with a model.
 
-    The model is evaluated at the measured pressures, where there are any, so that errors are those
-    of the arm's model and not of the regulators; for an arm under gravity at their mean over the
-    repetitions, since each pose takes milliseconds.
+    The model is evaluated at the measured pressures, if there are any, so that errors are those of
+    the arm's model and not of the regulators. For an arm under gravity, whose poses take
+    milliseconds each, their mean over the repetitions is used.
 
     Raises
     ------
@@ -132,7 +131,7 @@ def evaluate_kinematics(logs: Sequence[Log], model: Manipulator) -> KinematicsRe
     tips = np.stack([one.tip for one in each])
     models = np.stack([one.model for one in each])
     with np.errstate(invalid="ignore"), warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # of moments at which no tip was seen
+        warnings.simplefilter("ignore", RuntimeWarning)  # times at which the tip was not seen
         distances = np.linalg.norm(models - tips, axis=2)
         component_error = np.nanmean(models - tips, axis=0)
     return KinematicsResult(
@@ -197,12 +196,12 @@ class CoverageResult(DistanceStatistics):
 
     Attributes
     ----------
-    pressures : (M, n), in Pa; measured, or commanded where not.
+    pressures : (M, n), in Pa; commanded where not measured.
     tip : measured tip (M, 3), in m.
     model : tip of the model (M, 3), in m.
-    speed : speed at which the tip still moved (M,), in m/s, including noise.
+    speed : remaining speed of the tip (M,), in m/s, including noise.
     length : of the arm at rest, in m.
-    doubts : what is suspicious in the recordings, in sentences.
+    doubts : about the recordings, as sentences.
     errors : distances (M,) between measured and modelled tip, in m.
     """
 
@@ -230,7 +229,7 @@ def evaluate_coverage(logs: Sequence[Log], model: Manipulator) -> CoverageResult
     Returns
     -------
     CoverageResult or None
-        None if the tip was seen in none of them.
+        None if there is no pose in which the tip was seen.
 
     Raises
     ------
@@ -311,7 +310,7 @@ def _disobedient(logs: Sequence[Log]) -> list[str]:
 
 
 def _recent_extremes(time: Array, commanded: Array) -> tuple[Array, Array]:
-    """Return the least and greatest command (N, n) in the time that a regulator may take."""
+    """Return the lowest and highest command (N, n) within the time that a regulator may take."""
     low, high = commanded.copy(), commanded.copy()
     rows = int(np.ceil(RULES.regulator_time / max(float(np.median(np.diff(time))), 1e-3)))
     for back in range(1, min(rows, len(time) - 1) + 1):

@@ -1,4 +1,4 @@
-"""Poses of a file, recorded one after another: `format: stiffopt-experiment/1`."""
+"""Record the poses of a file one after another: `format: stiffopt-experiment/1`."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ POSES = "poses"
 
 
 class PosesFile(Schema):
-    """What is done on which rig.
+    """A file of poses.
 
     Attributes
     ----------
     rig : path of a rig file, relative to this one.
-    hold : time for which each pose is held, in s.
-    pressures : of each pose, one value a channel, in Pa.
+    hold : time for which to hold each pose, in s.
+    pressures : of each pose, one value per channel, in Pa.
     """
 
     rig: Annotated[str, Field(min_length=1)]
@@ -40,7 +40,7 @@ class PosesFile(Schema):
 
 
 def load_poses(path: str | os.PathLike[str]) -> PosesFile:
-    """Read a file of poses; `FileError` with the line and the key of the first mistake."""
+    """Read a file of poses; raise `FileError` with line and key of the first mistake."""
     return read_file(path, "experiment", PosesFile)
 
 
@@ -52,7 +52,7 @@ def save_poses(path: str | os.PathLike[str], rig: str, pressures: ArrayLike) -> 
 
 
 def poses_for(rig: Rig, settings: PosesFile) -> Array:
-    """Return the poses (N, n) in Pa; `InputError` if the rig cannot do one of them."""
+    """Return the poses (N, n) in Pa; raise `InputError` if the rig does not allow one of them."""
     for number, pose in enumerate(settings.pressures, start=1):
         if len(pose) != rig.supply.n:
             raise InputError(
@@ -79,7 +79,7 @@ def run_poses(
     progress: Progress = lambda done, total, text: None,
     check: Callable[[], None] = lambda: None,
 ) -> None:
-    """Go from nothing through all poses and back, gently, and record it as ``poses.csv``.
+    """Move gently from zero pressure through all poses and back, and record ``poses.csv``.
 
     Parameters
     ----------
@@ -91,14 +91,14 @@ def run_poses(
     rate : float
         Rate of the commands, in Hz.
     progress : callable
-        Called with the number of poses done, of all, and what goes on.
+        Called with the number of poses done, the total and a description.
     check : callable
-        Called often; raises to stop.
+        Called often; it may raise to stop.
 
     Raises
     ------
     InputError
-        The rig cannot do it; nothing has moved.
+        The rig does not allow a pose; nothing has moved.
     DeviceError
         A device fails.
     """

@@ -1,6 +1,6 @@
-"""A series of the stiffness experiment: the probe touches the tip and displaces it in steps.
+"""Do a series of the stiffness experiment: the probe touches the tip and displaces it in steps.
 
-`Probing` does a series on the rig, `PointsFile` stores the points of all series.
+`Probing` does a series on the rig; `PointsFile` stores the points of all series.
 """
 
 from __future__ import annotations
@@ -28,18 +28,18 @@ _FLAGS = ("touching", "settled")
 
 @dataclass(frozen=True)
 class ProbeTuning:
-    """How the probe approaches the tip, and when a force counts as settled."""
+    """Tuning of the probe's approach, and of the criterion for a settled force."""
 
     speed: float = 0.002  # of the stage, in m/s
-    piece: float = 0.1  # duration of one movement at most, in s; the supply is commanded in between
-    approach: float = 1e-4  # steps in which the stage looks for the tip, in m
-    tare: float = 1.0  # time over which the force without contact is read, in s
-    # time over which a force must not change at a step, in s; its second half is averaged
+    piece: float = 0.1  # longest single movement, in s; the supply is commanded in between
+    approach: float = 1e-4  # step of the stage during the search for the tip, in m
+    tare: float = 1.0  # time over which the force without contact is averaged, in s
+    # time over which a force must be constant at a step, in s; its second half is averaged
     window: float = 1.0
-    change: float = 0.01  # share by which it may change nevertheless
+    change: float = 0.01  # share by which a constant force may change
     timeout: float = 6.0  # longest time at a step, in s
-    touch: float = 5.0  # force, in standard deviations of its noise, that is contact
-    least_touch: float = 1e-3  # force that is contact, at least, in N
+    touch: float = 5.0  # smallest force of a contact, in standard deviations of the noise
+    least_touch: float = 1e-3  # smallest force of a contact, in N
 
 
 PROBE = ProbeTuning()
@@ -50,28 +50,28 @@ class Series:
     """Parameters of a series."""
 
     direction: Array  # unit vector (3,) in the base frame, along which the probe pushes
-    displacement: float  # by which the stage goes beyond the first contact, and back, in m
-    steps: int  # in which it does so, each way
-    reach: float  # how far the stage looks for the tip, in m
-    most_force: float  # at which the series ends, in N
+    displacement: float  # travel of the stage beyond the first contact, and back, in m
+    steps: int  # number of steps each way
+    reach: float  # travel within which the stage searches for the tip, in m
+    most_force: float  # force at which the series ends, in N
 
 
 @dataclass(frozen=True)
 class ProbePoint:
-    """A step of a series: means over a time in which the force did not change."""
+    """A step of a series: means over a time in which the force was constant."""
 
     time: float  # middle of that time on the rig's clock, in s
-    force: float  # force of the probe, less its reading without contact, in N
+    force: float  # of the probe, minus its reading without contact, in N
     displacement: float  # of the tip along the direction, from its free position, in m
     stage: float  # travel of the stage beyond the first contact, in m
     position: Array  # of the tip (3,), in m
     measured: Array  # pressures (n,), in Pa
-    touching: bool  # whether the force is more than noise
-    settled: bool  # whether the force had come to rest
+    touching: bool  # whether the force exceeds the noise
+    settled: bool  # whether the force became constant in time
 
 
 class Probing:
-    """Does series with the probe of a conductor's rig while the pressures are held."""
+    """Does series with the probe of a rig while its conductor holds the pressures."""
 
     def __init__(self, conductor: Conductor) -> None:
         if conductor.rig.probe is None:
@@ -81,10 +81,11 @@ class Probing:
         self._at = 0.0
 
     def run(self, pressures: Array, series: Series) -> list[ProbePoint]:
-        """Touch, displace in steps, return in the same steps, retreat; pressures (n,) are held.
+        """Touch the tip, displace it in steps, return in the same steps, and retreat.
 
-        The way back separates the creep of the arm, which never stops, from the effect of the
-        displacement. `DeviceError`: the probe meets nothing, or a device fails.
+        Pressures (n,), in Pa, are held. The way back separates the arm's creep, which never stops,
+        from the effect of the displacement. Raises `DeviceError` if the probe does not find the tip
+        or a device fails.
         """
         self._conductor.probing = True
         try:
@@ -126,7 +127,7 @@ class Probing:
         return _Free(float(forces.mean()), noise, np.mean(seen, axis=0))
 
     def _touch(self, pressures: Array, series: Series, free: _Free) -> float:
-        """Move on until a force is felt; return the position of the stage."""
+        """Advance until the probe measures a contact; return the position of the stage."""
         begin = self._at
         least = max(PROBE.touch * free.noise, PROBE.least_touch)
         step = min(PROBE.approach, series.displacement / 4)
@@ -178,7 +179,7 @@ class Probing:
         )
 
     def _move(self, pressures: Array, place: float, most_force: float) -> bool:
-        """Move in short pieces; return False if `most_force` came first."""
+        """Move in short pieces; stop and return False if the force exceeds `most_force`."""
         while self._at != place:
             far = PROBE.speed * PROBE.piece
             self._at += float(np.clip(place - self._at, -far, far))
@@ -192,11 +193,11 @@ class Probing:
 
 
 class _Free(NamedTuple):
-    """The tip before it is touched."""
+    """Readings without contact."""
 
-    force: float  # that the probe reads, in N
-    noise: float  # of that
-    position: Array  # (3,), in m
+    force: float  # mean reading of the probe, in N
+    noise: float  # its standard deviation, in N
+    position: Array  # of the tip (3,), in m
 
 
 @dataclass(frozen=True)
@@ -223,7 +224,7 @@ class SeriesPoints:
 
 
 class PointsFile:
-    """The file with the points of all series, of n channels; a series is appended as a whole."""
+    """The file with the points of all series on n channels; each series is appended as a whole."""
 
     def __init__(self, folder: Path, n: int) -> None:
         self.path = folder / NAME
@@ -253,7 +254,7 @@ class PointsFile:
             if count < 1 or rows[:, place].tolist() != list(range(1, count + 1)):
                 later = np.flatnonzero(table["point"][start + 1 :] == 1)
                 start = start + 1 + int(later[0]) if len(later) else len(table.values)
-                continue  # the end of a run that was killed
+                continue  # the last series of a killed run
             series.append(self._series(dict(zip(table.columns, rows.T, strict=True))))
             start += count
         return series

@@ -1,10 +1,9 @@
-"""Slopes with confidence intervals: least squares for a series, scatter for repetitions.
+"""Estimate slopes with confidence intervals: least squares per series, scatter of repetitions.
 
-The uncertainty of interest is by how much the stiffness would differ if the whole measurement were
-repeated, with the probe aligned and the arm pressurised anew. Only the scatter between repetitions
-shows that, not the residuals of one series. So each repetition counts as one measurement of the
-slope. As a few repetitions may agree by chance, the uncertainty is never less than the residuals
-imply.
+The uncertainty of interest is the change of the stiffness if the whole measurement were repeated,
+with the probe aligned and the arm pressurised anew. The scatter between repetitions shows it; the
+residuals of one series do not. So each repetition counts as one measurement of the slope. Since a
+few repetitions may agree by chance, the uncertainty is at least that which the residuals imply.
 """
 
 from __future__ import annotations
@@ -19,8 +18,8 @@ from numpy.typing import ArrayLike, NDArray
 Array = NDArray[np.float64]
 
 _FEWEST = 3  # points; a line through two has no residual
-_BEND = 3.0  # standard errors by which a curvature must differ from 0 for a parabola to be fitted
-_ALIKE = 0.9  # correlation of a trend with x from which on the trend is left out
+_BEND = 3.0  # significance of a curvature, in standard errors, from which a parabola is fitted
+_ALIKE = 0.9  # correlation of a trend with x from which the trend is left out
 
 
 @dataclass(frozen=True)
@@ -55,10 +54,10 @@ def fit_line(
     x, y : (N,)
         Points; those that are not finite are left out.
     trend : (N,), optional
-        Another regressor, such as time; the slope is that at a constant trend. A trend that
-        correlates with x too much is left out.
+        Another regressor, such as time; the slope is that at a constant trend. A trend that is
+        strongly correlated with x is left out.
     curved :
-        Fit a parabola, whose slope at x = 0 is the result.
+        Whether to fit a parabola and return its slope at x = 0.
     """
     u, v = np.asarray(x, dtype=float), np.asarray(y, dtype=float)
     w = np.zeros_like(u) if trend is None else np.asarray(trend, dtype=float)
@@ -86,7 +85,7 @@ def fit_line(
 
 
 def _is_independent(x: Array, trend: Array) -> bool:
-    """Whether a trend correlates so little with x that both can be fitted."""
+    """Whether a trend's correlation with x is small enough to fit both."""
     dx, dt = x - x.mean(), trend - trend.mean()
     size = math.sqrt(float(dx @ dx) * float(dt @ dt))
     return size > 0 and abs(float(dx @ dt)) < _ALIKE * size
@@ -97,8 +96,8 @@ def fit_lines(
 ) -> list[LineFit]:
     """Fit the slopes at x = 0 of repetitions, each (x, y, trend).
 
-    Straight lines are fitted, unless all repetitions together show a significant curvature; then
-    all are parabolas.
+    All are straight lines, or all parabolas if the repetitions together show a significant
+    curvature.
     """
     bent = [fit_line(x, y, trend, curved=True) for x, y, trend in series]
     bends = [line.bend for line in bent if line is not None]
@@ -124,7 +123,7 @@ def combine(lines: Sequence[LineFit], confidence: float = 0.95) -> SlopeEstimate
 
 
 def student_t(confidence: float, freedom: int) -> float:
-    """Return the t that |T| of Student's distribution exceeds with probability 1 - confidence."""
+    """Return the t with P(|T| <= t) = `confidence` for Student's distribution."""
     from scipy.special import stdtrit
 
     return float(stdtrit(freedom, 0.5 * (1 + confidence)))

@@ -1,8 +1,8 @@
 """Experiment 2 of the paper: a probe displaces the tip at several pressures of one channel.
 
-At each pressure the arm settles. Then the probe is aligned with each direction in turn, touches the
-tip, displaces it in steps, there and back, and waits at each step until the force has come to rest.
-All of it is repeated. The stiffness is the slope of force over displacement.
+At each pressure the arm settles. Then, for each direction, the probe is aligned, touches the tip
+and displaces it in steps, there and back; at each step it waits until the force is constant. The
+whole is repeated. The stiffness is the slope of force over displacement.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from stiffopt.units import Duration, Force, Length, Pressure
 
 HARD_STOP = 5.0
 """Multiple of `StiffnessSettings.force` at which a series ends."""
-_REST_WINDOW = 4.0  # s over which the tip must not move before a series
+_REST_WINDOW = 4.0  # s for which the tip must be at rest before a series
 
 
 class StiffnessSettings(ExperimentSettings):
@@ -37,14 +37,14 @@ class StiffnessSettings(ExperimentSettings):
     Attributes
     ----------
     experiment : its kind.
-    channel : channel that is pressurised, counted from 1.
-    pressures : pressures of that channel, in Pa.
+    channel : the channel to pressurise, counted from 1.
+    pressures : of that channel, in Pa.
     directions : unit vectors along which the probe pushes, in the base frame.
     displacement : travel of the stage beyond the first contact, in m.
-    force : force, in N, that the model must not expect; else the displacement is made smaller.
+    force : in N; the displacement is reduced if the model predicts a larger force.
     steps : number of steps of a series, each way.
     settle : time that the arm may take to come to rest, in s.
-    reach : travel within which the stage looks for the tip, in m.
+    reach : travel within which the stage searches for the tip, in m.
     """
 
     experiment: Literal["stiffness"] = "stiffness"
@@ -77,7 +77,7 @@ class StiffnessSettings(ExperimentSettings):
 
 
 def check_stiffness(rig: Rig, settings: StiffnessSettings) -> None:
-    """Refuse what this rig cannot do, before anything moves."""
+    """Raise `InputError` if the rig cannot do the experiment."""
     if rig.probe is None:
         raise InputError("this rig has no probe; the stiffness experiment needs one")
     if rig.tracker is None:
@@ -116,7 +116,7 @@ def run_stiffness(
     check: Callable[[], None] = lambda: None,
     aside: Callable[[], AbstractContextManager[None]] = nullcontext,
 ) -> list[str]:
-    """Do the series that are missing in a folder.
+    """Do the series of the experiment that are missing in a folder.
 
     Parameters
     ----------
@@ -127,15 +127,15 @@ def run_stiffness(
         ``stiffness_1.csv`` (log v1) and ``stiffness_1.mcap``.
     settings : StiffnessSettings
     model : Manipulator
-        Decides on the size of the steps alone; the data are independent of it.
+        Only limits the size of the steps; the data are independent of it.
     rate : float
         Rate of the commands, in Hz.
     progress : callable
-        Called with the number of series done, of all series, and what goes on.
+        Called with the number of series done, the total and a description.
     check : callable
-        Called often; raises to stop.
+        Called often; it may raise to stop.
     aside : callable
-        Returns the context in which the probe is aligned, for which a person may be asked.
+        Returns the context in which the probe is aligned, perhaps by a person.
 
     Returns
     -------
@@ -145,7 +145,7 @@ def run_stiffness(
     Raises
     ------
     InputError
-        This rig cannot do it; nothing has moved.
+        The rig cannot do the experiment; nothing has moved.
     DeviceError
         A device fails, or the probe does not find the tip; what was measured is kept.
     """
@@ -172,7 +172,7 @@ def run_stiffness(
 
 
 def _still(rows: Sequence[TrackedFrame]) -> bool:
-    """Return whether the tip creeps so slowly that it hardly moves during a series."""
+    """Return whether the tip creeps too slowly to move noticeably during a series."""
     return at_rest(rows, window=_REST_WINDOW)
 
 
@@ -208,7 +208,7 @@ class _StiffnessRun:
         if before is not None and before != self._at:
             self._withdraw()  # the arm is about to move
         if before is None or before[0] != key.repetition:
-            conductor.ramp(np.zeros(settings.channels))  # each repetition starts from nothing
+            conductor.ramp(np.zeros(settings.channels))  # repetitions start from zero pressure
             self._rest(np.zeros(settings.channels))
         self._rest(p)
         self._by_hand(partial(self._probing.probe.align, key.direction))
@@ -243,7 +243,7 @@ class _StiffnessRun:
         return self._conductor.settle(p, _still, self._settings.settle)
 
     def _planned(self, p: Array, key: SeriesKey) -> Series:
-        """Return a series whose steps are so small that the model expects no more than `force`."""
+        """Return a series in which the model predicts at most `StiffnessSettings.force`."""
         settings = self._settings
         expected = float(self._model.stiffness(p, key.direction))
         return Series(

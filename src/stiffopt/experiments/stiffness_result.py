@@ -1,4 +1,4 @@
-"""Results of the stiffness experiment: the measured stiffness of each series, and the model's."""
+"""Evaluate the stiffness experiment: measured and modelled stiffness of each series."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class StiffnessCell:
     pressure : of the channel, in Pa.
     direction : unit vector in the base frame.
     estimate : from the displacement of the tip, in N/m; None if no repetition gave a slope.
-    by_stage : the same from the position of the stage; less, since contact and sensor yield too.
+    by_stage : the same from the position of the stage; lower, since contact and sensor yield too.
     slopes : of the repetitions, in N/m.
     points : number of points in contact, in all repetitions.
     model : stiffness of the model, in N/m.
@@ -66,7 +66,7 @@ class StiffnessResult:
         return sorted(found, key=lambda cell: cell.pressure)
 
     def beside(self, table: StiffnessTable) -> list[tuple[int, StiffnessCell]]:
-        """Rows of a table with the cells of the same pressures and line of action, tip free."""
+        """Return the free rows of a table with the cells of the same pressures and direction."""
         return [
             (row, cell)
             for row in range(len(table.stiffness))
@@ -101,7 +101,7 @@ class StiffnessResult:
 def evaluate_stiffness(
     folder: Path, settings: StiffnessSettings, model: Manipulator, curve: int = 61
 ) -> StiffnessResult:
-    """Fit the slopes of all series in a folder; compare with a model.
+    """Fit the stiffness of all series in a folder, and compare it with a model.
 
     Parameters
     ----------

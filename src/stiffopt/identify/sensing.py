@@ -72,11 +72,6 @@ def readings(
     return Readings(position[..., 0], per_twist, turn[..., 0], turn_per_twist)
 
 
-def turned_by(turn: Array) -> Array:
-    """Return the angles (N,) of `Readings.turn` in rad, up to a quarter turn."""
-    return np.asarray(np.arcsin(np.clip(np.linalg.norm(turn, axis=-1), 0.0, 1.0)))
-
-
 def _flat(matrices: Array) -> Array:
     """Matrices (N, r, c) as CasADi stores them, (N, r c)."""
     return np.ascontiguousarray(np.swapaxes(matrices, 1, 2)).reshape(len(matrices), -1)

@@ -17,7 +17,6 @@ from stiffopt.control.state import Event, Snapshot
 from stiffopt.display import FIGURES, display_units
 from stiffopt.files import file_text
 from stiffopt.model.description import RobotDescription
-from stiffopt.model.scene import Scene
 from stiffopt.optimise.measures.directional import StiffnessMeasure
 from stiffopt.optimise.solution import PressureSolution
 from stiffopt.plots import style
@@ -271,11 +270,6 @@ def task_text(design: Design) -> str:
 def robot_text(design: Design) -> str:
     """Return the design's robot file."""
     return file_text("robot", design.description)
-
-
-def scene_text(scene: Scene) -> str:
-    """Return a scene file."""
-    return file_text("scene", scene)
 
 
 def python_text(design: Design) -> str:
