@@ -245,7 +245,9 @@ class Loop:
         settings = PlantSettings(
             dynamics="quasi-static",
             silicone=Silicone(creep=(), hysteresis=()),
-            discretisation={"step": 0.01},
+            discretisation={
+                "step": 0.01, "bending_degree": 2, "shear_degree": 1, "sub_intervals": 3
+            },
             **plant,
         )
         description = RigDescription(

@@ -447,7 +447,7 @@ class World:
 def test_random_ticks(seed: int, low: float) -> None:
     """Long, these are a million ticks. `Recorder` judges every write, `World.judge` every state."""
     world = World(seed, low)
-    parts = 10 if os.environ.get("STIFFOPT_LONG", "") not in ("", "0") else 3
+    parts = 10 if os.environ.get("STIFFOPT_LONG", "") not in ("", "0") else 2
     for _ in range(parts):
         world.live(25_000)
         world.settle()

@@ -337,6 +337,7 @@ def asked(**update: Any) -> Task:
 HANGING = load_robot("stiff-flop-2-hanging")
 
 
+@pytest.mark.usefixtures("compiled")
 def test_a_press_is_planned_as_its_reaction() -> None:
     pressed = PressureSolver(HANGING, asked()).solve()
     load = Load(force=(-0.03, 0.0, 0.0))
@@ -347,6 +348,7 @@ def test_a_press_is_planned_as_its_reaction() -> None:
     assert np.linalg.norm(pressed.tip_position - np.array([0.01, 0.0, 0.195])) < 1.1e-4
 
 
+@pytest.mark.usefixtures("compiled")
 @pytest.mark.parametrize(
     ("press", "why"),
     [
