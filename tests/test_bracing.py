@@ -246,7 +246,10 @@ class Loop:
             dynamics="quasi-static",
             silicone=Silicone(creep=(), hysteresis=()),
             discretisation={
-                "step": 0.01, "bending_degree": 2, "shear_degree": 1, "sub_intervals": 3
+                "step": 0.01,
+                "bending_degree": 2,
+                "shear_degree": 1,
+                "sub_intervals": 3,
             },
             **plant,
         )
