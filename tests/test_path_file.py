@@ -384,9 +384,9 @@ def test_what_a_csv_file_says_is_not_said_twice(tmp_path: FilePath) -> None:
         "time_s,x_m,y_m,z_m,qw,qx,qy,qz\n0,0,0,0.18,1,0,0,0\n0.5,0.01,0,0.18,-1,0,0,0\n"
     )
     csv = "path: {csv: points.csv}\n"
-    with pytest.raises(FileError, match="timing: is told by the column time_s too"):
+    with pytest.raises(FileError, match="timing: is given by the column time_s too"):
         read(tmp_path, csv + "timing: {fastest: true}\n")
-    with pytest.raises(FileError, match=r"pointing: is told by path.csv too"):
+    with pytest.raises(FileError, match=r"pointing: is given by path.csv too"):
         read(tmp_path, csv + "pointing: [0, 0, 1]\n")
 
 

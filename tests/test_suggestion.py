@@ -93,7 +93,7 @@ def test_suggestions_keep_to_what_a_rig_allows() -> None:
     assert len(np.unique(found.pressures, axis=0)) == 8
     with pytest.raises(InputError, match="there are only 0 poses that the rig allows"):
         suggest_poses(known_robot(), is_allowed=lambda p: False)
-    with pytest.raises(InputError, match="does not tell the errors of its predictions"):
+    with pytest.raises(InputError, match="has no model of its prediction errors"):
         suggest_poses(load_description("stiff-flop-1"))
 
 

@@ -28,7 +28,7 @@ Exit codes:
   0    the rig fits its files
   2    bad input: a file, an option, or a rig that cannot do it; nothing has moved
   5    stopped by danger or a fault of the rig; the arm is vented
-  6    the rig does not fit its files; what to change is told
+  6    the rig does not fit its files; the report says what to change
   130  interrupted (Ctrl-C); the arm is vented
 """
 

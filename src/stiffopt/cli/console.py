@@ -103,14 +103,14 @@ def report_note(message: str) -> None:
 @contextmanager
 def showing_slow_warnings(show: Callable[[str], object]) -> Iterator[None]:
     """Context in which a function shows the text of each `SlowWarning` and `UnfitWarning` once."""
-    show_other, told = warnings.showwarning, set[str]()
+    show_other, shown = warnings.showwarning, set[str]()
 
     def show_warning(
         message: Warning | str, category: type[Warning], *rest: Any, **more: Any
     ) -> None:
         if issubclass(category, SlowWarning | UnfitWarning):
-            if str(message) not in told:
-                told.add(str(message))
+            if str(message) not in shown:
+                shown.add(str(message))
                 show(str(message))
         else:
             show_other(message, category, *rest, **more)

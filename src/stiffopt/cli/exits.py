@@ -149,13 +149,13 @@ def stoppable_work(*, quiet: bool) -> Iterator[Progress]:
     It yields a progress function, which raises `CancelledError` once after the first Ctrl-C. Work
     without results lets the error pass, and ends as interrupted.
     """
-    interrupt, is_told = InterruptBetweenSteps(), False
+    interrupt, is_reported = InterruptBetweenSteps(), False
     with interrupt.handled(), ProgressBar(quiet=quiet) as bar, warnings_as_notes(quiet=quiet):
 
         def progress(done: float, total: float, text: str) -> None:
-            nonlocal is_told
-            if interrupt.pressed and not is_told:
-                is_told = True
+            nonlocal is_reported
+            if interrupt.pressed and not is_reported:
+                is_reported = True
                 bar.report(done, total, "interrupted: keeping the best so far")
                 raise CancelledError("interrupted")
             bar.report(done, total, text)

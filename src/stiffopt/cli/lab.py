@@ -153,8 +153,8 @@ def _obey(lab: VirtualLab, words: list[str]) -> str:
         pressures = ", ".join(pressure.number(p, ".3f") for p in lab.world.pressures)
         tip = ", ".join(length.number(x, ".1f") for x in lab.world.plant.tip_pose()[:3, 3])
         faults = {device: fault for device, fault in lab.world.faults.items() if fault != "ok"}
-        told = ", ".join(f"{device} {fault}" for device, fault in faults.items()) or "none"
-        return f"pressures {pressures} {pressure}; tip at {tip} {length}; faults: {told}"
+        active = ", ".join(f"{device} {fault}" for device, fault in faults.items()) or "none"
+        return f"pressures {pressures} {pressure}; tip at {tip} {length}; faults: {active}"
     raise InputError(
         f"'{' '.join(words)}' is no command; there are: fault DEVICE NAME [CHANNEL], "
         "mount X Y Z, status, quit"

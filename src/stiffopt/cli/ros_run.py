@@ -27,7 +27,7 @@ from stiffopt.rig.config import RigDescription, load_rig_description
 from stiffopt.rig.settings import RosSettings
 
 _START = 600.0  # s; a first start compiles the model
-_TELL = 10.0  # s until a note says that the daemon is still starting; later ones come less often
+_FIRST_NOTE = 10.0  # s until a note says that the daemon is still starting; later ones are rarer
 _LATE = 30.0  # s that a daemon may take to end, beyond the ramp
 _LOOPBACK = (None, "lo")
 
@@ -66,7 +66,7 @@ def run(rig: str, given: Mapping[str, Any], remap: Sequence[str], token_file: st
                 )
                 bridge = Bridge(rig, description, robot, url, token, node, report_note)
                 with closing(bridge):
-                    _tell(names, domain, settings)
+                    _announce(names, domain, settings)
                     # a daemon started here stays visible, and can be vented, until it has ended
                     bridge.run(daemon.left)
         except ServiceError as error:
@@ -99,7 +99,7 @@ def _domain() -> int:
     return int(text)
 
 
-def _tell(names: Any, domain: int, settings: RosSettings) -> None:
+def _announce(names: Any, domain: int, settings: RosSettings) -> None:
     where = settings.interface or "lo"
     node = names.full("~/tip").removesuffix("/tip")
     may = "takes commands" if settings.commands else "takes no command but to vent"
@@ -167,34 +167,34 @@ class _Daemon:
             command, stdout=subprocess.PIPE, text=True, start_new_session=True
         )
         started: dict[str, Any] = {}
-        there = threading.Event()
-        threading.Thread(target=self._listen, args=(started, there), daemon=True).start()
-        begin, told = time.monotonic(), _TELL
-        while not there.wait(0.05) and not over.is_set():
+        ready = threading.Event()
+        threading.Thread(target=self._listen, args=(started, ready), daemon=True).start()
+        begin, next_note = time.monotonic(), _FIRST_NOTE
+        while not ready.wait(0.05) and not over.is_set():
             if self._process.poll() is not None:
                 raise ServiceError("the daemon did not start; it says why above")
             if (gone := time.monotonic() - begin) > _START:
                 raise ServiceError(f"the daemon did not start within {_START:g} s")
-            if gone > told:
-                told *= 2
+            if gone > next_note:
+                next_note *= 2
                 report_note(f"it is starting, for {gone:.0f} s now; a first start compiles models")
         if over.is_set():
             return "", ""
         return started["url"], self._token(started.get("token_file"))
 
-    def _listen(self, started: dict[str, Any], there: threading.Event) -> None:
+    def _listen(self, started: dict[str, Any], ready: threading.Event) -> None:
         """Forward the daemon's messages, and store its address."""
         assert self._process is not None
         assert self._process.stdout is not None
         for line in self._process.stdout:
             with suppress(OSError, ValueError):
                 print(line, end="", flush=True)
-            if not there.is_set():
+            if not ready.is_set():
                 with suppress(ValueError):
                     said = json.loads(line)
                     if said.get("kind") == "started":
                         started.update(said)
-                        there.set()
+                        ready.set()
 
     def begin_end(self) -> None:
         """Ask the daemon to end if it was started here, else disconnect; does not wait.

@@ -36,7 +36,7 @@ _KEYS = {
     "sensor moved": (_SENSOR,), "sensor turned": (_SENSOR,), "load": (), "length": ("robot",),
     "response": ("robot",), "gain": ("robot",),
 }  # fmt: skip
-_TELLS = {
+_CHECKS = {
     "frame turned": "move the sensor by hand along the base's x, y and z, and see what is read",
     "frame moved": "hold the sensor at the base's origin, and see what is read",
     "frame": "hold the sensor at known places of the base, and see what is read",
@@ -45,8 +45,8 @@ _TELLS = {
     "load": "weigh what hangs at the tip, hold a spirit level to the base, and see whether "
     "anything touches the arm",
     "length": "measure the arm from base to tip with a calliper",
-    "response": "push the tip with a known force ('stiffopt experiment stiffness'), which tells "
-    "modulus from gain",
+    "response": "push the tip with a known force ('stiffopt experiment stiffness'), which "
+    "distinguishes modulus from gain",
     "gain": "put another gauge on that channel's tube",
 }
 _WORST = 3.0  # standard deviations from the files' value from which a number does not fit
@@ -121,7 +121,7 @@ def _wiring(
     text, advice = wiring_words(best.wiring), ["pull the tubes in question and see which one blows"]
     if rivals:
         text += f"; or {'; or '.join(rivals)}: the tip's motion does not tell these apart"
-        advice.append(_TELLS["frame turned"])
+        advice.append(_CHECKS["frame turned"])
     for k, source in enumerate(best.wiring):
         if source == () and np.isfinite(seen.gauge[k, k]):
             reads = seen.gauge[k, k] > 0.5
@@ -175,20 +175,20 @@ def _causes(
         others = [pair for pair in rivals if not (pair[0] is cause or _are_one(cause, pair[0]))]
         sizes = [cause_size(each, expected, e) for each, e in rivals]
         fits = all(size < 1 or size < _WORST * deviation for size, deviation in sizes)
-        told = dict.fromkeys(cause_words(other, expected, e) for other, e in others)
+        alternatives = dict.fromkeys(cause_words(other, expected, e) for other, e in others)
         if cause.name.startswith("frame"):
             orders = [e for e in explainer.wiring_rivals(best) if e.wiring != explainer.ordinary]
-            told |= dict.fromkeys(wiring_words(e.wiring) for e in orders)
-        told.pop(words, None)
+            alternatives |= dict.fromkeys(wiring_words(e.wiring) for e in orders)
+        alternatives.pop(words, None)
         text = words
-        if told:
-            text += f"; or {'; or '.join(told)}: what was seen does not tell these apart"
+        if alternatives:
+            text += f"; or {'; or '.join(alternatives)}: what was seen does not tell these apart"
         names = dict.fromkeys(each.name for each, _ in [(cause, best), *others])
-        tells = "; ".join(dict.fromkeys(_TELLS[name] for name in names))
+        checks = "; ".join(dict.fromkeys(_CHECKS[name] for name in names))
         keys = tuple(dict.fromkeys(key for name in names for key in _KEYS[name]))
-        if keys and not told:
-            tells = f"correct {_listed(keys)}; to be sure, {tells}"
-        yield Finding(cause.name, text, fits, tells if told or not fits else "", keys)
+        if keys and not alternatives:
+            checks = f"correct {_listed(keys)}; to be sure, {checks}"
+        yield Finding(cause.name, text, fits, checks if alternatives or not fits else "", keys)
 
 
 def _are_one(cause: Cause, other: Cause) -> bool:

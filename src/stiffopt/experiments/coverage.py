@@ -83,7 +83,7 @@ class Coverage:
         folder: Path,
         number: int,
         about: dict[str, str],
-        tell: Callable[[float, str], None],
+        report: Callable[[float, str], None],
     ) -> int:
         """Record a round, from `base` through its poses and back.
 
@@ -95,7 +95,7 @@ class Coverage:
             As for `recorded`; the files are named by `round_name`.
         number :
             Of the round, from 1.
-        tell :
+        report :
             Called with the seconds done and a description.
 
         Returns
@@ -108,7 +108,7 @@ class Coverage:
         with recorded(conductor, folder, round_name(number), about):
             for index, pose in enumerate([*poses, self.base]):
                 count = min(before + index + 1, before + len(poses))
-                tell(
+                report(
                     _BEFORE + sum(durations[:index]),
                     f"combined pose {count} of {len(self.poses)}",
                 )

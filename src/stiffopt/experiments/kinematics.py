@@ -199,24 +199,24 @@ def run_kinematics(
 
     done = 0.0
 
-    def tell(t: float, text: str) -> None:
+    def report(t: float, text: str) -> None:
         progress(done + t, total, text)
 
     for repetition in todo:
         text = f"repetition {repetition} of {settings.repetitions}"
-        tell(0.0, text)
+        report(0.0, text)
         rest(sequence.at(0.0), f"repetition {repetition}")
         about = {"experiment": "kinematics", "repetition": str(repetition), "rig": settings.rig}
         name = recording_name(repetition)
-        _record(conductor, sequence, folder, name, about, partial(tell, text=text))
+        _record(conductor, sequence, folder, name, about, partial(report, text=text))
         done += sequence.duration
     restless = 0
     for number in rounds:
         text = f"round {number} of combined poses"
-        tell(0.0, text)
+        report(0.0, text)
         rest(coverage.base, text)
         about = {"experiment": "kinematics", "poses": str(number), "rig": settings.rig}
-        restless += coverage.record(conductor, folder, number, about, tell)
+        restless += coverage.record(conductor, folder, number, about, report)
         done += coverage.duration(number)
     if restless:
         notes.append(
@@ -232,13 +232,13 @@ def _record(
     folder: Path,
     name: str,
     about: dict[str, str],
-    tell: Callable[[float], None],
+    report: Callable[[float], None],
 ) -> None:
     clock = conductor.clock
     end = sequence.duration + _AFTER
     with recorded(conductor, folder, name, about, end) as begin:
         while (t := clock.now() - begin) < end + _TAIL:
             conductor.tick(sequence.at(t))
-            tell(min(t, sequence.duration))
+            report(min(t, sequence.duration))
             if t > end and conductor.rows[-1].time - begin > end:
                 break  # all frames have arrived

@@ -129,18 +129,18 @@ class Probing:
     def _touch(self, pressures: Array, series: Series, free: _Free) -> float:
         """Advance until the probe measures a contact; return the position of the stage."""
         begin = self._at
-        least = max(PROBE.touch * free.noise, PROBE.least_touch)
+        threshold = max(PROBE.touch * free.noise, PROBE.least_touch)
         step = min(PROBE.approach, series.displacement / 4)
         while self._at - begin < series.reach:
             self._move(pressures, self._at + step, free.force + series.most_force)
-            if self._felt() - free.force > least and self._felt() - free.force > least:
+            if self._force() - free.force > threshold and self._force() - free.force > threshold:
                 return self._at
         raise DeviceError(
             f"the probe has met nothing within {series.reach * 1e3:g} mm; is it aligned with the "
             "tip, is its force read with the right sign?"
         )
 
-    def _felt(self) -> float:
+    def _force(self) -> float:
         force = self.probe.sample().force
         if not np.isfinite(force):
             raise DeviceError("the force of the probe cannot be read")
@@ -187,7 +187,7 @@ class Probing:
                 self._at = place
             self.probe.move_to(self._at, PROBE.speed)
             self._conductor.tick(pressures)
-            if self._felt() > most_force:
+            if self._force() > most_force:
                 return False
         return True
 

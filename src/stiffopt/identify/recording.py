@@ -362,7 +362,7 @@ def _check_time(name: str, time: Array) -> tuple[str, ...]:
 def _check_lengths(name: str, log: Log, frame: str | None, length: float) -> None:
     """Refuse positions that cannot be in m, by the range of the tip and its distance."""
     tip = log.tip_position
-    seen = whole(tip) & np.any(tip != 0, axis=1)  # zeros may stand for none
+    seen = whole(tip) & np.any(tip != 0, axis=1)  # zeros may mean "missing"
     if not seen.any():
         raise FileError(name, "the position of tip is missing in every row")
     low, high = np.quantile(tip[seen], (0.1, 0.9), axis=0)

@@ -8,8 +8,8 @@ The variance has two parts that recordings can reduce:
   with slopes J_c that is read with a covariance R leaves
   ``C - C J_c' (J_c C J_c' + R)^-1 J_c C``, so that the mean falls by
   ``trace((J_c C J_c' + R)^-1 J_c C M C J_c')`` with the mean M of ``J' J``;
-* the discrepancy between model and arm, whose variance grows with the distance from what was
-  recorded (`stiffopt.model.calibration.ErrorModel`).
+* the discrepancy between model and arm, whose variance grows with the distance from recorded
+  pressures (`stiffopt.model.calibration.ErrorModel`).
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ def suggest_poses(
     calibration = robot.calibration
     if calibration is None or calibration.errors is None:
         raise InputError(
-            f"robot '{robot.name}' does not tell the errors of its predictions; fit it to "
+            f"robot '{robot.name}' has no model of its prediction errors; fit it to "
             "recordings with 'stiffopt calibrate'"
         )
     low = np.array(robot.pressure_min if low is None else low, dtype=float)

@@ -38,11 +38,11 @@ from stiffopt.paths.tree_search import TreeSearch
 
 Vector = NDArray[np.float64]
 
-_NEARLY_AS_STIFF = 0.95  # of the best, which is not worth looking for stiffer ones
-_MORE = 50  # motions tried for a stiffer goal, beyond as many as for the first
-_LEAST_STEP = 1.1e-3  # s, between points: what a trajectory takes
-_STEPS = 50  # into which the motion is divided at least, unless they are shorter than:
-_SHORT = 5e-3  # s
+_NEARLY_AS_STIFF = 0.95  # share of the best stiffness from which no stiffer goal is sought
+_MORE = 50  # motions checked for a stiffer goal, in addition to as many as for the first
+_LEAST_STEP = 1.1e-3  # s, shortest time between points that a trajectory accepts
+_STEPS = 50  # smallest number of steps in a motion, unless they would be shorter than ...
+_SHORT = 5e-3  # ... this, in s
 
 
 def plan_motion(

@@ -322,7 +322,7 @@ class Path(ForRobot):
         table, timing = self.path.table, self.timing
         if table is not None and table.times is not None:
             if timing is not None:
-                raise BadKeyError("timing", "is told by the column time_s too; remove one of them")
+                raise BadKeyError("timing", "is given by the column time_s too; remove one of them")
             return np.array(table.times)
         if timing is None:
             raise ValueError("the key 'timing' is missing; expected a speed, times or fastest")
@@ -377,7 +377,7 @@ class Path(ForRobot):
         """Refuse the path's pointing or orientation where the points have their own."""
         for key in ("pointing", "orientation"):
             if getattr(self, key) is not None:
-                raise BadKeyError(key, f"is told by {where} too; remove one of them")
+                raise BadKeyError(key, f"is given by {where} too; remove one of them")
 
     def _goals(self, tangents: Vector) -> tuple[StiffnessGoal | None, ...]:
         if self.stiffness is None:

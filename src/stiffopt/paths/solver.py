@@ -86,7 +86,7 @@ class _PathSolver:
 
     def solve(self) -> PathSolution:
         """Answer; see `solve_path`."""
-        if len(self._tasks) > RATES.few_points:  # so many that waiting for machine code pays
+        if len(self._tasks) > RATES.few_points:  # enough points to wait for machine code
             PressureSolver(self._robot, self._tasks[0], seed=self._seed).compile()
         tasks = PathTasks(self._robot, self._tasks, self._seed)
         self._check_ends(tasks)
@@ -199,7 +199,7 @@ class _PathSolver:
         if times is None:
             times = self._fastest(pressures)
         alone = np.array([max((c.value for c in layer), default=np.nan) for layer in layers])
-        if self._unreachable is not None:  # the tasks of the path as it is given
+        if self._unreachable is not None:  # judge by the original tasks
             tasks = PathTasks(self._robot, self._tasks, self._seed)
         solution = self._judged(tasks, pressures, times, alone)
         branches = max(map(len, layers))

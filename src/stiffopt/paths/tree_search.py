@@ -51,8 +51,8 @@ class TreeSearch:
     def way(self, start: Vector, goals: Vector, most: float) -> tuple[Vector | None, Vector | None]:
         """Search a way (k, n) from the start to one of the goals (N, n).
 
-        The search ends after `most` checked motions in all. Without a way it returns None, and, if
-        known, the pressures (n,) that the tree from the start reached.
+        The search ends after checking `most` motions. Without a way it returns None, and, if known,
+        the pressures (n,) that the tree from the start reached.
         """
         from ompl import base, geometric, util
 

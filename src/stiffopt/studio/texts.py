@@ -49,8 +49,8 @@ def answer_html(bench: Workbench) -> str:
     if answer is None:
         return _padded(_headline("failed" if bench.trouble else "", bench.trouble or _SEARCHING))
     solution = answer.solution
-    is_told = answer.is_best or not solution.found  # the message of a solution takes a while
-    message = bench.trouble or (solution.message if is_told else "")
+    shows_message = answer.is_best or not solution.found  # the message of a solution takes a while
+    message = bench.trouble or (solution.message if shows_message else "")
     status = "failed" if bench.trouble else solution.status
     return _padded(
         _headline(status, message)
@@ -107,7 +107,7 @@ def _rows(answer: StudioAnswer) -> Iterable[tuple[str, str]]:
         clear = solution.clearance if answer.is_best else None
         yield (
             "clearance",
-            "told when you pause" if clear is None else units.length.text(clear, ".3g"),
+            "shown when you pause" if clear is None else units.length.text(clear, ".3g"),
         )
     doubt = answer.robot.description.extrapolation(answer.pressures)
     if doubt:
