@@ -228,7 +228,7 @@ _QUANTITIES = {
 
 
 def _read(key: str, value: str | int) -> Any:
-    """Value of an option."""
+    """Return the value of an option."""
     if not isinstance(value, str):
         return value
     option = f"--{key}"

@@ -25,7 +25,7 @@ from stiffopt.model.scene import Scene, load_scene
 from stiffopt.optimise.task import Task, load_task
 from stiffopt.paths.motion import plan_motion
 from stiffopt.paths.motion_file import RESULT_FORMAT
-from stiffopt.paths.solution import PathSolution, Vector
+from stiffopt.paths.solution import PathSolution
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -77,7 +77,7 @@ class PlanCommand:
         tasks = [each for each in given if isinstance(each, Task)]
         robot = self._robot(tasks)
         ends = [
-            each if isinstance(each, Task) else _pressures(option, each)
+            each if isinstance(each, Task) else np.array(listed(option, each, "Pa", "pressure"))
             for option, each in zip(["--from"] + ["--to"] * len(self.goals), given, strict=True)
         ]
         own = [each.scene for each in (*ends[1:], ends[0]) if isinstance(each, Task)]
@@ -174,7 +174,3 @@ class PlanCommand:
 def _is_file(text: str) -> bool:
     """Whether an end of a motion is a task file rather than pressures."""
     return text.lower().endswith((".yaml", ".yml")) or FilePath(text).is_file()
-
-
-def _pressures(option: str, text: str) -> Vector:
-    return np.array(listed(option, text, "Pa", "pressure"))

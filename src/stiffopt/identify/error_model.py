@@ -166,7 +166,7 @@ class _Fold:
         )
 
     def misfit(self, index: int, discrepancy: float, residual: float, tail: float) -> float:
-        """Negative logarithm of the probability density of the errors, up to a constant."""
+        """Return the negative log density of the errors, up to a constant."""
         from scipy.special import gammaln
 
         covariance = (

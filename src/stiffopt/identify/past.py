@@ -288,7 +288,7 @@ def _columns(values: Array, count: int) -> Array:
 
 
 def _steps(history: History, channels: int, lags: bool, falls: bool) -> ca.Function:
-    """One step of `_HistoryRun`: state, pressures, their changes, length and lags in s -> state."""
+    """Return one step of `_HistoryRun`: from state, pressures, changes, step and lags to state."""
     blocks = 1 + _TIMES + _sides(history, channels)
     state = ca.SX.sym("state", history.n_states, blocks * channels)
     value, *slopes = ca.horzsplit(state, channels)

@@ -73,7 +73,7 @@ def readings(
 
 
 def _flat(matrices: Array) -> Array:
-    """Matrices (N, r, c) as CasADi stores them, (N, r c)."""
+    """Return matrices (N, r, c) in CasADi's column order, (N, r c)."""
     return np.ascontiguousarray(np.swapaxes(matrices, 1, 2)).reshape(len(matrices), -1)
 
 

@@ -189,7 +189,7 @@ STRUCTURES = (
 
 
 def other_laws(description: RobotDescription) -> list[type[StrainLaw]]:
-    """Strain laws that all segments of a robot could have instead of their own, simplest first."""
+    """Return the other strain laws that all segments of a robot could have, simplest first."""
     own = {segment.strain_law for segment in description.segments}
     if len(own) != 1:
         return []

@@ -71,7 +71,7 @@ def dropouts(position: Array, length: float) -> Rows:
 
 
 def roughness(time: Array, position: Array) -> Array:
-    """Distance (N - 2,) of each position (N, 3) from the straight line between its neighbours."""
+    """Return distances (N - 2,) of positions (N, 3) from the line between their neighbours."""
     share = ((time[1:-1] - time[:-2]) / (time[2:] - time[:-2]))[:, None]
     line = (1 - share) * position[:-2] + share * position[2:]
     return np.asarray(norms(position[1:-1] - line))
@@ -148,7 +148,7 @@ def _away(
 
 
 def _slope(time: Array, position: Array, a: NDArray[np.int_], b: NDArray[np.int_]) -> Array:
-    """Velocities (K, 3) between rows a and b; zero where they are the same row."""
+    """Return velocities (K, 3) between rows a and b; zero where they are the same row."""
     between = time[b] - time[a]
     safe = np.where(between > 0, between, 1.0)
     return np.asarray((position[b] - position[a]) / safe[:, None])
@@ -158,7 +158,7 @@ def _slope(time: Array, position: Array, a: NDArray[np.int_], b: NDArray[np.int_
 
 
 def _cube() -> Array:
-    """Quaternions (24, 4) of the proper rotations of the cube; the identity is the first."""
+    """Return quaternions (24, 4) of the proper rotations of the cube; the identity comes first."""
     directions = np.array(list(product((-1.0, 0.0, 1.0), repeat=4)))
     directions = directions[np.isin(np.sum(directions != 0, axis=1), (1, 2, 4))]
     found = directions / norms(directions)[:, None]
@@ -359,5 +359,5 @@ def _turned(q: Array, version: NDArray[np.int_]) -> Array:
 
 
 def _product(a: Array, b: Array) -> Array:
-    """Hamilton products (N, 4) of rows."""
+    """Return the Hamilton products (N, 4) of rows."""
     return np.stack(lie.quaternion_product(a.T, b.T), axis=1)

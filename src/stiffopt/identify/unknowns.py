@@ -73,7 +73,7 @@ class Unknowns:
         return tuple(unknown for group in groups for unknown in group)
 
     def slices(self) -> tuple[slice, list[slice], list[slice], list[slice]]:
-        """Slices of `all`: the base's, and those of each sensor, each zero and each side."""
+        """Return slices of `all`: the base's, and those of each sensor, zero and side."""
         begin = len(self.parameters)
         found: list[slice] = []
         for group in (self.base, *self.sensors, *self.zeros, *self.sides):

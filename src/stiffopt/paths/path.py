@@ -279,7 +279,7 @@ class Path(ForRobot):
             raise BadKeyError(".".join(map(str, ("path", *error.loc))), str(error)) from None
 
     def _lengths(self, curve: Curve) -> Vector:
-        """Arc lengths (N,) of the points."""
+        """Return the arc lengths (N,) of the points."""
         if self.path.is_listed and isinstance(curve, Polyline):
             self._check_listed(curve)
             return curve.knots

@@ -125,14 +125,14 @@ class PathTasks:
     # -- local optima -----------------------------------------------------------------------
 
     def locals(self, questions: Sequence[Local]) -> list[PathCandidate | None]:
-        """Local optima next to guesses; None where none was found that holds."""
+        """Return the local optima near guesses; None where the search finds no valid one."""
         if self._fast is None:
             return [self._general(question) for question in questions]
         solver = self._fast[0]
         rows = [solver.next_to(self._row(q.point), q.guess, q.lower, q.upper) for q in questions]
         if not rows:
             return []
-        threads = None if len(rows) > 64 else 1  # a thread costs as much as some answers
+        threads = None if len(rows) > 64 else 1  # starting threads costs as much as several answers
         pressures, values = solver.optima(np.stack(rows), threads)
         pairs = zip(pressures, (-values).tolist(), strict=True)
         return [PathCandidate(p, value) if value > -np.inf else None for p, value in pairs]

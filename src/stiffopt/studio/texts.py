@@ -22,7 +22,7 @@ from stiffopt.optimise.solution import PressureSolution
 from stiffopt.plots import style
 from stiffopt.plots.wording import direction_text, gain_text, stiffness_text
 from stiffopt.studio.design import Design
-from stiffopt.studio.leaning import Leaning, contact_rows, leaning_rows
+from stiffopt.studio.leaning import contact_rows, leaning_rows
 from stiffopt.studio.rig_watch import RigWatch
 from stiffopt.studio.timeline import Timeline
 from stiffopt.studio.workbench import StudioAnswer, Workbench
@@ -45,7 +45,10 @@ def answer_html(bench: Workbench) -> str:
     """Return the panel's view of the solution: status, numbers and pressures."""
     answer = bench.answer
     if bench.leaning is not None:
-        return _padded(_headline("", _LEANING) + _table(_leaning_rows(bench.leaning)))
+        return _padded(
+            _headline("", _LEANING)
+            + _table((escape(name), escape(text)) for name, text in leaning_rows(bench.leaning))
+        )
     if answer is None:
         return _padded(_headline("failed" if bench.trouble else "", bench.trouble or _SEARCHING))
     solution = answer.solution
@@ -57,10 +60,6 @@ def answer_html(bench: Workbench) -> str:
         + _table(_rows(answer))
         + pressures_html(answer.robot.description, *_bars(answer))
     )
-
-
-def _leaning_rows(leaning: Leaning) -> Iterable[tuple[str, str]]:
-    return ((escape(name), escape(text)) for name, text in leaning_rows(leaning))
 
 
 def _padded(html: str) -> str:
