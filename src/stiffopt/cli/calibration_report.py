@@ -36,10 +36,10 @@ from stiffopt.model.parameters import Parameter
 from stiffopt.plots import calibration as plots
 from stiffopt.plots.wording import vector_text
 
-_MOST_REMARKS = 8  # on the terminal; the page has all
-_MOST_STIFFNESSES = 30
-_MOST_PAIRS = 3
-_MOST_DRAWN = 60  # measured stiffnesses
+_MAX_REMARKS = 8  # on the terminal; the page has all
+_MAX_STIFFNESSES = 30
+_MAX_PAIRS = 3
+_MAX_DRAWN = 60  # measured stiffnesses
 _ALL = "all"
 _NORMAL = 1.96  # standard deviations of a 95 % interval
 _OTHERS = "base in the tracker's frame, and sensors (moves from the robot file)"
@@ -60,17 +60,17 @@ def calibration(result: CalibrationResult, out: str, report: str | None) -> Rend
         blocks += [Text(""), errors_held_back(result).renderable()]
     if result.tables:
         rows = compare_stiffness(result.tables, result.before, result.robot)
-        blocks += [Text(""), stiffnesses_compared(rows[:_MOST_STIFFNESSES]).renderable()]
-        blocks += _more(len(rows) - _MOST_STIFFNESSES, "of these", report)
+        blocks += [Text(""), stiffnesses_compared(rows[:_MAX_STIFFNESSES]).renderable()]
+        blocks += _more(len(rows) - _MAX_STIFFNESSES, "of these", report)
     for table in fitted_numbers(result, beginnings=False):
         blocks += [Text(""), table.renderable()]
     found = [f"{each.name}: {remark}" for each in result.calibrated for remark in each.remarks]
     blocks += _list("What was found in the logs", found, report)
     own = [remark for remark in result.remarks if remark not in found]
     pairs = [remark for remark in own if remark.startswith(TIED)]
-    hidden = pairs[_MOST_PAIRS:]
+    hidden = pairs[_MAX_PAIRS:]
     kept = [remark for remark in own if remark not in hidden]
-    blocks += _list("What to make of it", kept, report, most=None)
+    blocks += _list("What to make of it", kept, report, limit=None)
     blocks += _more(len(hidden), f"of '{TIED}'", report)
     blocks += [Text(""), Text(f"  robot file  {printable(out)}")]
     if report is not None:
@@ -87,7 +87,7 @@ def validation(
     covered = coverage_table(found)
     if covered.rows:
         blocks += [Text(""), covered.renderable()]
-    blocks += _list("Training range", range_remarks(robot, found), report, most=None)
+    blocks += _list("Training range", range_remarks(robot, found), report, limit=None)
     remarks = [f"{each.name}: {remark}" for each in found for remark in each.remarks]
     blocks += _list("What was found in the logs", remarks, report)
     if report is not None:
@@ -96,11 +96,11 @@ def validation(
 
 
 def _list(
-    heading: str, remarks: Sequence[str], report: str | None, most: int | None = _MOST_REMARKS
+    heading: str, remarks: Sequence[str], report: str | None, limit: int | None = _MAX_REMARKS
 ) -> list[RenderableType]:
     if not remarks:
         return []
-    shown = remarks if most is None else remarks[:most]
+    shown = remarks if limit is None else remarks[:limit]
     grid = Table.grid(padding=(0, 1), pad_edge=False)
     grid.add_column(no_wrap=True)
     grid.add_column(overflow="fold")
@@ -221,7 +221,7 @@ def _stiffness(page: MarkdownPage, result: CalibrationResult) -> None:
     if rows:
         page.figure(
             "stiffness.png", "Stiffness, measured and predicted",
-            plots.plot_stiffnesses(rows[:_MOST_DRAWN], title=f"{result.robot.name}: stiffness"),
+            plots.plot_stiffnesses(rows[:_MAX_DRAWN], title=f"{result.robot.name}: stiffness"),
         )  # fmt: skip
 
 

@@ -358,9 +358,9 @@ def _check_force(rig: Rig, channel: int, pressure: float) -> None:
     alone[channel] = pressure
     force = rig.force(alone)
     if rig.max_force is not None and force > rig.max_force:
-        most = pressure * rig.max_force / force
+        allowed = pressure * rig.max_force / force
         raise InputError(
             f"channel {channel + 1} cannot have {pressure * 1e-5:g} bar: that is {force:.3g} N, "
-            f"and the rig file's safety.max_force is {rig.max_force:g} N, or {most * 1e-5:.3g} bar "
-            "of this channel"
+            f"and the rig file's safety.max_force is {rig.max_force:g} N, or "
+            f"{allowed * 1e-5:.3g} bar of this channel"
         )

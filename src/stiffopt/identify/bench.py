@@ -147,15 +147,15 @@ def run_bench(
             raise InputError(f"there is no method '{name}'; expected some of {', '.join(METHODS)}")
     if set(methods) & LEARNT:
         require_package("scikit-learn", "baselines", "sklearn")
-    there = [
+    available = [
         arm
         for arm in bench.arms
         if all((folder / each).exists() for each in (*arm.train, *arm.test))
     ]
-    if not there:
+    if not available:
         raise InputError(f"{folder}: none of the arms of the bench has its files here")
-    total = len(there) * len(methods)
-    for i, arm in enumerate(there):
+    total = len(available) * len(methods)
+    for i, arm in enumerate(available):
         robot = load_description(arm.robot, base=base)
         logs = {name: read_log(folder / name) for name in (*arm.train, *arm.test)}
         settings = CalibrationSettings(rows=rows, trial_rows=rows, sequence=arm.sequence)
@@ -192,12 +192,12 @@ class BenchTask:
         """Return logs as stiffopt reads them: in the robot's order of channels, without faults."""
         return recordings_of(self.robot, [(name, self.logs[name]) for name in names], self.settings)
 
-    def chosen(self, recording: Recording, most: int) -> tuple[Array, Array]:
+    def chosen(self, recording: Recording, limit: int) -> tuple[Array, Array]:
         """Return lagged pressures (N, n), as shares of the maximum, and tips (N, 3) in m.
 
-        Of at most `most` rows.
+        Of at most `limit` rows.
         """
-        rows = chosen_rows(recording, most)
+        rows = chosen_rows(recording, limit)
         p = recording.pressures / np.max(self.robot.pressure_max)
         return lagged(recording.time, p, _LAG)[rows], recording.tracks[0].position[rows]
 

@@ -54,10 +54,10 @@ def on_one_clock(recording: Recording, span: Array) -> Recording:
         )
         return np.array([_unexplained(np.column_stack(each), tip[rows]) for each in moved])
 
-    most = min(DETECTION.clock_most, DETECTION.clock_share * float(time[-1] - time[0]))
+    longest = min(DETECTION.clock_most, DETECTION.clock_share * float(time[-1] - time[0]))
     step = max(2 * float(np.median(np.diff(time))), 0.2)
     usual = misfits(np.linspace(-step, DETECTION.clock_usual, 12)).min()
-    coarse = np.linspace(-most, most, DETECTION.clock_shifts)
+    coarse = np.linspace(-longest, longest, DETECTION.clock_shifts)
     near = coarse[np.argmin(misfits(coarse))]
     fine = np.linspace(near - coarse[1] + coarse[0], near + coarse[1] - coarse[0], 21)
     found = misfits(fine)

@@ -37,7 +37,7 @@ from stiffopt.model.calibration import ErrorModel, distances_from, growth
 Array = NDArray[np.float64]
 Rows = NDArray[np.bool_]
 
-_LEAST_FREEDOM = 4.0  # of a t-distribution; below, its covariance says little
+_MIN_FREEDOM = 4.0  # of a t-distribution; below, its covariance says little
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +72,7 @@ def error_model(
         discrepancy=float(f"{discrepancy:.4g}"),
         reach=float(f"{reaches[index]:.4g}"),
         gain=ERRORS.gain,
-        degrees_of_freedom=float(f"{_LEAST_FREEDOM + tail:.3g}"),
+        degrees_of_freedom=float(f"{_MIN_FREEDOM + tail:.3g}"),
         settled=settled,
         moving=moving,
         recorded=tuple(map(tuple, np.round(kept, -1).tolist())),
@@ -174,7 +174,7 @@ class _Fold:
             + discrepancy**2 * (self.through_fit[index] + self.direct[index])
             + residual**2 * np.eye(3)
         )
-        v = _LEAST_FREEDOM + tail
+        v = _MIN_FREEDOM + tail
         squares = np.einsum(
             "ni,ni->n", self.errors,
             np.linalg.solve(covariance, self.errors[..., np.newaxis])[..., 0],
@@ -197,9 +197,10 @@ def _weights(pressures: Array, reach: float, independent: float) -> Array:
     as are independent in time.
     """
     cells = len(np.unique(np.round(pressures / reach), axis=0))
-    most = len(pressures) / independent
+    independent_rows = len(pressures) / independent
     return np.full(
-        len(pressures), min(max(most, 1.0), ERRORS.per_cell * cells) / max(len(pressures), 1)
+        len(pressures),
+        min(max(independent_rows, 1.0), ERRORS.per_cell * cells) / max(len(pressures), 1),
     )
 
 

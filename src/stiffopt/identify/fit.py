@@ -61,7 +61,7 @@ class Fit:
 def fit(
     problem: CalibrationProblem,
     starts: Sequence[Array],
-    tell: Callable[[], None] = lambda: None,
+    on_evaluation: Callable[[], None] = lambda: None,
     rounds: int = FIT.rounds,
     most: int = FIT.evaluations,
 ) -> Fit:
@@ -72,22 +72,22 @@ def fit(
     problem : CalibrationProblem
     starts : sequence of (d,)
         Scaled coordinates.
-    tell : called at every evaluation of the problem, to show progress; it may raise to stop.
+    on_evaluation : called at every evaluation of the problem; it may raise to stop the fit.
     rounds : how often noise and weights are estimated anew and the fit is repeated.
     most : largest number of evaluations of the problem from each start, and in each round.
     """
     different = {start.tobytes(): start for start in starts}.values()
-    begun = [_minimum(problem, start, tell, most) for start in different]
+    begun = [_minimum(problem, start, on_evaluation, most) for start in different]
     x, cost = min(begun, key=lambda found: found[1])
     independent = 1.0
     for _ in range(rounds):
         problem, independent = _reweighted(problem, x, independent)
-        x, cost = _minimum(problem, x, tell, most)
+        x, cost = _minimum(problem, x, on_evaluation, most)
     return Fit(problem, x, cost, *_covariance(problem, x), independent)
 
 
 def _minimum(
-    problem: CalibrationProblem, start: Array, tell: Callable[[], None], most: int
+    problem: CalibrationProblem, start: Array, on_evaluation: Callable[[], None], most: int
 ) -> tuple[Array, float]:
     """Return scaled coordinates (d,) of a minimum near a start, and its cost."""
     from scipy.optimize import least_squares  # a large library; only fits need it
@@ -97,7 +97,7 @@ def _minimum(
     def both(x: Array) -> tuple[Array, Array]:
         key = x.tobytes()
         if key not in memory:
-            tell()
+            on_evaluation()
             memory.clear()
             value, slope = problem.residuals(x)
             # the solver takes back a step to where the model fails; elsewhere it needs slopes

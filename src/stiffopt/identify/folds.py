@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 Rows = NDArray[np.bool_]
 
 
-def held_back(found: Fit, settle: float, tell: Callable[[], None]) -> dict[str, HeldBack]:
+def held_back(found: Fit, settle: float, on_evaluation: Callable[[], None]) -> dict[str, HeldBack]:
     """Hold back each fold in turn, fit the other rows, and predict the fold.
 
     Parameters
@@ -32,7 +32,7 @@ def held_back(found: Fit, settle: float, tell: Callable[[], None]) -> dict[str, 
     found : fit to all rows, at which the other fits begin.
     settle : time in s. A held-back log whose initial state or zero is unknown keeps this much of
         its beginning in the fit, since a prediction of it would also use that.
-    tell : called at every evaluation.
+    on_evaluation : called at every evaluation.
 
     Returns
     -------
@@ -50,7 +50,9 @@ def held_back(found: Fit, settle: float, tell: Callable[[], None]) -> dict[str, 
         if not any(each.any() for each in kept):
             continue  # the log is shorter than its beginning
         rows = np.concatenate(kept)
-        others = fit(problem.without(kept), [found.x], tell, rounds=0, most=CHOICE.evaluations)
+        others = fit(
+            problem.without(kept), [found.x], on_evaluation, rounds=0, most=CHOICE.evaluations
+        )
         distances = np.linalg.norm(others.predicted.errors[0], axis=1)
         errors = Errors.of(distances[rows], None)
         if errors.n:

@@ -22,8 +22,8 @@ from stiffopt.model.history import NO_HISTORY, History, part_of
 Array = NDArray[np.float64]
 
 _CHUNKS = (1, 8, 32, 128, 512, 2048)  # rows per call; shorter blocks are padded
-_MOST_FILLED = 0.25  # largest padded share of a chunk; beyond it, a smaller chunk is run
-_WORTH_FILLING = 128  # rows from which machine code pays, though it always runs the largest chunk
+_MAX_PADDING = 0.25  # largest padded share of a chunk; beyond it, a smaller chunk is run
+_WORTH_PADDING = 128  # rows from which machine code pays, though it always runs the largest chunk
 _WORTH_COMPILING = 100_000  # rows from which machine code pays; compiling takes a second
 _TIMES = 3  # lag, falling lag and dead time
 
@@ -225,10 +225,10 @@ class _HistoryRun:
 
     def _at_once(self, count: int) -> int:
         """Return the chunk to run for `count` remaining rows; a larger one means padding."""
-        if self._compiled is not None and count >= _WORTH_FILLING:
+        if self._compiled is not None and count >= _WORTH_PADDING:
             return _CHUNKS[-1]
         enough = next((rows for rows in _CHUNKS if rows >= count), _CHUNKS[-1])
-        if count >= (1 - _MOST_FILLED) * enough:
+        if count >= (1 - _MAX_PADDING) * enough:
             return enough
         return next(rows for rows in reversed(_CHUNKS) if rows <= count)
 

@@ -83,8 +83,8 @@ class Recording:
         for track in self.tracks:
             if track.name == name:
                 return track
-        there = ", ".join(track.name for track in self.tracks)
-        raise FileError(self.name, f"there is no track {shown(name)}; the tracks are {there}")
+        available = ", ".join(track.name for track in self.tracks)
+        raise FileError(self.name, f"there is no track {shown(name)}; the tracks are {available}")
 
 
 def prepare(
@@ -124,8 +124,8 @@ def prepare(
     for body in (*bodies, *([frame] if frame is not None else [])):
         if body not in log.bodies:
             others = ", ".join(log.bodies)
-            there = f"the bodies there are {others}" if others else "there is none but the tip"
-            raise FileError(name, f"there is no body {shown(body)}; {there}")
+            available = f"the bodies there are {others}" if others else "there is none but the tip"
+            raise FileError(name, f"there is no body {shown(body)}; {available}")
     if len(set(bodies)) < len(tuple(bodies)):
         raise InputError(f"a body is asked for twice: {', '.join(bodies)}")
     remarks = _check_time(name, log.time)
@@ -165,13 +165,14 @@ def prepare(
     return Recording(name, log.time, p, before, kept, remarks)
 
 
-def _columns(there: int, channels: Sequence[int] | None, wanted: int) -> list[int]:
+def _columns(available: int, channels: Sequence[int] | None, wanted: int) -> list[int]:
     """Return the log's column, from 0, of each channel of the robot."""
     if channels is None:
-        if there != wanted:
+        if available != wanted:
             raise InputError(
-                f"the log has {there} pressures and the robot {wanted} channels; say for each "
-                f"channel of the robot which column of the log, from 1 to {there}, is its pressure"
+                f"the log has {available} pressures and the robot {wanted} channels; say for each "
+                f"channel of the robot which column of the log, from 1 to {available}, is its "
+                "pressure"
             )
         return list(range(wanted))
     chosen = [int(column) for column in channels]
@@ -181,9 +182,9 @@ def _columns(there: int, channels: Sequence[int] | None, wanted: int) -> list[in
             "expected one for each"
         )
     for column in chosen:
-        if not 1 <= column <= there:
+        if not 1 <= column <= available:
             raise InputError(
-                f"there is no pressure column {column}; expected a number from 1 to {there}"
+                f"there is no pressure column {column}; expected a number from 1 to {available}"
             )
         if chosen.count(column) > 1:
             raise InputError(

@@ -214,8 +214,8 @@ class Setup:
         total = sum(len(recording.time) for recording in self.recordings)
         found = []
         for recording, begin in zip(self.recordings, self.begins, strict=True):
-            most = max(10, rows * len(recording.time) // total)
-            found.append(sampled(recording, chosen_rows(recording, most), self.span, begin))
+            limit = max(10, rows * len(recording.time) // total)
+            found.append(sampled(recording, chosen_rows(recording, limit), self.span, begin))
         return found
 
     def problem(self, structure: ModelStructure, rows: int) -> CalibrationProblem:
@@ -306,12 +306,12 @@ class Setup:
 # rows ---------------------------------------------------------------------------------------------
 
 
-def chosen_rows(recording: Recording, most: int) -> Rows:
-    """Return at most `most` rows (M,) in which the tip was measured, evenly spread."""
+def chosen_rows(recording: Recording, limit: int) -> Rows:
+    """Return at most `limit` rows (M,) in which the tip was measured, evenly spread."""
     usable = np.flatnonzero(np.isfinite(recording.tracks[0].position).all(axis=1))
-    if len(usable) <= most:
+    if len(usable) <= limit:
         return usable
-    chosen: Rows = usable[np.linspace(0, len(usable) - 1, most).round().astype(np.intp)]
+    chosen: Rows = usable[np.linspace(0, len(usable) - 1, limit).round().astype(np.intp)]
     return chosen
 
 

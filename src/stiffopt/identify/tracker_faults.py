@@ -99,7 +99,7 @@ def jumps(time: Array, position: Array, reach: Array, length: float) -> Rows:
     usual = (
         TRACKER.jump_sigmas * float(np.median(roughness(time[seen], position[seen]))) / MEDIAN_NORM
     )
-    least = max(usual, TRACKER.jump_least * length)
+    threshold = max(usual, TRACKER.jump_least * length)
     pause = TRACKER.jump_pause * float(np.median(np.diff(time[seen])))
     for count in 2 * (
         *range(1, TRACKER.jump_rows + 1),
@@ -107,31 +107,33 @@ def jumps(time: Array, position: Array, reach: Array, length: float) -> Rows:
         rows = np.flatnonzero(whole(position) & ~bad)
         if len(rows) < count + 2:
             break
-        found = _away(time[rows], position[rows], reach[rows], count, least, pause)
+        found = _away(time[rows], position[rows], reach[rows], count, threshold, pause)
         for k in range(count):
             bad[rows[found + k]] = True
     return bad
 
 
 def _away(
-    time: Array, position: Array, reach: Array, count: int, least: float, pause: float
+    time: Array, position: Array, reach: Array, count: int, threshold: float, pause: float
 ) -> NDArray[np.int_]:
     """Return the first row of each run of `count` rows that jumps away from both neighbours."""
     last = len(time) - 1
     step = norms(np.diff(position, axis=0))
-    some = 1 - 1 / TRACKER.jump_factor  # of `least`: no run that is found starts or ends with less
-    large = step > some * least
+    share = (
+        1 - 1 / TRACKER.jump_factor
+    )  # of `threshold`: no run that is found starts or ends with less
+    large = step > share * threshold
     before = np.flatnonzero(large[: len(step) - count] & large[count:])
     after = before + count + 1
     soon = time[after] - time[before] <= pause * (count + 1)
     before, after = before[soon], after[soon]
     around = np.concatenate([before + k for k in (-3, -2, -1)] + [after + k for k in (0, 1, 2)])
-    there = (around >= 0) & (around < len(step))
-    steps = np.where(there, step[np.clip(around, 0, len(step) - 1)], 0.0).reshape(6, -1)
+    inside = (around >= 0) & (around < len(step))
+    steps = np.where(inside, step[np.clip(around, 0, len(step) - 1)], 0.0).reshape(6, -1)
     across = norms(position[after] - position[before])
     ordinary = np.maximum(np.median(steps, axis=0), across)
     moved = reach[after - 1] - reach[np.maximum(before - 1, 0)]
-    limit = np.maximum(least, TRACKER.jump_factor * ordinary) + moved
+    limit = np.maximum(threshold, TRACKER.jump_factor * ordinary) + moved
 
     earlier, later = np.maximum(before - 1, 0), np.minimum(after + 1, last)
     lines = (

@@ -104,7 +104,7 @@ def _with_frames_found(setup: Setup, found: tuple[Comparison, ...]) -> tuple[Com
 def compare(
     setup: Setup,
     known: Mapping[str, float] | None = None,
-    tell: Callable[[], None] = lambda: None,
+    on_evaluation: Callable[[], None] = lambda: None,
 ) -> tuple[Comparison, ...]:
     """Predict the recordings of a setup and compare.
 
@@ -112,7 +112,7 @@ def compare(
     ----------
     setup : Setup
     known : scaled coordinates of zeros and initial states by name, as far as a fit has found them.
-    tell : called at every evaluation.
+    on_evaluation : called at every evaluation.
     """
     description, recordings = setup.description, setup.recordings
     most = setup.settings.compared_rows if any(description.gravity) else SAMPLING.rows
@@ -123,7 +123,7 @@ def compare(
         samples.append(sampled(recording, rows, setup.span, begin))
         kept.append(rows)
     samples = setup.oriented(description, samples)
-    unknowns, x = _beginnings(setup, samples, known or {}, tell)
+    unknowns, x = _beginnings(setup, samples, known or {}, on_evaluation)
     problem = CalibrationProblem(description, unknowns, samples, setup.points, setup.base, NOISE)
     predicted = problem.predict(x)
     return tuple(
@@ -135,7 +135,10 @@ def compare(
 
 
 def _beginnings(
-    setup: Setup, samples: Sequence[Sample], known: Mapping[str, float], tell: Callable[[], None]
+    setup: Setup,
+    samples: Sequence[Sample],
+    known: Mapping[str, float],
+    on_evaluation: Callable[[], None],
 ) -> tuple[Unknowns, Array]:
     """Return zeros and initial states, known or estimated from the logs' beginnings."""
     all_zeros, all_sides = setup.beginnings(setup.description, samples)
@@ -158,7 +161,7 @@ def _beginnings(
                 setup.base,
                 _noise(setup.description),
             )
-            x = fit(problem, [x], tell, rounds=0).x
+            x = fit(problem, [x], on_evaluation, rounds=0).x
         found_zeros.append(x[: len(zeros)])
         found_sides.append(x[len(zeros) :])
     unknowns = Unknowns((), (), sensors, all_zeros, all_sides)
@@ -186,9 +189,9 @@ def _comparison(
     angle = None
     track = sample.recording.track(tip.name)
     if track.rotation is not None:
-        there = track.rotation[sample.rows] @ tip.sensor[:3, :3].T[:, 2]
+        axis = track.rotation[sample.rows] @ tip.sensor[:3, :3].T[:, 2]
         expected = setup.base[:3, :3] @ predicted.poses[0][own, :3, 2, np.newaxis]
-        cosine = np.einsum("ni,ni->n", there, expected[..., 0])
+        cosine = np.einsum("ni,ni->n", axis, expected[..., 0])
         angle = np.arccos(np.clip(cosine, -1, 1))
     pressures = recording.pressures[rows]
     inside = np.ones(len(rows), dtype=bool)

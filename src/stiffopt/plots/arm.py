@@ -23,7 +23,7 @@ TUBE_STATIONS = 24
 _SPOKES = 28  # points around the tube
 _ALONG = 24  # points along an arrow, which labels avoid
 _SMALL = 4.0  # inches, width below which a panel counts as small
-_LEAST_SIDES = (0.5, 0.3, 0.5)  # smallest sides of the box, as shares of the longest
+_MIN_SIDES = (0.5, 0.3, 0.5)  # smallest sides of the box, as shares of the longest
 
 
 def draw_arm(
@@ -222,7 +222,7 @@ class ArmDrawing:
         low, high = points.min(axis=0), points.max(axis=0)
         sides = (high - low) + 0.04 * self.size
         sides = np.maximum(
-            sides, sides.max() * np.array(_LEAST_SIDES)
+            sides, sides.max() * np.array(_MIN_SIDES)
         )  # room for the labels of a slender arm
         width = self.axes.get_position().width * self.axes.figure.get_figwidth()  # inches
         for name, start, side in zip("xyz", (low + high - sides) / 2, sides, strict=True):

@@ -36,8 +36,8 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-_MOST = 8  # logs in a figure: those with the largest errors
-_MOST_PATHS = 4  # logs in a figure of paths
+_MAX_LOGS = 8  # logs in a figure: those with the largest errors
+_MAX_PATHS = 4  # logs in a figure of paths
 _DRAWN = 3000  # points of a line
 _SCATTERED = 1200  # points of a log in a scatter plot
 _OUTSIDE = "#f2a541"
@@ -51,7 +51,7 @@ _FEW = 30  # distinct pressures up to which logs are drawn side by side
 _ASIDE = 0.015  # distance of logs side by side, as a share of the pressures' range
 _PAUSE_STEPS = 5.0  # a pause in a recording exceeds this many median time steps, ...
 _PAUSE = 1.0  # ... and this many seconds
-_LEAST_RANGE = 1e-3  # m, smallest range of an axis of the tip
+_MIN_RANGE = 1e-3  # m, smallest range of an axis of the tip
 _FLAT = 0.25  # smallest range of an axis, as a share of the widest of x, y and z
 
 
@@ -111,7 +111,7 @@ def plot_tip_over_time(
             axes.set_ylabel(f"{'xyz'[axis]} ({unit})")
             if axis == 0:
                 _panel_title(axes, each)
-            _room(axes, both[:, axis], max(_FLAT * widest, unit.of(_LEAST_RANGE)))
+            _room(axes, both[:, axis], max(_FLAT * widest, unit.of(_MIN_RANGE)))
     for axes in panels[-1]:
         axes.set_xlabel("time (s)")
     _key(figure, panels[0, 0], found)
@@ -123,7 +123,7 @@ def plot_paths(
     found: Sequence[Comparison], *, title: str = "paths", frame: str = "the tracker's frame"
 ) -> Figure:
     """Draw the measured and the predicted path of the tip in three views, a row for each log."""
-    shown, unit = _worst(found, _MOST_PATHS), display_units().length
+    shown, unit = _worst(found, _MAX_PATHS), display_units().length
     figure, panels = _rows(len(shown), 3.3 if len(shown) == 1 else 2.6, columns=3)
     for row, i in enumerate(shown):
         each = found[i]
@@ -326,12 +326,12 @@ def _rows(rows: int, height: float, *, columns: int = 1, **settings: Any) -> tup
     return stacked_panels([height] * rows, columns=columns, **settings)
 
 
-def _worst(found: Sequence[Comparison], most: int = _MOST) -> list[int]:
+def _worst(found: Sequence[Comparison], limit: int = _MAX_LOGS) -> list[int]:
     """Return the indices of the logs with the largest errors, in order."""
-    if len(found) <= most:
+    if len(found) <= limit:
         return list(range(len(found)))
     errors = np.nan_to_num(np.array([each.errors.p95 for each in found]))
-    return sorted(np.argsort(errors)[::-1][:most].tolist())
+    return sorted(np.argsort(errors)[::-1][:limit].tolist())
 
 
 def _note(what: str, found: Sequence[Comparison], shown: Sequence[int]) -> str:
@@ -369,8 +369,8 @@ def _path(time: Array, values: Array) -> Array:
     return np.asarray(np.insert(points, pauses, np.nan, axis=0))
 
 
-def _evenly(count: int, most: int) -> NDArray[np.intp]:
-    return np.unique(np.linspace(0, count - 1, min(count, most)).astype(np.intp))
+def _evenly(count: int, limit: int) -> NDArray[np.intp]:
+    return np.unique(np.linspace(0, count - 1, min(count, limit)).astype(np.intp))
 
 
 def _shade_outside(axes: Any, found: Comparison) -> None:
@@ -391,12 +391,12 @@ def _limit_decades(axes: Any, found: Sequence[Comparison], before: Sequence[Comp
         axes.set_ylim(np.quantile(known, 0.002) * 0.8, known.max() * 1.2)
 
 
-def _room(axes: Any, values: Array, least: float) -> None:
-    """Set the limits of the axis around values, with a margin and at least a range of `least`."""
+def _room(axes: Any, values: Array, minimum: float) -> None:
+    """Set the limits of the axis around values, with a margin and at least a range of `minimum`."""
     known = values[np.isfinite(values)]
     if len(known):
         middle, half = (known.max() + known.min()) / 2, (known.max() - known.min()) / 2
-        half = max(1.08 * half, least / 2)
+        half = max(1.08 * half, minimum / 2)
         axes.set_ylim(middle - half, middle + half)
 
 

@@ -113,10 +113,10 @@ class _CoveredCells:
     def cover(self, points: Vector, radius: float) -> None:
         """Mark squares around points (k, 3) as covered; the radius is in points."""
         reach = round(radius * self.pixels / _CELL) + 1
-        most = np.array(self.cells.shape) - 1
+        bounds = np.array(self.cells.shape) - 1
         cells = (self.at(points) // _CELL).astype(int)
         for shift in np.ndindex(2 * reach + 1, 2 * reach + 1):
-            at = np.clip(cells + shift - reach, 0, most)
+            at = np.clip(cells + shift - reach, 0, bounds)
             self.cells[at[:, 0], at[:, 1]] = 1.0
 
     def put(self, label: PlacedLabel) -> None:
@@ -151,7 +151,7 @@ class _CoveredCells:
 
     def _of(self, low: Vector, high: Vector) -> Vector:
         """Return the cells of a box in pixels; cells at the edge for a box outside the axes."""
-        most = np.array(self.cells.shape)
-        first = np.clip((low // _CELL).astype(int), 0, most - 1)
-        last = np.clip((high // _CELL).astype(int) + 1, first + 1, most)
+        bounds = np.array(self.cells.shape)
+        first = np.clip((low // _CELL).astype(int), 0, bounds - 1)
+        last = np.clip((high // _CELL).astype(int) + 1, first + 1, bounds)
         return self.cells[first[0] : last[0], first[1] : last[1]]

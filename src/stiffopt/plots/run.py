@@ -39,7 +39,7 @@ _WIDE = 11.5  # inches
 _HEAD = 1.82  # inches, title and four lines
 _PANEL, _GAP, _ROW, _LINE = 1.35, 0.16, 0.24, 0.2
 _FOOT = 0.62
-_MOST_EVENTS = 14  # in the list
+_MAX_EVENTS = 14  # in the list
 _FLOOR = 1e-5  # m; smaller errors are drawn here
 _SMALLEST_RANGE = 2e-3  # m, of an axis of the tip
 _BELOW_ZERO = 3e3  # Pa, shown below zero on axes of pressure
@@ -52,7 +52,7 @@ _STATES = {
 }
 _SEVERITIES = {"info": "#4e79a7", "warning": "#e0a100", "error": "#b00020"}
 _ALARM = "#e07b39"
-_MOST_ALARMS = 6  # kinds of alarms that have a row
+_MAX_ALARMS = 6  # kinds of alarms that have a row
 _HALF = 0.36  # half width of a band, as a share of a row
 _LONGEST = 20  # letters of a name
 _LETTER_WIDTH = 0.0095  # of the panel's width
@@ -120,10 +120,10 @@ def _draw_tip(axes: Any, run: RecordedRun, axis: int) -> None:
             label="target",
         )  # fmt: skip
     low, high = axes.get_ylim()
-    least = unit.of(_SMALLEST_RANGE)
-    if high - low < least:  # else noise would look like motion
+    minimum = unit.of(_SMALLEST_RANGE)
+    if high - low < minimum:  # else noise would look like motion
         middle = (low + high) / 2
-        axes.set_ylim(middle - least / 2, middle + least / 2)
+        axes.set_ylim(middle - minimum / 2, middle + minimum / 2)
     axes.set_ylabel(f"tip {'xyz'[axis]} ({unit})")
     legend_beside(axes)
 
@@ -261,7 +261,7 @@ def _listed(events: tuple[Event, ...]) -> list[Event]:
         return {"error": 0, "warning": 1}.get(event.severity, 2) + over, index
 
     order = sorted(range(len(events)), key=rank)
-    return [events[i] for i in sorted(order[:_MOST_EVENTS])]
+    return [events[i] for i in sorted(order[:_MAX_EVENTS])]
 
 
 def _what(run: RecordedRun) -> str:
@@ -362,5 +362,5 @@ def _alarm_kinds(run: RecordedRun) -> list[str]:
     stood: dict[str, float] = {}
     for span in run.alarms:
         stood[span.kind] = stood.get(span.kind, 0.0) + span.end - span.begin
-    kept = sorted(stood, key=lambda kind: -stood[kind])[:_MOST_ALARMS]
+    kept = sorted(stood, key=lambda kind: -stood[kind])[:_MAX_ALARMS]
     return [kind for kind in stood if kind in kept]

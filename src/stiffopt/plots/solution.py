@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 Vector = NDArray[np.float64]
 
-_MOST_LABELS = 15  # largest number of pressures with a number on their bar
+_MAX_LABELS = 15  # largest number of pressures with a number on their bar
 _NEAR_BOUND = 0.06  # of the axis; a bar nearer to its limit has its number above the limit
 _BOLD_NUMBER = 3.4  # width of "1.234", in font sizes
 _ELLIPSOID_SHARE = 0.22  # largest semi-axis, as a share of the arm's length
@@ -186,7 +186,7 @@ def draw_pressures(axes: Any, robot: Manipulator, solution: PressureSolution) ->
     colours = [style.AT_LIMIT if at else style.WITHIN_LIMITS for at in at_limit]
     axes.bar(places, values, width=0.62, color=colours, zorder=3)
     top = max(upper.max(), 0.0) - min(lower.min(), 0.0)
-    if len(values) <= _MOST_LABELS:
+    if len(values) <= _MAX_LABELS:
         wide = axes.bbox.width / axes.get_figure(root=True).dpi * 72 / (np.ptp(places) + 1.5)
         size = min(9.0, wide / _BOLD_NUMBER)
         for place, value, bound, colour in zip(places, values, upper, colours, strict=True):
@@ -430,8 +430,8 @@ class _Drawing(ArmDrawing):
         self.add_body(np.stack([x, y, z], axis=-1).reshape(-1, 3))
         longest = ways[:, -1] * np.copysign(radii[-1], self.rotation[:, 2] @ ways[:, -1])
         unit = display_units().stiffness
-        most = unit.text(values[-1], FIGURES)
-        self.add_label(self.tip + longest, f"ellipsoid\n{most}", style.ELLIPSOID)
+        largest = unit.text(values[-1], FIGURES)
+        self.add_label(self.tip + longest, f"ellipsoid\n{largest}", style.ELLIPSOID)
         listed = ", ".join(unit.number(value, FIGURES) for value in values[::-1])
         self.add_patch(
             style.ELLIPSOID, f"stiffness ellipsoid, radius² ∝ k:\n{listed} {unit}\nalong its axes"

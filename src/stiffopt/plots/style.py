@@ -229,14 +229,14 @@ _STEPS = (
 """Ticks of a decade, from few to many."""
 
 
-def round_steps(low: float, high: float, most: int = 8) -> Array:
-    """Return at most about `most` round numbers between two, evenly spread on a log scale."""
+def round_steps(low: float, high: float, limit: int = 8) -> Array:
+    """Return at most about `limit` round numbers between two, evenly spread on a log scale."""
     decades = range(int(np.floor(np.log10(low))), int(np.ceil(np.log10(high))) + 1)
     found: list[float] = []
     for steps in _STEPS:
         ticks = [float(step) * 10.0**decade for decade in decades for step in steps]
         ticks = [tick for tick in ticks if low * 0.999 <= tick <= high * 1.001]
-        if len(found) >= 2 and len(ticks) > most:
+        if len(found) >= 2 and len(ticks) > limit:
             break
         found = ticks
     return np.array(found)
@@ -248,19 +248,19 @@ def make_logarithmic(axes: Any) -> None:
     label_logarithmic(axes.yaxis, *axes.get_ylim())
 
 
-def label_logarithmic(axis: Any, low: float, high: float, most: int = 8) -> None:
+def label_logarithmic(axis: Any, low: float, high: float, limit: int = 8) -> None:
     """Put plain round numbers on a logarithmic axis."""
     from matplotlib.ticker import FixedLocator, NullLocator
 
-    axis.set_major_locator(FixedLocator(list(round_steps(low, high, most))))
+    axis.set_major_locator(FixedLocator(list(round_steps(low, high, limit))))
     axis.set_minor_locator(NullLocator())
     axis.set_major_formatter(lambda value, _: f"{value:.5g}")
 
 
-def thinned(time: Array, values: Array, most: int = 4000) -> tuple[Array, Array]:
-    """Return a line with at most about `most` points that shows the same extremes."""
+def thinned(time: Array, values: Array, limit: int = 4000) -> tuple[Array, Array]:
+    """Return a line with at most about `limit` points that shows the same extremes."""
     count = len(time)
-    size = -(-2 * count // most)
+    size = -(-2 * count // limit)
     if size <= 2:
         return time, values
     bins = count // size

@@ -20,13 +20,13 @@ On = Callable[[str, Callable[[Design, Any], Design]], Callable[[Any], None]]
 """Takes the kind of a change and a function of design and input; returns viser's callback."""
 
 _GRAM, _MILLINEWTON = DisplayUnit("g", 1e3), DisplayUnit("mN", 1e3)
-_MOST_FORCE = 0.2  # N
+_MAX_FORCE = 0.2  # N
 _ANGULAR: dict[str, Angular] = {
     "any direction": "any",
     "pointing": "pointing",
     "full orientation": "orientation",
 }
-_MAXIMISE, _LEAST, _FILE = "stiff along a direction", "least pressure", "as in the file"
+_MAXIMISE, _LEAST_PRESSURE, _FILE = "stiff along a direction", "least pressure", "as in the file"
 _GRAVITY = {
     "none": (0.0, 0.0, 0.0),
     "standing": (0.0, 0.0, -9.81),
@@ -104,7 +104,7 @@ class StiffnessInputs:
     """
 
     def __init__(self, gui: Any, on: On, design: Design) -> None:
-        options: tuple[str, ...] = (_MAXIMISE, _LEAST)
+        options: tuple[str, ...] = (_MAXIMISE, _LEAST_PRESSURE)
         if design.measure is None and design.task.stiffness is not None:
             options = (*options, _FILE)
         self._given = design.task.stiffness
@@ -125,7 +125,7 @@ class StiffnessInputs:
             box.on_update(on(key, partial(_with_choice, key)))
 
     def _with_goal(self, design: Design, goal: str) -> Design:
-        if goal == _LEAST:
+        if goal == _LEAST_PRESSURE:
             return design.with_least_pressure()
         if goal == _FILE:
             return design.with_task(stiffness=self._given)
@@ -134,7 +134,7 @@ class StiffnessInputs:
     def show(self, design: Design) -> None:
         """Show a design."""
         goal, measure = design.task.stiffness, design.measure
-        word = _LEAST if goal is None else _MAXIMISE if measure is not None else _FILE
+        word = _LEAST_PRESSURE if goal is None else _MAXIMISE if measure is not None else _FILE
         show_value(self._goal, word)
         if measure is not None:
             show_value(self._direction, tuple(round(x, 4) for x in measure.direction))
@@ -168,7 +168,7 @@ class LoadInputs:
                 self._weights[self._gravity.value],
                 _GRAM.to_si(self._mass.value))))  # fmt: skip
         self._force = [
-            add_slider(gui, f"force {a}", _MILLINEWTON, -_MOST_FORCE, _MOST_FORCE, 1e-3, 0.0)
+            add_slider(gui, f"force {a}", _MILLINEWTON, -_MAX_FORCE, _MAX_FORCE, 1e-3, 0.0)
             for a in "xyz"
         ]
         for each in self._force:
