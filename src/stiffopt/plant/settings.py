@@ -81,7 +81,7 @@ class SiliconeHysteresis(Schema):
 
 
 class Silicone(Schema):
-    """How the material differs from a linear elastic one.
+    """Differences of the material from a linear elastic one.
 
     Attributes
     ----------
@@ -108,19 +108,19 @@ class Silicone(Schema):
 
 
 class Mismatch(Schema):
-    """How this arm differs from its robot file.
+    """Differences of this arm from its robot file.
 
     Lists have one value per channel or per segment, the proximal segment first.
 
     Attributes
     ----------
-    gain : of each channel: pressure that acts per pressure in the chamber.
-    offset : of each channel: pressure that acts in addition, in Pa.
+    gain : of each channel: acting pressure per pressure in the chamber.
+    offset : of each channel: additional acting pressure, in Pa.
     angle : of each channel: rotation of its chambers about the axis, in rad.
     modulus : of each segment: factor on Young's modulus.
     length : of each segment: factor on the rest length.
     base : the true base frame in the nominal one.
-    registration : what the registered tracker says is the base frame, in the true one.
+    registration : the base frame that the registered tracker assumes, in the true one.
     """
 
     gain: Items[Annotated[Ratio, Positive]] = ()
@@ -154,7 +154,7 @@ class Mismatch(Schema):
 
 
 class Spread(Schema):
-    """Standard deviations from which a mismatch is drawn, on top of the one that is given."""
+    """Standard deviations of a random mismatch, in addition to the given one."""
 
     gain: Share = 0.05
     offset: Annotated[Pressure, NotNegative] = 500.0
@@ -173,7 +173,7 @@ class PlantLoad(Schema):
     Attributes
     ----------
     force, moment : in N and N m.
-    frame : ``base``: keeps its direction; ``tip``: follows the section it acts on.
+    frame : ``base``: keeps its direction; ``tip``: follows the section on which it acts.
     at : arc length of that section at rest, connectors included and as in the robot file, in m;
         the tip by default.
     """
@@ -185,11 +185,11 @@ class PlantLoad(Schema):
 
 
 class SoftSurface(Schema):
-    """A flat soft surface that the tip may press on, without friction.
+    """A flat soft surface on which the tip may press, without friction.
 
     Attributes
     ----------
-    point : on it, in the base frame, in m.
+    point : a point on it, in the base frame, in m.
     normal : unit vector out of it.
     stiffness : force per depth of the tip's centre in it, in N/m.
     """
@@ -218,14 +218,14 @@ def check_touchable(scene: Scene) -> Scene:
 
 
 class Discretisation(Schema):
-    """Of the rod, per segment.
+    """Discretisation of the rod, per segment.
 
     Attributes
     ----------
-    bending_degree : of the Legendre polynomials of curvature.
-    shear_degree : of those of stretch, shear and twist.
-    sub_intervals : over which the strains are integrated to poses.
-    step : in time, in s; with inertia, steps above 4 ms are taken in parts.
+    bending_degree : degree of the Legendre polynomials of curvature.
+    shear_degree : degree of those of stretch, shear and twist.
+    sub_intervals : number of intervals for integrating the strains to poses.
+    step : time step, in s; with inertia, steps above 4 ms are divided.
     """
 
     bending_degree: Annotated[int, Field(ge=0, le=8)] = 3
@@ -252,14 +252,14 @@ class PlantSettings(RigSection):
     ----------
     dynamics : ``full``: the arm has inertia; ``quasi-static``: it has none.
     silicone, mismatch, discretisation : see there.
-    spread : draw a mismatch from the seed with these standard deviations; None draws none.
+    spread : standard deviations of a mismatch drawn from the seed; None draws none.
     seed : of the mismatch and of all noise.
-    payload : mass at the tip that the robot file does not know of, in kg.
-    gravity : acceleration in the base frame, in m/s^2, where it is not that of the robot file.
-    load : acts all the time; None for none.
-    surface : what the tip may press on, where no probe is mounted; None for nothing.
-    scene : what the body really meets, all of it; None: what of the rig's scene it may lean on.
-        Friction and stiffness are those under ``contact``.
+    payload : mass at the tip that the robot file does not contain, in kg.
+    gravity : acceleration in the base frame, in m/s^2, if it differs from the robot file's.
+    load : constant load; None for none.
+    surface : surface on which the tip may press while no probe is mounted; None for none.
+    scene : all objects that the body really meets; None: those of the rig's scene that it may lean
+        on. Friction and stiffness are those under ``contact``.
     faults : whether faults may be injected while the rig runs.
     """
 
@@ -313,15 +313,15 @@ class SimulatedSupplySettings(SupplySettings):
 
     Attributes
     ----------
-    dead_time : until a set-point has any effect, in s.
+    dead_time : time until a set-point has any effect, in s.
     lag : time constant, in s.
     slew : greatest rate of change, in Pa/s.
     resolution : step of the set-points and of the readings, in Pa.
     noise : standard deviation of the readings, in Pa.
     ripple : standard deviation of the pressure itself, in Pa.
-    saturation : the highest pressure that the supply has, in Pa; None: the limits.
+    saturation : highest pressure of the supply, in Pa; None: the limits.
     leak : time constant with which a chamber empties through a leak, in s; None: no leak.
-    watchdog : vents after this time without a command, in s; None: never.
+    watchdog : time without a command after which it vents, in s; None: never.
     dump_valve : whether there is a valve that empties all chambers, see `PressureSupply.arm`.
     """
 

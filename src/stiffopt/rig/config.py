@@ -120,22 +120,22 @@ def _section(name: str) -> BeforeValidator:
 
 
 class RigDescription(Schema):
-    """A rig: the arm, its devices and what they may do.
+    """A rig: the arm, its devices, their limits and settings.
 
     Attributes
     ----------
     name : for people.
     robot : name of a built-in robot, or path of a robot file, relative to the rig file.
-    rate : of the loop that commands, in Hz.
+    rate : rate of commands, in Hz.
     supply, tracker, probe : the devices; each has a ``driver``, see `stiffopt.rig.registry`.
-    safety : limits.
-    control : how the daemon's loop steers.
-    service : where the daemon listens.
+    safety : limits and timeouts.
+    control : settings of the daemon's control loop.
+    service : addresses at which the daemon listens.
     log : recordings.
     ros : the node of `stiffopt ros`.
-    commissioning : what has to be found before the arm may be armed.
-    published : of this arm, which experiments compare themselves with; None for nothing.
-    scene : what is around the arm, or None; checked against the robot, see `stiffopt.model.scene`.
+    commissioning : the record that is required before the arm may be armed.
+    published : published results of this arm, for comparison in experiments; None for none.
+    scene : objects around the arm, or None; checked against the robot, see `stiffopt.model.scene`.
     plant : the arm behind simulated devices, and in the virtual lab; a
         `stiffopt.plant.settings.PlantSettings`.
     lab : the devices in the virtual lab; a `stiffopt.plant.settings.LabSettings`.

@@ -35,31 +35,32 @@ _PortOrNone = Annotated[
 
 
 class Safety(Schema):
-    """Limits of what may be commanded, and what counts as a fault.
+    """Limits of commands, and definitions of faults.
 
     Attributes
     ----------
     max_pressure : one value or one per channel, in Pa; None: that of the robot.
     max_slew : one value or one per channel, in Pa/s; None: that of the robot.
-    max_force : sum over all chambers of pressure times area, in N; None: no limit.
-    command_timeout : a command that was not repeated for this long no longer holds, in s.
-    guard_timeout : the guard vents when the loop has not commanded for this long, in s.
-    tracker_timeout : a tracker that has not seen the tip for this long is lost and the pressures
-        are let down, in s.
-    tracker_frames : missing frames in a row after which the pressures are held.
-    max_tip_speed : no tip moves faster; samples that say so are rejected, in m/s.
-    max_jumps : rejected samples in a row that are a fault.
-    max_pressure_error : between what a regulator should have reached and what is measured, in Pa;
-        more than that, for `pressure_error_time`, is a fault.
+    max_force : largest sum over all chambers of pressure times area, in N; None: no limit.
+    command_timeout : time after which a command expires unless repeated, in s.
+    guard_timeout : time without a command of the loop after which the guard vents, in s.
+    tracker_timeout : time without sight of the tip after which the tracker counts as lost and the
+        pressures are let down, in s.
+    tracker_frames : successive missing frames after which the pressures are held.
+    max_tip_speed : greatest speed of the tip, in m/s; samples that imply a greater one are
+        rejected.
+    max_jumps : successive rejected samples that are a fault.
+    max_pressure_error : largest difference between the pressure that a regulator should have
+        reached and the measured one, in Pa; exceeding it for `pressure_error_time` is a fault.
     pressure_error_time : in s.
-    max_overruns : ticks in a row that came too late, which are a fault.
-    ramp_time : in which pressures are let down in a controlled way, in s.
-    heartbeat : a client that has not been heard for this long has lost control, in s.
-    hold_timeout : pressures that the loop holds by itself are let down after this long, in s; a
+    max_overruns : successive late ticks that are a fault.
+    ramp_time : duration of letting the pressures down, in s.
+    heartbeat : time of silence after which a client loses control, in s.
+    hold_timeout : time after which pressures that the loop holds on its own are let down, in s; a
         client's own hold lasts while its heartbeat does. None, in a file ``none``: never, which
-        `unlimited_hold` has to accept.
-    unlimited_hold : ``accepted``: the loop may hold pressures for ever, also of an arm that it does
-        not understand; ``refused``: it may not.
+        requires `unlimited_hold`.
+    unlimited_hold : ``accepted``: the loop may hold pressures for ever, even on an arm whose state
+        it does not know; ``refused``: it may not.
     unprotected_supply : ``accepted``: a supply may be armed although it has neither a watchdog nor
         a dump valve, so that nothing vents the arm when this computer fails; ``refused``: it may
         not. Simulated supplies are exempt.
@@ -100,17 +101,18 @@ class ControlSettings(Schema):
     Attributes
     ----------
     regulator_lag : time constant with which a regulator follows its set-point, in s.
-    regulator_dead_time : until a set-point has any effect, in s.
+    regulator_dead_time : time until a set-point has any effect, in s.
     tracker_noise : standard deviation of a tracked position in each axis, in m.
-    vibration : ``modelled``: the arm swings as its robot file says; ``none``: it follows its
+    vibration : ``modelled``: the arm vibrates according to its robot file; ``none``: it follows its
         pressures at once, as a damped arm does; ``auto``: ``none`` on a simulated rig without
-        inertia, else ``modelled``.
-    damping : share of critical damping of that vibration; where the rig file has none, that which
-        commissioning has found.
-    frequency : of the swing of the vented arm, in Hz; None: what commissioning has found, or else
-        what the robot file implies.
-    solver : of the small quadratic program of each tick.
-    adaptation : ``auto``: the arm's numbers are adapted to where the tip is seen at rest; ``none``.
+        inertia, otherwise ``modelled``.
+    damping : share of critical damping of that vibration; if the rig file has none, the result of
+        commissioning.
+    frequency : frequency of the vented arm's vibration, in Hz; None: the result of commissioning,
+        or the one that the robot file implies.
+    solver : solver of each tick's small quadratic program.
+    adaptation : ``auto``: the model's numbers are adapted to where the tip is seen at rest;
+        ``none``: they are not.
     """
 
     regulator_lag: Annotated[Duration, Field(ge=0, le=2)] = 0.06
@@ -124,17 +126,17 @@ class ControlSettings(Schema):
 
 
 class ServiceSettings(Schema):
-    """Where the daemon listens. Loopback, unless you know what you do.
+    """Addresses at which the daemon listens. Use loopback unless you know what you do.
 
     Attributes
     ----------
     host : address.
-    port : of the control interface (HTTP and WebSocket) and of the metrics; 0: any free one.
-    foxglove_port : of the Foxglove WebSocket, which anyone who reaches it may read, web pages of
-        any site included; 0: any free one; None, in a file ``none``: no such server.
-    token : environment variable that holds the token of those who may move the arm; where it is
-        empty, a token is drawn and written to `token_file`.
-    token_file : for this user's eyes only; by default beside the recordings.
+    port : port of the control interface (HTTP and WebSocket) and of the metrics; 0: any free one.
+    foxglove_port : port of the Foxglove WebSocket, which anyone who reaches it may read, including
+        web pages of any site; 0: any free one; None, in a file ``none``: no such server.
+    token : environment variable with the token of those who may move the arm; if it is empty, a
+        token is drawn and written to `token_file`.
+    token_file : file that only this user can read; by default next to the recordings.
     """
 
     host: Annotated[str, Field(min_length=1)] = "127.0.0.1"
@@ -145,19 +147,20 @@ class ServiceSettings(Schema):
 
 
 class RosSettings(Schema):
-    """What `stiffopt ros` shows on a ROS 2 graph, and what it takes from there.
+    """What `stiffopt ros` publishes on a ROS 2 graph, and what it accepts from there.
 
     Attributes
     ----------
-    commands : whether whoever is on the graph may move the arm; venting is taken in any case.
-    interface : network interface, such as ``eth0``; None: loopback, on which no other machine is.
-        It has to be given, as ``lo`` too, where commands are taken.
-    domain : of DDS; None: the environment variable ROS_DOMAIN_ID, or else 0.
-    distro : by whose layout other nodes are told what there is.
-    namespace, node : of the node.
-    frame_prefix : before the names of the frames: ``base``, ``tip``, ``target``, ``station_1`` ...
-    remap : names of topics and services in the place of others, such as ``~/tip: /arm/tip``.
-    rate : at which the state is published, in Hz.
+    commands : whether anyone on the graph may move the arm; venting is always accepted.
+    interface : network interface, such as ``eth0``; None: loopback, which no other machine can
+        reach. Required if commands are accepted, even for ``lo``.
+    domain : DDS domain; None: the environment variable ROS_DOMAIN_ID, by default 0.
+    distro : ROS 2 distribution whose discovery messages are used.
+    namespace, node : names of the node.
+    frame_prefix : prefix of the names of the frames: ``base``, ``tip``, ``target``, ``station_1``
+        ...
+    remap : names that replace those of topics and services, such as ``~/tip: /arm/tip``.
+    rate : rate of publishing the state, in Hz.
     """
 
     commands: bool = False
@@ -186,23 +189,22 @@ class LogSettings(Schema):
 
     Attributes
     ----------
-    folder : made if it is not there.
+    folder : folder of the recordings; made if it does not exist.
     """
 
     folder: Annotated[str, Field(min_length=1)] = "runs"
 
 
 class CommissioningSettings(Schema):
-    """What `stiffopt commission` has to have found before the arm may be armed.
+    """The record of `stiffopt commission` that is required before the arm may be armed.
 
     Attributes
     ----------
-    record : path of its record, relative to the rig file; by default beside it, with its name and
+    record : path of the record, relative to the rig file; by default next to it, with its name and
         the ending ``.commissioning.yaml``.
-    max_age : an older record does not count, in s.
-    required : whether the arm may be armed only with a record that fits; by default so, but not
-        for simulated supplies. A record that is there and says that something does not fit
-        counts in any case.
+    max_age : greatest valid age of a record, in s.
+    required : whether arming requires a record that fits; by default it does, except for simulated
+        supplies. An existing record that reports a misfit always counts.
     """
 
     record: Annotated[str, BeforeValidator(_beside)] | None = None
@@ -211,13 +213,13 @@ class CommissioningSettings(Schema):
 
 
 class Published(Schema):
-    """What was published of this arm: experiments show it beside what they find.
+    """Published results of this arm, which experiments show next to theirs.
 
     Attributes
     ----------
     stiffness : path of a table of stiffness, relative to the rig file.
-    tip_error : error of a model's tip along each axis that most of the time was not exceeded, in m.
-    largest_tip_error : the largest along an axis, in m.
+    tip_error : error of a model's tip along each axis that was mostly not exceeded, in m.
+    largest_tip_error : the largest error along an axis, in m.
     """
 
     stiffness: str | None = None

@@ -83,8 +83,8 @@ class TrackerSettings(DeviceSettings):
 
     Attributes
     ----------
-    registration : where tracker and sensor are.
-    calibrated : whether the robot file's own registration then corrects the poses.
+    registration : placement of tracker and sensor.
+    calibrated : whether the robot file's own registration corrects the poses in addition.
     """
 
     registration: Registration = Registration()
@@ -178,8 +178,8 @@ class StreamedSettings(TrackerSettings):
 
     Attributes
     ----------
-    latency : the least time from the capture of a pose to its arrival here, in s.
-    range : poses farther from the tracker than this count as not seen, in m.
+    latency : shortest time from the capture of a pose to its arrival here, in s.
+    range : distance from the tracker beyond which poses count as not seen, in m.
     connect_timeout : longest wait for the first answer when the tracker is opened, in s.
     """
 

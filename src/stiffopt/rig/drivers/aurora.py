@@ -26,20 +26,20 @@ _POLLS_PER_FRAME = 10  # so a frame is seen at most a tenth of a period late
 class AuroraSettings(StreamedSettings):
     """An NDI Aurora.
 
-    The device does not say when it captured a frame, and NDI states no latency: by default it is
-    taken for one frame at 40 Hz. A sensor of five degrees of freedom does not know its roll.
+    The device does not report when it captured a frame, and NDI states no latency: the default is
+    one frame at 40 Hz. A sensor with five degrees of freedom does not know its roll.
 
     Attributes
     ----------
-    port : serial port, such as ``/dev/ttyUSB0`` or ``COM3``; ``auto`` takes the one USB port that
-        says it is NDI's, and speaks to no other.
+    port : serial port, such as ``/dev/ttyUSB0`` or ``COM3``; ``auto`` uses the only USB port that
+        identifies itself as NDI's, and no other.
     baud : speed of the line while tracking.
-    sensor : which of the sensors is at the tip, counted from 1 in the order of port handles.
-    rate : frames that the device makes in a second.
+    sensor : number of the sensor at the tip, counted from 1 in the order of port handles.
+    rate : frames that the device captures per second.
     reply : ``binary`` is finer and faster; ``text`` (0.01 mm) is for old firmware, which ``auto``
-        knows.
+        recognises.
     outside_volume : accept poses outside of the volume that NDI characterised.
-    reconnect_after : silence after which the device is connected anew, in s.
+    reconnect_after : time of silence after which the device is reconnected, in s.
     """
 
     extra: ClassVar[str] = "aurora"
@@ -116,7 +116,7 @@ class AuroraTracker(StreamedTracker):
 
     def _start_reader(self, likely_baud: int) -> subprocess.Popen[str]:
         chosen = self.settings
-        told = {
+        options = {
             **chosen.model_dump(
                 include={"port", "baud", "sensor", "reply", "outside_volume", "reconnect_after"}
             ),
@@ -124,7 +124,7 @@ class AuroraTracker(StreamedTracker):
             "pause": 1 / (_POLLS_PER_FRAME * chosen.rate),
         }
         return subprocess.Popen(
-            [sys.executable, str(_READER), json.dumps(told)],
+            [sys.executable, str(_READER), json.dumps(options)],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,

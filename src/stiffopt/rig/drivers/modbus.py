@@ -71,7 +71,7 @@ class ModbusTcp(Schema):
     Attributes
     ----------
     host : name or IP address of the device.
-    port : 0 stands for any free port, in the virtual lab alone.
+    port : 0 means any free port, only in the virtual lab.
     """
 
     host: Annotated[str, Field(min_length=1)]
@@ -135,13 +135,13 @@ class ModbusSettings(SupplySettings):
     ----------
     tcp, serial : the connection, one of the two.
     unit : number of the device on its line.
-    timeout : for each answer, in s.
+    timeout : time for each answer, in s.
     channels : one for each channel of the robot, in its order.
-    scale, type, word_order : of all registers that have none of their own.
-    table : of the readings.
-    read_write : write and read in one request (function 23) if the device can.
+    scale, type, word_order : defaults for all registers.
+    table : default table of the readings.
+    read_write : write and read in one request (function 23) if the device supports it.
     verify : read back what was written.
-    watchdog, dump_valve : of the device, where it has them.
+    watchdog, dump_valve : of the device, if it has them.
     """
 
     extra: ClassVar[str] = "modbus"
@@ -269,7 +269,9 @@ class ModbusSupply(PressureSupply):
         self._verified = runs_of(enumerate(self._read_backs)) if settings.verify else ()
         self._measured = runs_of(self._readings.items())
         self._joint = self._joint_run() if settings.read_write else None
-        self._told: Registers | None = None  # registers that the device must have; None: unknown
+        self._held_registers: Registers | None = (
+            None  # registers that the device must have; None: unknown
+        )
         self.has_watchdog = settings.watchdog is not None
         self.has_dump_valve = settings.dump_valve is not None
         requests = len(self._written) + len(self._verified) + len(self._measured) + 1
@@ -353,7 +355,7 @@ class ModbusSupply(PressureSupply):
             _insist(lambda: self._write_once(registers, whatever_happens=True))
 
     def _write_once(self, registers: Registers, *, whatever_happens: bool = False) -> None:
-        self._told = None
+        self._held_registers = None
         errors: list[DeviceError] = []
         for run in self._written:
             try:
@@ -368,14 +370,16 @@ class ModbusSupply(PressureSupply):
         self._trigger()
         for run in self._verified:
             self._read_back(run, registers)
-        self._told = registers
+        self._held_registers = registers
 
     def _check_held(self) -> None:
-        told = self._told
-        if told is None or self.settings.serial is not None:  # a serial line has only one master
+        registers = self._held_registers
+        if (
+            registers is None or self.settings.serial is not None
+        ):  # a serial line has only one master
             return
         for run in self._verified:
-            self._read_back(run, told)
+            self._read_back(run, registers)
 
     def _read_back(self, run: RegisterRun, registers: Registers) -> None:
         self._verify(run, self._line.read(str(run), run.table, run.start, run.count), registers)
@@ -412,7 +416,7 @@ class ModbusSupply(PressureSupply):
             return None
         self._watch()
         registers, (written,) = self._encoded(pressures), self._written
-        self._told = None
+        self._held_registers = None
         what = f"write {written} and read {joint}"
         addresses = {"read_address": joint.start, "write_address": written.start}
         try:
@@ -437,7 +441,7 @@ class ModbusSupply(PressureSupply):
                 self._verify(joint, values, registers)
             else:
                 self._read_back(run, registers)
-        self._told = registers
+        self._held_registers = registers
         return measured
 
     # dump valve ----------------------------------------------------------------------------------

@@ -34,7 +34,7 @@ _LONGEST = 120  # registers that every request may carry, even one that reads an
 class PressureScale(Schema):
     """The straight line between counts and pressure, through two points.
 
-    In a file, one pressure such as ``1 mbar`` stands for that pressure per count.
+    In a file, one pressure such as ``1 mbar`` means that pressure per count.
 
     Attributes
     ----------
@@ -79,12 +79,12 @@ class PressureScale(Schema):
 
 
 class Register(Schema):
-    """A register; in a file, a bare address stands for it.
+    """A register; in a file, a bare address is enough.
 
     Attributes
     ----------
     address : as in the protocol, counted from 0.
-    type, scale : where they differ from those of the supply.
+    type, scale : if they differ from those of the supply.
     """
 
     address: Address
@@ -103,18 +103,18 @@ class SetPointRegister(Register):
 
     Attributes
     ----------
-    read_back : address at which the device tells what was written, if it is another one.
+    read_back : address from which the set-point is read back, if it is a different one.
     """
 
     read_back: Address | None = None
 
 
 class ReadingRegister(Register):
-    """A register that tells a measured pressure.
+    """A register with a measured pressure.
 
     Attributes
     ----------
-    table : where it differs from that of the supply.
+    table : if it differs from that of the supply.
     """
 
     table: RegisterTable | None = None
@@ -129,8 +129,8 @@ class ModbusChannel(Schema):
     Attributes
     ----------
     setpoint : register that sets its pressure.
-    reading : register that tells the measured pressure; None: it is not measured.
-    min, max : limits that hold where they are tighter than those of the rig, in Pa.
+    reading : register with the measured pressure; None: it is not measured.
+    min, max : limits in Pa, if they are tighter than those of the rig.
     """
 
     setpoint: Annotated[SetPointRegister, _OR_ADDRESS]
@@ -140,26 +140,26 @@ class ModbusChannel(Schema):
 
 
 class RegisterValue(Schema):
-    """What to write into a holding register."""
+    """A value to write into a holding register."""
 
     address: Address
     value: Annotated[int, Field(ge=0, le=0xFFFF)]
 
 
 class ModbusWatchdog(Schema):
-    """The device's own watchdog, which turns its outputs off when no command comes.
+    """The device's own watchdog, which turns its outputs off when commands stop.
 
-    It is set up whenever a connection is made: first ``before``, then the time, unless the
-    register holds it already, then ``after``.
+    It is set up on every new connection: first ``before``, then the time, unless the register
+    already has it, then ``after``.
 
     Attributes
     ----------
-    timeout : after which it acts, in s.
-    address : of the holding register that takes the time.
+    timeout : time without a command after which it acts, in s.
+    address : holding register of the time.
     resolution : time per count of that register, in s.
-    before, after : other registers to be written, in this order.
-    trigger : holding register that must change to show that someone is there; it is written
-        after every command. None: commands alone are enough.
+    before, after : other registers to write, in this order.
+    trigger : holding register that must change as a sign of life; it is written after every
+        command. None: commands alone are enough.
     """
 
     timeout: Annotated[Duration, Field(gt=0, le=60)] = 0.5

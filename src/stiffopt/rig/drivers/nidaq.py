@@ -64,7 +64,7 @@ def _through(x: float, xs: tuple[float, float], ys: tuple[float, float]) -> floa
 
 
 class NidaqOutput(_VoltageLine):
-    """The set-point of a regulator. No voltage beyond the two points is ever written.
+    """The set-point of a regulator. Voltages beyond the two points are never written.
 
     Attributes
     ----------
@@ -84,13 +84,13 @@ class NidaqOutput(_VoltageLine):
 
 
 class NidaqInput(_VoltageLine):
-    """What a regulator or a sensor measures.
+    """The measured pressure of a regulator or a sensor.
 
     Attributes
     ----------
     channel : physical channel, such as ``Dev1/ai0``.
-    terminals : how it is wired.
-    range : of the converter, in V.
+    terminals : wiring of the input.
+    range : range of the converter, in V.
     """
 
     channel: InputName
@@ -111,7 +111,7 @@ class NidaqChannel(Schema):
     ----------
     output : its set-point.
     input : its measured pressure; None: it is not measured.
-    min, max : lowest and highest pressure, where less is allowed than elsewhere, in Pa.
+    min, max : lowest and highest pressure in Pa, if tighter than elsewhere.
     """
 
     output: NidaqOutput
@@ -126,7 +126,7 @@ class NidaqDumpValve(Schema):
     Attributes
     ----------
     line : digital line, such as ``Dev1/port0/line0``.
-    closed_when : level of the line that holds the valve shut. Wire it so that the valve opens
+    closed_when : level of the line that keeps the valve closed. Wire it so that the valve opens
         when the power fails.
     """
 
@@ -140,13 +140,13 @@ class NidaqSettings(SupplySettings):
     Attributes
     ----------
     grpc : host and port of NI's gRPC device server; None: the driver on this machine.
-    timeout : of every exchange with the device, in s.
+    timeout : timeout of every exchange with the device, in s.
     channels : one for each channel of the arm.
-    read_back_tolerance : by which an output that is read back may differ, in V.
-    share_inputs : the probe reads inputs of the same device: hold it only while reading.
+    read_back_tolerance : allowed error of an output that is read back, in V.
+    share_inputs : the probe reads inputs of the same device, so reserve it only while reading.
     dump_valve : None: there is none.
-    watchdog : the device opens the dump valve by itself when nothing was written for so long, in
-        s; None: it does not.
+    watchdog : time without a write after which the device opens the dump valve by itself, in s;
+        None: it does not.
     """
 
     extra: ClassVar[str] = "nidaq"

@@ -64,10 +64,10 @@ class OpenRegulatorSettings(SupplySettings):
     ----------
     port : for example ``/dev/serial/by-id/...``.
     baudrate : that of the firmware.
-    board : its number; another board is refused.
-    timeout : for each answer, in s.
-    startup : time that a board may take to answer after the port was opened, in s; some reset then
-        and wait in a boot loader.
+    board : number of the board; any other board is refused.
+    timeout : time for each answer, in s.
+    startup : time for a board to answer after the port was opened, in s; some boards reset then and
+        wait in a boot loader.
     slew : limit that the board enforces, in Pa/s; by default its highest.
     channels : one for each channel of the robot, in its order.
     """
@@ -126,8 +126,12 @@ class OpenRegulatorSupply(PressureSupply):
         self._outputs = np.array([channel.output for channel in settings.channels]) - 1
         self._line: BoardLine
         self._identity: Identity
-        self._told: tuple[int, ...] | None = None  # set-points that the board has; None: unknown
-        self._seen: tuple[float, Status] | None = None  # time of the last report, and the report
+        self._held_counts: tuple[int, ...] | None = (
+            None  # set-points that the board has; None: unknown
+        )
+        self._last_report: tuple[float, Status] | None = (
+            None  # time of the last report, and the report
+        )
         self.patience = settings.startup + 6 * settings.timeout
 
     @property
@@ -161,7 +165,7 @@ class OpenRegulatorSupply(PressureSupply):
 
     def _open(self) -> None:
         self._line = self._new_line()
-        self._told = self._seen = None
+        self._held_counts = self._last_report = None
         try:
             self._identity = self._first_identity()
             self._check_identity(self._identity)
@@ -209,7 +213,7 @@ class OpenRegulatorSupply(PressureSupply):
         return tuple(counts.tolist())
 
     def _keep(self, status: Status) -> Status:
-        self._seen = self.clock.now(), status
+        self._last_report = self.clock.now(), status
         return status
 
     def _report(self) -> Status:
@@ -217,8 +221,11 @@ class OpenRegulatorSupply(PressureSupply):
 
     def _recent(self) -> Status:
         """Return the last report, or a new one if that is old: commands expire with it."""
-        if self._seen is not None and self.clock.now() - self._seen[0] < self._identity.silence / 4:
-            return self._seen[1]
+        if (
+            self._last_report is not None
+            and self.clock.now() - self._last_report[0] < self._identity.silence / 4
+        ):
+            return self._last_report[1]
         return self._report()
 
     def _begin(self) -> None:
@@ -235,8 +242,8 @@ class OpenRegulatorSupply(PressureSupply):
         self._set(pressures)
 
     def _set(self, pressures: Array) -> Status:
-        counts, before = self._counts(pressures), self._told
-        self._told = None
+        counts, before = self._counts(pressures), self._held_counts
+        self._held_counts = None
         if any(counts) and before is not None and not any(before):
             self._begin()  # silence without pressure has vented the board, for no other reason
         time, validity = self._recent().time, round(self._identity.silence * 1e3)
@@ -244,7 +251,7 @@ class OpenRegulatorSupply(PressureSupply):
         status = self._keep(self._line.status(SET, payload))
         if status.set_points != counts:
             raise DeviceError(f"{self._line} holds other set-points than it was told")
-        self._told = counts
+        self._held_counts = counts
         return status
 
     def _exchange(self, pressures: Array) -> ArrayLike | None:
@@ -259,15 +266,15 @@ class OpenRegulatorSupply(PressureSupply):
 
     def _check_held(self) -> None:
         status = self._report()
-        if self._told and any(self._told) and status.set_points != self._told:
+        if self._held_counts and any(self._held_counts) and status.set_points != self._held_counts:
             why = "another program commands it" if status.armed else f"it vented: {status.reason}"
             raise DeviceError(f"{self._line} does not hold its set-points; {why}")
 
     def _dump(self, *, open_valve: bool) -> None:
         if open_valve:
-            self._told = None
+            self._held_counts = None
             status = self._keep(_insist(lambda: self._line.status(VENT)))
-            self._told = status.set_points
+            self._held_counts = status.set_points
         else:
             self._begin()
 

@@ -33,9 +33,9 @@ class OpenIGTLinkSettings(StreamedSettings):
     Attributes
     ----------
     host, port : of the server.
-    name : device name of the messages, such as ``TipToTracker``: sensor to tracker.
-    reconnect_after : silence after which the server is called anew, in s; PLUS is also silent
-        while it sees no tool.
+    name : device name in the messages, such as ``TipToTracker``: sensor to tracker.
+    reconnect_after : time of silence after which the connection is renewed, in s; PLUS is also
+        silent while it sees no tool.
     """
 
     extra: ClassVar[str] = "openigtlink"

@@ -42,18 +42,18 @@ _WORSE = 1.2  # factor on an excessive force that is allowed while the probe bac
 
 
 class ZaberStageSettings(Schema):
-    """The stage and how it is mounted.
+    """The stage and its mounting.
 
     Attributes
     ----------
     host, port : of a device with Ethernet or a serial server.
     serial : or the serial port, for example ``/dev/ttyUSB0``.
     device, axis : address of the device on its line, and number of the axis.
-    microstep : length of one, in m; by default that of the X-LSM100A.
-    travel : places on the rail that may be gone to, in m from the home position.
+    microstep : length of a microstep, in m; by default that of the X-LSM100A.
+    travel : permitted range on the rail, in m from the home position.
     max_speed : in m/s.
-    towards_tip : 1 if the probe nears the tip as the stage moves away from its home, else -1.
-    home : whether a stage that does not know where it is may be homed, or is refused.
+    towards_tip : 1 if the probe nears the tip as the stage moves away from its home, otherwise -1.
+    home : whether to home a stage that does not know its position, or to refuse it.
     """
 
     host: Annotated[str, Field(min_length=1)] | None = None
@@ -87,11 +87,11 @@ class ForceSensorSettings(Schema):
     Attributes
     ----------
     channel : physical channel, such as ``Dev1/ai3``.
-    terminals : how it is wired.
-    range : of the converter, in V.
-    sensitivity : force that pushes the tip per volt, in N/V; negative if the sign is the other.
+    terminals : wiring of the input.
+    range : range of the converter, in V.
+    sensitivity : pushing force on the tip per volt, in N/V; negative for the opposite sign.
     offset : force at 0 V before the first taring, in N.
-    tare_samples : readings that are averaged when the probe is aligned.
+    tare_samples : number of readings to average when the probe is aligned.
     grpc : host and port of NI's gRPC device server; None: the driver on this machine.
     """
 
@@ -124,8 +124,8 @@ class ZaberProbeSettings(ProbeSettings):
     Attributes
     ----------
     stage, force : see there.
-    max_force : at which the stage is stopped, in N.
-    timeout : of every exchange with either device, in s.
+    max_force : force at which the stage is stopped, in N.
+    timeout : timeout of every exchange with either device, in s.
     """
 
     extra: ClassVar[str] = "probe"
