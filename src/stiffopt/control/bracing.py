@@ -192,7 +192,7 @@ class Bracing:
         to_free = self.approach.free_tip - self.approach.tips[-1].pose[:3, 3]
         distance = float(np.linalg.norm(to_free))
         share = float(residual @ to_free) / max(distance, 1e-9) ** 2
-        is_free = distance > t.told_apart and share > t.free_share
+        is_free = distance > t.min_distance and share > t.free_share
         self._free = self._free + 1 if is_free else 0
         if self._free >= t.samples:
             self.release(why="the tip is where an arm without contact has it: the brace is lost")

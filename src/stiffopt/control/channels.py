@@ -1,7 +1,7 @@
 """Channels that do not follow their commands: shortfalls, and limited, stuck or removed channels.
 
 A channel that stays below its command by s has a leak, which its regulator may be able to feed, or
-no more pressure. Its command is raised by s, slowly, up to `_most`, a share of the pressure
+no more pressure. Its command is raised by s, slowly, up to `_max_allowed`, a share of the pressure
 monitor's tolerance. If the channel is still short by more, it is *limited*: its present pressure
 becomes the plan's upper bound, and the command stays just above it, where more pressure shows as
 soon as there is some. If a limited channel does not follow its command down either, it is *stuck*:
@@ -55,8 +55,8 @@ class Channels:
         self, limits: PressureLimits, slew: Array, tolerance: Array, tuning: RegulatorTuning
     ) -> None:
         self._limits, self._tuning = limits, tuning
-        self._least = np.full(limits.n, tuning.max_compensation)
-        self._most = np.maximum(self._least, tuning.make_up_share * tolerance)
+        self._min_allowed = np.full(limits.n, tuning.max_compensation)
+        self._max_allowed = np.maximum(self._min_allowed, tuning.make_up_share * tolerance)
         self._below = tuning.probe_share * tolerance
         self._let_down = tuning.let_down_share * slew
         self._empty = np.clip(0.0, limits.low, limits.high)
@@ -70,10 +70,10 @@ class Channels:
         self.limited: Flags = np.zeros(n, dtype=bool)
         self.stuck: Flags = np.zeros(n, dtype=bool)
         self.shortfall: Array = np.zeros(n)
-        self._allowed: Array = self._least.copy()  # shortfall to compensate, in Pa
-        self._has: Array = np.zeros(n)  # pressure of a limited or stuck channel, in Pa
-        self._for: Array = np.zeros((2, n))  # durations of being short, and too high, in s
-        self._read: Array = np.zeros(n)  # smoothed readings, in Pa
+        self._allowed: Array = self._min_allowed.copy()  # shortfall to compensate, in Pa
+        self._held: Array = np.zeros(n)  # pressure of a limited or stuck channel, in Pa
+        self._durations: Array = np.zeros((2, n))  # durations of being short, and too high, in s
+        self._smoothed: Array = np.zeros(n)  # smoothed readings, in Pa
         self._ceiling: Array = np.where(self.out, self._empty, self._limits.high)
         self._quiet = True  # whether no channel is short, or was until now
 
@@ -85,7 +85,7 @@ class Channels:
         if len(chosen) == n:
             raise InputError("all channels cannot be taken out; disarm or vent instead")
         out = np.isin(np.arange(n), sorted(chosen))
-        now = np.clip(self._read, self._empty, self._limits.high)
+        now = np.clip(self._smoothed, self._empty, self._limits.high)
         falling = np.where(self.out, self._ceiling, now)
         self._ceiling = np.where(out, falling, self._limits.high)
         self.out, self._any_out = out, bool(out.any())
@@ -103,50 +103,54 @@ class Channels:
         """
         self.shortfall = -offset
         share = -math.expm1(-elapsed / self._tuning.reading_time)
-        change = share * (reading - self._read)
+        change = share * (reading - self._smoothed)
         change[~np.isfinite(change)] = 0.0
-        self._read = self._read + change
+        self._smoothed = self._smoothed + change
         if self._any_out:
             self._ceiling = np.where(
                 self.out, np.maximum(self._ceiling - self._let_down * elapsed, self._empty),
                 self._limits.high,
             )  # fmt: skip
         short = self.shortfall
-        if self._quiet and (short <= self._least).all():
+        if self._quiet and (short <= self._min_allowed).all():
             return
         share = -math.expm1(-elapsed / self._tuning.make_up_time)
-        wanted = np.minimum(np.maximum(short, self._least), self._most)
+        wanted = np.minimum(np.maximum(short, self._min_allowed), self._max_allowed)
         self._allowed = self._allowed + share * (wanted - self._allowed)
         self._judge(elapsed, short, command)
         self._quiet = not (
-            self._for.any() or self.limited.any() or (self._allowed > self._least + 1.0).any()
+            self._durations.any()
+            or self.limited.any()
+            or (self._allowed > self._min_allowed + 1.0).any()
         )
 
     def _judge(self, elapsed: float, short: Array, command: Array) -> None:
         """Find channels that are limited or stuck, and those that follow again."""
         follows, patience = self._tuning.follows, self._tuning.patience
-        wrong = np.stack([short > self._most, self.limited & (-short > follows)])
-        self._for = np.clip(self._for + np.where(wrong, elapsed, -elapsed), 0.0, patience)
-        lasting = self._for >= patience
-        moved = self._read - self._has
+        wrong = np.stack([short > self._max_allowed, self.limited & (-short > follows)])
+        self._durations = np.clip(
+            self._durations + np.where(wrong, elapsed, -elapsed), 0.0, patience
+        )
+        lasting = self._durations >= patience
+        moved = self._smoothed - self._held
         again = np.where(self.stuck, np.abs(moved) > follows, (moved > follows) & (short < follows))
         before, self.limited = self.limited, (self.limited | lasting[0]) & ~again
         found = self.limited & ~before
-        self._has = np.where(found, self._read, self._has)
-        pressed = np.minimum(short, command - self._read) > self._most
+        self._held = np.where(found, self._smoothed, self._held)
+        pressed = np.minimum(short, command - self._smoothed) > self._max_allowed
         pressed &= self.limited & ~self.stuck
-        self._has = np.where(pressed, np.minimum(self._has, self._read), self._has)
+        self._held = np.where(pressed, np.minimum(self._held, self._smoothed), self._held)
         stuck = self.limited & lasting[1] & ~self.stuck
-        self._has = np.where(stuck, self._read, self._has)
+        self._held = np.where(stuck, self._smoothed, self._held)
         self.stuck = (self.stuck | stuck) & self.limited
 
     def compensated(self, offset: Array) -> Array:
         """Return the part of `offset` (n,), see `update`, that commands compensate, in Pa."""
         if self._quiet:
-            most = above = self._least
+            most = above = self._min_allowed
         else:
             most = np.where(self.limited, np.inf, self._allowed)
-            above = np.where(self.limited, np.inf, self._least)
+            above = np.where(self.limited, np.inf, self._min_allowed)
         part: Array = np.minimum(np.maximum(offset, -most), above)
         return part
 
@@ -155,7 +159,7 @@ class Channels:
         low, high = self._limits.low, self._limits.high
         if self._quiet and not self._any_out:
             return low, high
-        has = np.clip(self._has, low, high)
+        has = np.clip(self._held, low, high)
         high = np.where(self.out, self._empty, np.where(self.limited, has, high))
         low = np.where(self.out, self._empty, np.where(self.stuck, has, low))
         return low, high
@@ -166,9 +170,9 @@ class Channels:
         They stay within `low` and `high` (n,).
         """
         if not self._quiet and self.limited.any():
-            above, below = self._has + self._most, self._read - self._below
-            pressed = path > self._has - self._tuning.follows
-            least = np.where(self.stuck, self._has - self._below, np.where(pressed, above, below))
+            above, below = self._held + self._max_allowed, self._smoothed - self._below
+            pressed = path > self._held - self._tuning.follows
+            least = np.where(self.stuck, self._held - self._below, np.where(pressed, above, below))
             greatest = np.where(self.stuck, least, above)
             low, high = (
                 np.where(self.limited, np.clip(bound, low, high), limit)
@@ -183,7 +187,7 @@ class Channels:
         if not (self._quiet and not self._any_out) and self.lost.any():
             each = ", ".join(self._words(int(c)) for c in np.flatnonzero(self.lost))
             yield Notice("lost-channel", f"{each}; the plan goes on with the others", standing=True)
-        fed = ~self.limited & (self._allowed > self._tuning.told_share * self._most)
+        fed = ~self.limited & (self._allowed > self._tuning.alarm_share * self._max_allowed)
         if not self._quiet and fed.any():
             names = ", ".join(str(c + 1) for c in np.flatnonzero(fed))
             text = (
@@ -193,7 +197,7 @@ class Channels:
             yield Notice("shortfall", text, Severity.WARNING, standing=True)
 
     def _words(self, channel: int) -> str:
-        name, has = f"channel {channel + 1}", f"{self._has[channel] * 1e-5:.2f} bar"
+        name, has = f"channel {channel + 1}", f"{self._held[channel] * 1e-5:.2f} bar"
         if self.out[channel]:
             return f"{name} was taken out"
         return f"{name} is stuck at {has}" if self.stuck[channel] else f"{name} has {has} at most"

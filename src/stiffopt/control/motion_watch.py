@@ -66,7 +66,7 @@ class MotionWatch:
 
     def __init__(self, robot: RobotDescription, tuning: MotionTuning) -> None:
         self._tuning = tuning
-        self._least = max(tuning.least_motion, tuning.least_motion_share * robot.length)
+        self._min_motion = max(tuning.least_motion, tuning.least_motion_share * robot.length)
         ends = np.cumsum([segment.n_channels for segment in robot.segments]).tolist()
         self._segments = [slice(a, b) for a, b in pairwise([0, *ends])]
         longest = max(scale.interval * scale.count for scale in tuning.scales)
@@ -196,7 +196,7 @@ class MotionWatch:
         wrong = (along < tuning.least_response * distance) | (
             across > tuning.most_across * distance
         )
-        suspects = np.flatnonzero(meant & wrong & (distance > self._least))
+        suspects = np.flatnonzero(meant & wrong & (distance > self._min_motion))
         off = np.sqrt(((seen - way)[suspects] ** 2).sum(axis=1))
         steps = np.diff(rows, axis=0)
         speeds = np.sqrt((steps[:, _PREDICTED] ** 2).sum(axis=1)) / steps[:, _TIME]
@@ -231,7 +231,7 @@ class MotionWatch:
         moved, turned = way[_OFFSET], way[_TURN]
         own = float(self._explained(np.diff(rows, axis=0), jacobian).sum())
         wrong = False
-        if float(np.linalg.norm(moved)) > self._least / 2 + own + 6 * tuning.scatter:
+        if float(np.linalg.norm(moved)) > self._min_motion / 2 + own + 6 * tuning.scatter:
             bent = turn_of_a_push(tip) @ moved
             missing = float(np.linalg.norm(bent - turned))
             size = float(np.linalg.norm(bent))

@@ -55,7 +55,7 @@ class RegulatorTuning:
     make_up_share: float = 0.8
     # its time constant, in s: slower than the pressure monitor, which finds sudden leaks
     make_up_time: float = 1.0
-    told_share: float = 0.5  # share of that shortfall above which there is an alarm
+    alarm_share: float = 0.5  # share of that shortfall above which there is an alarm
     reading_time: float = 0.1  # time constant that smooths readings, in s
     patience: float = 0.5  # time for which a channel must be short, or above, in s
     follows: float = 3e3  # distance from a command, in Pa, at which a regulator follows
@@ -364,7 +364,7 @@ class BracingTuning:
     settle: float = 1.0  # time at the end of the approach before the brace counts as held, in s
     # distance between the tips of the braced and the free arm that the tracker can distinguish, in
     # m; share of it beyond which the arm is free; and successive samples
-    told_apart: float = 4e-3
+    min_distance: float = 4e-3
     free_share: float = 0.6
     samples: int = 3
     off_plan: float = 1.5e4  # pressure error above which contacts are not judged, in Pa

@@ -23,13 +23,13 @@ Array = NDArray[np.float64]
 
 _PIECE = 1e4  # Pa, longest initial piece of a way, over which points of the body go straight
 _CURVED = 1.1  # bound of the length of a point's way over the straight distance between two states
-_FORGIVEN = 1e-4  # m, by which a state may be nearer than the clearance
-_UNSEEN = 2e-4  # m, by which the body may be nearer between two states
-_EXACT = 5e-4  # m, accuracy of a shortfall
+_STATE_SLACK = 1e-4  # m, by which a state may be nearer than the clearance
+_BETWEEN_SLACK = 2e-4  # m, by which the body may be nearer between two states
+_ACCURACY = 5e-4  # m, accuracy of a shortfall
 _STATIONS = 13  # along the body, whose ways are measured
 _SAMPLES = 64  # pressures at which the body's speed is measured
 _SPEED_FACTOR = 1.5  # safety factor on that speed
-_DOWN = 5  # states on each piece of a way down
+_STATES_DOWN = 5  # states on each piece of a way down
 _MAX_COST = 5e-3  # s, of choosing a way down, for which a tick has to wait
 
 
@@ -60,8 +60,8 @@ class Ways:
             least = min(self._scene.clearance, float(clearance[0]))
             while True:
                 worst = int(np.argmin(clearance))
-                is_clear = clearance[worst] >= least - _FORGIVEN
-                limit = least - _UNSEEN if is_clear else clearance[worst] - _EXACT
+                is_clear = clearance[worst] >= least - _STATE_SLACK
+                limit = least - _BETWEEN_SLACK if is_clear else clearance[worst] - _ACCURACY
                 motion = np.linalg.norm(np.diff(lines, axis=0), axis=-1).max(axis=1)
                 between = (clearance[:-1] + clearance[1:] - _CURVED * motion) / 2
                 open_ = np.flatnonzero(between < limit)
@@ -93,7 +93,7 @@ class ClearanceWatch:
 
     def __init__(self, robot: Manipulator, scene: Scene) -> None:
         self._robot, self._scene = robot, scene
-        self._least = scene.clearance / 2
+        self._min_clearance = scene.clearance / 2
         self._speed = np.full(robot.n_pressures, np.inf)  # of the body per pressure, in m/Pa
         self._ways_down = _ways_down(robot)
         self._cost = np.inf  # of the clearance at one state, in s
@@ -120,10 +120,10 @@ class ClearanceWatch:
 
     def _measure_cost(self) -> None:
         robot = self._robot
-        states = np.linspace(robot.pressure_min, robot.pressure_max, _DOWN)
+        states = np.linspace(robot.pressure_min, robot.pressure_max, _STATES_DOWN)
         begin = time.perf_counter()
         robot.clearance(states, self._scene)
-        self._cost = (time.perf_counter() - begin) / _DOWN
+        self._cost = (time.perf_counter() - begin) / _STATES_DOWN
 
     def too_near(self, pressures: Array) -> str:
         """Return why the body must not go to effective pressures (n,), in Pa; empty if it may.
@@ -134,14 +134,14 @@ class ClearanceWatch:
         """
         robot = self._robot
         moved = float(np.abs(pressures - self._at) @ self._speed)
-        if moved <= self._clearance - self._least:
+        if moved <= self._clearance - self._min_clearance:
             return ""
         within = np.clip(pressures, robot.pressure_min, robot.pressure_max)
         try:
             clearance = float(robot.clearance(within, self._scene))
         except StiffoptError as error:
             return f"the model has no answer at the next pressures: {error}"
-        if not clearance >= min(self._least, self._clearance):
+        if not clearance >= min(self._min_clearance, self._clearance):
             return shortfall(robot, self._scene, within)
         self._at, self._clearance = pressures.copy(), clearance
         return ""
@@ -161,17 +161,17 @@ class ClearanceWatch:
             That the body comes too near all the same, or that this was not checked; may be empty.
         """
         ways = self._ways_down
-        if self._cost * _DOWN * sum(len(way) - 1 for way in ways) > _MAX_COST:
+        if self._cost * _STATES_DOWN * sum(len(way) - 1 for way in ways) > _MAX_COST:
             return ways[0], "whether the body keeps clear on the way down was not looked at"
         best = ways[0], -np.inf, np.zeros_like(pressures)
         robot = self._robot
         try:
             for way in ways:
-                steps = np.linspace(0, len(way) - 1, _DOWN * (len(way) - 1) + 1)
+                steps = np.linspace(0, len(way) - 1, _STATES_DOWN * (len(way) - 1) + 1)
                 shares = np.stack([np.interp(steps, np.arange(len(way)), c) for c in way.T], axis=1)
                 states = np.clip(shares * pressures, robot.pressure_min, robot.pressure_max)
                 clearance = np.asarray(robot.clearance(states, self._scene))
-                if clearance.min() >= min(self._least, float(clearance[0])) - _FORGIVEN:
+                if clearance.min() >= min(self._min_clearance, float(clearance[0])) - _STATE_SLACK:
                     return way, ""
                 if clearance.min() > best[1]:
                     best = way, float(clearance.min()), states[int(clearance.argmin())]

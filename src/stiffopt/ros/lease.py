@@ -46,7 +46,6 @@ class GraphLease:
         self._lock = threading.Lock()
         self._holder: tuple[Subscription, Writer] | None = None
         self._heard = -math.inf
-        self._renewed = -math.inf
 
     @property
     def period(self) -> float:

@@ -206,7 +206,7 @@ class StateMessages:
 
         `control` names the process on the graph that has control of the arm.
         """
-        told = [
+        values = [
             KeyValue(key, value if isinstance(value, str) else json.dumps(value))
             for key, value in {**json_of(now, rounded=True), "control": control}.items()
             if not isinstance(value, (dict, list))
@@ -214,7 +214,7 @@ class StateMessages:
         waiting = now.state is State.HOLDING or bool(now.alarms)
         level = _ERROR if now.state is State.FAULT else _WARN if waiting else _OK
         name, reason = f"{self._node}: {self._rig}", self.state(now).data
-        status = [DiagnosticStatus(level, name, reason, self._rig, told)]
+        status = [DiagnosticStatus(level, name, reason, self._rig, values)]
         for alarm in now.alarms:
             named = f"{name}: {alarm.kind}"
             status.append(DiagnosticStatus(_WARN, named, alarm.text, self._rig, []))

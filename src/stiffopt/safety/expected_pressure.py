@@ -13,7 +13,7 @@ from stiffopt.rig.settings import ControlSettings
 
 Array = NDArray[np.float64]
 
-_TOLD = 1000  # commands kept, at most, while a dead time passes
+_MAX_COMMANDS = 1000  # commands kept, at most, while a dead time passes
 
 
 @dataclass(frozen=True)
@@ -82,12 +82,14 @@ class ExpectedPressure:
         self._up, self._down = _rates(regulation.lag), _rates(regulation.lag_falling)
         self._dead_time = regulation.dead_time
         self._slew = slew
-        self._told: deque[tuple[float, Array]] = deque([(-np.inf, np.zeros(n))], maxlen=_TOLD)
+        self._commands: deque[tuple[float, Array]] = deque(
+            [(-np.inf, np.zeros(n))], maxlen=_MAX_COMMANDS
+        )
         self._time = -np.inf
 
     def tell(self, time: float, commanded: Array) -> None:
         """Record set-points (n,), in Pa, that apply from a time on, in s."""
-        self._told.append((time, commanded))
+        self._commands.append((time, commanded))
 
     def follow(self, time: float) -> float:
         """Advance the bounds to a time; return the time since the last call, both in s."""
@@ -96,12 +98,12 @@ class ExpectedPressure:
         elapsed = time - self._time
         if not elapsed > 0:
             return 0.0
-        told, acting = self._told, self._time - self._dead_time
-        while len(told) > 1 and told[1][0] <= acting:
-            told.popleft()
+        commands, acting = self._commands, self._time - self._dead_time
+        while len(commands) > 1 and commands[1][0] <= acting:
+            commands.popleft()
         # any of these commands may have acted since then
-        commands = np.array([commanded for _, commanded in told])
-        least, most = np.minimum.reduce(commands), np.maximum.reduce(commands)
+        pressures = np.array([commanded for _, commanded in commands])
+        least, most = np.minimum.reduce(pressures), np.maximum.reduce(pressures)
         reach = self._slew * elapsed
         rise = np.minimum((least - self.lowest) * -np.expm1(-elapsed * self._up), reach)
         self.lowest = np.minimum(self.lowest + rise, least)
