@@ -61,8 +61,8 @@ Sequence = Annotated[
     bool,
     typer.Option(
         "--sequence",
-        help="The logs follow each other: each begins in the state in which the one before ended. "
-        "Without it, how a log begins is estimated.",
+        help="The logs were recorded without a break: each begins in the state in which the "
+        "previous one ended. Without it, each log's initial state is estimated.",
     ),
 ]
 Rezero = Annotated[
@@ -97,8 +97,8 @@ Keep = Annotated[
     list[str] | None,
     typer.Option(
         metavar="WHAT",
-        help="units, clock, axes, channels or lines: take these as they were recorded, even where "
-        "they are clearly something else; may be repeated.",
+        help="units, clock, axes, channels or lines: leave these as recorded, even if they are "
+        "clearly wrong; may be repeated.",
     ),
 ]
 Report = Annotated[
@@ -176,8 +176,8 @@ def calibrate(
         str | None,
         typer.Option(
             metavar="FILE.yaml",
-            help="Write the poses to record next, by which the arm would be known best, as a file "
-            "for `stiffopt experiment poses`; with --rig.",
+            help="Write the poses to record next, which would reduce the model's uncertainty most, "
+            "as a file for `stiffopt experiment poses`; with --rig.",
         ),
     ] = None,
     rig: Annotated[

@@ -8,12 +8,12 @@ from stiffopt.cli.exits import with_exit_code
 from stiffopt.cli.options import Json, Quiet, RigArgument, Units
 
 COMMISSION_HELP = """\
-Find out by small steps from rest whether a rig is as its files say: the first hour with a rig.
+Check by small steps from rest whether a rig matches its files: the first hour with a rig.
 
-One channel after the other moves the tip by a few mm. That tells which channel moves what, how the
-tracker's frame and its sensor are placed, how much, how fast and how tight the channels are, what
-the gauges read and how the tip swings. It says what is wrong and what to change, keeps a record
-that 'stiffopt run' checks before it arms, and draws a page. RIG is a rig file.
+One channel after another moves the tip by a few mm. This shows which chambers each channel fills,
+where the tracker's frame and its sensor are, the gain, delay and leaks of the channels, errors of
+the gauges, and the swing of the tip. The report says what is wrong and what to change. The command
+also writes a record that 'stiffopt run' checks before it arms, and draws a page. RIG is a rig file.
 """
 
 COMMISSION_EPILOG = """\
@@ -40,8 +40,8 @@ def commission(
         bool,
         typer.Option(
             "--quick",
-            help="For every other day: less than a minute for six channels. Slow leaks, and "
-            "creep, are not seen.",
+            help="For every other day: hold the steps only briefly, less than a minute for six "
+            "channels. Slow leaks and creep go unnoticed.",
         ),
     ] = False,
     out: Annotated[

@@ -208,8 +208,8 @@ POSES_HELP = """\
 Go through the pressures of a file on a rig, hold each, and record the tip.
 
 FILE (format: stiffopt-experiment/1) has the keys rig, a rig file relative to it; hold, a time; and
-pressures, one value a channel for each pose. The arm goes there gently, through the safety gate,
-begins and ends at nothing, and the recording (log v1 as CSV, and MCAP) can be calibrated with.
+pressures, one value per channel for each pose. The arm moves gently, through the safety gate, and
+begins and ends at zero pressure. The recording (log v1 as CSV, and MCAP) serves for a calibration.
 """
 
 _POSES_EPILOG = f"""\

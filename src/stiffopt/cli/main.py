@@ -73,7 +73,7 @@ app.command(
 app.command("robots", short_help="List the robots that come with stiffopt.")(robots)
 app.command(
     "commission",
-    short_help="Find out whether a rig fits its files: the first hour.",
+    short_help="Check whether a rig fits its files: the first hour.",
     help=COMMISSION_HELP,
     epilog=COMMISSION_EPILOG,
 )(commission)
@@ -101,7 +101,7 @@ app.command(
 )(calibrate)
 app.command(
     "validate",
-    short_help="Say how well a robot file predicts recordings.",
+    short_help="Measure how well a robot file predicts recordings.",
     help=VALIDATE_HELP,
     epilog=VALIDATE_EPILOG,
 )(validate)

@@ -40,8 +40,8 @@ Exit codes:
 HELP = """\
 Sample the pressures of an arm and map its workspace.
 
-Space is divided into cells. For each cell that the tip reaches the map holds how many samples did,
-and for each direction the greatest and the least stiffness that they have, with the pressures.
+Space is divided into cells. For each cell that the tip reaches, the map contains the number of
+samples and, for each direction, their largest and smallest stiffness with the pressures.
 ROBOT is the name of a built-in robot or a robot file. With --out, the map is kept as a Zarr group;
 the same command continues a run that was interrupted, or ended by --timeout.
 """
@@ -183,9 +183,9 @@ CONTACT_HELP = """\
 Lean an arm on the objects of a scene that allow contact, and say how stiff it is.
 
 Prints the contacts with their forces, the stiffness of the tip free and braced, with contacts that
-slide and that stick, and the pushes by which the first contact is lost. The equilibrium is the one
-that is reached from rest as the pressures grow together. ROBOT is the name of a built-in robot or a
-robot file.
+slide and that stick, and the pushes that lose the first contact. The equilibrium is the one reached
+from rest as all pressures grow in proportion. ROBOT is the name of a built-in robot or a robot
+file.
 """
 
 _CONTACT_EPILOG = f"""\

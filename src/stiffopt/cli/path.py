@@ -11,7 +11,7 @@ PATH_HELP = """\
 Find the pressures with which the tip follows a path, as stiff as possible along it.
 
 Each PATH is a path file. The pressures change no faster than their rates allow, and the whole body
-keeps clear of the scene. A wrong file is reported on stderr, and the others are still answered.
+keeps clear of the scene. An invalid file is reported on stderr, and the others are still solved.
 """
 
 PATH_EPILOG = """\

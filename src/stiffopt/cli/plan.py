@@ -10,9 +10,9 @@ from stiffopt.cli.options import Json, Quiet, Units, ViewOption
 PLAN_HELP = """\
 Find a motion from one configuration to another with the whole body clear of a scene all the way.
 
-The ends are pressures, proximal segment first, or task files; a task as a goal means any
-configuration that solves it. Of several goals one is reached. The pressures change no faster than
-the rates allow. A way that is not straight needs the extra 'plan'.
+The ends are pressures, proximal segment first, or task files; a task as a goal stands for any
+configuration that solves it. The motion reaches one of several goals. The pressures change no
+faster than the rates allow. A way that is not straight needs the extra 'plan'.
 """
 
 PLAN_EPILOG = """\
@@ -25,7 +25,7 @@ Examples:
 Exit codes:
   0    a motion was found
   2    bad input: a file or an option is wrong
-  3    no clear way was found, or an end of it cannot be had
+  3    no clear way was found, or an end of it is unreachable or not clear
   4    the planner failed
   130  interrupted (Ctrl-C)
 """

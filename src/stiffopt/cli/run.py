@@ -16,8 +16,8 @@ It connects to the devices of RIG, vents, checks everything and waits, vented, f
 arm goes to its first point, follows it and stays at its end. A process of its own, the guard, owns
 the pressures and vents when this one is killed, stopped or hangs.
 
-On a terminal it shows how things stand; otherwise it prints one JSON object a line. Ctrl-C, SIGTERM
-and a terminal that is closed let the pressures down and vent; a second Ctrl-C vents at once.
+On a terminal it shows a live status; otherwise it prints one JSON object a line. Ctrl-C, SIGTERM or
+closing the terminal let the pressures down and vent; a second Ctrl-C vents at once.
 """
 
 RUN_EPILOG = """\

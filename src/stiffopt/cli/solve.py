@@ -8,11 +8,11 @@ from stiffopt.cli.exits import with_exit_code
 from stiffopt.cli.options import Quiet, Units, Version, ViewOption
 
 HELP = """\
-Find the chamber pressures that reach a tip pose and do best by its stiffness.
+Find the chamber pressures that reach a tip pose and meet its stiffness goal best.
 
 Each TASK is a task file, or a folder whose task files (*.yaml) are solved in the order of their
-names. Subfolders are left alone; files in a folder that say they are something else, such as robot
-files, are skipped with a note. A wrong file is reported on stderr, and the others are still solved.
+names. Subfolders are ignored; files in a folder whose format is another, such as robot files, are
+skipped with a note. An invalid file is reported on stderr, and the others are still solved.
 """
 
 EXAMPLES = """\

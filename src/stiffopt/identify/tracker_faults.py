@@ -4,7 +4,7 @@ A tracker may lose a body for some rows, repeat its last reading, or report a bo
 moment. Where the markers of a body look alike after quarter turns, it may also report the body
 turned by one of the 24 proper rotations of the cube about the body's own axes,
 ``R_reported = R g``. Rotations of an arm are continuous, so that such flips can be undone along a
-recording, but for one of these rotations that all of it may share.
+recording, up to one rotation g that the whole recording may share.
 
 Quaternions are w first.
 """
@@ -119,9 +119,7 @@ def _away(
     """Return the first row of each run of `count` rows that jumps away from both neighbours."""
     last = len(time) - 1
     step = norms(np.diff(position, axis=0))
-    share = (
-        1 - 1 / TRACKER.jump_factor
-    )  # of `threshold`: no run that is found starts or ends with less
+    share = 1 - 1 / TRACKER.jump_factor  # smallest step at an end of a jump, of `threshold`
     large = step > share * threshold
     before = np.flatnonzero(large[: len(step) - count] & large[count:])
     after = before + count + 1
