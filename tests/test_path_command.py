@@ -111,8 +111,9 @@ def test_the_table_says_all_that_matters(write: Write) -> None:
     result = run(write("line.yaml", LINE + SCENE))
     assert result.exit_code == 0, result.stderr
     text = result.stdout
+    words = " ".join(text.split())  # the name of a long folder wraps
     for part in (
-        "solved  0.25 s",
+        "solved 0.25 s",
         "line of 20 mm, 11 points in 2 s",
         "N/m at its worst, point 1, 98.0% of that alone (maximised)",
         "against translation along (1, 0, 0), base axes, free",
@@ -121,7 +122,7 @@ def test_the_table_says_all_that_matters(write: Write) -> None:
         "2 branches were searched",
         "of alone: share of what the point could have by itself",
     ):
-        assert part in text
+        assert part in words
     rows = re.findall(r"^ +(\d+) +([\d.]+) .*%", text, re.M)
     assert [int(point) for point, _ in rows] == list(range(1, 12))
     assert [float(time) for _, time in rows] == pytest.approx(np.linspace(0, 2, 11))

@@ -60,6 +60,18 @@ def test_two_segments_against_a_lattice_of_the_null_space(compiled: FilePath) ->
     assert found > program.value(asked, best) + np.log(SHARE)
 
 
+def test_where_rates_bind_all_along_nothing_is_left_to_gain(compiled: FilePath) -> None:
+    robot = load_robot("stiff-flop-2")
+    path = path_of(robot, 24, SLEW / 10)
+    asked, program = question(path, 6), reference.PathProgram(robot, 24)
+    solution = solve_path(robot, path)
+    assert solution.found, solution.message
+    pressures = solution.pressures / reference.BAR
+    better = program.improved(asked, pressures)
+    assert better is not None
+    assert program.value(asked, pressures) > program.value(asked, better) + np.log(SHARE)
+
+
 def test_three_segments_against_refined_random_starts(compiled: FilePath) -> None:
     robot = load_robot("stiff-flop-3")
     path = path_of(robot, 12, SLEW)

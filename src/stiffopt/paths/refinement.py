@@ -48,9 +48,17 @@ def refined(
     over : "worst" or "mean"
     fixed : indices of points that must not change.
     """
-    for window in _windows(pressures, steps):
-        pressures = _Window(tasks, pressures, steps, over, window, set(fixed)).optimised()
+    done: list[range] = []
+    for _ in range(REFINEMENT.passes):  # a window may be held back at its ends: a wider one then
+        windows = [each for each in _windows(pressures, steps) if not _is_within(each, done)]
+        for window in windows:
+            pressures = _Window(tasks, pressures, steps, over, window, set(fixed)).optimised()
+        done += windows
     return pressures
+
+
+def _is_within(window: range, others: Sequence[range]) -> bool:
+    return any(each.start <= window.start and window.stop <= each.stop for each in others)
 
 
 def _windows(pressures: Vector, steps: Vector) -> list[range]:
@@ -355,7 +363,7 @@ class _Window:
         width = 1 + ball.end - ball.first
         own = slice(ball.first, ball.end)
         bounds = np.zeros((k, width))
-        bounds[:, 0] = ball.radius * REFINEMENT.inside / ball.scale
+        bounds[:, 0] = ball.radius * REFINEMENT.of_tolerance / ball.scale
         bounds[:, 1:] = state.slopes.residuals[:, own] / ball.scale
         tops = np.arange(k) * width
         below = (tops[:, np.newaxis] + np.arange(1, width)).ravel()

@@ -99,12 +99,14 @@ class RefinementSettings:
     aside : clearance kept beyond the required one, in m.
     mean : weight of the mean stiffness where the worst is maximised.
     difference : step of finite differences for second derivatives, as a share of a channel's range.
-    inside : share of the tolerances and rates that is used, so that rounding stays within them.
+    inside : share of the rates that is used, so that rounding stays within them.
+    of_tolerance : share of the tolerances that a step aims at; the rest is for its curvature.
+    passes : largest number of times that windows are made, each time wider where rates bind.
     """
 
     near: float = 0.9
     margin: int = 8
-    iterations: int = 12
+    iterations: int = 60
     radius: float = 0.1
     last_radius: float = 1e-3
     last_gain: float = 1e-4
@@ -113,6 +115,8 @@ class RefinementSettings:
     mean: float = 1e-2
     difference: float = 1e-5
     inside: float = 1 - 1e-4
+    of_tolerance: float = 0.98
+    passes: int = 4
 
 
 @dataclass(frozen=True)
