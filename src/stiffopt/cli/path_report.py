@@ -133,7 +133,7 @@ def points_table(solution: PathSolution) -> RenderableType:
         marks[solution.worst_index] = "worst"
     if solution.first_failure is not None:
         both = ", worst" * (solution.first_failure in marks)
-        marks[solution.first_failure] = f"cannot be had{both}"
+        marks[solution.first_failure] = f"first failure{both}"
     shown = {*range(0, count, max(1, round(count / _ROWS))), count - 1, *marks}
     columns = _columns(solution)
     table = number_table("  point", *columns, "")

@@ -144,7 +144,7 @@ def _brace(solution: PressureSolution) -> Iterable[Line]:
     free, unit = solution.stiffness_free, units.of_si(solution.stiffness_unit)
     value = solution.stiffness
     if free is None or value is None:
-        yield "clear of it", "the target cannot be had without leaning on something"
+        yield "clear of it", "the target cannot be reached without leaning on something"
     else:
         yield "clear of it", f"{unit.text(free)}; leaning is {value / free:.3g} times as stiff"
     for number, held in enumerate(solution.preloads):

@@ -214,7 +214,7 @@ def draw_path(
     if solution.worst_index is not None:
         marks.append((solution.worst_index, "D", style.AT_LIMIT, "least stiff", 7))
     if solution.first_failure is not None:
-        marks.append((solution.first_failure, "X", style.TARGET, "first that cannot be had", 7))
+        marks.append((solution.first_failure, "X", style.TARGET, "first failure", 7))
     for index, marker, colour, label, size in marks:
         look = {"marker": marker, "markersize": size, "markeredgecolor": "white"}
         axes.plot(*tips[:, index, None], color=colour, linestyle="none", zorder=11, **look)

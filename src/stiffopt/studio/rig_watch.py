@@ -67,7 +67,7 @@ class RigWatch:
     ) -> None:
         rig = load_rig_description(file)
         if not rig.service.port:
-            raise InputError(f"{file}: service.port is 0, so that nobody knows where to ask")
+            raise InputError(f"{file}: service.port is 0, so its daemon has no known address")
         self._file, self._is_watched = file, is_watched
         robot = load_description(rig.robot, base=Path(file).parent)
         design = Design.of_description(robot, robot_path(rig.robot, Path(file).parent))
