@@ -1,4 +1,4 @@
-"""Plans a motion around a box, streams it to a simulated rig, and draws what its arm did.
+"""Plan a motion around a box, play it on a simulated rig, and draw the motion of its arm.
 
     python examples/plan_around_a_box.py [FIGURE.png]
 

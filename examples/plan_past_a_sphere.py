@@ -1,12 +1,12 @@
-"""A planner of one's own: the tip follows a line of 40 mm while the whole body passes a sphere.
+"""A custom planner: the tip follows a line of 40 mm while the whole body passes a sphere.
 
     python examples/plan_past_a_sphere.py [FIGURE.png]
 
-The planner knows two calls of stiffopt. `PressureSolver.warm` gives configurations for each of the
-50 poses, the stiffest within boxes about those of the pose before; `robot.clearance` says
-which of them, and which straight ways between them in the space of pressures, keep the body clear.
+The planner uses two calls of stiffopt. `PressureSolver.warm` returns configurations for each of the
+50 poses, the stiffest within boxes about those of the previous pose. `robot.clearance` decides
+which of them, and which straight lines between them in the space of pressures, keep the body clear.
 The shortest way through this layered graph, within the rates of the pressures, becomes a trajectory
-of pressures. A simulated rig plays it, whose arm differs from the model, and the clearance is
+of pressures. A simulated rig plays it. Its arm differs from the model, and the clearance is
 measured on its true body.
 """
 

@@ -8,9 +8,9 @@ In another:
 
     python examples/ros_planner.py stiff-flop-1 "20, 5, 95" "-10, 15, 93"
 
-It reads where the pressures are, finds the stiffest pressures for each target in mm (or those of
-least pressure where the target leaves no choice), and sends them as one JointTrajectory of
-pressures. It offers a lease of liveliness: when it is killed, the arm is held, let down and vented.
+It reads the present pressures, finds the stiffest pressures for each target in mm (or the lowest
+ones if the target leaves no choice), and sends them as one JointTrajectory of pressures. It offers
+a lease of liveliness: when it is killed, the arm is held, lowered and vented.
 docs/ros.md has the same writer for a node of rclpy.
 """
 

@@ -1,6 +1,6 @@
-"""A rig on a simulated clock with the daemon's control loop, whose true body can be looked at.
+"""A rig on a simulated clock with the daemon's control loop and access to the arm's true body.
 
-For the examples beside it. On a real rig the same trajectory goes to the daemon instead:
+The examples beside it use it. On a real rig the same trajectory goes to the daemon instead:
 ``stiffopt.Client(...).follow_trajectory(trajectory)``.
 """
 
