@@ -98,7 +98,7 @@ class Twist(_Screw):
 
     @classmethod
     def from_axis(cls, point: ArrayLike, direction: ArrayLike, pitch: float = 0.0) -> Self:
-        """Return the twist about an axis through `point`, |direction| rad; `pitch` is in m."""
+        """Return the twist about an axis through `point`, ``|direction|`` rad; `pitch` is in m."""
         omega, v = cls._from_axis(point, direction, pitch)
         return cls(np.concatenate([v, omega]))
 
@@ -125,7 +125,7 @@ class Wrench(_Screw):
 
     @classmethod
     def from_axis(cls, point: ArrayLike, direction: ArrayLike, pitch: float = 0.0) -> Self:
-        """Return the wrench along an axis through `point`, |direction| N; `pitch` is in m."""
+        """Return the wrench along an axis through `point`, ``|direction|`` N; `pitch` is in m."""
         force, moment = cls._from_axis(point, direction, pitch)
         return cls(np.concatenate([force, moment]))
 
