@@ -18,9 +18,9 @@ from recordings import UCL, needs_ucl
 from stiffopt.cli import calibrate_run, exits
 from stiffopt.cli.calibrate_run import fixed_keys, log_names
 from stiffopt.cli.main import main
-from stiffopt.errors import FileError, InputError
+from stiffopt.errors import CancelledError, FileError, InputError
 from stiffopt.files import save_file
-from stiffopt.identify.calibration import calibrate
+from stiffopt.identify.calibration import CalibrationResult, calibrate
 from stiffopt.identify.settings import CalibrationSettings
 from stiffopt.identify.structures import STRUCTURES
 from stiffopt.logs import (
@@ -596,6 +596,32 @@ def test_ctrl_c_keeps_the_best_model_so_far(
         assert "# Interrupted: not all models were compared" in out.read_text(encoding="utf-8")
         with pytest.warns(stiffopt.UnfitWarning):  # the simplest model of an arm that lags
             assert load_description(out).calibration is not None
+
+
+def test_a_calibration_that_is_cancelled_has_the_best_so_far(folder: Path) -> None:
+    """And its result is made in spite of what goes on asking to give up."""
+    fitted: set[str] = set()
+
+    def progress(done: float, total: float, words: str) -> None:
+        if words.startswith("fitting"):
+            fitted.add(words)
+
+    settings = CalibrationSettings(rows=60, trial_rows=60)
+    with pytest.raises(CancelledError) as stopped:
+        calibrate(
+            "stiff-flop-1", [folder / "monday.csv"], settings=settings, progress=progress,
+            cancel=lambda: len(fitted) > 1,
+        )  # fmt: skip
+    assert isinstance(stopped.value.found, CalibrationResult)
+    assert "was interrupted" in stopped.value.found.remarks[0]
+
+
+def test_a_calibration_that_is_out_of_time(folder: Path, tmp_path: Path, capsys: Any) -> None:
+    command = ["calibrate", "--robot", "stiff-flop-1", folder / "monday.csv", "--timeout", "1 ms"]
+    code, out, err = run(capsys, *command, "--out", tmp_path / "fitted.yaml")
+    assert (code, out) == (130, "")
+    assert "no answer within the 0.001 s" in err
+    assert not list(tmp_path.iterdir())
 
 
 def test_ctrl_c_while_logs_are_read_is_an_interrupt(

@@ -41,7 +41,8 @@ Examples:
   stiffopt calibrate --robot asu-two-segment apr4_*.csv --sequence --out asu.yaml --report fit
   stiffopt calibrate --robot arm.yaml run/*.csv --out fitted.yaml --suggest next.yaml --rig rig.yaml
 {_CODES}{_UNFIT}\
-  130  interrupted (Ctrl-C): the best model so far is written, if there is one; twice: nothing is
+  130  interrupted (Ctrl-C, or --timeout is over): the best model so far is written, if there is
+       one; Ctrl-C twice: nothing is
 """
 
 VALIDATE_EPILOG = f"""\
@@ -157,6 +158,9 @@ def calibrate(
             "nothing is held back.",
         ),
     ] = False,
+    timeout: Annotated[
+        str | None, typer.Option(metavar="TIME", help="After which to stop, as by Ctrl-C.")
+    ] = None,
     sequence: Sequence = False,
     rezero: Rezero = False,
     pressures: Pressures = "commanded",
@@ -198,8 +202,8 @@ def calibrate(
     )  # fmt: skip
     return calibrate_run.run_calibrate(
         recordings, out, tables=stiffness or (), model=model, strain_law=strain_law, fix=fix or (),
-        rows=rows, quick=quick, suggest=suggest, rig=rig, report=report, as_json=as_json,
-        quiet=quiet,
+        rows=rows, quick=quick, timeout=timeout, suggest=suggest, rig=rig, report=report,
+        as_json=as_json, quiet=quiet,
     )  # fmt: skip
 
 

@@ -28,7 +28,15 @@ from stiffopt.cli.exits import (
 )
 from stiffopt.cli.outputs import check_new_file, check_new_folder, new_folder
 from stiffopt.display import display_units
-from stiffopt.errors import CancelledError, FileError, InputError, printable, require_package, shown
+from stiffopt.errors import (
+    FileError,
+    InputError,
+    OutOfTimeError,
+    StoppedError,
+    printable,
+    require_package,
+    shown,
+)
 from stiffopt.experiments.poses import save_poses
 from stiffopt.files import save_file
 from stiffopt.identify.calibration import CalibrationResult
@@ -63,6 +71,7 @@ def run_calibrate(
     fix: Sequence[str],
     rows: int | None,
     quick: bool,
+    timeout: str | None,
     suggest: str | None,
     rig: str | None,
     report: str | None,
@@ -90,6 +99,9 @@ def run_calibrate(
             raise InputError(
                 f"--model: there is no model {shown(model)}; expected one of {', '.join(names)}"
             )
+        seconds = (
+            None if timeout is None else quantities.quantity("--timeout", timeout, "s", "time")
+        )
         quantities.choice("--strain-law", strain_law, ("auto", "keep"))
         counts = {}
         if rows is not None:
@@ -107,11 +119,13 @@ def run_calibrate(
         stiffnesses = read_tables(tables, robot)
         logs = recordings.read(robot, progress)
         try:
-            result = fit_robot(robot, logs, stiffnesses, settings, progress)
+            result = fit_robot(robot, logs, stiffnesses, settings, progress, timeout=seconds)
             code = FAILED if result.unfit else SOLVED
-        except CancelledError as stop:
+        except StoppedError as stop:
             if not isinstance(stop.found, CalibrationResult):
-                raise
+                if isinstance(stop, OutOfTimeError):
+                    report_error(str(stop))
+                raise KeyboardInterrupt from None
             result, code = stop.found, INTERRUPTED
         with new_folder(report) as folder:
             if folder is not None:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt import lie
-from stiffopt.errors import CancelledError, InputError, PressureError
+from stiffopt.errors import InputError, PressureError, StoppedError
 from stiffopt.identify.detection import Comparer, Hypothesis, found_wrong
 from stiffopt.identify.error_model import covariance_with, error_model, kept_unknowns
 from stiffopt.identify.fit import Fit, fit
@@ -55,6 +55,7 @@ from stiffopt.model.calibration import Calibration, ErrorModel, FittedParameter
 from stiffopt.model.description import Recordings, RobotDescription
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.parameters import Parameter, with_values
+from stiffopt.model.stopping import Cancel, checkpoint, giving_up
 from stiffopt.registration import Placement, Registration
 
 Array = NDArray[np.float64]
@@ -108,6 +109,9 @@ def calibrate(
     tables: Sequence[TableSource] = (),
     settings: CalibrationSettings | None = None,
     progress: Progress | None = None,
+    *,
+    timeout: float | None = None,
+    cancel: Cancel | None = None,
 ) -> CalibrationResult:
     """Fit a robot to recordings.
 
@@ -137,9 +141,9 @@ def calibrate(
         A file cannot be read or is invalid.
     EquilibriumError
         An arm under gravity buckles during the fit.
-    CancelledError
-        From `progress`. Its `found` is the result with the best model fitted so far, to
-        `trial_rows` rows; None if there is none yet.
+    OutOfTimeError, CancelledError
+        Where `timeout`, `cancel` or `progress` ended it. Its `found` is the result with the best
+        model fitted so far, to `trial_rows` rows; None if there is none yet.
     """
     description, settings = description_of(robot), settings or CalibrationSettings()
     if not logs and not tables:
@@ -152,25 +156,26 @@ def calibrate(
         Parameter(key).value(description)  # raises if there is no such number
     laws = other_laws(description) if settings.strain_law == "auto" else []
     teller = _Teller(progress, len(structures) + len(laws))
-    recordings = recordings_of(description, logs, settings)
-    setup = _put_right(Setup.of(description, recordings, read, settings), teller)
-    if not recordings:  # tables alone: trust the robot file's poses
-        teller.begin("fitting the stiffness")
-        alone = ModelStructure(
-            "stiffness", "stiffness alone", ("compensation.stiffness",), as_given=True
-        )
-        return _result(setup, _final(setup, alone, {}, teller), alone, [], teller)
     candidates: list[Candidate] = []
     try:
-        if settings.holds_back:
-            chosen = _chosen(setup, structures, laws, candidates, teller)
-            structure, near = chosen.structure, chosen.fit.problem.named(chosen.fit.x)
-        else:
-            structure, near = structures[0], _screened(setup, teller)
-        teller.begin(f"final fit: {structure.words}")
-        final = _final(setup, structure, near, teller)
-        return _result(setup, final, structure, candidates, teller)
-    except CancelledError as stop:
+        with giving_up(timeout, cancel):
+            recordings = recordings_of(description, logs, settings)
+            setup = _put_right(Setup.of(description, recordings, read, settings), teller)
+            if not recordings:  # tables alone: trust the robot file's poses
+                teller.begin("fitting the stiffness")
+                alone = ModelStructure(
+                    "stiffness", "stiffness alone", ("compensation.stiffness",), as_given=True
+                )
+                return _result(setup, _final(setup, alone, {}, teller), alone, [], teller)
+            if settings.holds_back:
+                chosen = _chosen(setup, structures, laws, candidates, teller)
+                structure, near = chosen.structure, chosen.fit.problem.named(chosen.fit.x)
+            else:
+                structure, near = structures[0], _screened(setup, teller)
+            teller.begin(f"final fit: {structure.words}")
+            final = _final(setup, structure, near, teller)
+            return _result(setup, final, structure, candidates, teller)
+    except StoppedError as stop:
         if candidates:
             leader = best(candidates)
             silent = _Teller(None, 0)
@@ -252,6 +257,7 @@ class _Teller:
         self()
 
     def __call__(self) -> None:
+        checkpoint()
         if self._progress is not None:
             # approaches the end of the phase asymptotically
             share = 1 - 1 / (1 + self._evaluations / 60)

@@ -197,14 +197,16 @@ class PressureSolver:
                 checkpoint()
             return found
 
-    def follow(self, guess: ArrayLike, *, timeout: float | None = None) -> PressureSolution:
+    def follow(
+        self, guess: ArrayLike, *, timeout: float | None = None, cancel: Cancel | None = None
+    ) -> PressureSolution:
         """Return an answer for interactive display: sooner than `solve`, even where out of reach.
 
         If there is none next to the guess, (n,) in Pa, this is the closest configuration found from
         there.  Only for a pose that can be reached does a global search follow.  See `solve`.
         """
         start = self._checked(guess)
-        with giving_up(timeout, None):
+        with giving_up(timeout, cancel):
             calls = self._warm_calls or self._prepare_warm_calls()
             block = None if calls is None else calls.next_to(start, None, None, None)
             try:
