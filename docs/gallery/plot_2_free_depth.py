@@ -2,7 +2,7 @@
 A free axis
 ===========
 
-The same position, but its height does not matter. The tip chooses its height, and the arm is
+The same position, but with a free height. The optimiser chooses the height, and the arm is
 stiffer. A free axis is often the cheapest way to gain stiffness.
 """
 

@@ -3,7 +3,7 @@ A push with a tool, three segments
 ==================================
 
 A blunt tool at a position and a pointing, as stiff as possible along its own axis. Three
-segments have nine pressures. The pose takes five of them, four are left to get stiff.
+segments have nine pressures. The pose takes five of them, four are left for stiffness.
 """
 
 import stiffopt

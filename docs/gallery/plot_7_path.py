@@ -2,8 +2,8 @@
 A path
 ======
 
-The tip follows a line. The pressures of all points are chosen together, so that the least
-stiffness on the line is as large as possible and no pressure changes faster than it may.
+The tip follows a line. The pressures of all points are chosen together, so that the smallest
+stiffness on the line is as large as possible and no pressure exceeds its rate limit.
 """
 
 import stiffopt

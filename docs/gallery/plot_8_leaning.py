@@ -2,9 +2,9 @@
 Leaning on a wall
 =================
 
-The back of the arm is on the wall behind it. A task with a brace decides whether, where and how
-hard to lean; beside the answer the stiffest one that keeps clear of the wall, whose ellipsoid is
-the dotted one.
+The back of the arm rests on the wall behind it. For a task with a brace, the optimiser decides
+whether, where and how hard to lean. The dotted ellipsoid is that of the stiffest answer that keeps
+clear of the wall.
 """
 
 import stiffopt
