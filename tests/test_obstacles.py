@@ -289,6 +289,17 @@ def test_a_scene_that_leaves_no_way(compiled: Path) -> None:
     assert found.clearance < CLEARANCE
 
 
+def test_a_way_through_a_narrow_tube_is_found(compiled: Path) -> None:
+    """Out of reach of its target, and not one of the samples is clear of it."""
+    robot = load_robot("stiff-flop-2")
+    shape = robot.backbone([125e3, 96e3, 142e3, 51e3, 150e3, 130e3], 14)[:, :3, 3]
+    points = [(0, 0, -0.02), *shape.tolist()]
+    lumen = {"name": "lumen", "inside_tube": {"points": points, "radius": 0.02}}
+    found = solve_pressure(robot, task_with(scene_of(lumen), (0.2, 0.2, 0.3)))
+    assert "held back by 'lumen'" in found.message
+    assert found.clearance == pytest.approx(CLEARANCE, abs=EXACT)
+
+
 @pytest.fixture
 def no_general_method(monkeypatch: pytest.MonkeyPatch) -> None:
     """Have what takes seconds among obstacles fail."""

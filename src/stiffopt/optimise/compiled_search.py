@@ -5,6 +5,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.errors import EquilibriumError
+from stiffopt.model.scene import Scene
 from stiffopt.model.stopping import checkpoint
 from stiffopt.optimise import diagnosis
 from stiffopt.optimise.answers import Answers, pressed
@@ -114,8 +116,8 @@ class CompiledSearch:
         """Return an answer among obstacles where `solve` and `nearest` have none.
 
         If the pose is reached and clear but too soft, return the stiffest answer.  Otherwise
-        descend from the clear sample nearest to the target or, if none is clear, from the clearest
-        ones.  If all fail, return the clearest sample.
+        descend from the clear sample nearest to the target or, if none is clear, from the first
+        clear configuration found near the clearest ones.  Without one, return the clearest.
         """
         fast = self.fast(task, None)
         if fast is None or task.scene is None:
@@ -134,9 +136,34 @@ class CompiledSearch:
         far = solver.table.distances(program.terms, self._robot.length)[: len(samples)]
         if clear.any():
             return self.nearest(task, samples[np.where(clear, far, np.inf).argmin()])
-        clearest = samples[np.argsort(-distances)[: OBSTACLES.starts]]
-        found = (self.nearest(task, start) for start in clearest)
-        return next(filter(None, found), None) or self._clearest(task, samples, distances)
+        p, drawn = self._clearest_near(task.scene, samples, distances)
+        if self._robot.clearance(p, task.scene) >= task.scene.clearance:
+            return self.nearest(task, p)
+        return self._clearest(task, p, len(samples) + drawn)
+
+    def _clearest_near(self, scene: Scene, p: Vector, distances: Vector) -> tuple[Vector, int]:
+        """Return pressures (n,) clear of a scene, or the clearest found, and how many were drawn.
+
+        Each round draws closer around the clearest so far, at first those of p (N, n).
+        """
+        rng, drawn = np.random.default_rng(0), 0
+        low, high = self._prepared.lower, self._prepared.upper
+        for share in np.geomspace(*OBSTACLES.spread, OBSTACLES.rounds):
+            if distances.max() >= scene.clearance:
+                break
+            checkpoint()
+            best = np.argsort(-distances)[: OBSTACLES.parents]
+            p, distances = p[best], distances[best]
+            others = np.repeat(p, OBSTACLES.children, axis=0)
+            others += share * (high - low) * rng.standard_normal(others.shape)
+            try:
+                found = self._robot.clearance(np.clip(others, low, high, out=others), scene)
+            except EquilibriumError:  # near where the arm buckles
+                break
+            drawn += len(others)
+            p, distances = np.concatenate([p, others]), np.concatenate([distances, found])
+        nearest: Vector = p[distances.argmax()]
+        return nearest, drawn
 
     def _too_soft(
         self, task: Task, judgement: Judgement, answer: CompiledAnswer
@@ -152,15 +179,14 @@ class CompiledSearch:
             counts=answer.counts,
         )
 
-    def _clearest(self, task: Task, samples: Vector, distances: Vector) -> PressureSolution:
+    def _clearest(self, task: Task, p: Vector, tried: int) -> PressureSolution:
         """Return the sample with the most clearance, where none has enough."""
-        p = samples[int(distances.argmax())]
         judgement = judge(self._robot, task, p)
         return PressureSolution(
             status="unreachable",
-            message=diagnosis.no_way_message(judgement, task, len(samples)),
+            message=diagnosis.no_way_message(judgement, task, tried),
             active_bounds=tuple(active_bounds(self._robot, task, p)),
             **self._answers.quantities(task, judgement),
             pressures=p,
-            confidence=Confidence(len(samples), 0, 0, 0, complete=False),
+            confidence=Confidence(tried, 0, 0, 0, complete=False),
         )

@@ -143,7 +143,9 @@ class ObstacleSettings:
     turns, closer : refinements of the nearest point without machine code, and stations of each.
     clearest : samples among which a clear start is sought if none near the target arrives clear;
         the clearest of them is shown if none is clear.
-    starts : number of the clearest samples from which descents start if none is clear.
+    parents, children, rounds, spread : if none is clear, so many of the clearest have so many
+        others drawn around them in a round, in the first and the last round by these standard
+        deviations, as shares of the range of pressures.
     allowed : violation of the clearance that is allowed in an answer, in m: the precision of least
         distances.
     """
@@ -154,7 +156,10 @@ class ObstacleSettings:
     turns: int = 5
     closer: int = 9
     clearest: int = 2048
-    starts: int = 8
+    parents: int = 64
+    children: int = 16
+    rounds: int = 14
+    spread: tuple[float, float] = (0.15, 0.003)
     allowed: float = 1e-5
 
 
