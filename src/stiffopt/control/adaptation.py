@@ -77,7 +77,7 @@ class Estimate:
 
 
 class Learning:
-    """What the planner's process learns of the arm besides its plans.
+    """Estimates of the arm and of its stiffness that the planner's process makes between plans.
 
     The first windows take half a second, later ones tens of milliseconds; the arm is at rest then.
 

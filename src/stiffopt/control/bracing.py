@@ -5,8 +5,8 @@ that the arm comes into contact slowly and at the planned equilibrium. The same 
 the contacts.
 
 While the brace is held, the tracker measures the tip at y and the braced model predicts s. The slow
-part of y - s is the error b of the model and creep. The rest is the effect of a push F at the tip,
-of which the most likely one is taken. With the compliance C of the braced tip and the deviations
+part of y - s is the error b of the model and creep. The rest is the effect of a push F at the tip;
+its most likely value is taken. With the compliance C of the braced tip and the deviations
 sigma of y - s - b and f of pushes,
 
     F = C (C C + (sigma / f)^2)^-1 (y - s - b).

@@ -25,7 +25,7 @@ class LeaningTip:
     Parameters
     ----------
     approach :
-        The way into contact. Pressures beside it use the model of its nearest equilibrium.
+        The way into contact. Other pressures use the model of its nearest equilibrium.
     """
 
     def __init__(self, approach: BraceApproach) -> None:

@@ -9,8 +9,8 @@ look for what no push, payload or model error explains:
 * drift: y - s keeps moving, faster than the model's error can change while s moves;
 * swing: y - r oscillates, and does not decay.
 
-A push or a payload moves y - s too, but then it rests. Drift is tested at three time scales, so
-that creep is told apart. The model may be wrong by a share of the motion that each segment causes,
+A push or a payload moves y - s too, but then it rests. Drift is tested at three time scales, to
+distinguish it from creep. The model may be wrong by a share of the motion that each segment causes,
 even if segments move the tip in opposite directions.
 """
 

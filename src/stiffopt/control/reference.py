@@ -177,7 +177,7 @@ class VibrationFilter:
 def _step(reach: Array, extra: int) -> Formula:
     """Return the formula of a step: states (5, n + m), motion (4, n + m), command, chamber (n,).
 
-    Inputs: states, the first of which is the input of the lags; the plan (n + m,); transition
+    Inputs: states, the first being the input of the lags; the plan (n + m,); transition
     matrix (5, 5); differences (4, 5); weights (4,) of the motion in command and chamber; the share
     of `reach`, the greatest change of the n pressures in a step, that may be used.
     """

@@ -1,4 +1,4 @@
-"""The state machine of the control loop: what a tick does in each state, what requests change.
+"""The state machine of the control loop: the work of a tick in each state, and the transitions.
 
 It has no threads and no clock of its own: `ControlLoop` makes its calls one at a time.
 """

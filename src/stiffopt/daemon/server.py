@@ -32,7 +32,7 @@ except ModuleNotFoundError as error:
 
 MAX_CONNECTIONS = 128
 """Connections without the token, streams included; and as many with it, without streams. Each is an
-open file, of which a process may have about a thousand."""
+open file; a process may have about a thousand."""
 MAX_STREAMS = 16
 """Streams without the token, and as many with it; a hundred would delay the control loop."""
 GRACE = 1.0

@@ -207,27 +207,27 @@ def _piece_distance(kind: int, q: Array, x: Array, normal: Array) -> float:
     length = math.sqrt(length)
     height = along / length if length > 0 else 0.0
     foot = height if kind == CYLINDER else min(max(height, 0.0), length)
-    beside = 0.0
+    radial = 0.0
     for i in range(3):
         normal[i] = x[i] - q[i] - (foot / length * (q[3 + i] - q[i]) if length > 0 else 0.0)
-        beside += normal[i] ** 2
-    beside = max(math.sqrt(beside), 1e-12)
+        radial += normal[i] ** 2
+    radial = max(math.sqrt(radial), 1e-12)
     for i in range(3):
-        normal[i] /= beside
+        normal[i] /= radial
     if kind == TUBE:
         for i in range(3):
             normal[i] = -normal[i]
-        return float(q[6] - beside)
+        return float(q[6] - radial)
     if kind == CYLINDER:
         excess, weight = np.empty(2), np.empty(2)
-        excess[0] = beside - q[6]
+        excess[0] = radial - q[6]
         excess[1] = abs(height - 0.5 * length) - 0.5 * length
         distance = _beyond(excess, weight)
         up = math.copysign(weight[1], height - 0.5 * length) / length
         for i in range(3):
             normal[i] = weight[0] * normal[i] + up * (q[3 + i] - q[i])
         return distance
-    return float(beside - q[6])
+    return float(radial - q[6])
 
 
 @jit

@@ -40,7 +40,7 @@ _LOOK = 0.005  # s between checks of a moving stage
 
 @dataclass(frozen=True)
 class Owned:
-    """What a guard owns.
+    """The objects that a guard owns.
 
     Attributes
     ----------
