@@ -93,8 +93,8 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 
-# Names are imported at their first use: NumPy, CasADi and pydantic take a quarter of a second, for
-# which neither `--help` nor a wrong option should wait.
+# Names are imported at their first use: NumPy, CasADi and pydantic take a quarter of a second, too
+# long for `--help` or a wrong option.
 _NAMES = {
     "stiffopt.daemon.client": ("Client",),
     "stiffopt.errors": (

@@ -1,4 +1,4 @@
-"""``python -m stiffopt``: the program `stiffopt`."""
+"""Run the program `stiffopt` by ``python -m stiffopt``."""
 
 from stiffopt.cli.main import main
 

@@ -1,4 +1,4 @@
-"""Directions and rotations as a user gives them: brought to length 1, or refused."""
+"""Normalise or reject directions and rotations that a user gives."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from stiffopt.units import Number
 
 
 def unit_vector(vector: tuple[float, ...]) -> tuple[float, ...]:
-    """Return a vector at length 1; leave it be if it has that already."""
+    """Scale a vector to length 1; return it unchanged if it has that length."""
     largest = max(map(abs, vector))
     if largest == 0:
         raise InputError("is zero; expected a direction such as [1, 0, 0]")
@@ -27,7 +27,7 @@ def unit_vector(vector: tuple[float, ...]) -> tuple[float, ...]:
 
 
 def unit_quaternion(quaternion: tuple[float, ...]) -> tuple[float, ...]:
-    """Return a quaternion at length 1 with w >= 0; it must be nearly one already."""
+    """Scale a quaternion to length 1 with w >= 0; it must nearly have length 1 already."""
     norm = math.hypot(*quaternion)
     if abs(norm - 1) > 1e-3:
         raise InputError(
@@ -50,7 +50,7 @@ Quaternion = Annotated[
 
 
 def direction_name(direction: Sequence[float]) -> str:
-    """Return the name of a unit vector (3,) for people: ``x``, ``-z``, ``(0.6, 0.8, 0)``."""
+    """Return a readable name of a unit vector (3,): ``x``, ``-z``, ``(0.6, 0.8, 0)``."""
     for axis, name in enumerate("xyz"):
         if abs(abs(direction[axis]) - 1) < 1e-9:
             return name if direction[axis] > 0 else f"-{name}"

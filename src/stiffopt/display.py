@@ -1,8 +1,8 @@
-"""In which units people read answers: tables, figures and messages.
+"""Units in which answers are displayed: in tables, figures and messages.
 
-One choice holds for all that is shown, so that a table and its figure agree. It is made once, by
-``--units`` of the commands, by the environment variable ``STIFFOPT_UNITS``, or in Python by
-`choose_units`. Files that stiffopt writes and JSON do not follow it.
+One choice holds for everything that is displayed, so that a table and its figure agree. It is made
+by ``--units`` of the commands, by the environment variable ``STIFFOPT_UNITS``, or in Python by
+`choose_units`. It does not affect JSON and the files that stiffopt writes.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ __all__ = [
 ]
 
 VARIABLE = "STIFFOPT_UNITS"
-"""Environment variable that names units, as ``--units`` does."""
+"""Environment variable with units, in the form of ``--units``."""
 
 FIGURES = "#.4g"
 """Format of a number with four significant figures, zeros at its end included."""
@@ -41,22 +41,22 @@ _USUAL = {
     "rotational_stiffness": ("N*m/rad", "N*m/rad"),
     "angle": ("rad", "deg"),
 }
-"""Of each dimension its SI unit, and the unit that is shown unless another one is asked for."""
+"""SI unit and default display unit of each dimension."""
 _EXAMPLE = "'mm, bar, N/mm'"
 
 
 @dataclass(frozen=True)
 class DisplayUnit:
-    """A unit in which numbers are shown.
+    """A unit in which numbers are displayed.
 
     Attributes
     ----------
     name : str
-        As people write it: ``mm``, ``N mm/rad``.
+        Its readable name: ``mm``, ``N mm/rad``.
     per_si : float
-        How many of it are one SI unit.
+        Its number in one SI unit.
     more_decimals : int
-        How many decimals numbers have more than in the usual unit, for the same resolution.
+        Additional decimals of numbers, compared to the default unit, for the same resolution.
     """
 
     name: str
@@ -78,7 +78,7 @@ class DisplayUnit:
         ----------
         value : float
         form : str
-            How it is formatted; decimals, such as ``.3f``, are those in the usual unit.
+            Its format; decimals, such as ``.3f``, are those in the default unit.
         """
         if form.endswith("f"):
             form = f".{max(0, int(form[1:-1]) + self.more_decimals)}f"
@@ -96,12 +96,12 @@ class DisplayUnit:
 
 
 PLAIN = DisplayUnit("")
-"""Of numbers without a unit, or with one that stands elsewhere."""
+"""For numbers without a unit, or with a unit given elsewhere."""
 
 
 @dataclass(frozen=True)
 class DisplayUnits:
-    """The units in which people read answers, one for each dimension.
+    """The units in which answers are displayed, one for each dimension.
 
     Attributes
     ----------
@@ -118,7 +118,7 @@ class DisplayUnits:
 
     @classmethod
     def named(cls, text: str = "") -> DisplayUnits:
-        """Return the units that a text such as ``mm, bar, N/mm`` names, and the usual others.
+        """Return the units in a text such as ``mm, bar, N/mm``, and the default ones for the rest.
 
         Raises
         ------
@@ -128,9 +128,9 @@ class DisplayUnits:
         return _named(text)
 
     def of_si(self, unit: str | None) -> DisplayUnit:
-        """Return the unit in which values of an SI unit, such as ``N*m/rad``, are shown.
+        """Return the unit in which values of an SI unit, such as ``N*m/rad``, are displayed.
 
-        What has another dimension is shown as it is.
+        Values of other dimensions are displayed in their SI unit.
         """
         for name, (si, _) in _USUAL.items():
             if si == unit:
@@ -184,13 +184,13 @@ _chosen: DisplayUnits | None = None
 
 
 def choose_units(text: str | None) -> None:
-    """Show everything in units that a text such as ``mm, bar, N/mm`` names, from now on.
+    """Display everything in the units of a text such as ``mm, bar, N/mm``, from now on.
 
     Parameters
     ----------
     text :
-        Dimensions that it does not name keep their usual units. None: what the environment
-        variable ``STIFFOPT_UNITS`` names.
+        Dimensions that are not in it keep their default units. None: the units in the environment
+        variable ``STIFFOPT_UNITS``.
 
     Raises
     ------
@@ -202,7 +202,7 @@ def choose_units(text: str | None) -> None:
 
 
 def display_units() -> DisplayUnits:
-    """Return the units in which to show values.
+    """Return the units in which to display values.
 
     Raises
     ------

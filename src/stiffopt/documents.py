@@ -1,8 +1,8 @@
-"""YAML documents, read as plain data with the line number of every value, and written.
+"""Read YAML documents as plain data with the line number of every value, and write them.
 
-The core schema of YAML 1.2 holds: ``1e-3`` is a number, ``yes``, ``on``, ``1:30`` and dates are
-text. Anchors, aliases, tags, several documents in a file and deep nesting are refused: no file that
-is written by hand needs them, and a malicious one does.
+The core schema of YAML 1.2 applies: ``1e-3`` is a number, ``yes``, ``on``, ``1:30`` and dates are
+text. Anchors, aliases, tags, several documents in a file and deep nesting are rejected: files
+written by hand do not need them, and malicious ones do.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class Document:
     lines: dict[Loc, int] = field(repr=False)
 
     def error(self, loc: Loc, reason: str) -> FileError:
-        """Return the error that blames what is at `loc`."""
+        """Return an error about the value at `loc`."""
         return FileError(self.path, reason, line=self.lines.get(loc), key=dotted(loc) or None)
 
 
@@ -46,20 +46,20 @@ def read_document(path: str | os.PathLike[str]) -> Document:
 
 
 def document_of(text: str, name: str) -> Document:
-    """Return a YAML text as plain data with line numbers, as `read_document` does with a file.
+    """Parse a YAML text as plain data with line numbers, as `read_document` does for a file.
 
     Parameters
     ----------
     text :
-        What the file would say.
+        Content of the file.
     name :
-        What errors call it.
+        Name of the file in errors.
     """
     return _Composer(name, text).document()
 
 
 def to_yaml(data: Mapping[str, Any]) -> str:
-    """Return data as the YAML text that `read_document` reads back as they were."""
+    """Return data as YAML text, which `read_document` reads back as equal data."""
     return str(
         yaml.dump(_plain(data), Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=100)
     )
@@ -68,9 +68,9 @@ def to_yaml(data: Mapping[str, Any]) -> str:
 def write_file(
     path: str | os.PathLike[str], data: Mapping[str, Any], comment: Sequence[str] = ()
 ) -> None:
-    """Write data as YAML that `read_document` reads back as they were.
+    """Write data as YAML, which `read_document` reads back as equal data.
 
-    The file appears whole or not at all, see `write_whole`.
+    The file appears complete or not at all, see `write_whole`.
 
     Parameters
     ----------
@@ -79,19 +79,19 @@ def write_file(
     data :
         Text, numbers, booleans, None, lists, tuples, arrays and mappings with text as keys.
     comment :
-        Lines that stand above the data, for people.
+        Lines above the data, for people.
     """
     text = "".join(f"# {printable(line)}\n" for line in comment) + to_yaml(data)
     write_whole(path, text.encode())
 
 
 def write_whole(path: str | os.PathLike[str], content: bytes) -> None:
-    """Write a file that appears whole or not at all: as a temporary file, then moved to its place.
+    """Write a file that appears complete or not at all, by moving a temporary file to its place.
 
     Raises
     ------
     FileError
-        It cannot be written; the file that was there is as it was.
+        It cannot be written; an existing file is unchanged.
     """
     target = Path(path)
     try:
@@ -145,7 +145,7 @@ _WORDS: dict[str, Any] = {
 
 
 def _resolve(text: str) -> Any:
-    """Return what a plain scalar means in the core schema of YAML 1.2."""
+    """Return the value of a plain scalar in the core schema of YAML 1.2."""
     if text in _WORDS:
         return _WORDS[text]
     if _INT.fullmatch(text) and len(text) < 400:
@@ -155,7 +155,7 @@ def _resolve(text: str) -> Any:
 
 
 class _Composer:
-    """Builds a `Document` from the events of the YAML parser."""
+    """Build a `Document` from the events of the YAML parser."""
 
     def __init__(self, path: str, text: str) -> None:
         self.path = path
@@ -239,13 +239,13 @@ class _Composer:
 
 
 class _Dumper(yaml.SafeDumper):
-    """Writes what `read_document` reads: no aliases, and text quoted where it looks like data."""
+    """Write YAML for `read_document`: no aliases, and text quoted where it looks like data."""
 
     def ignore_aliases(self, data: Any) -> bool:
         return True
 
     def write_plain(self, text: str, split: bool = True) -> None:
-        """Break lines between the items of a list, not within one such as ``0.5 bar``."""
+        """Break lines between the items of a list, but not within an item such as ``0.5 bar``."""
         super().write_plain(text, split and not self.flow_level)
 
     def represent_text(self, text: str) -> yaml.ScalarNode:
@@ -262,7 +262,7 @@ _Dumper.add_representer(list, _Dumper.represent_items)
 
 
 def _plain(value: Any) -> Any:
-    """Return data as dicts, lists and scalars that YAML knows."""
+    """Convert data to dicts, lists and scalars that YAML supports."""
     if isinstance(value, np.ndarray | np.generic):
         return _plain(value.tolist())
     if isinstance(value, Mapping):

@@ -1,4 +1,4 @@
-"""The errors of stiffopt: each says what was wrong, where, and what to do about it."""
+"""The errors of stiffopt: each message says what was wrong, where, and what to do about it."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from importlib.util import find_spec
 
 MAX_MISTAKES = 10
-"""How many mistakes of a file one message tells."""
+"""Largest number of mistakes of a file in one message."""
 Loc = tuple[str | int, ...]
 """The place of a value in nested data: keys, and indices of items counted from 0."""
 
@@ -19,12 +19,12 @@ class StiffoptError(Exception):
 class InputError(StiffoptError, ValueError):
     """Something given to stiffopt, in a file or in a call, is wrong.
 
-    It is a `ValueError` too, which is what a Python caller expects of a bad argument.
+    It is also a `ValueError`, as Python callers expect for a bad argument.
     """
 
 
 class FileError(InputError):
-    """A file cannot be read or written, or says something wrong.
+    """A file cannot be read or written, or its content is wrong.
 
     Parameters
     ----------
@@ -33,9 +33,9 @@ class FileError(InputError):
     reason :
         What is wrong and what was expected, as one sentence.
     line :
-        Line number, counted from 1, if one line is to blame.
+        Line number, counted from 1, if the mistake is on one line.
     key :
-        Dotted key such as ``target.position[0]``, if one key is to blame.
+        Dotted key such as ``target.position[0]``, if the mistake is at one key.
     others :
         The file's further mistakes.
     """
@@ -73,7 +73,7 @@ class FileError(InputError):
         return f"{where}: {self.key}: {reason}" if self.key else f"{where}: {reason}"
 
     def __reduce__(self) -> tuple[object, ...]:
-        """Support pickling, so that the error crosses process boundaries whole."""
+        """Support pickling with all fields, so that the error can cross process boundaries."""
         return _rebuild_file_error, (self.path, self.own_reason, self.line, self.key, self.others)
 
 
@@ -84,7 +84,7 @@ def _rebuild_file_error(
 
 
 class PressureError(InputError):
-    """Pressures are not finite, have the wrong shape or drive the modulus to zero."""
+    """Pressures are not finite, have the wrong shape or are outside the strain law's range."""
 
 
 class EquilibriumError(StiffoptError):
@@ -95,38 +95,38 @@ class EquilibriumError(StiffoptError):
 
 
 class DerivativeError(StiffoptError):
-    """An answer has no derivatives: it is no strict optimum."""
+    """An answer has no derivatives: it is not a strict optimum."""
 
 
 class StoppedError(StiffoptError):
-    """A computation was ended before it had a result.
+    """A computation was stopped before it had a result.
 
     Attributes
     ----------
     found :
-        What there was by then, for example the first points of a trade-off; None if nothing.
+        Results so far, for example the first points of a trade-off; None if there are none.
     """
 
     found: object = None
 
 
 class OutOfTimeError(StoppedError, TimeoutError):
-    """The time that a call was given is over."""
+    """A call's timeout has passed."""
 
 
 class CancelledError(StoppedError):
-    """The caller no longer wants what he asked for."""
+    """The caller cancelled the computation."""
 
 
 class MissingExtraError(StiffoptError):
-    """An optional package is needed that is not installed.
+    """An optional package is needed but not installed.
 
     Parameters
     ----------
     package :
         Name of the missing package, for example ``matplotlib``.
     extra :
-        Name of stiffopt's extra that brings it, for example ``plot``.
+        Name of stiffopt's extra that includes it, for example ``plot``.
     """
 
     def __init__(self, package: str, extra: str) -> None:
@@ -164,35 +164,35 @@ class DeviceError(StiffoptError):
 
 
 class GuardTripped(DeviceError):  # noqa: N818
-    """The guard has vented by itself; the message says why. No device need have failed."""
+    """The guard has vented on its own; the message says why. It need not be a device failure."""
 
 
 class CommandError(InputError):
-    """A command to the rig is refused; nothing was written to any device."""
+    """A command to the rig is rejected; nothing was written to any device."""
 
 
 class ServiceError(StiffoptError, ConnectionError):
     """The daemon cannot be reached, or does not answer in time.
 
-    Whether it did what it was asked to is not known then.
+    It is then unknown whether it carried out the request.
     """
 
 
 class SlowWarning(UserWarning):
-    """Machine code cannot be made or kept here; the same results come more slowly."""
+    """Machine code cannot be compiled or stored here; results are the same but slower."""
 
 
 class UnfitWarning(UserWarning):
-    """A robot file was read whose calibration missed its own recordings widely."""
+    """The calibration of a robot file missed its own recordings by far."""
 
 
 def os_reason(error: OSError | ValueError) -> str:
-    """Return why the operating system refused a file, as the end of a sentence."""
+    """Return the operating system's reason for an error, as the end of a sentence."""
     return (error.strerror or str(error)).lower() if isinstance(error, OSError) else str(error)
 
 
 def shown(value: object) -> str:
-    """Return a value as an error message shows it: text in quotes, on one line, never long."""
+    """Return a value for an error message: text in quotes, on one line, never long."""
     if isinstance(value, dict):
         return "a mapping"
     if isinstance(value, list | tuple):
@@ -210,7 +210,7 @@ def printable(text: str) -> str:
 
 
 def dotted(loc: Sequence[str | int]) -> str:
-    """Return a place as people write it: ``target.position[0]``."""
+    """Return a place in readable form: ``target.position[0]``."""
     text = ""
     for step in loc:
         text += f"[{step}]" if isinstance(step, int) else f".{step}" if text else step

@@ -1,7 +1,7 @@
-"""Robot, task, rig and other stiffopt files: read strictly, with the line in every error.
+"""Read robot, task, rig and other stiffopt files strictly, with the line in every error.
 
-A file is a YAML document (`stiffopt.documents`) that names its kind and version in the key
-``format``. Its data are validated by the model that describes it in code (`stiffopt.schema`).
+A file is a YAML document (`stiffopt.documents`) with its kind and version in the key
+``format``. Its data are validated by the model that also describes it in code (`stiffopt.schema`).
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from stiffopt.schema import Schema, explain
 from stiffopt.units import FROM_FILE, read_from_file
 
 VERSIONS = {"robot": 1, "task": 1, "rig": 1}
-"""The version of each kind of file that is read; a kind not listed is at version 1."""
+"""Supported version of each kind of file; it is 1 for kinds that are not listed."""
 
 ModelT = TypeVar("ModelT", bound=BaseModel)
 
@@ -35,7 +35,7 @@ def _not_in_a_file(value: Any, info: ValidationInfo) -> Any:
 
 
 SourceFile = Annotated[Path | None, Field(exclude=True), BeforeValidator(_not_in_a_file)]
-"""The file that a description was read from; no key of a file."""
+"""The file that a description was read from; not allowed as a key of a file."""
 
 
 def read_file(path: str | os.PathLike[str], kind: str, model: type[ModelT]) -> ModelT:
@@ -46,10 +46,9 @@ def read_file(path: str | os.PathLike[str], kind: str, model: type[ModelT]) -> M
     path :
         The file.
     kind :
-        What it must be, for example ``"robot"``: the file must then say
-        ``format: stiffopt-robot/1``.
+        Its required kind, for example ``"robot"`` for files with ``format: stiffopt-robot/1``.
     model :
-        The schema that describes it.
+        Its schema.
 
     Raises
     ------
@@ -60,7 +59,7 @@ def read_file(path: str | os.PathLike[str], kind: str, model: type[ModelT]) -> M
 
 
 def from_document(document: Document, kind: str, model: type[ModelT]) -> ModelT:
-    """Validate what was read; as `read_file`, which says more."""
+    """Validate a document; see `read_file`."""
     _check_format(document, kind)
     for loc, value in _walk(document.data):
         if value is None:
@@ -74,7 +73,7 @@ def from_document(document: Document, kind: str, model: type[ModelT]) -> ModelT:
 
 
 def line_of(path: str | os.PathLike[str], *loc: str | int) -> int | None:
-    """Return the line of a key in a file, if the file (still) has it."""
+    """Return the line of a key in a file; None if the file does not (or no longer) have it."""
     with suppress(FileError):
         return read_document(path).lines.get(loc)
     return None
@@ -85,8 +84,8 @@ def save_file(
 ) -> None:
     """Write a description as a file of its kind, which `read_file` reads back as its equal.
 
-    Quantities are written with units; what is None or an empty list is left out. The lines of
-    `comment` stand above it, for people.
+    Quantities are written with units; None and empty lists are left out. The lines of
+    `comment` are written above, for people.
     """
     write_file(path, _as_file(kind, schema), comment)
 
@@ -97,7 +96,7 @@ def file_text(kind: str, schema: Schema) -> str:
 
 
 def format_of(kind: str) -> str:
-    """Return what a file of a kind says under the key ``format``."""
+    """Return the value of the key ``format`` in a file of a kind."""
     return f"stiffopt-{kind}/{VERSIONS.get(kind, 1)}"
 
 
@@ -107,7 +106,7 @@ def _as_file(kind: str, schema: Schema) -> dict[str, Any]:
 
 
 def _check_format(document: Document, kind: str) -> None:
-    """Refuse a file that does not say it is of this kind and of the version that is read."""
+    """Reject a file of another kind or version."""
     version = VERSIONS.get(kind, 1)
     wanted = format_of(kind)
     if "format" not in document.data:

@@ -1,15 +1,15 @@
-"""Rigid motions, twists and wrenches: SE(3) for CasADi and NumPy alike.
+"""Rigid motions, twists and wrenches: SE(3) for CasADi and NumPy.
 
 Conventions: a twist is ``(v, omega)`` and a wrench is ``(F, M)``, linear part first (eqs 1
 and 4 of the paper).  ``T_ab`` maps coordinates of frame b into frame a.  Twists and wrenches
-transform differently and each map has its own name:
+transform differently, and each map has its own name:
 
 * ``adjoint(T_ab) @ twist_b = twist_a``, defined by ``exp(adjoint(T) x) = T exp(x) T^-1``;
 * ``coadjoint(T_ab) @ wrench_b = wrench_a`` (``Ad`` of eq. 5), defined by equal power in
   both frames, that is ``coadjoint(T) = adjoint(T)^-T``.
 
-Every function takes CasADi ``SX``/``MX``/``DM`` or NumPy arrays of a single element and
-returns the same kind.  All are smooth through zero rotation, in their second derivatives too.
+Every function takes CasADi ``SX``/``MX``/``DM`` or NumPy arrays, without batches, and
+returns the same type.  All are smooth at zero rotation, including their second derivatives.
 """
 
 from math import factorial
@@ -55,7 +55,7 @@ def _sqrt(x: Array) -> Array:
 
 
 def _series(x: Array, coefficients: list[float]) -> Array:
-    """Polynomial in x by Horner's rule."""
+    """Evaluate a polynomial in x by Horner's rule."""
     value = coefficients[-1]
     for coefficient in reversed(coefficients[:-1]):
         value = coefficient + x * value
@@ -63,13 +63,13 @@ def _series(x: Array, coefficients: list[float]) -> Array:
 
 
 def _guarded(x: Array) -> tuple[Array, Array]:
-    """Whether the series applies, and an angle squared that is safe for the closed forms."""
+    """Return whether the series applies, and a squared angle that is safe for the closed forms."""
     small = x < _SERIES_BELOW
     return small, _where(small, _SERIES_BELOW, x)
 
 
 def exponential_coefficients(x: Array) -> tuple[Array, Array, Array]:
-    """Coefficients of the exponential map as entire functions of the squared angle.
+    """Return coefficients of the exponential map as entire functions of the squared angle.
 
     With ``x = theta^2``: ``sin(theta)/theta``, ``(1 - cos(theta))/theta^2`` and
     ``(theta - sin(theta))/theta^3``.
@@ -88,13 +88,13 @@ def exponential_coefficients(x: Array) -> tuple[Array, Array, Array]:
 
 
 def hat(w: Array) -> Array:
-    """Skew matrix of a 3-vector: ``hat(w) @ x = w x x`` (eq. 2)."""
+    """Return the skew matrix of a 3-vector: ``hat(w) @ x = w x x`` (eq. 2)."""
     zero = 0 * w[0]
     return _blocks([[zero, -w[2], w[1]], [w[2], zero, -w[0]], [-w[1], w[0], zero]])
 
 
 def vee(matrix: Array) -> Array:
-    """3-vector of a skew matrix, the inverse of `hat`; of a general one, of its skew part."""
+    """Return the 3-vector of a skew matrix, the inverse of `hat`, or of a matrix's skew part."""
     return 0.5 * _column(
         [
             matrix[2, 1] - matrix[1, 2],
@@ -109,7 +109,7 @@ def _identity_like(x: Array) -> Array:
 
 
 def exp(twist: Array) -> Array:
-    """Rigid motion ``T = exp(twist^)`` (eq. 3): (6,) -> (4, 4)."""
+    """Return the rigid motion ``T = exp(twist^)`` (eq. 3): (6,) -> (4, 4)."""
     v, w = twist[:3], twist[3:]
     first, second, third = exponential_coefficients(w[0] * w[0] + w[1] * w[1] + w[2] * w[2])
     W = hat(w)
@@ -120,7 +120,7 @@ def exp(twist: Array) -> Array:
 
 
 def log(T: Array) -> Array:
-    """Twist of a rigid motion, rotation angle in [0, pi]: (4, 4) -> (6,), ``exp(log(T)) = T``."""
+    """Return the twist (6,) of a rigid motion (4, 4), its angle in [0, pi]: ``exp(log(T)) = T``."""
     q = quaternion_from_rotation(T[:3, :3])
     w = rotation_vector_from_quaternion(q)
     x = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
@@ -149,7 +149,7 @@ def _stack(upper: Array, lower: Array) -> Array:
 
 
 def transform(rotation: Array, position: Array) -> Array:
-    """Homogeneous matrix of a rotation (3, 3) and a position (3,)."""
+    """Return the homogeneous matrix of a rotation (3, 3) and a position (3,)."""
     if _is_casadi(rotation) or _is_casadi(position):
         return ca.vertcat(ca.horzcat(rotation, position), ca.DM([[0, 0, 0, 1]]))
     T = np.eye(4)
@@ -159,33 +159,33 @@ def transform(rotation: Array, position: Array) -> Array:
 
 
 def inverse(T: Array) -> Array:
-    """Inverse of a rigid motion (4, 4)."""
+    """Return the inverse of a rigid motion (4, 4)."""
     rotation = T[:3, :3].T
     return transform(rotation, -(rotation @ T[:3, 3]))
 
 
 def adjoint(T: Array) -> Array:
-    """Twist map of a motion, (6, 6): ``twist_a = adjoint(T_ab) @ twist_b``."""
+    """Return the twist map of a motion, (6, 6): ``twist_a = adjoint(T_ab) @ twist_b``."""
     rotation = T[:3, :3]
     zero = 0 * rotation
     return _blocks([[rotation, hat(T[:3, 3]) @ rotation], [zero, rotation]])
 
 
 def coadjoint(T: Array) -> Array:
-    """Wrench map of a motion (eq. 5), (6, 6): ``wrench_a = coadjoint(T_ab) @ wrench_b``."""
+    """Return a motion's (6, 6) wrench map (eq. 5): ``wrench_a = coadjoint(T_ab) @ wrench_b``."""
     rotation = T[:3, :3]
     zero = 0 * rotation
     return _blocks([[rotation, zero], [hat(T[:3, 3]) @ rotation, rotation]])
 
 
 def rotate_blocks(rotation: Array) -> Array:
-    """Map (6, 6) that turns both halves of a twist or wrench and moves no point."""
+    """Return the map (6, 6) that rotates both halves of a twist or wrench but keeps its point."""
     zero = 0 * rotation
     return _blocks([[rotation, zero], [zero, rotation]])
 
 
 def quaternion_product(a: Array, b: Array) -> Array:
-    """Hamilton product of two quaternions (w, x, y, z)."""
+    """Return the Hamilton product of two quaternions (w, x, y, z)."""
     return _column(
         [
             a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3],
@@ -197,7 +197,7 @@ def quaternion_product(a: Array, b: Array) -> Array:
 
 
 def rotation_from_quaternion(q: Array) -> Array:
-    """Rotation (3, 3) of a unit quaternion (w, x, y, z)."""
+    """Return the rotation (3, 3) of a unit quaternion (w, x, y, z)."""
     w, x, y, z = q[0], q[1], q[2], q[3]
     return _blocks(
         [
@@ -209,9 +209,9 @@ def rotation_from_quaternion(q: Array) -> Array:
 
 
 def quaternion_from_rotation(rotation: Array) -> Array:
-    """Unit quaternion (w, x, y, z), w >= 0, of a rotation (3, 3).
+    """Return the unit quaternion (w, x, y, z), w >= 0, of a rotation (3, 3).
 
-    Shepperd's method: four times each squared component, and the largest is divided by, so
+    Shepperd's method: compute four times each squared component and divide by the largest, so
     that no angle up to and including pi loses digits.
     """
     R = rotation
@@ -239,7 +239,7 @@ def quaternion_from_rotation(rotation: Array) -> Array:
 
 
 def rotation_vector_from_quaternion(q: Array) -> Array:
-    """Rotation vector (3,) in rad of a unit quaternion (w, x, y, z) with w >= 0."""
+    """Return the rotation vector (3,) in rad of a unit quaternion (w, x, y, z) with w >= 0."""
     w, v = q[0], q[1:]
     x = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
     small = x < 1e-2

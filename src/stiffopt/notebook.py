@@ -1,7 +1,7 @@
-"""How objects show themselves in a notebook: by a page that `stiffopt.plots` makes of them.
+"""Display of objects in notebooks, by pages that `stiffopt.plots` generates.
 
-The classes that are shown know nothing of figures, so that the module that does is imported when a
-notebook asks for a page.
+The displayed classes do not depend on figures; `stiffopt.plots` is imported only when a notebook
+requests a page.
 """
 
 from html import escape
@@ -11,12 +11,12 @@ _PAGES = "stiffopt.plots.pages"
 
 
 class ShownInNotebook:
-    """A class of which notebooks show a small table, and a figure if matplotlib is installed."""
+    """Base of classes that notebooks display as a table, and as a figure given matplotlib."""
 
     __slots__ = ()
 
     def _repr_html_(self) -> str:
-        """Return HTML; it compiles nothing, takes no longer than a glance, and never fails."""
+        """Return HTML; this compiles nothing, is fast, and never fails."""
         try:
             return str(import_module(_PAGES).page(self))
         except Exception:

@@ -1,6 +1,7 @@
-"""Registration: where a tracker and its sensor are with respect to the arm.
+"""Registration: poses of a tracker and its sensor relative to the arm.
 
-A tracker measures its sensor in its own frame; only here does that become the tip in the base.
+A tracker measures its sensor in its own frame; this module converts that to the tip in the base
+frame.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ Array = NDArray[np.float64]
 
 @lru_cache(maxsize=64)
 def _transform(position: tuple[float, ...], orientation: tuple[float, ...]) -> tuple[Array, Array]:
-    """Transform (4, 4) and its inverse, not to be written to: they are shared."""
+    """Return the transform (4, 4) and its inverse, cached and read-only."""
     rotation = lie.rotation_from_quaternion(np.array(orientation))
     transform = np.asarray(lie.transform(rotation, np.array(position)))
     inverse = np.linalg.inv(transform)
@@ -31,7 +32,7 @@ def _transform(position: tuple[float, ...], orientation: tuple[float, ...]) -> t
 
 @lru_cache(maxsize=64)
 def _between(first: tuple[float, ...], last: tuple[float, ...]) -> Array:
-    """Matrix (4, 4) that takes a quaternion q to the product first q last; shared as well."""
+    """Return the matrix (4, 4) that maps a quaternion q to the product first q last; cached too."""
     products = [
         lie.quaternion_product(lie.quaternion_product(first, unit), last) for unit in np.eye(4)
     ]
@@ -41,7 +42,7 @@ def _between(first: tuple[float, ...], last: tuple[float, ...]) -> Array:
 
 
 def _turned(quaternion: list[float], vector: tuple[float, ...]) -> tuple[float, ...]:
-    """Turn a vector (3,) by a unit quaternion (w, u): v + 2 w u x v + 2 u x (u x v)."""
+    """Rotate a vector (3,) by a unit quaternion (w, u): v + 2 w u x v + 2 u x (u x v)."""
     w, x, y, z = quaternion
     a, b, c = vector
     d, e, f = 2 * (y * c - z * b), 2 * (z * a - x * c), 2 * (x * b - y * a)
@@ -49,7 +50,7 @@ def _turned(quaternion: list[float], vector: tuple[float, ...]) -> tuple[float, 
 
 
 def _with_sign(quaternion: Array) -> Array:
-    """Of the two quaternions (4,) of a rotation the one with w >= 0; of a half turn always one."""
+    """Return the quaternion (4,) with w >= 0; for a half turn, always the same of the two."""
     w = quaternion[0]
     if w < 0 or (w == 0 and max(quaternion, key=abs) < 0):
         return -quaternion
@@ -69,11 +70,11 @@ class Placement(Schema):
     orientation: Quaternion = (1.0, 0.0, 0.0, 0.0)
 
     def transform(self) -> Array:
-        """Transform (4, 4) of coordinates in this frame to those in the other."""
+        """Return the transform (4, 4) of coordinates in this frame to those in the other."""
         return _transform(self.position, self.orientation)[0]
 
     def inverse(self) -> Array:
-        """Transform (4, 4) of coordinates in the other frame to those in this."""
+        """Return the transform (4, 4) of coordinates in the other frame to those in this."""
         return _transform(self.position, self.orientation)[1]
 
     @classmethod
@@ -86,7 +87,7 @@ class Placement(Schema):
 
 
 class Registration(Schema):
-    """How a tracker's readings become the pose of the tip in the base frame.
+    """Transforms that convert a tracker's readings to the pose of the tip in the base frame.
 
     Attributes
     ----------
@@ -104,19 +105,19 @@ class Registration(Schema):
         ----------
         position, quaternion :
             Of the sensor in the tracker's frame, in m and w first; without a quaternion the
-            sensor's place is taken for that of the tip.
+            sensor's position is used for the tip.
         """
         T = self.tracker_in_base.transform()
         if quaternion is None:
             return T[:3, :3] @ position + T[:3, 3], None
-        # by quaternions: products of matrices take four times as long, for each sample of a tick
+        # quaternions are four times faster than products of matrices, for each sample of a tick
         tip = self.tip_in_sensor
         lever = _turned(quaternion.tolist(), tip.position)
         turn = _between(self.tracker_in_base.orientation, tip.orientation) @ quaternion
         return T[:3, :3] @ (position + lever) + T[:3, 3], _with_sign(turn)
 
     def then(self, correction: Registration) -> Registration:
-        """Return the registration that is this one, its poses then registered by a correction."""
+        """Return this registration followed by a correction of its poses."""
         return Registration(
             tracker_in_base=Placement.of(
                 correction.tracker_in_base.transform() @ self.tracker_in_base.transform()
@@ -127,5 +128,5 @@ class Registration(Schema):
         )
 
     def sensor_in_tracker(self, tip: Array) -> Array:
-        """Return what a perfect tracker reads (4, 4) where the tip (4, 4) is in the base frame."""
+        """Return a perfect tracker's reading (4, 4) of a tip pose (4, 4) in the base frame."""
         return self.tracker_in_base.inverse() @ tip @ self.tip_in_sensor.inverse()

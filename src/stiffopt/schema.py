@@ -1,6 +1,6 @@
-"""Base of all descriptions: frozen pydantic models whose errors are sentences.
+"""`Schema`: base of all descriptions, a frozen pydantic model whose errors are sentences.
 
-One model is both the schema of a kind of file and the description in code, see `Schema`.
+One model is both the schema of a kind of file and the description in code.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ ItemT = TypeVar("ItemT")
 
 
 class BadKeyError(ValueError):
-    """Raised by a validator of a whole mapping to say which of its keys is to blame."""
+    """Raised by a validator of a whole mapping for a mistake at one of its keys."""
 
     def __init__(self, key: str, reason: str) -> None:
         super().__init__(reason)
@@ -39,10 +39,11 @@ class BadKeyError(ValueError):
 
 
 class Schema(BaseModel):
-    """Base of what is both the schema of a file and its frozen description in code.
+    """Base of classes that are both the schema of a file and its frozen description in code.
 
-    Built in code, quantities are numbers in SI (or text with a unit) and a mistake raises
-    `InputError`. Read by `read_file`, quantities must have units and mistakes raise `FileError`.
+    In code, quantities are numbers in SI (or text with a unit) and a mistake raises
+    `InputError`. In files read by `read_file`, quantities must have units and mistakes raise
+    `FileError`.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", validate_default=False)
@@ -53,18 +54,18 @@ class Schema(BaseModel):
         except ValidationError as error:
             raise InputError(_sentence(type(self), error)) from None
 
-    # pydantic then keeps building nested models itself, so that errors know where they are.
+    # pydantic then still builds nested models itself, so that errors have their locations
     __init__.__pydantic_base_init__ = True  # type: ignore[attr-defined]
 
 
 @dataclass(frozen=True)
 class JsonSchemaOfFile:
-    """Part of a type whose values are written in a file in other ways than the type tells.
+    """Annotation of a type whose values have another form in a file.
 
     Parameters
     ----------
     change :
-        Makes of the JSON Schema of the type that of what stands in the file.
+        Function from the JSON Schema of the type to that of its form in the file.
     """
 
     change: Callable[[dict[str, Any]], dict[str, Any]]
@@ -74,7 +75,7 @@ class JsonSchemaOfFile:
 
 
 def _as_tuple(value: Any) -> Any:
-    """Let lists and arrays stand for tuples; nothing else that can be iterated over."""
+    """Convert lists and arrays to tuples; reject other iterables."""
     if isinstance(value, np.ndarray):
         value = value.tolist()
     if isinstance(value, list | tuple):
@@ -83,7 +84,7 @@ def _as_tuple(value: Any) -> Any:
 
 
 def items_of(n: int) -> Callable[[Any], Any]:
-    """Return the validator of a list of just `n` items."""
+    """Return a validator of a list of exactly `n` items."""
 
     def read(value: Any) -> Any:
         items = _as_tuple(value)
@@ -117,7 +118,7 @@ def _sentence(model: type[BaseModel], error: ValidationError) -> str:
 def explain(
     model: type[BaseModel], details: ErrorDetails, data: Mapping[str, Any] | None
 ) -> tuple[Loc, str]:
-    """Return where a mistake is, in the file's own terms, and what it is, as a sentence."""
+    """Return a mistake's place, in the file's own terms, and a sentence about it."""
     kind, value, context = details["type"], details["input"], details.get("ctx", {})
     raw: Loc = details["loc"]
     error = context.get("error")
@@ -154,7 +155,7 @@ def explain(
 
 
 def _place(raw: Loc, data: Mapping[str, Any] | None) -> Loc:
-    """Drop from pydantic's path what the user did not write: union tags, implied list items."""
+    """Drop steps of pydantic's path that the user did not write: union tags, implied list items."""
     steps = tuple(step for step in raw if not str(step).startswith("<"))
     if data is None:
         return steps
@@ -180,7 +181,7 @@ def _at(data: Any, loc: Loc) -> Any:
 
 
 def _unknown_key(model: type[BaseModel], raw: Loc) -> str:
-    """Name the valid key that is nearest to an unknown one, or all of them."""
+    """Suggest the valid key nearest to an unknown one, or list all."""
     models: list[type[BaseModel]] = [model]
     for step in raw[:-1]:
         if isinstance(step, str) and not step.startswith("<"):
@@ -202,7 +203,7 @@ def _unknown_key(model: type[BaseModel], raw: Loc) -> str:
 
 
 def _models(annotation: Any) -> Iterator[type[BaseModel]]:
-    """Yield the models that an annotation speaks of."""
+    """Yield the models in an annotation."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         yield annotation
     for inner in get_args(annotation):

@@ -1,9 +1,9 @@
 """Quantities: text with a unit in files, floats in SI in code.
 
-A quantity in a file is a string, a decimal number and its unit: ``90 mm``. pint knows the units;
-this module asks it for exact decimal factors, so that ``90 mm`` is the float ``0.09``, and refuses
-what pint alone would let pass: an angle without a unit (the radian counts as a dimension here) and
-a moment in joules. The field types at the end carry these rules into pydantic models.
+A quantity in a file is a string, a decimal number and its unit: ``90 mm``. This module gets exact
+decimal factors from pint, so that ``90 mm`` is the float ``0.09``. It rejects two things that pint
+accepts: an angle without a unit (the radian counts as a dimension here) and
+a moment in joules. The field types at the end apply these rules in pydantic models.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ __all__ = [
 ]
 
 FROM_FILE = {"from_file": True}
-"""The pydantic validation context of data that come from a file: quantities must have units."""
+"""Pydantic validation context of data from a file, in which quantities must have units."""
 
 _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]{1,4})?")
 _QUANTITY = r"^ *[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]{1,4})? *[A-Za-zµμ°%(].*$"
@@ -71,13 +71,13 @@ _TOKEN = re.compile(
     re.VERBOSE,
 )
 _POWER_WORD = re.compile(r"\b(?:sq|squared?|cubic|cubed)\b")  # exponents to pint
-_LONGEST = 80  # characters; no quantity that a person writes is longer
-_MOST, _DEEPEST = 10, 2  # factors of a unit, and parentheses in each other
+_LONGEST = 80  # characters; longer than any quantity that a person writes
+_MAX_FACTORS, _MAX_DEPTH = 10, 2  # of a unit: factors, and nested parentheses
 
 
 @dataclass(frozen=True)
 class QuantityKind:
-    """A kind of quantity: its SI unit, its name, an example, and the unit in which it is written.
+    """A kind of quantity: its SI unit, name, example, and unit in files.
 
     It is part of the types below, so that the unit of a field can be found from its type.
     """
@@ -120,8 +120,8 @@ _EXAMPLES = {kind.unit: kind.example for kind in _KINDS}
 _DEGREE = "0.01745329251994329576923690768"
 
 
-# How many SI units the usual units are. pint says the same, but needs 0.2 s to get ready, so it is
-# asked only for units that are not here.
+# Common units in SI units. pint gives the same factors, but takes 0.2 s to load, so it is used only
+# for other units.
 _COMMON = {
     "m": {"m": "1", "cm": "0.01", "mm": "0.001", "um": "1e-6", "µm": "1e-6"},
     "rad": {"rad": "1", "deg": _DEGREE, "°": _DEGREE},
@@ -153,7 +153,7 @@ def parse_quantity(text: str, unit: str, what: str = "quantity") -> float:
     unit :
         The SI unit of the result, for example ``"m"``; ``""`` for a ratio such as ``"1 %"``.
     what :
-        What the quantity is, for the error message, for example ``"length"``.
+        Name of the quantity, for the error message, for example ``"length"``.
 
     Returns
     -------
@@ -163,7 +163,7 @@ def parse_quantity(text: str, unit: str, what: str = "quantity") -> float:
     Raises
     ------
     InputError
-        Not a string, no unit, a unit that does not measure this, not a finite number.
+        Not a string, no unit, a unit of another quantity, or not a finite number.
     """
     expected = f"expected {_article(what)} such as '{_EXAMPLES.get(unit, f'1 {unit}'.strip())}'"
     if isinstance(text, Real) and not isinstance(text, bool):
@@ -202,7 +202,7 @@ def format_quantity(value: float, unit: str, written: str | None = None) -> str:
     unit :
         The SI unit of `value`.
     written :
-        The unit to write it in if that loses nothing, for example ``"mm"``; otherwise `unit`.
+        The unit of the text if that is exact, for example ``"mm"``; otherwise `unit` is used.
     """
     if written is not None and written != unit:
         factor = _factor(written, unit)
@@ -226,24 +226,24 @@ def quantity_schema(what: str, *examples: str) -> dict[str, Any]:
 
 
 def unit_size(text: str, unit: str) -> Decimal | None:
-    """Return how many `unit`, an SI unit, one `text` is; None if it is no unit of that."""
+    """Return how many of the SI unit `unit` one `text` is; None if the quantities differ."""
     factor = _factor(text, unit)
     return None if isinstance(factor, str) else factor
 
 
 def unit_suffix(unit: str) -> str:
-    """Return how a name ends that tells a unit: ``_nm_per_rad`` for N*m/rad, nothing for none."""
+    """Return the suffix of names for a unit: ``_nm_per_rad`` for N*m/rad, "" for none."""
     return f"_{unit.replace('*', '').replace('/', '_per_').lower()}" if unit else ""
 
 
 def read_from_file(info: ValidationInfo) -> bool:
-    """Say whether a pydantic validator is looking at a file (rather than at a call)."""
+    """Return whether a pydantic validator checks a file (rather than a call)."""
     return isinstance(info.context, Mapping) and bool(info.context.get("from_file"))
 
 
 @cache
 def _registry() -> pint.UnitRegistry[Any]:
-    """Return pint's registry with exact decimals; made on first use, as it is slow to make."""
+    """Return pint's registry with exact decimals; created at first use, as that is slow."""
     import pint
 
     return pint.UnitRegistry(non_int_type=Decimal, cache_folder=None)
@@ -251,7 +251,7 @@ def _registry() -> pint.UnitRegistry[Any]:
 
 @lru_cache(maxsize=1024)
 def _factor(text: str, unit: str) -> Decimal | str:
-    """Return how many `unit` make one `text`, or what is wrong with `text`."""
+    """Return the number of `unit` in one `text`, or what is wrong with `text`."""
     common = _COMMON.get(unit, {}).get(text)
     if common is not None:
         return Decimal(common)
@@ -262,7 +262,7 @@ def _factor(text: str, unit: str) -> Decimal | str:
     joule = registry.get_root_units("joule")[1]
     try:
         given, wanted = registry.parse_units(text), registry.parse_units(unit)
-        # Root units keep the radian, which dimensions do not: N*m/rad is not N*m, 1 is no angle.
+        # Root units, unlike dimensions, include the radian: N*m/rad is not N*m, 1 is not an angle.
         if registry.get_root_units(given)[1] != registry.get_root_units(wanted)[1]:
             return "is not a unit of"
         if any(registry.get_root_units(part)[1] == joule for part in given._units):
@@ -270,13 +270,13 @@ def _factor(text: str, unit: str) -> Decimal | str:
         zero, one = (registry.convert(Decimal(n), given, wanted) for n in (0, 1))
     except Exception:  # pint, its tokenizer and its evaluator raise many kinds for junk
         return unknown
-    return Decimal(one) if zero == 0 else unknown  # an offset unit has another zero
+    return Decimal(one) if zero == 0 else unknown  # reject units with an offset
 
 
 def _is_simple(text: str) -> bool:
-    """Whether text is a product of few units, each with one exponent of one digit at most.
+    """Return whether text is a product of few units, each with at most one exponent of one digit.
 
-    Only that is handed to pint, which evaluates what it is given: 9^9^9 takes it for ever.
+    Only such text is passed to pint, which evaluates it: 9^9^9 would take forever.
     """
     if len(text) > _LONGEST or not _UNIT.fullmatch(text):
         return False
@@ -290,9 +290,9 @@ def _is_simple(text: str) -> bool:
         factors += kind == "factor"
         powers += kind == "power"
         depth += (kind == "open") - (kind == "close")
-        if not 0 <= depth <= _DEEPEST or factors > _MOST:
+        if not 0 <= depth <= _MAX_DEPTH or factors > _MAX_FACTORS:
             return False
-        if kind == "power" and before not in ("factor", "close"):  # of a power, for example
+        if kind == "power" and before not in ("factor", "close"):  # such as a power of a power
             return False
         before = kind
     words = len(_POWER_WORD.findall(text))
@@ -300,7 +300,7 @@ def _is_simple(text: str) -> bool:
 
 
 def get_ready() -> None:
-    """Load what knows the rarer units, which takes a second: before anything must not wait."""
+    """Load the units that are not common, which takes a second, before time is critical."""
     _registry()
 
 
@@ -309,7 +309,7 @@ def _article(noun: str) -> str:
 
 
 def finite_number(value: Any) -> float:
-    """Accept a finite real number; refuse booleans, text, NaN and infinities."""
+    """Return a finite real number; reject booleans, text, NaN and infinities."""
     if isinstance(value, bool) or not isinstance(value, Real):
         raise InputError(f"{shown(value)} is not a number")
     try:
@@ -326,7 +326,7 @@ def _ratio(value: Any) -> float:
 
 
 def _reader(kind: QuantityKind) -> BeforeValidator:
-    """Return the validator for a kind: text with its unit, or in code a number in SI."""
+    """Return the validator of a kind: text with its unit, or in code a number in SI."""
 
     def read(value: Any, info: ValidationInfo) -> float:
         if isinstance(value, str) or read_from_file(info):
@@ -339,7 +339,7 @@ def _reader(kind: QuantityKind) -> BeforeValidator:
 
 
 def _writer(kind: QuantityKind) -> PlainSerializer:
-    """Return the serializer with which ``model_dump(mode="json")`` writes quantities as text."""
+    """Return the serializer of a kind, which ``model_dump(mode="json")`` uses to write text."""
 
     def write(value: float) -> str:
         return format_quantity(value, kind.unit, kind.written)
@@ -348,7 +348,7 @@ def _writer(kind: QuantityKind) -> PlainSerializer:
 
 
 def within(limit: float, unit: str) -> AfterValidator:
-    """Return the validator that refuses magnitudes beyond a limit, both in SI."""
+    """Return the validator that rejects magnitudes beyond a limit, both in SI."""
 
     def check(value: float) -> float:
         if abs(value) > limit:

@@ -1,1 +1,1 @@
-"""Arms for other programs: as a model for MuJoCo, and as a mesh."""
+"""Export arms to other programs: as a model for MuJoCo, and as a mesh."""

@@ -1,4 +1,4 @@
-"""The surface of an arm under pressure as a mesh file."""
+"""Export the surface of an arm under pressure as a mesh file."""
 
 from pathlib import Path
 from typing import Any
@@ -22,8 +22,8 @@ _CAP = 12  # rings of the hemisphere
 def surface_mesh(robot: Manipulator, pressures: ArrayLike, spacing: float = SPACING) -> Any:
     """Return the surface of an arm under pressure as a `trimesh.Trimesh`, in m, in base axes.
 
-    It is the body of `Manipulator.clearance`: a tube of the outer radius, swelling included where
-    the strain law gives it, that is flat at the base and ends in a hemisphere at the tip.  Under
+    It is the body of `Manipulator.clearance`: a tube of the outer radius (with swelling if
+    the strain law models it) that is flat at the base and ends in a hemisphere at the tip.  Under
     gravity and loads it is that of the equilibrium.
 
     Raises
@@ -31,7 +31,7 @@ def surface_mesh(robot: Manipulator, pressures: ArrayLike, spacing: float = SPAC
     PressureError
         The pressures are not (n,), or the strain law does not hold there.
     InputError
-        A setting makes no sense.
+        The spacing does not suit the arm.
     MissingExtraError
         trimesh is not installed.
     """
@@ -64,7 +64,7 @@ def surface_mesh(robot: Manipulator, pressures: ArrayLike, spacing: float = SPAC
 
 
 def _rings(robot: Manipulator, p: Vector, spacing: float) -> Vector:
-    """Return vertices (rings, around, 3) of the tube and of the hemisphere but for its pole."""
+    """Return vertices (rings, around, 3) of the tube and of the hemisphere without its pole."""
     at = np.linspace(0, robot.length, int(np.ceil(robot.length / spacing)) + 1)[1:]
     poses = np.concatenate([np.eye(4)[None], robot.pose(p, at)])
     radii = robot.body_radius(p, np.concatenate([[0.0], at]))

@@ -1,10 +1,10 @@
-"""An arm under pressure as a model for MuJoCo (MJCF).
+"""Export an arm under pressure as a model for MuJoCo (MJCF).
 
-Each segment is cut into pieces of equal length h at rest.  In the middle of a piece is a joint of
-three slides and three hinges; half of the piece, exp(xi h / 2) as the pressures strain it, lies on
-either side.  A wrench strains the section by C_S per length, so the joint gives way by C_S h, and
-its stiffness is the inverse.  MuJoCo knows one stiffness per axis; where axes are coupled, six
-fixed tendons along the eigenvectors of the stiffness have the same energy.
+Each segment is divided into pieces of equal length h at rest.  In the middle of a piece is a joint
+of three slides and three hinges; half of the piece, exp(xi h / 2) as the pressures strain it, lies
+on either side.  A wrench strains the section by C_S per length, so the joint has the compliance C_S
+h, and its stiffness is the inverse.  MuJoCo has one stiffness per axis.  If axes are coupled, six
+fixed tendons along the eigenvectors of the stiffness store the same energy.
 """
 
 from collections.abc import Iterator, Sequence
@@ -27,12 +27,12 @@ Vector = NDArray[np.float64]
 PIECES = 12
 """Joints per segment."""
 DAMPING = 0.05
-"""Share of critical damping of the slowest swing."""
+"""Share of critical damping of the slowest vibration."""
 
 _LONGEST_STEP = 2e-3  # of time, in s
-_COUPLED = 1e-6  # of the geometric mean of two stiffnesses; less is rounding
-_SILICONE = 1070.0  # kg/m^3, for robots without densities: bodies of MuJoCo have masses
-_TIP_RADIUS = 2e-3  # of the site, and of the ball that the tip's mass is, in m
+_COUPLED = 1e-6  # of the geometric mean of two stiffnesses; smaller couplings are rounding errors
+_SILICONE = 1070.0  # kg/m^3, for robots without densities: bodies in MuJoCo need masses
+_TIP_RADIUS = 2e-3  # of the site, and of the ball for the tip's mass, in m
 
 
 class _Part(NamedTuple):
@@ -47,14 +47,14 @@ class _Part(NamedTuple):
 
 @dataclass
 class _Link:
-    """A rigid body and the joint at which it hangs.
+    """A rigid body and the joint that connects it to the link before.
 
     Attributes
     ----------
     name : str
     placed : pose (4, 4) of the joint in the axes of the link before.
     stiffness : (6, 6) of the joint, linear first; None: it is fixed.
-    parts : what it is made of, from the joint on.
+    parts : its pieces, from the joint on.
     """
 
     name: str
@@ -68,27 +68,27 @@ def mjcf(
 ) -> str:
     """Return a robot under pressure as the text of an MJCF file.
 
-    The joints rest where the free arm is; MuJoCo finds the sag under gravity by itself.  Wrenches
-    at the tip that `Manipulator.with_load` has added are left to the simulation.  The site ``tip``
-    has the tip's pose.
+    The joints rest where the free arm is; MuJoCo computes the sag under gravity.  Wrenches
+    at the tip from `Manipulator.with_load` are not exported.  The site ``tip`` has the tip's pose.
 
     Parameters
     ----------
     robot : Manipulator
-        Its densities give the masses; without one a segment counts as silicone.
+        Its densities give the masses; a segment without one counts as silicone.
     pressures : (n,)
-        In Pa.  Shape and stiffness are those at these pressures: for others, export anew.
+        In Pa.  Shape and stiffness are those at these pressures: for others, export again.
     pieces : int
         Joints per segment.  The error falls with the square of their number.
     damping : float
-        Share of critical damping of the slowest swing.  Dampers are proportional to the springs.
+        Share of critical damping of the slowest vibration.  Dampers are proportional to the
+        springs.
 
     Raises
     ------
     PressureError
         The pressures are not (n,), or the strain law does not hold there.
     InputError
-        A setting makes no sense.
+        `pieces` or `damping` is out of range.
     """
     if not 2 <= pieces <= 100:
         raise InputError(f"an arm needs 2 to 100 pieces per segment, not {pieces}")
@@ -158,7 +158,7 @@ def _slowest_swing(robot: Manipulator, p: Vector, pieces: int) -> float:
 def _document(robot: Manipulator, links: list[_Link], tip: Vector, delay: float) -> str:
     root = ET.Element("mujoco", model=robot.description.name)
     _add(root, "compiler", angle="radian")
-    step = min(_LONGEST_STEP, delay)  # of a longer one the quick swings might grow
+    step = min(_LONGEST_STEP, delay)  # with a longer one the fast vibrations might grow
     _add(
         root, "option", gravity=robot.description.gravity, integrator="implicitfast", timestep=step
     )
@@ -170,7 +170,7 @@ def _document(robot: Manipulator, links: list[_Link], tip: Vector, delay: float)
         body = _add(body, "body", name=link.name, **_pose(link.placed))
         if link.stiffness is not None:
             _add_joint(body, tendons, link.name, link.stiffness, delay, order)
-            order = order[::-1]  # turns do not commute: in two joints, the error cancels
+            order = order[::-1]  # rotations do not commute; the error cancels over two joints
         _add_parts(body, link)
     _add(body, "site", name="tip", size=_TIP_RADIUS, **_pose(tip))
     if mass := robot.description.tip_mass:
@@ -191,7 +191,7 @@ def _add_joint(
     delay: float,
     order: Sequence[int],
 ) -> None:
-    """Add the six axes of a joint, with their springs, or tendons where they are coupled."""
+    """Add the six axes of a joint, with springs, or with tendons if they are coupled."""
     scale = np.sqrt(np.diag(stiffness))
     between = np.abs(stiffness - np.diag(np.diag(stiffness))) / np.outer(scale, scale)
     coupled = bool((between > _COUPLED).any())
@@ -209,7 +209,7 @@ def _add_joint(
 
 
 def _eigenvectors(K: Vector, scale: Vector) -> Iterator[tuple[float, Vector]]:
-    """Yield stiffnesses k and vectors c with K = sum k c c', all axes in units of their scale."""
+    """Yield stiffnesses k and vectors c with K = sum k c c', with axes in units of their scale."""
     values, vectors = np.linalg.eigh(K / np.outer(scale, scale))
     for value, vector in zip(values, vectors.T, strict=True):
         column = scale * vector
@@ -223,7 +223,7 @@ def _spring(stiffness: float, delay: float) -> dict[str, float]:
 
 
 def _add_parts(body: ET.Element, link: _Link) -> None:
-    """Add what a link looks like and touches with, and its mass, as that of a cylinder."""
+    """Add the shapes of a link for display and contact, and its mass, as that of a cylinder."""
     masses = np.array([part.mass for part in link.parts])
     mass, radius = masses.sum(), link.parts[0].radius
     length = sum(float(np.linalg.norm(part.end - part.start)) for part in link.parts)

@@ -1,8 +1,8 @@
-"""JSON Schemas of stiffopt's files, with which editors complete and check them.
+"""JSON Schemas of stiffopt's files, for completion and checking in editors.
 
-They are made from the models that read the files (`stiffopt.schema`), so that they cannot say
-anything else: keys, what quantities look like, and the descriptions in the models' docstrings.
-A JSON Schema cannot say everything that the models check; ``stiffopt check`` does.
+They are generated from the models that read the files (`stiffopt.schema`): keys, the form of
+quantities, and the descriptions in the models' docstrings.
+A JSON Schema cannot express everything that the models check; ``stiffopt check`` does.
 """
 
 from __future__ import annotations
@@ -60,12 +60,12 @@ def json_schema(kind: str) -> dict[str, Any]:
 
 
 def schema_file(kind: str) -> Path:
-    """Return the file in this package that has the JSON Schema of a kind of file."""
+    """Return the file in this package with the JSON Schema of a kind of file."""
     return Path(__file__).parent / f"{kind}.schema.json"
 
 
 class _Generator(GenerateJsonSchema):
-    """Describes keys by the docstrings of their models, and leaves out what no file has."""
+    """Describe keys by the docstrings of their models; leave out fields that files do not have."""
 
     def model_schema(self, schema: core_schema.ModelSchema) -> JsonSchemaValue:
         made = super().model_schema(schema)
@@ -85,17 +85,17 @@ class _Generator(GenerateJsonSchema):
         return made
 
     def default_schema(self, schema: core_schema.WithDefaultSchema) -> JsonSchemaValue:
-        """Leave defaults out: in SI they are not what a file would say."""
+        """Leave defaults out: they are in SI, and files have units."""
         return self.generate_inner(schema["schema"])
 
     def nullable_schema(self, schema: core_schema.NullableSchema) -> JsonSchemaValue:
-        """Leave null out: what has no value in a file is refused."""
+        """Leave null out: files may not have it."""
         return self.generate_inner(schema["schema"])
 
 
 @cache
 def _attributes(model: type[BaseModel]) -> dict[str, str]:
-    """Return what the docstrings of a model and of its bases say about its attributes."""
+    """Return the descriptions of attributes in the docstrings of a model and its bases."""
     found: dict[str, str] = {}
     for base in reversed(model.__mro__):
         names: list[str] = []
@@ -112,7 +112,7 @@ def _attributes(model: type[BaseModel]) -> dict[str, str]:
 
 
 def write_schema_files() -> None:
-    """Write the files that ship with the package anew; `make schemas` does."""
+    """Rewrite the files that ship with the package, for `make schemas`."""
     for kind in MODELS:
         text = json.dumps(json_schema(kind), ensure_ascii=False, separators=(",", ":"))
         write_whole(schema_file(kind), f"{text}\n".encode())

@@ -209,7 +209,7 @@ class StrainLaw(ABC):
 
     @classmethod
     def fitted_numbers(cls) -> dict[str, FittedNumber]:
-        """Return the `FittedNumber`s of the law's own keys, by key."""
+        """Return the `FittedNumber` of each of the law's own keys, by key."""
         fields = cls.Keys.model_fields if cls.Keys is not None else {}
         return {
             f"law.{key}": number

@@ -1,4 +1,4 @@
-"""Turn search results into `PressureSolution`s: judge them by the model and write the messages."""
+"""Judge search results by the model and turn them, with messages, into `PressureSolution`."""
 
 from collections.abc import Callable, Iterable
 from typing import Any

@@ -1,4 +1,4 @@
-"""The workspace map as a result: the cells that the tip reaches and the stiffness range in each."""
+"""`WorkspaceMap`: the cells that the tip reaches, and the stiffness range in each."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -28,7 +28,7 @@ class Extreme(NamedTuple):
     stiffness : in N/m, for a rotation in N m/rad.
     sample : number of the sample.
     pressures : (n,) in Pa.
-    cell_centre : (3,) centre of the cell that the tip is in, in m.
+    cell_centre : (3,) centre of the tip's cell, in m.
     """
 
     stiffness: float
@@ -41,17 +41,17 @@ class Extreme(NamedTuple):
 class WorkspaceMap:
     """The cells of space that the tip reaches, with the range of stiffness in each.
 
-    Rows are the M cells that a sample reached, in the order of their indices; `grid` has them as
-    a box.
+    Rows are the M cells that a sample reached, in the order of their indices; `grid` returns them
+    as a box.
 
     Attributes
     ----------
-    plan : what was sampled.
-    table : what was found.
-    lost : samples at which the arm has no stable equilibrium.
+    plan : the samples and their evaluation.
+    table : the results.
+    lost : number of samples at which the arm has no stable equilibrium.
     low, high : (3,) least and greatest coordinates of the tip, in m; NaN if no sample has one.
     path : where it is stored, or None.
-    evaluated : samples that were evaluated to make it now; fewer than all where it was resumed.
+    evaluated : number of samples evaluated in this run; fewer than all if the map was resumed.
     """
 
     plan: MapPlan
@@ -89,17 +89,17 @@ class WorkspaceMap:
 
     @property
     def ratio(self) -> Vector:
-        """Ratio (m, M) of greatest to least stiffness: how much can be chosen at a place."""
+        """Ratio (m, M) of greatest to least stiffness: the range of choice at a place."""
         return np.asarray(self.best / self.worst)
 
     @property
     def best_sample(self) -> Numbers:
-        """Sample (m, M) that is the stiffest; see `pressures`."""
+        """Number (m, M) of the stiffest sample; see `pressures`."""
         return self.table.best_sample
 
     @property
     def worst_sample(self) -> Numbers:
-        """Sample (m, M) that is the softest; see `pressures`."""
+        """Number (m, M) of the softest sample; see `pressures`."""
         return self.table.worst_sample
 
     @cached_property
@@ -124,18 +124,18 @@ class WorkspaceMap:
 
     @cached_property
     def shape(self) -> tuple[int, int, int]:
-        """Number of cells along each axis of the box that holds all cells."""
+        """Number of cells along each axis of the box that contains all cells."""
         if not len(self.table):
             return (0, 0, 0)
         x, y, z = (self.cells.max(axis=0) - self.first_cell + 1).tolist()
         return (x, y, z)
 
     def pressures(self, sample: int) -> Vector:
-        """Pressures (n,) of a sample in Pa."""
+        """Return the pressures (n,) of a sample in Pa."""
         return np.asarray(self.plan.sampling.pressures(int(sample), int(sample) + 1)[0])
 
     def grid(self, name: Quantity) -> NDArray[np.generic]:
-        """A quantity in the box of all cells, (x, y, z) or (m, x, y, z).
+        """Return a quantity in the box of all cells, (x, y, z) or (m, x, y, z).
 
         Cells that no sample reached hold NaN, samples -1, counts 0.
         """
@@ -145,11 +145,11 @@ class WorkspaceMap:
         return box
 
     def best_in(self, direction: int) -> Extreme | None:
-        """The stiffest sample in a direction, counted from 0; None if no tip was found."""
+        """Return the stiffest sample in a direction, counted from 0; None if no tip was found."""
         return self._extreme(-self.best[direction], self.best, self.best_sample, direction)
 
     def worst_in(self, direction: int) -> Extreme | None:
-        """The softest sample in a direction, counted from 0; None if no tip was found."""
+        """Return the softest sample in a direction, counted from 0; None if no tip was found."""
         return self._extreme(self.worst[direction], self.worst, self.worst_sample, direction)
 
     def _extreme(

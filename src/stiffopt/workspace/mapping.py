@@ -1,4 +1,4 @@
-"""`map_workspace` makes a workspace map, or resumes one; `open_workspace_map` reads it."""
+"""`map_workspace` computes a workspace map, or resumes one; `open_workspace_map` reads it."""
 
 import os
 from collections.abc import Callable, Iterable
@@ -49,16 +49,16 @@ def map_workspace(
 ) -> WorkspaceMap:
     """Map where an arm's tip can be, and the range of its stiffness there, by sampling pressures.
 
-    The same arguments give the same map to the last bit, whatever computes it and however often it
-    was interrupted.
+    The same arguments give the same map to the last bit, with any number of threads or workers and
+    after any number of interruptions.
 
     Parameters
     ----------
     robot : Manipulator
         The arm, with any load at its tip.
     path : path, optional
-        Folder of the map, a Zarr group. A map that is there and unfinished is continued; one
-        that is complete is returned as it is. Without a path nothing is stored.
+        Folder of the map, a Zarr group. An unfinished map there is resumed; a complete one is
+        returned as it is. Without a path nothing is stored.
     directions : list of (3,), optional
         Of the stiffnesses; need not be of unit length. By default the axes x, y and z.
     kind, boundary, frame
@@ -66,7 +66,8 @@ def map_workspace(
     samples : int, optional
         Number of quasi-random samples; by default a million, for an arm with gravity or load 1000.
     levels : int, optional
-        Instead of `samples`, a full grid with so many levels of each channel, limits included.
+        Instead of `samples`: a full grid with this number of levels of each channel, limits
+        included.
     cell : float
         Size of a cell in m.
     seed : int
@@ -74,16 +75,17 @@ def map_workspace(
     scene : Scene, optional
         Samples whose body is nearer to its objects than its clearance are left out.
     scheduler : str, optional
-        Address of a Dask scheduler; its workers do the sampling.
+        Address of a Dask scheduler, whose workers evaluate the samples.
     threads : int, optional
-        Of this process; by default one for each core. Without effect on the result.
+        Number of threads of this process; by default one for each core. The result does not depend
+        on it.
     overwrite : bool
-        Replace a map that is at the path.
+        Replace a map that exists at the path.
     progress : callable, optional
-        Called now and then with the number of samples done and of all samples. What it raises
-        stops the run, which can then be resumed.
+        Called now and then with the number of samples done and of all samples. An exception that it
+        raises stops the run, which can then be resumed.
     timeout, cancel : optional
-        When to stop, as of `PressureSolver.solve`; a run with a path can then be resumed.
+        When to stop, as for `PressureSolver.solve`; a run with a path can then be resumed.
 
     Returns
     -------
@@ -100,7 +102,7 @@ def map_workspace(
     ClusterError
         The cluster cannot be reached, or failed.
     OutOfTimeError, CancelledError
-        Where `timeout` or `cancel` stopped it.
+        `timeout` or `cancel` stopped it.
     """
     plan = MapPlan.of(
         robot, directions=directions, kind=kind, boundary=boundary, frame=frame, samples=samples,
@@ -161,7 +163,7 @@ def _opened(
         if not overwrite:
             store.check(plan.record)
             stack.enter_context(store.locked())
-            return MapStore(path)  # read again now that nobody else works on it
+            return MapStore(path)  # read again, now that it is locked
         with store.locked():
             store = MapStore.create(path, plan.record, overwrite=True)
     else:
@@ -183,19 +185,19 @@ class _MapRun:
         self._state, self._begun = begun, begun.blocks
         self._gathering = Gathering(begun.table, TUNING.most_cells)
         self._saved = begun.blocks
-        self._whole = True  # False while a step is half done, for interrupts
+        self._whole = True  # False during an update, in case it is interrupted
         self._next_save = monotonic() + TUNING.checkpoint
 
     def finish(self, workers: Threads | Cluster) -> WorkspaceMap:
         """Evaluate the missing blocks and complete the map."""
         plan = self._plan
-        self._tell()
+        self._report_progress()
         try:
-            for block in results(workers, range(self._begun, plan.n_blocks), self._tell):
+            for block in results(workers, range(self._begun, plan.n_blocks), self._report_progress):
                 self._take(block)
                 if monotonic() > self._next_save:
                     self._save()
-                self._tell()
+                self._report_progress()
         except BaseException:
             self._save()
             raise
@@ -219,11 +221,11 @@ class _MapRun:
         )
         self._whole = True
 
-    def _tell(self) -> None:
+    def _report_progress(self) -> None:
         self._report(self._plan.samples_in(self._state.blocks), self._plan.total)
 
     def _save(self) -> None:
-        """Write a checkpoint if there is something new and no step is half done."""
+        """Write a checkpoint if there is progress and no update was interrupted."""
         if self._store is None or self._state.blocks == self._saved or not self._whole:
             return
         begin = monotonic()
@@ -243,25 +245,25 @@ def _as_map(plan: MapPlan, state: MapPart, path: Path | None, evaluated: int) ->
 
 def _plan_of(store: MapStore) -> MapPlan:
     """Return the plan of a stored map."""
-    said: dict[str, Any] = store.attributes
+    data: dict[str, Any] = store.attributes
     try:
-        load = np.array(said["tip_load"], dtype=float)
+        load = np.array(data["tip_load"], dtype=float)
         follows = bool(load[6:].any())
         wrench = load[6:] if follows else load[:6]
         robot = Manipulator(
-            RobotDescription.model_validate(said["robot_description"], strict=False),
+            RobotDescription.model_validate(data["robot_description"], strict=False),
             force=wrench[:3],
             moment=wrench[3:],
             load_frame="tip" if follows else "base",
-            resolution=said["resolution"],
+            resolution=data["resolution"],
         )
-        grid = said["sampling"] == "grid"
+        grid = data["sampling"] == "grid"
         return MapPlan.of(
-            robot, directions=said["directions"], kind=said["kind"], boundary=said["boundary"],
-            frame=said["frame"], samples=None if grid else said["samples"],
-            levels=said["levels"] if grid else None, cell=said["cell_m"],
-            seed=0 if grid else said["seed"],
-            scene=Scene.model_validate(said["scene"], strict=False) if "scene" in said else None,
+            robot, directions=data["directions"], kind=data["kind"], boundary=data["boundary"],
+            frame=data["frame"], samples=None if grid else data["samples"],
+            levels=data["levels"] if grid else None, cell=data["cell_m"],
+            seed=0 if grid else data["seed"],
+            scene=Scene.model_validate(data["scene"], strict=False) if "scene" in data else None,
         )  # fmt: skip
     except (KeyError, TypeError, ValueError) as error:
         raise FileError(store.path, f"is damaged: {error}") from None

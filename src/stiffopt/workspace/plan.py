@@ -1,6 +1,6 @@
-"""The plan of a workspace map: arm, stiffnesses, samples and cells, and how a block is evaluated.
+"""`MapPlan`: arm, stiffnesses, samples and cells of a workspace map, and the evaluation of a block.
 
-Sample i of a plan depends on i (and a seed) alone, so any block of samples can be computed anywhere
+Sample i of a plan depends only on i (and a seed), so any block of samples can be computed anywhere
 and the pressures of a sample follow from its number. Sampling uses integer arithmetic up to the
 last step, which rounds the same on every machine.
 """
@@ -37,15 +37,15 @@ from stiffopt.workspace.table import FARTHEST, CellTable, MapPart, cell_indices,
 Vector = NDArray[np.float64]
 
 AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-"""Directions of a map unless others are named."""
-_NAME = "workspace_map_1"  # to be counted up when what `MapPlan._outputs` gives is changed
+"""Default directions of a map."""
+_NAME = "workspace_map_1"  # increase the number when `MapPlan._outputs` changes
 MOST_SAMPLES = 10**12
-"""Samples of a map, at most."""
+"""Largest number of samples of a map."""
 
 
 @dataclass(frozen=True)
 class MapTuning:
-    """Sizes and times of making a map; none changes the cells' values for a given plan."""
+    """Sizes and times of a map run; none changes the cells' values for a given plan."""
 
     # default number of samples of a free arm, and of one with gravity or loads, whose equilibria
     # take thousands of times longer than the closed form
@@ -62,7 +62,7 @@ class MapTuning:
     checkpoint_share: float = 0.05  # share of the time that checkpoints may take
     # time to wait for a scheduler, and for workers while there are none, in s
     cluster_patience: float = 30.0
-    retries: int = 3  # of a block that fails for a passing reason, such as a worker that is gone
+    retries: int = 3  # of a block that fails for a temporary reason, such as a lost worker
 
 
 TUNING = MapTuning()
@@ -70,7 +70,7 @@ TUNING = MapTuning()
 
 @dataclass(frozen=True)
 class Sampling(ABC):
-    """Samples of the pressures, by number, between the limits of each channel, in Pa."""
+    """Numbered samples of the pressures, between the limits of each channel, in Pa."""
 
     lower: tuple[float, ...]
     upper: tuple[float, ...]
@@ -82,14 +82,14 @@ class Sampling(ABC):
 
     @abstractmethod
     def shares(self, start: int, stop: int) -> Vector:
-        """Samples start to stop - 1 as shares (k, n) of each channel's range, 0 to 1."""
+        """Return samples start to stop - 1 as shares (k, n) of each channel's range, 0 to 1."""
 
     @abstractmethod
     def record(self) -> dict[str, Any]:
-        """The parameters of the sampling, as plain data."""
+        """Return the parameters of the sampling, as plain data."""
 
     def pressures(self, start: int, stop: int) -> Vector:
-        """Pressures (k, n) of samples start to stop - 1, in Pa."""
+        """Return pressures (k, n) of samples start to stop - 1, in Pa."""
         lower, upper = np.array(self.lower), np.array(self.upper)
         return np.asarray(lower + (upper - lower) * self.shares(start, stop))
 
@@ -99,7 +99,7 @@ class QuasiRandom(Sampling):
     """Additive recurrence with the generalised golden ratio (M. Roberts, 2018), in 64 bits.
 
     Sample i is ``frac(shift + (i + 1) ratio^-j)`` of the range of channel j, in fixed point; the
-    seed gives the shifts.
+    seed determines the shifts.
     """
 
     count: int
@@ -111,7 +111,7 @@ class QuasiRandom(Sampling):
         return self.count
 
     def shares(self, start: int, stop: int) -> Vector:
-        """Samples start to stop - 1 as shares (k, n) of each channel's range, 0 to below 1."""
+        """Return samples start to stop - 1 as shares (k, n) of the channels' ranges, in [0, 1)."""
         n = len(self.lower)
         steps = np.array(_golden_steps(n), dtype=np.uint64)
         shifts = np.array([_shift(self.seed, channel) for channel in range(n)], dtype=np.uint64)
@@ -120,7 +120,7 @@ class QuasiRandom(Sampling):
         return np.asarray((fixed >> np.uint64(11)).astype(np.float64) * 2.0**-53)
 
     def record(self) -> dict[str, Any]:
-        """Kind, count and seed."""
+        """Return kind, count and seed."""
         return {"sampling": "quasi-random", "samples": self.count, "seed": self.seed}
 
 
@@ -136,7 +136,7 @@ class Grid(Sampling):
         return int(self.levels ** len(self.lower))
 
     def shares(self, start: int, stop: int) -> Vector:
-        """Samples start to stop - 1 as shares (k, n) of each channel's range, 0 to 1."""
+        """Return samples start to stop - 1 as shares (k, n) of each channel's range, 0 to 1."""
         left = np.arange(start, stop, dtype=np.int64)
         digits = np.empty((len(left), len(self.lower)))
         for channel in reversed(range(len(self.lower))):
@@ -144,17 +144,17 @@ class Grid(Sampling):
         return digits / (self.levels - 1)
 
     def record(self) -> dict[str, Any]:
-        """Kind, levels and the number of samples that they make."""
+        """Return kind, levels and the resulting number of samples."""
         return {"sampling": "grid", "samples": self.total, "levels": self.levels}
 
 
 @cache
 def _golden_steps(n: int) -> tuple[int, ...]:
-    """Steps of the recurrence per channel in units of 2^-64; the ratio solves r^(n+1) = r + 1."""
+    """Return the steps per channel in units of 2^-64, from the ratio r^(n+1) = r + 1."""
     with localcontext() as context:
         context.prec = 60
         ratio, change = Decimal(2), Decimal(1)
-        while abs(change) > Decimal("1e-50"):  # Newton from above: each step is nearer
+        while abs(change) > Decimal("1e-50"):  # Newton's method converges from above
             change = (ratio ** (n + 1) - ratio - 1) / ((n + 1) * ratio**n - 1)
             ratio -= change
         return tuple(int(2**64 / ratio**power) for power in range(1, n + 1))
@@ -173,9 +173,9 @@ class MapPlan:
     ----------
     robot : the arm, with the load at its tip.
     measures : the stiffness measures (m,), with unit directions.
-    sampling : the pressures that are sampled.
+    sampling : the sampled pressures.
     cell : edge length of a cell, in m.
-    scene : what the body keeps clear of, or None.
+    scene : objects that the body keeps clear of, or None.
     """
 
     robot: Manipulator
@@ -199,7 +199,13 @@ class MapPlan:
         seed: int = 0,
         scene: Scene | None = None,
     ) -> "MapPlan":
-        """Plan from arguments; see `map_workspace`. `InputError`: one of them is wrong."""
+        """Return the plan for the arguments of `map_workspace`, after checking them.
+
+        Raises
+        ------
+        InputError
+            One of them is wrong.
+        """
         if not isinstance(robot, Manipulator):
             raise InputError(
                 f"expected a Manipulator, as load_robot returns it, not {type(robot).__name__}"
@@ -221,7 +227,7 @@ class MapPlan:
 
     @property
     def block_size(self) -> int:
-        """Samples of a block, the last one excepted."""
+        """Number of samples of a block, except the last."""
         return TUNING.loaded_block if self.robot.is_loaded else TUNING.block
 
     @property
@@ -230,11 +236,11 @@ class MapPlan:
         return -(-self.total // self.block_size)
 
     def samples_in(self, blocks: int) -> int:
-        """Number of samples in the first `blocks` blocks."""
+        """Return the number of samples in the first `blocks` blocks."""
         return min(blocks * self.block_size, self.total)
 
     def prepare(self) -> None:
-        """Compile what blocks need; after that several threads may evaluate blocks at once."""
+        """Compile the functions of blocks; then several threads may evaluate blocks at once."""
         if not self.robot.is_loaded:
             self._function  # noqa: B018
         if self.scene is not None and self.total >= TUNING.clear_from:
@@ -242,7 +248,7 @@ class MapPlan:
                 self._is_clear(self.sampling.pressures(0, TUNING.clear_from))
 
     def evaluate(self, index: int) -> MapPart:
-        """Result of one block, counted from 0."""
+        """Return the result of one block, counted from 0."""
         start, stop = self.samples_in(index), self.samples_in(index + 1)
         pressures = self.sampling.pressures(start, stop)
         evaluate = self._at_equilibria if self.robot.is_loaded else self._in_closed_form
@@ -265,7 +271,7 @@ class MapPlan:
         )
 
     def _is_clear(self, pressures: Vector) -> NDArray[np.bool_]:
-        """Whether the body keeps the clearance of the scene, at each of some pressures (k, n)."""
+        """Return whether the body keeps the scene's clearance, at each of the pressures (k, n)."""
         assert self.scene is not None
         clear: NDArray[np.bool_] = (
             self.robot.clearance(pressures, self.scene) >= self.scene.clearance
@@ -273,17 +279,17 @@ class MapPlan:
         return clear
 
     def _in_closed_form(self, pressures: Vector) -> tuple[Vector, Vector]:
-        """Positions (k, 3) and stiffnesses (m, k) of the arm without loads."""
+        """Return positions (k, 3) and stiffnesses (m, k) of the arm without loads."""
         position, stiffness = self._function.many(pressures, self.robot.numbers, threads=1)
         return position[:, :, 0], np.ascontiguousarray(stiffness[:, :, 0].T)
 
     def _at_equilibria(self, pressures: Vector) -> tuple[Vector, Vector]:
-        """The same of the loaded arm; NaN where it has no equilibrium."""
+        """Return the same for the loaded arm; NaN where it has no equilibrium."""
         position = np.full((len(pressures), 3), np.nan)
         stiffness = np.full((len(self.measures), len(pressures)), np.nan)
         evaluator = self.robot.evaluator(("workspace", self.measures), self._outputs)
         for row, p in enumerate(pressures):
-            evaluator.restart()  # each from rest: it must not matter which came before
+            evaluator.restart()  # from rest, so that the order of samples does not matter
             try:
                 at, values = evaluator(p)
             except EquilibriumError:
@@ -293,7 +299,7 @@ class MapPlan:
 
     @property
     def _function(self) -> BatchFunction:
-        """Outputs at pressures (n,), in machine code if that pays; the robot keeps it."""
+        """Outputs at pressures (n,), in machine code if that pays; the robot caches it."""
 
         def functions() -> list[ca.Function]:
             return [self.robot.tip_function(_NAME, self._outputs)]
@@ -308,7 +314,7 @@ class MapPlan:
         return self.robot.kept((_NAME, self.measures), make)
 
     def _outputs(self, shape: Shape, _: Any) -> list[Any]:
-        """Position (3, 1) of the tip and its stiffnesses (m, 1)."""
+        """Return the position (3, 1) of the tip and its stiffnesses (m, 1)."""
         stiffness = (
             directional_stiffness(
                 shape.compliance, shape.rotation, ca.DM(measure.direction),
@@ -327,7 +333,7 @@ class MapPlan:
 
     @cached_property
     def record(self) -> dict[str, Any]:
-        """The plan as plain data, enough to make it again."""
+        """The plan as plain data, enough to recreate it."""
         from stiffopt import __version__
 
         first = self.measures[0]
@@ -400,7 +406,7 @@ def _sampling(robot: Manipulator, samples: int | None, levels: int | None, seed:
 
 def _cell_size(robot: Manipulator, cell: float) -> float:
     size = checked_number("cell", cell)
-    # no segment grows to eight times its length, so cells farther away need no index
+    # no segment grows to eight times its length, so no cell is farther away
     smallest = 8 * robot.length / FARTHEST
     if not smallest <= size <= robot.length:
         raise InputError(

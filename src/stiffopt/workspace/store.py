@@ -1,9 +1,9 @@
-"""A workspace map on disk: a Zarr group (format 3) that can be resumed until it is complete.
+"""Store a workspace map on disk: a Zarr group (format 3) that can be resumed until it is complete.
 
-While a map is unfinished, ``checkpoint.npz`` in its folder holds what its first blocks have found;
-it is replaced as a whole, so that a process may be killed at any time. At the end the arrays are
-written, the attributes of the group are set to ``complete`` (again in one step) and the checkpoint
-is removed. The process at work holds a lock on the folder.
+While a map is unfinished, ``checkpoint.npz`` in its folder holds the results of its first blocks.
+It is replaced atomically, so a process may be killed at any time. At the end the arrays are
+written, the attributes of the group are set to ``complete`` (also atomically) and the checkpoint
+is removed. The running process holds a lock on the folder.
 """
 
 import json
@@ -39,7 +39,7 @@ _WHAT = {
 
 
 class MapStore:
-    """The folder of a map; `FileError` if there is something else at the path, or nothing."""
+    """The folder of a map; `FileError` if the path has something else, or nothing."""
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path)
@@ -49,7 +49,7 @@ class MapStore:
     def create(
         cls, path: str | os.PathLike[str], record: dict[str, Any], *, overwrite: bool
     ) -> "MapStore":
-        """Make a new, empty map in one step; with `overwrite` it replaces another one."""
+        """Create a new, empty map atomically; with `overwrite` it replaces another one."""
         target = Path(path)
         attributes = {"format": FORMAT, "status": "unfinished", **record}
         try:
@@ -73,7 +73,7 @@ class MapStore:
 
     @contextmanager
     def locked(self) -> Iterator[None]:
-        """Keep other processes from working on this map; `FileError` if another one does."""
+        """Keep other processes from working on this map; `FileError` if one already does."""
         try:
             import fcntl
         except ImportError:  # Windows
@@ -97,22 +97,22 @@ class MapStore:
             os.close(handle)
 
     def check(self, record: dict[str, Any]) -> None:
-        """Raise `FileError` if this map has another plan; it names what differs."""
+        """Raise `FileError` with the differences if this map has another plan."""
         differing = [key for key in record if self.attributes.get(key) != record[key]]
         if not differing:
             return
-        told = [
+        differences = [
             f"{key} is {_said(self.attributes.get(key))} there and {_said(record[key])} here"
             for key in differing
             if not isinstance(record[key], dict)
         ] or ["the robot's description differs"]
         raise FileError(
             self.path,
-            f"holds a map with other settings: {'; '.join(told[:4])}. Take another name, the same "
-            "settings, or overwrite it (--overwrite)",
+            f"holds a map with other settings: {'; '.join(differences[:4])}. Take another name, "
+            "the same settings, or overwrite it (--overwrite)",
         )
 
-    # -- while it is made -------------------------------------------------------------------
+    # -- unfinished maps --------------------------------------------------------------------
 
     def save(self, progress: MapPart) -> None:
         """Replace the checkpoint."""
@@ -143,7 +143,7 @@ class MapStore:
                 path, "is damaged, so the map cannot be resumed; begin anew with --overwrite"
             ) from None
 
-    # -- when it is complete ----------------------------------------------------------------
+    # -- complete maps ----------------------------------------------------------------------
 
     def finish(self, done: WorkspaceMap) -> None:
         """Write the arrays and mark the map as complete."""
@@ -195,7 +195,7 @@ def write_arrays(path: Path, done: WorkspaceMap) -> None:
     """Write the cells that were reached; the whole box need not fit into memory."""
     import zarr
 
-    for entry in path.iterdir():  # of a run that was killed here
+    for entry in path.iterdir():  # left by a run that was killed here
         if entry.is_dir():
             shutil.rmtree(entry)
     group = zarr.open_group(str(path), mode="r+", zarr_format=3)
@@ -255,7 +255,7 @@ def read_table(path: Path, first: NDArray[np.int64]) -> CellTable:
         key = cell_keys(np.stack(where, axis=1) + first + np.array([start, 0, 0]))
         parts.append(CellTable(key, **{name: box[inside] for name, box in slab.items()}))
     names = list(parts[0].arrays)
-    # slabs follow each other along x, so keys ascend
+    # slabs are in order along x, so keys ascend
     return CellTable(*(np.concatenate([getattr(p, n) for p in parts], axis=-1) for n in names))
 
 
@@ -263,7 +263,7 @@ def read_table(path: Path, first: NDArray[np.int64]) -> CellTable:
 
 
 def _read_attributes(path: Path) -> dict[str, Any]:
-    """Attributes of a map."""
+    """Read the attributes of a map."""
     no_map = "is not a map of a workspace that stiffopt made; nothing was changed"
     try:
         data = json.loads((path / _METADATA).read_text(encoding="utf-8"))
@@ -290,7 +290,7 @@ def _read_attributes(path: Path) -> dict[str, Any]:
 
 
 def is_vacant(path: str | os.PathLike[str]) -> bool:
-    """Whether there is nothing at a path, or an empty folder."""
+    """Return whether there is nothing at a path, or an empty folder."""
     place = Path(path)
     if not os.path.lexists(place):
         return True
@@ -301,7 +301,7 @@ def is_vacant(path: str | os.PathLike[str]) -> bool:
 
 
 def _group(attributes: dict[str, Any]) -> dict[str, Any]:
-    """Metadata of a Zarr group."""
+    """Return the metadata of a Zarr group."""
     return {"zarr_format": 3, "node_type": "group", "attributes": attributes}
 
 

@@ -1,8 +1,8 @@
-"""What samples have found: tables of cells with the range of stiffness in each.
+"""`CellTable`: cells that samples fell into, with the range of stiffness in each.
 
-Cell (i, j, k) of size c is centred at (i, j, k) c in the base frame. Merging tables adds up the
+Cell (i, j, k) of size c is centred at (i, j, k) c in the base frame. Merging tables adds the
 numbers of samples and keeps the greatest and least stiffness, each with the lowest sample number
-that attains it, so the outcome does not depend on how samples are grouped.
+that attains it, so the result does not depend on how samples are grouped.
 """
 
 from collections.abc import Sequence
@@ -33,18 +33,18 @@ class CellTable:
     count: Numbers  # (M,) number of samples
     best: Vector  # (m, M) greatest stiffness
     worst: Vector  # (m, M) least stiffness
-    best_sample: Numbers  # (m, M) the lowest sample that has it
-    worst_sample: Numbers  # likewise
+    best_sample: Numbers  # (m, M) lowest number of a sample with the greatest stiffness
+    worst_sample: Numbers  # (m, M) likewise for the least
 
     @classmethod
     def empty(cls, m: int) -> "CellTable":
-        """No cells, for m directions."""
+        """Return a table without cells, for m directions."""
         none, values = np.empty(0, np.int64), np.empty((m, 0))
         return cls(none, none, values, values, values.astype(np.int64), values.astype(np.int64))
 
     @classmethod
     def of_samples(cls, key: Numbers, stiffness: Vector, sample: Numbers) -> "CellTable":
-        """Table of samples in cells (k,), with stiffnesses (m, k), in ascending order."""
+        """Return the table of ascending samples in cells (k,), with stiffnesses (m, k)."""
         each = np.broadcast_to(sample, stiffness.shape)
         return _reduced(cls(key, np.ones(len(key), np.int64), stiffness, stiffness, each, each))
 
@@ -65,9 +65,9 @@ class CellTable:
 
 
 class MapPart(NamedTuple):
-    """What blocks of samples have found: one of them, or the first so many."""
+    """Results of some blocks of samples: of one block, or of the first ones."""
 
-    blocks: int  # how many
+    blocks: int  # their number
     lost: int  # samples at which the arm has no stable equilibrium
     low: Vector  # least coordinates (3,) of the tip, in m
     high: Vector  # greatest coordinates (3,)
@@ -75,12 +75,12 @@ class MapPart(NamedTuple):
 
 
 def cell_indices(position: Vector, cell: float) -> Numbers:
-    """Indices (k, 3) of the cells that positions (k, 3) are in."""
+    """Return the indices (k, 3) of the cells that contain positions (k, 3)."""
     return np.asarray(np.floor(position / cell + 0.5), dtype=np.int64)
 
 
 def cell_keys(indices: Numbers) -> Numbers:
-    """Indices (k, 3) of cells packed into one number each; they sort alike."""
+    """Pack indices (k, 3) of cells into one number each, with the same order."""
     shifted = indices + _HALF
     return np.asarray(
         (shifted[:, 0] << (2 * _BITS)) | (shifted[:, 1] << _BITS) | shifted[:, 2], dtype=np.int64
@@ -97,7 +97,7 @@ def merged(tables: Sequence[CellTable]) -> CellTable:
 
 
 class Gathering:
-    """A table that grows up to `most_cells`; added tables are merged when there are enough rows."""
+    """A table that grows to at most `most_cells`; added tables are merged in batches."""
 
     _ENOUGH = 1 << 18  # rows
 
@@ -115,7 +115,7 @@ class Gathering:
             self.table()
 
     def table(self) -> CellTable:
-        """Table of everything that was added so far."""
+        """Return the table of everything added so far."""
         self._table = merged([self._table, *self._waiting])
         self._waiting, self._rows = [], 0
         if len(self._table) > self._most_cells:
@@ -127,7 +127,7 @@ class Gathering:
 
 
 def _reduced(rows: CellTable) -> CellTable:
-    """Rows with each key once, in ascending order."""
+    """Merge rows with the same key; return them in ascending order."""
     if not len(rows.key):
         return rows
     order = np.argsort(rows.key, kind="stable")
@@ -144,7 +144,7 @@ def _reduced(rows: CellTable) -> CellTable:
 def _least(
     values: Vector, samples: Numbers, order: NDArray[np.intp], starts: Numbers, group: Numbers
 ) -> tuple[Vector, Numbers]:
-    """Least value (m, M) of each group of rows, and the lowest sample that attains it."""
+    """Return each group's least value (m, M) and the lowest sample that attains it."""
     values = values[:, order]
     least = np.minimum.reduceat(values, starts, axis=1)
     holders = np.where(values == least[:, group], samples[:, order], _NO_SAMPLE)

@@ -1,7 +1,7 @@
 """Workers that evaluate the blocks of a plan: threads of this process, or a Dask cluster.
 
-Results come in the order of the blocks, each exactly once, however often its evaluation had to be
-repeated; a bounded number of blocks is in work at a time.
+Results come in the order of the blocks, each exactly once, even if its evaluation had to be
+repeated; the number of blocks in progress is bounded.
 """
 
 import os
@@ -53,8 +53,8 @@ def results(
 class Threads(AbstractContextManager["Threads"]):
     """Threads of this process.
 
-    By default there is one for each core; one for an arm with loads, whose equilibria are found in
-    Python, which has no use for more.
+    By default there is one for each core.  For an arm with loads there is only one, as its
+    equilibria are computed in Python, which would not run faster in several threads.
     """
 
     def __init__(self, plan: MapPlan, count: int | None = None) -> None:
@@ -73,7 +73,7 @@ class Threads(AbstractContextManager["Threads"]):
 
     @property
     def width(self) -> int:
-        """Number of blocks to have in work."""
+        """Largest number of blocks in progress."""
         return 2 * self._count
 
     def submit(self, index: int, done: Callable[[int, Any], None]) -> None:
@@ -82,12 +82,12 @@ class Threads(AbstractContextManager["Threads"]):
         future.add_done_callback(lambda finished: done(index, finished))
 
     def result(self, future: Any) -> MapPart:
-        """Result of a future that is done."""
+        """Return the result of a future that is done."""
         found: MapPart = future.result()
         return found
 
     def check(self) -> None:
-        """Threads do not get lost."""
+        """Do nothing: threads do not get lost."""
 
 
 class Cluster(AbstractContextManager["Cluster"]):
@@ -98,7 +98,7 @@ class Cluster(AbstractContextManager["Cluster"]):
         try:
             self._payload = pickle.dumps(plan)
             self._token = plan.token
-            self._run = uuid.uuid4().hex  # keeps results of other runs apart
+            self._run = uuid.uuid4().hex  # distinguishes the results of runs
             self._futures: set[Any] = set()
             self._seen = monotonic()
             self._threads = self._count_threads(wait=TUNING.cluster_patience)
@@ -117,7 +117,7 @@ class Cluster(AbstractContextManager["Cluster"]):
     ) -> None:
         try:
             self._client.cancel(list(self._futures), force=True)
-        except Exception:  # a cluster that is gone has nothing left to cancel
+        except Exception:  # the cluster may be gone
             pass
         finally:
             self._futures.clear()
@@ -125,7 +125,7 @@ class Cluster(AbstractContextManager["Cluster"]):
 
     @property
     def width(self) -> int:
-        """Number of blocks to have in work."""
+        """Largest number of blocks in progress."""
         return 3 * self._threads + 2
 
     def submit(self, index: int, done: Callable[[int, Any], None]) -> None:
@@ -138,7 +138,7 @@ class Cluster(AbstractContextManager["Cluster"]):
         future.add_done_callback(lambda finished: done(index, finished))
 
     def result(self, future: Any) -> MapPart:
-        """Result of a future that is done; `ClusterError` if the cluster gave up on it."""
+        """Return a done future's result; `ClusterError` if the cluster gave up on it."""
         self._futures.discard(future)
         try:
             token, block = future.result(timeout=TUNING.cluster_patience)
@@ -158,7 +158,7 @@ class Cluster(AbstractContextManager["Cluster"]):
         return result
 
     def check(self) -> None:
-        """Raise if no result will ever come; distributed reconnects for a while."""
+        """Raise `ClusterError` if no result can come any more; distributed first reconnects."""
         if self._client.status != "running" and monotonic() - self._seen > TUNING.cluster_patience:
             raise ClusterError("the connection to the scheduler is lost")
         if monotonic() - self._seen > TUNING.cluster_patience:
@@ -206,9 +206,9 @@ _PLANS_KEPT = 4
 
 
 def _evaluate_on_worker(token: str, payload: bytes, index: int) -> tuple[str, MapPart]:
-    """Result of a block, and the worker's name for the plan; runs on a worker.
+    """Return the plan's token, as computed on this worker, and the result of a block.
 
-    The plan with what was compiled for it is kept for the next block.
+    The plan and its compiled functions are cached for the next block.
     """
     with _plans_lock:
         if token not in _plans:
