@@ -211,7 +211,7 @@ def _next_to(here: _Place, known: Sequence[LocalResult], same: float) -> LocalRe
 
 
 def _update(B: Vector, s: Vector, y: Vector) -> None:
-    """Powell's damped BFGS update in place, which keeps B positive definite."""
+    """Apply Powell's damped BFGS update in place, which keeps B positive definite."""
     Bs = B @ s
     sBs = float(s @ Bs)
     if not sBs >= 1e-16:

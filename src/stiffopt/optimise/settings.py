@@ -143,9 +143,9 @@ class ObstacleSettings:
     turns, closer : refinements of the nearest point without machine code, and stations of each.
     clearest : samples among which a clear start is sought if none near the target arrives clear;
         the clearest of them is shown if none is clear.
-    parents, children, rounds, spread : if none is clear, so many of the clearest have so many
-        others drawn around them in a round, in the first and the last round by these standard
-        deviations, as shares of the range of pressures.
+    parents, children, rounds, spread : search if none is clear: in each round, `children` samples
+        are drawn around each of the `parents` clearest. `spread` gives the standard deviations in
+        the first and the last round, as shares of the range of pressures.
     allowed : violation of the clearance that is allowed in an answer, in m: the precision of least
         distances.
     """

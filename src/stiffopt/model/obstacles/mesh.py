@@ -160,7 +160,7 @@ class Mesh(Obstacle):
         super().check_against(robot, clearance)
 
     def outline(self, size: float) -> list[Array]:
-        """Its triangles, (3, m, 3); see `Obstacle.outline`."""
+        """Return its triangles, (3, m, 3); see `Obstacle.outline`."""
         corners = self.surface.vertices @ self._axes.T + np.array(self.centre)
         triangles: Array = corners[self.surface.faces]  # (m, 3, 3)
         return [np.moveaxis(triangles, 2, 0)]
