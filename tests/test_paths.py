@@ -284,15 +284,40 @@ def test_steps_that_are_asked_of_a_crossing_are_kept(robot, compiled):
     assert route.value("mean") >= max(values) - 2e-3
 
 
-def test_a_body_that_is_too_near_between_two_points_is_told(robot, compiled):
-    """Both points are clear of a post that the body passes half-way."""
+def post_half_way(arm, solution):
+    """A scene with a post that the body comes within 0.5 mm of, half-way between two points."""
+    at, (begin, end) = 0.9 * arm.length, solution.pressures
+    first, middle, last = (arm.pose(p, at)[:3, 3] for p in (begin, (begin + end) / 2, end))
+    out = middle - (first + last) / 2  # of the chord
+    reach = arm.description.segments[0].outer_radius + 0.0045
+    centre = middle + reach * out / np.linalg.norm(out)
+    post = {"name": "post", "sphere": {"centre": tuple(centre), "radius": 0.004}}
+    return {"clearance": 0.001, "objects": [post]}
+
+
+def test_the_body_keeps_clear_between_points_too(robot, compiled):
     options = {"points": 2, "timing": {"times": [0, 4.0]}}
     free = solve_path(robot, path_of(**options))
-    half = robot.pose(free.pressures.mean(axis=0), 0.165)
-    outer = robot.description.segments[0].outer_radius
-    centre = half[:3, 3] + half[:3, 0] * (outer + 0.0045)
-    post = {"name": "post", "sphere": {"centre": tuple(centre), "radius": 0.004}}
-    solution = solve_path(robot, path_of(**options, scene={"clearance": 0.001, "objects": [post]}))
+    scene = post_half_way(robot, free)
+    solution = solve_path(robot, path_of(**options, scene=scene))
     assert solution.found
+    shares = np.linspace(0, 1, 41)[:, np.newaxis]
+    between = (1 - shares) * solution.pressures[0] + shares * solution.pressures[1]
+    assert robot.clearance(free.pressures.mean(axis=0), so.Scene(**scene)) < 0.0006
+    assert robot.clearance(between, so.Scene(**scene)).min() > 0.001 - 1e-4
+
+
+def test_a_path_on_which_it_cannot_is_told(compiled):
+    """One segment has no other pressures for a position."""
+    arm = so.load_robot("stiff-flop-1")
+    tips = arm.tip_pose([[0, 0.7e5, 0.7e5], [0.7e5, 0, 0.7e5]])[:, :3, 3]
+    options = {"path": through(tips), "points": None, "timing": {"times": [0, 4.0]}}
+    free = solve_path(arm, path_of(**options))
+    assert free.status == "solved"
+    scene = post_half_way(arm, free)
+    solution = solve_path(arm, path_of(**options, scene=scene))
     assert solution.clearance.min() > 0.001
-    assert "Between points 1 and 2 the body is only 0.5 mm clear of the scene" in solution.message
+    assert solution.status == "unreachable"
+    assert solution.first_failure == 0
+    assert "Between points 1 and 2 the clearance of the body falls to -" in solution.message
+    assert "the scene asks for 1 mm" in solution.message

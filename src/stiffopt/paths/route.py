@@ -4,11 +4,12 @@ Candidates at consecutive points are linked if the rates allow the step.  A cros
 candidates several points apart: the pressures go from one to the other at full rate while the tip
 stays on the path.  Dynamic programming finds the best sequence.  The stiffness along a crossing is
 expensive; it is computed only if a best sequence would use the crossing, and until then estimated
-from its ends.
+from its ends.  Likewise, whether the body keeps clear of a scene between the points is checked
+only for links that a best sequence would use.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -63,6 +64,7 @@ class _Links:
     origin, goal : candidates at both ends.
     worst, total : smallest value and sum of values in between; estimates until `known`.
     known : whether these are computed.
+    checked : whether the body is known to keep clear along a link.
     between : the candidates along each computed crossing, by the link's number.
     """
 
@@ -71,13 +73,15 @@ class _Links:
     worst: Vector
     total: Vector
     known: NDArray[np.bool_]
+    checked: NDArray[np.bool_]
     between: dict[int, list[PathCandidate]] = field(default_factory=dict)
 
     @classmethod
     def steps(cls, origin: Indices, goal: Indices) -> "_Links":
         """Return links to the next point, with nothing in between."""
         count = len(goal)
-        return cls(origin, goal, np.full(count, np.inf), np.zeros(count), np.ones(count, bool))
+        known, checked = np.ones(count, bool), np.zeros(count, bool)
+        return cls(origin, goal, np.full(count, np.inf), np.zeros(count), known, checked)
 
     def with_crossings(self, others: "_Links") -> "_Links":
         """Return these links and crossings together."""
@@ -88,6 +92,7 @@ class _Links:
             np.concatenate([self.worst, others.worst])[order],
             np.concatenate([self.total, others.total])[order],
             np.concatenate([self.known, others.known])[order],
+            np.concatenate([self.checked, others.checked])[order],
         )
 
     def sorted_by_point(self, first: Indices) -> list[tuple[slice, Indices, Indices]]:
@@ -117,6 +122,8 @@ class RouteSearch:
     lanes : list of list of PathCandidate, optional
         Further candidates at each point.
     is_closed : whether sequences end with the pressures with which they begin.
+    is_clear : callable, optional
+        Whether the body keeps clear of the scene along pressures (k, n).
     """
 
     def __init__(
@@ -127,8 +134,10 @@ class RouteSearch:
         over: str,
         lanes: Sequence[Sequence[PathCandidate]] | None = None,
         is_closed: bool = False,
+        is_clear: Callable[[Vector], bool] | None = None,
     ) -> None:
         self._tasks, self._steps, self._over = tasks, steps, over
+        self._is_clear = is_clear
         count = len(layers)
         if is_closed:
             layers = [*layers[:-1], layers[0]]
@@ -238,7 +247,31 @@ class RouteSearch:
         self._starts = np.searchsorted(links.goal, np.arange(len(self._values) + 1))
 
     def _sequence(self, *, computed: bool = False) -> _Sequence | None:
-        """Return the best sequence, of computed links alone if asked; None if there is none."""
+        """Return the best sequence, of computed links alone if asked; None if there is none.
+
+        The body keeps clear of the scene along its computed links.
+        """
+        found = self._unchecked_sequence(computed)
+        while found is not None and self._drops_blocked(found.links):
+            checkpoint()
+            found = self._unchecked_sequence(computed)
+        return found
+
+    def _drops_blocked(self, links: Sequence[int]) -> bool:
+        """Exclude links along which the body does not keep clear; return whether there were any."""
+        all_links, dropped = self._links, False
+        for number in links:
+            if self._is_clear is None or all_links.checked[number] or not all_links.known[number]:
+                continue
+            between = [each.pressures for each in all_links.between.get(number, [])]
+            ends = self._pressures[[all_links.origin[number], all_links.goal[number]]]
+            all_links.checked[number] = True
+            if not self._is_clear(np.array([ends[0], *between, ends[1]])):
+                all_links.worst[number] = all_links.total[number] = -np.inf
+                dropped = True
+        return dropped
+
+    def _unchecked_sequence(self, computed: bool) -> _Sequence | None:
         if self._over == "mean":
             return self._traced(-np.inf, computed=computed)
         worst = self._reached(-np.inf, bottleneck=True, computed=computed)
@@ -367,7 +400,8 @@ class RouteSearch:
         between = self._point[goal] - self._point[origin] - 1
         worst = np.minimum(values[origin], values[goal]) - ROUTE.price
         total = between * ((values[origin] + values[goal]) / 2 - ROUTE.price)
-        return _Links(origin, goal, worst, total, np.zeros(len(goal), dtype=bool))
+        known, checked = np.zeros((2, len(goal)), dtype=bool)
+        return _Links(origin, goal, worst, total, known, checked)
 
     def _compute(self, number: int) -> None:
         """Compute the values along a crossing; minus infinity if it cannot be followed."""

@@ -128,7 +128,7 @@ class RateSettings:
     rounding : relative excess over a rate that counts as rounding.
     largest_step : of a channel between two points, as a share of its range, if rates or times are
         unknown.
-    clearance_between : loss of clearance between two points that a message reports, in m.
+    clearance_between : allowed loss of clearance between two points, in m.
     few_points : largest number of points for which the solver does not wait for machine code.
     least_time : shortest time between two points, in s.
     """

@@ -1,6 +1,6 @@
 """`solve_path`: find the stiffest pressures with which the tip follows a path within the rates."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,6 +10,7 @@ from stiffopt.display import display_units
 from stiffopt.errors import EquilibriumError, InputError, StoppedError, shown
 from stiffopt.model.compiled import Stopwatch
 from stiffopt.model.manipulator import Manipulator
+from stiffopt.model.motion_clearance import ClearMotions
 from stiffopt.model.stopping import Cancel, giving_up
 from stiffopt.optimise.solution import Judgement, PressureSolution
 from stiffopt.optimise.solver import PressureSolver
@@ -83,6 +84,7 @@ class _PathSolver:
         self._over = "mean" if path.stiffness is None else path.stiffness.over
         self._unreachable: tuple[int, str] | None = None  # the first point, and why
         self._lanes: list[list[PathCandidate]] | None = None
+        self._motions: ClearMotions | None = None
 
     def solve(self) -> PathSolution:
         """Answer; see `solve_path`."""
@@ -195,7 +197,7 @@ class _PathSolver:
             for index, end in zip((0, -1), self._ends, strict=True)
             if end is not None or self._path.closed
         ]
-        pressures = refined(tasks, pressures, steps, self._over, fixed)
+        pressures = refined(tasks, pressures, steps, self._over, fixed, self._is_clear(tasks))
         if times is None:
             times = self._fastest(pressures)
         alone = np.array([max((c.value for c in layer), default=np.nan) for layer in layers])
@@ -229,17 +231,44 @@ class _PathSolver:
         """Return the best sequence, with further configurations if local optima do not suffice."""
         if not all(layers):
             return None
+        clear = self._is_clear(tasks)
+        route = self._best_clear_route(tasks, layers, steps, clear, any_will_do=any_will_do)
+        if route is None and clear is not None:  # the judgement names the obstacle
+            return self._best_clear_route(tasks, layers, steps, None, any_will_do=any_will_do)
+        return route
+
+    def _best_clear_route(
+        self,
+        tasks: PathTasks,
+        layers: list[list[PathCandidate]],
+        steps: Vector,
+        clear: Callable[[Vector], bool] | None,
+        *,
+        any_will_do: bool,
+    ) -> Route | None:
         closed = self._path.closed
-        search = RouteSearch(tasks, layers, steps, self._over, is_closed=closed)
+        search = RouteSearch(tasks, layers, steps, self._over, is_closed=closed, is_clear=clear)
         best = search.best(ROUTE.first_rounds, any_will_do=any_will_do)
         if (best is not None and any_will_do) or search.comes_up_to(best, ROUTE.enough):
             return best
         further = self._further(tasks)
-        search = RouteSearch(tasks, layers, steps, self._over, further, is_closed=closed)
+        search = RouteSearch(
+            tasks, layers, steps, self._over, further, is_closed=closed, is_clear=clear
+        )
         rounds = ROUTE.first_rounds if any_will_do else ROUTE.rounds
         found = [best, search.best(rounds, share=ROUTE.enough, any_will_do=any_will_do)]
         known = [each for each in found if each is not None]
         return max(known, key=lambda each: each.value(self._over), default=None)
+
+    def _is_clear(self, tasks: PathTasks) -> Callable[[Vector], bool] | None:
+        """Return a check of the body between points; None without a scene or machine code."""
+        scene = self._path.scene
+        if scene is None or not tasks.is_compiled:
+            return None
+        if self._motions is None:
+            self._motions = ClearMotions(tasks.robot, scene)
+        motions, asked = self._motions, scene.clearance - RATES.clearance_between
+        return lambda pressures: motions.along(pressures, asked).clear
 
     def _further(self, tasks: PathTasks) -> list[list[PathCandidate]]:
         """Return further candidates, none where the pressures are given."""
@@ -324,7 +353,33 @@ class _PathSolver:
         if self._slew is not None and self._points.times is not None:
             limits = step_limits(times, self._slew)
             assert (np.abs(np.diff(pressures, axis=0)) <= limits * (1 + 1e-6) + 1e-6).all()
+        blocked = self._blocked(tasks, solution)
+        if blocked is not None:
+            index, message = blocked
+            return replace(solution, status="unreachable", message=message, first_failure=index)
         return replace(solution, message=self._notes(solution))
+
+    def _blocked(self, tasks: PathTasks, solution: PathSolution) -> tuple[int, str] | None:
+        """Return the first point after which the body is too near the scene, and the message."""
+        scene, p = self._path.scene, solution.pressures
+        if scene is None or len(p) < 2:
+            return None
+        motions = self._motions or ClearMotions(tasks.robot, scene)
+        asked = scene.clearance - RATES.clearance_between
+        whole = motions.along(p, asked)
+        if whole.clear:
+            return None
+        found = ((k, motions.along(p[k : k + 2], asked)) for k in range(len(p) - 1))
+        index, motion = next(((k, each) for k, each in found if not each.clear), (0, whole))
+        between = f"Between points {index + 1} and {index + 2}"
+        if not np.isfinite(motion.least):
+            return index, f"{between} the arm has no stable equilibrium, or snaps to another."
+        length = display_units().length
+        return index, (
+            f"{between} the clearance of the body falls to {length.text(motion.least, '.3g')}; "
+            f"the scene asks for {length.text(scene.clearance, 'g')}. With more points, or lower "
+            "rates, it may keep clear."
+        )
 
     def _notes(self, solution: PathSolution) -> str:
         """Return remarks for the user on a path that can be followed."""
@@ -342,16 +397,6 @@ class _PathSolver:
                 notes.append(
                     f"Between points {index + 1} and {index + 2} the tip is up to {error} off the "
                     "path; with more points, or lower rates, it stays nearer."
-                )
-        scene = self._path.scene
-        if len(middle) and scene is not None:
-            clear = solution.robot.clearance(middle, scene)
-            index = int(clear.argmin())
-            if clear[index] < scene.clearance - RATES.clearance_between:
-                distance = display_units().length.text(clear[index], ".3g")
-                notes.append(
-                    f"Between points {index + 1} and {index + 2} the body is only {distance} clear "
-                    "of the scene; with more points, or lower rates, it keeps further away."
                 )
         return " ".join(notes)
 
