@@ -559,7 +559,7 @@ def test_an_interrupt_leaves_nothing_behind(
 ) -> None:
     """In the middle of the fit, and after the report was drawn but before anything has a name."""
 
-    def interrupted(*_: object) -> None:
+    def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr(calibrate_run, where, interrupted)
