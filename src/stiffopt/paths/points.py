@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 
 from stiffopt.errors import EquilibriumError
 from stiffopt.model.manipulator import Manipulator
+from stiffopt.model.motion_clearance import ClearMotions, MotionClearance
+from stiffopt.model.scene import Scene
 from stiffopt.optimise.fast import CompiledAnswer
 from stiffopt.optimise.functions import functions
 from stiffopt.optimise.local import descend
@@ -23,7 +25,7 @@ from stiffopt.optimise.reach import bounded_steps, reach
 from stiffopt.optimise.settings import REACH
 from stiffopt.optimise.solution import Judgement, are_within, judge
 from stiffopt.optimise.task import Task
-from stiffopt.paths.settings import LANES
+from stiffopt.paths.settings import LANES, RATES
 
 Vector = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -69,6 +71,30 @@ class Slopes(NamedTuple):
     jacobians: Vector
     costs: Vector
     gradients: Vector
+
+
+class BodyCheck:
+    """Checks that the body keeps the clearance of a scene between the points of a path.
+
+    Parameters
+    ----------
+    robot : Manipulator
+        With its load.
+    scene : Scene
+    """
+
+    def __init__(self, robot: Manipulator, scene: Scene) -> None:
+        self._robot, self._scene = robot, scene
+        self._motions = ClearMotions(robot, scene)
+        self._required = scene.clearance - RATES.clearance_between
+
+    def motion(self, pressures: Vector) -> MotionClearance:
+        """Check the motion along rows of pressures (N, n)."""
+        return self._motions.along(pressures, self._required)
+
+    def are_clear(self, pressures: Vector) -> NDArray[np.bool_]:
+        """Return whether the body keeps clear at each of the pressures (N, n)."""
+        return np.asarray(self._robot.clearance(pressures, self._scene) >= self._required)
 
 
 class PathTasks:

@@ -13,7 +13,7 @@ Lagrangian enter as a convex quadratic term; Clarabel solves the program, a seco
 each tolerance.  A trust region and an exact penalty decide whether a step is taken.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -25,7 +25,7 @@ from scipy import sparse
 from stiffopt.model.stopping import checkpoint
 from stiffopt.optimise.program import Constraint
 from stiffopt.optimise.settings import DESCENT
-from stiffopt.paths.points import PathTasks, Slopes
+from stiffopt.paths.points import BodyCheck, PathTasks, Slopes
 from stiffopt.paths.settings import REFINEMENT
 
 Vector = NDArray[np.float64]
@@ -39,7 +39,7 @@ def refined(
     steps: Vector,
     over: str,
     fixed: Sequence[int] = (),
-    is_clear: Callable[[Vector], bool] | None = None,
+    body: BodyCheck | None = None,
 ) -> Vector:
     """Return pressures (N, n) that are better where the rates bind.
 
@@ -52,16 +52,16 @@ def refined(
         Largest changes from point to point, in Pa.
     over : "worst" or "mean"
     fixed : indices of points that must not change.
-    is_clear : callable, optional
-        Whether the body keeps clear of the scene along pressures (k, n); a window that does not is
-        left as it was.
+    body : BodyCheck, optional
+        A window in which the body would not keep clear is left as it was.
     """
     done: list[range] = []
     for _ in range(REFINEMENT.passes):  # a window may be held back at its ends: a wider one then
         windows = [each for each in _windows(pressures, steps) if not _is_within(each, done)]
         for window in windows:
             new = _Window(tasks, pressures, steps, over, window, set(fixed)).optimised()
-            if is_clear is None or is_clear(new[max(window.start - 1, 0) : window.stop + 1]):
+            near = new[max(window.start - 1, 0) : window.stop + 1]
+            if body is None or body.motion(near).clear:
                 pressures = new
         done += windows
     return pressures

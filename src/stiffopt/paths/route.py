@@ -9,7 +9,7 @@ only for links that a best sequence would use.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt.model.stopping import checkpoint
-from stiffopt.paths.points import Local, PathCandidate, PathTasks
+from stiffopt.paths.points import BodyCheck, Local, PathCandidate, PathTasks
 from stiffopt.paths.settings import RATES, ROUTE
 
 Vector = NDArray[np.float64]
@@ -122,8 +122,8 @@ class RouteSearch:
     lanes : list of list of PathCandidate, optional
         Further candidates at each point.
     is_closed : whether sequences end with the pressures with which they begin.
-    is_clear : callable, optional
-        Whether the body keeps clear of the scene along pressures (k, n).
+    body : BodyCheck, optional
+        Excludes links on which the body does not keep clear.
     """
 
     def __init__(
@@ -134,10 +134,10 @@ class RouteSearch:
         over: str,
         lanes: Sequence[Sequence[PathCandidate]] | None = None,
         is_closed: bool = False,
-        is_clear: Callable[[Vector], bool] | None = None,
+        body: BodyCheck | None = None,
     ) -> None:
         self._tasks, self._steps, self._over = tasks, steps, over
-        self._is_clear = is_clear
+        self._body = body
         count = len(layers)
         if is_closed:
             layers = [*layers[:-1], layers[0]]
@@ -251,25 +251,43 @@ class RouteSearch:
 
         The body keeps clear of the scene along its computed links.
         """
-        found = self._unchecked_sequence(computed)
-        while found is not None and self._drops_blocked(found.links):
+        for _ in range(ROUTE.repeats):
             checkpoint()
             found = self._unchecked_sequence(computed)
-        return found
+            if found is None or not self._drops_blocked(found.links):
+                return found
+        return None
 
-    def _drops_blocked(self, links: Sequence[int]) -> bool:
-        """Exclude links along which the body does not keep clear; return whether there were any."""
-        all_links, dropped = self._links, False
-        for number in links:
-            if self._is_clear is None or all_links.checked[number] or not all_links.known[number]:
+    def _drops_blocked(self, numbers: Sequence[int]) -> bool:
+        """Exclude links on which the body does not keep clear; return whether there were any."""
+        links, blocked = self._links, False
+        for number in numbers:
+            if self._body is None or links.checked[number] or not links.known[number]:
                 continue
-            between = [each.pressures for each in all_links.between.get(number, [])]
-            ends = self._pressures[[all_links.origin[number], all_links.goal[number]]]
-            all_links.checked[number] = True
-            if not self._is_clear(np.array([ends[0], *between, ends[1]])):
-                all_links.worst[number] = all_links.total[number] = -np.inf
-                dropped = True
-        return dropped
+            between = [each.pressures for each in links.between.get(number, [])]
+            ends = self._pressures[[links.origin[number], links.goal[number]]]
+            links.checked[number] = True
+            if not self._body.motion(np.array([ends[0], *between, ends[1]])).clear:
+                blocked = True
+                self._exclude(np.array([number]))
+                if not between:
+                    self._exclude_others(int(self._point[links.origin[number]]))
+        return blocked
+
+    def _exclude_others(self, point: int) -> None:
+        """Exclude steps from a point half-way along which the body is too near."""
+        assert self._body is not None
+        links = self._links
+        is_step = (self._point[links.origin] == point) & (self._point[links.goal] == point + 1)
+        steps = np.flatnonzero(is_step & ~links.checked)
+        middle = (self._pressures[links.origin[steps]] + self._pressures[links.goal[steps]]) / 2
+        if len(steps):
+            self._exclude(steps[~self._body.are_clear(middle)])
+
+    def _exclude(self, numbers: Indices) -> None:
+        links = self._links
+        links.checked[numbers] = True
+        links.worst[numbers] = links.total[numbers] = -np.inf
 
     def _unchecked_sequence(self, computed: bool) -> _Sequence | None:
         if self._over == "mean":

@@ -63,6 +63,7 @@ class RouteSettings:
     nearest : number of candidates to which crossings lead from another, for each length.
     rounds, first_rounds : largest number of rounds in which crossings are computed; and the same
         before further configurations are added.
+    repeats : largest number of searches for a sequence on which the body keeps clear.
     price : small penalty on a crossing, which prevents useless ones.
     within : share of a rate that crossings use.
     hardly : gain in the logarithm of stiffness for which no crossing is computed.
@@ -76,6 +77,7 @@ class RouteSettings:
     nearest: int = 6
     rounds: int = 100
     first_rounds: int = 8
+    repeats: int = 100
     price: float = 1e-3
     within: float = 0.98
     hardly: float = 2e-3

@@ -1,6 +1,6 @@
 """`solve_path`: find the stiffest pressures with which the tip follows a path within the rates."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,14 +10,13 @@ from stiffopt.display import display_units
 from stiffopt.errors import EquilibriumError, InputError, StoppedError, shown
 from stiffopt.model.compiled import Stopwatch
 from stiffopt.model.manipulator import Manipulator
-from stiffopt.model.motion_clearance import ClearMotions
 from stiffopt.model.stopping import Cancel, giving_up
 from stiffopt.optimise.solution import Judgement, PressureSolution
 from stiffopt.optimise.solver import PressureSolver
 from stiffopt.optimise.task import Task
 from stiffopt.paths.candidates import candidates, lanes
 from stiffopt.paths.path import Path
-from stiffopt.paths.points import PathCandidate, PathTasks
+from stiffopt.paths.points import BodyCheck, PathCandidate, PathTasks
 from stiffopt.paths.rates import least_times, slew_limits, step_limits
 from stiffopt.paths.refinement import refined
 from stiffopt.paths.route import Route, RouteSearch
@@ -84,7 +83,7 @@ class _PathSolver:
         self._over = "mean" if path.stiffness is None else path.stiffness.over
         self._unreachable: tuple[int, str] | None = None  # the first point, and why
         self._lanes: list[list[PathCandidate]] | None = None
-        self._motions: ClearMotions | None = None
+        self._body: BodyCheck | None = None
 
     def solve(self) -> PathSolution:
         """Answer; see `solve_path`."""
@@ -197,7 +196,7 @@ class _PathSolver:
             for index, end in zip((0, -1), self._ends, strict=True)
             if end is not None or self._path.closed
         ]
-        pressures = refined(tasks, pressures, steps, self._over, fixed, self._is_clear(tasks))
+        pressures = refined(tasks, pressures, steps, self._over, fixed, self._body_check(tasks))
         if times is None:
             times = self._fastest(pressures)
         alone = np.array([max((c.value for c in layer), default=np.nan) for layer in layers])
@@ -231,9 +230,9 @@ class _PathSolver:
         """Return the best sequence, with further configurations if local optima do not suffice."""
         if not all(layers):
             return None
-        clear = self._is_clear(tasks)
-        route = self._best_clear_route(tasks, layers, steps, clear, any_will_do=any_will_do)
-        if route is None and clear is not None:  # the judgement names the obstacle
+        body = self._body_check(tasks)
+        route = self._best_clear_route(tasks, layers, steps, body, any_will_do=any_will_do)
+        if route is None and body is not None:  # the judgement names the obstacle
             return self._best_clear_route(tasks, layers, steps, None, any_will_do=any_will_do)
         return route
 
@@ -242,33 +241,29 @@ class _PathSolver:
         tasks: PathTasks,
         layers: list[list[PathCandidate]],
         steps: Vector,
-        clear: Callable[[Vector], bool] | None,
+        body: BodyCheck | None,
         *,
         any_will_do: bool,
     ) -> Route | None:
         closed = self._path.closed
-        search = RouteSearch(tasks, layers, steps, self._over, is_closed=closed, is_clear=clear)
+        search = RouteSearch(tasks, layers, steps, self._over, is_closed=closed, body=body)
         best = search.best(ROUTE.first_rounds, any_will_do=any_will_do)
         if (best is not None and any_will_do) or search.comes_up_to(best, ROUTE.enough):
             return best
         further = self._further(tasks)
-        search = RouteSearch(
-            tasks, layers, steps, self._over, further, is_closed=closed, is_clear=clear
-        )
+        search = RouteSearch(tasks, layers, steps, self._over, further, is_closed=closed, body=body)
         rounds = ROUTE.first_rounds if any_will_do else ROUTE.rounds
         found = [best, search.best(rounds, share=ROUTE.enough, any_will_do=any_will_do)]
         known = [each for each in found if each is not None]
         return max(known, key=lambda each: each.value(self._over), default=None)
 
-    def _is_clear(self, tasks: PathTasks) -> Callable[[Vector], bool] | None:
-        """Return a check of the body between points; None without a scene or machine code."""
-        scene = self._path.scene
-        if scene is None or not tasks.is_compiled:
+    def _body_check(self, tasks: PathTasks) -> BodyCheck | None:
+        """Return the check of the body between points; None without a scene or machine code."""
+        if self._path.scene is None or not tasks.is_compiled:
             return None
-        if self._motions is None:
-            self._motions = ClearMotions(tasks.robot, scene)
-        motions, asked = self._motions, scene.clearance - RATES.clearance_between
-        return lambda pressures: motions.along(pressures, asked).clear
+        if self._body is None:
+            self._body = BodyCheck(tasks.robot, self._path.scene)
+        return self._body
 
     def _further(self, tasks: PathTasks) -> list[list[PathCandidate]]:
         """Return further candidates, none where the pressures are given."""
@@ -364,12 +359,11 @@ class _PathSolver:
         scene, p = self._path.scene, solution.pressures
         if scene is None or len(p) < 2:
             return None
-        motions = self._motions or ClearMotions(tasks.robot, scene)
-        asked = scene.clearance - RATES.clearance_between
-        whole = motions.along(p, asked)
+        body = self._body or BodyCheck(tasks.robot, scene)
+        whole = body.motion(p)
         if whole.clear:
             return None
-        found = ((k, motions.along(p[k : k + 2], asked)) for k in range(len(p) - 1))
+        found = ((k, body.motion(p[k : k + 2])) for k in range(len(p) - 1))
         index, motion = next(((k, each) for k, each in found if not each.clear), (0, whole))
         between = f"Between points {index + 1} and {index + 2}"
         if not np.isfinite(motion.least):
