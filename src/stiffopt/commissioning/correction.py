@@ -74,7 +74,7 @@ def check_place(out: str | os.PathLike[str], path: str) -> None:
 def write_corrected(
     out: str | os.PathLike[str], path: str, data: dict[str, Any], changed: Sequence[str]
 ) -> None:
-    """Write the corrected rig file beside the old one, and check it.
+    """Write the corrected rig file into the folder of the old one, and check it.
 
     Raises
     ------

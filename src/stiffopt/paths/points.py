@@ -92,7 +92,7 @@ class BodyCheck:
         """Check the motion along rows of pressures (N, n)."""
         return self._motions.along(pressures, self._required)
 
-    def are_clear(self, pressures: Vector) -> NDArray[np.bool_]:
+    def are_clear(self, pressures: Vector) -> Mask:
         """Return whether the body keeps clear at each of the pressures (N, n)."""
         return np.asarray(self._robot.clearance(pressures, self._scene) >= self._required)
 
