@@ -150,7 +150,7 @@ def with_true_file(case: Case) -> Case:
     return replace(case, believed=case.truth.model.description.model_copy(update=update))
 
 
-def draw_case(seed: int, targets: int = 3, payload: float = 0.0) -> Case:
+def draw_case(seed: int, targets: int = 3, payload: float = 0.0, *, ranked: bool = True) -> Case:
     """Draw an arm and targets for it; the controller gets the nominal robot file.
 
     Parameters
@@ -158,6 +158,7 @@ def draw_case(seed: int, targets: int = 3, payload: float = 0.0) -> Case:
     seed : all is drawn from it, also noise.
     targets : how many; their directions take turns, the first one changes with the seed.
     payload : mass at the tip that nobody knows of, beside the 20 g of the robot file, in kg.
+    ranked : whether to find each target's stiffest pressures and ideal time, which takes a minute.
     """
     rig = load_rig_description(RIG)
     robot = load_description(rig.robot)
@@ -171,9 +172,11 @@ def draw_case(seed: int, targets: int = 3, payload: float = 0.0) -> Case:
     aims: list[Aim] = []
     for k, (position, drawn) in enumerate(places(arm, targets, rng)):
         kind = kinds[(seed + k) % len(kinds)]
-        stiffest = arm.stiffest(position, DIRECTIONS[kind], drawn, rng)
+        stiffest = arm.stiffest(position, DIRECTIONS[kind], drawn, rng) if ranked else drawn
         aims.append(Aim(position, kind, drawn, stiffest, np.nan))
     case = Case(seed, rig, robot, truth, tuple(aims), robot)
+    if not ranked:
+        return case
     times = ideal_times(case, [aim.stiffest for aim in aims])
     timed = [replace(aim, ideal=time) for aim, time in zip(aims, times, strict=True)]
     return replace(case, aims=tuple(timed))

@@ -225,7 +225,7 @@ def main() -> None:
     parser.add_argument("--dynamics", choices=DYNAMICS, nargs="+", default=list(DYNAMICS))
     parser.add_argument("--rows", nargs="+", help="only rows whose name has one of these words")
     arguments = parser.parse_args()
-    cases = [draw_case(arguments.seed + k, 2) for k in range(arguments.cases)]
+    cases = [draw_case(arguments.seed + k, 2, ranked=False) for k in range(arguments.cases)]
     for dynamics in arguments.dynamics:
         lines = []
         for row in ROWS:

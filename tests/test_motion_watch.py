@@ -26,10 +26,14 @@ J = TIP.pose[:3, :3] @ TIP.jacobian[:3]
 NONE = np.zeros(6)  # no offset
 
 
-def take(watch: MotionWatch, time: float, seen: Array, predicted: Array, offset: Array) -> None:
+def take(
+    watch: MotionWatch, time: float, seen: Array, predicted: Array, offset: Array, swing: float = 0
+) -> None:
     """Have a sample watched, at the least pressures that make the model move as predicted."""
-    pressures = np.linalg.pinv(J) @ predicted
-    watch.take(time, seen, predicted, offset, pressures, TIP, turns=bool(offset.any()))
+    pressures, turns = np.linalg.pinv(J) @ predicted, bool(offset.any())
+    watch.take(
+        time, seen, predicted, offset, pressures, TIP, turns=turns, swings=(swing, swing / 2)
+    )
 
 
 def watched(
@@ -37,6 +41,7 @@ def watched(
     seen: Callable[[float], Array],
     predicted: Callable[[float], Array],
     intended: Callable[[float], Array],
+    swing: Callable[[float], float] = lambda _: 0.0,
 ) -> tuple[float, Doubt | None]:
     """When and what the watch doubts of a tip that is sampled for so many seconds."""
     rng = np.random.default_rng(1)
@@ -44,7 +49,7 @@ def watched(
     for time in np.arange(0.0, duration, FRAME):
         watch.intend(time, intended(time))
         noise = NOISE * rng.standard_normal(3)
-        take(watch, time, seen(time) + noise, predicted(time), NONE)
+        take(watch, time, seen(time) + noise, predicted(time), NONE, swing(time))
         if watch.doubt is not None:
             return float(time), watch.doubt
     return np.inf, None
@@ -104,6 +109,32 @@ def test_a_tip_that_does_not_move_when_it_should_is_doubted_after_a_few_millimet
     assert doubt.kind == "no-response"
     assert "sensor has come off" in doubt.text
     assert moved(time) < 0.018
+
+
+def test_the_swing_that_a_motion_excites_does_not_excuse_a_tip_that_lies_still() -> None:
+    """The estimator takes the motion that it does not see for a vibration of this size."""
+    moved = step(0.04, lag=0.3)
+    time, doubt = watched(
+        4, still, lambda t: moved(t) * X, lambda t: moved(t) * X, lambda t: 0.8 * moved(t)
+    )
+    assert doubt is not None
+    assert moved(time) < 0.012
+
+
+def test_feedback_that_moves_the_tip_away_is_doubted() -> None:
+    """Swapped channels: r rests, the model's tip is driven back, and the real one goes on."""
+    moved = step(0.01, lag=0.2)
+
+    def away(t: float) -> float:
+        return 2e-3 * (np.exp(max(t - 1.5, 0) / 0.2) - 1)
+
+    time, doubt = watched(
+        4, lambda t: moved(t) * X + away(t) * Y, lambda t: moved(t) * X - away(t) * Y,
+        lambda t: moved(t) * X,
+    )  # fmt: skip
+    assert doubt is not None
+    assert doubt.kind == "no-response"
+    assert away(time) < 0.009
 
 
 @pytest.mark.parametrize("way", [-X, Y, -0.5 * X + 0.8 * Y])

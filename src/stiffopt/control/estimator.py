@@ -115,7 +115,8 @@ class TipEstimator:
         self._ticks = 0
         self.sample: PoseSample | None = None  # the latest that was used
         self.predicted: Array = np.zeros(3)  # position at its capture without the offset
-        self.swing = 0.0  # sum of the amplitudes of both vibrations at that time, in m
+        # amplitudes of the driven and the free vibration at that time, in m
+        self.swings = (0.0, 0.0)
         self._first: PoseSample | None = None
         self._unchanged: tuple[Array, Array] | None = None  # a sample, and the model's tip with it
         self._last_sample, self._rejected = -math.inf, 0
@@ -308,7 +309,7 @@ class TipEstimator:
         self._used_until = sample.time
         self.sample, self._rejected = sample, 0
         self.predicted = past.static + past.driven[0]
-        self.swing = self._amplitude(past.driven) + self._amplitude(self._free)
+        self.swings = self._amplitude(past.driven), self._amplitude(self._free)
 
 
 def _prediction(mode: BendingMode | None, n: int, damping: float) -> Formula:

@@ -32,7 +32,8 @@ from stiffopt.optimise.tip import TipAt
 Array = NDArray[np.float64]
 
 _TIME, _SEEN, _PREDICTED, _INTENDED = 0, slice(1, 4), slice(4, 7), slice(7, 10)  # columns of a row
-_OFFSET, _TURN, _SWING, _PRESSURES = slice(10, 13), slice(13, 16), 16, slice(17, None)
+_OFFSET, _TURN, _DRIVEN, _FREE, _WAY = slice(10, 13), slice(13, 16), 16, 17, 18
+_PRESSURES = slice(19, None)
 
 
 @dataclass(frozen=True)
@@ -116,7 +117,7 @@ class MotionWatch:
         tip: TipAt,
         *,
         turns: bool,
-        swing: float = 0.0,
+        swings: tuple[float, float] = (0.0, 0.0),
     ) -> None:
         """Take in a sample of the tracker.
 
@@ -134,8 +135,8 @@ class MotionWatch:
             The model's tip at these pressures.
         turns :
             Whether the tracker measures orientations.
-        swing :
-            Amplitude of the vibration, whose phase may be wrong, in m.
+        swings :
+            Amplitudes of the vibration that the pressures drive, and of the free one, in m.
         """
         intended = self._intended_at(time)
         if intended is None or self._is_early(time) or self.doubt is not None:
@@ -145,14 +146,16 @@ class MotionWatch:
         if self._count == len(self._rows):
             self._rows[: self._kept] = self._rows[-self._kept :]
             self._count = self._kept
-        self._rows[self._count] = (time, *seen, *predicted, *intended, *offset, swing, *pressures)
+        self._rows[self._count] = (
+            *(time, *seen, *predicted, *intended, *offset, *swings, self._path), *pressures,
+        )  # fmt: skip
         self._count += 1
         if self._count > 1:
             self._path += float(np.linalg.norm(intended - self._rows[self._count - 2, _INTENDED]))
-        for swings, error in zip(self._swings, (seen - intended).tolist(), strict=True):
-            swings.take(_Turn(time, error, self._path))
+        for axis, error in zip(self._swings, (seen - intended).tolist(), strict=True):
+            axis.take(_Turn(time, error, self._path))
         jacobian = tip.pose[:3, :3] @ tip.jacobian[:3]
-        self.doubt = self._no_response(jacobian)
+        self.doubt = self._no_response(jacobian, tip.pose[:3, 2])
         if turns:
             self.doubt = self.doubt or self._slip(jacobian, tip)
         self.doubt = self.doubt or self._drift(jacobian) or self._swing()
@@ -167,15 +170,19 @@ class MotionWatch:
                 return position if time - moment < self._tuning.longest_pause else None
         return None
 
+    def _path_before(self, duration: float) -> float:
+        """Return the length of the way of r until so many seconds ago, in m."""
+        return float(self._since(duration)[0, _WAY])
+
     def _since(self, duration: float) -> Array:
-        """Return the samples (k, 17 + n) of the last so many seconds."""
+        """Return the samples (k, 19 + n) of the last so many seconds."""
         rows = self._rows[: self._count]
         return rows[np.searchsorted(rows[:, _TIME], rows[-1, _TIME] - duration) :]
 
     def _explained(self, changes: Array, jacobian: Array) -> Array:
         """Return the model errors (k,) to expect over changes between samples, in m.
 
-        `changes` (k, 17 + n) are differences of samples; the Jacobian (3, n) is of the tip's
+        `changes` (k, 19 + n) are differences of samples; the Jacobian (3, n) is of the tip's
         position, base axes.
         """
         moved = np.zeros(len(changes))
@@ -184,33 +191,18 @@ class MotionWatch:
             moved += np.sqrt((motion**2).sum(axis=1))
         return self._tuning.model_error * moved
 
-    def _no_response(self, jacobian: Array) -> Doubt | None:
-        """Test whether the tip has not moved although reference and model have."""
-        tuning, rows = self._tuning, self._since(self._tuning.response_window)
-        ways = rows[-1] - rows[:-1]
-        way, seen = ways[:, _PREDICTED], ways[:, _SEEN]
-        distance = np.sqrt((way**2).sum(axis=1))
-        meant = (ways[:, _INTENDED] * way).sum(axis=1) > distance**2 / 2
-        along = (seen * way).sum(axis=1) / np.maximum(distance, 1e-9)
-        across = np.sqrt(np.maximum((seen**2).sum(axis=1) - along**2, 0.0))
-        wrong = (along < tuning.least_response * distance) | (
-            across > tuning.most_across * distance
-        )
-        suspects = np.flatnonzero(meant & wrong & (distance > self._min_motion))
-        off = np.sqrt(((seen - way)[suspects] ** 2).sum(axis=1))
-        steps = np.diff(rows, axis=0)
-        speeds = np.sqrt((steps[:, _PREDICTED] ** 2).sum(axis=1)) / steps[:, _TIME]
-        late = tuning.late * (speeds[suspects] + speeds[-1:])  # error by a delay of y, in m
-        swing = rows[suspects, _SWING] + rows[-1, _SWING]
-        # summed along the way, on which segments may have moved the tip in opposite directions
-        own = np.cumsum(self._explained(steps, jacobian)[::-1])[::-1][suspects]
-        explained = own + late + swing + tuning.noise + 6 * tuning.scatter
-        missed = suspects[off > explained]
-        self._misses = self._misses + 1 if len(missed) else 0
-        if self._misses < tuning.misses:
+    def _no_response(self, jacobian: Array, axis: Array) -> Doubt | None:
+        """Test whether the tip has not moved although the model has, or has moved elsewhere.
+
+        It is tested in space, and across the tip's axis (3,), where elongation hides nothing.
+        """
+        rows = self._since(self._tuning.response_window)
+        across = np.eye(3) - np.outer(axis, axis)
+        missed = self._missed(rows, jacobian, np.eye(3)) or self._missed(rows, jacobian, across)
+        self._misses = self._misses + 1 if missed else 0
+        if missed is None or self._misses < self._tuning.misses:
             return None
-        row = missed[0]
-        most, moved = 1e3 * float(distance[row]), 1e3 * float(np.linalg.norm(seen[row]))
+        most, moved = 1e3 * missed[0], 1e3 * missed[1]
         text = f"the tip should have moved by {most:.1f} mm and was seen to move by {moved:.1f} mm"
         if moved < most / 2:
             causes = (
@@ -223,6 +215,42 @@ class MotionWatch:
                 "slipped, or something pushes the arm; run 'stiffopt commission'"
             )
         return Doubt("no-response", f"{text}{':' if moved < most / 2 else ''} {causes}")
+
+    def _missed(self, rows: Array, jacobian: Array, P: Array) -> tuple[float, float] | None:
+        """Return lengths of the model's way and of the seen one where they do not fit, in m.
+
+        Ways are projected by P (3, 3). They must be longer than explained.
+        """
+        tuning = self._tuning
+        ways = rows[-1] - rows[:-1]
+        way, seen = ways[:, _PREDICTED] @ P, ways[:, _SEEN] @ P
+        distance = np.sqrt((way**2).sum(axis=1))
+        along = (seen * way).sum(axis=1) / np.maximum(distance, 1e-9)
+        aside = np.sqrt(np.maximum((seen**2).sum(axis=1) - along**2, 0.0))
+        wrong = (along < tuning.least_response * distance) | (aside > tuning.most_across * distance)
+        meant = (ways[:, _INTENDED] @ P * way).sum(axis=1) > distance**2 / 2
+        away = float(np.linalg.norm(rows[-1, _SEEN] - rows[-1, _INTENDED]))
+        steered = self._path - self._path_before(tuning.steered) > self._min_motion
+        led = meant | (steered and away > self._min_motion)
+        suspects = np.flatnonzero(led & wrong & (distance > self._min_motion))
+        if not len(suspects):
+            return None
+        off = np.sqrt(((seen - way)[suspects] ** 2).sum(axis=1))
+        steps = np.diff(rows, axis=0)
+        speeds = np.sqrt(((steps[:, _PREDICTED] @ P) ** 2).sum(axis=1)) / steps[:, _TIME]
+        late = tuning.late * (speeds[suspects] + speeds[-1:])  # error by a delay of y, in m
+        driven = rows[suspects, _DRIVEN] + rows[-1, _DRIVEN]
+        swing = tuning.swing_error * driven + rows[suspects, _FREE]
+        # summed along the way, on which segments may have moved the tip in opposite directions
+        own = np.cumsum(self._explained(steps, P @ jacobian)[::-1])[::-1][suspects]
+        moved = np.sqrt((seen[suspects] ** 2).sum(axis=1))
+        lies = meant[suspects] & (moved < tuning.still * distance[suspects])
+        own[lies] = 0.0  # a wrong model would move it somewhere
+        explained = own + late + swing + tuning.noise + 6 * tuning.scatter
+        missed = suspects[off > explained]
+        if not len(missed):
+            return None
+        return float(distance[missed[0]]), float(np.linalg.norm(seen[missed[0]]))
 
     def _slip(self, jacobian: Array, tip: TipAt) -> Doubt | None:
         """Test whether the offset has changed as no force, wherever it acts, changes it."""

@@ -172,7 +172,7 @@ class ArmObserver:
             pushed = self.touch.felt.displacement
         self.watch.take(
             sample.time, sample.position - pushed, predicted, self.tip.offset,
-            effective, tip, turns=self.tip.turn_known, swing=self.tip.swing,
+            effective, tip, turns=self.tip.turn_known, swings=self.tip.swings,
         )  # fmt: skip
 
     def lean_on(self, leaning: LeaningTip | None) -> Array:

@@ -325,10 +325,13 @@ class Supervisor:
         """Return pressures (n,) that stop the arm, in Pa.
 
         Chambers lag behind rising commands, so these are the measured pressures. Whatever the
-        gauges read, none is above the last command or below all recent ones.
+        gauges read, none is above the last command or below all recent ones. A motion that is
+        doubted is undone: the pressures are the lowest of the recent ones.
         """
-        last = np.minimum(self._requested, self.commanded)
-        measured = np.maximum(self.reading.pressures, np.min(self._recent, axis=0))
+        last, lowest = np.minimum(self._requested, self.commanded), np.min(self._recent, axis=0)
+        if "doubt" in self._holds:
+            return np.asarray(np.minimum(last, lowest))
+        measured = np.maximum(self.reading.pressures, lowest)
         held: Array = np.fmin(measured, last)  # ignores NaN: not measured
         return held
 

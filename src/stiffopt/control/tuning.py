@@ -260,8 +260,15 @@ class MotionTuning:
     least_motion_share: float = 0.025
     response_window: float = 0.6  # within which the tip must have moved like the model's, in s
     least_response: float = 0.25  # share of the model's way by which it must have moved along it
+    # share of the model's way below which the tip lies still, which no error of the model explains
+    still: float = 0.1
     most_across: float = 0.75  # share of that way by which it may have moved across it
     late: float = 0.01  # by which the tip may move later than the model's, in s
+    # share of the amplitude of the vibration that the pressures excite, whose phase may be wrong
+    swing_error: float = 0.35
+    # time in which r must have moved as far as the shortest way, in s, where s moves another way
+    # than r, as feedback moves it
+    steered: float = 1.0
     misses: int = 2  # successive samples that show no response
     slip_window: float = 1.0  # in which a slip is looked for, in s
     # share of the turn that a push would cause by which the measured turn must miss it
