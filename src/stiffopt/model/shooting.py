@@ -289,7 +289,7 @@ class Chain:
     @property
     def base_turn(self) -> ca.MX:
         """Turn of the base (3, 3) per turn of the tip, in base axes: the identity if unloaded."""
-        per_turn = _turn_between(self.nodes[-1], ca.jacobian(self.nodes[-1], self.x)[:, :3])
+        per_turn = _turn_between(self.nodes[-1], self._nodes_per(self.x, 0)[-4:, :])
         return per_turn @ lie.rotation_from_quaternion(self.tip_quaternion).T
 
     @property
@@ -299,12 +299,18 @@ class Chain:
         Each block is for the arm clamped at one of the k nodes instead of at the base.
         """
         R = lie.rotation_from_quaternion(self.tip_quaternion)
+        turns = ca.vertsplit(self._nodes_per(self.x, 0), 4)
+        moments = ca.vertsplit(self._nodes_per(self.inputs[3], 3), 4)
         blocks = []
-        for node in self.nodes:
-            per_turn = _turn_between(node, ca.jacobian(node, self.x)[:, :3])
-            per_moment = _turn_between(node, ca.jacobian(node, self.inputs[3])[:, 3:6])
+        for node, turn, moment in zip(self.nodes, turns, moments, strict=True):
+            per_turn, per_moment = _turn_between(node, turn), _turn_between(node, moment)
             blocks.append(-inverse_3x3(per_turn) @ per_moment @ R)
         return ca.horzcat(*blocks)
+
+    def _nodes_per(self, variables: ca.MX, first: int) -> ca.MX:
+        """Return the change (4 k, 3) of all nodes per each of three variables, in one sweep."""
+        seeds = ca.DM.eye(variables.numel())[:, first : first + 3]
+        return ca.jtimes(ca.vertcat(*self.nodes), variables, ca.MX(seeds))
 
 
 def pieces_of(
