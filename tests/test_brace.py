@@ -15,6 +15,7 @@ import pytest
 from rich.console import Console
 
 import stiffopt
+from conftest import use_compiler
 from stiffopt.cli.main import main
 from stiffopt.cli.solve_report import block
 from stiffopt.cli.solved_task import SolvedTask
@@ -42,9 +43,10 @@ RIB = """    - {name: rib, sphere: {centre: [-32 mm, 30 mm, 140 mm], radius: 5 m
 
 
 @pytest.fixture(scope="module", autouse=True)
-def few_starts() -> Iterator[None]:
+def few_starts(code_cache: Path) -> Iterator[None]:
     """A search of few starts: all of it is what `benchmarks/brace.py` looks at."""
     with pytest.MonkeyPatch.context() as patch:
+        use_compiler(patch, code_cache)
         few = replace(BRACE, effort=Effort(3, 1, 2), screened=256)
         patch.setattr(braced, "BRACE", few)
         yield
@@ -189,7 +191,9 @@ def test_a_guess_is_where_the_search_begins(robot, task, solution):
     assert str(again.confidence).startswith("local answer")
 
 
-def test_a_search_that_is_ended_keeps_the_free_answer(robot, task):
+def test_a_search_that_is_ended_keeps_the_free_answer(task, monkeypatch):
+    monkeypatch.setenv("STIFFOPT_COMPILER", "none")
+    robot = stiffopt.load_robot("stiff-flop-2")
     calls = iter(range(10**6))
     found = stiffopt.solve_pressure(robot, task, cancel=lambda: next(calls) > 2)
     assert found.status in {"solved", "failed"}
@@ -246,7 +250,9 @@ def test_a_brace_needs_a_scene(tmp_path):
 
 
 @pytest.mark.parametrize("file", sorted(PROBLEMS.glob("leaning_*.yaml")), ids=lambda p: p.stem)
-def test_the_gallery_holds_at_its_golden_pressures(robot, file):
+def test_the_gallery_holds_at_its_golden_pressures(file, monkeypatch):
+    monkeypatch.setenv("STIFFOPT_COMPILER", "none")
+    robot = stiffopt.load_robot("stiff-flop-2")
     task = stiffopt.load_task(file)
     golden = json.loads((PROBLEMS / "golden" / f"{file.stem}.json").read_text())
     problem = BracedProblem(robot, task)

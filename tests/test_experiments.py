@@ -19,6 +19,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 import stiffopt
+from conftest import is_long
 from fake_rig import CLEARANCE, PERIOD, FakeSupply, FakeWorld, fake_rig, straight, world_of
 from stiffopt.cli import experiment_run
 from stiffopt.cli.main import main
@@ -74,7 +75,7 @@ def short(**given: object) -> KinematicsSettings:
 
 
 def quick(**given: object) -> StiffnessSettings:
-    values = {"channels": 3, "pressures": (0.4e5,), "repetitions": 1, "steps": 4, **given}
+    values = {"channels": 3, "pressures": (0.4e5,), "repetitions": 1, "steps": 2, **given}
     return StiffnessSettings(**values)
 
 
@@ -545,7 +546,7 @@ def test_the_slope_is_the_stiffness_of_the_arm(tmp_path: Path) -> None:
         assert cell.model == pytest.approx(truth, rel=2e-3)
         series = 1 / (1 / truth + 1 / 5000)  # the stage also compresses the contact
         assert cell.by_stage.value == pytest.approx(series, rel=1e-3)
-        assert cell.points == 9
+        assert cell.points == 5
     assert world_of(rig).swept == 0
     for series in PointsFile(tmp_path, 3).read():  # tared: no displacement, no force
         truth = golden(np.array([series.key.pressure]), np.array(series.key.direction))
@@ -560,7 +561,7 @@ def test_the_slope_is_the_stiffness_of_the_arm(tmp_path: Path) -> None:
 
 def test_noise_is_covered_by_the_interval(tmp_path: Path) -> None:
     rig = fake_rig(stiffness=lambda p, d: 12.4, noise=3e-5, force_noise=5e-4, seed=3)
-    settings = quick(repetitions=3, directions=((1.0, 0.0, 0.0),))
+    settings = quick(repetitions=3, directions=((1.0, 0.0, 0.0),), steps=4)
     with rig:
         run_stiffness(rig, tmp_path, settings, model(), rate=50.0)
     (cell,) = evaluate_stiffness(tmp_path, settings, model()).cells
@@ -578,7 +579,7 @@ def test_creep_is_not_taken_for_stiffness(tmp_path: Path) -> None:
 
     rig = fake_rig(creeping, lambda p, d: 12.67)
     world.append(world_of(rig))
-    settings = quick(directions=((1.0, 0.0, 0.0),), settle=5.0)
+    settings = quick(directions=((1.0, 0.0, 0.0),), settle=5.0, steps=4)
     with rig:
         run_stiffness(rig, tmp_path, settings, model(), rate=50.0)
     (cell,) = evaluate_stiffness(tmp_path, settings, model()).cells
@@ -592,7 +593,7 @@ def test_creep_is_not_taken_for_stiffness(tmp_path: Path) -> None:
 
 def test_only_points_in_contact_count(tmp_path: Path) -> None:
     rig = fake_rig(stiffness=golden)
-    settings = quick(directions=((1.0, 0.0, 0.0),))
+    settings = quick(directions=((1.0, 0.0, 0.0),), steps=4)
     with rig:
         run_stiffness(rig, tmp_path, settings, model(), rate=50.0)
     path = tmp_path / "points.csv"
@@ -1469,7 +1470,10 @@ STEPS = st.tuples(
 )
 
 
-@examples(max_examples=40, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
+@examples(
+    max_examples=40 if is_long() else 12, deadline=None, derandomize=True,
+    suppress_health_check=list(HealthCheck),
+)  # fmt: skip
 @example(LIMITS[0], 0.3, 0.0, [("ramp", 0.7, True), ("stall", 1.0, True), ("tick", 0.7, True)], 0)
 @example(LIMITS[1], 0.3, 0.0, [("ramp", 0.2, True), ("halt", 1.0, True), ("ramp", 0.2, False)], 0)
 @example(LIMITS[3], math.inf, -0.07e5, [("ramp", 0.7, True)] * 3, 1)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from conftest import is_long
 from stiffopt.control.interface import SampleCounts
 from stiffopt.control.tracker_watch import Sight, TrackerWatch
 from stiffopt.control.tuning import TrackerTuning
@@ -230,7 +231,7 @@ def test_8_a_line_that_sags_under_several_channels_is_flagged_and_no_leak(
     bench.line = lambda t: line + swing * math.sin(2 * math.pi * t / 10)  # a compressor
     assert bench.hold(*commands, seconds=8.5)[0] is None  # at the lowest pressure of the line
     np.testing.assert_array_equal(bench.monitor.saturated, [True, True])
-    assert bench.hold(*commands, seconds=21.5)[0] is None
+    assert bench.hold(*commands, seconds=21.5 if is_long() else 11.5)[0] is None
     # what the line has now is known for a channel that is at its end alone, too
     sagged = float(bench.line(bench.t))
     bench.line = lambda t: sagged
@@ -304,6 +305,7 @@ def test_9_a_leak_from_the_beginning_is_found_when_its_command_creeps() -> None:
     assert any(bench.hold(p, 1e5, seconds=1.0)[0] is not None for p in pressures)
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("lag", [0.03, 0.06, 0.15])
 def test_8_a_regulator_that_saturates_is_no_leak_whatever_it_is_told(lag: float) -> None:
     bench = Regulators(lag=lag)

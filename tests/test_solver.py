@@ -247,17 +247,18 @@ def test_task_for_another_number_of_channels(robot):
 
 
 def test_hanging_arm_under_load():
-    robot = so.load_robot("stiff-flop-2-hanging")
+    free = so.load_robot("stiff-flop-1").description
+    robot = so.Manipulator(free.model_copy(update={"gravity": (0, 0, 9.81), "tip_mass": 0.02}))
     task = so.Task(
-        robot="stiff-flop-2-hanging",
-        target=so.Target(position=(-0.01, 0.01, 0.195)),
+        robot="hanging",
+        target=so.Target(position=(-0.01, 0.005, None)),
         stiffness=maximise(along(1, 0, 0)),
         load=so.Load(force=(0.02, 0, 0)),
     )
     solution = so.solve_pressure(robot, task)
     assert solution.found
     tip = robot.with_load((0.02, 0, 0)).tip_pose(solution.pressures)[:3, 3]
-    assert np.linalg.norm(tip - task.target.position) <= 1e-4
+    assert np.linalg.norm(tip[:2] - task.target.position[:2]) <= 1e-4
     # the load matters: without it the tip is elsewhere
     assert np.linalg.norm(robot.tip_pose(solution.pressures)[:3, 3] - tip) > 1e-3
 

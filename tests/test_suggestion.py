@@ -48,15 +48,17 @@ def test_the_next_pose_tells_most() -> None:
     everywhere = rng.uniform(robot.pressure_min, robot.pressure_max, (150, 3))
     arm = Manipulator(robot)
 
+    def changed(key: str, step: float) -> Manipulator:
+        parameter = Parameter(key)
+        value = parameter.at(parameter.value(robot), step)
+        return Manipulator(with_values(robot, {parameter: value}))
+
+    pairs = [[changed(key, step) for step in (1e-4, -1e-4)] for key in KEYS]
+
     def slopes(p: np.ndarray) -> np.ndarray:
         columns = []
-        for key in KEYS:
-            parameter = Parameter(key)
-            ends = [
-                Manipulator(with_values(robot, {parameter: parameter.at(
-                    parameter.value(robot), step)})).tip_pose(p)[:3, 3]
-                for step in (1e-4, -1e-4)
-            ]  # fmt: skip
+        for pair in pairs:
+            ends = [each.tip_pose(p)[:3, 3] for each in pair]
             columns.append((ends[0] - ends[1]) / 2e-4)
         return np.stack(columns, axis=1)
 
