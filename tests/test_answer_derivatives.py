@@ -110,7 +110,7 @@ def test_derivatives_by_limits():
                 check(of_p[:, side, i], expected[0], 1e-3)
 
 
-@pytest.mark.parametrize("code", ["compiled", "VM"])
+@pytest.mark.parametrize("code", ["VM", pytest.param("compiled", marks=pytest.mark.long)])
 def test_derivatives_of_a_hanging_arm(code, request):
     if code == "compiled":
         request.getfixturevalue("compiled")

@@ -44,7 +44,7 @@ def rough(seed: int, high: float, more: int = 30) -> Iterator[Any]:
         yield random.uniform(-0.2, 1.2, N) * high
 
 
-@pytest.mark.one_in(3, "driver", "way")
+@pytest.mark.one_in(6, "driver", "way")
 @pytest.mark.parametrize(
     ("way", "limit"),
     [(way, limit) for way in WAYS for limit in LIMITS if limit != "task" or way == "control-loop"],
@@ -165,7 +165,7 @@ FAILURES = {
 }
 
 
-@pytest.mark.one_in(3)
+@pytest.mark.one_in(6)
 @pytest.mark.parametrize("failure", FAILURES)
 @pytest.mark.parametrize("way", WAYS)
 def test_a_single_failure_ends_vented_and_within_the_limits(

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from conftest import is_long
 from stiffopt.errors import FileError, InputError
 from stiffopt.identify.error_model import (
     covariance_with,
@@ -189,7 +190,7 @@ def test_what_a_discrepancy_does_to_a_fit_is_that_of_draws() -> None:
     begin = np.zeros(plain.size)
     true = fit(plain, [begin], rounds=0)
     moves = []
-    for _ in range(80):
+    for _ in range(80 if is_long() else 30):
         wrong = p + size * root @ rng.normal(size=p.shape)
         tips = Manipulator(ONE).tip_pose(wrong)[:, :3, 3]
         track = replace(plain.samples[0].recording.tracks[0], position=tips)
@@ -203,12 +204,12 @@ def test_what_a_discrepancy_does_to_a_fit_is_that_of_draws() -> None:
     expected = covariance_with(true, known) - true.covariance
     values, axes = np.linalg.eigh(expected)
     found = np.var(np.array(moves) @ axes[:, -6:], axis=0)
-    assert found == pytest.approx(values[-6:], rel=0.5)
+    assert found == pytest.approx(values[-6:], rel=0.5 if is_long() else 0.7)
 
 
 def test_an_arm_that_is_as_the_model_has_no_discrepancy_and_the_residual_of_its_noise() -> None:
     rng = np.random.default_rng(7)
-    problem = problem_of(rng.uniform(0, 1e5, (300, 3)), rng, 3e-4)
+    problem = problem_of(rng.uniform(0, 1e5, (300 if is_long() else 120, 3)), rng, 3e-4)
     found = fit(problem, [np.zeros(problem.size)], rounds=1)
     parts = held_back(found, 2.0, lambda: None)
     known = error_model(found, parts)

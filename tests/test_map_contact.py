@@ -52,7 +52,7 @@ def test_json_says_what_the_model_says(scene, capsys):
     assert [loss["how"] for loss in along_x["lost"]] == ["lifts off", "holds"]
 
 
-def test_the_report_and_the_picture(scene, capsys, tmp_path):
+def test_the_report_and_the_picture(scene, capsys, tmp_path, compiled):
     pytest.importorskip("matplotlib")
     picture = tmp_path / "lean.png"
     assert lean(scene, "--plot", str(picture)) == 0

@@ -115,7 +115,9 @@ def check(motion: PathSolution, scene: Scene, asked: float = ASKED) -> None:
 # -- the judge of motions -------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["stiff-flop-2", "stiff-flop-3"])
+@pytest.mark.parametrize(
+    "name", ["stiff-flop-2", pytest.param("stiff-flop-3", marks=pytest.mark.long)]
+)
 def test_no_motion_is_clear_that_touches_something(name: str, compiled: Path) -> None:
     robot, rng = load_robot(name), np.random.default_rng(2)
     robot._body.machine_code(10_000)

@@ -6,6 +6,7 @@ from pathlib import Path as FilePath
 import numpy as np
 from numpy.typing import NDArray
 
+from conftest import is_long
 from stiffopt import Manipulator, load_robot
 from stiffopt.paths.path import Path
 from stiffopt.paths.solver import solve_path
@@ -76,7 +77,7 @@ def test_three_segments_against_refined_random_starts(compiled: FilePath) -> Non
     robot = load_robot("stiff-flop-3")
     path = path_of(robot, 12, SLEW)
     asked, program = question(path, 9), reference.PathProgram(robot, 12)
-    starts = reference.followed(robot, asked, 2, seed=0)
+    starts = reference.followed(robot, asked, 2 if is_long() else 1, seed=0)
     refined = [program.improved(asked, start, 60) for start in starts]
     values = [program.value(asked, each) for each in refined if each is not None]
     assert values

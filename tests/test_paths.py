@@ -104,7 +104,8 @@ def test_the_same_seed_gives_the_same_answer(robot, compiled):
     np.testing.assert_array_equal(a.pressures, b.pressures)
 
 
-@pytest.mark.parametrize("slew", [5e5, 1e5, 0.5e5])
+@pytest.mark.one_in(2)
+@pytest.mark.parametrize("slew", [1e5, 5e5, 0.5e5])
 def test_where_warm_starts_jump_the_rates_are_kept(slew, robot, compiled):
     positions = wandering(robot, 3, 20, 60)
     jumping, stiffness = warm_started(robot, positions)

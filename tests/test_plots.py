@@ -14,6 +14,7 @@ from matplotlib.image import imread
 from matplotlib.text import Text
 
 import stiffopt
+from conftest import is_long
 from examples import run_examples
 from stiffopt import plots
 from stiffopt.display import display_units
@@ -31,6 +32,14 @@ def solved(
     task = stiffopt.Task(robot=robot, target={"position": target}, stiffness=MAXIMISE)
     arm = stiffopt.load_robot(robot)
     return arm, stiffopt.solve_pressure(arm, task)
+
+
+def answer(arm: stiffopt.Manipulator, task: stiffopt.Task, p: Any) -> PressureSolution:
+    """Return an answer with some pressures (n,), without a solver."""
+    return PressureSolution(
+        "solved", "", task, p, arm.tip_pose(p), 0.0, compliance=arm.tip_compliance(p),
+        stiffnesses=(1.0,) * len(task.measures), robot=arm,
+    )  # fmt: skip
 
 
 def texts(figure: Any) -> str:
@@ -120,7 +129,13 @@ def test_every_kind_of_target_is_drawn(target: dict[str, Any]) -> None:
         },
     )
     arm = stiffopt.load_robot("stiff-flop-2")
-    text = texts(plots.plot_solution(arm, stiffopt.solve_pressure(arm, task)))
+    away = target.get("position") == (-0.2, 0.0, 0.3)
+    if is_long() or away:
+        solution = stiffopt.solve_pressure(arm, task)
+        assert solution.found != away
+    else:
+        solution = answer(arm, task, np.full(6, 0.5e5))
+    text = texts(plots.plot_solution(arm, solution))
     assert "tip axes, guided" in text
     if "orientation" in target:
         assert "target orientation" in text
@@ -137,7 +152,10 @@ def test_a_load_is_drawn() -> None:
         load={"force": (0, 0, -0.02)},
     )
     arm = stiffopt.load_robot("stiff-flop-1")
-    assert "load 0.02 N" in texts(plots.plot_solution(arm, stiffopt.solve_pressure(arm, task)))
+    solution = (
+        stiffopt.solve_pressure(arm, task) if is_long() else answer(arm, task, np.full(3, 0.5e5))
+    )
+    assert "load 0.02 N" in texts(plots.plot_solution(arm, solution))
 
 
 def test_a_hanging_arm_hangs() -> None:
@@ -224,6 +242,7 @@ TASKS: dict[str, dict[str, Any]] = {
 }
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("kind", TASKS)
 @pytest.mark.parametrize("bend", [(1.0, 0, 0), (0, 1.0, 0), (0, 0, 1.0), (0.5, 0.5, 0.5)])
 def test_labels_cover_neither_each_other_nor_the_arm(kind: str, bend: tuple[float, ...]) -> None:
@@ -232,11 +251,7 @@ def test_labels_cover_neither_each_other_nor_the_arm(kind: str, bend: tuple[floa
     tip = arm.tip_pose(p)
     changes = {"stiffness": MAXIMISE, **TASKS[kind]}
     task = stiffopt.Task(robot="stiff-flop-2", target={"position": tuple(tip[:3, 3])}, **changes)
-    solution = PressureSolution(
-        "solved", "", task, p, tip, 0.0, compliance=arm.tip_compliance(p),
-        stiffnesses=(1.0,) * len(task.measures), robot=arm,
-    )  # fmt: skip
-    figure = plots.plot_solution(arm, solution)
+    figure = plots.plot_solution(arm, answer(arm, task, p))
     axes = figure.axes[0]
     figure.canvas.draw()
     labels = [each for each in axes.texts if each.get_text()]

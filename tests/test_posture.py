@@ -79,7 +79,7 @@ def beside(robot: so.Manipulator, way: np.ndarray, gap: float) -> Scene:
         centre = tuple(map(float, point + outwards * away))
         ball = {"name": "post", "sphere": {"centre": centre, "radius": 0.005}}
         scene = Scene(clearance=ASKED, objects=[ball])
-        away += gap - float(robot.clearance(dense(way) if len(way) > 1 else way, scene).min())
+        away += gap - float(robot.clearance(dense(way, 201) if len(way) > 1 else way, scene).min())
     return scene
 
 
@@ -201,7 +201,7 @@ def test_ways_are_checked_between_their_corners(robot: str) -> None:
     way = sideways(arm.n_pressures)
     for gap, clear in ((ASKED + 1e-3, True), (ASKED - 1e-3, False), (-0.01, False)):
         scene = beside(arm, way, gap)
-        least = arm.clearance(dense(way, 4001), scene).min()
+        least = arm.clearance(dense(way, 801), scene).min()
         assert (least > ASKED) == clear
         reason = Ways(arm, scene).blocked(way, waypoints=True)
         assert (reason == "") == clear

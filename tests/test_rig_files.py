@@ -90,6 +90,7 @@ def displaced_rig(recordings: Recordings | None, *, calibrated: bool = True) -> 
         },
         plant={
             "dynamics": "quasi-static",
+            "discretisation": {"step": 0.01},
             "silicone": {"law": "linear", "creep": (), "hysteresis": ()},
             "mismatch": {"registration": OFF},
         },

@@ -98,6 +98,14 @@ def pilot(api: Api) -> Api:
     return api
 
 
+@pytest.fixture(scope="module")
+def idle() -> Api:
+    """One who has control, for requests that change nothing."""
+    api = Api()
+    assert api.take().status_code == 200
+    return api
+
+
 def refused(answer: httpx.Response, status: int, text: str = "") -> None:
     assert answer.status_code == status, answer.text
     error = answer.json()["error"]
@@ -190,16 +198,16 @@ VENT = ("POST", "/v1/vent", None)
 
 @pytest.mark.parametrize(("method", "path", "body"), [*COMMANDS, *CONTROL, VENT])
 def test_nothing_but_reading_goes_without_the_token(
-    pilot: Api, method: str, path: str, body: Any
+    idle: Api, method: str, path: str, body: Any
 ) -> None:
-    answer = pilot(method, path, body, token=None)
+    answer = idle(method, path, body, token=None)
     refused(answer, 401, "token")
     assert answer.headers["www-authenticate"] == "Bearer"
-    refused(pilot(method, path, body, token="another"), 403, "not this daemon's token")
-    refused(pilot(method, path, body, token=None, headers={"Authorization": "Basic x"}), 401)
-    refused(pilot(method, path, content=b"{", token=None), 401)  # before the body is looked at
-    assert pilot.loop.calls == []
-    assert pilot.operations.lease.holder.client == "planner"
+    refused(idle(method, path, body, token="another"), 403, "not this daemon's token")
+    refused(idle(method, path, body, token=None, headers={"Authorization": "Basic x"}), 401)
+    refused(idle(method, path, content=b"{", token=None), 401)  # before the body is looked at
+    assert idle.loop.calls == []
+    assert idle.operations.lease.holder.client == "planner"
 
 
 def test_every_call_that_is_not_reading_is_among_those_tested(api: Api) -> None:
@@ -264,19 +272,18 @@ def test_requests_to_this_machine_are_answered(host: str) -> None:
 
 @pytest.mark.parametrize("host", ["evil.example", "evil.example:8470", "localhost.evil.example",
                                   "127.0.0.1.evil.example", "", "[::1", "a@b:c"])  # fmt: skip
-def test_names_that_a_strangers_name_server_may_hand_out_are_refused(host: str) -> None:
-    api = Api()
-    refused(api("GET", "/v1/state", headers={"Host": host}), 403, "Host")
-    refused(api("POST", "/v1/vent", headers={"Host": host}), 403, "Host")
-    assert api.loop.calls == []
+def test_names_that_a_strangers_name_server_may_hand_out_are_refused(idle: Api, host: str) -> None:
+    refused(idle("GET", "/v1/state", headers={"Host": host}), 403, "Host")
+    refused(idle("POST", "/v1/vent", headers={"Host": host}), 403, "Host")
+    assert idle.loop.calls == []
 
 
 @pytest.mark.parametrize(
     "origin", ["http://evil.example", "null", "http://127.0.0.1:3000", "file://127.0.0.1:8470", ""]
 )
-def test_pages_of_other_sites_may_not_command(pilot: Api, origin: str) -> None:
-    refused(pilot("POST", "/v1/arm", headers={"Origin": origin}), 403, "other sites")
-    assert pilot.loop.calls == []
+def test_pages_of_other_sites_may_not_command(idle: Api, origin: str) -> None:
+    refused(idle("POST", "/v1/arm", headers={"Origin": origin}), 403, "other sites")
+    assert idle.loop.calls == []
 
 
 # What is refused --------------------------------------------------------------------------------
@@ -309,9 +316,9 @@ BAD_TARGETS = [
 
 
 @pytest.mark.parametrize("content", BAD_TARGETS, ids=lambda c: c[:40].decode("latin-1"))
-def test_malformed_targets_are_refused_and_change_nothing(pilot: Api, content: bytes) -> None:
-    refused(pilot("POST", "/v1/target", content=content), 422)
-    assert pilot.loop.calls == []
+def test_malformed_targets_are_refused_and_change_nothing(idle: Api, content: bytes) -> None:
+    refused(idle("POST", "/v1/target", content=content), 422)
+    assert idle.loop.calls == []
 
 
 def test_json_must_say_that_it_is_json(pilot: Api) -> None:
@@ -412,9 +419,9 @@ def test_the_text_of_a_task_makes_the_daemon_read_no_file(
         ({"target": TARGET, "load": {"force_n": [0, 0, 1e9]}}, "out of range"),
     ],
 )
-def test_tasks_that_make_no_sense_are_refused(pilot: Api, body: Any, says: str) -> None:
-    refused(pilot("POST", "/v1/task", body), 422, says)
-    assert pilot.loop.calls == []
+def test_tasks_that_make_no_sense_are_refused(idle: Api, body: Any, says: str) -> None:
+    refused(idle("POST", "/v1/task", body), 422, says)
+    assert idle.loop.calls == []
 
 
 def test_all_of_a_task_arrives(pilot: Api) -> None:

@@ -12,6 +12,7 @@ import subprocess
 import sys
 import textwrap
 import time
+from collections.abc import Iterator
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -23,6 +24,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import stiffopt
+from conftest import is_long
 from stiffopt.cli.main import main
 from stiffopt.errors import (
     CancelledError,
@@ -43,8 +45,16 @@ from stiffopt.workspace import (
 from stiffopt.workspace.plan import TUNING, Grid, QuasiRandom
 from stiffopt.workspace.table import CellTable, Gathering, cell_indices, cell_keys, merged
 
-SAMPLES = 70_000  # three blocks
+BLOCK = TUNING.block if is_long() else TUNING.block // 8
+SAMPLES = 2 * BLOCK + BLOCK // 8  # three blocks
 COMMAND = Path(sys.executable).with_name("stiffopt")
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _blocks() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("stiffopt.workspace.plan.TUNING", replace(TUNING, block=BLOCK))
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -300,7 +310,7 @@ def test_a_run_goes_on_where_it_stopped(
 
         return report
 
-    for stop in (1, 40_000):
+    for stop in (1, BLOCK + 1):
         with pytest.raises(Stop):
             map_workspace(
                 robot, path, samples=SAMPLES, cell=0.004, threads=1, progress=stop_at(stop)
@@ -308,7 +318,7 @@ def test_a_run_goes_on_where_it_stopped(
         with pytest.raises(FileError, match="not complete"):
             open_workspace_map(path)
     found = map_workspace(robot, path, samples=SAMPLES, cell=0.004, progress=stop_at(10**9))
-    assert found.evaluated == SAMPLES - 65536
+    assert found.evaluated == SAMPLES - 2 * BLOCK
     assert reports == sorted(reports)
     assert_same(found, whole)
 
@@ -331,7 +341,8 @@ def test_a_run_survives_being_killed(
     script = f"""
         import sys, time, stiffopt
         from dataclasses import replace
-        from stiffopt.workspace import map_workspace, mapping
+        from stiffopt.workspace import map_workspace, mapping, plan
+        plan.TUNING = replace(plan.TUNING, block={BLOCK})
         mapping.TUNING = replace(mapping.TUNING, checkpoint=1e-9, checkpoint_share=1e9)
         def report(done, total):
             if done:
@@ -480,7 +491,7 @@ def test_what_a_scene_forbids_is_left_out(tmp_path: Path) -> None:
 def test_a_cluster_makes_no_difference_even_if_it_loses_a_worker(
     robot: Manipulator, tmp_path: Path
 ) -> None:
-    samples = 150_000  # six blocks
+    samples = 150_000 if is_long() else 70_000  # five blocks or three
     script = tmp_path / "cluster.py"
     script.write_text(textwrap.dedent(CLUSTER), encoding="utf-8")
     done = subprocess.run(
@@ -536,7 +547,9 @@ MEASURED = """
 
 
 def test_memory_is_bounded(tmp_path: Path) -> None:
-    _, peak = map(float, run_script(MEASURED, tmp_path / "map.zarr", 1e5).split())
+    _, peak = map(
+        float, run_script(MEASURED, tmp_path / "map.zarr", 1e5 if is_long() else 7e4).split()
+    )
     assert peak < 400e6
 
 
@@ -629,13 +642,13 @@ def test_one_process_at_a_time(robot: Manipulator, tmp_path: Path) -> None:
 def test_damage_is_noticed(robot: Manipulator, tmp_path: Path) -> None:
     path = tmp_path / "map.zarr"
     with pytest.raises(Stop):
-        map_workspace(robot, path, samples=40_000, threads=1, progress=_raise_at(1))
+        map_workspace(robot, path, samples=BLOCK + 99, threads=1, progress=_raise_at(1))
     checkpoint = path / "checkpoint.npz"
     content = bytearray(checkpoint.read_bytes())
     content[len(content) // 2] ^= 1
     checkpoint.write_bytes(content)
     with pytest.raises(FileError, match=r"is damaged.*--overwrite"):
-        map_workspace(robot, path, samples=40_000)
+        map_workspace(robot, path, samples=BLOCK + 99)
     map_workspace(robot, path, samples=10, overwrite=True)
     (path / "best" / "zarr.json").unlink()
     with pytest.raises(FileError, match="is damaged"):
@@ -806,7 +819,7 @@ def interrupted(path: Path, wait_for: str = "") -> str:
                 if path.exists() and wait_for in " ".join(said.read_text().split()):
                     break
                 time.sleep(0.01)
-            time.sleep(1.5)
+            time.sleep(1.0 if not wait_for else 0.2)  # for some samples
             os.kill(process.pid, signal.SIGINT)
             out, _ = process.communicate(timeout=60)
         finally:
