@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import lsq_linear, minimize
 
+from conftest import is_long
 from stiffopt.control.allocation import SOLVERS, Allocation
 from stiffopt.control.feedback import TrackingRows
 
@@ -154,7 +155,7 @@ def test_channels_at_limits_are_said(solver):
     assert p == pytest.approx(np.array([0.0, 1.5, 0.75, 0.0, 1.5, 0.65]) * BAR, abs=1.0)
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150 if is_long() else 60, deadline=None)
 @given(
     seed=st.integers(0, 10**6),
     kind=st.sampled_from(["full", "tall", "none", "zero", "rank 1", "huge", "tiny"]),

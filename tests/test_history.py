@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
+from conftest import is_long
 from independent import FLOP
 from stiffopt.errors import InputError
 from stiffopt.model.description import Segment
@@ -142,7 +143,7 @@ def test_a_pulse_shorter_than_the_dead_time_comes_through() -> None:
     assert memory.advance(0.27, [0.0]) == pytest.approx(rise * np.exp(-0.17 / lag), rel=1e-9)
 
 
-@settings(max_examples=60, deadline=None, derandomize=True)
+@settings(max_examples=60 if is_long() else 25, deadline=None, derandomize=True)
 @given(
     levels=st.lists(pressures, min_size=1, max_size=4),
     cuts=st.lists(st.integers(1, 9), min_size=1, max_size=4),
@@ -186,7 +187,7 @@ def test_play_is_a_superposition_of_relays(seed: int) -> None:
     assert responses(HYSTERETIC, path.tolist()) == pytest.approx(expected, abs=cell)
 
 
-@settings(max_examples=100, deadline=None, derandomize=True)
+@settings(max_examples=100 if is_long() else 40, deadline=None, derandomize=True)
 @given(
     past=st.lists(pressures, max_size=5),
     ends=st.tuples(pressures, pressures),
@@ -223,7 +224,7 @@ def test_loops_between_the_same_ends_are_congruent(
     assert loops[0] == pytest.approx(loops[1], abs=1e-6)
 
 
-@settings(max_examples=100, deadline=None, derandomize=True)
+@settings(max_examples=100 if is_long() else 40, deadline=None, derandomize=True)
 @given(path=st.lists(st.floats(-50 * KPA, 150 * KPA), min_size=1, max_size=12))
 def test_hysteresis_never_takes_more_than_the_largest_memory(path: list[float]) -> None:
     most = HYSTERETIC.largest_memory

@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from conftest import is_long
 from fake_control import FakeController
 from simulated_loop import TASK, Lab
 from stiffopt.control import checks
@@ -295,7 +296,7 @@ def json_of(target: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150 if is_long() else 50, deadline=None)
 @given(TARGETS, st.lists(NUMBERS, min_size=1, max_size=4))
 def test_any_target_and_trajectory_is_accepted_or_changes_nothing(
     armed: Lab, said: dict[str, Any], times: list[Any]
@@ -323,7 +324,7 @@ def test_any_target_and_trajectory_is_accepted_or_changes_nothing(
         ask(armed, lambda trajectory=trajectory: armed.loop.follow_trajectory(trajectory))
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150 if is_long() else 50, deadline=None)
 @given(TARGETS, GOALS, THREE, BOUNDS, BOUNDS)
 def test_any_task_is_accepted_or_changes_nothing(
     armed: Lab, said: dict[str, Any], goal: Any, force: Any, low: Any, high: Any

@@ -13,6 +13,7 @@ import pytest
 from numpy.typing import NDArray
 
 import stiffopt
+from conftest import is_long
 from made_logs import course, made_log
 from stiffopt import CalibrationSettings
 from stiffopt.errors import FileError, InputError
@@ -199,7 +200,8 @@ def test_calibration_tries_a_new_law(wound: type[StrainLaw], path: Path) -> None
     log = made_log(true, *course(3, 20.0, 3, highest=1.2e5), noise=1e-4, turns=True)
     segment = true.segments[0].model_copy(update={"strain_law": "rest-length", "law": None})
     other = true.model_copy(update={"segments": (segment,)})
-    told = CalibrationSettings(structure="static", rows=60, trial_rows=50)
+    rows = {"rows": 60 if is_long() else 50, "trial_rows": 50}
+    told = CalibrationSettings(structure="static", **rows)
     result = calibrate(other, [("a.csv", log)], settings=told)
     tried = {each.structure.strain_law for each in result.candidates}
     assert tried == {"", *strain_laws()} - {"rest-length"}
