@@ -58,6 +58,8 @@ def refined(
     done: list[range] = []
     for _ in range(REFINEMENT.passes):  # a window may be held back at its ends: a wider one then
         windows = [each for each in _windows(pressures, steps) if not _is_within(each, done)]
+        if done:
+            windows = [_wider(each, len(pressures)) for each in windows]
         for window in windows:
             new = _Window(tasks, pressures, steps, over, window, set(fixed)).optimised()
             near = new[max(window.start - 1, 0) : window.stop + 1]
@@ -69,6 +71,11 @@ def refined(
 
 def _is_within(window: range, others: Sequence[range]) -> bool:
     return any(each.start <= window.start and window.stop <= each.stop for each in others)
+
+
+def _wider(window: range, count: int) -> range:
+    """Return a window three times as long, within `count` points."""
+    return range(max(0, window.start - len(window)), min(count, window.stop + len(window)))
 
 
 def _windows(pressures: Vector, steps: Vector) -> list[range]:
@@ -164,10 +171,15 @@ class _Window:
             if found is None:
                 break
             trial = self._state(np.clip(state.x + found.d, self._lower, self._upper))
-            if trial is not None and trial.excess > 0:  # constraints are curved: correct the step
-                corrected = self._step(self._bent(state, trial, found.d), curvature, radius)
-                if corrected is not None:
-                    trial = self._state(np.clip(state.x + corrected.d, self._lower, self._upper))
+            d = found.d
+            for _ in range(REFINEMENT.corrections):  # constraints are curved: correct the step
+                if trial is None or trial.excess <= 0:
+                    break
+                corrected = self._step(self._bent(state, trial, d), curvature, radius)
+                if corrected is None:
+                    break
+                d = corrected.d
+                trial = self._state(np.clip(state.x + d, self._lower, self._upper))
             gained = -np.inf if trial is None else state.merit - trial.merit
             weights, pulls = found.weights, found.pulls
             if trial is not None and gained > 0.1 * found.promised:
@@ -310,9 +322,10 @@ class _Window:
         for ball in self._balls:
             self._add_ball(rows, state, ball, slack)
             cones += [clarabel.SecondOrderConeT(1 + ball.end - ball.first)] * k
-        P = sparse.block_diag(
-            [*curvature, sparse.csc_matrix((size - k * n, size - k * n))], format="csc"
-        )
+        row, column = np.triu_indices(n)
+        corner = n * np.arange(k)[:, np.newaxis]
+        where = (corner + row).ravel(), (corner + column).ravel()
+        P = sparse.csc_matrix((curvature[:, row, column].ravel(), where), shape=(size, size))
         q = np.zeros(size)
         q[e : e + k] = (REFINEMENT.mean if worst else 1.0) / k
         q[slack : slack + k] = self._price
@@ -322,9 +335,7 @@ class _Window:
         settings.verbose = False
         settings.max_threads = 1
         A, bounds = rows.matrix()
-        solution = clarabel.DefaultSolver(
-            sparse.triu(P, format="csc"), q, A, bounds, cones, settings
-        ).solve()
+        solution = clarabel.DefaultSolver(P, q, A, bounds, cones, settings).solve()
         if str(solution.status) not in ("Solved", "AlmostSolved"):
             return None
         x, z = np.array(solution.x), np.array(solution.z)

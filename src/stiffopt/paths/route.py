@@ -124,6 +124,10 @@ class RouteSearch:
     is_closed : whether sequences end with the pressures with which they begin.
     body : BodyCheck, optional
         Excludes links on which the body does not keep clear.
+
+    Attributes
+    ----------
+    first : the first sequence that `best` found, which may be worse than what it returns.
     """
 
     def __init__(
@@ -156,6 +160,7 @@ class RouteSearch:
         )
         self._ends: Sequence[int | None] = range(len(layers[0])) if is_closed else [None]
         self._usable = self._values
+        self.first: Route | None = None
         self._set_links(self._all_steps())
 
     def best(
@@ -189,6 +194,8 @@ class RouteSearch:
     ) -> _Sequence | None:
         known = self._sequence(computed=True)
         for _ in range(rounds):
+            if known is not None and self.first is None:
+                self.first = self._route(known)
             if known is not None and (any_will_do or self._is_enough(known, hope, share)):
                 return known
             hoped = self._sequence()
@@ -243,8 +250,9 @@ class RouteSearch:
 
     def _set_links(self, links: _Links) -> None:
         self._links = links
+        self._done: dict[tuple[bool, bool], tuple[Vector, Vector, Vector]] = {}
         self._by_point = links.sorted_by_point(self._first)
-        self._starts = np.searchsorted(links.goal, np.arange(len(self._values) + 1))
+        self._starts = np.searchsorted(links.goal, np.arange(len(self._values) + 1)).tolist()
 
     def _sequence(self, *, computed: bool = False) -> _Sequence | None:
         """Return the best sequence, of computed links alone if asked; None if there is none.
@@ -315,11 +323,22 @@ class RouteSearch:
         join = np.minimum if bottleneck else np.add
         own = np.where(self._usable >= least, self._usable, -np.inf)
         found = np.full(len(own), -np.inf)
+        new = 0  # the first candidate whose value may have changed since the last call
+        if (bottleneck, computed) in self._done:
+            before, price_before, own_before = self._done[bottleneck, computed]
+            changed = [
+                *self._links.goal[np.flatnonzero(price != price_before)[:1]],
+                *np.flatnonzero(own != own_before)[:1],
+            ]
+            new = min((self._first[self._point[each]] for each in changed), default=len(own))
+            found[:new] = before[:new]
         found[: self._first[1]] = own[: self._first[1]]
         origin = self._links.origin
         for some, runs, goals in self._by_point:
-            came = join(found[origin[some]], price[some])
-            found[goals] = join(np.maximum.reduceat(came, runs), own[goals])
+            if goals[0] >= new:
+                came = join(found[origin[some]], price[some])
+                found[goals] = join(np.maximum.reduceat(came, runs), own[goals])
+        self._done[bottleneck, computed] = found, price, own
         return found
 
     def _traced(self, least: float, *, computed: bool = False) -> _Sequence | None:
@@ -331,11 +350,12 @@ class RouteSearch:
             return None
         mean = float(reached[at]) / (len(self._first) - 1)
         links: list[int] = []
-        while self._point[at]:
-            some = slice(self._starts[at], self._starts[at + 1])
-            came = reached[self._links.origin[some]] + price[some]
-            links.append(int(some.start + came.argmax()))
-            at = int(self._links.origin[links[-1]])
+        starts, origin = self._starts, self._links.origin
+        while at >= self._first[1]:
+            begin, end = starts[at], starts[at + 1]
+            came = reached[origin[begin:end]] + price[begin:end]
+            links.append(begin + int(came.argmax()))
+            at = int(origin[links[-1]])
         return _Sequence(at, links[::-1], -np.inf, mean)
 
     def _route(self, found: _Sequence) -> Route:

@@ -61,9 +61,11 @@ class RouteSettings:
     ends : approximate number of points at which crossings from one of them may end.
     lengths : of a crossing, relative to the smallest number of steps that the rates allow.
     nearest : number of candidates to which crossings lead from another, for each length.
-    rounds, first_rounds : largest number of rounds in which crossings are computed; and the same
-        before further configurations are added.
+    rounds, rounds_in_scene : largest number of rounds in which crossings are computed, without and
+        with a scene.
+    first_rounds : the same before further configurations are added.
     repeats : largest number of searches for a sequence on which the body keeps clear.
+    refined : largest number of sequences that are refined where there is no scene.
     price : small penalty on a crossing, which prevents useless ones.
     within : share of a rate that crossings use.
     hardly : gain in the logarithm of stiffness for which no crossing is computed.
@@ -75,9 +77,11 @@ class RouteSettings:
     ends: int = 40
     lengths: tuple[float, ...] = (1.0, 1.5, 2.5)
     nearest: int = 6
-    rounds: int = 100
+    rounds: int = 300
+    rounds_in_scene: int = 100
     first_rounds: int = 8
     repeats: int = 100
+    refined: int = 2
     price: float = 1e-3
     within: float = 0.98
     hardly: float = 2e-3
@@ -94,6 +98,7 @@ class RefinementSettings:
     near : share of a rate from which on the rate counts as binding.
     margin : number of points added on either side of those where a rate binds.
     iterations : largest number.
+    corrections : largest number for each step.
     radius : initial radius of the trust region, as a share of a channel's range.
     last_radius : radius below which the method stops.
     last_gain : gain in the objective below which the method stops.
@@ -103,12 +108,14 @@ class RefinementSettings:
     difference : step of finite differences for second derivatives, as a share of a channel's range.
     inside : share of the rates that is used, so that rounding stays within them.
     of_tolerance : share of the tolerances that a step aims at; the rest is for its curvature.
-    passes : largest number of times that windows are made, each time wider where rates bind.
+    passes : largest number of times that windows are made, each time three times as long where
+        rates bind at their ends.
     """
 
     near: float = 0.9
     margin: int = 8
     iterations: int = 60
+    corrections: int = 2
     radius: float = 0.1
     last_radius: float = 1e-3
     last_gain: float = 1e-4

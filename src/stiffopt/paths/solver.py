@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -181,25 +182,19 @@ class _PathSolver:
         times = self._points.times
         slowed = 1.0
         steps = self._steps(tasks, times)
-        route = self._best_route(tasks, layers, steps)
+        routes = self._best_routes(tasks, layers, steps)
         stuck = None
-        if route is None and times is not None and all(layers):
+        if not routes and times is not None and all(layers):
             stuck = RouteSearch(tasks, layers, steps, self._over).furthest
-            slowed, route = self._slower(tasks, layers, steps)
+            slowed, routes = self._slower(tasks, layers, steps)
             times = times * slowed
             steps = steps * slowed
-        if route is None:
+        if not routes:
             return self._without_route(tasks, layers, steps)
-        pressures = np.array([each.pressures for each in route.candidates])
-        fixed = [
-            index % len(pressures)
-            for index, end in zip((0, -1), self._ends, strict=True)
-            if end is not None or self._path.closed
-        ]
-        pressures = refined(tasks, pressures, steps, self._over, fixed, self._body_check(tasks))
+        alone = np.array([max((c.value for c in layer), default=np.nan) for layer in layers])
+        route, pressures = self._refined(tasks, routes, steps, alone)
         if times is None:
             times = self._fastest(pressures)
-        alone = np.array([max((c.value for c in layer), default=np.nan) for layer in layers])
         if self._unreachable is not None:  # judge by the original tasks
             tasks = PathTasks(self._robot, self._tasks, self._seed)
         solution = self._judged(tasks, pressures, times, alone)
@@ -219,43 +214,65 @@ class _PathSolver:
             return np.tile(RATES.largest_step * tasks.unit, (len(tasks) - 1, 1))
         return step_limits(times, self._slew)
 
-    def _best_route(
-        self,
-        tasks: PathTasks,
-        layers: list[list[PathCandidate]],
-        steps: Vector,
-        *,
-        any_will_do: bool = False,
-    ) -> Route | None:
-        """Return the best sequence, with further configurations if local optima do not suffice."""
-        if not all(layers):
-            return None
-        body = self._body_check(tasks)
-        route = self._best_clear_route(tasks, layers, steps, body, any_will_do=any_will_do)
-        if route is None and body is not None:  # the judgement names the obstacle
-            return self._best_clear_route(tasks, layers, steps, None, any_will_do=any_will_do)
-        return route
+    def _refined(
+        self, tasks: PathTasks, routes: Sequence[Route], steps: Vector, alone: Vector
+    ) -> tuple[Route, Vector]:
+        """Return the sequence that is best when refined, and its pressures.
 
-    def _best_clear_route(
+        Others are refined only if the first does not become about as stiff as single points.
+        """
+        fixed = [
+            index % len(tasks)
+            for index, end in zip((0, -1), self._ends, strict=True)
+            if end is not None or self._path.closed
+        ]
+        join = np.min if self._over == "worst" else np.mean
+        found: list[tuple[float, Route, Vector]] = []
+        for route in routes:
+            pressures = np.array([each.pressures for each in route.candidates])
+            pressures = refined(tasks, pressures, steps, self._over, fixed, self._body_check(tasks))
+            slopes = tasks.slopes(range(len(tasks)), pressures)
+            value = -np.inf if slopes is None else float(join(-slopes.costs.max(axis=1)))
+            found.append((value, route, pressures))
+            if value > join(alone) + np.log(ROUTE.enough):
+                break
+        return max(found, key=lambda each: each[0])[1:]
+
+    def _best_routes(
+        self, tasks: PathTasks, layers: list[list[PathCandidate]], steps: Vector
+    ) -> list[Route]:
+        """Return the best sequences, with further configurations if local optima do not suffice."""
+        if not all(layers):
+            return []
+        body = self._body_check(tasks)
+        routes = self._best_clear_routes(tasks, layers, steps, body)
+        if not routes and body is not None:  # the judgement names the obstacle
+            return self._best_clear_routes(tasks, layers, steps, None)
+        return routes
+
+    def _best_clear_routes(
         self,
         tasks: PathTasks,
         layers: list[list[PathCandidate]],
         steps: Vector,
         body: BodyCheck | None,
         *,
-        any_will_do: bool,
-    ) -> Route | None:
+        any_will_do: bool = False,
+    ) -> list[Route]:
         closed = self._path.closed
         search = RouteSearch(tasks, layers, steps, self._over, is_closed=closed, body=body)
         best = search.best(ROUTE.first_rounds, any_will_do=any_will_do)
-        if (best is not None and any_will_do) or search.comes_up_to(best, ROUTE.enough):
-            return best
+        if best is not None and (any_will_do or search.comes_up_to(best, ROUTE.enough)):
+            return [best]
         further = self._further(tasks)
         search = RouteSearch(tasks, layers, steps, self._over, further, is_closed=closed, body=body)
-        rounds = ROUTE.first_rounds if any_will_do else ROUTE.rounds
-        found = [best, search.best(rounds, share=ROUTE.enough, any_will_do=any_will_do)]
-        known = [each for each in found if each is not None]
-        return max(known, key=lambda each: each.value(self._over), default=None)
+        rounds = ROUTE.rounds if body is None else ROUTE.rounds_in_scene
+        rounds = ROUTE.first_rounds if any_will_do else rounds
+        last = search.best(rounds, share=ROUTE.enough, any_will_do=any_will_do)
+        known = [each for each in (last, best, search.first) if each is not None]
+        ranked = sorted({each.value(self._over): each for each in known}.items(), reverse=True)
+        # another one, once refined, may become better than the best
+        return [each for _, each in ranked[: ROUTE.refined if body is None else 1]]
 
     def _body_check(self, tasks: PathTasks) -> BodyCheck | None:
         """Return the check of the body between points; None without a scene or machine code."""
@@ -276,23 +293,29 @@ class _PathSolver:
 
     def _slower(
         self, tasks: PathTasks, layers: list[list[PathCandidate]], steps: Vector
-    ) -> tuple[float, Route | None]:
+    ) -> tuple[float, list[Route]]:
         """Find the smallest slow-down, to 5 %, with which the path can be followed, and how."""
-        factor, route = 1.0, None
-        while route is None and (steps * factor < tasks.unit).any():
-            factor *= 8
-            route = self._best_route(tasks, layers, steps * factor, any_will_do=True)
-        low = factor / 8
-        while route is not None and factor / low > 1.05:
-            middle = (low * factor) ** 0.5
-            quicker = self._best_route(tasks, layers, steps * middle, any_will_do=True)
-            if quicker is None:
-                low = middle
-            else:
-                factor, route = middle, quicker
-        if route is not None:
-            route = self._best_route(tasks, layers, steps * factor) or route
-        return factor, route
+        factor: float = 1.0
+        routes: list[Route] = []
+        for body in dict.fromkeys(
+            (self._body_check(tasks), None)
+        ):  # clear of the scene if possible
+            follow = partial(self._best_clear_routes, tasks, layers, body=body)
+            factor = 1.0
+            while not routes and (steps * factor < tasks.unit).any():
+                factor *= 8
+                routes = follow(steps=steps * factor, any_will_do=True)
+            low = factor / 8
+            while routes and factor / low > 1.05:
+                middle = (low * factor) ** 0.5
+                quicker = follow(steps=steps * middle, any_will_do=True)
+                if quicker:
+                    factor, routes = middle, quicker
+                else:
+                    low = middle
+            if routes:
+                return factor, follow(steps=steps * factor) or routes
+        return factor, []
 
     def _fastest(self, pressures: Vector) -> Vector:
         """Return the earliest times (N,) of the points that the rates allow."""
