@@ -1,39 +1,51 @@
 """Measure which faults the control loop detects on simulated arms; pushes must not be detected.
 
     python benchmarks/disturbances.py --cases 4 --seed 500
+    python benchmarks/disturbances.py --commission --cases 4 --seed 500
 
 Arms and targets are those of `control_cases.py`; the controller has the nominal robot file. In each
 run the arm goes to a first target and rests there; then a fault begins, and four seconds later a
-second target follows. Columns: number of runs that detected the fault, and as what; time from its
-beginning to detection (for faults that only show in motion, from the second target); largest
-distance of the tip from its way, until it was let down, over all runs, in mm; and number of arms
-that were vented in the end. A push or a payload must not be detected as a fault.
+second target follows. Faults of the set-up are there from the beginning. Columns: number of runs
+that detected the fault, and as what; longest time from its beginning to detection (for faults that
+only show in motion, from the second target); largest distance of the tip from the way that it takes
+without a fault, over all runs, in mm; and the state in the end. A push or a payload must not be
+detected as a fault. With `--commission`, `stiffopt commission --quick` looks for the faults of the
+set-up instead: its first finding, whether it permits arming, and how far the tip moved from rest.
 """
 
 from __future__ import annotations
 
 import argparse
+import tempfile
 from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from control_baselines import PERIOD
 from control_cases import DYNAMICS, Case, draw_case
 from control_runs import LoopRun
 from report import table
-from stiffopt import load_robot
+from stiffopt import lie, load_robot
+from stiffopt.commissioning.commission import commission
+from stiffopt.commissioning.expected import expected_steps
+from stiffopt.commissioning.procedure import DangerError
 from stiffopt.control.controller import TipController
 from stiffopt.control.state import State
-from stiffopt.errors import CommandError
+from stiffopt.errors import CommandError, InputError
 from stiffopt.plant.settings import PlantLoad
+from stiffopt.safety.rigs import gated_rig
 
 Array = NDArray[np.float64]
 
-REST, BEFORE, AFTER = 3.0, 4.0, 16.0  # s: at the first target, with the fault there, and after
+REST, BEFORE = 3.0, 4.0  # s: at the first target, and with the fault there
+AFTER, END = 3.0, 16.0  # s: at the second target, and until a hold has ended
 DOUBTS = (
     "no-response",
     "slip",
@@ -45,6 +57,7 @@ DOUBTS = (
     "shortfall",
     "regulator-stuck",
     "tracker-jumps",
+    "unreachable",
 )
 
 
@@ -55,42 +68,87 @@ class Row:
     Attributes
     ----------
     name : for the table.
-    begin : lets it begin on a run.
-    at_once : whether it is there from the beginning, before anything moves.
+    begin : lets it begin on a rig.
+    at_once : whether it is there from the beginning, as a fault of the set-up.
     shows_in_motion : whether it can be noticed only while the tip is to move.
     is_fault : whether it is to be noticed.
     noise : of the tracker, in m, if not as usual.
     """
 
     name: str
-    begin: Callable[[LoopRun], object]
+    begin: Callable[[Any], object]
     at_once: bool = False
     shows_in_motion: bool = False
     is_fault: bool = True
     noise: float = 5e-5
 
 
-def _tracker(fault: str) -> Callable[[LoopRun], object]:
-    return lambda run: run.rig.world.inject("tracker", fault)
+def _tracker(fault: str) -> Callable[[Any], object]:
+    return lambda rig: rig.world.inject("tracker", fault)
 
 
-def _push(*force: float) -> Callable[[LoopRun], object]:
-    return lambda run: run.rig.world.plant.set_load(PlantLoad(force=force))
+def _push(*force: float) -> Callable[[Any], object]:
+    return lambda rig: rig.world.plant.set_load(PlantLoad(force=force))
 
 
-def _push_halfway(force: float) -> Callable[[LoopRun], object]:
-    def push(run: LoopRun) -> None:
-        at = run.rig.robot.length / 2
-        run.rig.world.plant.set_load(PlantLoad(force=(force, 0.0, 0.0), at=at))
+def _push_halfway(force: float) -> Callable[[Any], object]:
+    def push(rig: Any) -> None:
+        at = rig.robot.length / 2
+        rig.world.plant.set_load(PlantLoad(force=(force, 0.0, 0.0), at=at))
 
     return push
 
 
-def _slipped(*way: float) -> Callable[[LoopRun], object]:
+def _slow_push(rate: float, most: float) -> Callable[[Any], object]:
+    """Push with a force that grows, in N/s, up to `most`, in N."""
+
+    def push(rig: Any) -> None:
+        plant = rig.world.plant
+        follow, began = plant.follow, plant.time
+
+        def pushed(trace: Array) -> None:
+            force = min(most, rate * (plant.time - began))
+            plant.set_load(PlantLoad(force=(force, 0.0, 0.0)))
+            follow(trace)
+
+        plant.follow = pushed
+
+    return push
+
+
+def _turned(axis: int, degrees: float) -> Callable[[Any], object]:
+    """Turn the tracker's frame about an axis of the base."""
+
+    def turn(rig: Any) -> None:
+        camera = rig.world.camera
+        see, base = camera.sensor_in_tracker, camera.settings.registration.tracker_in_base
+        turned = np.asarray(lie.exp(np.deg2rad(degrees) * np.eye(6)[3 + axis]))
+        moved = np.linalg.inv(base.transform()) @ turned @ base.transform()
+        camera.sensor_in_tracker = lambda: moved @ see()
+
+    return turn
+
+
+def _dead_gauges(rig: Any) -> None:
+    rig.world.measured = lambda: np.full(len(rig.world.pressures), np.nan)
+
+
+def _weak(share: float) -> Callable[[Any], object]:
+    """Give the chambers a share of their pressures, of which no gauge knows."""
+
+    def weaken(rig: Any) -> None:
+        plant = rig.world.plant
+        follow = plant.follow
+        plant.follow = lambda trace: follow(share * trace)
+
+    return weaken
+
+
+def _slipped(*way: float) -> Callable[[Any], object]:
     """Move the sensor on the tip, in its own axes."""
 
-    def slip(run: LoopRun) -> None:
-        camera = run.rig.world.camera
+    def slip(rig: Any) -> None:
+        camera = rig.world.camera
         see = camera.sensor_in_tracker
         moved = np.eye(4)
         moved[:3, 3] = way
@@ -99,25 +157,25 @@ def _slipped(*way: float) -> Callable[[LoopRun], object]:
     return slip
 
 
-def _stuck(run: LoopRun) -> None:
-    run.rig.world.inject("supply", "stuck", 1)
+def _stuck(rig: Any) -> None:
+    rig.world.inject("supply", "stuck", 1)
 
 
-def _leaking(run: LoopRun) -> None:
+def _leaking(rig: Any) -> None:
     """A leak by which a regulator of 60 ms lag stays 6 % below its command."""
-    run.rig.world._regulators.leak[1] = 1.0
+    rig.world._regulators.leak[1] = 1.0
 
 
-def _nothing(run: LoopRun) -> None:
+def _nothing(rig: Any) -> None:
     pass
 
 
-def _swapped(*order: int) -> Callable[[LoopRun], object]:
+def _swapped(*order: int) -> Callable[[Any], object]:
     """Feed the chambers from other regulators than the robot file says."""
 
-    def swap(run: LoopRun) -> None:
-        plant = run.rig.world.plant
-        follow, n = plant.follow, len(run.rig.world.pressures)
+    def swap(rig: Any) -> None:
+        plant = rig.world.plant
+        follow, n = plant.follow, len(rig.world.pressures)
         channels = [*order, *range(len(order), n)]
         plant.follow = lambda trace: follow(np.ascontiguousarray(trace[:, channels]))
 
@@ -127,6 +185,11 @@ def _swapped(*order: int) -> Callable[[LoopRun], object]:
 ROWS = (
     Row("channels 1 and 2 swapped", _swapped(1, 0), at_once=True),
     Row("channels 1 and 4 swapped", _swapped(3, 1, 2, 0), at_once=True),
+    Row("tracker's frame turned by 10 deg about z", _turned(2, 10.0), at_once=True),
+    Row("tracker's frame turned by 5 deg about x", _turned(0, 5.0), at_once=True),
+    Row("sensor 10 mm further along", _slipped(0.0, 0.0, 0.01), at_once=True),
+    Row("all gauges dead", _dead_gauges, at_once=True),
+    Row("arm with 0.6 of its strength", _weak(0.6), at_once=True),
     Row("sensor has come off, lies still", _tracker("loose"), shows_in_motion=True),
     Row("tracker drifts by 5 mm/s", _tracker("drifting")),
     Row("sensor slips by 10 mm", _slipped(0.006, -0.008, 0.0)),
@@ -138,6 +201,7 @@ ROWS = (
     Row("a push of 20 mN", _push(0.02, 0.0, 0.0), is_fault=False),
     Row("a push of 30 mN halfway along", _push_halfway(0.03), is_fault=False),
     Row("a push of 50 mN", _push(0.0, -0.05, 0.0), is_fault=False),
+    Row("a push that grows by 20 mN/s to 60 mN", _slow_push(0.02, 0.06), is_fault=False),
     Row("a payload of 10 g", _push(0.0, 0.0, 0.0981), is_fault=False),
     Row("tracker noise of 0.15 mm", _nothing, is_fault=False, noise=1.5e-4),
     Row("nothing", _nothing, is_fault=False),
@@ -146,12 +210,20 @@ ROWS = (
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of a run: when it was told, in s (infinite: never), and as what; mm; the end."""
+    """What came of a run.
+
+    Attributes
+    ----------
+    told : when a fault was detected, in s since its beginning; infinite if it was not.
+    kind : as what it was detected.
+    tips : of the arm (T, 3), from the beginning of the fault, in m.
+    end : state in the end.
+    """
 
     told: float
     kind: str
-    off: float
-    vented: bool
+    tips: Array
+    end: str
 
 
 def run_row(case: Case, row: Row, dynamics: str) -> Outcome:
@@ -166,37 +238,36 @@ def run_row(case: Case, row: Row, dynamics: str) -> Outcome:
         control=rig.settings.control, safety=rig.settings.safety, vibrates=dynamics == "full",
     )  # fmt: skip
     run = LoopRun(rig, controller, case.point)
-    aims = case.aims
     try:
         if row.at_once:
-            row.begin(run)
-        run.start()
+            row.begin(rig)
+        try:
+            run.start()
+        except InputError:
+            return Outcome(0.0, "refused", np.empty((0, 3)), "refused")
         run.go(0.3)
-        begin, way = rig.clock.now(), [run.tip(), aims[0].position]
-        run.set_task(case.task(aims[0].position, aims[0].kind))
-        parts = [run.go(REST)]
+        begin = rig.clock.now()
+        _try_task(run, case, 0)
+        tips = [run.go(REST).tips]
         if not row.at_once:
-            begin, way, parts = rig.clock.now(), [aims[0].position] * 2, []
-            row.begin(run)
-            parts.append(run.go(BEFORE))
-            off = [_off(parts[0].tips, way)]
-            if run.loop.snapshot().state is State.ACTIVE:
-                if row.shows_in_motion:
-                    begin = rig.clock.now()
-                way = [run.tip(), aims[1].position]
-                _try_task(run, case, 1)
-                parts = [run.go(2.0)]
-        else:
-            off = []
-        parts.append(run.go(AFTER))
-        off += [_off(part.tips, way) for part in parts[:1]]
+            begin = rig.clock.now()
+            row.begin(rig)
+            tips = [*tips[: row.name == "nothing"], run.go(BEFORE).tips]
+        if run.loop.snapshot().state is State.ACTIVE:
+            if row.shows_in_motion:
+                begin = rig.clock.now()
+            _try_task(run, case, 1)
+            tips.append(run.go(AFTER).tips)
+        for _ in range(round(END)):
+            if run.loop.snapshot().state is State.HOLDING:
+                run.go(1.0)
         events, _ = run.loop.events.since(0)
         told = [event for event in events if event.kind in DOUBTS]
         return Outcome(
             told=told[0].time - begin if told else np.inf,
             kind=told[0].kind if told else "",
-            off=1e3 * max(off),
-            vented=run.loop.snapshot().state in (State.INACTIVE, State.FAULT),
+            tips=np.concatenate(tips),
+            end=run.loop.snapshot().state.value,
         )
     finally:
         run.close()
@@ -207,14 +278,61 @@ def _try_task(run: LoopRun, case: Case, number: int) -> None:
         run.set_task(case.task(case.aims[number].position, case.aims[number].kind))
 
 
-def _off(tips: Array, way: list[Array]) -> float:
-    """Largest distance of the tip (T, 3) from the straight way between two places, in m."""
-    start, direction = way[0], way[1] - way[0]
-    length = float(direction @ direction)
-    share = (
-        np.clip((tips - start) @ direction / length, 0, 1) if length > 0 else np.zeros(len(tips))
-    )
-    return float(np.linalg.norm(tips - start - share[:, None] * direction, axis=1).max())
+def run_commissioning(case: Case, row: Row) -> tuple[str, bool, float]:
+    """First finding of a quick commissioning, whether it permits arming, and the way in m."""
+    rig: Any = case.rig("quasi-static")
+    gated_rig(rig, rig.settings.safety, PERIOD)
+    with rig, tempfile.TemporaryDirectory() as folder:
+        row.begin(rig)
+        expected = expected_steps(rig.robot, rig.supply.limits)
+        rest, tips = rig.world.plant.tip_pose()[:3, 3].copy(), []
+        try:
+            found = commission(
+                rig, expected, Path(folder), rate=1 / PERIOD, quick=True,
+                check=lambda: tips.append(rig.world.plant.tip_pose()[:3, 3].copy()),
+            )  # fmt: skip
+            first, fits = found.findings[0].text if found.findings else "nothing", found.fits
+        except DangerError as error:
+            first, fits = str(error), False
+    return first, fits, float(np.linalg.norm(np.array(tips) - rest, axis=1).max())
+
+
+def _commissioned(cases: list[Case], rows: list[Row]) -> list[list[str]]:
+    """Lines of the table of commissioning."""
+    lines = []
+    for row in rows:
+        found = [run_commissioning(case, row) for case in cases]
+        refused = sum(not fits for _, fits, _ in found)
+        way = 1e3 * max(way for _, _, way in found)
+        lines.append([row.name, f"{refused} of {len(found)}", f"{way:.1f}", found[0][0]])
+        print(lines[-1], flush=True)
+    return lines
+
+
+def _looped(cases: list[Case], rows: list[Row], dynamics: str) -> list[list[str]]:
+    """Lines of the table of the control loop."""
+    lines = []
+    usual = [cKDTree(run_row(case, ROWS[-1], dynamics).tips) for case in cases]
+    for row in rows:
+        found = [run_row(case, row, dynamics) for case in cases]
+        noticed = [outcome for outcome in found if outcome.kind]
+        kinds = Counter(outcome.kind for outcome in noticed)
+        ends = Counter(outcome.end for outcome in found)
+        off = [
+            float(way.query(o.tips)[0].max())
+            for way, o in zip(usual, found, strict=True)
+            if len(o.tips)
+        ]
+        lines.append([
+            row.name,
+            f"{len(noticed)} of {len(found)}{'' if row.is_fault else ' (none should)'}",
+            ", ".join(f"{kind} {count}" for kind, count in kinds.most_common()),
+            f"{max((o.told for o in noticed), default=np.nan):.2f}",
+            f"{1e3 * max(off, default=np.nan):.1f}",
+            ", ".join(f"{end} {count}" for end, count in ends.most_common()),
+        ])  # fmt: skip
+        print(lines[-1], flush=True)
+    return lines
 
 
 def main() -> None:
@@ -224,31 +342,19 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=500)
     parser.add_argument("--dynamics", choices=DYNAMICS, nargs="+", default=list(DYNAMICS))
     parser.add_argument("--rows", nargs="+", help="only rows whose name has one of these words")
+    parser.add_argument("--commission", action="store_true", help="look for faults of the set-up")
     arguments = parser.parse_args()
     cases = [draw_case(arguments.seed + k, 2, ranked=False) for k in range(arguments.cases)]
+    words = arguments.rows or [""]
+    rows = [row for row in ROWS if any(word in row.name for word in words)]
+    if arguments.commission:
+        lines = _commissioned(cases, [row for row in rows if row.at_once])
+        print("\n".join(table(["what", "refused", "way, mm", "first finding"], lines)))
+        return
+    head = ["what", "noticed", "as", "told, s", "off its way, mm", "ends"]
     for dynamics in arguments.dynamics:
-        lines = []
-        for row in ROWS:
-            if arguments.rows and not any(word in row.name for word in arguments.rows):
-                continue
-            found = [run_row(case, row, dynamics) for case in cases]
-            noticed = [outcome for outcome in found if outcome.kind]
-            kinds = Counter(outcome.kind for outcome in noticed)
-            lines.append([
-                row.name,
-                f"{len(noticed)} of {len(found)}{'' if row.is_fault else ' (none should)'}",
-                ", ".join(f"{kind} {count}" for kind, count in kinds.most_common()),
-                f"{max((o.told for o in noticed), default=np.nan):.2f}",
-                f"{max(o.off for o in found):.1f}",
-                f"{sum(o.vented for o in found)}",
-            ])  # fmt: skip
-            print(lines[-1], flush=True)
-        print(f"\n### plant: {dynamics}\n")
-        print(
-            "\n".join(
-                table(["what", "noticed", "as", "told, s", "off its way, mm", "vented"], lines)
-            )
-        )
+        lines = _looped(cases, rows, dynamics)
+        print(f"\n### plant: {dynamics}\n", *table(head, lines), sep="\n")
 
 
 if __name__ == "__main__":

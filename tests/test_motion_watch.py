@@ -201,18 +201,23 @@ def test_nothing_is_doubted_after_steering_has_ended() -> None:
     assert watch.doubt is None
 
 
-def displaced(turned: float) -> Doubt | None:
+def displaced(
+    turned: float, force: float = 1.0, grown: Callable[[float], float] | None = None
+) -> Doubt | None:
     """Doubt of a tip that is displaced by 10 mm and turned by a share of what a push turns it."""
-    force = TIP.pose[:3, :3] @ np.array([0.01, 0.004, 0.0])
-    pushed = ROBOT.loaded_tip_pose(P, [*force, 0.0, 0.0, 0.0])
+    push = TIP.pose[:3, :3] @ np.array([0.01, 0.004, 0.0]) * force
+    pushed = ROBOT.loaded_tip_pose(P, [*push, 0.0, 0.0, 0.0])
     moved = pushed[:3, 3] - TIP.pose[:3, 3]
     turn = turned * lie.log(pushed @ np.linalg.inv(TIP.pose))[3:]
     watch = MotionWatch(ROBOT.description, MotionTuning())
     for time in np.arange(0.0, 3.0, FRAME):
-        offset = step(1.0, lag=0.05)(time) * np.concatenate([moved, turn])
+        offset = (grown or step(1.0, lag=0.05))(time) * np.concatenate([moved, turn])
         watch.intend(time, np.zeros(3))
-        take(watch, time, np.zeros(3), -offset[:3], offset)  # the loop has made up for it
-    assert np.linalg.norm(moved) > 6e-3
+        if grown:  # the loop has not made up for it
+            take(watch, time, offset[:3], np.zeros(3), offset)
+        else:
+            take(watch, time, np.zeros(3), -offset[:3], offset)
+    assert np.linalg.norm(moved) > 6e-3 * force
     return watch.doubt
 
 
@@ -227,6 +232,19 @@ def test_a_displacement_that_turns_nothing_is_a_slip(turned: float) -> None:
     assert doubt is not None
     assert doubt.kind == "slip"
     assert "sensor has slipped" in doubt.text
+
+
+def slowly(t: float) -> float:
+    return min(max(t - 1.0, 0.0) / 2.0, 1.0)
+
+
+@pytest.mark.parametrize(("turned", "force"), [(0.0, 0.7), (1.0, 2.0)])
+def test_a_displacement_that_grows_as_no_usual_push_is_doubted(turned: float, force: float) -> None:
+    assert displaced(turned, force, slowly) is not None
+
+
+def test_a_push_that_grows_slowly_is_no_drift() -> None:
+    assert displaced(1.0, 0.7, slowly) is None
 
 
 def test_segments_that_move_the_tip_against_each_other_may_miss_by_more() -> None:

@@ -158,7 +158,8 @@ class MotionWatch:
         self.doubt = self._no_response(jacobian, tip.pose[:3, 2])
         if turns:
             self.doubt = self.doubt or self._slip(jacobian, tip)
-        self.doubt = self.doubt or self._drift(jacobian) or self._swing()
+        bending = turn_of_a_push(tip) if turns else None
+        self.doubt = self.doubt or self._drift(jacobian, bending) or self._swing()
 
     def _is_early(self, time: float) -> bool:
         last = self._rows[self._count - 1, _TIME] if self._count else -np.inf
@@ -275,10 +276,14 @@ class MotionWatch:
             "moved; run 'stiffopt commission'",
         )
 
-    def _drift(self, jacobian: Array) -> Doubt | None:
-        """Test whether the tip keeps moving without a cause in the pressures."""
+    def _drift(self, jacobian: Array, bending: Array | None) -> Doubt | None:
+        """Test whether the tip keeps moving without a cause in the pressures.
+
+        `bending` (3, 3) is the turn of the tip by the displacement of a push; None if the tracker
+        measures no orientations.
+        """
         for scale in self._tuning.scales:
-            if speed := self._drift_speed(scale, jacobian):
+            if speed := self._drift_speed(scale, jacobian, bending):
                 return Doubt(
                     "drift",
                     f"the tip seems to move on at {1e3 * speed:.1f} mm/s although its pressures do "
@@ -287,7 +292,7 @@ class MotionWatch:
                 )
         return None
 
-    def _drift_speed(self, scale: DriftScale, jacobian: Array) -> float:
+    def _drift_speed(self, scale: DriftScale, jacobian: Array, bending: Array | None) -> float:
         """Return the speed of a drift over all intervals of a scale, in m/s; 0 if there is none."""
         duration = scale.interval * scale.count
         first = self._rows[0, _TIME] if self._count else np.inf
@@ -302,9 +307,18 @@ class MotionWatch:
         along = np.diff(offsets, axis=0) @ drift / max(size, 1e-9)
         explained = self._explained(np.diff(marks, axis=0), jacobian)
         least = scale.least_speed * scale.interval + 2 * self._tuning.scatter
-        if (along - explained < least).any():
+        if (along - explained < least).any() or self._is_push(marks[-1] - marks[0], bending):
             return 0.0
         return size / duration
+
+    def _is_push(self, change: Array, bending: Array | None) -> bool:
+        """Whether the offset has changed as under a push that grows, by not too much."""
+        moved, tuning = change[_OFFSET], self._tuning
+        if bending is None or float(np.linalg.norm(moved)) > tuning.largest_push:
+            return False
+        bent = bending @ moved
+        size, missing = (float(np.linalg.norm(v)) for v in (bent, bent - change[_TURN]))
+        return size > tuning.least_turn and missing < tuning.slip * size
 
     def _swing(self) -> Doubt | None:
         for swings in self._swings:

@@ -274,6 +274,8 @@ class MotionTuning:
     # share of the turn that a push would cause by which the measured turn must miss it
     slip: float = 0.7
     least_turn: float = 0.02  # by which it must miss it at least, in rad
+    # displacement up to which a drift that turns the tip as a push does is a push that grows, in m
+    largest_push: float = 8e-3
     slips: int = 4  # successive samples that show a slip
     scales: tuple[DriftScale, ...] = (
         DriftScale(0.25, 5, 2e-3),
