@@ -6,7 +6,9 @@ import json
 import re
 import signal
 import sys
+from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import replace
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +49,7 @@ FIGURES = {
 }
 KEYS = {"n", "position_error_mm", "position_error_percent_of_length", "angle_error_deg"}
 FAST = ["--model", "lag", "--strain-law", "keep", "--rows", "120"]
+QUICK = ["--model", "lag", "--rows", "60", "--quick"]
 
 
 def truth() -> RobotDescription:
@@ -94,6 +97,20 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.fixture(scope="module")
+def again(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str, str]:
+    """The same calibration once more, for programs: its folder, stdout and stderr."""
+    path, out, err = tmp_path_factory.mktemp("again"), StringIO(), StringIO()
+    logs = [str(folder / "monday.csv"), str(folder / "tuesday.csv")]
+    with redirect_stdout(out), redirect_stderr(err):
+        code = main(
+            ["calibrate", "--robot", "stiff-flop-1", *logs, "--out", str(path / "again.yaml"),
+             "--json", *FAST]
+        )  # fmt: skip
+    assert code == 0
+    return path, out.getvalue(), err.getvalue()
+
+
 def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
     """Exit code, stdout and stderr of a command."""
     capsys.readouterr()
@@ -136,7 +153,7 @@ def test_a_fit_that_misses_its_own_logs_is_unfit(
     log = recorded(0)
     write_log(tmp_path / "wrong.csv", replace(log, tip_position=log.tip_position[::-1].copy()))
     fitted = tmp_path / "fitted.yaml"
-    calibrating = ("calibrate", "--robot", "stiff-flop-1", tmp_path / "wrong.csv", *FAST)
+    calibrating = ("calibrate", "--robot", "stiff-flop-1", tmp_path / "wrong.csv", *QUICK)
     code, out, err = run(capsys, *calibrating, "--out", fitted, "--json")
     assert code == 4
     assert json.loads(out)["unfit"] is True
@@ -163,17 +180,11 @@ def test_a_fit_that_misses_its_own_logs_is_unfit(
         assert err.count("is marked as unfit") == 1, err
 
 
-def test_the_same_command_writes_the_same_file(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    logs = [folder / "monday.csv", folder / "tuesday.csv"]
-    code, out, err = run(
-        capsys, "calibrate", "--robot", "stiff-flop-1", *logs, "--out", tmp_path / "again.yaml",
-        "--json", *FAST,
-    )  # fmt: skip
-    assert (code, err) == (0, "")
-    assert (tmp_path / "again.yaml").read_bytes() == (folder / "fitted.yaml").read_bytes()
-    assert [path.name for path in tmp_path.iterdir()] == ["again.yaml"]
+def test_the_same_command_writes_the_same_file(folder: Path, again: tuple[Path, str, str]) -> None:
+    path, out, err = again
+    assert err == ""
+    assert (path / "again.yaml").read_bytes() == (folder / "fitted.yaml").read_bytes()
+    assert [each.name for each in path.iterdir()] == ["again.yaml"]
     found = json.loads(out)
     assert found["model"] == "lag"
     assert found["report"] is None
@@ -236,7 +247,7 @@ def test_several_models_are_compared_on_what_is_held_back(
     monkeypatch.setattr("stiffopt.identify.calibration.STRUCTURES", some)
     code, out, _ = run(
         capsys, "calibrate", "--robot", "stiff-flop-1", folder / "monday.csv", "--out",
-        tmp_path / "r.yaml", "--strain-law", "keep", "--rows", "120", "--report",
+        tmp_path / "r.yaml", "--strain-law", "keep", "--rows", "60", "--report",
         tmp_path / "report",
     )  # fmt: skip
     assert code == 0
@@ -402,7 +413,9 @@ def test_help_names_every_model(capsys: pytest.CaptureFixture[str]) -> None:
     assert not missing
 
 
-def test_command_page_names_every_option_and_key(folder: Path, capsys: Any, tmp_path: Path) -> None:
+def test_command_page_names_every_option_and_key(
+    folder: Path, again: tuple[Path, str, str], capsys: Any
+) -> None:
     page = (ROOT / "docs" / "command.md").read_text(encoding="utf-8")
     page = page[page.index("## Calibrate and validate") :]
     for command in ("calibrate", "validate"):
@@ -410,11 +423,7 @@ def test_command_page_names_every_option_and_key(folder: Path, capsys: Any, tmp_
         options = set(re.findall(r"^  (?:-\w, )?(--[\w-]+)", out, re.M)) - {"--help"}
         assert {"--robot", "--json", "--report"} <= options
         assert not {option for option in options if f"`{option}" not in page}
-    _, out, _ = run(
-        capsys, "calibrate", "--robot", "stiff-flop-1", folder / "monday.csv", "--out",
-        tmp_path / "r.yaml", "--json", *FAST,
-    )  # fmt: skip
-    found = json.loads(out)
+    found = json.loads(again[1])
     keys = {*found, *found["models"][0], *found["parameters"][0]}
     _, out, _ = run(capsys, "validate", "--robot", "stiff-flop-1", folder / "monday.csv", "--json")
     found = json.loads(out)
@@ -565,7 +574,7 @@ def test_an_interrupt_leaves_nothing_behind(
     monkeypatch.setattr(calibrate_run, where, interrupted)
     code, out, _ = run(
         capsys, *(each.replace("{tmp}", str(tmp_path)) for each in _CALIBRATE),
-        folder / "monday.csv", "--report", tmp_path / "page", *FAST,
+        folder / "monday.csv", "--report", tmp_path / "page", *QUICK,
     )  # fmt: skip
     assert (code, out) == (130, "")
     assert not list(tmp_path.iterdir())
@@ -651,8 +660,7 @@ def test_quick_fits_one_model_to_few_rows() -> None:
 
 def test_the_command_is_quick(folder: Path, tmp_path: Path, capsys: Any) -> None:
     command = ["calibrate", "--robot", "stiff-flop-1", folder / "monday.csv"]
-    options = ["--out", tmp_path / "q.yaml", "--quick", "--model", "lag", "--rows", "60", "--json"]
-    code, text, _ = run(capsys, *command, *options)
+    code, text, _ = run(capsys, *command, "--out", tmp_path / "q.yaml", "--json", *QUICK)
     found = json.loads(text)
     assert (code, found["models"], found["model"]) == (0, [], "lag")
     assert found["after"] is not None

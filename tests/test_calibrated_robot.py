@@ -234,7 +234,9 @@ def log_files(tmp_path: Path) -> list[Path]:
 
 
 def test_robots_and_logs_may_be_named(log_files: list[Path], tmp_path: Path) -> None:
-    settings = stiffopt.CalibrationSettings(structure="static", rows=100, trial_rows=60)
+    settings = stiffopt.CalibrationSettings(
+        structure="static", strain_law="keep", rows=100, trial_rows=60
+    )
     result = stiffopt.calibrate("stiff-flop-1", log_files, settings=settings)
     assert result.robot.segments[0].material.youngs_modulus == pytest.approx(8e4, rel=0.15)
     assert [each.name for each in result.calibrated] == [str(path) for path in log_files]

@@ -14,6 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import Field
 
+from conftest import is_long
 from stiffopt.documents import read_document, write_file
 from stiffopt.errors import FileError, InputError, MissingExtraError, StiffoptError
 from stiffopt.files import line_of, read_file, save_file
@@ -220,7 +221,7 @@ def test_lines_of_keys_and_items(tmp_path: Path) -> None:
     assert line_of(tmp_path / "none", "b") is None
 
 
-@settings(max_examples=300)
+@settings(max_examples=300 if is_long() else 100)
 @given(st.binary(max_size=60) | st.text(alphabet="a:b -[]{}&*!|>'\"\n\t#%,?.1~", max_size=60))
 def test_no_text_crashes_the_reader(tmp_path_factory: Any, text: str | bytes) -> None:
     path = written(tmp_path_factory.getbasetemp(), text, "fuzz.yaml")
@@ -245,7 +246,7 @@ anything = st.recursive(
 )
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200 if is_long() else 60, deadline=None)
 @given(st.dictionaries(st.sampled_from(["a", "b", "yes"]), anything, min_size=1))
 def test_what_is_written_is_read_back(tmp_path_factory: Any, data: dict[str, Any]) -> None:
     path = tmp_path_factory.getbasetemp() / "round.yaml"
