@@ -177,8 +177,14 @@ def test_the_radius_is_what_the_law_says():
     assert radii == pytest.approx([0.014, 0.012, 0.012], abs=0)
 
 
-@pytest.mark.one_in(2)
-@pytest.mark.parametrize("case", ["mixed", "hanging, mixed", "follower"])
+@pytest.mark.parametrize(
+    "case",
+    [
+        pytest.param("mixed", marks=pytest.mark.long),
+        pytest.param("hanging, mixed", marks=pytest.mark.long),
+        *("2 segments", "follower"),
+    ],
+)
 def test_machine_code_gives_what_the_vm_gives(case, compiled, monkeypatch):
     monkeypatch.setattr(body, "LOOKED_UP_FROM", 10**9)
     model, rng = made(case), np.random.default_rng(5)

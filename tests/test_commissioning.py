@@ -132,6 +132,12 @@ def seen_by(
     )
 
 
+@cache
+def as_modelled() -> Responses:
+    """What is seen of the arm of the robot file; nobody changes it."""
+    return seen_by()
+
+
 def explained(seen: Responses, robot: str = HANGING) -> tuple[SetupExplanation, list[Finding]]:
     explainer = Explainer(expected_of(robot), seen)
     best = explainer.best()
@@ -161,6 +167,7 @@ def usual_arm(seed: int, **other: Any) -> Mismatch:
 # -- what is explained -----------------------------------------------------------------------------
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("seed", range(6))
 def test_usual_arms_fit(seed: int) -> None:
     best, findings = explained(seen_by(mismatch=usual_arm(seed), seed=seed))
@@ -172,14 +179,22 @@ def test_usual_arms_fit(seed: int) -> None:
     ("fault", "text"),
     [
         ({"wiring": {0: (1,), 1: (0,)}}, "channels 1 and 2 seem swapped"),
-        ({"wiring": {0: (3,), 3: (0,)}}, "channels 1 and 4 seem swapped"),
+        pytest.param(
+            {"wiring": {0: (3,), 3: (0,)}},
+            "channels 1 and 4 seem swapped",
+            marks=pytest.mark.long,
+        ),
         ({"wiring": {0: (1,), 1: (2,), 2: (0,)}}, "1 drives what 2 should, 2 drives what 3"),
         ({"wiring": {2: ()}}, "channel 3 did not move the tip"),
         ({"wiring": {0: (0, 1), 1: (0, 1)}}, "they share a line"),
         ({"sensor": Placement(position=(0, 0, 0.01))}, "mm further along the arm"),
         ({"sensor": turned("y", 12.0)}, "the sensor is turned on the tip by 1"),
         ({"registration": turned("z", 10.0)}, "the tracker's frame is turned by"),
-        ({"registration": turned("x", 5.0)}, "the tracker's frame is turned by"),
+        pytest.param(
+            {"registration": turned("x", 5.0)},
+            "the tracker's frame is turned by",
+            marks=pytest.mark.long,
+        ),
         ({"modulus": (1.9, 1.9)}, "a gain of all its channels that does the same"),
     ],
 )
@@ -248,7 +263,7 @@ def test_nothing_moves() -> None:
 
 
 def with_changes(**changes: Any) -> list[Finding]:
-    return explained(replace(seen_by(), **changes))[1]
+    return explained(replace(as_modelled(), **changes))[1]
 
 
 def test_gauges_noise_lag_and_swings_are_judged() -> None:
@@ -269,7 +284,7 @@ def test_gauges_noise_lag_and_swings_are_judged() -> None:
     slow = Delays(*np.broadcast_to([[0.05], [0.4], [0.4], [5e5], [5e5]], (5, 6)))
     assert "follows after 0.45 s" in only_wrong(with_changes(delays=slow)).text
     swing = Swing(1.7, 0.05, 2e-3, 0.01, 0.001)
-    e, seen = expected_of(HANGING), replace(seen_by(), swing=swing)
+    e, seen = expected_of(HANGING), replace(as_modelled(), swing=swing)
     explainer = Explainer(e, seen)
     for modelled, count in ((1.6, 0), (0.9, 1)):
         found = findings_of(rig_of(HANGING), e, seen, explainer, explainer.best(), modelled)
@@ -509,7 +524,7 @@ def test_a_registration_is_corrected() -> None:
         off = Mismatch(registration=turned("z", 10.0))
         best, findings = explained(seen_by(mismatch=off))
         path = Path(__file__).parent.parent / "rig" / "sim-two-segment.yaml"
-        data, changed = corrections(rig, str(path), best, seen_by(), findings)
+        data, changed = corrections(rig, str(path), best, as_modelled(), findings)
     finally:
         rig.settings, rig.tracker.registration = before
     assert changed == ["tracker.registration.tracker_in_base"]

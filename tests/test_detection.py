@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -28,7 +29,10 @@ Array = NDArray[np.float64]
 
 AS_RECORDED = CalibrationSettings()
 AWAY = np.array([0.3, -0.1, 0.2])
-FAST = {"structure": "static", "strain_law": "keep", "rows": 60, "trial_rows": 60, "start_rows": 40}
+FAST = {
+    "structure": "static", "strain_law": "keep", "rows": 60, "trial_rows": 60, "start_rows": 40,
+    "holds_back": False,
+}  # fmt: skip
 MODULES = recordings("ucl_stiff_flop_*55mm/*.csv")
 
 
@@ -47,6 +51,7 @@ def driven(pressures: Array, time: Array, name: str = "stiff-flop-1") -> Log:
     return made_log(arm(name), time, pressures)
 
 
+@cache
 def log_of(name: str = "stiff-flop-1", n: int = 3, duration: float = 60.0, seed: int = 0) -> Log:
     time, pressures = course(n, duration, seed, rate=5.0)
     return driven(pressures, time, name)
