@@ -375,7 +375,7 @@ def test_channels_and_frame_are_kept_in_the_file(tmp_path: Path, capsys: Any) ->
     write_log(tmp_path / "moved.csv", moved)
     code, _, err = run(
         capsys, "calibrate", "--robot", "stiff-flop-1", tmp_path / "moved.csv", "--channels",
-        "2,3,1", "--frame", "stand", "--out", tmp_path / "r.yaml", "--quiet", *FAST,
+        "2,3,1", "--frame", "stand", "--out", tmp_path / "r.yaml", "--quiet", *QUICK,
     )  # fmt: skip
     assert (code, err) == (0, "")
     recordings = load_description(tmp_path / "r.yaml").recordings

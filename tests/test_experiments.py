@@ -75,7 +75,10 @@ def short(**given: object) -> KinematicsSettings:
 
 
 def quick(**given: object) -> StiffnessSettings:
-    values = {"channels": 3, "pressures": (0.4e5,), "repetitions": 1, "steps": 2, **given}
+    steps = 4 if is_long() else 2
+    values = {
+        "channels": 3, "pressures": (0.4e5,), "repetitions": 1, "steps": steps, **given,
+    }  # fmt: skip
     return StiffnessSettings(**values)
 
 
@@ -546,7 +549,7 @@ def test_the_slope_is_the_stiffness_of_the_arm(tmp_path: Path) -> None:
         assert cell.model == pytest.approx(truth, rel=2e-3)
         series = 1 / (1 / truth + 1 / 5000)  # the stage also compresses the contact
         assert cell.by_stage.value == pytest.approx(series, rel=1e-3)
-        assert cell.points == 5
+        assert cell.points == 2 * settings.steps + 1
     assert world_of(rig).swept == 0
     for series in PointsFile(tmp_path, 3).read():  # tared: no displacement, no force
         truth = golden(np.array([series.key.pressure]), np.array(series.key.direction))
