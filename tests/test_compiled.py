@@ -41,6 +41,25 @@ def cache(tmp_path, monkeypatch):
     return directory
 
 
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A cache with the library of `functions`."""
+    directory = tmp_path_factory.mktemp("made")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("STIFFOPT_CACHE_DIR", str(directory))
+        for name in ("CC", "STIFFOPT_COMPILER"):
+            patch.delenv(name, raising=False)
+        as_a_new_process(patch)
+        library("f", functions)
+    return directory
+
+
+@pytest.fixture
+def filled(made, cache):
+    """A cache that has that library already."""
+    return shutil.copytree(made, cache)
+
+
 def as_a_new_process(monkeypatch):
     monkeypatch.setattr(compiled, "_loaded", {})
     monkeypatch.setattr(compiled, "_notified", set())
@@ -101,8 +120,8 @@ def test_values_of_machine_code_and_of_the_vm():
 @pytest.mark.one_in(3)
 @pytest.mark.parametrize("count", [0, 1, 255, 256, 257, 10_000])
 @pytest.mark.parametrize("rows_of", [(True, True, True), (True, False, True), (True, True, False)])
-def test_a_batch_is_row_by_row(count, rows_of, monkeypatch):
-    native, vm = library("f", functions).function("mixed"), interpreted(functions)["mixed"]
+def test_a_batch_is_row_by_row(count, rows_of, filled):
+    native, vm = library("f", unexpected).function("mixed"), interpreted(functions)["mixed"]
     rng = np.random.default_rng(0)
     shapes = ((3,), (2, 3), (1,))
     arguments = [
@@ -251,9 +270,9 @@ def test_the_key_of_own_sources(tmp_path):
 
 
 @pytest.mark.parametrize("damage", ["cut", "empty", "changed", "gone", "no entry", "half an entry"])
-def test_code_that_is_not_whole_is_made_again(cache, monkeypatch, damage):
-    expected = library("f", functions).function("mixed")(*ARGUMENTS)
-    (code,), (entry,) = code_files(cache), cache.glob("*.json")
+def test_code_that_is_not_whole_is_made_again(filled, monkeypatch, damage):
+    expected = library("f", unexpected).function("mixed")(*ARGUMENTS)
+    (code,), (entry,) = code_files(filled), filled.glob("*.json")
     content = code.read_bytes()
     code.unlink()  # not in place: the code is mapped into this process
     if damage == "cut":
