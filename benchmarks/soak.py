@@ -51,7 +51,8 @@ COARSE = {"bending_degree": 2, "shear_degree": 1, "sub_intervals": 3, "step": 0.
 class Soak:
     """One arm and its loop."""
 
-    def __init__(self, seed: int) -> None:
+    def __init__(self, seed: int, fault_every: float = FAULT_EVERY) -> None:
+        self.fault_every = fault_every
         told = load_rig_description(RIG).model_dump(exclude_unset=True)
         told["plant"].update(dynamics="quasi-static", faults=True, seed=seed, discretisation=COARSE)
         # what the tracker's registration is off by nobody could know
@@ -104,7 +105,7 @@ class Soak:
         rng, clock = self.rng, self.rig.clock
         self.ready()
         end, next_target = clock.now() + duration, clock.now()
-        next_fault = clock.now() + rng.uniform(0.5, 1.5) * FAULT_EVERY
+        next_fault = clock.now() + rng.uniform(0.5, 1.5) * self.fault_every
         faults: dict[str, dict[str, int]] = {}
         errors: list[float] = []
         wrong: list[str] = []
@@ -155,7 +156,10 @@ class Soak:
                 self.rig.world.inject(fault[0], "ok")
                 fault = leaking = None
                 self.ready()
-                next_target, next_fault = clock.now(), now + rng.uniform(0.5, 1.5) * FAULT_EVERY
+                next_target, next_fault = (
+                    clock.now(),
+                    now + rng.uniform(0.5, 1.5) * self.fault_every,
+                )
             if not disturbed and since + SETTLED < now < since + TARGET:
                 tip = self.rig.world.plant.tip_pose()[:3, 3]
                 errors.append(1e3 * float(np.linalg.norm(tip - goal)))
@@ -218,6 +222,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--hours", type=float, default=24.0)
     parser.add_argument("--block", type=float, default=BLOCK, help="simulated seconds a line")
+    parser.add_argument("--fault-every", type=float, default=FAULT_EVERY, help="s between faults")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, help="lines of JSON; a run goes on from what is there")
     parser.add_argument("--report", type=Path, help="only say what a file holds")
@@ -229,7 +234,7 @@ def main() -> int:
     if options.report is None:
         soak, wanted = None, round(options.hours * 3600 / options.block)
         while len(blocks) < wanted:
-            soak = soak or Soak(options.seed + len(blocks))
+            soak = soak or Soak(options.seed + len(blocks), options.fault_every)
             block = soak.block(options.block) | {"process": os.getpid()}
             blocks.append(block)
             if options.out is not None:

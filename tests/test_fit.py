@@ -62,7 +62,12 @@ def true_robot(kind: str) -> RobotDescription:
 
 
 def settings(structure: str, **others: object) -> CalibrationSettings:
-    usual: dict[str, object] = {"rows": 400, "trial_rows": 150, "strain_law": "keep"}
+    usual: dict[str, object] = {
+        "rows": 250,
+        "trial_rows": 100,
+        "strain_law": "keep",
+        "holds_back": False,
+    }
     return CalibrationSettings(structure=structure, **{**usual, **others})  # type: ignore[arg-type]
 
 
@@ -234,7 +239,7 @@ def test_what_was_not_learnt_keeps_its_prior_and_is_named() -> None:
     time, pressures = course(3, 40.0, 5)
     pressures[:, 2] = 0.0
     log = made_log(true_robot("lag"), time, pressures, base=BASE)
-    result = calibrate(ONE, [("a.csv", log)], settings=settings("lag", rows=200))
+    result = calibrate(ONE, [("a.csv", log)], settings=settings("lag", rows=150, holds_back=True))
     by_key = {estimate.key: estimate for estimate in result.estimates if estimate.key}
     for name, deviation in (
         ("corrections.gain[2]", 0.05),
@@ -268,9 +273,8 @@ def test_what_was_not_learnt_keeps_its_prior_and_is_named() -> None:
     [*(pytest.param(kind, marks=pytest.mark.long) for kind in ("static", "lag")), "hysteresis"],
 )
 def test_the_model_that_made_the_log_is_chosen(kind: str) -> None:
-    result = calibrate(
-        ONE, [("a.csv", log_of(kind))], settings=settings("auto", rows=100, trial_rows=90)
-    )
+    few = settings("auto", rows=100, trial_rows=90, holds_back=True)
+    result = calibrate(ONE, [("a.csv", log_of(kind))], settings=few)
     assert result.structure.name == kind
     scores = {each.structure.name: each.score for each in result.candidates}
     assert len(scores) >= 5
@@ -286,7 +290,7 @@ def test_another_strain_law_is_chosen_where_it_predicts_better() -> None:
     )
     time, pressures = course(3, 60.0, 3, highest=1.4e5)
     log = made_log(other, time, pressures, noise=1e-4)
-    told = settings("static", strain_law="auto", rows=200)
+    told = settings("static", strain_law="auto", rows=200, holds_back=True)
     result = calibrate(ONE, [("a.csv", log)], settings=told)
     assert result.robot.segments[0].strain_law == "neo-hookean"
     kept = calibrate(ONE, [("a.csv", log)], settings=settings("static", rows=200))
@@ -341,7 +345,7 @@ def consecutive(kind: str, parts: int) -> list[tuple[str, Log]]:
 @pytest.mark.parametrize("sequence", [False, True])
 def test_logs_in_sequence_or_with_unknown_beginnings(sequence: bool) -> None:
     logs = consecutive("hysteresis", 3)
-    told = settings("hysteresis", sequence=sequence, rows=300)
+    told = settings("hysteresis", sequence=sequence, rows=200, holds_back=True)
     result = calibrate(ONE, logs, settings=told)
     sides = [e for e in result.estimates if "at the beginning of" in e.name]
     assert len(sides) == (0 if sequence else 6)
@@ -426,7 +430,8 @@ def test_tables_with_logs_tell_stiffness_and_softening(softening: float) -> None
     time, pressures = course(3, 40.0, 8)
     log = made_log(true, time, pressures, base=BASE)
     table = stiffness_table(true)
-    result = calibrate(ONE, [("a", log)], [table], settings=settings("static", rows=200))
+    told = settings("static", rows=200, holds_back=True)
+    result = calibrate(ONE, [("a", log)], [table], settings=told)
     arm = Manipulator(result.robot)
     pairs = zip(table.pressures, table.directions, strict=True)
     found = [float(arm.stiffness(p, d)) for p, d in pairs]
