@@ -13,7 +13,13 @@ from made_logs import course, made_log
 from recordings import ASU, UCL, recordings
 from stiffopt.errors import FileError
 from stiffopt.identify.calibration import calibrate
-from stiffopt.identify.detection import Comparer, Found, found_wrong, on_one_clock
+from stiffopt.identify.detection import (
+    Comparer,
+    Found,
+    found_wrong,
+    on_one_clock,
+    without_drift,
+)
 from stiffopt.identify.recording import Recording
 from stiffopt.identify.settings import CalibrationSettings
 from stiffopt.identify.setup import Setup, recordings_of
@@ -22,7 +28,7 @@ from stiffopt.identify.validation import validate
 from stiffopt.logs import Body, Log, read_log
 from stiffopt.model.calibration import Calibration
 from stiffopt.model.description import RobotDescription
-from stiffopt.model.history import History
+from stiffopt.model.history import Creep, History, Play
 from stiffopt.model.robot_files import load_description
 
 Array = NDArray[np.float64]
@@ -218,6 +224,68 @@ def test_an_arm_that_lags_has_one_clock() -> None:
         np.testing.assert_array_equal(read.pressures, log.commanded)
 
 
+# -- the beginning ---------------------------------------------------------------------------------
+
+
+def test_a_log_that_begins_with_a_step_begins_at_rest() -> None:
+    robot, log = load_description("stiff-flop-1"), log_of()
+    stepped = replace(log, commanded=np.vstack([[[9e4, 3e4, 0.0]], log.commanded[1:]]))
+    (read,) = recordings_of(robot, [stepped], AS_RECORDED)
+    np.testing.assert_array_equal(read.before, 0.0)
+    (read,) = recordings_of(robot, [replace(stepped, measured=stepped.commanded)], AS_RECORDED)
+    np.testing.assert_array_equal(read.before, stepped.commanded[0])
+
+
+def test_a_log_of_an_arm_under_pressure_begins_there() -> None:
+    log = log_of(duration=80.0)
+    begin = int(np.argmax(log.commanded.min(axis=1)))
+    late = Log(log.time[begin:], log.commanded[begin:], log.tip_position[begin:])
+    (read,) = recordings_of(load_description("stiff-flop-1"), [late], AS_RECORDED)
+    np.testing.assert_array_equal(read.before, late.commanded[0])
+
+
+# -- a drift ---------------------------------------------------------------------------------------
+
+
+@cache
+def laps() -> Log:
+    """A log of an arm with hysteresis and creep that repeats its course eleven times."""
+    pressures = course(3, 20.0, 1, rate=5.0)[1]
+    robot = arm()
+    history = History(
+        lag=0.2, play=(Play(width=2e4, share=0.3),), creep=(Creep(time=20.0, share=0.1),)
+    )
+    segments = [each.model_copy(update={"history": history}) for each in robot.segments]
+    robot = robot.model_copy(update={"segments": tuple(segments)})
+    repeated = np.tile(pressures, (11, 1))
+    return made_log(robot, np.arange(len(repeated)) / 5.0, repeated)
+
+
+def test_a_drift_is_removed() -> None:
+    log = laps()
+    drift = np.outer((log.time / log.time[-1]) ** 3, [4e-3, -5e-3, 1e-3])
+    off = replace(log, tip_position=log.tip_position + drift)
+    (read,) = recordings_of(load_description("stiff-flop-1"), [off], AS_RECORDED)
+    found = without_drift(read)
+    assert "the tip's positions drift by up to 5.2 mm" in found.remarks[-1]
+    left = (found.tracks[0].position - log.tip_position)[: len(log.time) * 15 // 16]
+    np.testing.assert_allclose(left - left.mean(axis=0), 0.0, atol=6e-4)
+
+
+def test_hysteresis_and_creep_are_no_drift() -> None:
+    robot = load_description("stiff-flop-1")
+    (read,) = recordings_of(robot, [laps()], AS_RECORDED)
+    assert without_drift(read) is read
+
+
+def test_only_a_log_that_returns_to_its_pressures_tells_a_drift() -> None:
+    log = log_of(duration=160.0)
+    drift = np.outer((log.time / log.time[-1]) ** 3, [4e-3, -5e-3, 1e-3])
+    off = replace(log, tip_position=log.tip_position + drift)
+    (read,) = recordings_of(load_description("stiff-flop-1"), [off], AS_RECORDED)
+    assert without_drift(read) is read
+
+
 # -- real arms -------------------------------------------------------------------------------------
 
 
@@ -231,10 +299,11 @@ def test_recordings_of_real_arms_are_left_as_they_are() -> None:
         (read,) = recordings_of(one, [log], AS_RECORDED)
         np.testing.assert_array_equal(read.pressures, np.nan_to_num(log.commanded))
         assert not of_recordings(one, [read])
+        assert (without_drift(read) is read) == (path.name != "run_2022-10-20-ol-p2p.csv")
     robot = load_description("asu-two-segment")
     read = recordings_of(robot, list(ASU), AS_RECORDED)
     span = np.subtract(robot.pressure_max, robot.pressure_min)
-    assert all(on_one_clock(each, span) is each for each in read)
+    assert all(without_drift(on_one_clock(each, span)) is each for each in read)
     assert not of_recordings(robot, read)
 
 

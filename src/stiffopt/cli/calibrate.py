@@ -98,8 +98,8 @@ Keep = Annotated[
     list[str] | None,
     typer.Option(
         metavar="WHAT",
-        help="units, clock, axes, channels or lines: leave these as recorded, even if they are "
-        "clearly wrong; may be repeated.",
+        help="units, clock, drift, axes, channels or lines: leave these as recorded, even if they "
+        "are clearly wrong; may be repeated.",
     ),
 ]
 Report = Annotated[

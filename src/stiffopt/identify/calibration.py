@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from stiffopt import lie
 from stiffopt.errors import InputError, PressureError, StoppedError
-from stiffopt.identify.detection import Comparer, Hypothesis, found_wrong
+from stiffopt.identify.detection import Comparer, Hypothesis, found_wrong, without_drift
 from stiffopt.identify.error_model import covariance_with, error_model, kept_unknowns
 from stiffopt.identify.fit import Fit, fit
 from stiffopt.identify.folds import held_back
@@ -160,6 +160,8 @@ def calibrate(
     try:
         with giving_up(timeout, cancel):
             recordings = recordings_of(description, logs, settings)
+            if "drift" not in settings.keep:
+                recordings = [without_drift(each) for each in recordings]
             setup = _put_right(Setup.of(description, recordings, read, settings), teller)
             if not recordings:  # tables alone: trust the robot file's poses
                 teller.begin("fitting the stiffness")

@@ -18,9 +18,11 @@ from numpy.typing import NDArray
 
 from stiffopt import lie
 from stiffopt.errors import PressureError
+from stiffopt.identify.discrepancy import smooth_functions
 from stiffopt.identify.recording import Recording, Track
-from stiffopt.identify.settings import DETECTION, Finding
+from stiffopt.identify.settings import DETECTION, PLAUSIBLE, Finding
 from stiffopt.identify.tracker_faults import CUBE_ROTATIONS, whole
+from stiffopt.model.calibration import distances_from
 from stiffopt.model.description import RobotDescription, Tolerances
 from stiffopt.model.manipulator import Manipulator
 
@@ -85,13 +87,112 @@ def lagged(time: Array, pressures: Array, lag: float) -> Array:
     return followed
 
 
-def _unexplained(pressures: Array, tip: Array) -> float:
-    """Return the RMS residual, in m, of positions (N, 3) regressed on quadratics of pressures."""
+def _quadratics(pressures: Array) -> Array:
+    """Return 1, the pressures (N, n) and their products, side by side."""
     n = pressures.shape[1]
     products = [pressures[:, i] * pressures[:, j] for i in range(n) for j in range(i, n)]
-    known = np.column_stack([np.ones(len(tip)), pressures, *products])
+    return np.column_stack([np.ones(len(pressures)), pressures, *products])
+
+
+def _unexplained(pressures: Array, tip: Array) -> float:
+    """Return the RMS residual, in m, of positions (N, 3) regressed on quadratics of pressures."""
+    known = _quadratics(pressures)
     solution = np.linalg.lstsq(known, tip, rcond=1e-8)[0]
     return float(np.sqrt(np.mean(np.sum((tip - known @ solution) ** 2, axis=1))))
+
+
+# -- the beginning ---------------------------------------------------------------------------------
+
+
+def begun(recording: Recording, span: Array) -> Recording:
+    """Return the recording as one that begins at rest, if its tip is still there in the first row.
+
+    A log without gauges may begin with a commanded step that the arm has yet to follow. The tip is
+    regressed on the lagged pressures and their products after the first seconds, and predicted at
+    rest and at the first pressures.
+
+    Parameters
+    ----------
+    recording : Recording
+    span : range (n,) of the pressures, in Pa.
+    """
+    tip, late = recording.tracks[0].position, recording.time > recording.time[0] + DETECTION.begins
+    rows = np.flatnonzero(whole(tip) & late)
+    at = _quadratics(np.vstack([np.zeros_like(span), recording.before]) / span)
+    steps = (np.abs(recording.before) > PLAUSIBLE.late * span).any()
+    if not steps or np.isnan(tip[0]).any() or len(rows) < 2 * at.shape[1]:
+        return recording
+    known = _quadratics(lagged(recording.time, recording.pressures / span, DETECTION.clock_lag))
+    solution = np.linalg.lstsq(known[rows], tip[rows], rcond=1e-8)[0]
+    error = float(np.median(np.linalg.norm(tip[rows] - known[rows] @ solution, axis=1)))
+    rest, first = np.linalg.norm(at @ solution - tip[0], axis=1)
+    if first < DETECTION.begins_apart * error or rest > DETECTION.begins_share * first:
+        return recording
+    return replace(recording, before=np.zeros_like(recording.before))
+
+
+# -- a drift ---------------------------------------------------------------------------------------
+
+
+def without_drift(recording: Recording) -> Recording:
+    """Return the recording without a drift of the tip's positions, if it clearly has one.
+
+    Where all parts of a log move through the same pressures, the tip is regressed on smooth
+    functions of the lagged pressures, with and without a displacement that is piecewise linear in
+    time. If that leaves a small enough share of the error, the displacement is removed. The part of
+    the log whose displacement is most like that of the others stays where it is.
+    """
+    seen = np.flatnonzero(whole(recording.tracks[0].position))
+    rows = seen[np.linspace(0, len(seen) - 1, min(len(seen), DETECTION.drift_rows)).astype(int)]
+    time, tip = recording.time[rows], recording.tracks[0].position[rows]
+    acting = lagged(recording.time, recording.pressures, DETECTION.clock_lag)[rows]
+    ends = np.linspace(time[0], time[-1], DETECTION.drift_parts + 1)
+    knots = (ends[1:] + ends[:-1]) / 2
+    part = np.searchsorted(ends[1:-1], time)
+    near = DETECTION.drift_near * np.ptp(acting, axis=0).max()
+    parts = [acting[part == k] for k in np.unique(part)]
+    spread = [float(np.linalg.norm(each.std(axis=0))) for each in (acting, *parts)]
+    visits = [distances_from((acting.shape[1],), acting, each) <= near for each in parts]
+    if min(spread) < DETECTION.drift_spread * spread[0] or (
+        np.median(np.mean(visits, axis=0)) < DETECTION.drift_visits
+    ):
+        return recording
+    smooth = np.column_stack([np.ones(len(rows)), smooth_functions(acting)])
+    hats = np.column_stack([np.interp(time, knots, hat) for hat in np.eye(len(knots))[1:]])
+    fixed, _ = _regressed(smooth, tip)
+    left, found = _regressed(np.column_stack([smooth, hats]), tip)
+    if left > DETECTION.drift_left * fixed:
+        return recording
+    drift = np.vstack([np.zeros(3), found[smooth.shape[1] :]])
+    apart = np.linalg.norm(drift[:, np.newaxis] - drift, axis=2)
+    drift -= drift[np.median(apart, axis=1).argmin()]
+    moved = np.column_stack([np.interp(recording.time, knots, each) for each in drift.T])
+    far = np.linalg.norm(drift, axis=1)
+    remark = (
+        f"the tip's positions drift by up to {far.max() * 1e3:.1f} mm at the same pressures, most "
+        f"at {knots[far.argmax()] - knots[0]:.0f} s, as if tracker or mount had moved: this is "
+        f"removed (a regression of the tip on pressures then misses it by {left / fixed * 100:.0f} "
+        "% of what it does otherwise); --keep drift leaves it"
+    )
+    tip_track, *others = recording.tracks
+    return replace(
+        recording,
+        tracks=(replace(tip_track, position=tip_track.position - moved), *others),
+        remarks=(*recording.remarks, remark),
+    )
+
+
+def _regressed(known: Array, tip: Array) -> tuple[float, Array]:
+    """Return the median residual, in m, and the coefficients of a robust ridge regression."""
+    weight, solution, middle = np.ones(len(tip)), np.zeros((known.shape[1], 3)), 0.0
+    for _ in range(DETECTION.drift_rounds):
+        weighted = known * weight[:, np.newaxis]
+        normal = weighted.T @ known + DETECTION.drift_ridge * np.eye(known.shape[1])
+        solution = np.asarray(np.linalg.solve(normal, weighted.T @ tip))
+        distance = np.linalg.norm(tip - known @ solution, axis=1)
+        middle = float(np.median(distance))
+        weight = 1 / np.sqrt(1 + (distance / max(middle, 1e-9)) ** 2)
+    return middle, solution
 
 
 # -- axes, channels and lines ----------------------------------------------------------------------

@@ -11,7 +11,7 @@ from pydantic import Field
 from stiffopt.schema import Items, Schema
 from stiffopt.units import Duration
 
-Finding = Literal["units", "clock", "axes", "channels", "lines"]
+Finding = Literal["units", "clock", "drift", "axes", "channels", "lines"]
 """Errors of recordings that are corrected automatically (`stiffopt.identify.detection`)."""
 
 
@@ -334,6 +334,16 @@ class DetectionSettings:
     clock_most, clock_share : largest time shift that is tried, in s and as a share of the log.
     clock_shifts : number of shifts that are tried.
     clock_overwhelming : as `overwhelming`, for the regression.
+    begins : time in s at the beginning of a log that does not tell where its tip is at rest.
+    begins_share, begins_apart : a log begins at rest if the first tip's distance from there is at
+        most this share of that from where the first pressures hold it, and the latter at least this
+        multiple of the median error.
+    drift_rows, drift_parts : number of rows in the regression for a drift, and of parts of the log.
+    drift_spread : smallest spread of the pressures in each part, over that of all.
+    drift_near, drift_visits : a part visits the pressures of a row if it comes this near to them,
+        as a share of their range; and share of the parts that must do so.
+    drift_left : largest share of the median error that an accepted drift leaves.
+    drift_ridge, drift_rounds : of the robust regression.
     unit : largest factor between the arm's observed and expected motion with the right unit.
     """
 
@@ -354,6 +364,17 @@ class DetectionSettings:
     clock_share: float = 0.2
     clock_shifts: int = 61
     clock_overwhelming: float = 0.3
+    begins: float = 2.0
+    begins_share: float = 0.3
+    begins_apart: float = 3.0
+    drift_rows: int = 1200
+    drift_parts: int = 8
+    drift_near: float = 0.1
+    drift_visits: float = 0.75
+    drift_spread: float = 0.5
+    drift_left: float = 0.7
+    drift_ridge: float = 0.01
+    drift_rounds: int = 8
     unit: float = 2.3
 
 
@@ -384,9 +405,9 @@ class CalibrationSettings(Schema):
     pressures : which of the recorded pressures drive the model.
     fixed : keys of parameters that are not fitted.
     keep : what to leave as recorded: the ``units`` of pressures, the ``clock`` of pressures and
-        tracker, the ``axes`` of a log's frame, the order of the ``channels``, dead or shared
-        ``lines``. Errors in the others are corrected, with a remark, if the evidence is
-        overwhelming.
+        tracker, a ``drift`` of a log's positions, the ``axes`` of a log's frame, the order of the
+        ``channels``, dead or shared ``lines``. Errors in the others are corrected, with a remark,
+        if the evidence is overwhelming.
     settle : time in s at the beginning of a log from which its initial state (unless at rest) and
         its zero are estimated if the log is only predicted.
     rows : number of fitted rows of all logs together, spread evenly.

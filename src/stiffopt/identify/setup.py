@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt.errors import InputError
-from stiffopt.identify.detection import on_one_clock
+from stiffopt.identify.detection import begun, on_one_clock
 from stiffopt.identify.problem import Begin, CalibrationProblem, Noise, Sample, TrackedPoint
 from stiffopt.identify.recording import Recording, Track, prepare
 from stiffopt.identify.settings import SAMPLING, START, CalibrationSettings
@@ -104,7 +104,7 @@ def recordings_of(
     settings: CalibrationSettings,
 ) -> list[Recording]:
     """Read logs as recordings of this robot, as its file and the settings specify."""
-    given = description.recordings or Recordings()
+    given, read = description.recordings or Recordings(), _named(logs)
     found = [
         prepare(
             log,
@@ -116,12 +116,15 @@ def recordings_of(
             pressures=settings.pressures,
             keep_units="units" in settings.keep,
         )
-        for name, log in _named(logs)
+        for name, log in read
     ]
-    if "clock" in settings.keep:
-        return found
     span = np.subtract(description.pressure_max, description.pressure_min)
-    return [on_one_clock(recording, span) for recording in found]
+    if "clock" not in settings.keep:
+        found = [on_one_clock(recording, span) for recording in found]
+    return [
+        begun(recording, span) if log.measured is None else recording
+        for recording, (_, log) in zip(found, read, strict=True)
+    ]
 
 
 @dataclass(frozen=True, eq=False)
