@@ -32,8 +32,9 @@ from stiffopt.optimise.tip import TipAt
 Array = NDArray[np.float64]
 
 _TIME, _SEEN, _PREDICTED, _INTENDED = 0, slice(1, 4), slice(4, 7), slice(7, 10)  # columns of a row
-_OFFSET, _TURN, _DRIVEN, _FREE, _WAY = slice(10, 13), slice(13, 16), 16, 17, 18
-_PRESSURES = slice(19, None)
+_OFFSET, _TURN, _DRIVEN, _FREE, _PRESSURES = (
+    slice(10, 13), slice(13, 16), 16, 17, slice(18, None),
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -147,7 +148,7 @@ class MotionWatch:
             self._rows[: self._kept] = self._rows[-self._kept :]
             self._count = self._kept
         self._rows[self._count] = (
-            *(time, *seen, *predicted, *intended, *offset, *swings, self._path), *pressures,
+            *(time, *seen, *predicted, *intended, *offset, *swings), *pressures,
         )  # fmt: skip
         self._count += 1
         if self._count > 1:
@@ -171,19 +172,15 @@ class MotionWatch:
                 return position if time - moment < self._tuning.longest_pause else None
         return None
 
-    def _path_before(self, duration: float) -> float:
-        """Return the length of the way of r until so many seconds ago, in m."""
-        return float(self._since(duration)[0, _WAY])
-
     def _since(self, duration: float) -> Array:
-        """Return the samples (k, 19 + n) of the last so many seconds."""
+        """Return the samples (k, 18 + n) of the last so many seconds."""
         rows = self._rows[: self._count]
         return rows[np.searchsorted(rows[:, _TIME], rows[-1, _TIME] - duration) :]
 
     def _explained(self, changes: Array, jacobian: Array) -> Array:
         """Return the model errors (k,) to expect over changes between samples, in m.
 
-        `changes` (k, 19 + n) are differences of samples; the Jacobian (3, n) is of the tip's
+        `changes` (k, 18 + n) are differences of samples; the Jacobian (3, n) is of the tip's
         position, base axes.
         """
         moved = np.zeros(len(changes))
@@ -230,10 +227,7 @@ class MotionWatch:
         aside = np.sqrt(np.maximum((seen**2).sum(axis=1) - along**2, 0.0))
         wrong = (along < tuning.least_response * distance) | (aside > tuning.most_across * distance)
         meant = (ways[:, _INTENDED] @ P * way).sum(axis=1) > distance**2 / 2
-        away = float(np.linalg.norm(rows[-1, _SEEN] - rows[-1, _INTENDED]))
-        steered = self._path - self._path_before(tuning.steered) > self._min_motion
-        led = meant | (steered and away > self._min_motion)
-        suspects = np.flatnonzero(led & wrong & (distance > self._min_motion))
+        suspects = np.flatnonzero(meant & wrong & (distance > self._min_motion))
         if not len(suspects):
             return None
         off = np.sqrt(((seen - way)[suspects] ** 2).sum(axis=1))
@@ -243,9 +237,9 @@ class MotionWatch:
         driven = rows[suspects, _DRIVEN] + rows[-1, _DRIVEN]
         swing = tuning.swing_error * driven + rows[suspects, _FREE]
         # summed along the way, on which segments may have moved the tip in opposite directions
-        own = np.cumsum(self._explained(steps, P @ jacobian)[::-1])[::-1][suspects]
+        own = np.cumsum(self._explained(steps, jacobian)[::-1])[::-1][suspects]
         moved = np.sqrt((seen[suspects] ** 2).sum(axis=1))
-        lies = meant[suspects] & (moved < tuning.still * distance[suspects])
+        lies = moved < tuning.still * distance[suspects]
         own[lies] = 0.0  # a wrong model would move it somewhere
         explained = own + late + swing + tuning.noise + 6 * tuning.scatter
         missed = suspects[off > explained]

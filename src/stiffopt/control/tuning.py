@@ -266,9 +266,6 @@ class MotionTuning:
     late: float = 0.01  # by which the tip may move later than the model's, in s
     # share of the amplitude of the vibration that the pressures excite, whose phase may be wrong
     swing_error: float = 0.35
-    # time in which r must have moved as far as the shortest way, in s, where s moves another way
-    # than r, as feedback moves it
-    steered: float = 1.0
     misses: int = 2  # successive samples that show no response
     slip_window: float = 1.0  # in which a slip is looked for, in s
     # share of the turn that a push would cause by which the measured turn must miss it
