@@ -102,14 +102,14 @@ class ContactEquilibrium:
         q = [np.interp(wanted, shape.mesh.at[up], row[up]) for row in shape.nodes.quaternion.T]
         found = np.zeros((len(wanted), 4, 4))
         found[:, :3, :3] = rotations(np.stack(q, axis=1))
-        found[:, :3, 3] = self._arm.problem.body(self._arm, wanted)[0]
+        found[:, :3, 3] = shape.body(wanted)[0]
         found[:, 3, 3] = 1
         return found
 
     def backbone(self, n: int = 50) -> Vector:
         """Return points (n, 3) of the centre line, equally spaced at rest from base to tip."""
         wanted = np.linspace(0.0, self._arm.problem.rod.arm.length, n)
-        return self._arm.problem.body(self._arm, wanted)[0]
+        return self._arm.shape.body(wanted)[0]
 
     @property
     def stable(self) -> bool:
@@ -128,10 +128,10 @@ class ContactEquilibrium:
 
     def line(self, at: Vector) -> tuple[Vector, Vector, Vector]:
         """Return centre line (k, 3), unit tangents (k, 3) and radii (k,) at arc lengths (k,)."""
-        body, length = self._arm.problem.body, self._arm.problem.rod.arm.length
-        points, radii = body(self._arm, at)
+        body, length = self._arm.shape.body, self._arm.problem.rod.arm.length
+        points, radii = body(at)
         ends = [np.clip(at + step, 0.0, length) for step in (-_BESIDE, _BESIDE)]
-        ways = body(self._arm, ends[1])[0] - body(self._arm, ends[0])[0]
+        ways = body(ends[1])[0] - body(ends[0])[0]
         return points, ways / np.linalg.norm(ways, axis=1, keepdims=True), radii
 
     # -- compliance -------------------------------------------------------------------------
@@ -323,20 +323,13 @@ def contact_equilibrium(
     if nearby is not None:
         found = problem.follow(nearby._arm, end)
         return _arrived(*found, "the way from the nearby equilibrium")
-    hanging = end._replace(
-        pressures=np.zeros_like(pressures), dead=np.zeros(6), follower=np.zeros(6)
-    )
     if approach == "pressures":
-        rest, share = problem.follow(problem.straight(end), hanging)
-        _arrived(rest, share, "its own weight and payload")
-        return _arrived(*problem.follow(rest, end), "its pressures and load")
-    alone, nothing = ContactProblem(problem.rod, ()), np.zeros(0)
-    free = alone.straight(end._replace(retreat=nothing))
-    for target in (hanging, end):
-        free, share = alone.follow(free, target._replace(retreat=nothing))
-        _arrived(free, share, "its weight, pressures and load, free of objects")
-    found = problem.follow(problem.clear(free), end)
-    return _arrived(*found, "the objects' way to it")
+        rest = _arrived(*problem.hanging, "its own weight and payload")
+        return _arrived(*problem.follow(rest._arm, end), "its pressures and load")
+    alone, what = problem.alone, "its weight, pressures and load, free of objects"
+    rest = _arrived(*alone.hanging, what)
+    free = _arrived(*alone.follow(rest._arm, end._replace(retreat=np.zeros(0))), what)
+    return _arrived(*problem.follow(problem.clear(free._arm), end), "the objects' way to it")
 
 
 def _arrived(arm: LeaningArm, share: float, what: str) -> ContactEquilibrium:

@@ -56,7 +56,8 @@ _ARRAYS = (
     *("segment", "rigid", "per_station", "longest", "strain", "compliance", "radius", "weight"),
     *("centroid", "retreat"),
 )
-_RESULTS = ("at", "q", "m", "J", "near", "far", "position", "force_far", "moment_far")
+_RESULTS = {"at": 1, "q": 4, "m": 3, "position": 3, "force_far": 3, "moment_far": 3}
+_RESULTS_OF_STEPS = {"J": 90, "near": 3, "far": 3}
 
 
 class _Problem(ctypes.Structure):
@@ -72,8 +73,20 @@ class _Problem(ctypes.Structure):
         ("tip_load", _double * 3),
         ("surfaces", _pointer),
         ("touches", _pointer),
-        *((name, _pointer) for name in _RESULTS),
+        *((name, _pointer) for name in (*_RESULTS, *_RESULTS_OF_STEPS)),
     ]
+
+
+_FUNCTIONS = {
+    "stiffopt_contact_correct": (_integer, [_pointer]),
+    "stiffopt_contact_is_stable": (_integer, [_pointer] * 3),
+    "stiffopt_contact_body": (None, [_pointer, _integer, *[_pointer] * 3]),
+    "stiffopt_contact_between": (
+        None,
+        [_pointer, _pointer, _integer, _pointer, _integer, _pointer, _pointer],
+    ),
+    "stiffopt_contact_distances": (None, [_pointer, _integer, *[_pointer] * 2]),
+}
 
 
 class NativeContacts:
@@ -91,11 +104,10 @@ class NativeContacts:
         for which, kind in enumerate((_Surface, _Touch, _Problem)):
             if size(which) != ctypes.sizeof(kind):
                 raise RuntimeError("native/contact.c and this file disagree on their interface")
-        self._correct = code.cdll.stiffopt_contact_correct
-        self._correct.argtypes, self._correct.restype = [_pointer], _integer
-        self._is_stable = code.cdll.stiffopt_contact_is_stable
-        self._is_stable.argtypes = [_pointer, _pointer, _pointer]
-        self._is_stable.restype = _integer
+        self._cdll = code.cdll
+        for name, (result, arguments) in _FUNCTIONS.items():
+            function = getattr(code.cdll, name)
+            function.argtypes, function.restype = arguments, result
         self._keep = [*(each.pieces for each in surfaces)]
         self._surfaces = (_Surface * max(1, len(surfaces)))()
         for own, each in zip(self._surfaces, surfaces, strict=False):
@@ -106,27 +118,16 @@ class NativeContacts:
 
     def correct(
         self, state: Contacts, sections: RodSections
-    ) -> tuple[int, Contacts, RodShape, list[ContactRow], bool]:
-        """Return the outcome, the new state, its shape, its contacts, and whether it is stable.
-
-        Stability is valid only for loads that have a potential.
-        """
+    ) -> tuple[int, Contacts, NativeShape, list[ContactRow]]:
+        """Return the outcome, the new state, its shape, and its contacts."""
         rod, mesh, condition = self._rod, state.mesh, state.condition
         count = len(mesh.segment)
-        longest = np.where(mesh.rigid, np.inf, rod.longest[mesh.segment])
-        inputs: dict[str, Any] = {
-            "segment": mesh.segment, "rigid": mesh.rigid.astype(np.int64),
-            "per_station": np.ascontiguousarray(mesh.per_station), "longest": longest,
-            "strain": np.ascontiguousarray(sections.strain), "compliance": sections.compliance,
-            "radius": sections.radius, "weight": sections.weight, "centroid": rod.centroid,
-            "retreat": condition.retreat,
-        }  # fmt: skip
-        found: dict[str, Vector] = {
-            "at": mesh.at.copy(), "q": state.nodes.quaternion.copy(),
-            "m": state.nodes.moment.copy(), "J": np.empty((count, 10, 9)),
-            "near": np.empty((count, 3)), "far": np.empty((count, 3)),
-            **{name: np.empty((count + 1, 3)) for name in _RESULTS[6:]},
-        }  # fmt: skip
+        inputs = (
+            mesh.segment, mesh.rigid, mesh.per_station, rod.longest, sections.strain,
+            sections.compliance, sections.radius, sections.weight, rod.centroid, condition.retreat,
+        )  # fmt: skip
+        memory = np.empty((count + 1) * 17 + count * 96)
+        results, place, address = {}, 0, memory.ctypes.data
         touches = (_Touch * max(1, len(state.touches)))()
         for own, touch, node in zip(touches, state.touches, mesh.node.tolist(), strict=False):
             here = rod.ranges[touch.range]
@@ -139,16 +140,19 @@ class NativeContacts:
         problem = _Problem(
             steps=count, contacts=len(state.touches), length=rod.arm.length,
             surfaces=ctypes.addressof(self._surfaces), touches=ctypes.addressof(touches),
-            **{name: array.ctypes.data for name, array in {**inputs, **found}.items()},
         )  # fmt: skip
+        for name, array in zip(_ARRAYS, inputs, strict=True):
+            setattr(problem, name, array.ctypes.data)
+        for length, sizes in ((count + 1, _RESULTS), (count, _RESULTS_OF_STEPS)):
+            for name, size in sizes.items():
+                setattr(problem, name, address + 8 * place)
+                results[name] = memory[place : place + length * size].reshape(length, size)
+                place += length * size
+        at = results["at"][:, 0]
+        at[:], results["q"][:], results["m"][:] = mesh.at, *state.nodes
         problem.dead[:], problem.follower[:] = condition.dead.tolist(), condition.follower.tolist()
         problem.tip_load[:] = (rod.arm.description.tip_mass * condition.gravity).tolist()
-        outcome = self._correct(ctypes.addressof(problem))
-        stable = False
-        if outcome == CONVERGED:
-            memory = np.empty((6 * count + 6) ** 2 + 72 * count)
-            starts = memory.ctypes.data + 8 * (6 * count + 6) ** 2
-            stable = bool(self._is_stable(ctypes.addressof(problem), memory.ctypes.data, starts))
+        outcome = self._cdll.stiffopt_contact_correct(ctypes.addressof(problem))
         moved = [
             replace(old, force=np.array(new.force), normal_force=new.normal_force,
                     station=new.station)
@@ -163,11 +167,59 @@ class NativeContacts:
             )
             for new in touches[: len(moved)]
         ]  # fmt: skip
-        nodes = RodNodes(found["q"], found["m"])
-        mesh = mesh._replace(at=found["at"])
-        shape = RodShape()
-        shape.mesh, shape.nodes, shape.sections = mesh, nodes, sections
-        shape.h, shape.J = mesh.at[:-1] - mesh.at[1:], found["J"].swapaxes(1, 2)
+        shape = NativeShape(self._cdll, problem, (*inputs, touches, self._surfaces))
+        shape.mesh, shape.sections = mesh._replace(at=at), sections
+        shape.nodes = RodNodes(results["q"], results["m"])
+        shape.h = at[:-1] - at[1:]
+        shape.J = results["J"].reshape(count, 10, 9).swapaxes(1, 2)
         for name in ("near", "far", "position", "force_far", "moment_far"):
-            setattr(shape, name, found[name])
-        return outcome, Contacts(condition, mesh, nodes, tuple(moved)), shape, rows, stable
+            setattr(shape, name, results[name])
+        return outcome, Contacts(condition, shape.mesh, shape.nodes, tuple(moved)), shape, rows
+
+    def distances(self, surface: int, points: Vector) -> Vector:
+        """Return the distances (k,) of points (k, 3) from a surface, in m."""
+        points, found = np.ascontiguousarray(points), np.empty(len(points))
+        address = ctypes.addressof(self._surfaces[surface])
+        self._cdll.stiffopt_contact_distances(
+            address, len(points), points.ctypes.data, found.ctypes.data
+        )
+        return found
+
+
+class NativeShape(RodShape):
+    """A shape whose numbers are in the memory of a problem of contact.c."""
+
+    is_native = True
+
+    def __init__(self, cdll: Any, problem: _Problem, keep: tuple[Any, ...]) -> None:
+        self._cdll, self._problem, self._keep = cdll, problem, keep
+
+    def body(self, at: Vector) -> tuple[Vector, Vector]:
+        """See `RodShape.body`."""
+        at, points, radii = np.ascontiguousarray(at), np.empty((len(at), 3)), np.empty(len(at))
+        self._cdll.stiffopt_contact_body(
+            ctypes.addressof(self._problem), len(at), *(x.ctypes.data for x in (at, points, radii))
+        )
+        return points, radii
+
+    def between(self, other: RodShape, shares: Vector, at: Vector) -> Vector:
+        """See `RodShape.between`; turns and ways from node to node change evenly."""
+        if not isinstance(other, NativeShape):
+            return super().between(other, shares, at)
+        found = np.empty((len(shares), len(at), 3))
+        self._cdll.stiffopt_contact_between(
+            ctypes.addressof(self._problem), ctypes.addressof(other._problem),
+            len(shares), shares.ctypes.data, len(at), at.ctypes.data, found.ctypes.data,
+        )  # fmt: skip
+        return found
+
+    def is_stable(self) -> bool:
+        """See `RodShape.is_stable`."""
+        count = len(self.h)
+        memory = np.empty((6 * count + 6) ** 2 + 72 * count)
+        starts = memory.ctypes.data + 8 * (6 * count + 6) ** 2
+        return bool(
+            self._cdll.stiffopt_contact_is_stable(
+                ctypes.addressof(self._problem), memory.ctypes.data, starts
+            )
+        )

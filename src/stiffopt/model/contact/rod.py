@@ -179,13 +179,13 @@ class Rod:
         """Return the nodes of the unloaded arm."""
         strain = self.sections(condition).strain[mesh.segment, 3:]
         turns = np.where(mesh.rigid[:, None], 0.0, strain * (mesh.at[:-1] - mesh.at[1:])[:, None])
-        q = np.empty((len(mesh.at), 4))
-        q[-1] = 1, 0, 0, 0
-        for i in range(len(turns) - 1, -1, -1):
-            angle = float(np.linalg.norm(turns[i]))
-            axis = turns[i] * (np.sinc(angle / (2 * np.pi)) / 2)
-            q[i] = lie.quaternion_product(q[i + 1], np.array([np.cos(angle / 2), *axis]))
-        return RodNodes(q, np.zeros((len(mesh.at), 3)))
+        angles = np.linalg.norm(turns, axis=1)
+        shares = np.sinc(angles / (2 * np.pi)) / 2
+        steps = np.concatenate([np.cos(angles / 2)[:, None], shares[:, None] * turns], axis=1)
+        q = [[1.0, 0.0, 0.0, 0.0]]
+        for step in reversed(steps.tolist()):
+            q.append(lie.quaternion_product(q[-1], step).tolist())
+        return RodNodes(np.array(q[::-1]), np.zeros((len(mesh.at), 3)))
 
     def moved(self, mesh: RodMesh, slides: Vector) -> RodMesh | None:
         """Return the mesh after contacts (k,) have moved along the arm; None if it no longer fits.
@@ -232,14 +232,12 @@ class Rod:
 
 def interpolated(nodes: RodNodes, old: RodMesh, new: RodMesh) -> RodNodes:
     """Interpolate nodes from one mesh to another, as a start of Newton's method."""
-    order = slice(None, None, -1)
-    at = old.at[order]
-
-    def column(values: Vector) -> Vector:
-        return np.stack([np.interp(new.at, at, row[order]) for row in values.T], axis=1)
-
-    q = column(nodes.quaternion)
-    return RodNodes(q / np.linalg.norm(q, axis=1, keepdims=True), column(nodes.moment))
+    values = np.concatenate([nodes.quaternion, nodes.moment], axis=1)
+    i = np.clip(np.searchsorted(-old.at, -new.at, side="right") - 1, 0, len(old.at) - 2)
+    x = ((old.at[i] - new.at) / np.maximum(old.at[i] - old.at[i + 1], 1e-12))[:, None]
+    found = (1 - x) * values[i] + x * values[i + 1]
+    q = found[:, :4]
+    return RodNodes(q / np.sqrt((q * q).sum(axis=1, keepdims=True)), found[:, 4:].copy())
 
 
 class PointLoads(NamedTuple):
@@ -259,8 +257,10 @@ class RodShape:
     near, far : tangents (N, 3) of the centre line at starts and ends of the steps.
     force_far, moment_far : at the nodes, (N + 1, 3), on their distal sides.
     J : changes (N, 9, 10) of the steps' ends, see `stiffopt.model.contact.steps`.
+    is_native : whether it was computed by machine code.
     """
 
+    is_native = False
     mesh: RodMesh
     nodes: RodNodes
     sections: RodSections
@@ -276,6 +276,33 @@ class RodShape:
     def rotation(self) -> Vector:
         """Axes (N + 1, 3, 3) of the nodes."""
         return rotations(self.nodes.quaternion)
+
+    def is_stable(self) -> bool | None:
+        """Return whether it is stable under dead forces, where machine code can tell."""
+        return None
+
+    def body(self, at: Vector) -> tuple[Vector, Vector]:
+        """Return points (k, 3) of the centre line at arc lengths (k,), and radii (k,) there."""
+        marks = self.mesh.at
+        i = np.clip(np.searchsorted(-marks, -at, side="right") - 1, 0, len(marks) - 2)
+        h = self.h[i, None]
+        x = (marks[i] - at)[:, None] / h
+        start, first = self.position[i], -h * self.near[i]
+        end, last = self.position[i + 1], -h * self.far[i]
+        way = end - start
+        points = start + x * (
+            first + x * (3 * way - 2 * first - last + x * (first + last - 2 * way))
+        )
+        return points, self.sections.radius[self.mesh.segment[i]]
+
+    def between(self, other: "RodShape", shares: Vector, at: Vector) -> Vector:
+        """Return points (m, k, 3) of bodies at shares (m,) of the way to another shape.
+
+        Both have the same mesh.  Without machine code, points move on straight lines.
+        """
+        first, last = self.body(at)[0], other.body(at)[0]
+        found: Vector = first + shares[:, None, None] * (last - first)
+        return found
 
 
 class LinearRod(RodShape):

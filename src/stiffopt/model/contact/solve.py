@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +26,8 @@ from stiffopt.model.contact.system import Contacts, ContactSystem, LeaningArm, T
 
 Vector = NDArray[np.float64]
 
-_LARGEST_TURN = 0.5  # rad, largest turn of a part of the arm in one correction
+_LARGEST_TURN = 0.5  # rad, largest turn of a part of the arm in one correction; the rest is cut
+_FARTHEST_TURN = 1.5  # rad; if more were wanted, the equilibrium is not near
 _LARGEST_SLIDE = 0.02  # m, largest motion of a contact along the arm in one correction
 _TURN_LEFT, _SLIDE_LEFT = 1e-6, 1e-7  # rad and m; quadratic convergence: the error is 1e-12
 _MAX_ITERATIONS = 14
@@ -37,6 +40,8 @@ _PENETRATION = 2e-6  # m, allowed penetration
 _SPACING = 4e-3  # m along the arm between stations at which gaps are evaluated
 _FINE_STATIONS = 17  # stations about a local minimum of a gap
 _SEEN_FROM = 2e-4  # m; a larger gap at a coarse minimum excludes a contact
+_SCANNED = 0.5  # motion of a free arm between two looks at the gaps, over the body's radius
+_MOST_LOOKS, _CLOSER_LOOKS = 24, 8  # along the motion, and where it first enters a surface
 _SWEPT = 1.0  # motion of a station in a step that is always allowed, over the body's radius
 _AS_NEAR = 1e-5  # m, allowed penetration next to a contact
 _BESIDE = 1e-3  # m along the arm, least neighbourhood of a contact
@@ -73,10 +78,12 @@ class ContactProblem:
             except np.linalg.LinAlgError:
                 return None
             changes, _ = system.along(solution)
-            turns = changes[:, TURN, 0]
-            size = float(np.sqrt((turns**2).sum(axis=1).max()))
-            if not size <= _LARGEST_TURN or (iteration > 3 and size > previous):  # NaN too
+            size = float(np.sqrt((changes[:, TURN, 0] ** 2).sum(axis=1).max()))
+            if not size <= _FARTHEST_TURN or (iteration > 3 and size > previous):  # NaN too
                 return None
+            share = min(1.0, _LARGEST_TURN / max(size, _TURN_LEFT))
+            changes, solution = share * changes, share * solution
+            turns = changes[:, TURN, 0]
             q = turned(state.nodes.quaternion, turns)
             nodes = RodNodes(q, state.nodes.moment + changes[:, MOMENT, 0])
             touches, slide = self._moved(state, system, solution[:, 0])
@@ -102,18 +109,19 @@ class ContactProblem:
         """Newton's method in C, if there is machine code and every surface has a formula."""
         if self._in_c is None and not any(each.is_interpolated for each in self.surfaces):
             code = self.rod.step.code
-            self._in_c = None if code is None else NativeContacts(code, self.rod, self.surfaces)
+            if code is not None:
+                self._in_c = NativeContacts(code, self.rod, self.surfaces)
+                for name in ("straight", "hanging", "alone"):
+                    vars(self).pop(name, None)
         return self._in_c
 
     def _correct_in_c(
         self, native: NativeContacts, state: Contacts, sections: RodSections
     ) -> LeaningArm | None:
         for _ in range(_MAX_MESHES):
-            outcome, moved, shape, rows, stable = native.correct(state, sections)
+            outcome, moved, shape, rows = native.correct(state, sections)
             if outcome == CONVERGED:
-                found = LeaningArm(self, moved, shape, rows)
-                found.minimum = stable if state.condition.is_conservative else None
-                return found
+                return LeaningArm(self, moved, shape, rows)
             if outcome == LOST:
                 return None
             touches = tuple(each if each.pinned else self._within(each) for each in moved.touches)
@@ -227,7 +235,6 @@ class ContactProblem:
     def missed(self, arm: LeaningArm) -> list[Touch] | None:
         """Return open contacts that should be closed; None if a surface is entered too deeply."""
         found = []
-        arm.gaps = self.gaps(arm, self.stations) + arm.state.condition.retreat[:, None]
         for index, gaps in enumerate(arm.gaps):
             if gaps.min() > _SEEN_FROM:
                 continue
@@ -237,7 +244,8 @@ class ContactProblem:
                     continue
                 ends = self.stations[[i - 1, min(i + 1, len(gaps) - 1)]]
                 around = np.linspace(ends[0], ends[1], _FINE_STATIONS)
-                closely = self.gaps(arm, around, index)[0] + arm.state.condition.retreat[index]
+                retreat = arm.state.condition.retreat[index]
+                closely = self._gaps_of(index, *arm.shape.body(around), around) + retreat
                 s, gap = float(around[closely.argmin()]), float(closely.min())
                 if gap > -_PENETRATION or any(self._is_of(arm, j, s, gap) for j in own):
                     continue
@@ -266,30 +274,18 @@ class ContactProblem:
         none = np.zeros(3)
         return Touch(surface, index, length if pinned else inside, pinned, none, 0.0, none)
 
-    def gaps(self, arm: LeaningArm, at: Vector, only: int | None = None) -> Vector:
-        """Return gaps (surfaces, k) of all surfaces or of one at arc lengths (k,), in m."""
-        points, radii = self.body(arm, at)
-        code = None if self._native is None else self._native.code
-        found = []
-        for surface in self.surfaces if only is None else self.surfaces[only : only + 1]:
-            own = surface.distances(points, code) - radii
-            own[at < surface.begin] = np.inf
-            found.append(own)
-        return np.array(found).reshape(len(found), len(at))
+    def gaps(self, points: Vector, radii: Vector) -> Vector:
+        """Return gaps (surfaces, k) to a body with points (k, 3) at the stations."""
+        found = [self._gaps_of(j, points, radii, self.stations) for j in range(len(self.surfaces))]
+        return np.array(found).reshape(len(found), len(points))
 
-    def body(self, system: LeaningArm, at: Vector) -> tuple[Vector, Vector]:
-        """Return points (k, 3) of the centre line at arc lengths (k,), and radii (k,) there."""
-        shape, marks = system.shape, system.shape.mesh.at
-        i = np.clip(np.searchsorted(-marks, -at, side="right") - 1, 0, len(marks) - 2)
-        h = shape.h[i, None]
-        x = (marks[i] - at)[:, None] / h
-        start, first = shape.position[i], -h * shape.near[i]
-        end, last = shape.position[i + 1], -h * shape.far[i]
-        way = end - start
-        points = start + x * (
-            first + x * (3 * way - 2 * first - last + x * (first + last - 2 * way))
-        )
-        return points, shape.sections.radius[shape.mesh.segment[i]]
+    def _gaps_of(self, index: int, points: Vector, radii: Vector, at: Vector) -> Vector:
+        """Return gaps (..., k) of a surface to bodies with points (..., k, 3)."""
+        surface, native, rows = self.surfaces[index], self._native, points.reshape(-1, 3)
+        values = surface.distances(rows) if native is None else native.distances(index, rows)
+        found: Vector = values.reshape(points.shape[:-1]) - radii
+        found[..., at < surface.begin] = np.inf
+        return found
 
     # -- continuation -----------------------------------------------------------------------
 
@@ -298,40 +294,101 @@ class ContactProblem:
         arm, share, step, halved = start, 0.0, 1.0, False
         while share < 1.0:
             target = min(1.0, share + step)
-            condition = start.state.condition.towards(end, target)
+            guess = self._guess(arm.state, start.state.condition.towards(end, target))
             self._deepest = None
-            found = self.settle(self._guess(arm.state, condition))
-            if found is None or self._leaves(arm, found):
-                step = (target - share) * (0.5 if found else self._share_to_touch(arm))
+            way, found = self._lean(arm, guess) if arm.state.touches else self._move(arm, guess)
+            if found is None or not found.is_stable:
+                step = way * (target - share) * self._share_to_touch(arm)
                 halved = True
                 if step < _SHORTEST_STEP:
                     break
                 continue
-            arm, share = found, target
+            arm, share = found, target if way == 1.0 else share + way * (target - share)
             step, halved = (step if halved else 2 * step), False
         return arm, share
 
+    def _lean(self, before: LeaningArm, guess: Contacts) -> tuple[float, LeaningArm | None]:
+        """Return 1 and the next equilibrium of an arm with contacts, if it is near."""
+        found = self.settle(guess)
+        touched = [touch.surface for touch in before.state.touches]
+        if found and self._may_have_passed(before.body[0], before.gaps, touched, found):
+            return 1.0, None
+        return 1.0, found
+
+    def _move(self, before: LeaningArm, guess: Contacts) -> tuple[float, LeaningArm | None]:
+        """Return how far an arm without contacts comes, and the equilibrium there if it is near.
+
+        The arm moves freely until it would enter a surface too deeply for a step.  It goes back to
+        where it has just entered it, and leans on it there.
+        """
+        after = self.correct(guess)
+        if after is None or not self.surfaces:
+            return 1.0, after
+        way, points, gaps = self._until_entered(before, after)
+        touched = np.flatnonzero(gaps.min(axis=1) < -_PENETRATION).tolist()
+        touches: list[Touch] | None
+        if way == 1.0:
+            state, touches = after.state, self.missed(after)
+        else:
+            pairs = zip(before.state.nodes, after.state.nodes, strict=True)
+            nodes = RodNodes(*((1 - way) * a + way * b for a, b in pairs))
+            condition = before.state.condition.towards(after.state.condition, way)
+            state = after.state._replace(condition=condition, nodes=nodes)
+            deepest = self.stations[gaps.argmin(axis=1)].tolist()
+            touches = [self._touch(index, deepest[index]) for index in touched]
+        if touches is None:
+            return way, None
+        found = self.settle(self.with_touches(state, tuple(touches))) if touches else after
+        if not (before.shape.is_native and after.shape.is_native):  # only its ends are exact
+            points, gaps, touched = before.body[0], before.gaps, []
+        if found and self._may_have_passed(points, gaps, touched, found):
+            return way, None
+        return way, found
+
+    def _until_entered(self, before: LeaningArm, after: LeaningArm) -> tuple[float, Vector, Vector]:
+        """Return how far an arm moves freely, and its points and gaps there, as `gaps` does."""
+        radii, at = after.body[1], self.stations
+        too_deep = -_DEEPEST * radii.min()
+        retreat = [each.state.condition.retreat[:, None, None] for each in (before, after)]
+        way = np.linalg.norm(after.body[0] - before.body[0], axis=1).max()
+        way += np.abs(retreat[1] - retreat[0]).max()
+        looks, row = int(np.clip(way / (_SCANNED * radii.min()), 1, _MOST_LOOKS)), -1
+        low, high = 0.0, 1.0
+        for scan in range(2):
+            shares = np.linspace(low, high, looks + 1)
+            points = before.shape.between(after.shape, shares, at)
+            x, every = shares[:, None], range(len(self.surfaces))
+            gaps = np.array([self._gaps_of(index, points, radii, at) for index in every])
+            gaps += (1 - x) * retreat[0] + x * retreat[1]
+            least = gaps.min(axis=(0, 2))
+            if scan == 0 and least.min() >= too_deep:
+                break
+            row = int(np.argmax(least < too_deep))
+            low, high, looks = shares[row - 1], shares[row], _CLOSER_LOOKS
+        return float(high), points[row], gaps[:, row]
+
     def _share_to_touch(self, arm: LeaningArm) -> float:
         """Return the share of a failed step to try next: half, or up to a light touch."""
-        if self._deepest is None:
+        if self._deepest is None or not arm.state.touches:
             return 0.5
         index, gap = self._deepest
         before = float(arm.gaps[index].min())
         return float(np.clip((before + _ENTERED) / (before - gap), 0.1, 0.9))
 
-    def _leaves(self, before: LeaningArm, after: LeaningArm) -> bool:
-        """Return whether stability is lost, or the body may have passed through a surface."""
-        if not after.is_stable:
-            return True
-        if not self.surfaces:
-            return False
-        (old, radii), (new, _) = (self.body(each, self.stations) for each in (before, after))
-        ways = np.linalg.norm(new - old, axis=1)
+    def _may_have_passed(
+        self, points: Vector, gaps: Vector, touched: Sequence[int], after: LeaningArm
+    ) -> bool:
+        """Return whether the body may have passed through a surface that it did not touch.
+
+        Points (k, 3) and gaps (surfaces, k) are those before.
+        """
+        ways = np.linalg.norm(after.body[0] - points, axis=1)
+        radius = after.shape.sections.radius.min()
         # gaps change by no more than the path, which is nearly straight
-        least = (before.gaps + after.gaps - 1.05 * ways) / 2
-        least[:, ways < _SWEPT * radii] = np.inf
-        least[[touch.surface for touch in before.state.touches]] = np.inf
-        return bool((least < -_DEEPEST * radii).any())
+        least = (gaps + after.gaps - 1.05 * ways) / 2
+        least[:, ways < _SWEPT * radius] = np.inf
+        least[touched] = np.inf
+        return bool((least < -_DEEPEST * radius).any())
 
     def _guess(self, state: Contacts, condition: Condition) -> Contacts:
         """Return a state to start from at a condition."""
@@ -340,11 +397,25 @@ class ContactProblem:
             return state._replace(condition=condition)
         return Contacts(condition, state.mesh, self.rod.free(condition, state.mesh), ())
 
-    def straight(self, like: Condition) -> LeaningArm:
-        """Return the unpressurised arm without weight, clear of all surfaces."""
+    @cached_property
+    def alone(self) -> ContactProblem:
+        """The arm without surfaces."""
+        return ContactProblem(self.rod, ())
+
+    @cached_property
+    def hanging(self) -> tuple[LeaningArm, float]:
+        """The arm under its own weight and payload alone, as `follow` returns it."""
+        gravity, none = np.array(self.rod.arm.description.gravity), np.zeros(len(self.surfaces))
+        condition = self.straight.state.condition._replace(gravity=gravity, retreat=none)
+        return self.follow(self.straight, condition)
+
+    @cached_property
+    def straight(self) -> LeaningArm:
+        """The unpressurised arm without weight, clear of all surfaces."""
         mesh = self.rod.mesh(np.zeros(0))
         q = np.tile([1.0, 0.0, 0.0, 0.0], (len(mesh.at), 1))
-        zero = Condition(*(np.zeros_like(each) for each in like))
+        sizes = self.rod.arm.n_pressures, 6, 6, 3, len(self.surfaces)
+        zero = Condition(*(np.zeros(size) for size in sizes))
         nodes = RodNodes(q, np.zeros((len(mesh.at), 3)))
         found = self.correct(Contacts(zero, mesh, nodes, ()))
         assert found is not None  # the state is already an equilibrium
@@ -352,12 +423,10 @@ class ContactProblem:
 
     def clear(self, arm: LeaningArm) -> LeaningArm:
         """Return the arm without contacts, with surfaces that would touch it moved back."""
-        least = (_APART - self.gaps(arm, self.stations)).max(axis=1, initial=0.0)
+        least = (_APART - self.gaps(*arm.body)).max(axis=1, initial=0.0)
         retreat = np.where(least > _APART, least, 0.0)
         state = arm.state._replace(condition=arm.state.condition._replace(retreat=retreat))
-        found = LeaningArm(self, state, arm.shape, [])
-        self.missed(found)
-        return found
+        return LeaningArm(self, state, arm.shape, [])
 
 
 def _is_same(touches: tuple[Touch, ...], before: tuple[Touch, ...]) -> bool:

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from stiffopt.model.batch import InterpretedFunction
 from stiffopt.model.codegen import dense
-from stiffopt.model.compiled import Library
 from stiffopt.model.distances import MeasuredObject
 from stiffopt.model.obstacle import Obstacle
 from stiffopt.model.obstacles.mesh import Mesh
@@ -59,13 +58,9 @@ class ContactSurface:
     def _measured(self) -> MeasuredObject:
         return MeasuredObject(self._shape, self.begin)
 
-    def distances(self, points: Vector, code: Library | None = None) -> Vector:
-        """Return distances (k,) of points (k, 3), in m, by machine code if given."""
-        if code is None or self.is_interpolated:
-            return self._measured.distances(points).values
-        formula = code.function(f"surface_{self.key}")
-        found = [formula.many(points, piece, threads=1)[0][:, 0, 0] for piece in self.pieces]
-        return np.asarray(np.max(found, axis=0))
+    def distances(self, points: Vector) -> Vector:
+        """Return distances (k,) of points (k, 3), in m."""
+        return self._measured.distances(points).values
 
     def at(self, point: Vector) -> SurfacePoint:
         """Return the distance of one point (3,) with its derivatives."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -83,7 +84,6 @@ class LeaningArm:
     Attributes
     ----------
     rows : of each contact.
-    gaps : of the surfaces (surfaces, k) at stations of the body, in m; infinite before evaluation.
     """
 
     def __init__(
@@ -94,15 +94,22 @@ class LeaningArm:
         rows: list[ContactRow],
     ) -> None:
         self.problem, self.state, self.shape, self.rows = problem, state, shape, rows
-        self.gaps = np.full((len(problem.surfaces), 1), np.inf)
-        self.minimum: bool | None = None  # whether stable; None: unknown yet
 
-    @property
+    @cached_property
     def is_stable(self) -> bool:
         """Whether the energy is at a minimum, see `stiffopt.model.contact.stability`."""
-        if self.minimum is None:
-            self.minimum = is_stable(self)
-        return self.minimum
+        quickly = self.shape.is_stable() if self.state.condition.is_conservative else None
+        return is_stable(self) if quickly is None else quickly
+
+    @cached_property
+    def body(self) -> tuple[Vector, Vector]:
+        """Points (k, 3) and radii (k,) of the body at the problem's stations, in m."""
+        return self.shape.body(self.problem.stations)
+
+    @cached_property
+    def gaps(self) -> Vector:
+        """Gaps of the surfaces (surfaces, k) at these stations, in m."""
+        return self.problem.gaps(*self.body) + self.state.condition.retreat[:, None]
 
     def bend(self, j: int) -> float:
         """Return the second derivative of the gap along the arm at a contact, in 1/m."""

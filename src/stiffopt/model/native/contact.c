@@ -7,6 +7,7 @@
  */
 #include <math.h>
 #include <stdint.h>
+#include <stdlib.h>
 #include <string.h>
 
 #include "functions.h"
@@ -19,6 +20,7 @@
 #define LEAST_LEFT_TURN 1e-6 /* these mirror solve.py */
 #define LEAST_LEFT_SLIDE 1e-7
 #define LARGEST_TURN 0.5
+#define FARTHEST_TURN 1.5
 #define LARGEST_SLIDE 0.02
 #define MOST_ITERATIONS 14
 #define STRETCHED 1.3
@@ -49,16 +51,16 @@ typedef struct {
 /* Mirrored by `_Problem`. */
 typedef struct {
     int64_t steps, contacts;
-    const int64_t *segment, *rigid;                  /* of each step */
+    const int64_t *segment;                          /* of each step */
+    const uint8_t *rigid;
     const double *per_station;                       /* (steps, contacts) */
-    const double *longest;                           /* of each step */
-    const double *strain, *compliance, *radius, *weight, *centroid; /* of each segment */
+    const double *longest, *strain, *compliance, *radius, *weight, *centroid; /* of each segment */
     const double *retreat;                           /* of each surface */
     double length, dead[6], follower[6], tip_load[3];
     const Surface *surfaces;
     Touch *touches;
     double *at, *q, *m;                              /* (steps + 1, ...), updated in place */
-    double *J, *near, *far, *position, *force_far, *moment_far; /* output */
+    double *position, *force_far, *moment_far, *J, *near, *far; /* output */
 } Problem;
 
 int64_t stiffopt_contact_sizes(int64_t which) {
@@ -336,22 +338,27 @@ static int eliminate(double *A, double *B, int64_t n, int64_t m) {
     return 1;
 }
 
-/* Add a correction to nodes and contacts; return the largest turn. */
-static double correct_nodes(const Problem *p, const Changes *c, const double *x) {
+/* Add a correction to the nodes, shortened, with the rest of it, so that nothing turns by more than
+ * is allowed; return the largest turn. */
+static double correct_nodes(const Problem *p, const Changes *c, double *x) {
     int64_t last = 3 + 4 * p->contacts;
-    double largest = 0;
+    double largest = 0, to[MOST_STEPS + 1][6];
     for (int64_t i = 0; i <= p->steps; i++) {
-        double to[6];
         for (int r = 0; r < 6; r++) {
-            to[r] = c->X[i][r][last];
-            for (int64_t col = 0; col < last; col++) to[r] += c->X[i][r][col] * x[col];
+            to[i][r] = c->X[i][r][last];
+            for (int64_t col = 0; col < last; col++) to[i][r] += c->X[i][r][col] * x[col];
         }
-        double size = sqrt(dot(to, to));
-        if (!(size <= LARGEST_TURN)) return INFINITY;
+        double size = sqrt(dot(to[i], to[i]));
+        if (!(size <= FARTHEST_TURN)) return INFINITY;
         largest = fmax(largest, size);
-        turn_by(p->q + 4 * i, to);
-        for (int r = 0; r < 3; r++) p->m[3 * i + r] += to[3 + r];
     }
+    double share = fmin(1, LARGEST_TURN / largest);
+    for (int64_t i = 0; i <= p->steps; i++) {
+        for (int r = 0; r < 6; r++) to[i][r] *= share;
+        turn_by(p->q + 4 * i, to[i]);
+        for (int r = 0; r < 3; r++) p->m[3 * i + r] += to[i][3 + r];
+    }
+    for (int64_t i = 0; i < last + p->contacts; i++) x[i] *= share;
     return largest;
 }
 
@@ -361,7 +368,8 @@ static int move_nodes(const Problem *p, const double *slides) {
     for (int64_t i = 0; i < p->steps; i++) {
         h[i] = p->at[i] - p->at[i + 1];
         for (int64_t j = 0; j < p->contacts; j++) h[i] += p->per_station[p->contacts * i + j] * slides[j];
-        if (!(h[i] > 0 && h[i] <= STRETCHED * p->longest[i])) return 0;
+        double longest = p->rigid[i] ? INFINITY : STRETCHED * p->longest[p->segment[i]];
+        if (!(h[i] > 0 && h[i] <= longest)) return 0;
     }
     for (int64_t i = 0; i < p->steps; i++) p->at[i + 1] = p->at[i] - h[i];
     return 1;
@@ -379,7 +387,7 @@ int64_t stiffopt_contact_correct(const Problem *p) {
         if (!linearise(&work, p, &changes) || !assemble(&work, p, &changes, A, x)) return LOST;
         if (!eliminate(A, x, 3 + 5 * k, 1)) return LOST;
         double size = correct_nodes(p, &changes, x), slides[MOST_CONTACTS], slide = 0;
-        if (!(size <= LARGEST_TURN) || (iteration > 3 && size > previous)) return LOST;
+        if (!(size <= FARTHEST_TURN) || (iteration > 3 && size > previous)) return LOST;
         int inside = 1;
         for (int64_t j = 0; j < k; j++) {
             Touch *touch = p->touches + j;
@@ -394,6 +402,91 @@ int64_t stiffopt_contact_correct(const Problem *p) {
         previous = fmax(size, LEAST_LEFT_TURN);
     }
     return LOST;
+}
+
+/* Compute a point of the body at an arc length; return its step. */
+static int64_t point_at(const Problem *p, double at, double *point) {
+    int64_t i = 0;
+    while (i + 1 < p->steps && at <= p->at[i + 1]) i++;
+    double h = p->at[i] - p->at[i + 1], x = (p->at[i] - at) / h;
+    for (int r = 0; r < 3; r++) {
+        double start = p->position[3 * i + r], way = p->position[3 * i + 3 + r] - start;
+        double first = -h * p->near[3 * i + r], last = -h * p->far[3 * i + r];
+        point[r] =
+            start + x * (first + x * (3 * way - 2 * first - last + x * (first + last - 2 * way)));
+    }
+    return i;
+}
+
+/* Compute points (count, 3) and radii (count) of the body at arc lengths. */
+void stiffopt_contact_body(const Problem *p, int64_t count, const double *at, double *points,
+                           double *radii) {
+    for (int64_t k = 0; k < count; k++)
+        radii[k] = p->radius[p->segment[point_at(p, at[k], points + 3 * k)]];
+}
+
+static void mix(double share, const double *a, const double *b, int count, double *to) {
+    for (int i = 0; i < count; i++) to[i] = (1 - share) * a[i] + share * b[i];
+}
+
+/* Compute bodies (looks, count, 3) at shares of the way between two shapes on one mesh: turns and
+ * ways from node to node change evenly. */
+void stiffopt_contact_between(const Problem *first, const Problem *last, int64_t looks,
+                              const double *shares, int64_t count, const double *at,
+                              double *points) {
+    const Problem *ends[2] = {first, last};
+    double turns[2][MOST_STEPS][4], ways[2][MOST_STEPS][3], R[MOST_STEPS][9], r[MOST_STEPS + 1][3];
+    double(*local)[2][3] = malloc((size_t)count * sizeof *local);
+    int64_t N = first->steps, *step = malloc((size_t)count * sizeof *step);
+    for (int e = 0; e < 2; e++) {
+        for (int64_t k = 0; k < count; k++) {
+            double x[3], Q[9];
+            int64_t i = step[k] = point_at(ends[e], at[k], x);
+            rotation(ends[e]->q + 4 * (i + 1), Q);
+            for (int a = 0; a < 3; a++) x[a] -= ends[e]->position[3 * (i + 1) + a];
+            transposed_times(Q, x, local[k][e]);
+        }
+        for (int64_t i = 0; i < N; i++) {
+            const double *q = ends[e]->q + 4 * i, *base = q + 4, *x = ends[e]->position + 3 * i;
+            double *turn = turns[e][i], way[3] = {x[0] - x[3], x[1] - x[4], x[2] - x[5]}, c[3];
+            cross(base + 1, q + 1, c);
+            turn[0] = base[0] * q[0] + dot(base + 1, q + 1);
+            for (int a = 0; a < 3; a++) turn[1 + a] = base[0] * q[1 + a] - q[0] * base[1 + a] - c[a];
+            for (int a = 3; a >= 0; a--) turn[a] *= turn[0] < 0 ? -1 : 1;
+            rotation(base, R[0]), transposed_times(R[0], way, ways[e][i]);
+        }
+    }
+    for (int64_t look = 0; look < looks; look++) {
+        double q[4], turn[4], way[3], c[3], share = shares[look];
+        memcpy(q, first->q + 4 * N, sizeof q), memset(r[N], 0, sizeof r[N]);
+        for (int64_t i = N - 1; i >= 0; i--) {
+            rotation(q, R[i]); /* of the node at the base's side */
+            mix(share, ways[0][i], ways[1][i], 3, way), mix(share, turns[0][i], turns[1][i], 4, turn);
+            times(R[i], way, c);
+            for (int a = 0; a < 3; a++) r[i][a] = r[i + 1][a] + c[a];
+            cross(q + 1, turn + 1, c);
+            double real = q[0] * turn[0] - dot(q + 1, turn + 1);
+            for (int a = 0; a < 3; a++) q[1 + a] = q[0] * turn[1 + a] + turn[0] * q[1 + a] + c[a];
+            q[0] = real;
+        }
+        for (int64_t k = 0; k < count; k++) {
+            double here[3], x[3];
+            mix(share, local[k][0], local[k][1], 3, here), times(R[step[k]], here, x);
+            for (int a = 0; a < 3; a++) points[3 * (look * count + k) + a] = r[step[k] + 1][a] + x[a];
+        }
+    }
+    free(local), free(step);
+}
+
+/* Compute the distances (count) of points (count, 3) from a surface. */
+void stiffopt_contact_distances(const Surface *surface, int64_t count, const double *points,
+                                double *distances) {
+    NEW_WORK(work);
+    Touch found;
+    for (int64_t k = 0; k < count; k++) {
+        look_at(&work, surface, points + 3 * k, &found);
+        distances[k] = found.distance;
+    }
 }
 
 /* -- stability ------------------------------------------------------------------------------- */
