@@ -32,9 +32,8 @@ from stiffopt.optimise.tip import TipAt
 Array = NDArray[np.float64]
 
 _TIME, _SEEN, _PREDICTED, _INTENDED = 0, slice(1, 4), slice(4, 7), slice(7, 10)  # columns of a row
-_OFFSET, _TURN, _DRIVEN, _FREE, _PRESSURES = (
-    slice(10, 13), slice(13, 16), 16, 17, slice(18, None),
-)  # fmt: skip
+_OFFSET, _TURN, _DRIVEN, _FREE = slice(10, 13), slice(13, 16), 16, 17
+_PRESSURES = slice(18, None)
 
 
 @dataclass(frozen=True)
@@ -147,9 +146,8 @@ class MotionWatch:
         if self._count == len(self._rows):
             self._rows[: self._kept] = self._rows[-self._kept :]
             self._count = self._kept
-        self._rows[self._count] = (
-            *(time, *seen, *predicted, *intended, *offset, *swings), *pressures,
-        )  # fmt: skip
+        row = (time, *seen, *predicted, *intended, *offset, *swings, *pressures)
+        self._rows[self._count] = row
         self._count += 1
         if self._count > 1:
             self._path += float(np.linalg.norm(intended - self._rows[self._count - 2, _INTENDED]))
@@ -192,7 +190,8 @@ class MotionWatch:
     def _no_response(self, jacobian: Array, axis: Array) -> Doubt | None:
         """Test whether the tip has not moved although the model has, or has moved elsewhere.
 
-        It is tested in space, and across the tip's axis (3,), where elongation hides nothing.
+        Motion is compared in space, and then without its part along the tip's axis (3,), so that a
+        long elongation does not hide a wrong direction across it.
         """
         rows = self._since(self._tuning.response_window)
         across = np.eye(3) - np.outer(axis, axis)
@@ -306,7 +305,7 @@ class MotionWatch:
         return size / duration
 
     def _is_push(self, change: Array, bending: Array | None) -> bool:
-        """Whether the offset has changed as under a push that grows, by not too much."""
+        """Return whether a growing push explains the change: it turns the tip too, and is small."""
         moved, tuning = change[_OFFSET], self._tuning
         if bending is None or float(np.linalg.norm(moved)) > tuning.largest_push:
             return False
