@@ -143,6 +143,29 @@ def test_a_channel_that_is_stuck_has_a_fixed_pressure_until_it_moves() -> None:
     assert not line.channels.lost.any()
 
 
+@pytest.mark.parametrize(("to", "stuck"), [(0.1, True), (0.9, False)])
+def test_a_channel_that_keeps_its_pressure_is_found_before_the_monitor_faults(
+    to: float, stuck: bool
+) -> None:
+    line = Line()
+    line.to(0.9 * BAR, 0.5 * BAR, 0.0, seconds=0.5)
+    line.to(0.5 * BAR, 0.5 * BAR, 0.0, seconds=0.5)
+    line.held[0] = line.p[0]
+    line.to(to * BAR, 0.5 * BAR, 0.0, seconds=0.25)
+    assert line.channels.lost.tolist() == [True, False, False]
+    assert line.channels.stuck[0] == stuck
+    line.to(to * BAR, 0.5 * BAR, 0.0, seconds=2.0)
+    assert 3e3 < abs(line.p[0] - line.command[0]) < TOLERANCE / 2
+
+
+def test_a_regulator_that_is_slower_than_believed_is_not_lost() -> None:
+    line = Line()
+    line.rising = line.falling = 0.15  # of believed 0.06 s
+    line.to(0.9 * BAR, 0.5 * BAR, 0.0, seconds=1.0)
+    line.to(0.2 * BAR, 0.5 * BAR, 0.0, seconds=1.0)
+    assert not line.channels.lost.any()
+
+
 def test_a_channel_with_hardly_any_pressure_is_done_without() -> None:
     line = Line()
     line.saturation[2] = 0.02 * BAR  # its tube is off

@@ -5,9 +5,10 @@ no more pressure. Its command is raised by s, slowly, up to `_max_allowed`, a sh
 monitor's tolerance. If the channel is still short by more, it is *limited*: its present pressure
 becomes the plan's upper bound, and the command stays just above it, where more pressure shows as
 soon as there is some. If a limited channel does not follow its command down either, it is *stuck*:
-the plan takes its pressure as fixed, and the command stays just below it. Faults of the pressure
-monitor remain faults: none of these commands exceeds the limits, nor differs from the reading by
-more than the monitor tolerates.
+the plan takes its pressure as fixed, and the command stays just below it. A reading that does not
+move at all, although the command has left it, shows both within a fraction of a second. Faults of
+the pressure monitor remain faults: none of these commands exceeds the limits, nor differs from the
+reading by more than the monitor tolerates.
 
 A channel that was *taken out* by request is let down and stays without pressure.
 """
@@ -57,7 +58,7 @@ class Channels:
         self._limits, self._tuning = limits, tuning
         self._min_allowed = np.full(limits.n, tuning.max_compensation)
         self._max_allowed = np.maximum(self._min_allowed, tuning.make_up_share * tolerance)
-        self._below = tuning.probe_share * tolerance
+        self._probe = tuning.probe_share * tolerance
         self._let_down = tuning.let_down_share * slew
         self._empty = np.clip(0.0, limits.low, limits.high)
         self.out: Flags = np.zeros(limits.n, dtype=bool)
@@ -73,6 +74,8 @@ class Channels:
         self._allowed: Array = self._min_allowed.copy()  # shortfall to compensate, in Pa
         self._held: Array = np.zeros(n)  # pressure of a limited or stuck channel, in Pa
         self._durations: Array = np.zeros((2, n))  # durations of being short, and too high, in s
+        self._unmoved: Array = np.zeros(n)  # time for which a reading ignores its command, in s
+        self._followed: Array = np.zeros(n)  # last readings that followed, in Pa
         self._smoothed: Array = np.zeros(n)  # smoothed readings, in Pa
         self._ceiling: Array = np.where(self.out, self._empty, self._limits.high)
         self._quiet = True  # whether no channel is short, or was until now
@@ -112,14 +115,22 @@ class Channels:
                 self._limits.high,
             )  # fmt: skip
         short = self.shortfall
-        if self._quiet and (short <= self._min_allowed).all():
+        follows = np.abs(short) <= self._min_allowed
+        if self._quiet and follows.all():
+            self._followed = reading
             return
+        self._followed = np.where(follows, reading, self._followed)
+        still = np.abs(reading - self._followed) < self._tuning.unmoved  # False for NaN
+        size = np.abs(short) / self._probe
+        self._unmoved = np.where(still & (size > 1), self._unmoved + size * elapsed, 0.0)
+        self._smoothed = np.where(self._unmoved > 0, reading, self._smoothed)
         share = -math.expm1(-elapsed / self._tuning.make_up_time)
         wanted = np.minimum(np.maximum(short, self._min_allowed), self._max_allowed)
         self._allowed = self._allowed + share * (wanted - self._allowed)
         self._judge(elapsed, short, command)
         self._quiet = not (
             self._durations.any()
+            or self._unmoved.any()
             or self.limited.any()
             or (self._allowed > self._min_allowed + 1.0).any()
         )
@@ -132,9 +143,12 @@ class Channels:
             self._durations + np.where(wrong, elapsed, -elapsed), 0.0, patience
         )
         lasting = self._durations >= patience
+        ignores = self._unmoved >= self._tuning.unmoved_time
+        lasting |= np.stack([ignores, ignores & (short < 0)])
         moved = self._smoothed - self._held
         again = np.where(self.stuck, np.abs(moved) > follows, (moved > follows) & (short < follows))
-        before, self.limited = self.limited, (self.limited | lasting[0]) & ~again
+        before = self.limited
+        self.limited = (before & ~again) | (~before & lasting[0])
         found = self.limited & ~before
         self._held = np.where(found, self._smoothed, self._held)
         pressed = np.minimum(short, command - self._smoothed) > self._max_allowed
@@ -170,9 +184,9 @@ class Channels:
         They stay within `low` and `high` (n,).
         """
         if not self._quiet and self.limited.any():
-            above, below = self._held + self._max_allowed, self._smoothed - self._below
+            above, below = self._held + self._probe, self._smoothed - self._probe
             pressed = path > self._held - self._tuning.follows
-            least = np.where(self.stuck, self._held - self._below, np.where(pressed, above, below))
+            least = np.where(self.stuck, self._held - self._probe, np.where(pressed, above, below))
             greatest = np.where(self.stuck, least, above)
             low, high = (
                 np.where(self.limited, np.clip(bound, low, high), limit)

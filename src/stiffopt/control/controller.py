@@ -140,6 +140,7 @@ class TipController:
         self._computed_at = now
         self._adapted_at = -math.inf  # last adaptation of the model since the last request
         self._watched_at = -math.inf  # last check whether the tip rests
+        self._lost = self._arm.channels.lost
         self._windows.begin()
         self._led_to: Target | None = None  # present target of a trajectory of pressures
 
@@ -246,9 +247,8 @@ class TipController:
         self._computed_at = now
         self._arm.watch.go_on()
         offset, pressures = self._offset, self._arm.pressures
-        self._reference.begin(
-            np.concatenate([pressures.command + pressures.history_offset, offset])
-        )
+        here = pressures.chamber if self._arm.channels.lost.any() else pressures.command
+        self._reference.begin(np.concatenate([here + pressures.history_offset, offset]))
         self._feedback.resume(offset)
         self._at_rest = False
 
@@ -300,8 +300,10 @@ class TipController:
             self._at_rest = True
             _, high = self._arm.channels.commands(last, *self._permitted)
             return ControlOutput(np.minimum(last, high), True, np.zeros(n, dtype=bool))
-        if self._at_rest:
+        lost = self._arm.channels.lost
+        if self._at_rest or (lost & ~self._lost).any():  # they are not where the reference is
             self.resume(now)
+        self._lost = lost
         if self._model_is_wrong():
             return ControlOutput(last.copy(), False, self._feedback.saturated.copy())
         self._set_reference_rate()

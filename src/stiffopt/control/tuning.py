@@ -59,9 +59,12 @@ class RegulatorTuning:
     reading_time: float = 0.1  # time constant that smooths readings, in s
     patience: float = 0.5  # time for which a channel must be short, or above, in s
     follows: float = 3e3  # distance from a command, in Pa, at which a regulator follows
-    # distance of a command below the pressure of a channel that does not fall, as a share of
-    # `Safety.max_pressure_error`
-    probe_share: float = 0.5
+    # distance of the command from the pressure of a channel that does not follow, as a share of
+    # `Safety.max_pressure_error`: less than the half at which the monitor looks for leaks
+    probe_share: float = 0.4
+    # change of a reading, in Pa, below which it does not move; time for which it must not, in s
+    unmoved: float = 1e3
+    unmoved_time: float = 0.1
     let_down_share: float = 0.1  # share of the slew with which a removed channel is let down
 
 
