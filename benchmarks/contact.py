@@ -3,13 +3,14 @@
     python benchmarks/contact.py --cases 100 --out out/contact
 
 Random arms, with and without weight, at random pressures, half of them with a load, among one to
-three spheres, capsules and walls that the free arm would enter by up to 20 mm. With `--enclosed`
-the arms are in tubes, or pass through rings. Cases are stored in the folder and computed once.
-JAX is needed; a case takes half a minute.
+three spheres, capsules and walls that the free arm would enter by up to 20 mm. With `--strong`
+objects are early on the arm's way from rest, and bend it far; with `--enclosed` the arms are in
+tubes, or pass through rings. Cases are stored in the folder and computed once. JAX is needed and
+compiles for a minute; a case takes some seconds.
 
 Metrics, each the largest over a case's objects or directions: the error of the tip, over the arm's
 length; the error of the contact forces, over the largest force; the error of the tip's stiffness
-along a random direction, where the rod's stiffness is that between two pushes of 0.1 mN; contacts
+along a random direction, where the rod's stiffness is that between two pushes of 1 mN; contacts
 above 1 mN that only one of the two has. If a push below 0.3 N loses a contact of more than 2 mN:
 whether the independent rod still has the contact at 0.9 of that push and has lost it at 1.1.
 """
@@ -34,12 +35,14 @@ from report import table
 from stiffopt.errors import EquilibriumError
 
 _ELEMENTS = {"1 segment": 32, "2 segments": 16}
+_PUSH = 1e-3  # N; the rod's discrete springs blur smaller ones
 
 
-def draw(seed: int, *, enclosed: bool = False) -> dict[str, Any]:
+def draw(seed: int, *, enclosed: bool = False, strong: bool = False) -> dict[str, Any]:
     """A random case: arm, pressures, load and objects, clear of the arm at rest.
 
-    If it is enclosed, the arm is in a tube or passes through a ring instead.
+    If it is enclosed, the arm is in a tube or passes through a ring instead. If it is strong,
+    objects are early on the arm's way, and pressures higher.
     """
     rng = np.random.default_rng([20, seed])
     name = ("2 segments", "1 segment", "2 segments")[seed % 3]
@@ -63,7 +66,12 @@ def draw(seed: int, *, enclosed: bool = False) -> dict[str, Any]:
             if not (-0.05 if around[0] == 2 else -0.015) < gap < -0.001:
                 continue
         else:
-            objects = [_object(rng, T, arm.tubes[0].outer_radius) for _ in range(count)]
+            early = None
+            if strong:
+                p, share = 1.25 * p, rng.uniform(0.1, 0.5)
+                early = robot.with_load(share * force).backbone(share * p, 61)
+                T = robot.with_load(force).backbone(p, 61)
+            objects = [_object(rng, T, arm.tubes[0].outer_radius, early) for _ in range(count)]
             widest = arm.tubes[0].outer_radius + 0.001
             clear = all(_nearest(each, rest) > widest for each in objects)
         if clear and T[-1, 2, 2] > np.cos(2):
@@ -76,15 +84,24 @@ def draw(seed: int, *, enclosed: bool = False) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _object(rng: np.random.Generator, T: Any, radius: float) -> tuple[int, list[float]]:
-    """One that presses the body at a random station from a random side."""
-    pose = T[round(rng.uniform(0.3, 1.0) * 60)]
+def _object(
+    rng: np.random.Generator, T: Any, radius: float, early: Any = None
+) -> tuple[int, list[float]]:
+    """One that presses the body at a random station from a random side, or stops it early."""
+    row = round(rng.uniform(0.3, 1.0) * 60)
     angle, depth, own = (
         rng.uniform(0, 2 * np.pi),
         rng.uniform(0.001, 0.02),
         rng.uniform(0.003, 0.02),
     )
+    pose = T[row]
     side = pose[:3, :3] @ [np.cos(angle), np.sin(angle), 0]
+    if early is not None:
+        side = 0.3 * side - (pose - early[row])[:3, 3] / np.linalg.norm((pose - early[row])[:3, 3])
+        pose, depth = early[row], 0.0
+        axis = pose[:3, 2]
+        side = side - (axis @ side) * axis
+        side /= np.linalg.norm(side)
     kind = rng.choice(["sphere", "capsule", "wall"], p=[0.25, 0.5, 0.25])
     if kind == "wall":
         return 1, [*(pose[:3, 3] - side * (radius - depth)), *side, 0.0]
@@ -181,7 +198,7 @@ def found_by_rod(case: dict[str, Any], lost_at: float | None) -> dict[str, Any]:
     n, objects, d = _ELEMENTS[case["arm"]], case["objects"], np.array(case["direction"])
     try:
         state = pressed(arm_of(case), case["pressures"], objects, case["force"], n)
-        ends = [pushed(state, objects, sign * 1e-4 * d) for sign in (1, -1)]
+        ends = [pushed(state, objects, sign * _PUSH * d) for sign in (1, -1)]
         around = []
         if lost_at is not None and lost_at < 0.3:
             first = pushed(state, objects, 0.9 * lost_at * d, steps=4)
@@ -191,16 +208,16 @@ def found_by_rod(case: dict[str, Any], lost_at: float | None) -> dict[str, Any]:
         return {"error": str(error)}
     return {
         "tip": state.tip.tolist(), "forces": state.forces.tolist(), "at": state.at.tolist(),
-        "stiffness": float(2e-4 / ((ends[0].tip - ends[1].tip) @ d)), "around": around,
+        "stiffness": float(2 * _PUSH / ((ends[0].tip - ends[1].tip) @ d)), "around": around,
     }  # fmt: skip
 
 
-def run(cases: int, folder: Path, *, enclosed: bool) -> Iterator[dict[str, Any]]:
+def run(seeds: range, folder: Path, **kind: Any) -> Iterator[dict[str, Any]]:
     """All cases, from the folder where they are there; the model's part always anew."""
     folder.mkdir(parents=True, exist_ok=True)
-    for seed in range(cases):
+    for seed in seeds:
         file = folder / f"{seed}.json"
-        case = json.loads(file.read_text()) if file.exists() else draw(seed, enclosed=enclosed)
+        case = json.loads(file.read_text()) if file.exists() else draw(seed, **kind)
         case["stiffopt"] = found_by_stiffopt(case)
         if "rod" not in case:
             case["rod"] = found_by_rod(case, case["stiffopt"].get("lost_at"))
@@ -270,13 +287,17 @@ def main() -> None:
     """Run, and print the report."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--cases", type=int, default=100)
+    parser.add_argument("--first", type=int, default=0, metavar="SEED")
+    parser.add_argument("--strong", action="store_true", help="contacts that bend the arm far")
     parser.add_argument("--out", type=Path, default=Path("out/contact"))
     parser.add_argument("--keep", type=Path, help="write the report here too")
     parser.add_argument("--enclosed", action="store_true", help="in tubes and through rings")
     arguments = parser.parse_args()
     warnings.simplefilter("ignore")
     cases = []
-    for case in run(arguments.cases, arguments.out, enclosed=arguments.enclosed):
+    seeds = range(arguments.first, arguments.first + arguments.cases)
+    kind = {"enclosed": arguments.enclosed, "strong": arguments.strong}
+    for case in run(seeds, arguments.out, **kind):
         cases.append(case)
         error = case["stiffopt"].get("error") or case["rod"].get("error")
         print(case["seed"], error or measured(case), flush=True)

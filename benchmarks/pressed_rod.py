@@ -26,6 +26,7 @@ SPRINGS = {"coarse": (8, 6.4e6), "fine": (24, 2e7)}
 """Springs along an element, and their stiffness in N/m per m along the arm."""
 _OF_TIP = 0.003  # m along the arm, that the spring of the hemisphere at the tip stands for
 _ENERGY_LEFT = 1e-17  # J
+_FAR = (1, [0.0, 0.0, -10.0, 0.0, 0.0, 1.0, 0.0])
 
 
 class Rod(NamedTuple):
@@ -147,10 +148,97 @@ _value = jax.jit(_energy, static_argnums=3)
 _seen = jax.jit(_springs, static_argnums=3)
 
 
+def _near(R: Array, r: Array) -> Array:
+    """Twist of a small motion, to second order."""
+    W = (R - R.T) / 2
+    return jnp.concatenate([r - W @ r / 2, jnp.array([W[2, 1], W[0, 2], W[1, 0]])])
+
+
+def _part(
+    twist: Array, y: Array, item: Array, beyond: tuple[Array, Array], objects: Array, fineness: str
+) -> tuple[Array, Array]:
+    """Energy of an element and, to second order, of all beyond; and the twist of its end.
+
+    Twists are in base axes about the base, that of the start is given. What is beyond exerts a
+    wrench (6,) on the end at its present pose, with a stiffness (6, 6).
+    """
+    R, r, R_end, r_end, free, root, h, weight, centroid, connector, radius = item
+    samples, stiffness = SPRINGS[fineness]
+    turn, way = _exponential(twist[:3], twist[3:])
+    R, r = turn @ R, turn @ r + way
+    xi = free + root @ y
+    shares = (jnp.arange(samples) + 0.5) / samples
+    places = jax.vmap(lambda s: r + R @ _exponential(xi[:3] * h * s, xi[3:] * h * s)[1])(shares)
+    depths = jax.vmap(lambda kind, numbers: radius - _distance(kind, numbers, places))(*objects)
+    R_half, half = _exponential(xi[:3] * h / 2, xi[3:] * h / 2)
+    energy = 0.5 * y @ y - h * (r + R @ (half + R_half @ centroid)) @ weight
+    energy += 0.5 * h / samples * stiffness * (jnp.maximum(depths, 0) ** 2).sum()
+    R_whole, whole = _exponential(xi[:3] * h, xi[3:] * h)
+    R_next = R @ R_whole
+    change = R_next @ R_end.T
+    moved = _near(change, r + R @ whole + connector * R_next[:, 2] - change @ r_end)
+    wrench, K = beyond
+    return energy + moved @ wrench + 0.5 * moved @ K @ moved, moved
+
+
+def _tip_part(
+    twist: Array, r: Array, force: Array, radius: Array, objects: Array, k: Array
+) -> Array:
+    turn, way = _exponential(twist[:3], twist[3:])
+    x = (turn @ r + way)[None]
+    depths = jax.vmap(lambda kind, numbers: radius - _distance(kind, numbers, x))(*objects)
+    return 0.5 * k * (jnp.maximum(depths, 0) ** 2).sum() - x[0] @ force
+
+
 @partial(jax.jit, static_argnums=3)
 def _derivatives(y: Array, rod: Rod, objects: Array, fineness: str) -> tuple[Array, ...]:
-    arguments = (y, rod, objects, fineness)
-    return _energy(*arguments), jax.grad(_energy)(*arguments), jax.hessian(_energy)(*arguments)
+    """Energy, gradient and Hessian; moving an element's end moves all beyond rigidly."""
+    y = y.reshape(-1, 6)
+    strains = rod.free + jnp.einsum("kij,kj->ki", rod.root, y)
+
+    def along(pose: Array, item: Array) -> tuple[Array, Array]:
+        (R, r), (xi, h, connector) = pose, item
+        turn, way = _exponential(xi[:3] * h, xi[3:] * h)
+        end = R @ turn, r + R @ way + connector * (R @ turn)[:, 2]
+        return end, (R, r, *end)
+
+    (_, tip), poses = jax.lax.scan(
+        along, (jnp.eye(3), jnp.zeros(3)), (strains, rod.h, rod.connector)
+    )
+    items = (*poses, rod.free, rod.root, rod.h, rod.weight, rod.centroid, rod.connector, rod.radius)
+    zero, none = jnp.zeros(6), (jnp.zeros(6), jnp.zeros((6, 6)))
+
+    def own(twist: Array, y: Array, item: Array) -> Array:
+        return _part(twist, y, item, none, objects, fineness)[0]
+
+    def last(twist: Array) -> Array:
+        return _tip_part(
+            twist, tip, rod.force, rod.radius[-1], objects, _OF_TIP * SPRINGS[fineness][1]
+        )
+
+    wrenches = jax.vmap(lambda y, item: jax.grad(own)(zero, y, item))(y, items)
+    stiffnesses = jax.vmap(lambda y, item: jax.hessian(own)(zero, y, item))(y, items)
+    beyond = tuple(
+        jnp.cumsum(jnp.concatenate([end[None], each[:0:-1]]), axis=0)[::-1]
+        for each, end in ((wrenches, jax.grad(last)(zero)), (stiffnesses, jax.hessian(last)(zero)))
+    )
+
+    def second(y: Array, item: Array, after: tuple[Array, Array]) -> tuple[Array, ...]:
+        def both(y: Array) -> tuple[Array, Array]:
+            return jax.grad(lambda *x: _part(*x, item, after, objects, fineness)[0], (0, 1))(
+                zero, y
+            )
+
+        S = jax.jacfwd(lambda y: _part(zero, y, item, after, objects, fineness)[1])(y)
+        return (*jax.jacfwd(both)(y), both(y)[1], S)
+
+    coupled, D, g, S = jax.vmap(second)(y, items, beyond)
+    count = len(y)
+    H = jnp.einsum("iab,jac->ibjc", S, coupled)
+    H = H * (jnp.arange(count)[:, None] < jnp.arange(count))[:, None, :, None]
+    H = H.reshape(6 * count, -1)
+    own_blocks = jnp.einsum("ij,iab->iajb", jnp.eye(count), D).reshape(6 * count, -1)
+    return _energy(y.ravel(), rod, objects, fineness), g.ravel(), H + H.T + own_blocks
 
 
 def _minimum(y: Array, rod: Rod, objects: Array, fineness: str) -> Array:
@@ -177,7 +265,7 @@ def _minimum(y: Array, rod: Rod, objects: Array, fineness: str) -> Array:
     raise ArithmeticError("no minimum was found")
 
 
-def _read(y: Array, rod: Rod, objects: Array, fineness: str) -> Pressed:
+def _read(y: Array, rod: Rod, objects: Array, fineness: str, count: int) -> Pressed:
     seen = _seen(rod, y.reshape(-1, 6), objects, fineness)
     loads, _, tip, R, _ = (np.asarray(each) for each in seen)
     samples = SPRINGS[fineness][0]
@@ -187,12 +275,14 @@ def _read(y: Array, rod: Rod, objects: Array, fineness: str) -> Pressed:
     at = np.append(at, ends[-1])
     forces = loads.sum(axis=1)
     mean = np.divide(loads @ at, forces, out=np.full(len(forces), np.nan), where=forces > 0)
-    return Pressed(tip, R, forces, mean, y, rod)
+    return Pressed(tip, R, forces[:count], mean[:count], y, rod)
 
 
 def _numbers(objects: Sequence[tuple[int, Sequence[float]]]) -> Array:
-    padded = [[*each, *[0.0] * (10 - len(each))] for _, each in objects]
-    return np.array([kind for kind, _ in objects]), np.array(padded, float)
+    """Kinds and numbers of at least three objects, so that JAX compiles once."""
+    known = [*objects, *[_FAR] * (3 - len(objects))]
+    padded = [[*each, *[0.0] * (10 - len(each))] for _, each in known]
+    return np.array([kind for kind, _ in known]), np.array(padded, float)
 
 
 def pressed(
@@ -209,7 +299,7 @@ def pressed(
     for share in np.arange(steps + 1) / steps:
         rod = make_rod(arm, share * np.asarray(p), n, share * np.asarray(force, float))
         y = _minimum(y, rod, known, "coarse")
-    return _read(_minimum(y, rod, known, "fine"), rod, known, "fine")
+    return _read(_minimum(y, rod, known, "fine"), rod, known, "fine", len(objects))
 
 
 def pushed(
@@ -220,4 +310,4 @@ def pushed(
     for share in np.arange(1, steps + 1) / steps:
         rod = state.rod._replace(force=state.rod.force + share * np.asarray(force, float))
         y = _minimum(y, rod, known, "fine")
-    return _read(y, rod, known, "fine")
+    return _read(y, rod, known, "fine", len(objects))

@@ -155,7 +155,10 @@ class ContactEquilibrium:
             on an arm whose contacts carry no tangential force leave them sticking.
         """
         check_choice("contacts", contacts, get_args(Grip))
-        per_wrench = self._per_wrench(self._with_friction() if contacts == "sticking" else ())
+        per_wrench = self._arm.tangent[:6]
+        if contacts == "sticking" and (sticking := self._with_friction()):
+            system = self._system_for("tip wrench", sticking)
+            per_wrench = system.of_tip(system.solution())[:6]
         R = self._arm.shape.rotation[0]
         turn = np.zeros((6, 6))
         turn[:3, :3] = turn[3:, 3:] = R
@@ -169,12 +172,6 @@ class ContactEquilibrium:
         surfaces = self._arm.problem.surfaces
         touches = enumerate(self._arm.state.touches)
         return [j for j, touch in touches if surfaces[touch.surface].friction > 0]
-
-    def _per_wrench(self, sticking: Collection[int] = ()) -> Vector:
-        """Return the twist of the tip per wrench on it, (6, 6), in base axes."""
-        system = self._system_for("tip wrench", sticking)
-        changes, moves = system.along(system.solution())
-        return np.concatenate([moves[0], changes[0, :3]])
 
     def _system_for(self, extras: str, sticking: Collection[int] = ()) -> ContactSystem:
         arm = self._arm
@@ -201,9 +198,8 @@ class ContactEquilibrium:
     def _per_pressure(self) -> tuple[Vector, Vector, Vector]:
         system = self._system_for("pressures")
         solution = system.solution()
-        changes, moves = system.along(solution)
-        u = system.linear.unknowns
-        return np.concatenate([moves[0], changes[0, :3]]), solution[u:], solution[9:u:7]
+        found = system.of_tip(solution)
+        return found[:6], found[6:], solution[9 : system.linear.unknowns : 7]
 
     @property
     def tip_jacobian(self) -> Vector:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.errors import EquilibriumError
 from stiffopt.model.compiled import Library
 from stiffopt.model.contact.rod import Rod, RodNodes, RodSections, RodShape
 from stiffopt.model.contact.surface import ContactSurface, SurfacePoint
@@ -80,6 +81,7 @@ class _Problem(ctypes.Structure):
 _FUNCTIONS = {
     "stiffopt_contact_correct": (_integer, [_pointer]),
     "stiffopt_contact_is_stable": (_integer, [_pointer] * 3),
+    "stiffopt_contact_tangent": (_integer, [_pointer] * 2),
     "stiffopt_contact_body": (None, [_pointer, _integer, *[_pointer] * 3]),
     "stiffopt_contact_between": (
         None,
@@ -223,3 +225,11 @@ class NativeShape(RodShape):
                 ctypes.addressof(self._problem), memory.ctypes.data, starts
             )
         )
+
+    def tangent(self) -> Vector:
+        """See `RodShape.tangent`."""
+        found = np.empty((6 + self._problem.contacts, 6))
+        address = ctypes.addressof(self._problem)
+        if not self._cdll.stiffopt_contact_tangent(address, found.ctypes.data):
+            raise EquilibriumError("the tip moves freely there")
+        return found

@@ -83,7 +83,7 @@ class GrowingPush:
         return ContactLoss(first, name, touches[lost].station, how, stiffness, after)
 
     def _tangent(
-        self, arm: LeaningArm, sticking: Collection[int] = ()
+        self, arm: LeaningArm, sticking: Collection[int]
     ) -> tuple[ContactSystem, Vector, float]:
         """Return the equations for forces at the tip, their solution (u, 6), and a stiffness."""
         sections = arm.shape.sections
@@ -125,10 +125,9 @@ class GrowingPush:
 
     def _rates(self, arm: LeaningArm) -> tuple[Vector, float, float]:
         """Return changes (k,) of normal forces and of the tip's turn per push; a stiffness."""
-        system, solution, stiffness = self._tangent(arm)
-        changes, _ = system.along(solution)
-        turn = float(np.linalg.norm(changes[0, :3, :3] @ self._direction))
-        return solution[system.linear.unknowns :, :3] @ self._direction, turn, stiffness
+        found = arm.tangent[:, :3] @ self._direction
+        stiffness = 1 / float(self._direction @ found[:3])
+        return found[6:], float(np.linalg.norm(found[3:6])), stiffness
 
     def _lifted(self, arm: LeaningArm, force: float, lost: int) -> ContactLoss:
         state = arm.state

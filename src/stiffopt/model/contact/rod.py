@@ -281,6 +281,13 @@ class RodShape:
         """Return whether it is stable under dead forces, where machine code can tell."""
         return None
 
+    def tangent(self) -> Vector | None:
+        """Return changes (6 + contacts, 6) along a wrench on the tip, where machine code can.
+
+        Of the tip's place and turn in base axes, and of the normal forces; contacts slide.
+        """
+        return None
+
     def body(self, at: Vector) -> tuple[Vector, Vector]:
         """Return points (k, 3) of the centre line at arc lengths (k,), and radii (k,) there."""
         marks = self.mesh.at

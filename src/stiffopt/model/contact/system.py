@@ -102,6 +102,18 @@ class LeaningArm:
         return is_stable(self) if quickly is None else quickly
 
     @cached_property
+    def tangent(self) -> Vector:
+        """Changes (6 + contacts, 6) along a wrench on the tip while contacts slide.
+
+        Of the tip's place and turn and of the normal forces; all in base axes.
+        """
+        quickly = self.shape.tangent()
+        if quickly is not None:
+            return quickly
+        system = ContactSystem(self.problem, self.state, self.shape.sections, "tip wrench")
+        return system.of_tip(system.solution())
+
+    @cached_property
     def body(self) -> tuple[Vector, Vector]:
         """Points (k, 3) and radii (k,) of the body at the problem's stations, in m."""
         return self.shape.body(self.problem.stations)
@@ -256,6 +268,11 @@ class ContactSystem(LeaningArm):
     def solution(self) -> Vector:
         """Return the unknowns (u, e) for each extra."""
         return np.asarray(np.linalg.solve(self.matrix, self.right))
+
+    def of_tip(self, solution: Vector) -> Vector:
+        """Return the changes (6 + contacts, e) of the tip's place and turn and normal forces."""
+        changes, moves = self.along(solution)
+        return np.concatenate([moves[0], changes[0, TURN], solution[self.linear.unknowns :]])
 
     def along(self, solution: Vector) -> tuple[Vector, Vector]:
         """Return changes (N + 1, 9, e) and moves (N + 1, 3, e) of the nodes."""

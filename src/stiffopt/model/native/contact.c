@@ -1,8 +1,8 @@
 /* Newton's method for an arm in contact with surfaces, as in `stiffopt.model.contact`.
  *
  * The arm is divided into steps from its tip to its base.  Changes are propagated along the
- * unknowns: a turn of the tip (3), and force (3) and station of each contact; the last column holds
- * the defects of the nodes' states.  Matrices are stored by rows, except those of generated
+ * unknowns: a turn of the tip (3), and force (3) and station of each contact; the last columns hold
+ * the defects of the nodes' states, or the changes along a force and moment on the tip.  Matrices are stored by rows, except those of generated
  * functions.
  */
 #include <math.h>
@@ -15,7 +15,8 @@
 
 #define MOST_CONTACTS 8
 #define MOST_STEPS 128
-#define MOST_COLUMNS (3 + 4 * MOST_CONTACTS + 1)
+#define MOST_EXTRAS 6
+#define MOST_COLUMNS (3 + 4 * MOST_CONTACTS + MOST_EXTRAS)
 #define MOST_UNKNOWNS (3 + 5 * MOST_CONTACTS)
 #define LEAST_LEFT_TURN 1e-6 /* these mirror solve.py */
 #define LEAST_LEFT_SLIDE 1e-7
@@ -107,7 +108,7 @@ static void turn_by(double *q, const double *turn) {
 }
 
 typedef struct {
-    int64_t columns;
+    int64_t columns, extras; /* 1 for the defects, 6 for a wrench on the tip */
     double X[MOST_STEPS + 1][9][MOST_COLUMNS]; /* of turn, moment, force at the nodes */
     double moves[MOST_STEPS + 1][3][MOST_COLUMNS];
     double force[3];
@@ -148,10 +149,10 @@ static int step_ahead(const Work *work, const Problem *p, int64_t i, const doubl
 }
 
 /* Linearise the rod about its state: positions, tangents, forces, and all changes. */
-static int linearise(const Work *work, const Problem *p, Changes *c) {
+static int linearise(const Work *work, const Problem *p, Changes *c, int64_t extras) {
     int64_t k = p->contacts, last = 3 + 4 * k, N = p->steps;
     double R[9], f[3], m[3], n[3], ways[MOST_STEPS][3];
-    c->columns = last + 1;
+    c->columns = last + extras, c->extras = extras;
     memset(c->X[0], 0, sizeof c->X[0]);
     rotation(p->q, R), times(R, p->follower, f), times(R, p->follower + 3, m);
     for (int i = 0; i < 3; i++) {
@@ -161,6 +162,7 @@ static int linearise(const Work *work, const Problem *p, Changes *c) {
         cross(e, f, df), cross(e, m, dm);
         c->X[0][i][i] = 1;
         for (int r = 0; r < 3; r++) c->X[0][6 + r][i] = df[r], c->X[0][3 + r][i] = dm[r];
+        if (extras == 6) c->X[0][6 + i][last + i] = c->X[0][3 + i][last + 3 + i] = 1;
     }
     for (int64_t i = 0; i < N; i++) {
         double end[10], *J = p->J + 90 * i, Y[9][MOST_COLUMNS];
@@ -173,7 +175,7 @@ static int linearise(const Work *work, const Problem *p, Changes *c) {
                 for (int r = 0; r < 3; r++) n[r] += p->touches[j].force[r], N9[6 + r][3 + 4 * j + r] += 1;
         if (!step_ahead(work, p, i, n, end, J)) return 0;
         for (int r = 0; r < 9; r++)
-            for (int64_t col = 0; col <= last; col++) {
+            for (int64_t col = 0; col < c->columns; col++) {
                 double sum = 0;
                 for (int b = 0; b < 9; b++) sum += J[9 * b + r] * N9[b][col];
                 Y[r][col] = sum;
@@ -188,7 +190,7 @@ static int linearise(const Work *work, const Problem *p, Changes *c) {
         }
         turn_between(p->q + 4 * (i + 1), end, turn);
         for (int r = 0; r < 3; r++) {
-            Y[r][last] += turn[r], Y[6 + r][last] += end[7 + r] - p->m[3 * (i + 1) + r];
+            if (extras == 1) Y[r][last] += turn[r], Y[6 + r][last] += end[7 + r] - p->m[3 * (i + 1) + r];
             ways[i][r] = end[4 + r];
             if (!p->rigid[i]) n[r] += h * weight[r];
         }
@@ -203,7 +205,7 @@ static int linearise(const Work *work, const Problem *p, Changes *c) {
     for (int64_t i = N - 1; i >= 0; i--)
         for (int r = 0; r < 3; r++) {
             p->position[3 * i + r] = p->position[3 * (i + 1) + r] - ways[i][r];
-            for (int64_t col = 0; col <= last; col++)
+            for (int64_t col = 0; col < c->columns; col++)
                 c->moves[i][r][col] = c->moves[i + 1][r][col] - c->moves[i][r][col];
         }
     return 1;
@@ -261,13 +263,13 @@ static void mean_tangent(const Problem *p, const Changes *c, int64_t j, const do
     }
 }
 
-/* Assemble the equations of the base and of the contacts, A (u, u) and b (u). */
+/* Assemble the equations of the base and of the contacts, A (u, u) and b (u, extras). */
 static int assemble(const Work *work, const Problem *p, const Changes *c, double *A, double *b) {
-    int64_t k = p->contacts, last = 3 + 4 * k, u = 3 + 5 * k;
+    int64_t k = p->contacts, last = 3 + 4 * k, u = 3 + 5 * k, extras = c->extras;
     memset(A, 0, (size_t)(u * u) * sizeof(double));
     for (int r = 0; r < 3; r++) {
         memcpy(A + r * u, c->X[p->steps][r], (size_t)last * sizeof(double));
-        b[r] = -c->X[p->steps][r][last];
+        for (int64_t e = 0; e < extras; e++) b[r * extras + e] = -c->X[p->steps][r][last + e];
     }
     for (int64_t j = 0; j < k; j++) {
         Touch *touch = p->touches + j;
@@ -286,7 +288,7 @@ static int assemble(const Work *work, const Problem *p, const Changes *c, double
         times(H, touch->mean, bent); /* H is symmetric */
         double *row[3] = {A + first * u, A + (first + 1) * u, A + (first + 2) * u};
         double *slope = A + (first + 3) * u, *gap = A + (last + j) * u, moved[3], carried[3];
-        for (int64_t col = 0; col <= last; col++) {
+        for (int64_t col = 0; col < c->columns; col++) {
             for (int i = 0; i < 3; i++) moved[i] = dc[i][col];
             times(H, moved, carried);
             double by_slope = dot(bent, moved), by_gap = dot(n, moved);
@@ -296,9 +298,12 @@ static int assemble(const Work *work, const Problem *p, const Changes *c, double
                 if (!touch->pinned) slope[col] = by_slope;
                 gap[col] = by_gap;
             } else {
-                for (int i = 0; i < 3; i++) b[first + i] = f * carried[i] + f * n[i] - touch->force[i];
-                b[first + 3] = touch->pinned ? 0 : -by_slope - touch->slope;
-                b[last + j] = -by_gap - touch->gap;
+                double *to = b + col - last;
+                int left = extras == 1; /* of the equations */
+                for (int i = 0; i < 3; i++)
+                    to[(first + i) * extras] = f * carried[i] + left * (f * n[i] - touch->force[i]);
+                to[(first + 3) * extras] = touch->pinned ? 0 : -by_slope - left * touch->slope;
+                to[(last + j) * extras] = -by_gap - left * touch->gap;
             }
         }
         for (int i = 0; i < 3; i++) row[i][first + i] += 1, row[i][last + j] = -n[i];
@@ -384,7 +389,7 @@ int64_t stiffopt_contact_correct(const Problem *p) {
     NEW_WORK(work);
     if (k > MOST_CONTACTS || p->steps > MOST_STEPS) return LOST;
     for (int iteration = 0; iteration < MOST_ITERATIONS; iteration++) {
-        if (!linearise(&work, p, &changes) || !assemble(&work, p, &changes, A, x)) return LOST;
+        if (!linearise(&work, p, &changes, 1) || !assemble(&work, p, &changes, A, x)) return LOST;
         if (!eliminate(A, x, 3 + 5 * k, 1)) return LOST;
         double size = correct_nodes(p, &changes, x), slides[MOST_CONTACTS], slide = 0;
         if (!(size <= FARTHEST_TURN) || (iteration > 3 && size > previous)) return LOST;
@@ -402,6 +407,25 @@ int64_t stiffopt_contact_correct(const Problem *p) {
         previous = fmax(size, LEAST_LEFT_TURN);
     }
     return LOST;
+}
+
+/* Compute changes (6 + contacts, 6) of an equilibrium along a force and moment on the tip, in base
+ * axes: of the tip's place and turn, and of the normal forces. */
+int64_t stiffopt_contact_tangent(const Problem *p, double *found) {
+    static _Thread_local Changes changes;
+    double A[MOST_UNKNOWNS * MOST_UNKNOWNS], x[MOST_UNKNOWNS * MOST_EXTRAS];
+    int64_t k = p->contacts, last = 3 + 4 * k;
+    NEW_WORK(work);
+    if (!linearise(&work, p, &changes, 6) || !assemble(&work, p, &changes, A, x)) return 0;
+    if (!eliminate(A, x, 3 + 5 * k, 6)) return 0;
+    for (int r = 0; r < 6; r++)
+        for (int e = 0; e < 6; e++) {
+            const double *change = r < 3 ? changes.moves[0][r] : changes.X[0][r - 3];
+            found[6 * r + e] = change[last + e];
+            for (int64_t col = 0; col < last; col++) found[6 * r + e] += change[col] * x[6 * col + e];
+        }
+    memcpy(found + 36, x + 6 * last, (size_t)(6 * k) * sizeof(double));
+    return 1;
 }
 
 /* Compute a point of the body at an arc length; return its step. */
