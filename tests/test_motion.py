@@ -464,9 +464,10 @@ main()
     ("arguments", "text"),
     [
         ((), "--robot: name a robot"),
-        (("--robot", "stiff-flop-2", "--to", "2 bar"), "must be 6"),
+        (("--robot", "stiff-flop-2", "--to", "2 bar"), "--to: expected one pressure for each"),
         (("--robot", "stiff-flop-2", "--to", "0, 0 mm"), "--to: "),
         (("--robot", "stiff-flop-2", "--slew", "2 bar"), "--slew: "),
+        (("--robot", "stiff-flop-2", "--slew", "2, 1 bar/s"), "--slew: expected one rate"),
         (("--robot", "stiff-flop-2", "--clearance", "2 mm"), "a clearance needs a scene"),
         (("--robot", "stiff-flop-2", "--to", "missing.yaml"), "missing.yaml"),
         (("--robot", "stiff-flop-2", "--timeout", "-1 s"), "timeout must be"),

@@ -276,13 +276,18 @@ def test_steps_that_are_asked_of_a_crossing_are_kept(robot, compiled):
     layers, _ = candidates(tasks)
     small = [layer[:2] for layer in layers[:8]]
     steps = np.full((7, robot.n_pressures), 1.5e5)
-    route = RouteSearch(tasks, small, steps, "mean").best()
+    search, by_numpy = (RouteSearch(tasks, small, steps, "mean") for _ in range(2))
+    route = search.best()
+    by_numpy._code = None
+    assert search._code is not None
+    assert by_numpy.best() == route
     values = [
         np.mean([each.value for each in some])
         for some in itertools.product(*small)
         if (np.abs(np.diff([each.pressures for each in some], axis=0)) <= 1.5e5).all()
     ]
     assert route.value("mean") >= max(values) - 2e-3
+    assert search.furthest == by_numpy.furthest == 7
 
 
 def post_half_way(arm, solution):

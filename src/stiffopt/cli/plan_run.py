@@ -8,6 +8,7 @@ from pathlib import Path as FilePath
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from stiffopt.cli import exits
 from stiffopt.cli.console import report_error, show, write_json
@@ -19,7 +20,7 @@ from stiffopt.cli.quantities import listed, quantity
 from stiffopt.cli.quantities import view as view_angles
 from stiffopt.cli.solve_files import check_result_file
 from stiffopt.documents import write_file, write_whole
-from stiffopt.errors import InputError, StiffoptError, printable
+from stiffopt.errors import InputError, StiffoptError, printable, shown
 from stiffopt.model.manipulator import Manipulator, load_robot
 from stiffopt.model.scene import Scene, load_scene
 from stiffopt.optimise.task import Task, load_task
@@ -77,7 +78,7 @@ class PlanCommand:
         tasks = [each for each in given if isinstance(each, Task)]
         robot = self._robot(tasks)
         ends = [
-            each if isinstance(each, Task) else np.array(listed(option, each, "Pa", "pressure"))
+            each if isinstance(each, Task) else _of_channels(robot, option, each, "Pa", "pressure")
             for option, each in zip(["--from"] + ["--to"] * len(self.goals), given, strict=True)
         ]
         own = [each.scene for each in (*ends[1:], ends[0]) if isinstance(each, Task)]
@@ -88,7 +89,7 @@ class PlanCommand:
         if self.clearance is not None:
             clearance = quantity("--clearance", self.clearance, "m", "length")
         solution = plan_motion(
-            robot, ends[0], ends[1:], scene=scene, clearance=clearance, slew=self._slew(),
+            robot, ends[0], ends[1:], scene=scene, clearance=clearance, slew=self._slew(robot),
             seed=self.seed, timeout=quantity("--timeout", self.timeout, "s", "time"),
         )  # fmt: skip
         if scene is not None and clearance is not None:
@@ -105,11 +106,12 @@ class PlanCommand:
             raise InputError("--robot: the tasks name different robots; say which one is meant")
         return load_robot(descriptions[0])
 
-    def _slew(self) -> float | tuple[float, ...] | None:
+    def _slew(self, robot: Manipulator) -> float | NDArray[np.float64] | None:
         if self.slew is None:
             return None
-        rates = listed("--slew", self.slew, "Pa/s", "rate of pressure")
-        return rates[0] if len(rates) == 1 else rates
+        if "," in self.slew:
+            return _of_channels(robot, "--slew", self.slew, "Pa/s", "rate of pressure")
+        return quantity("--slew", self.slew, "Pa/s", "rate of pressure")
 
     def _write(
         self,
@@ -169,6 +171,19 @@ class PlanCommand:
         yield from clearance_lines(solution, scene)
         if solution.confidence:
             yield "search", Text(solution.confidence)
+
+
+def _of_channels(
+    robot: Manipulator, option: str, text: str, unit: str, what: str
+) -> NDArray[np.float64]:
+    """Return the values of an option, one for each channel."""
+    values = np.array(listed(option, text, unit, what))
+    if len(values) != robot.n_pressures:
+        raise InputError(
+            f"{option}: expected one {what} for each of the {robot.n_pressures} channels of "
+            f"'{printable(robot.description.name)}'; got {len(values)}: {shown(text)}"
+        )
+    return values
 
 
 def _is_file(text: str) -> bool:

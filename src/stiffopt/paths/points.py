@@ -19,7 +19,7 @@ from stiffopt.optimise.fast import CompiledAnswer
 from stiffopt.optimise.functions import functions
 from stiffopt.optimise.local import descend
 from stiffopt.optimise.prepared import prepared
-from stiffopt.optimise.problem import PressureProblem
+from stiffopt.optimise.problem import Bounding, PressureProblem
 from stiffopt.optimise.program import Program, pressure_ranges
 from stiffopt.optimise.reach import bounded_steps, reach
 from stiffopt.optimise.settings import REACH
@@ -134,6 +134,11 @@ class PathTasks:
         self._rows: dict[int, Vector] = {}
 
     @cached_property
+    def _bounding(self) -> Bounding:
+        """Bounds on the terms' residuals."""
+        return PressureProblem(self.robot, self._without_load[0]).terms_bounding
+
+    @cached_property
     def _parameters(self) -> Vector:
         """Parameters of the compiled functions at each point."""
         return np.array([self.robot.parameters(each.parameters) for each in self.programs])
@@ -221,7 +226,7 @@ class PathTasks:
         Returns those that arrive, and a mask (k,) of which these are.
         """
         lower, upper = self.lower / self.unit, self.upper / self.unit
-        bounding = PressureProblem(self.robot, self._without_load[0]).terms_bounding
+        bounding = self._bounding
         x, is_at = np.clip(pressures / self.unit, lower, upper), np.zeros(len(pressures), bool)
         parameters = self._parameters[indices]
         going = np.arange(len(x))
@@ -242,6 +247,13 @@ class PathTasks:
             x[going] = np.clip(x[going] + bounded_steps(J, -r, D, low, high), lower, upper)
         return x[is_at] * self.unit, is_at
 
+    def _values(self, indices: NDArray[np.intp], pressures: Vector) -> Vector:
+        """Return `PathCandidate.value` of pressures (k, n) of a free arm, each at its point."""
+        if not self.programs[0].measures:
+            return np.asarray(-np.mean((pressures / self.programs[0].reference) ** 2, axis=1))
+        judged = self._functions["judge"].many(pressures, self._parameters[indices], threads=1)
+        return np.asarray(judged[3][..., 0].min(axis=1))
+
     def assessed(self, indices: NDArray[np.intp], pressures: Vector) -> list[list[PathCandidate]]:
         """Return candidates at each point, from pressures (k, n) on target with a clear body."""
         found: list[list[PathCandidate]] = [[] for _ in range(len(self))]
@@ -249,11 +261,9 @@ class PathTasks:
         if scene is not None and len(pressures):
             clear = self.robot.clearance(pressures, scene) >= scene.clearance
             indices, pressures = indices[clear], pressures[clear]
-        slopes = self.slopes(indices.tolist(), pressures) if len(pressures) else None
-        if slopes is not None:
-            values = (-slopes.costs.max(axis=1)).tolist()
-            for index, p, value in zip(indices.tolist(), pressures, values, strict=True):
-                found[index].append(PathCandidate(p, value))
+        values = self._values(indices, pressures).tolist()
+        for index, p, value in zip(indices.tolist(), pressures, values, strict=True):
+            found[index].append(PathCandidate(p, value))
         return found
 
     def judged(self, pressures: Vector) -> list[Judgement | None]:

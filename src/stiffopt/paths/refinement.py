@@ -59,6 +59,10 @@ def refined(
     for _ in range(REFINEMENT.passes):  # a window may be held back at its ends: a wider one then
         windows = [each for each in _windows(pressures, steps) if not _is_within(each, done)]
         if done:
+            if over == "worst":  # a wider window is worth its time where the worst point is in it
+                slopes = tasks.slopes(range(len(tasks)), pressures)
+                worst = -1 if slopes is None else int(slopes.costs.max(axis=1).argmax())
+                windows = [each for each in windows if worst in each]
             windows = [_wider(each, len(pressures)) for each in windows]
         for window in windows:
             new = _Window(tasks, pressures, steps, over, window, set(fixed)).optimised()

@@ -8,14 +8,18 @@ from its ends.  Likewise, whether the body keeps clear of a scene between the po
 only for links that a best sequence would use.
 """
 
+import ctypes
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.model.compiled import Library, compiling_at_once, library
 from stiffopt.model.stopping import checkpoint
 from stiffopt.paths.points import BodyCheck, Local, PathCandidate, PathTasks
 from stiffopt.paths.settings import RATES, ROUTE
@@ -23,6 +27,14 @@ from stiffopt.paths.settings import RATES, ROUTE
 Vector = NDArray[np.float64]
 Indices = NDArray[np.intp]
 _NONE = np.zeros(0, dtype=np.intp)
+_SOURCES = (str(Path(__file__).with_name("native") / "route.c"),)
+
+
+@lru_cache(maxsize=1)
+def _compiled() -> Library | None:
+    """Return machine code of the dynamic programming, which takes little time to compile."""
+    with compiling_at_once():
+        return library("routes", list, _SOURCES)
 
 
 @dataclass
@@ -142,6 +154,7 @@ class RouteSearch:
     ) -> None:
         self._tasks, self._steps, self._over = tasks, steps, over
         self._body = body
+        self._code = _compiled() if tasks.is_compiled else None
         count = len(layers)
         if is_closed:
             layers = [*layers[:-1], layers[0]]
@@ -243,16 +256,14 @@ class RouteSearch:
     @property
     def furthest(self) -> int:
         """The last point that a sequence reaches."""
-        reached = np.isfinite(self._reached(-np.inf, bottleneck=True, computed=True))
+        reached = np.isfinite(self._reached(-np.inf, bottleneck=True, computed=True)[0])
         return int(self._point[reached].max(initial=0))
 
     # -- dynamic programming ------------------------------------------------------------------
 
     def _set_links(self, links: _Links) -> None:
         self._links = links
-        self._done: dict[tuple[bool, bool], tuple[Vector, Vector, Vector]] = {}
-        self._by_point = links.sorted_by_point(self._first)
-        self._starts = np.searchsorted(links.goal, np.arange(len(self._values) + 1)).tolist()
+        self._begin = np.searchsorted(links.goal, np.arange(len(self._values) + 1))
 
     def _sequence(self, *, computed: bool = False) -> _Sequence | None:
         """Return the best sequence, of computed links alone if asked; None if there is none.
@@ -300,62 +311,57 @@ class RouteSearch:
     def _unchecked_sequence(self, computed: bool) -> _Sequence | None:
         if self._over == "mean":
             return self._traced(-np.inf, computed=computed)
-        worst = self._reached(-np.inf, bottleneck=True, computed=computed)
+        worst, _ = self._reached(-np.inf, bottleneck=True, computed=computed)
         best = float(worst[self._first[-2] :].max(initial=-np.inf))
         if not np.isfinite(best):
             return None
         found = self._traced(best - 1e-9, computed=computed)
         return found and found._replace(worst=best)
 
-    def _prices(self, least: float, *, bottleneck: bool, computed: bool) -> Vector:
-        links = self._links
-        usable = links.worst >= least
-        if computed:
-            usable &= links.known
-        return np.where(usable, links.worst if bottleneck else links.total, -np.inf)
-
-    def _reached(self, least: float, *, bottleneck: bool, computed: bool = False) -> Vector:
-        """Return for each candidate the best sequence to it: its worst value, or its sum.
+    def _reached(
+        self, least: float, *, bottleneck: bool, computed: bool = False
+    ) -> tuple[Vector, Indices]:
+        """Return for each candidate the best sequence to it: its worst value or sum, its last link.
 
         All values of a sequence are at least `least`.
         """
-        price = self._prices(least, bottleneck=bottleneck, computed=computed)
-        join = np.minimum if bottleneck else np.add
+        links = self._links
         own = np.where(self._usable >= least, self._usable, -np.inf)
-        found = np.full(len(own), -np.inf)
-        new = 0  # the first candidate whose value may have changed since the last call
-        if (bottleneck, computed) in self._done:
-            before, price_before, own_before = self._done[bottleneck, computed]
-            changed = [
-                *self._links.goal[np.flatnonzero(price != price_before)[:1]],
-                *np.flatnonzero(own != own_before)[:1],
-            ]
-            new = min((self._first[self._point[each]] for each in changed), default=len(own))
-            found[:new] = before[:new]
-        found[: self._first[1]] = own[: self._first[1]]
-        origin = self._links.origin
-        for some, runs, goals in self._by_point:
-            if goals[0] >= new:
-                came = join(found[origin[some]], price[some])
-                found[goals] = join(np.maximum.reduceat(came, runs), own[goals])
-        self._done[bottleneck, computed] = found, price, own
-        return found
+        found, last = np.empty(len(own)), np.zeros(len(own), dtype=np.intp)
+        first, origin, goal = int(self._first[1]), links.origin, links.goal
+        price = links.worst if bottleneck else links.total
+        if self._code is not None:
+            usable = links.known if computed else np.ones_like(links.known)
+            arrays = (self._begin, origin, usable, links.worst, price, own, found, last)
+            self._code.cdll.stiffopt_reached(
+                *map(ctypes.c_int64, (bottleneck, first, len(own))),
+                ctypes.c_double(least),
+                *(ctypes.c_void_p(each.ctypes.data) for each in arrays),
+            )
+            return found, last
+        price = np.where((links.worst >= least) & (links.known | (not computed)), price, -np.inf)
+        join = np.minimum if bottleneck else np.add
+        came = np.full(len(own), -np.inf)
+        found[:] = -np.inf
+        found[:first] = own[:first]
+        for some, runs, goals in links.sorted_by_point(self._first):
+            came[goals] = np.maximum.reduceat(join(found[origin[some]], price[some]), runs)
+            found[goals] = join(came[goals], own[goals])
+        best = np.flatnonzero(join(found[origin], price) == came[goal])[::-1]
+        last[goal[best]] = best
+        return found, last
 
     def _traced(self, least: float, *, computed: bool = False) -> _Sequence | None:
         """Return the sequence with the largest sum of values that are all at least `least`."""
-        price = self._prices(least, bottleneck=False, computed=computed)
-        reached = self._reached(least, bottleneck=False, computed=computed)
+        reached, last = self._reached(least, bottleneck=False, computed=computed)
         at = int(self._first[-2] + reached[self._first[-2] :].argmax())
         if not np.isfinite(reached[at]):
             return None
         mean = float(reached[at]) / (len(self._first) - 1)
         links: list[int] = []
-        starts, origin = self._starts, self._links.origin
         while at >= self._first[1]:
-            begin, end = starts[at], starts[at + 1]
-            came = reached[origin[begin:end]] + price[begin:end]
-            links.append(begin + int(came.argmax()))
-            at = int(origin[links[-1]])
+            links.append(int(last[at]))
+            at = int(self._links.origin[links[-1]])
         return _Sequence(at, links[::-1], -np.inf, mean)
 
     def _route(self, found: _Sequence) -> Route:
@@ -374,8 +380,12 @@ class RouteSearch:
         origins, goals = [_NONE], [_NONE]
         first = self._first.tolist()
         for a, b, c, step in zip(first[:-2], first[1:-1], first[2:], self._steps, strict=True):
-            apart = np.abs(self._pressures[b:c, np.newaxis] - self._pressures[a:b])
-            after, before = (apart <= step * (1 + RATES.rounding) + 1e-9).all(axis=2).nonzero()
+            most = step * (1 + RATES.rounding) + 1e-9
+            own, others = self._pressures[b:c].T, self._pressures[a:b].T
+            after, before = (np.abs(own[0][:, np.newaxis] - others[0]) <= most[0]).nonzero()
+            for channel in range(1, len(most)):
+                fits = np.abs(own[channel][after] - others[channel][before]) <= most[channel]
+                after, before = after[fits], before[fits]
             origins.append(a + before)
             goals.append(b + after)
         return _Links.steps(np.concatenate(origins), np.concatenate(goals))
