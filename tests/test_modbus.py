@@ -1,50 +1,29 @@
-"""The Modbus driver against a device written by hand, the peer of the lab against raw requests."""
+"""The Modbus driver against a handmade device: requests, refusals, broken lines, watchdog."""
 
 from __future__ import annotations
 
-import os
 import random
 import socket
 import struct
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from fake_bench import FakeBench
 from modbus_device import HandmadeDevice
-from stiffopt.errors import DeviceError, FileError, InputError, MissingExtraError
-from stiffopt.files import read_file
-from stiffopt.lab.modbus_peer import ModbusPeer
-from stiffopt.rig.drivers.modbus import ModbusLine, ModbusSettings, ModbusSupply, ModbusTcp
-from stiffopt.rig.drivers.modbus_registers import PressureRegister, PressureScale
+from modbus_devices import LIMITS, WATCHDOG, P, settings, until
+from stiffopt.errors import DeviceError, InputError
+from stiffopt.rig.drivers.modbus import ModbusLine, ModbusSupply, ModbusTcp
 from stiffopt.rig.interface import Clock, PressureLimits
-from stiffopt.schema import Schema
 
 pytestmark = pytest.mark.real_time
 
-LIMITS = PressureLimits(np.zeros(3), np.full(3, 1.5e5))
-P = (1e5, 0.5e5, 1.2e5)
+
 COUNTS = (1000, 500, 1200)  # at 1 mbar per count
-
-
-def settings(port: int = 0, **changes: Any) -> ModbusSettings:
-    values: dict[str, Any] = {
-        "driver": "modbus",
-        "tcp": {"host": "127.0.0.1", "port": port},
-        "timeout": 2.0,
-        "scale": "1 mbar",
-        "channels": [{"setpoint": 0x800 + i, "reading": 0x10 + i} for i in range(3)],
-    }
-    return ModbusSettings(**{**values, **changes})
 
 
 @pytest.fixture
@@ -73,92 +52,6 @@ def opened(device: HandmadeDevice, **changes: Any) -> Iterator[ModbusSupply]:
         supply.arm()
         device.requests.clear()
         yield supply
-
-
-def until(condition: Callable[[], bool], seconds: float = 5.0) -> bool:
-    end = time.monotonic() + seconds
-    while not condition() and time.monotonic() < end:
-        time.sleep(0.005)
-    return condition()
-
-
-# counts ------------------------------------------------------------------------------------------
-
-TYPES = ("int16", "uint16", "int32", "uint32", "float32")
-SCALES = (
-    PressureScale(counts=(0, 32767), pressure=(0.0, 1e6)),
-    PressureScale(counts=(6553, 32767), pressure=(0.0, 1e6)),
-    PressureScale(counts=(0, 4095), pressure=(2e5, -1e4)),
-    PressureScale(counts=(0, 1), pressure=(0.0, 100.0)),
-)
-
-
-@given(
-    st.sampled_from(TYPES),
-    st.sampled_from(["big", "little"]),
-    st.sampled_from(SCALES),
-    st.floats(0, 1.5e5),
-)
-def test_counts_never_say_more_than_the_limit(
-    kind: Any, order: Any, scale: PressureScale, pressure: float
-) -> None:
-    point = PressureRegister(7, "holding", kind, order, scale)
-    per_count = abs(np.diff(scale.pressure)[0] / np.diff(scale.counts)[0])
-    for highest, slack in ((pressure, 1.0), (1e9, 0.5)):
-        registers = point.encode(pressure, highest=highest)
-        assert len(registers) == point.width
-        assert all(0 <= word <= 0xFFFF for word in registers)
-        said = point.decode(registers)
-        assert said <= highest + 1e-9 * highest
-        assert abs(said - pressure) <= (slack + 1e-3) * per_count
-
-
-@given(
-    st.sampled_from(TYPES),
-    st.sampled_from(SCALES),
-    st.lists(st.floats(-1.5e5, 1.5e5), min_size=3, max_size=3),
-)
-def test_counts_stay_within_both_limits(
-    kind: Any, scale: PressureScale, pressures: list[float]
-) -> None:
-    low, pressure, high = sorted(pressures)
-    point = PressureRegister(7, "holding", kind, "big", scale)
-    per_count = abs(np.diff(scale.pressure)[0] / np.diff(scale.counts)[0])
-    reach = point.pressure_range()
-    try:
-        said = point.decode(point.encode(pressure, lowest=low, highest=high))
-    except InputError:  # only where the register can say nothing between them
-        assert min(high, reach[1]) - max(low, reach[0]) < 1.001 * per_count
-    else:
-        assert low <= said <= high or (pressure == 0 and said <= max(high, 0))
-        assert abs(said - pressure) <= 1.001 * per_count or not reach[0] <= pressure <= reach[1]
-    vented = point.decode(point.encode(0.0, lowest=low, highest=high))
-    assert -1.001 * per_count <= vented <= max(high, 0.0)
-
-
-def test_words_are_in_order() -> None:
-    scale = PressureScale(counts=(0, 1), pressure=(0.0, 1.0))
-    for kind, value, words in (
-        ("int32", 0x12345, (0x0001, 0x2345)),
-        ("uint32", 0x12345, (0x0001, 0x2345)),
-        ("int16", -1.0, (0xFFFF,)),
-        ("float32", 1.5, (0x3FC0, 0x0000)),
-    ):
-        assert PressureRegister(0, "holding", kind, "big", scale).encode(value) == words
-        little = PressureRegister(0, "holding", kind, "little", scale)
-        assert little.encode(value) == words[::-1]
-        assert little.decode(words[::-1]) == value
-
-
-def test_counts_stay_in_the_register() -> None:
-    scale = PressureScale(counts=(0, 1), pressure=(0.0, 1.0))
-    assert PressureRegister(0, "holding", "int16", "big", scale).encode(1e9) == (0x7FFF,)
-    assert PressureRegister(0, "holding", "uint16", "big", scale).encode(-5.0) == (0,)
-    with pytest.raises(InputError):
-        PressureRegister(0, "holding", "int16", "big", scale).encode(float("nan"))
-
-
-# driver: what is on the wire ---------------------------------------------------------------------
 
 
 def test_writes_all_channels_in_one_request_and_reads_back(device: HandmadeDevice) -> None:
@@ -317,9 +210,6 @@ def test_limits_between_two_counts_leave_nothing() -> None:
         made.device(PressureLimits(np.array([30040.0]), np.array([30060.0])))
     made.device(PressureLimits(np.array([0.0]), np.array([60.0])))
     made.device(PressureLimits(np.array([0.0]), np.array([0.0])))
-
-
-# driver: failures --------------------------------------------------------------------------------
 
 
 def refuse(code: int) -> Callable[[bytes], bytes]:
@@ -595,18 +485,6 @@ def test_dump_valve(device: HandmadeDevice, energised: str, shut: bool) -> None:
     assert device.coils == {9: not shut}
 
 
-# driver: the device's watchdog -------------------------------------------------------------------
-
-WATCHDOG = {
-    "timeout": "400 ms",
-    "address": 0x1000,
-    "resolution": "100 ms",
-    "before": [{"address": 0x1008, "value": 0x55AA}],
-    "after": [{"address": 0x1001, "value": 0x8000}],
-    "trigger": 0x1003,
-}
-
-
 def test_watchdog_is_started_before_anything_moves(device: HandmadeDevice) -> None:
     with settings(device.port, watchdog=WATCHDOG, verify=False).device(LIMITS) as supply:
         assert device.requests[:5] == [
@@ -668,212 +546,6 @@ def test_supply_vents_though_the_watchdog_is_refused(device: HandmadeDevice) -> 
     assert not any(device.holding[0x800 + i] for i in range(3))
 
 
-# settings ----------------------------------------------------------------------------------------
-
-
-class RigFile(Schema):
-    supply: ModbusSettings
-
-
-RIG = """
-format: stiffopt-rig/1
-supply:
-  driver: modbus
-  tcp: {host: 192.168.1.10}
-  scale: {counts: [0, 32767], pressure: [0 bar, 10 bar]}
-  watchdog: {timeout: 500 ms, address: 0x1120}
-  channels:
-    - {setpoint: 0x0800, reading: 0}
-    - setpoint: {address: 0x0801, type: uint16, scale: 1 mbar}
-"""
-
-
-def test_settings_from_a_file(tmp_path: Path) -> None:
-    path = tmp_path / "rig.yaml"
-    path.write_text(RIG)
-    read = read_file(path, "rig", RigFile).supply
-    assert read.setpoints[0].address == 0x800
-    assert read.setpoints[0].encode(1e6) == (32767,)
-    assert read.setpoints[1].encode(1e5) == (1000,)
-    assert list(read.readings) == [0]
-    assert read.timeout == 0.2
-    assert read.watchdog is not None
-    assert read.watchdog.counts == 500
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "message"),
-    [
-        ("0x0801, type", "0x0800, type", "[1].setpoint: register 2048 is that of channel 1"),
-        ("scale: 1 mbar", "scale: 1", "scale: bare number 1 has no unit"),
-        ("scale: 1 mbar", "scale: 1 mm", "scale: '1 mm': 'mm' is not a unit of pressure per count"),
-        ("tcp: {host: 192.168.1.10}", "timeout: 1 s", "one of the keys 'tcp' and 'serial'"),
-        ("reading: 0}", "reading: 70000}", "must be at most 65535"),
-        ("[0, 32767]", "[5, 5]", "scale.counts: the two points must differ"),
-        ("reading: 0}", "reading: 0, max: 0 bar, min: 1 bar}", "[0].max: must be above min"),
-        ("type: uint16, scale: 1 mbar", "scale: {counts: [0, 1], pressure: [4 bar, 5 bar]}, "
-         "type: uint16", "the register cannot say 0 bar"),
-        ("timeout: 500 ms", "timeout: 0.1 ms", "expected 1 to 65535 times the resolution"),
-        ("0x1120", "0x0800", "register 2048 is that of the watchdog"),
-        ("0x1120}", "0x1120, trigger: 0x0801}", "register 2049 is that of the watchdog"),
-        ("reading: 0}", "reading: {address: 65535, type: int32}}", "[0]: its registers go beyond"),
-        ("type: uint16", "typ: uint16", "did you mean 'type'?"),
-        ("192.168.1.10}", "192.168.1.10}\n  serial: {port: COM3}", "one of the keys"),
-        ("tcp: {host: 192.168.1.10}", "serial: {port: COM3}\n  unit: 0", "expected 1 to 247"),
-        ("reading: 0}", "reading: true}", "expected a mapping, not True"),
-    ],
-)  # fmt: skip
-def test_mistakes_in_a_file(tmp_path: Path, old: str, new: str, message: str) -> None:
-    path = tmp_path / "rig.yaml"
-    assert old in RIG
-    path.write_text(RIG.replace(old, new))
-    with pytest.raises(FileError) as error:
-        read_file(path, "rig", RigFile)
-    assert message in str(error.value)
-
-
-@pytest.mark.parametrize("module", ["pymodbus.client", "serial"])
-def test_library_that_is_missing(monkeypatch: pytest.MonkeyPatch, module: str) -> None:
-    monkeypatch.setitem(sys.modules, module, None)
-    supply = settings(tcp=None, serial={"port": "COM3"}).device(LIMITS)
-    with pytest.raises(MissingExtraError, match=r"stiffopt\[modbus\]"):
-        supply.open()
-
-
-def test_template_can_be_rehearsed() -> None:
-    from stiffopt.rig.config import RigDescription
-
-    template = Path(__file__).parents[1] / "rig" / "modbus-aurora.yaml"
-    given = read_file(template, "rig", RigDescription).supply.model_copy(update={"timeout": 2.0})
-    assert given.verify
-    assert given.dump_valve is not None
-    bench = FakeBench()
-    peer = ModbusPeer(given, bench)
-    try:
-        with peer.start().device(LIMITS) as supply:
-            assert bench.valve_open
-            supply.arm()
-            measured = supply.exchange(LIMITS.high).pressures
-            assert supply._joint is not None
-            for values in (measured, bench.pressures, bench.pressures_in_arm):
-                np.testing.assert_allclose(values, LIMITS.high, atol=1e6 / 32767)
-            assert until(lambda: bench.valve_open)  # the watchdog
-            assert not bench.pressures.any()
-    finally:
-        peer.close()
-
-
-# the lab's peer ----------------------------------------------------------------------------------
-
-
-class Raw:
-    """A Modbus TCP client by hand."""
-
-    def __init__(self, port: int) -> None:
-        self.socket = socket.create_connection(("127.0.0.1", port), timeout=5)
-
-    def __enter__(self) -> Raw:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.socket.close()
-
-    def ask(self, request: str) -> str:
-        body = bytes.fromhex(request)
-        self.socket.sendall(struct.pack(">HHHB", 77, 0, len(body) + 1, 1) + body)
-        head = self.socket.recv(7, socket.MSG_WAITALL)
-        transaction, _, length, _ = struct.unpack(">HHHB", head)
-        assert transaction == 77
-        return self.socket.recv(length - 1, socket.MSG_WAITALL).hex()
-
-
-@contextmanager
-def peer_for(**changes: Any) -> Iterator[tuple[ModbusSettings, FakeBench]]:
-    bench = FakeBench()
-    peer = ModbusPeer(settings(**changes), bench)
-    try:
-        yield peer.start(), bench
-    finally:
-        peer.close()
-
-
-def port_of(given: ModbusSettings) -> int:
-    assert given.tcp is not None
-    return given.tcp.port
-
-
-def test_peer_carries_pressures_over() -> None:
-    with peer_for() as (given, bench), Raw(port_of(given)) as raw:
-        assert raw.ask("10 0800 0003 06 03e8 01f4 04b0") == "1008000003"
-        np.testing.assert_allclose(bench.pressures, P)
-        assert raw.ask("03 0800 0003") == "030603e801f404b0"
-        assert raw.ask("04 0010 0003") == "040603e801f404b0"
-        bench.readings = np.array([-100.0, np.nan, 1e9])
-        assert raw.ask("04 0010 0003") == "0406ffff7fff7fff"
-        assert raw.ask("06 0801 0001") == "0608010001"
-        assert bench.pressures[1] == 100.0
-        assert raw.ask("03 0803 0001") == "8302"  # no such address
-        assert raw.ask("10 07ff 0002 04 0001 0001") == "9002"
-        assert raw.ask("04 0000 0001") == "8402"
-
-
-def test_peer_hides_set_points_behind_readings_as_couplers_do() -> None:
-    channels = [
-        {"setpoint": {"address": i, "read_back": 0x200 + i}, "reading": i} for i in range(3)
-    ]
-    with peer_for(channels=channels, table="holding") as (given, bench):
-        bench.readings = np.array([100.0, 200.0, 300.0])
-        with given.device(LIMITS) as supply, Raw(port_of(given)) as raw:
-            supply.arm()
-            reading = supply.exchange(P)
-            np.testing.assert_allclose(reading.pressures, bench.readings)
-            np.testing.assert_allclose(bench.pressures, P)
-            assert raw.ask("03 0000 0003") == "0306000100020003"
-            assert raw.ask("03 0200 0003") == "030603e801f404b0"
-            assert raw.ask("17 0000 0001 0001 0001 02 0007") == "17020001"
-            assert bench.pressures[1] == 700.0
-
-
-@pytest.mark.parametrize("kind", ["int32", "uint32", "float32"])
-@pytest.mark.parametrize("order", ["big", "little"])
-def test_peer_and_driver_in_wide_registers(kind: str, order: str) -> None:
-    channels = [{"setpoint": 2 * i, "reading": 10 + 2 * i} for i in range(3)]
-    wide = {"type": kind, "word_order": order, "scale": "1 Pa", "table": "holding"}
-    with peer_for(channels=channels, **wide) as (given, bench), given.device(LIMITS) as supply:
-        supply.arm()
-        np.testing.assert_allclose(supply.exchange(P).pressures, P)
-        np.testing.assert_allclose(bench.pressures, P)
-        bench.readings = np.array([np.nan, 1e5, 2e5])
-        assert np.isnan(supply.read().pressures[0]) == (kind == "float32")
-
-
-def test_peer_has_a_watchdog() -> None:
-    valve = {"coil": 3}
-    watchdog = {**WATCHDOG, "timeout": 0.5, "resolution": 0.01}
-    with peer_for(watchdog=watchdog, dump_valve=valve) as (given, bench):
-        assert bench.valve_open  # as long as nobody is there
-        with given.device(LIMITS) as supply:
-            supply.arm()
-            end = time.monotonic() + 0.9
-            while time.monotonic() < end:
-                supply.command(P)
-                supply.read()
-                time.sleep(0.01)
-            assert bench.pressures.all()
-            assert not bench.valve_open
-            assert until(lambda: bench.valve_open)
-            assert not bench.pressures.any()
-            commands = len(bench.commands)
-            time.sleep(0.1)
-            assert len(bench.commands) == commands
-            with pytest.raises(DeviceError, match="has the device's watchdog run out"):
-                supply.command(P)
-            supply.vent()
-            supply.arm()
-            supply.command(P)
-            assert bench.pressures.all()
-
-
 @pytest.mark.parametrize("table", ["input", "holding"])
 def test_a_foreign_set_point_is_a_fault(device: HandmadeDevice, table: str) -> None:
     with opened(device, table=table) as supply:
@@ -884,79 +556,3 @@ def test_a_foreign_set_point_is_a_fault(device: HandmadeDevice, table: str) -> N
         supply.clock.sleep(0.05)
         with pytest.raises(DeviceError, match="does another program write to it"):
             supply.exchange(P)
-
-
-def test_peer_without_a_watchdog_keeps_pressures() -> None:
-    with peer_for() as (given, bench), Raw(port_of(given)) as raw:
-        raw.ask("10 0800 0003 06 03e8 01f4 04b0")
-        time.sleep(0.3)
-        np.testing.assert_allclose(bench.pressures, P)
-
-
-def test_peer_that_is_off_or_slow() -> None:
-    with peer_for(timeout=0.6) as (given, bench), given.device(LIMITS) as supply:
-        supply.arm()
-        supply.command(P)
-        bench.faults["supply"] = "off"
-        with pytest.raises(DeviceError, match="does not answer"):
-            supply.command(np.zeros(3))
-        np.testing.assert_allclose(bench.pressures, P)
-        bench.faults["supply"] = "slow"
-        began = time.monotonic()
-        supply.read()
-        assert time.monotonic() - began > 0.05
-        bench.faults.clear()
-        supply.command(np.zeros(3))
-        assert not bench.pressures.any()
-
-
-def test_peer_listens_where_it_may() -> None:
-    with peer_for(tcp={"host": "192.168.1.10", "port": 502}) as (given, _):
-        assert given.tcp is not None
-        assert given.tcp.host == "127.0.0.1"
-        assert given.tcp.port != 502
-        with pytest.raises(DeviceError, match=f"port {given.tcp.port} of 127.0.0.1 is in use"):
-            ModbusPeer(given, FakeBench()).start()
-        with Raw(given.tcp.port) as raw:  # it still answers after that
-            assert raw.ask("03 0800 0001") == "03020000"
-
-
-def test_peer_leaves_nothing_behind() -> None:
-    def state() -> tuple[int, int]:
-        return threading.active_count(), len(os.listdir("/proc/self/fd"))
-
-    for changes in ({}, {"tcp": None, "serial": {"port": "/dev/ttyUSB0"}}):
-        with peer_for(**changes):  # what libraries open once stays open
-            pass
-        before = state()
-        for _ in range(3):
-            bench = FakeBench()
-            peer = ModbusPeer(settings(**changes), bench)
-            with peer.start().device(LIMITS) as supply:
-                supply.arm()
-                supply.command(P)
-            peer.close()
-            peer.close()
-            with pytest.raises(DeviceError):
-                supply.open()
-        assert until(lambda before=before: state() <= before), (before, state())
-
-
-def test_serial_line() -> None:
-    serial = {"port": "/dev/ttyUSB0", "baudrate": 115200}
-    lost = {"tcp": None, "serial": serial, "dump_valve": {"coil": 1}, "table": "holding"}
-    with peer_for(**lost) as (given, bench):
-        assert given.serial is not None
-        assert given.serial.baudrate == 115200
-        with given.device(LIMITS) as supply:
-            supply.arm()
-            for p in (P, P[::-1]):
-                np.testing.assert_allclose(supply.exchange(p).pressures, p)
-                np.testing.assert_allclose(bench.pressures, p)
-            bench.faults["supply"] = "off"
-            with pytest.raises(DeviceError, match=f"{given.serial.port} does not answer"):
-                supply.read()
-            bench.faults.clear()
-            np.testing.assert_allclose(supply.read().pressures, P[::-1])
-        assert not bench.pressures.any()
-        assert bench.valve_open

@@ -20,7 +20,7 @@ GUARDING = {
     "safety/gate.py": ("tests/test_safety.py", "tests/test_claim.py", "tests/test_goal.py"),
     "safety/goal.py": ("tests/test_goal.py",),
     "safety/claim.py": ("tests/test_claim.py",),
-    "safety/guard.py": ("tests/test_guard.py",),
+    "safety/guard.py": tuple(f"tests/test_guard{part}.py" for part in ("", "_goals", "_program")),
     "safety/rescue.py": ("tests/test_rescue.py",),
     "safety/vent_line.py": ("tests/test_vent_line.py",),
 }
