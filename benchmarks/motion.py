@@ -9,8 +9,9 @@ arm's own stiffest pressures without inertia, creep and hysteresis: the regulato
 larger of 5 % of the step and 0.5 mm. *Doubts* are steps after which the motion watch doubts.
 
 ``commissioned`` is the loop after ``stiffopt commission --quick`` of that arm, with the measured
-frequency and damping of its swing. ``--speeds`` also follows figures-of-eight of 40 mm at these
-speeds in m/s: root mean square error for the known latency of 70 ms, and for the best latency.
+frequency and damping of its swing, and the moduli and gains that its steps imply. ``--speeds`` also
+follows figures-of-eight of 40 mm at these speeds in m/s: root mean square error at the time, for
+the regulators' latency of 70 ms, and for the best latency.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ from report import table
 from stiffopt import RobotDescription, load_robot
 from stiffopt.commissioning.commission import commission, record_of
 from stiffopt.commissioning.expected import expected_steps
-from stiffopt.commissioning.record import CommissioningRecord
+from stiffopt.commissioning.record import CommissioningRecord, with_measured_steps
 from stiffopt.control.controller import TipController
 from stiffopt.control.interface import Controller
 from stiffopt.control.tuning import ControlTuning
@@ -90,6 +91,7 @@ def controller_of(
         if record is not None and record.swing is not None:
             swing = {"frequency": record.swing.frequency, "damping": record.swing.damping}
             control = control.model_copy(update=swing)
+            robot = with_measured_steps(robot, record)
         return TipController(
             load_robot(robot), rig.supply.limits, rig.slew, period=PERIOD, control=control,
             safety=rig.settings.safety, vibrates=dynamics == DYNAMICS, tuning=tuning,

@@ -30,6 +30,7 @@ from stiffopt.commissioning.record import (
     CommissioningRecord,
     RecordedFinding,
     commissioned_control,
+    commissioned_robot,
     fingerprints,
     load_record,
     save_record,
@@ -39,6 +40,7 @@ from stiffopt.commissioning.timing import Delays, Swing, fit_swing
 from stiffopt.control.state import State
 from stiffopt.documents import read_document
 from stiffopt.errors import InputError
+from stiffopt.model.description import RobotDescription
 from stiffopt.model.robot_files import load_description
 from stiffopt.plant.plant import Plant
 from stiffopt.plant.settings import Mismatch, PlantLoad, PlantSettings
@@ -608,6 +610,32 @@ def test_the_loop_gets_the_swing_that_was_found(tmp_path: Path) -> None:
     assert settings_with(armed) == (None, 0.06)
     armed.path.unlink()
     assert settings_with(armed) == (None, 0.06)
+
+
+def test_the_loop_gets_the_modulus_and_the_gains_that_were_measured(tmp_path: Path) -> None:
+    """Elongation has no say."""
+    ways, factors = np.array([(4.0, 0.0), (-2.0, 3.0), (-2.0, -3.0)]) * 1e-3, (0.7, 0.8, 0.9)
+    channels = [
+        {"displacement": (*(f * way), 0.0), "expected": (*way, 5e-4), "deviation": 1e-5}
+        for f, way in zip(factors, ways, strict=True)
+    ]
+
+    def model_with(**record: Any) -> tuple[RobotDescription, RobotDescription]:
+        rig = Armed(tmp_path, **record).lab.rig
+        return rig.robot, commissioned_robot(rig.settings, rig.robot)
+
+    robot, found = model_with(channels=channels)
+    (before,), (after,) = robot.segments, found.segments
+    ratio = after.material.youngs_modulus / before.material.youngs_modulus
+    assert ratio == pytest.approx(1 / 0.8)
+    assert after.corrections is not None
+    assert after.corrections.gain == pytest.approx((7 / 8, 1.0, 9 / 8))
+    for changes in ({"fits": False}, {"robot_hash": "0" * 16}, {"channels": ()}):
+        robot, found = model_with(**{"channels": channels} | changes)
+        assert found is robot
+    still = [{**each, "expected": (0.0, 0.0, 5e-4)} for each in channels]
+    robot, found = model_with(channels=still)
+    assert found is robot
 
 
 def test_arming_compares_the_vented_arm_with_the_record(tmp_path: Path) -> None:

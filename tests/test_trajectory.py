@@ -74,6 +74,20 @@ def test_both_ends_are_held():
     assert made.at(1e6).position == pytest.approx(POINTS[-1])
 
 
+def test_smoothing_by_the_lags_gives_back_the_positions():
+    times = np.linspace(0, 6, 61)
+    ring = 0.02 * np.stack([np.cos(2 * times), np.sin(2 * times), 0 * times], axis=1)
+    way, rate = course(times, position=[tuple(each) for each in ring.tolist()]), 10.0
+    ages, errors = np.linspace(0, 3, 600), []
+    lags = (rate * ages) ** 3 * np.exp(-rate * ages)
+    for spread in (0.0, 2 / rate):
+        led = np.array([way.at(103.0 + 4 / rate - age, spread).position for age in ages])
+        smooth = lags / lags.sum() @ led
+        errors.append(float(np.linalg.norm(smooth - np.array(way.at(103.0).position))))
+    assert errors[0] > 1e-3
+    assert errors[1] < 0.25 * errors[0]
+
+
 def test_later_first_waypoint_begins_at_the_present_tip():
     made = course(TIMES, position=POINTS)
     assert made.at(100.0).position == pytest.approx(tuple(HOME), abs=1e-12)

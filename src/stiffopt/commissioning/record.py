@@ -13,17 +13,21 @@ from collections.abc import Iterator
 from datetime import UTC, datetime
 from typing import Annotated, Any
 
+import numpy as np
 from pydantic import BeforeValidator, Field
 
 from stiffopt.directions import Quaternion
 from stiffopt.errors import InputError
 from stiffopt.files import read_file, save_file
 from stiffopt.model.description import RobotDescription
+from stiffopt.model.parameters import Parameter, with_values
 from stiffopt.rig.settings import ControlSettings
 from stiffopt.schema import Items, Schema, Vector
 from stiffopt.units import Angle, Duration, Frequency, Length, Number, Pressure, PressureRate, Ratio
 
 KIND = "commissioning"
+
+_LEAST_STEP = 1e-4  # m; a smaller expected displacement of the tip says nothing about a channel
 
 Count = Annotated[int, Field(ge=1)]
 Text = Annotated[str, Field(min_length=1)]
@@ -227,18 +231,63 @@ def commissioned_control(rig: Any, robot: RobotDescription) -> ControlSettings:
     robot : RobotDescription
     """
     control: ControlSettings = rig.control
-    path = rig.commissioning.record
-    if path is None or not os.path.exists(path):
-        return control
-    try:
-        record = load_record(path)
-    except InputError:  # the check before arming reports it
-        return control
-    if record.swing is None or not record.fits or not is_record_of(record, robot, rig):
+    record = _usable_record(rig, robot)
+    if record is None or record.swing is None:
         return control
     found = {"frequency": record.swing.frequency, "damping": record.swing.damping}
     own = control.model_fields_set
     return control.model_copy(update={k: v for k, v in found.items() if k not in own})
+
+
+def commissioned_robot(rig: Any, robot: RobotDescription) -> RobotDescription:
+    """Return a robot with the moduli and gains that the steps of its commissioning imply.
+
+    A calibrated robot is unchanged, and so is one without a record of exactly this rig that fits.
+
+    Parameters
+    ----------
+    rig : RigDescription
+    robot : RobotDescription
+    """
+    record = None if robot.calibration is not None else _usable_record(rig, robot)
+    return robot if record is None else with_measured_steps(robot, record)
+
+
+def with_measured_steps(robot: RobotDescription, record: CommissioningRecord) -> RobotDescription:
+    """Return a robot whose tip moves sideways as the recorded steps did.
+
+    The mean of a segment's channels gives its modulus, what is left the channels' gains. Elongation
+    is left out: silicone is stiffer in it at small steps than in bending.
+    """
+    moved, expected = (
+        np.array([getattr(channel, key)[:2] for channel in record.channels]).reshape(-1, 2)
+        for key in ("displacement", "expected")
+    )
+    if len(moved) != robot.n_pressures or (np.linalg.norm(expected, axis=1) < _LEAST_STEP).any():
+        return robot
+    ratios = (moved * expected).sum(axis=1) / (expected**2).sum(axis=1)
+    values, first = {}, 0
+    for place, segment in enumerate(robot.segments):
+        own = ratios[first : first + segment.n_channels]
+        first += segment.n_channels
+        factors = {"material.youngs_modulus": 1 / own.mean()}
+        factors |= {f"corrections.gain[{c}]": own[c] / own.mean() for c in range(len(own))}
+        for key, factor in factors.items():
+            parameter = Parameter(f"segments[{place}].{key}")
+            values[parameter] = float(factor * parameter.value(robot))
+    return with_values(robot, values)
+
+
+def _usable_record(rig: Any, robot: RobotDescription) -> CommissioningRecord | None:
+    """Return the record of exactly this rig; None if there is none that fits."""
+    path = rig.commissioning.record
+    if path is None or not os.path.exists(path):
+        return None
+    try:
+        record = load_record(path)
+    except InputError:  # the check before arming reports it
+        return None
+    return record if record.fits and is_record_of(record, robot, rig) else None
 
 
 def problems_of_record(

@@ -71,12 +71,20 @@ class Course:
         self._knots = knots
         self.begin, self.end = begin, begin + times[-1]
 
-    def at(self, now: float) -> Target:
-        """Return the target at a time, in s."""
-        t = float(np.clip(now - self.begin, self._knots[0], self._knots[-1]))
+    def at(self, now: float, spread: float = 0.0) -> Target:
+        """Return the target at a time, in s, for a reference that smooths it.
+
+        `spread` is the standard deviation of the reference's impulse response, in s. The smoothed
+        positions are then those of the course, except for its fourth and higher derivatives.
+        """
+        t, *around = (
+            float(np.clip(time - self.begin, self._knots[0], self._knots[-1]))
+            for time in (now, now - math.sqrt(3) * spread, now + math.sqrt(3) * spread)
+        )
         update: dict[str, object] = {}
         if self._position is not None and self._first.position is not None:
             values = self._position(t)
+            values = values - (self._position(np.array(around)).sum(axis=0) - 2 * values) / 6
             update["position"] = tuple(
                 None if axis is None else float(value)
                 for axis, value in zip(self._first.position, values, strict=True)

@@ -165,8 +165,11 @@ class Replanner:
         if task is not None and target is not None and now - self._requested_at >= interval - 1e-6:
             search = self._search and self.pursuit.course is None
             self._requested_at, self._search = now, False
-            if self.pursuit.course is not None:  # the target when the reference will be there
-                target = self.pursuit.course.at(now + delay + self._lead)
+            course, later = self.pursuit.course, now + delay + self._lead
+            if isinstance(course, Course):  # the target when the reference will be there
+                target = course.at(later, delay / 2)  # the spread of four equal lags
+            elif course is not None:
+                target = course.at(later)
             # The offset depends on the posture. Plans follow it slowly, feedback at once.
             time = max(self._tuning.offset_time, self._tuning.offset_periods / omega)
             share = 1.0 if search else -math.expm1(-interval / time)

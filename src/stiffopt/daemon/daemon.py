@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from stiffopt.commissioning.record import commissioned_control
+from stiffopt.commissioning.record import commissioned_control, commissioned_robot
 from stiffopt.control.controller import TipController
 from stiffopt.control.lifecycle import ARMED
 from stiffopt.control.loop import ControlLoop
@@ -132,7 +132,7 @@ class Daemon:
         self._clock = guarded.clock
         period, scene = 1 / description.rate, description.scene
         self._controller = TipController(
-            self.robot,
+            load_robot(commissioned_robot(description, self.robot.description)),
             self.link.limits,
             guarded.slew,
             period=period,
