@@ -1,6 +1,7 @@
 """Run all speed benchmarks, as `make bench` does.
 
-    python benchmarks/run.py [--quick] [--seed N] [--only NAME ...] [--keep] [--update]
+    python benchmarks/run.py [--quick] [--seed N] [--only NAME ...] [--set NAME=NUMBER ...]
+        [--keep] [--update]
 
 Writes `results.md`, `results.json` and a plot to out/bench/; `--keep` also copies them to
 benchmarks/results/, which is committed.  Exit code 1 if a count got worse (see `counts.py`);
@@ -13,7 +14,7 @@ import os
 import shutil
 import sys
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from time import perf_counter
 
@@ -125,8 +126,10 @@ def main() -> int:
     parser.add_argument("--out", type=Path, default=OUT)
     parser.add_argument("--keep", action="store_true", help="copy to benchmarks/results/ too")
     parser.add_argument("--update", action="store_true", help="put the counts on record")
+    parser.add_argument("--set", nargs="+", default=[], metavar="NAME=NUMBER", help="other sizes")
     given = parser.parse_args()
     sizes = quick(given.seed) if given.quick else Settings(seed=given.seed)
+    sizes = replace(sizes, **{name: int(size) for name, size in (w.split("=") for w in given.set)})
     fine = run(sizes, given.only, given.out, given.update)
     if given.keep:
         keep(given.out)

@@ -21,7 +21,7 @@ class Settings:
     batch : rows of the batched evaluations.
     batch_tasks : tasks of `solve_batch`.
     paths, scene_paths : random paths per arm, without and with objects.
-    reference_paths : of these with references.
+    reference_paths, reference_points : paths with references, and their points.
     lattice : configurations per point of the dynamic programme.
     path_starts : random starts of IPOPT for a whole path.
     """
@@ -40,6 +40,7 @@ class Settings:
     paths: int = 12
     scene_paths: int = 10
     reference_paths: int = 3
+    reference_points: int = 60
     lattice: int = 2500
     path_starts: int = 20
 
@@ -54,7 +55,7 @@ def quick(seed: int) -> Settings:
     return Settings(
         seed=seed, quick=True, segments=(1, 2), tasks=3, warm_tasks=2, kind_tasks=1,
         repetitions=2, reference_starts=1, most_seconds=0.5, batch=2000, batch_tasks=10,
-        paths=1, scene_paths=1, reference_paths=0, lattice=300, path_starts=2,
+        paths=1, scene_paths=1, reference_paths=0, reference_points=8, lattice=200, path_starts=2,
     )  # fmt: skip
 
 

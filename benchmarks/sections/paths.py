@@ -20,17 +20,20 @@ TEXT = """\
 Random splines, lines and arcs of 250 points 1 mm apart at 10 mm/s and at most 5 bar/s, of which
 every point can be had alone; free, and past one to three spheres, capsules and boxes beside the
 arm. *Warm starts* solve point after point from the one before, and may jump; *jumps* are steps of
-theirs above the rate. *Clear* is the least distance beyond the clearance, from 500 stations of
-the body, computed anew. The references have 60 points 4 mm apart at 5 to 0.2 bar/s: for two
-segments the best sequence over many random configurations at each point (a dynamic programme),
-refined by IPOPT; for three IPOPT on the whole path from random starts; they share nothing with
-`solve_path`."""
+theirs above the rate. The share *of warm starts* is the least on those paths (*fair*) on which
+these keep the rates and, half-way between points too, the clearance. *Clear* is the least distance
+beyond the clearance, at points and half-way, from 500 stations of the body, computed anew. The
+references have 60 points on 240 mm at 5 to 0.2 bar/s: for two segments the best sequence over many
+random configurations at each point (a dynamic programme), refined by IPOPT; for three IPOPT on the
+whole path from random starts; they share nothing with `solve_path`. Motions past objects, with the
+p95 of their time, are in the section *motions*."""
 
 POINTS, SPACING, SPEED = 250, 1e-3, 0.01
-FEW_POINTS, FEW_SPACING = 60, 4e-3
+REFERENCE_LENGTH = 0.24  # m
 SLEW, SLEWS = 5e5, (5e5, 1e5, 0.5e5, 0.2e5)
 TOLERANCE, CLEARANCE = 1e-4, 1e-3
 ROUNDING = 1e-6  # relative, of steps
+BETWEEN = 8e-5  # m, allowed loss of clearance between points
 KINDS = ("spline", "line", "arc")
 DIRECTIONS = (((1, 0, 0), "base"), ((0, 1, 0), "path"), ((0, 0, 1), "base"))
 
@@ -56,13 +59,14 @@ def section(sizes: Settings) -> Section:
         TEXT,
         (
             "segments", "scene", "paths", "solved", "steps above the rate", "clear, mm",
-            "of warm starts", "jumps of these", "CPU, s", "longest, s",
+            "of warm starts", "fair", "jumps of these", "CPU, s", "p90, s", "longest, s",
         ),
     )  # fmt: skip
     for segments in (2,) if sizes.quick else (2, 3):
         robot = tasks.arm(segments)
         for name, count in (("none", sizes.paths), ("1 to 3", sizes.scene_paths)):
-            _row(out, robot, segments, name, count, sizes.seed)
+            if count:
+                _row(out, robot, segments, name, count, sizes.seed)
         _references(out, robot, segments, sizes)
     return out
 
@@ -89,27 +93,31 @@ def _row(
         _add(found, robot, path, solution, warm)
     arm = f"{tasks.arm_words(segments)}, {scene if scene != 'none' else 'no'} objects"
     seconds = float(np.median(found.seconds))
+    slow = float(np.quantile(found.seconds, 0.9, method="inverted_cdf"))
     out.rows.append(
         (
             str(segments), scene, str(count), percent(float(np.mean(found.solved))),
             str(found.broken), f"{1e3 * min(found.clear):.3g}" if found.clear else "-",
-            f"{min(found.shares, default=np.nan):.4f}", str(found.jumps),
-            f"{seconds:.2g}", f"{max(found.seconds):.2g}",
+            f"{min(found.shares, default=np.nan):.4f}", str(len(found.shares)), str(found.jumps),
+            *(f"{each:.2f}" for each in (seconds, slow, max(found.seconds))),
         )
     )  # fmt: skip
     out.data[arm] = {
         "seconds": found.seconds, "of_warm_starts": found.shares, "clear_m": found.clear,
     }  # fmt: skip
-    share = min(found.shares, default=np.nan)
     out.verdicts += [
         at_least(f"paths solved, {arm}", 100, 100 * float(np.mean(found.solved)), "%"),
         at_most(f"steps above the rate, {arm}", 0, found.broken, "steps"),
-        at_least(f"worst stiffness over that of warm starts, {arm}", 1 - 1e-3, share, "x"),
         at_most(f"CPU time of {POINTS} points, {arm}", bars.PATH_SECONDS[segments], seconds, "s"),
     ]
+    if found.shares:
+        what = f"stiffness over that of warm starts, {arm}"
+        out.verdicts.append(at_least(what, 1 - 1e-3, min(found.shares), "x"))
     if found.clear:
         beyond = 1e3 * min(found.clear)
-        out.verdicts.append(at_least(f"distance beyond the clearance, {arm}", -0.05, beyond, "mm"))
+        out.verdicts.append(
+            at_least(f"distance beyond the clearance, {arm}", -1e3 * BETWEEN, beyond, "mm")
+        )
 
 
 def _add(
@@ -117,17 +125,27 @@ def _add(
 ) -> None:
     """Count one path's figures."""
     found.solved.append(solution.found)
-    found.jumps += int((np.abs(np.diff(warm, axis=0)) > _most(path)).any(axis=1).sum())
+    jumps = int((np.abs(np.diff(warm, axis=0)) > _most(path)).any(axis=1).sum())
+    found.jumps += jumps
     if not solution.found:
         return
     p = solution.pressures
     found.broken += int((np.abs(np.diff(p, axis=0)) > _most(path) * (1 + ROUNDING)).any(1).sum())
+    is_fair = not jumps
     if path.scene is not None:
-        found.clear.append(min(clearance(robot, each, path.scene) for each in p) - CLEARANCE)
-    mine, others = _stiffness(robot, path, p), _stiffness(robot, path, warm)
+        found.clear.append(_beyond(robot, p, path.scene))
+        is_fair = is_fair and _beyond(robot, warm, path.scene) > -BETWEEN
     assert path.stiffness is not None
-    if path.stiffness.over == "worst":
-        found.shares.append(float(mine.min() / others.min()))
+    join = np.min if path.stiffness.over == "worst" else np.mean
+    mine, others = (join(np.log(_stiffness(robot, path, each))) for each in (p, warm))
+    if is_fair:
+        found.shares.append(float(np.exp(mine - others)))
+
+
+def _beyond(robot: Manipulator, pressures: Vector, scene: Scene) -> float:
+    """Least distance beyond the clearance, at pressures (N, n) and half-way between them."""
+    every = [*pressures, *(pressures[1:] + pressures[:-1]) / 2]
+    return min(clearance(robot, each, scene) for each in every) - CLEARANCE
 
 
 def path_along(positions: Vector, number: int, over: str | None = None, slew: float = SLEW) -> Path:
@@ -251,11 +269,12 @@ def clearance(robot: Manipulator, pressures: Vector, scene: Scene) -> float:
 
 def _references(out: Section, robot: Manipulator, segments: int, sizes: Settings) -> None:
     rng = np.random.default_rng([sizes.seed, segments, 2])
-    program = reference.PathProgram(robot, FEW_POINTS)
+    count = sizes.reference_points
+    program = reference.PathProgram(robot, count)
     shares: dict[str, list[float]] = {}
     done = 0
     while done < sizes.reference_paths:
-        x = _positions(robot, rng, "spline", FEW_POINTS, FEW_SPACING)
+        x = _positions(robot, rng, "spline", count, REFERENCE_LENGTH / count)
         if _warm(robot, path_along(x, 3 * done)) is None:
             continue
         for slew in SLEWS:

@@ -117,22 +117,31 @@ def _at_knots(tasks: PathTasks, knots: Sequence[int]) -> tuple[dict[int, list[Pa
     starts = CANDIDATES.starts_loaded if tasks.robot.is_loaded else CANDIDATES.starts
     if not tasks.is_compiled:
         starts = CANDIDATES.general_starts
-    questions = [
-        Local(index, guess, tasks.lower, tasks.upper)
-        for index in knots
-        for guess in tasks.near(index, starts)
-    ]
     checkpoint()
-    answers = tasks.locals(questions)
-    best = tasks.bests(knots)
-    found: dict[int, list[PathCandidate]] = {}
-    for index, candidate in (
-        *zip(knots, best, strict=True),
-        *((q.point, a) for q, a in zip(questions, answers, strict=True)),
-    ):
-        if candidate is not None:
-            found.setdefault(index, []).append(candidate)
-    return {index: distinct(tasks, some) for index, some in found.items()}, len(questions)
+    found = {
+        index: [] if best is None else [best]
+        for index, best in zip(knots, tasks.bests(knots), strict=True)
+    }
+    going, count = list(knots), 0
+    for part in (slice(0, starts // 2), slice(starts // 2, starts)):
+        questions = [
+            Local(index, guess, tasks.lower, tasks.upper)
+            for index in going
+            for guess in tasks.near(index, starts)[part]
+        ]
+        count += len(questions)
+        for question, candidate in zip(questions, tasks.locals(questions), strict=True):
+            if candidate is not None:
+                found[question.point].append(candidate)
+        going = [index for index in going if not _agree(tasks, found[index])]
+    return {index: distinct(tasks, some) for index, some in found.items() if some}, count
+
+
+def _agree(tasks: PathTasks, some: Sequence[PathCandidate]) -> bool:
+    """Whether there are candidates, and each of them was found more than once."""
+    x = np.array([each.pressures for each in some]).reshape(-1, len(tasks.unit))
+    alike = (abs(x[:, np.newaxis] - x) <= CANDIDATES.same * tasks.unit).all(axis=2)
+    return len(x) > 0 and bool((alike.sum(axis=1) > 1).all())
 
 
 def _next_to(tasks: PathTasks, index: int, some: Sequence[PathCandidate]) -> list[PathCandidate]:

@@ -428,9 +428,12 @@ class RouteSearch:
             others = np.flatnonzero(~self._is_lane[goal] | (not is_lane or self._over == "mean"))
             if not len(own) or not len(others):
                 continue
-            apart = np.abs(self._pressures[own][:, np.newaxis] - self._pressures[goal[others]])
             # number of steps needed, if all allow the same change
-            needed = (apart / limit[others]).max(axis=2) * length[others]
+            needed = np.zeros((len(own), len(others)))
+            columns = self._pressures[own].T, self._pressures[goal[others]].T, limit[others].T
+            for a, b, most in zip(*columns, strict=True):
+                np.maximum(needed, np.abs(a[:, np.newaxis] - b) / most, out=needed)
+            needed *= length[others]
             for more in ROUTE.lengths:
                 wanted = np.ceil(more * np.maximum(needed, 1.0))
                 fits = (wanted <= length[others]) & (wanted > length[others] - every)

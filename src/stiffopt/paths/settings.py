@@ -11,7 +11,7 @@ class CandidateSettings:
     ----------
     knots : number of points at which new local optima are sought.
     starts, starts_loaded : number of samples near the target from which each search starts, for a
-        free and for a loaded arm.
+        free and for a loaded arm; half of them where each optimum is found more than once.
     kept : largest number of candidates at a point.
     same : candidates that differ by less than this share of the range in all channels count as one.
     general_knots, general_starts, general_kept : the same without machine code.
