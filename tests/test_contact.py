@@ -106,8 +106,19 @@ def test_the_tip_is_a_hemisphere():
     p = np.full(6, 1.5e4)
     free, C = robot().tip_pose(p)[2, 3], robot().tip_compliance(p)[2, 2]
     wall = {"half_space": {"point": (0, 0, free + 0.015 - 0.1 * C), "normal": (0, 0, -1)}}
-    found = robot().contact_equilibrium(p, scene(wall))
+    found = robot().contact_equilibrium(p, scene(wall, friction=0.2))
     (contact,) = found.contacts
+    # friction at the touched point is a wrench on the tip
+    lever = contact.position - found.tip_pose[:3, 3]
+    dragged = [
+        robot().contact_equilibrium(
+            p, scene(wall), load=1e-4 * np.array([*d, *np.cross(lever, d)]), nearby=found
+        )
+        for d in np.eye(3)[:2]
+    ]
+    moves = [1e4 * (each.tip_pose - found.tip_pose)[:2, 3] for each in dragged]
+    expected = 0.2 * np.linalg.norm(contact.force) * np.linalg.norm(moves, 2)
+    assert found.friction.tip == pytest.approx(expected, rel=1e-3)
     assert contact.at == TWO.length
     assert found.tip_pose[2, 3] == pytest.approx(free - 0.1 * C, abs=1e-5)
     assert contact.force == pytest.approx([0, 0, -0.1], abs=1e-3)
@@ -257,6 +268,7 @@ def test_a_sticking_contact_slips_at_its_friction(friction):
     # across, the touched point is held by turning the arm about its axis too
     law = rod_section(FLOP, np.zeros(3), TWO.gravity)
     held = own + 0.015**2 * law.compliance[5, 5] * at
+    assert found.friction.tip == pytest.approx(friction * normal * between, rel=0.02)
     lost = found.lift_off([0, 1, 0], contacts="sticking")
     assert (lost.how, lost.object) == ("slips", "0")
     assert lost.force == pytest.approx(friction * normal / (between / held), rel=0.02)

@@ -25,6 +25,8 @@ def record(robot: Manipulator, found: ContactEquilibrium) -> dict[str, Any]:
         "stable": found.stable,
         "within_limits": found.within_limits,
         "contacts": [contact_record(each) for each in found.contacts],
+        "friction_tip_m": found.friction.tip,
+        "friction_forces_n": found.friction.forces,
         "stiffness": {name: _stiffness(robot, found, d) for name, d in _AXES.items()},
     }
 
@@ -48,6 +50,8 @@ def summary(robot: Manipulator, found: ContactEquilibrium) -> RenderableType:
     ]
     if not found.contacts:
         facts.append(("contacts", "none"))
+    if said["friction_tip_m"]:
+        facts.append(("friction", friction_text(found)))
     parts: list[RenderableType] = [
         title(f"{printable(robot.description.name)}: leaning on objects"), labelled(facts),
     ]  # fmt: skip
@@ -84,6 +88,15 @@ def summary(robot: Manipulator, found: ContactEquilibrium) -> RenderableType:
     )
     parts.append(TextTable("", headings, lines, remark).renderable())
     return Group(*parts)
+
+
+def friction_text(found: ContactEquilibrium) -> str:
+    """Say what friction can change."""
+    units, bounds = display_units(), found.friction
+    return (
+        f"can keep the tip up to {units.length.text(bounds.tip, '.2g')} from there, and contact "
+        f"forces up to {units.force.text(bounds.forces.max(), '.2g')} from these"
+    )
 
 
 def _loss_text(loss: dict[str, Any]) -> str:

@@ -100,6 +100,7 @@ def _brace(solution: PressureSolution) -> Record:
         return {}
     return {
         "contacts": [contact_record(each) for each in solution.contacts],
+        "friction_tip_m": solution.equilibrium.friction.tip if solution.equilibrium else None,
         "stiffness_free": solution.stiffness_free,
         "preload": [
             {"direction": each.direction, "contacts": each.contacts, **loss_record(each.loss)}

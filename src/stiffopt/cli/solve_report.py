@@ -9,6 +9,7 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from stiffopt.cli.contact_report import friction_text
 from stiffopt.cli.solve_records import priced
 from stiffopt.cli.solved_task import SolvedTask
 from stiffopt.cli.tables import STATUS_COLOURS, block_title, labelled
@@ -141,6 +142,8 @@ def _brace(solution: PressureSolution) -> Iterable[Line]:
                 most if np.isfinite(each.max_force) else "",
             ),
         )
+    if solution.equilibrium and solution.equilibrium.friction.tip:
+        yield "friction", friction_text(solution.equilibrium)
     free, unit = solution.stiffness_free, units.of_si(solution.stiffness_unit)
     value = solution.stiffness
     if free is None or value is None:

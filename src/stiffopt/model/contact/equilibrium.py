@@ -15,7 +15,7 @@ from stiffopt.model.arguments import check_choice, checked_measure
 from stiffopt.model.arm_clearance import SceneKey, measured_scene
 from stiffopt.model.compliance import Boundary, Frame, Kind
 from stiffopt.model.contact.push import ContactLoss, GrowingPush
-from stiffopt.model.contact.rod import Condition, Rod, rotations
+from stiffopt.model.contact.rod import Condition, Rod, hat, rotations
 from stiffopt.model.contact.solve import ContactProblem
 from stiffopt.model.contact.surface import ContactSurface
 from stiffopt.model.contact.system import ContactSystem, LeaningArm
@@ -51,6 +51,19 @@ class Contact(NamedTuple):
     position: Vector
     normal: Vector
     max_force: float
+
+
+class FrictionBounds(NamedTuple):
+    """How far friction can keep an equilibrium from that of contacts that slide without it.
+
+    Attributes
+    ----------
+    tip : largest distance of the tip, in m.
+    forces : largest changes (contacts,) of the normal forces, in N.
+    """
+
+    tip: float
+    forces: Vector
 
 
 class ContactEquilibrium:
@@ -191,6 +204,29 @@ class ContactEquilibrium:
         """
         return _stiffness(self.compliance(contacts), self._arm.shape.rotation[0],
                           checked_measure(direction, kind, boundary, frame))  # fmt: skip
+
+    @property
+    def friction(self) -> FrictionBounds:
+        """What friction can change, to first order and whatever the way to the equilibrium.
+
+        Forces of up to the coefficient of friction times the normal force act at the touched points
+        of the body, each in the tangential direction in which it changes most. The contacts stay
+        closed.
+        """
+        system = self._system_for("tip wrench")
+        u, tip, forces = system.linear.unknowns, 0.0, np.zeros(len(self.contacts))
+        for j in self._with_friction():
+            touch, row, first = self._arm.state.touches[j], self._arm.rows[j], 3 + 7 * j
+            largest = self._arm.problem.surfaces[touch.surface].friction * touch.normal_force
+            across = np.linalg.svd(row.point.normal[None])[2][1:].T
+            right = np.zeros((len(system.matrix), 2))
+            right[first : first + 3] = across
+            right[first + 3 : first + 6] = hat(-row.radius * row.point.normal) @ across
+            solution = np.linalg.solve(system.matrix, right)
+            moved = system.linear.moves[0][:, :u] @ solution[:u]
+            tip += largest * float(np.linalg.norm(moved, 2))
+            forces += largest * np.linalg.norm(solution[u:], axis=1)
+        return FrictionBounds(tip, forces)
 
     # -- derivatives ------------------------------------------------------------------------
 

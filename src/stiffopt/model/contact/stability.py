@@ -131,8 +131,10 @@ def _slope_change(arm: LeaningArm, j: int, responses: list[Vector]) -> Vector:
     found[at : at + 3] += n @ (
         -hat(mean) + own @ hat(force) + crossed @ hat(linear.moment_far[node])
     )
-    near = responses[node]
-    found[at : at + 12] += n @ (own @ near[3:] / 2 + crossed @ near[:3])
+    # by lengths: a step shorter than the contact, at a segment's end, would count too much
+    h = linear.h[max(node - 1, 0) : node + 1]
+    share, near = h[-1] / h.sum() if node else 0.5, responses[node]
+    found[at : at + 12] += n @ (share * own @ near[3:] + crossed @ near[:3])
     if node > 0:  # the force on the distal side equals that at the start of the step before
-        found[at - 6 : at + 6] += n @ own @ responses[node - 1][3:] / 2
+        found[at - 6 : at + 6] += (1 - share) * n @ own @ responses[node - 1][3:]
     return found[:size]

@@ -572,12 +572,14 @@ static double slope_change(const Problem *p, const Touch *touch, const double *s
     for (int i = 0; i < 3; i++) to[6 + i] += vector[i];
     cross(crossed, moment, vector);
     for (int i = 0; i < 3; i++) to[6 + i] += vector[i];
+    /* by lengths: a step shorter than the contact, at a segment's end, would count too much */
     const double *near = starts + 72 * node;
+    double share = node ? (p->at[node] - p->at[node + 1]) / (p->at[node - 1] - p->at[node + 1]) : 0.5;
     for (int c = 0; c < 12; c++)
         for (int i = 0; i < 3; i++)
-            to[6 + c] += own[i] * near[12 * (3 + i) + c] / 2 + crossed[i] * near[12 * i + c];
+            to[6 + c] += share * own[i] * near[12 * (3 + i) + c] + crossed[i] * near[12 * i + c];
     for (int c = 0; c < 12 && node > 0; c++)
-        for (int i = 0; i < 3; i++) to[c] += own[i] * (near - 72)[12 * (3 + i) + c] / 2;
+        for (int i = 0; i < 3; i++) to[c] += (1 - share) * own[i] * (near - 72)[12 * (3 + i) + c];
     double local[6], xi[6], slope[6], a[3], b[3];
     transposed_times(R, force, local), transposed_times(R, moment, local + 3);
     for (int i = 0; i < 6; i++) {
