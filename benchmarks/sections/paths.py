@@ -67,7 +67,8 @@ def section(sizes: Settings) -> Section:
         for name, count in (("none", sizes.paths), ("1 to 3", sizes.scene_paths)):
             if count:
                 _row(out, robot, segments, name, count, sizes.seed)
-        _references(out, robot, segments, sizes)
+        if sizes.lattice if segments == 2 else sizes.path_starts:
+            _references(out, robot, segments, sizes)
     return out
 
 
