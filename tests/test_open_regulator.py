@@ -105,7 +105,8 @@ def test_six_channels_each_at_its_own_pressure() -> None:
         supply.arm()
         press(supply, bench, pressures)
         reading = supply.exchange(pressures).pressures
-        np.testing.assert_allclose(reading, pressures, atol=2e3)
+        # `press` waits until they are within 3 kPa; the set points are 20 kPa apart
+        np.testing.assert_allclose(reading, pressures, atol=4e3)
         told = supply.statistics()
         assert told["reset"] == 1
         assert told["bad_frames"] == told["refused"] == told["vented"] == 0
