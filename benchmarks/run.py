@@ -129,7 +129,11 @@ def main() -> int:
     parser.add_argument("--set", nargs="+", default=[], metavar="NAME=NUMBER", help="other sizes")
     given = parser.parse_args()
     sizes = quick(given.seed) if given.quick else Settings(seed=given.seed)
-    sizes = replace(sizes, **{name: int(size) for name, size in (w.split("=") for w in given.set)})
+    try:
+        other = {name: int(size) for name, size in (each.split("=") for each in given.set)}
+        sizes = replace(sizes, **other)
+    except (TypeError, ValueError):
+        parser.error("--set: expected names of `Settings` with whole numbers, NAME=NUMBER")
     fine = run(sizes, given.only, given.out, given.update)
     if given.keep:
         keep(given.out)

@@ -634,8 +634,10 @@ def test_the_loop_gets_the_modulus_and_the_gains_that_were_measured(tmp_path: Pa
         robot, found = model_with(**{"channels": channels} | changes)
         assert found is robot
     still = [{**each, "expected": (0.0, 0.0, 5e-4)} for each in channels]
-    robot, found = model_with(channels=still)
-    assert found is robot
+    back = [{**channels[0], "displacement": (-1e-4, 0.0, 0.0)}, *channels[1:]]
+    for other in (still, back):
+        robot, found = model_with(channels=other)
+        assert found is robot
 
 
 def test_arming_compares_the_vented_arm_with_the_record(tmp_path: Path) -> None:

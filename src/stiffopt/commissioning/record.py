@@ -266,6 +266,8 @@ def with_measured_steps(robot: RobotDescription, record: CommissioningRecord) ->
     if len(moved) != robot.n_pressures or (np.linalg.norm(expected, axis=1) < _LEAST_STEP).any():
         return robot
     ratios = (moved * expected).sum(axis=1) / (expected**2).sum(axis=1)
+    if (ratios <= 0).any():  # no gain or modulus moves the tip the other way
+        return robot
     values, first = {}, 0
     for place, segment in enumerate(robot.segments):
         own = ratios[first : first + segment.n_channels]

@@ -138,7 +138,7 @@ def _at_knots(tasks: PathTasks, knots: Sequence[int]) -> tuple[dict[int, list[Pa
 
 
 def _agree(tasks: PathTasks, some: Sequence[PathCandidate]) -> bool:
-    """Whether there are candidates, and each of them was found more than once."""
+    """Return whether there are candidates and several starts led to each of them."""
     x = np.array([each.pressures for each in some]).reshape(-1, len(tasks.unit))
     alike = (abs(x[:, np.newaxis] - x) <= CANDIDATES.same * tasks.unit).all(axis=2)
     return len(x) > 0 and bool((alike.sum(axis=1) > 1).all())

@@ -207,11 +207,11 @@ class ContactEquilibrium:
 
     @property
     def friction(self) -> FrictionBounds:
-        """What friction can change, to first order and whatever the way to the equilibrium.
+        """Bounds on how far friction can change this equilibrium, to first order.
 
-        Forces of up to the coefficient of friction times the normal force act at the touched points
-        of the body, each in the tangential direction in which it changes most. The contacts stay
-        closed.
+        They hold for every approach. At each touched point acts a tangential force of at most the
+        coefficient of friction times the normal force, in the direction in which it changes tip and
+        forces most. The contacts stay closed.
         """
         system = self._system_for("tip wrench")
         u, tip, forces = system.linear.unknowns, 0.0, np.zeros(len(self.contacts))

@@ -2,8 +2,8 @@
  *
  * The arm is divided into steps from its tip to its base.  Changes are propagated along the
  * unknowns: a turn of the tip (3), and force (3) and station of each contact; the last columns hold
- * the defects of the nodes' states, or the changes along a force and moment on the tip.  Matrices are stored by rows, except those of generated
- * functions.
+ * the defects of the nodes' states, or the changes along a force and moment on the tip.  Matrices
+ * are stored by rows, except those of generated functions.
  */
 #include <math.h>
 #include <stdint.h>
