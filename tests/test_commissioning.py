@@ -630,6 +630,8 @@ def test_the_loop_gets_the_modulus_and_the_gains_that_were_measured(tmp_path: Pa
     assert ratio == pytest.approx(1 / 0.8)
     assert after.corrections is not None
     assert after.corrections.gain == pytest.approx((7 / 8, 1.0, 9 / 8))
+    assert found.tolerances is not None
+    assert found.tolerances.youngs_modulus == 0.1
     for changes in ({"fits": False}, {"robot_hash": "0" * 16}, {"channels": ()}):
         robot, found = model_with(**{"channels": channels} | changes)
         assert found is robot

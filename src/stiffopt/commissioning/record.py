@@ -19,7 +19,7 @@ from pydantic import BeforeValidator, Field
 from stiffopt.directions import Quaternion
 from stiffopt.errors import InputError
 from stiffopt.files import read_file, save_file
-from stiffopt.model.description import RobotDescription
+from stiffopt.model.description import RobotDescription, Tolerances
 from stiffopt.model.parameters import Parameter, with_values
 from stiffopt.rig.settings import ControlSettings
 from stiffopt.schema import Items, Schema, Vector
@@ -27,6 +27,7 @@ from stiffopt.units import Angle, Duration, Frequency, Length, Number, Pressure,
 
 KIND = "commissioning"
 
+_MODULUS_ERROR = 0.1  # relative, of a modulus from the steps
 _LEAST_STEP = 1e-4  # m; a smaller expected displacement of the tip says nothing about a channel
 
 Count = Annotated[int, Field(ge=1)]
@@ -257,7 +258,8 @@ def with_measured_steps(robot: RobotDescription, record: CommissioningRecord) ->
     """Return a robot whose tip moves sideways as the recorded steps did.
 
     The mean of a segment's channels gives its modulus, what is left the channels' gains. Elongation
-    is left out: silicone is stiffer in it at small steps than in bending.
+    is left out: silicone is stiffer in it at small steps than in bending. The moduli are then known
+    to a tenth, so that adaptation changes them less.
     """
     moved, expected = (
         np.array([getattr(channel, key)[:2] for channel in record.channels]).reshape(-1, 2)
@@ -277,7 +279,10 @@ def with_measured_steps(robot: RobotDescription, record: CommissioningRecord) ->
         for key, factor in factors.items():
             parameter = Parameter(f"segments[{place}].{key}")
             values[parameter] = float(factor * parameter.value(robot))
-    return with_values(robot, values)
+    tolerances = robot.tolerances or Tolerances()
+    error = min(tolerances.youngs_modulus, _MODULUS_ERROR)
+    tolerances = tolerances.model_copy(update={"youngs_modulus": error})
+    return with_values(robot, values).model_copy(update={"tolerances": tolerances})
 
 
 def _usable_record(rig: Any, robot: RobotDescription) -> CommissioningRecord | None:
