@@ -116,7 +116,7 @@ def variants(record: CommissioningRecord) -> dict[str, MakeController]:
         "commissioned, faster reference": controller_of(
             tuned("reference", vibrating_rate=1.8), record
         ),
-        "commissioned, more damping": controller_of(tuned("feedback", effort=1.0), record),
+        "commissioned, less damping": controller_of(tuned("feedback", effort=3.0), record),
         "integral": integral_controller,
     }
 

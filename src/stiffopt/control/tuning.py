@@ -93,7 +93,7 @@ class FeedbackTuning:
     lever: float = 0.05  # weight of an angle against a length, in m/rad
     # weight of the vibration's part of the tip's motion against the motion itself
     mode_weight: float = 3.0
-    effort: float = 3.0  # weight of effort against error in the linear-quadratic regulator
+    effort: float = 1.0  # weight of effort against error in the linear-quadratic regulator
     # change of the tip's position below which a change of pressure is left to the plan, in m/bar:
     # the square root of epsilon of the quadratic program
     posture_weight: float = 0.3e-3
