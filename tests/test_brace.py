@@ -22,6 +22,8 @@ from stiffopt.cli.solved_task import SolvedTask
 from stiffopt.errors import DerivativeError, InputError
 from stiffopt.optimise import braced
 from stiffopt.optimise.leaning import MARGIN_ON, BracedProblem
+from stiffopt.optimise.local import LocalResult
+from stiffopt.optimise.search import Search
 from stiffopt.optimise.settings import BRACE, Effort
 
 PROBLEMS = Path(__file__).parents[1] / "problems"
@@ -286,3 +288,59 @@ def test_the_table_tells_where_it_leans_and_what_that_gives(robot, solution):
              "'post' lifts off", "limited by")  # fmt: skip
     for each in words:
         assert each in text.getvalue()
+
+
+def just_outside(robot, problem, solution) -> braced.Braced:
+    """An optimum moved to where the tip, from rest, is 5 um outside its tolerance."""
+    problem.here = solution.equilibrium
+    point = problem.point(solution.pressures / problem.unit)
+    outwards = point.residual[:3] / np.linalg.norm(point.residual[:3])
+    missing = 1e-4 + 5e-6 - np.linalg.norm(point.residual[:3])
+    step, *_ = np.linalg.lstsq(point.jacobian[:3], outwards * missing, rcond=None)
+    moved = LocalResult.at(problem, problem.point(point.x + step))
+    seen = braced.from_rest(problem, moved)
+    assert seen is not None
+    assert not seen.judgement.holds
+    return seen
+
+
+def test_an_optimum_that_fails_from_rest_is_reached_again(robot, task, solution):
+    problem = BracedProblem(robot, task)
+    seen = just_outside(robot, problem, solution)
+    again = braced.reached_again(problem, seen)
+    assert again is not None
+    assert again.judgement.holds
+    assert np.linalg.norm(again.equilibrium.tip_pose[:3, 3] - [-0.03, 0.01, 0.19]) <= 1e-4
+    assert again.least == pytest.approx(solution.stiffness, rel=0.01)
+
+
+def test_an_optimum_that_fails_and_is_reached_again_is_answered(robot, task, solution, monkeypatch):
+    problem, from_rest = BracedProblem(robot, task), braced.from_rest
+    moved = just_outside(robot, problem, solution)
+    calls = iter([moved])
+    monkeypatch.setattr(braced, "from_rest", lambda p, r: next(calls, None) or from_rest(p, r))
+    answer = stiffopt.solve_pressure(robot, task)
+    assert answer.stiffness == pytest.approx(solution.stiffness, rel=0.01)
+    assert answer.confidence.agreeing >= 1
+    assert "left out" not in answer.message
+
+
+def test_a_stiffer_posture_that_is_left_out_is_told(robot, task, solution, monkeypatch):
+    """An optimum that fails from rest, and again after a second descent, gives way to the next."""
+    problem = BracedProblem(robot, task)
+    moved = just_outside(robot, problem, solution)
+    stiffer = tuple(1.5 * each for each in moved.judgement.stiffnesses)
+    failing = moved._replace(judgement=moved.judgement._replace(stiffnesses=stiffer))
+    from_rest = braced.from_rest
+    calls = iter([failing])
+    monkeypatch.setattr(braced, "reached_again", lambda problem, seen: None)
+    found = braced.braced_answers
+    monkeypatch.setattr(braced, "braced_answers", lambda *args: _twice(found(*args)))
+    monkeypatch.setattr(braced, "from_rest", lambda p, r: next(calls, None) or from_rest(p, r))
+    answer = stiffopt.solve_pressure(robot, task)
+    assert answer.found
+    assert "N/m was left out; when it is reached from rest, " in answer.message
+
+
+def _twice(found: Search) -> Search:
+    return replace(found, results=(found.results[0], *found.results))

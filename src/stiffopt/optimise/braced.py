@@ -26,7 +26,7 @@ from stiffopt.model.contact.equilibrium import ContactEquilibrium
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.optimise.brace import quoted
 from stiffopt.optimise.leaning import FORCE_ON, MARGIN_ON, BracedProblem
-from stiffopt.optimise.local import LocalResult
+from stiffopt.optimise.local import LocalResult, descend
 from stiffopt.optimise.prices import prices_at
 from stiffopt.optimise.problem import ProgramPoint
 from stiffopt.optimise.program import Constraint
@@ -167,6 +167,24 @@ def from_rest(problem: BracedProblem, result: LocalResult) -> Braced | None:
     return Braced(result, eq, problem.judgement(eq)) if eq.contacts else None
 
 
+def reached_again(problem: BracedProblem, judged: Braced) -> Braced | None:
+    """Bring an optimum to the target from its equilibrium from rest, and descend again.
+
+    A descent follows one equilibrium from step to step.  From rest the arm may come to another one
+    close by, which misses the target by little.  Returns None if that is not remedied.
+    """
+    problem.restart()
+    problem.here = judged.equilibrium
+    point = reach(problem, judged.result.point.x, BRACE.iterations)
+    if point is None or not point.reached:
+        return None
+    result = descend(problem, point)
+    if not np.isfinite(result.value):
+        return None
+    again = from_rest(problem, result)
+    return again if again is not None and again.judgement.holds else None
+
+
 class Braced(NamedTuple):
     """An optimum in contact, with its equilibrium from rest and its judgement."""
 
@@ -205,20 +223,50 @@ def lean(
             return replace(free, task=task)
         return _free_answer(task, free, f"the search for where to lean was ended: {error}")
     judged: list[Braced | None] = []
+    holding: list[Braced] = []
     for result in found.results[: BRACE.tried]:
         judged.append(from_rest(problem, result))
-        best = judged[-1]
-        if best is not None and best.judgement.holds:
+        seen = judged[-1]
+        if seen is not None and seen.judgement.holds:
+            holding.append(seen)
             break
-    else:
+        again = None if seen is None else reached_again(problem, seen)
+        if again is not None:
+            holding.append(again)
+    if not holding:
         return _free_answer(task, free, _no_brace(problem, judged))
+    best = max(holding, key=lambda each: each.least)
     if free.found and least_maximised(task, free.stiffnesses) >= best.least:
         unit = display_units().stiffness
         why = (
             f"leaning on {quoted(problem.brace.objects)} gives no more than {unit.text(best.least)}"
         )
         return _free_answer(task, free, why)
-    return _braced_answer(problem, best, free, found.confidence)
+    answer = _braced_answer(problem, best, free, found.confidence_in(best.result))
+    message = "; ".join(filter(None, (answer.message, _left_out(judged, best))))
+    return replace(answer, message=message)
+
+
+def _left_out(judged: list[Braced | None], best: Braced) -> str:
+    """Tell of an optimum stiffer than the answer that does not hold from rest, or return ""."""
+    others = [each for each in judged if each is not None and not each.judgement.holds]
+    others = [each for each in others if each.least > (1 + BRACE.stiffer) * best.least]
+    if not others:
+        return ""
+    stiffest = max(others, key=lambda each: each.least)
+    return (
+        f"a posture of {display_units().stiffness.text(stiffest.least)} was left out; when it is "
+        f"reached from rest, {_failure(stiffest.judgement)}"
+    )
+
+
+def _failure(judgement: Judgement) -> str:
+    """Return the first reason why a judgement does not hold."""
+    if judgement.shortfalls:
+        return judgement.shortfalls[0]
+    if not judgement.pose_holds:
+        return "the target is missed by more than its tolerance"
+    return "the pressures leave their limits" if judgement.is_clear else "the body hits an object"
 
 
 def _free_answer(task: Task, free: PressureSolution, why: str) -> PressureSolution:

@@ -10,7 +10,7 @@ The folder ``native`` holds the same method in C.
 """
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from typing import Any
 
@@ -90,11 +90,24 @@ class Search:
     nearest : tuple of ProgramPoint
         Ends of starts that did not reach the pose, if none reached it.
     confidence : Confidence
+        In the best result.
+    ends : tuple of LocalResult
+        Ends of the converged descents, one of each, those included that stopped next to a known
+        optimum.
+    same : float
+        Difference of values below which ends count as one optimum.
     """
 
     results: tuple[LocalResult, ...]
     nearest: tuple[ProgramPoint, ...]
     confidence: Confidence
+    ends: tuple[LocalResult, ...] = ()
+    same: float = SEARCH.same_optimum
+
+    def confidence_in(self, result: LocalResult) -> Confidence:
+        """Return how sure the search is of another result than the best, with its own descent."""
+        agreeing = sum(_agree(end, result, self.same) for end in self.ends)
+        return replace(self.confidence, agreeing=max(1, agreeing))
 
 
 def search(
@@ -161,7 +174,7 @@ class _Trail:
         if not result.converged:
             return
         self._converged.append(result)
-        if any(self._agree(result, known) for known in self.optima):
+        if any(_agree(result, known, self.same) for known in self.optima):
             self._nothing_new += 1
         else:
             self.optima.append(result)
@@ -172,18 +185,20 @@ class _Trail:
         """Whether enough descents in a row have found nothing new."""
         return self._nothing_new >= self._agreeing
 
-    def _agree(self, a: LocalResult, b: LocalResult) -> bool:
-        return abs(a.value - b.value) < self.same and abs(a.violation - b.violation) < self.same
-
     def outcome(self) -> Search:
         """Return the outcome, the best results first."""
         results = sorted(self._results, key=_rank)
         best = min(self._converged, key=_rank, default=None)
-        agreeing = sum(best is not None and self._agree(result, best) for result in self._converged)
+        ends = tuple(self._converged)
+        agreeing = sum(best is not None and _agree(end, best, self.same) for end in ends)
         confidence = Confidence(
             self.starts, len(self._converged), agreeing, len(self.optima), self.is_complete
         )
-        return Search(tuple(results), tuple(self.nearest), confidence)
+        return Search(tuple(results), tuple(self.nearest), confidence, ends, self.same)
+
+
+def _agree(a: LocalResult, b: LocalResult, same: float) -> bool:
+    return abs(a.value - b.value) < same and abs(a.violation - b.violation) < same
 
 
 def _rank(result: LocalResult) -> tuple[float, float]:

@@ -180,6 +180,7 @@ class BraceSettings:
         nothing new, and most descents.
     iterations : iterations of a start, to the target and to the contacts' demands.
     tried : local optima that are judged in turn, from rest.
+    stiffer : share by which an optimum that does not hold is stiffer than the answer, to be told.
     least_price : gain from a whole tolerance or limit, as a share of the stiffness, to be reported.
     largest_push : largest push that is tested, in N.
     """
@@ -194,6 +195,7 @@ class BraceSettings:
     effort: Effort = field(default=Effort(32, 4, 12))
     iterations: int = 15
     tried: int = 8
+    stiffer: float = 0.01
     least_price: float = 1e-3
     largest_push: float = 1.0
 
