@@ -99,24 +99,31 @@ def _displaced(poses: Vector, twists: Vector) -> Vector:
 def _places(
     problem: BracedProblem, starts: Iterable[Vector]
 ) -> Iterator[tuple[int, ProgramPoint | None]]:
-    """Yield points at the target in contact to descend from, the stiffest first; see `search`."""
-    found: list[tuple[float, ProgramPoint, ContactEquilibrium]] = []
-    tried = 0
-    for x in starts:
-        tried += 1
-        try:
-            found += _brought(problem, x)
-        except StoppedError:
-            if not found:
-                raise
-            break
-    found.sort(key=lambda each: each[0])
-    if not found:
-        yield tried, None
-        return
-    for i in unlike_first(problem, np.array([point.x for _, point, _ in found])):
-        problem.here = found[i][2]
-        yield tried, found[i][1]
+    """Yield points at the target in contact to descend from; see `search`.
+
+    Starts are brought there by rounds, each when those before were not enough.  In a round the
+    stiffest come first.
+    """
+    remaining, tried, arrived = iter(starts), 0, False
+    while some := list(islice(remaining, BRACE.effort.screened)):
+        found: list[tuple[float, ProgramPoint, ContactEquilibrium]] = []
+        for x in some:
+            tried += 1
+            try:
+                found += _brought(problem, x)
+            except StoppedError:
+                if not (arrived or found):
+                    raise
+                remaining = iter(())
+                break
+        arrived = arrived or bool(found)
+        found.sort(key=lambda each: each[0])
+        if not found:
+            yield tried, None
+            continue
+        for i in unlike_first(problem, np.array([point.x for _, point, _ in found])):
+            problem.here = found[i][2]
+            yield tried, found[i][1]
 
 
 def _brought(
@@ -151,7 +158,7 @@ def braced_answers(problem: BracedProblem, table: SampleTable, guess: Vector | N
         nearby = search(problem, [guess / problem.unit], Effort(1, 1, 1), places=_places)
         if nearby.results:
             return nearby
-    starts = islice(candidates(problem, table), BRACE.effort.screened)
+    starts = islice(candidates(problem, table), BRACE.rounds * BRACE.effort.screened)
     return search(problem, starts, BRACE.effort, places=_places)
 
 

@@ -176,8 +176,9 @@ class BraceSettings:
     spare : share of tolerances, forces and margins that is not used.
     stations : stations along the body at which samples are tested for contact.
     screened : samples whose contact is estimated.
-    effort : starts that are brought to the target in contact, descents in a row that must find
-        nothing new, and most descents.
+    effort : starts of a round that are brought to the target in contact, descents in a row that
+        must find nothing new, and most descents.
+    rounds : most rounds; the next one begins if a search is not complete.
     iterations : iterations of a start, to the target and to the contacts' demands.
     tried : local optima that are judged in turn, from rest.
     stiffer : share by which an optimum that does not hold is stiffer than the answer, to be told.
@@ -193,6 +194,7 @@ class BraceSettings:
     stations: int = 14
     screened: int = 1024
     effort: Effort = field(default=Effort(32, 4, 12))
+    rounds: int = 2
     iterations: int = 15
     tried: int = 8
     stiffer: float = 0.01
