@@ -72,13 +72,14 @@ class ContactProblem:
             return self._correct_in_c(native, state, sections)
         previous = np.inf
         for iteration in range(_MAX_ITERATIONS):
-            system = ContactSystem(self, state, sections)
-            try:
-                solution = system.solution()
-            except np.linalg.LinAlgError:
-                return None
-            changes, _ = system.along(solution)
-            size = float(np.sqrt((changes[:, TURN, 0] ** 2).sum(axis=1).max()))
+            with np.errstate(over="ignore", invalid="ignore"):  # where it diverges; refused below
+                system = ContactSystem(self, state, sections)
+                try:
+                    solution = system.solution()
+                except np.linalg.LinAlgError:
+                    return None
+                changes, _ = system.along(solution)
+                size = float(np.sqrt((changes[:, TURN, 0] ** 2).sum(axis=1).max()))
             if not size <= _FARTHEST_TURN or (iteration > 3 and size > previous):  # NaN too
                 return None
             share = min(1.0, _LARGEST_TURN / max(size, _TURN_LEFT))
