@@ -54,7 +54,7 @@ class Confidence:
     reached : int
         Converged descents from starts that reached the pose.
     agreeing : int
-        Converged descents that ended within 0.1 % of the best.
+        Converged descents that ended within 0.1 % of the best; with a brace, of the answer.
     optima : int
         Distinct local optima among them.
     complete : bool
