@@ -24,6 +24,7 @@ __all__ = ["Document", "document_of", "read_document", "to_yaml", "write_file", 
 
 MAX_BYTES = 1_000_000
 MAX_DEPTH = 20
+_TOO_DEEP = f"is nested more than {MAX_DEPTH} levels deep"
 
 
 @dataclass(frozen=True)
@@ -187,9 +188,10 @@ class _Composer:
             mark = error.problem_mark or error.context_mark
             parts = [part for part in (error.context, error.problem) if part]
             line = mark.line + 1 if mark else None
-            raise FileError(
-                self.path, f"is not valid YAML: {', '.join(parts)}", line=line
-            ) from None
+            # libyaml has a limit of its own, and scans ahead of the events that it gives
+            too_deep = "maximum nesting depth" in (error.problem or "")
+            reason = _TOO_DEEP if too_deep else f"is not valid YAML: {', '.join(parts)}"
+            raise FileError(self.path, reason, line=line) from None
         except yaml.YAMLError as error:
             reason = getattr(error, "reason", None) or "it cannot be parsed"
             raise FileError(self.path, f"is not valid YAML: {reason}") from None
@@ -206,7 +208,7 @@ class _Composer:
     def value(self, event: Any, loc: Loc) -> Any:
         self.lines.setdefault(loc, event.start_mark.line + 1)
         if len(loc) > MAX_DEPTH:
-            raise self.error(event, f"is nested more than {MAX_DEPTH} levels deep")
+            raise self.error(event, _TOO_DEEP)
         if isinstance(event, yaml.MappingStartEvent):
             return self.mapping(loc)
         if isinstance(event, yaml.SequenceStartEvent):
