@@ -218,6 +218,24 @@ def test_too_much_for_a_message_is_refused_as_input() -> None:
         TargetMessage.of(Target.model_construct(position=(1.0, float("nan"), 0.0)))
 
 
+@pytest.mark.parametrize(
+    ("match", "expected"),
+    [
+        ({"direction": X, "value": 1.0, "valeu": 1.0}, "match.valeu: Extra"),
+        ({"matrix_n_per_m": [[1.0, 0.0, 0.0]] * 2}, "match.matrix_n_per_m: List"),
+        ({"frame": "base"}, "match.direction: Field required; also stiffness.match.value: Field"),
+    ],
+)
+def test_a_mistake_in_a_measure_is_named_by_its_key_alone(
+    match: dict[str, Any], expected: str
+) -> None:
+    sent = {"target": {"position_m": [0.0, 0.0, 0.18]}, "stiffness": {"match": match}}
+    with pytest.raises(InputError) as caught:
+        task_of(sent, "a robot")
+    assert str(caught.value).startswith(f"stiffness.{expected}")
+    assert "Message." not in str(caught.value)
+
+
 @pytest.mark.parametrize("path", sorted(PROBLEMS.glob("*.yaml")), ids=lambda path: path.stem)
 def test_every_problem_survives_its_message(path: Path) -> None:
     given = load_task(path)

@@ -8,6 +8,8 @@ also in its message. Unknown keys, text instead of numbers, NaN and infinities a
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import reduce
+from operator import or_
 from types import UnionType
 from typing import (
     Annotated,
@@ -41,6 +43,7 @@ from stiffopt.documents import document_of
 from stiffopt.errors import InputError, Loc, dotted, shown
 from stiffopt.files import from_document
 from stiffopt.model.obstacles.mesh import Mesh
+from stiffopt.optimise.measure import Measure
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import Task
 from stiffopt.paths.trajectory import MAX_WAYPOINTS, Trajectory, Waypoint
@@ -231,6 +234,9 @@ def _type(hint: Any) -> Any:
     if isinstance(hint, type) and issubclass(hint, Schema):
         return message_of(hint)
     if origin is Annotated:
+        kinds = [get_args(each)[0] for each in get_args(args[0]) if get_origin(each) is Annotated]
+        if kinds and all(isinstance(kind, type) and issubclass(kind, Measure) for kind in kinds):
+            return _either(kinds)
         return _bounded(_type(args[0]), args[1:])
     if origin in (Union, UnionType):
         return Union[tuple(map(_type, args))]  # noqa: UP007 - made of a tuple
@@ -238,10 +244,34 @@ def _type(hint: Any) -> Any:
         if args[-1] is not Ellipsis:
             return Annotated[list[_type(args[0])], bounds.Len(len(args), len(args))]  # type: ignore[misc]
         item = _type(args[0])
-        is_model = isinstance(item, type) and issubclass(item, SchemaMessage)
-        most = MAX_WAYPOINTS if args[0] is Waypoint else _MAX_ITEMS if is_model else _MAX_NUMBERS
+        most = MAX_WAYPOINTS if args[0] is Waypoint else _MAX_ITEMS
+        if not _is_message(item):
+            most = _MAX_NUMBERS
         return Annotated[list[item], bounds.Len(0, most)]  # type: ignore[valid-type]
     return hint
+
+
+def _is_message(kind: Any) -> bool:
+    """Whether a JSON type is a message, or a choice of messages."""
+    if isinstance(kind, type):
+        return issubclass(kind, SchemaMessage)
+    return get_origin(kind) in (Annotated, Union) and _is_message(get_args(kind)[0])
+
+
+def _either(kinds: list[type[Measure]]) -> Any:
+    """Return the type of the messages of measures, which are told apart by their keys."""
+    messages = {kind.key: message_of(kind) for kind in kinds}
+
+    def which(value: Any) -> str:
+        given = value.names if isinstance(value, SchemaMessage) else value
+        for key, message in reversed(messages.items()):
+            name = key if given is not value else message.names[key]
+            if isinstance(given, Mapping) and name in given:
+                return f"<{key}>"
+        return f"<{kinds[0].key}>"
+
+    tagged = [Annotated[message, Tag(f"<{key}>")] for key, message in messages.items()]
+    return Annotated[reduce(or_, tagged), Discriminator(which)]
 
 
 def _bounded(kind: Any, metadata: tuple[Any, ...]) -> Any:

@@ -74,7 +74,7 @@ class Target(_Keys):
         )
 
     def __repr__(self) -> str:
-        parts = [f"{term.key} {term.asked()}" for term in self.terms]
+        parts = [f"{term.key} {term.condition()}" for term in self.terms]
         return f"Target({', '.join(parts)})"
 
     __str__ = __repr__
