@@ -5,10 +5,11 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import pytest
+from pydantic import Discriminator, Tag
 
 from simulated_loop import TASK, Lab
 from stiffopt.control.checks import (
@@ -47,6 +48,7 @@ from stiffopt.paths.trajectory import Trajectory, Waypoint
 from stiffopt.rig.interface import PressureLimits
 from stiffopt.schema import Items, Schema, Vector
 from stiffopt.units import Length, Number, Speed, TranslationalStiffness
+from test_measures import MeanStiffness
 
 PROBLEMS = Path(__file__).resolve().parent.parent / "problems"
 LIMITS = PressureLimits([0.0] * 3, [1.5e5] * 3)  # type: ignore[arg-type]
@@ -211,6 +213,29 @@ def test_a_floor_among_what_is_maximised_is_not_forgotten() -> None:
         check_task(given, LIMITS)
 
 
+def test_a_goal_with_another_measure_survives_its_message() -> None:
+    """Each kind of measure is read as itself, and as many may be sent as of one kind."""
+
+    class Goal(StiffnessGoal):
+        maximise: Items[  # type: ignore[assignment]
+            Annotated[
+                Annotated[StiffnessMeasure, Tag("<direction>")]
+                | Annotated[MeanStiffness, Tag("<mean>")],
+                Discriminator(lambda value: "<mean>" if "mean" in value else "<direction>"),
+            ]
+        ] = ()
+
+    given = Goal(maximise=[{"mean": "translation"}, {"direction": X}])
+    message = message_of(Goal)
+    sent = json.loads(json.dumps(message.of(given).model_dump()))
+    assert sent["maximise"][0] == {"mean": "translation"}
+    assert message.model_validate(sent).read() == given
+    with pytest.raises(InputError, match=r"maximise: .* at most 50"):
+        message.of(Goal(maximise=[{"mean": "translation"}] * 51))
+    with pytest.raises(InputError, match=r"^maximise\[0\]\.value: Extra"):
+        message.of(Goal.model_construct(maximise=(AtLeast(direction=X, value=9.0),)))
+
+
 def test_too_much_for_a_message_is_refused_as_input() -> None:
     with pytest.raises(InputError, match=r"maximise: .* at most 50"):
         TaskMessage.of(goal(maximise=[StiffnessMeasure(direction=X)] * 51))
@@ -221,7 +246,7 @@ def test_too_much_for_a_message_is_refused_as_input() -> None:
 @pytest.mark.parametrize(
     ("match", "expected"),
     [
-        ({"direction": X, "value": 1.0, "valeu": 1.0}, "match.valeu: Extra"),
+        ({"direction": list(X), "value": 1.0, "valeu": 1.0}, "match.valeu: Extra"),
         ({"matrix_n_per_m": [[1.0, 0.0, 0.0]] * 2}, "match.matrix_n_per_m: List"),
         ({"frame": "base"}, "match.direction: Field required; also stiffness.match.value: Field"),
     ],

@@ -215,10 +215,10 @@ def _with_fields_of(schema: type[Schema]) -> Callable[[ClassT], ClassT]:
 
 
 def _is_left_out(info: FieldInfo) -> bool:
-    """Whether messages lack a field: it is a constant, a file, or read from a file."""
+    """Whether messages lack a field: it has always its default, is a file, or read from a file."""
     args = get_args(info.annotation)
     is_constant = get_origin(info.annotation) is Literal and len(args) == 1
-    return bool(info.exclude) or is_constant or Mesh in args
+    return bool(info.exclude) or (is_constant and not info.is_required()) or Mesh in args
 
 
 def _unit(hint: Any) -> str:
