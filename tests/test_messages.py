@@ -195,6 +195,16 @@ def test_a_message_of_a_target_or_trajectory_says_all_of_it() -> None:
             check_trajectory(trajectory, LIMITS, SLEW)
 
 
+def test_a_mesh_is_refused_and_not_dropped() -> None:
+    mesh = Mesh.model_construct(file=Path("organ.stl"), scale=1e-3)
+    item = SceneObject.model_construct(name="organ", mesh=mesh, contact=None)
+    given = task().model_copy(update={"scene": Scene.model_construct(objects=(item,))})
+    with pytest.raises(
+        InputError, match=r"scene\.objects\[0\]\.mesh: the daemon's messages cannot"
+    ):
+        TaskMessage.of(given)
+
+
 def test_the_loop_refuses_what_its_steering_does_not_understand() -> None:
     lab = Lab().under_pressure()
     calls = list(lab.controller.calls)

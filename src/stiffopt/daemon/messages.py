@@ -156,7 +156,7 @@ def _json_of(value: Any, place: Loc, lost: list[Loc]) -> Any:
         fields = type(value).model_fields
         for name in (*fields, *(value.model_extra or ())):
             field = getattr(value, name)
-            if field is None or (name in fields and _is_left_out(fields[name])):
+            if field is None or (name in fields and _is_implied(fields[name])):
                 continue
             if name in message.names:
                 found[message.names[name]] = _json_of(field, (*place, name), lost)
@@ -214,11 +214,16 @@ def _with_fields_of(schema: type[Schema]) -> Callable[[ClassT], ClassT]:
     return lambda base: message_of(schema, base)
 
 
-def _is_left_out(info: FieldInfo) -> bool:
-    """Whether messages lack a field: it has always its default, is a file, or read from a file."""
+def _is_implied(info: FieldInfo) -> bool:
+    """Whether messages do without a field: it has one value, or no key in files."""
     args = get_args(info.annotation)
     is_constant = get_origin(info.annotation) is Literal and len(args) == 1
-    return bool(info.exclude) or (is_constant and not info.is_required()) or Mesh in args
+    return bool(info.exclude) or (is_constant and not info.is_required())
+
+
+def _is_left_out(info: FieldInfo) -> bool:
+    """Whether messages lack a field: it is implied, or names a file."""
+    return _is_implied(info) or Mesh in get_args(info.annotation)
 
 
 def _unit(hint: Any) -> str:
