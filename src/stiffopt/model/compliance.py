@@ -161,11 +161,11 @@ def stiffness_of(C: Vector, d: Vector, kind: Kind, boundary: Boundary) -> Vector
         own, other = other, own
     block, d = C[..., own, own], d[..., None]
     if boundary == "free":
-        return 1 / np.sum(d * (block @ d), axis=(-2, -1))
+        flexibility: Vector = np.sum(d * (block @ d), axis=(-2, -1))
+        return 1 / flexibility
     if boundary == "clamped":
-        block = block - C[..., own, other] @ np.linalg.solve(
-            C[..., other, other], C[..., other, own]
-        )
+        reaction = np.linalg.solve(C[..., other, other], C[..., other, own])
+        block = block - C[..., own, other] @ reaction
     found: Vector = np.sum(d * np.linalg.solve(block, d), axis=(-2, -1))
     return found
 
