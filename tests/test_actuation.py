@@ -691,12 +691,17 @@ def tube_of(law: str, tube: Tube) -> Tube:
     return LAWS[law](tube) if law in LAWS else replace(tube, law=law, poisson_ratio=0.5)
 
 
-@pytest.mark.parametrize("tube", [FLOP, CROSS, LOPSIDED, PAIR, SIX], ids=list(TUBES))
+@pytest.mark.parametrize("tube", TUBES.values(), ids=TUBES)
 @pytest.mark.parametrize("law", strain_laws())
 def test_contract_of_a_strain_law(law: str, tube: Tube) -> None:
     tube = tube_of(law, tube)
     n = len(tube.channels)
-    segment = segment_of(tube)
+    try:
+        segment = segment_of(tube)
+    except InputError:
+        assert law not in LAWS
+        assert tube is not FLOP
+        pytest.skip("the law cannot describe this segment, see `StrainLaw.check`")
     assert type(strain_law(segment)) is strain_laws()[law]
     assert strain_laws()[law].limit
     assert strain_laws()[law].words

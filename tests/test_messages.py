@@ -5,10 +5,11 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import pytest
+from pydantic import Discriminator, Tag
 
 from simulated_loop import TASK, Lab
 from stiffopt.control.checks import (
@@ -42,11 +43,12 @@ from stiffopt.optimise.goal import (
 from stiffopt.optimise.press import Press
 from stiffopt.optimise.target import Target, Tolerance
 from stiffopt.optimise.task import Load, PressureRange, Task, load_task
-from stiffopt.optimise.terms.above import Plane
+from stiffopt.optimise.terms import TERMS
 from stiffopt.paths.trajectory import Trajectory, Waypoint
 from stiffopt.rig.interface import PressureLimits
 from stiffopt.schema import Items, Schema, Vector
 from stiffopt.units import Length, Number, Speed, TranslationalStiffness
+from test_measures import MeanStiffness
 
 PROBLEMS = Path(__file__).resolve().parent.parent / "problems"
 LIMITS = PressureLimits([0.0] * 3, [1.5e5] * 3)  # type: ignore[arg-type]
@@ -54,7 +56,7 @@ SLEW = np.full(3, 5e5)
 X = (1.0, 0.0, 0.0)
 MESSAGES: tuple[type[Schema], ...] = (
     *(Task, Target, Tolerance, StiffnessGoal, StiffnessMeasure, AtLeast, MatchValue, MatchMatrix),
-    *(Load, Brace, Press, PressureRange, Plane, Waypoint, Trajectory),
+    *(Load, Brace, Press, PressureRange, Waypoint, Trajectory),
     *(Scene, SceneObject, AllowedContact, *(kind for kind in OBSTACLES.values() if kind != Mesh)),
 )
 UNSAID: dict[type[Schema], set[str]] = {
@@ -193,6 +195,16 @@ def test_a_message_of_a_target_or_trajectory_says_all_of_it() -> None:
             check_trajectory(trajectory, LIMITS, SLEW)
 
 
+def test_a_mesh_is_refused_and_not_dropped() -> None:
+    mesh = Mesh.model_construct(file=Path("organ.stl"), scale=1e-3)
+    item = SceneObject.model_construct(name="organ", mesh=mesh, contact=None)
+    given = task().model_copy(update={"scene": Scene.model_construct(objects=(item,))})
+    with pytest.raises(
+        InputError, match=r"scene\.objects\[0\]\.mesh: the daemon's messages cannot"
+    ):
+        TaskMessage.of(given)
+
+
 def test_the_loop_refuses_what_its_steering_does_not_understand() -> None:
     lab = Lab().under_pressure()
     calls = list(lab.controller.calls)
@@ -211,11 +223,52 @@ def test_a_floor_among_what_is_maximised_is_not_forgotten() -> None:
         check_task(given, LIMITS)
 
 
+def test_a_goal_with_another_measure_survives_its_message() -> None:
+    """Each kind of measure is read as itself, and as many may be sent as of one kind."""
+
+    class Goal(StiffnessGoal):
+        maximise: Items[  # type: ignore[assignment]
+            Annotated[
+                Annotated[StiffnessMeasure, Tag("<direction>")]
+                | Annotated[MeanStiffness, Tag("<mean>")],
+                Discriminator(lambda value: "<mean>" if "mean" in value else "<direction>"),
+            ]
+        ] = ()
+
+    given = Goal(maximise=[{"mean": "translation"}, {"direction": X}])
+    message = message_of(Goal)
+    sent = json.loads(json.dumps(message.of(given).model_dump()))
+    assert sent["maximise"][0] == {"mean": "translation"}
+    assert message.model_validate(sent).read() == given
+    with pytest.raises(InputError, match=r"maximise: .* at most 50"):
+        message.of(Goal(maximise=[{"mean": "translation"}] * 51))
+    with pytest.raises(InputError, match=r"^maximise\[0\]\.value: Extra"):
+        message.of(Goal.model_construct(maximise=(AtLeast(direction=X, value=9.0),)))
+
+
 def test_too_much_for_a_message_is_refused_as_input() -> None:
     with pytest.raises(InputError, match=r"maximise: .* at most 50"):
         TaskMessage.of(goal(maximise=[StiffnessMeasure(direction=X)] * 51))
     with pytest.raises(InputError, match=r"position_m"):
         TargetMessage.of(Target.model_construct(position=(1.0, float("nan"), 0.0)))
+
+
+@pytest.mark.parametrize(
+    ("match", "expected"),
+    [
+        ({"direction": list(X), "value": 1.0, "valeu": 1.0}, "match.valeu: Extra"),
+        ({"matrix_n_per_m": [[1.0, 0.0, 0.0]] * 2}, "match.matrix_n_per_m: List"),
+        ({"frame": "base"}, "match.direction: Field required; also stiffness.match.value: Field"),
+    ],
+)
+def test_a_mistake_in_a_measure_is_named_by_its_key_alone(
+    match: dict[str, Any], expected: str
+) -> None:
+    sent = {"target": {"position_m": [0.0, 0.0, 0.18]}, "stiffness": {"match": match}}
+    with pytest.raises(InputError) as caught:
+        task_of(sent, "a robot")
+    assert str(caught.value).startswith(f"stiffness.{expected}")
+    assert "Message." not in str(caught.value)
 
 
 @pytest.mark.parametrize("path", sorted(PROBLEMS.glob("*.yaml")), ids=lambda path: path.stem)
@@ -260,7 +313,6 @@ EVERYTHING: list[Schema] = [
         target=Target(
             position=(0.01, None, 0.1),
             pointing=(0.0, 0.6, 0.8),
-            above={"point": (0.0, 0.01, 0.1), "normal": (0.0, 0.6, 0.8)},
             tolerance=Tolerance(position=2e-3, angle=0.3),
         ),
         stiffness=StiffnessGoal(
@@ -313,6 +365,10 @@ EVERYTHING: list[Schema] = [
     ),
     Trajectory(waypoints=[Waypoint(time=t, target=TASK.target) for t in (0.0, 0.5)]),
     Trajectory(waypoints=[Waypoint(time=0.0, target=TASK.target, pressures=(1e4, 0.0, 2e4))]),
+    *(
+        task(target=Target.model_validate({kind.key: kind.example}, context={"from_file": True}))
+        for kind in TERMS
+    ),
 ]  # fmt: skip
 """Descriptions in which each field has another value than by default, once at least."""
 
@@ -339,8 +395,10 @@ def test_every_field_of_every_schema_survives_its_message() -> None:
         for name, info in type(each).model_fields.items()
         if info.is_required() or getattr(each, name) != info.default
     }
-    assert {model for model, _ in seen} == set(MESSAGES)
-    for model in MESSAGES:
+    models = {model for model, _ in seen}
+    in_terms = {type(each) for given in EVERYTHING[-len(TERMS) :] for each in schemas_in(given)}
+    assert models == {*MESSAGES, *in_terms}
+    for model in models:
         unsaid = UNSAID.get(model, set())
         wanted = {(model, name) for name in model.model_fields if name not in unsaid}
         assert wanted <= seen, f"EVERYTHING lacks {wanted - seen}"

@@ -42,3 +42,19 @@ def test_help_explains_each_field_of_what_packages_export():
                 missing |= {f"{name}.{each}" for each in fields - words if each[0] != "_"}
     assert len(found) > 10
     assert missing == set()
+
+
+def test_the_glossary_has_one_row_for_a_term_and_places_that_exist():
+    root = Path(__file__).parents[1]
+    page = root / "docs" / "glossary.md"
+    terms, places = [], []
+    for line in page.read_text(encoding="utf-8").splitlines():
+        cells = [cell.strip() for cell in line.strip("|").split("|")]
+        if len(cells) == 5 and cells[0] not in ("term", "---"):
+            terms += cells[0].split(", ")
+            places += re.findall(r"`([^`]+)`", cells[-1])
+    assert len(terms) > 150
+    assert {term for term in terms if terms.count(term) > 1} == set()
+    folders = [place.replace("stiffopt", ".", 1).replace("..", "") for place in places]
+    known = [[*SOURCE.glob(folder), *root.glob(folder)] for folder in folders]
+    assert [place for place, files in zip(places, known, strict=True) if not files] == []

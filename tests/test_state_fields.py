@@ -52,7 +52,13 @@ there = Path(stiffopt.control.__path__[0], "state.py").read_text()
 last = "    samples: tuple[PoseSample, ...] = ()\\n"
 assert there.count(last) == 1
 line = '''    mood: Annotated[float, Shown("how it feels", "m", topic="/tip", metric="mood_meters",
-        row="mood", armed_only=False, line=True)] = 0.25\\n'''
+        row="mood", armed_only=False, line=True)] = 0.25
+    wet: Annotated[bool, Shown("whether it is wet", topic="/tip", metric="wet", row="wet",
+        armed_only=False, line=True)] = True
+    open: Annotated[Flags, Shown("open valves", topic="/tip", metric="open_valves", row="open",
+        armed_only=False)] = field(default_factory=lambda: np.arange(6) < 2)
+    volts: Annotated[tuple[float, ...], Shown("of its batteries", "V", topic="/tip",
+        row="volts", armed_only=False)] = (1.5, 9.0)\\n'''
 (folder / "state.py").write_text(there.replace(last, line + last))
 spec = importlib.util.spec_from_file_location("stiffopt.control.state", folder / "state.py")
 module = sys.modules[spec.name] = importlib.util.module_from_spec(spec)
@@ -82,15 +88,23 @@ with Client(server.url) as client, client.stream(rate=50) as stream:
     assert client._ask("GET", "state")["mood_m"] == 0.25
     assert client.state().mood == 0.25
     assert stream.state().mood == 0.25
+    assert stream.state().wet is True and stream.state().volts == (1.5, 9.0)
+    assert stream.state().open.tolist() == loop.now.open.tolist()
 server.stop()
 assert topic_schemas()["/tip"]["properties"]["mood_m"] == dict(type="number")
 run = read_run(recorded(folder, FakeRun(), ticks(5)))
 np.testing.assert_array_equal(run.mood, 0.25)
+assert run.wet.all() and (run.open == loop.now.open).all() and len(run.open) == len(run)
+again = next(run.snapshots())
+assert again.mood == 0.25 and again.wet is True
 assert b'stiffopt_mood_meters{{rig="a rig"}} 0.25' in Metrics("a rig", loop).render()
+assert b'stiffopt_open_valves{{channel="2",rig="a rig"}} 1.0' in Metrics("a rig", loop).render()
 console = Console(width=100)
 with console.capture() as captured:
     console.print(status(loop.now, "a rig", list("abcdef")))
-assert "mood  250.00 mm" in captured.get()
+lines = [" ".join(line.split()) for line in captured.get().splitlines()]
+for row in ("mood 250.00 mm", "wet yes", "open 1, 2", "volts (1.500, 9.000) V"):
+    assert row in lines
 assert "| `mood_m` | how it feels | `/tip` | `stiffopt_mood_meters` |" in table()
 Lines(as_json=True).update(loop.now, [])
 """

@@ -83,7 +83,7 @@ def test_without_the_token_it_only_reads(
     assert "<b>too warm" not in html
     for command in (watch.take_control, watch.arm, watch.hold, watch.disarm, watch.vent):
         command()
-        assert "needs the token" in watch.said
+        assert "needs the token" in watch.outcome
     watch.go(Workbench(watch.design))
     assert not watch.in_control
     assert loop.names == []
@@ -110,32 +110,32 @@ def test_with_token_and_control_a_preview_is_sent(
     watch = watching(TOKEN)
     watch.poll()
     watch.arm()
-    assert "take it" in watch.said
+    assert "take it" in watch.outcome
     bench = Workbench(watch.design)
     watch.go(bench)
-    assert watch.said == "not sent: wait until the preview is solved"
+    assert watch.outcome == "not sent: wait until the preview is solved"
     assert bench.answer_best(lambda: False)
     watch.take_control()
     assert watch.in_control
     watch.arm()
     watch.go(bench)
-    assert watch.said == "going to the target"
+    assert watch.outcome == "going to the target"
     bench.change("target", lambda d: d.with_target(position=(-0.15, 0.0, 0.19)))
     watch.go(bench)
-    assert "wait until" in watch.said
+    assert "wait until" in watch.outcome
     bench.answer_best(lambda: False)
     watch.go(bench)
-    assert watch.said == "not sent: the preview is unreachable"
+    assert watch.outcome == "not sent: the preview is unreachable"
     bench.change("gravity", lambda d: d.with_gravity((0, 0, 0), 0.01))
     watch.go(bench)
-    assert "not those of the rig" in watch.said
+    assert "not those of the rig" in watch.outcome
     assert [name for name in loop.names if name != "hold"] == ["arm", "set_task"]
     sent = dict(loop.calls)["set_task"]
     assert sent.target == watch.design.task.target
     watch.poll()
     watch.take_control()
     watch.disarm()
-    assert watch.said == "let down"
+    assert watch.outcome == "let down"
     watch.release()
     assert not watch.in_control
 
@@ -160,9 +160,9 @@ def test_a_wrong_token_commands_nothing(
     monkeypatch.setattr(rig_watch, "vent_rig", lambda file: "vented by the guard")
     watch = watching("not-the-token-of-this-daemon")
     watch.take_control()
-    assert "not this daemon's token" in watch.said
+    assert "not this daemon's token" in watch.outcome
     watch.vent()
-    assert watch.said == "vented by the guard"  # as `stiffopt vent`, which needs no token
+    assert watch.outcome == "vented by the guard"  # as `stiffopt vent`, which needs no token
     assert loop.names == []
 
 
@@ -175,19 +175,19 @@ def test_it_vents_without_control_and_without_the_daemon(
 ) -> None:
     watch = watching(TOKEN)
     watch.vent()
-    assert (watch.said, loop.names) == ("vented", ["vent"])
+    assert (watch.outcome, loop.names) == ("vented", ["vent"])
     server.stop()
     asked: list[Any] = []
     monkeypatch.setattr(rig_watch, "vent_rig", lambda file: asked.append(file) or "vented: guard")
     watch.vent()
-    assert (watch.said, asked) == ("vented: guard", [rig])
+    assert (watch.outcome, asked) == ("vented: guard", [rig])
 
     def failing(file: Any) -> str:
         raise DeviceError("no guard answers")
 
     monkeypatch.setattr(rig_watch, "vent_rig", failing)
     watch.vent()
-    assert watch.said == "THE ARM MAY BE UNDER PRESSURE: no guard answers"
+    assert watch.outcome == "THE ARM MAY BE UNDER PRESSURE: no guard answers"
     watch.poll()
     assert watch.state is None
     assert "cannot be reached" in texts.rig_html(watch)

@@ -1,6 +1,7 @@
 """Formulas that stand in more than one place, each for a reason, agree where they mean the same.
 
-The docstrings of `stiffopt.control.regulators` and `stiffopt.control.allocation` say why.
+The docstrings of `stiffopt.control.regulators` and `stiffopt.control.allocation` say why. Stiffness
+is a formula of symbols for its derivatives, and of numbers for contacts and for many pressures.
 """
 
 from __future__ import annotations
@@ -20,9 +21,13 @@ from stiffopt.control.reference import Reference
 from stiffopt.control.regulators import RegulatorModel
 from stiffopt.control.tip_errors import TipErrors
 from stiffopt.control.tuning import FeedbackTuning
+from stiffopt.model.compliance import directional_stiffness, stiffness_of
 from stiffopt.model.history import History, Memory
+from stiffopt.model.manipulator import load_robot
+from stiffopt.optimise.goal import StiffnessMeasure
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.tip import TipAt
+from stiffopt.paths.motion import _least_stiffness
 from stiffopt.rig.interface import PressureCommand
 from stiffopt.rig.settings import Safety
 from stiffopt.safety.expected_pressure import ExpectedPressure, Regulation
@@ -179,3 +184,24 @@ def test_rows_of_feedback_are_the_errors_derivative_at_the_target(name):
     _, jacobian, *_ = TipErrors().weighted(target, tip, lever)
     # the same quadratic form, though a pointing has three rows there and two here
     assert rows.T @ rows == pytest.approx(jacobian.T @ jacobian, rel=1e-6, abs=1e-18)
+
+
+@pytest.mark.parametrize("boundary", ["free", "guided", "clamped"])
+@pytest.mark.parametrize("kind", ["translation", "rotation"])
+@pytest.mark.parametrize("frame", ["base", "tip"])
+def test_routes_of_directional_stiffness(frame, kind, boundary):
+    """In symbols, in numbers, along a motion, and of an arm as the optimiser evaluates it."""
+    rng = np.random.default_rng([len(frame), len(kind), len(boundary)])
+    arm, p = load_robot("stiff-flop-2"), rng.uniform(0, 1.2e5, (4, 6))
+    C, R = arm.tip_compliance(p), arm.tip_pose(p)[:, :3, :3]
+    d = rng.normal(size=3)
+    d /= np.linalg.norm(d)
+    symbols = [ca.SX.sym("C", 6, 6), ca.SX.sym("R", 3, 3)]
+    formula = Formula(symbols, [directional_stiffness(*symbols, ca.DM(d), frame, kind, boundary)])
+    expected = [float(formula(*row)[0][0]) for row in zip(C, R, strict=True)]
+    directions = np.swapaxes(R, 1, 2) @ d if frame == "base" else np.broadcast_to(d, (4, 3))
+    assert stiffness_of(C, directions, kind, boundary) == pytest.approx(expected, rel=1e-9)
+    measure = StiffnessMeasure(direction=d, frame=frame, kind=kind, boundary=boundary)
+    assert _least_stiffness(arm, p, [measure]) == pytest.approx(expected, rel=1e-6)
+    found = arm.stiffness(p, direction=d, frame=frame, kind=kind, boundary=boundary)
+    assert found == pytest.approx(expected, rel=1e-9)

@@ -103,7 +103,7 @@ def test_merging_does_not_depend_on_groups_and_order(rows: Any, random: Any) -> 
         pieces.append(CellTable.of_samples(keys, values, np.arange(start, start + len(part))))
         start = end
     random.shuffle(pieces)
-    gathering = Gathering(CellTable.empty(1), TUNING.most_cells)
+    gathering = Gathering(CellTable.empty(1), TUNING.max_cells)
     for piece in pieces:
         gathering.add(piece)
     for table in (gathering.table(), merged(pieces)):
@@ -115,7 +115,7 @@ def test_merging_does_not_depend_on_groups_and_order(rows: Any, random: Any) -> 
 
 
 def test_too_many_cells_are_refused(monkeypatch: pytest.MonkeyPatch, robot: Manipulator) -> None:
-    monkeypatch.setattr("stiffopt.workspace.mapping.TUNING", replace(TUNING, most_cells=100))
+    monkeypatch.setattr("stiffopt.workspace.mapping.TUNING", replace(TUNING, max_cells=100))
     with pytest.raises(InputError, match=r"fills more than 100 cells.*larger cells"):
         map_workspace(robot, samples=2000, cell=0.002)
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from stiffopt.cli.exits import with_exit_code
-from stiffopt.cli.options import Json, Quiet, Units, command_group
+from stiffopt.cli.options import Json, Quiet, Units, command_group, option
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -54,25 +54,21 @@ def _bench() -> None:
 def recordings(
     folder: Annotated[str, typer.Argument(metavar="DIR", show_default=False)],
     splits: Annotated[
-        str | None,
-        typer.Option(metavar="FILE.yaml", help="Arms and their files; by default stiffopt's."),
+        str | None, option("FILE.yaml", "Arms and their files; by default stiffopt's.")
     ] = None,
     methods: Annotated[
         str | None,
-        typer.Option(
-            metavar="LIST",
-            help="Any of stiffopt, constant-curvature, polynomial, gaussian-process, network; by "
+        option(
+            "LIST",
+            "Any of stiffopt, constant-curvature, polynomial, gaussian-process, network; by "
             "default all. The last three need scikit-learn.",
         ),
     ] = None,
-    rows: Annotated[
-        int,
-        typer.Option(metavar="N", min=50, max=10_000, help="Fitted rows; by default 400."),
-    ] = 400,
+    rows: Annotated[int, option("N", "Fitted rows; by default 400.", min=50, max=10_000)] = 400,
     full: Annotated[
         bool, typer.Option("--full", help="stiffopt compares its models, which takes minutes.")
     ] = False,
-    seed: Annotated[int, typer.Option(metavar="N", min=0, help="Seed of the learnt methods.")] = 0,
+    seed: Annotated[int, option("N", "Seed of the learnt methods.", min=0)] = 0,
     units: Units = None,
     as_json: Json = False,
     quiet: Quiet = False,

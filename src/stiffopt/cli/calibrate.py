@@ -5,7 +5,7 @@ from typing import Annotated
 import typer
 
 from stiffopt.cli.exits import with_exit_code
-from stiffopt.cli.options import Json, Quiet, Units
+from stiffopt.cli.options import Json, Quiet, Units, option
 
 CALIBRATE_HELP = """\
 Fit a robot file to recordings of the arm, and write how well each number in it is then known.
@@ -54,10 +54,7 @@ Examples:
   130  interrupted (Ctrl-C); nothing is written
 """
 
-Robot = Annotated[
-    str,
-    typer.Option(metavar="ROBOT", help="A built-in robot, or a robot file (.yaml)."),
-]
+Robot = Annotated[str, option("ROBOT", "A built-in robot, or a robot file (.yaml).")]
 Sequence = Annotated[
     bool,
     typer.Option(
@@ -73,79 +70,72 @@ Rezero = Annotated[
     ),
 ]
 Pressures = Annotated[
-    str,
-    typer.Option(
-        metavar="WHICH", help="commanded or measured: the pressures that drive the model."
-    ),
+    str, option("WHICH", "commanded or measured: the pressures that drive the model.")
 ]
 Channels = Annotated[
     str | None,
-    typer.Option(
-        metavar="LIST",
-        help="For each channel of the robot its pressure column in the logs, such as 4,5,6,1,2,3; "
+    option(
+        "LIST",
+        "For each channel of the robot its pressure column in the logs, such as 4,5,6,1,2,3; "
         "by default as the robot file says, else in order.",
     ),
 ]
 Frame = Annotated[
     str | None,
-    typer.Option(
-        metavar="BODY",
-        help="The tracked body that carries the base; poses are taken in its frame. By default as "
+    option(
+        "BODY",
+        "The tracked body that carries the base; poses are taken in its frame. By default as "
         "the robot file says, else the tracker itself.",
     ),
 ]
 Keep = Annotated[
     list[str] | None,
-    typer.Option(
-        metavar="WHAT",
-        help="units, clock, drift, axes, channels or lines: leave these as recorded, even if they "
+    option(
+        "WHAT",
+        "units, clock, drift, axes, channels or lines: leave these as recorded, even if they "
         "are clearly wrong; may be repeated.",
     ),
 ]
 Report = Annotated[
-    str | None,
-    typer.Option(metavar="DIR", help="Write a page (report.md) with figures into this new folder."),
+    str | None, option("DIR", "Write a page (report.md) with figures into this new folder.")
 ]
 
 
 @with_exit_code
 def calibrate(
     robot: Robot,
-    out: Annotated[
-        str, typer.Option(metavar="FILE.yaml", help="Write the calibrated robot file; a new one.")
-    ],
+    out: Annotated[str, option("FILE.yaml", "Write the calibrated robot file; a new one.")],
     logs: Annotated[
         list[str] | None, typer.Argument(metavar="[LOG]...", show_default=False)
     ] = None,
     stiffness: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="TABLE.csv",
-            help="A table of measured stiffness, fitted too; may be repeated. LOGs may then be "
-            "absent.",
+        option(
+            "TABLE.csv",
+            "A table of measured stiffness, fitted too; may be repeated. LOGs may then be absent.",
         ),
     ] = None,
     model: Annotated[
         str,
-        typer.Option(
-            metavar="NAME",
-            help="auto, or one of static, lag, hysteresis, creep, progressive, progressive-creep, "
+        option(
+            "NAME",
+            "auto, or one of static, lag, hysteresis, creep, progressive, progressive-creep, "
             "channel-hysteresis, elongation-hysteresis.",
         ),
     ] = "auto",
     strain_law: Annotated[
         str,
-        typer.Option(
-            metavar="WHICH",
-            help="auto: another strain law than the robot file's, if that predicts clearly better; "
+        option(
+            "WHICH",
+            "auto: another strain law than the robot file's, if that predicts clearly better; "
             "or keep.",
         ),
     ] = "auto",
     fix: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="KEY",
-            help="Do not fit this: a key of the robot file, such as segments[0].length, or its end "
+        option(
+            "KEY",
+            "Do not fit this: a key of the robot file, such as segments[0].length, or its end "
             "alone, such as corrections.gain, for all segments and channels; may be repeated.",
         ),
     ] = None,
@@ -158,9 +148,7 @@ def calibrate(
             "nothing is held back.",
         ),
     ] = False,
-    timeout: Annotated[
-        str | None, typer.Option(metavar="TIME", help="After which to stop, as by Ctrl-C.")
-    ] = None,
+    timeout: Annotated[str | None, option("TIME", "After which to stop, as by Ctrl-C.")] = None,
     sequence: Sequence = False,
     rezero: Rezero = False,
     pressures: Pressures = "commanded",
@@ -169,24 +157,20 @@ def calibrate(
     keep: Keep = None,
     rows: Annotated[
         int | None,
-        typer.Option(
-            metavar="N",
-            min=50,
-            max=100_000,
-            help="Number of fitted rows of all logs together; by default 2000.",
+        option(
+            "N", "Number of fitted rows of all logs together; by default 2000.", min=50, max=100_000
         ),
     ] = None,
     suggest: Annotated[
         str | None,
-        typer.Option(
-            metavar="FILE.yaml",
-            help="Write the poses to record next, which would reduce the model's uncertainty most, "
+        option(
+            "FILE.yaml",
+            "Write the poses to record next, which would reduce the model's uncertainty most, "
             "as a file for `stiffopt experiment poses`; with --rig.",
         ),
     ] = None,
     rig: Annotated[
-        str | None,
-        typer.Option(metavar="RIG", help="The rig file of the poses that --suggest writes."),
+        str | None, option("RIG", "The rig file of the poses that --suggest writes.")
     ] = None,
     report: Report = None,
     as_json: Json = False,

@@ -5,7 +5,7 @@ from typing import Annotated
 import typer
 
 from stiffopt.cli.exits import with_exit_code
-from stiffopt.cli.options import Json, Quiet, RigArgument, Units
+from stiffopt.cli.options import Json, Quiet, RigArgument, Units, option
 
 COMMISSION_HELP = """\
 Check by small steps from rest whether a rig matches its files: the first hour with a rig.
@@ -45,16 +45,13 @@ def commission(
         ),
     ] = False,
     out: Annotated[
-        str | None,
-        typer.Option(
-            metavar="FILE.yaml", help="Write the corrected rig file there, if there is one."
-        ),
+        str | None, option("FILE.yaml", "Write the corrected rig file there, if there is one.")
     ] = None,
     folder: Annotated[
         str | None,
-        typer.Option(
-            metavar="DIR",
-            help="For recording, page and figure, made here; by default a new one in the rig's "
+        option(
+            "DIR",
+            "For recording, page and figure, made here; by default a new one in the rig's "
             "log folder.",
         ),
     ] = None,

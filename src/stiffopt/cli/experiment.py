@@ -5,7 +5,7 @@ from typing import Annotated
 import typer
 
 from stiffopt.cli.exits import with_exit_code
-from stiffopt.cli.options import Json, Quiet, RigArgument, Units, command_group
+from stiffopt.cli.options import Json, Quiet, RigArgument, Units, command_group, option
 
 experiment_app = command_group(help="Do the paper's experiments on a rig, real or simulated.")
 
@@ -53,23 +53,18 @@ Examples:
 
 Out = Annotated[
     str | None,
-    typer.Option(
-        metavar="DIR",
-        help="The folder of the experiment, made here; by default a new one in the rig's log "
-        "folder.",
+    option(
+        "DIR",
+        "The folder of the experiment, made here; by default a new one in the rig's log folder.",
     ),
 ]
 Resume = Annotated[
-    str | None,
-    typer.Option(metavar="DIR", help="Go on with the experiment in this folder: what is missing."),
+    str | None, option("DIR", "Go on with the experiment in this folder: what is missing.")
 ]
 Model = Annotated[
-    str | None,
-    typer.Option(metavar="ROBOT", help="Compare with this robot instead of that of the rig file."),
+    str | None, option("ROBOT", "Compare with this robot instead of that of the rig file.")
 ]
-Repetitions = Annotated[
-    int | None, typer.Option(metavar="N", min=1, max=1000, help="By default 5.")
-]
+Repetitions = Annotated[int | None, option("N", "By default 5.", min=1, max=1000)]
 NoPlot = Annotated[bool, typer.Option("--no-plot", help="Draw no figure.")]
 
 
@@ -85,38 +80,31 @@ def kinematics(
     out: Out = None,
     pressures: Annotated[
         str | None,
-        typer.Option(
-            metavar="LIST",
-            help="Peaks of the teeth: '0.4,0.8,1.0 bar' (the default) or '0.2:1:0.2 bar'.",
-        ),
+        option("LIST", "Peaks of the teeth: '0.4,0.8,1.0 bar' (the default) or '0.2:1:0.2 bar'."),
     ] = None,
     period: Annotated[
-        str | None,
-        typer.Option(metavar="TIME", help="Period of a tooth, up and down; by default 40 s / 9."),
+        str | None, option("TIME", "Period of a tooth, up and down; by default 40 s / 9.")
     ] = None,
     repetitions: Repetitions = None,
     poses: Annotated[
         int | None,
-        typer.Option(
-            metavar="N",
+        option(
+            "N",
+            "Poses of all channels together after that; by default 24, 0 for none.",
             min=0,
             max=1000,
-            help="Poses of all channels together after that; by default 24, 0 for none.",
         ),
     ] = None,
     settle: Annotated[
         str | None,
-        typer.Option(
-            metavar="TIME",
-            help="How long the arm may take to rest in each of these poses; by default 7 s.",
-        ),
+        option("TIME", "How long the arm may take to rest in each of these poses; by default 7 s."),
     ] = None,
     most: Annotated[
         str | None,
-        typer.Option(
+        option(
+            "PRESSURE",
+            "No channel goes higher in these poses; by default the rig's limits.",
             "--max",
-            metavar="PRESSURE",
-            help="No channel goes higher in these poses; by default the rig's limits.",
         ),
     ] = None,
     resume: Resume = None,
@@ -151,39 +139,33 @@ def stiffness(
     out: Out = None,
     pressures: Annotated[
         str | None,
-        typer.Option(
-            metavar="LIST",
-            help="Pressures of the channel: '0:1.5:0.25 bar' (the default) or '0,0.5,1 bar'.",
+        option(
+            "LIST", "Pressures of the channel: '0:1.5:0.25 bar' (the default) or '0,0.5,1 bar'."
         ),
     ] = None,
     channel: Annotated[
-        int | None,
-        typer.Option(metavar="N", min=1, help="The channel to pressurise; by default 1."),
+        int | None, option("N", "The channel to pressurise; by default 1.", min=1)
     ] = None,
     directions: Annotated[
         str | None,
-        typer.Option(
-            metavar="LIST",
-            help="Directions of the probe, of x, y, z, -x, -y, -z; by default x,y,-z.",
-        ),
+        option("LIST", "Directions of the probe, of x, y, z, -x, -y, -z; by default x,y,-z."),
     ] = None,
     displacement: Annotated[
-        str | None, typer.Option(metavar="LENGTH", help="Displacement of the tip; by default 3 mm.")
+        str | None, option("LENGTH", "Displacement of the tip; by default 3 mm.")
     ] = None,
     force: Annotated[
         str | None,
-        typer.Option(
-            metavar="FORCE",
-            help="Displace it less where the model expects more force than this; by default 0.2 N.",
+        option(
+            "FORCE",
+            "Displace it less where the model expects more force than this; by default 0.2 N.",
         ),
     ] = None,
     steps: Annotated[
-        int | None, typer.Option(metavar="N", min=2, max=1000, help="Steps each way; by default 5.")
+        int | None, option("N", "Steps each way; by default 5.", min=2, max=1000)
     ] = None,
     repetitions: Repetitions = None,
     settle: Annotated[
-        str | None,
-        typer.Option(metavar="TIME", help="How long the arm may take to rest; by default 60 s."),
+        str | None, option("TIME", "How long the arm may take to rest; by default 60 s.")
     ] = None,
     resume: Resume = None,
     model: Model = None,

@@ -2,11 +2,9 @@
 
 from typing import Annotated, Any
 
-import typer
-
 from stiffopt.cli.console import write_line
 from stiffopt.cli.exits import interruptible_work, with_exit_code
-from stiffopt.cli.options import Quiet, RobotArgument, command_group
+from stiffopt.cli.options import Quiet, RobotArgument, command_group, option
 from stiffopt.cli.outputs import check_ending, check_writable
 
 export_app = command_group(help="Write an arm under pressure for other programs.")
@@ -48,11 +46,7 @@ Examples:
 {_CODES}"""
 
 Pressures = Annotated[
-    str,
-    typer.Option(
-        metavar="LIST",
-        help="Pressures of all channels, proximal segment first: '0.2, 0, 0.3 bar'.",
-    ),
+    str, option("LIST", "Pressures of all channels, proximal segment first: '0.2, 0, 0.3 bar'.")
 ]
 
 
@@ -68,18 +62,11 @@ def _arm(robot: str, pressures: str) -> tuple[Any, Any]:
 def export_mjcf(
     robot: RobotArgument,
     pressures: Pressures,
-    out: Annotated[
-        str | None, typer.Option(metavar="FILE.xml", help="The file; by default it is printed.")
-    ] = None,
-    pieces: Annotated[
-        int | None, typer.Option(metavar="N", help="Joints per segment; by default 12.")
-    ] = None,
+    out: Annotated[str | None, option("FILE.xml", "The file; by default it is printed.")] = None,
+    pieces: Annotated[int | None, option("N", "Joints per segment; by default 12.")] = None,
     damping: Annotated[
         float | None,
-        typer.Option(
-            metavar="SHARE",
-            help="Damping of the slowest mode, as a share of critical; by default 0.05.",
-        ),
+        option("SHARE", "Damping of the slowest mode, as a share of critical; by default 0.05."),
     ] = None,
     quiet: Quiet = False,
 ) -> None:
@@ -105,7 +92,7 @@ def export_mjcf(
 def export_mesh(
     robot: RobotArgument,
     pressures: Pressures,
-    out: Annotated[str, typer.Option(metavar="FILE.stl", help="Or .obj or .ply.")],
+    out: Annotated[str, option("FILE.stl", "Or .obj or .ply.")],
     quiet: Quiet = False,
 ) -> None:
     """Write the surface of an arm under pressure as a mesh."""

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from stiffopt.cli.exits import with_exit_code
-from stiffopt.cli.options import command_group
+from stiffopt.cli.options import command_group, option
 
 init_app = command_group(
     help="Write a minimal file to begin with, with comments: it asks a few questions.",
@@ -29,9 +29,7 @@ Exit codes:
 
 Yes = Annotated[bool, typer.Option("--yes", "-y", help="Ask nothing; take the defaults.")]
 Force = Annotated[bool, typer.Option("--force", help="Write in the place of a file that is there.")]
-Robot = Annotated[
-    str | None, typer.Option(metavar="ROBOT", help="A built-in robot, or a robot file (.yaml).")
-]
+Robot = Annotated[str | None, option("ROBOT", "A built-in robot, or a robot file (.yaml).")]
 
 
 def _file(kind: str) -> Any:
@@ -58,43 +56,27 @@ def _write(kind: str, path: str, answers: dict[str, Any], yes: bool, force: bool
 def init_robot(
     file: Annotated[str, _file("robot")] = "my-arm.yaml",
     segments: Annotated[
-        int | None, typer.Option(metavar="N", min=1, max=6, help="Segments in series, all alike.")
+        int | None, option("N", "Segments in series, all alike.", min=1, max=6)
     ] = None,
-    length: Annotated[
-        str | None, typer.Option(metavar="LENGTH", help="Length of a segment at rest.")
-    ] = None,
+    length: Annotated[str | None, option("LENGTH", "Length of a segment at rest.")] = None,
     outer_radius: Annotated[
-        str | None, typer.Option(metavar="LENGTH", help="Radius of the silicone cylinder.")
+        str | None, option("LENGTH", "Radius of the silicone cylinder.")
     ] = None,
     inner_radius: Annotated[
-        str | None,
-        typer.Option(metavar="LENGTH", help="Radius of its central channel; 0 mm for none."),
+        str | None, option("LENGTH", "Radius of its central channel; 0 mm for none.")
     ] = None,
-    chambers: Annotated[
-        int | None, typer.Option(metavar="N", min=3, help="Chambers around a segment.")
-    ] = None,
-    channels: Annotated[
-        int | None, typer.Option(metavar="N", min=3, help="Regulators that feed a segment.")
-    ] = None,
-    chamber_radius: Annotated[
-        str | None, typer.Option(metavar="LENGTH", help="Radius of a chamber.")
-    ] = None,
+    chambers: Annotated[int | None, option("N", "Chambers around a segment.", min=3)] = None,
+    channels: Annotated[int | None, option("N", "Regulators that feed a segment.", min=3)] = None,
+    chamber_radius: Annotated[str | None, option("LENGTH", "Radius of a chamber.")] = None,
     chamber_offset: Annotated[
-        str | None,
-        typer.Option(metavar="LENGTH", help="Distance of a chamber's axis from the arm's."),
+        str | None, option("LENGTH", "Distance of a chamber's axis from the arm's.")
     ] = None,
-    modulus: Annotated[
-        str | None, typer.Option(metavar="PRESSURE", help="Young's modulus of the silicone.")
-    ] = None,
+    modulus: Annotated[str | None, option("PRESSURE", "Young's modulus of the silicone.")] = None,
     max_pressure: Annotated[
-        str | None,
-        typer.Option(metavar="PRESSURE", help="Highest gauge pressure that the arm bears."),
+        str | None, option("PRESSURE", "Highest gauge pressure that the arm bears.")
     ] = None,
     mounting: Annotated[
-        str | None,
-        typer.Option(
-            metavar="HOW", help="hanging, standing, horizontal, or weightless as in the paper."
-        ),
+        str | None, option("HOW", "hanging, standing, horizontal, or weightless as in the paper.")
     ] = None,
     yes: Yes = False,
     force: Force = False,
@@ -122,12 +104,9 @@ def init_task(
     file: Annotated[str, _file("task")] = "my-task.yaml",
     robot: Robot = None,
     position: Annotated[
-        str | None,
-        typer.Option(metavar="'X, Y, Z'", help="Target of the tip; an axis may be free."),
+        str | None, option("'X, Y, Z'", "Target of the tip; an axis may be free.")
     ] = None,
-    direction: Annotated[
-        str | None, typer.Option(metavar="'X, Y, Z'", help="Direction in which to be stiff.")
-    ] = None,
+    direction: Annotated[str | None, option("'X, Y, Z'", "Direction in which to be stiff.")] = None,
     yes: Yes = False,
     force: Force = False,
 ) -> int:
@@ -141,16 +120,10 @@ def init_task(
 def init_path(
     file: Annotated[str, _file("path")] = "my-path.yaml",
     robot: Robot = None,
-    begin: Annotated[
-        str | None, typer.Option("--from", metavar="'X, Y, Z'", help="Begin of the line.")
-    ] = None,
-    end: Annotated[
-        str | None, typer.Option("--to", metavar="'X, Y, Z'", help="End of the line.")
-    ] = None,
-    speed: Annotated[str | None, typer.Option(metavar="SPEED", help="Speed of the tip.")] = None,
-    direction: Annotated[
-        str | None, typer.Option(metavar="'X, Y, Z'", help="Direction in which to be stiff.")
-    ] = None,
+    begin: Annotated[str | None, option("'X, Y, Z'", "Begin of the line.", "--from")] = None,
+    end: Annotated[str | None, option("'X, Y, Z'", "End of the line.", "--to")] = None,
+    speed: Annotated[str | None, option("SPEED", "Speed of the tip.")] = None,
+    direction: Annotated[str | None, option("'X, Y, Z'", "Direction in which to be stiff.")] = None,
     yes: Yes = False,
     force: Force = False,
 ) -> int:
@@ -165,8 +138,7 @@ def init_scene(
     file: Annotated[str, _file("scene")] = "my-scene.yaml",
     robot: Robot = None,
     clearance: Annotated[
-        str | None,
-        typer.Option(metavar="LENGTH", help="Distance that the whole arm keeps from objects."),
+        str | None, option("LENGTH", "Distance that the whole arm keeps from objects.")
     ] = None,
     yes: Yes = False,
     force: Force = False,
@@ -181,12 +153,10 @@ def init_rig(
     file: Annotated[str, _file("rig")] = "my-rig.yaml",
     robot: Robot = None,
     supply: Annotated[
-        str | None,
-        typer.Option(metavar="DRIVER", help="simulated, modbus, nidaq or open-regulator."),
+        str | None, option("DRIVER", "simulated, modbus, nidaq or open-regulator.")
     ] = None,
     tracker: Annotated[
-        str | None,
-        typer.Option(metavar="DRIVER", help="simulated, aurora, openigtlink, or none."),
+        str | None, option("DRIVER", "simulated, aurora, openigtlink, or none.")
     ] = None,
     yes: Yes = False,
     force: Force = False,

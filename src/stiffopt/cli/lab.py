@@ -15,7 +15,7 @@ import typer
 
 from stiffopt.cli.console import report_error, report_note, warnings_as_notes, write_line
 from stiffopt.cli.exits import FAULT, SOLVED, with_exit_code
-from stiffopt.cli.options import Units
+from stiffopt.cli.options import Units, option
 from stiffopt.errors import InputError
 
 if TYPE_CHECKING:
@@ -54,21 +54,19 @@ Exit codes:
 def lab(
     rig: Annotated[str, typer.Argument(metavar="RIG", help="A rig file.")],
     out: Annotated[
-        str | None,
-        typer.Option(metavar="FILE", help="Write the rig file here instead of printing it."),
+        str | None, option("FILE", "Write the rig file here instead of printing it.")
     ] = None,
     supply: Annotated[
         str,
-        typer.Option(
-            metavar="DRIVER",
-            help="In place of a simulated supply: modbus, nidaq, open-regulator or a package's.",
+        option(
+            "DRIVER",
+            "In place of a simulated supply: modbus, nidaq, open-regulator or a package's.",
         ),
     ] = "modbus",
     tracker: Annotated[
         str,
-        typer.Option(
-            metavar="DRIVER",
-            help="In place of a simulated tracker: aurora, openigtlink or that of a package.",
+        option(
+            "DRIVER", "In place of a simulated tracker: aurora, openigtlink or that of a package."
         ),
     ] = "aurora",
     units: Units = None,

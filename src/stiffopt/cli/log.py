@@ -7,7 +7,7 @@ import typer
 
 from stiffopt.cli.console import report_note, write_line
 from stiffopt.cli.exits import interruptible, with_exit_code
-from stiffopt.cli.options import Units, command_group
+from stiffopt.cli.options import Units, command_group, option
 from stiffopt.cli.outputs import check_new_file, check_new_folder, check_picture, new_folder
 from stiffopt.errors import FileError, require_package
 
@@ -74,9 +74,7 @@ def export(
     ] = False,
     out: Annotated[
         str | None,
-        typer.Option(
-            metavar="FILE.csv", help="Write here, or into this folder; else beside the recording."
-        ),
+        option("FILE.csv", "Write here, or into this folder; else beside the recording."),
     ] = None,
     quiet: Quiet = False,
 ) -> None:
@@ -134,9 +132,8 @@ def plot(
     run: Recorded,
     out: Annotated[
         str | None,
-        typer.Option(
-            metavar="FILE.png",
-            help="Draw into this file (.png, .pdf, .svg); by default beside the recording.",
+        option(
+            "FILE.png", "Draw into this file (.png, .pdf, .svg); by default beside the recording."
         ),
     ] = None,
     units: Units = None,

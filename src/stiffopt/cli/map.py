@@ -21,6 +21,7 @@ from stiffopt.cli.options import (
     RobotArgument,
     Units,
     command_group,
+    option,
 )
 from stiffopt.cli.outputs import check_ending, check_picture, check_writable
 from stiffopt.errors import InputError, OutOfTimeError
@@ -62,57 +63,37 @@ Examples:
 def workspace(
     robot: RobotArgument,
     out: Annotated[
-        str | None,
-        typer.Option(metavar="FILE.zarr", help="Keep the map in this folder, a Zarr group."),
+        str | None, option("FILE.zarr", "Keep the map in this folder, a Zarr group.")
     ] = None,
     samples: Annotated[
         int | None,
-        typer.Option(
-            metavar="N",
-            min=1,
-            help="Number of quasi-random samples; by default a million, with gravity 1000.",
+        option(
+            "N", "Number of quasi-random samples; by default a million, with gravity 1000.", min=1
         ),
     ] = None,
     levels: Annotated[
-        int | None,
-        typer.Option(
-            metavar="K", min=2, help="Instead: all combinations of K levels of each channel."
-        ),
+        int | None, option("K", "Instead: all combinations of K levels of each channel.", min=2)
     ] = None,
-    cell: Annotated[str, typer.Option(metavar="LENGTH", help="Size of a cell.")] = "10 mm",
+    cell: Annotated[str, option("LENGTH", "Size of a cell.")] = "10 mm",
     direction: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="DIR",
-            help="x, y, z or a,b,c: direction of a stiffness; may be repeated. By default x, y, z.",
+        option(
+            "DIR",
+            "x, y, z or a,b,c: direction of a stiffness; may be repeated. By default x, y, z.",
         ),
     ] = None,
-    kind: Annotated[
-        str, typer.Option(metavar="KIND", help="translation or rotation.")
-    ] = "translation",
+    kind: Annotated[str, option("KIND", "translation or rotation.")] = "translation",
     boundary: BoundaryOption = "free",
     frame: FrameOption = "base",
-    seed: Annotated[
-        int, typer.Option(metavar="N", min=0, help="Seed of the quasi-random samples.")
-    ] = 0,
+    seed: Annotated[int, option("N", "Seed of the quasi-random samples.", min=0)] = 0,
     scene: Annotated[
-        str | None,
-        typer.Option(
-            metavar="FILE",
-            help="A scene file; samples without its clearance are left out.",
-        ),
+        str | None, option("FILE", "A scene file; samples without its clearance are left out.")
     ] = None,
     scheduler: Annotated[
-        str | None,
-        typer.Option(metavar="ADDRESS", help="Have the workers of this Dask scheduler do it."),
+        str | None, option("ADDRESS", "Have the workers of this Dask scheduler do it.")
     ] = None,
-    timeout: Annotated[
-        str | None, typer.Option(metavar="TIME", help="Stop after this time, as by Ctrl-C.")
-    ] = None,
-    plot: Annotated[
-        str | None,
-        typer.Option(metavar="FILE.png", help="Draw sections through the workspace."),
-    ] = None,
+    timeout: Annotated[str | None, option("TIME", "Stop after this time, as by Ctrl-C.")] = None,
+    plot: Annotated[str | None, option("FILE.png", "Draw sections through the workspace.")] = None,
     as_json: Json = False,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace a map that is in the folder of --out.")
@@ -205,17 +186,11 @@ Examples:
 @with_exit_code
 def contact(
     robot: RobotArgument,
-    scene: Annotated[str, typer.Option(metavar="FILE", help="A scene file.")],
+    scene: Annotated[str, option("FILE", "A scene file.")],
     pressures: Annotated[
-        str,
-        typer.Option(
-            metavar="LIST",
-            help="Pressures of all channels, proximal segment first: '0.2, 0, 0.3 bar'.",
-        ),
+        str, option("LIST", "Pressures of all channels, proximal segment first: '0.2, 0, 0.3 bar'.")
     ],
-    plot: Annotated[
-        str | None, typer.Option(metavar="FILE.png", help="Draw the arm and its contacts.")
-    ] = None,
+    plot: Annotated[str | None, option("FILE.png", "Draw the arm and its contacts.")] = None,
     as_json: Json = False,
     units: Units = None,
     quiet: Quiet = False,
@@ -267,38 +242,31 @@ def arm(
     robot: RobotArgument,
     channels: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="LIST",
-            help="Channels (counted from 1) that are pressurised together, such as 1 or 1,2; may "
+        option(
+            "LIST",
+            "Channels (counted from 1) that are pressurised together, such as 1 or 1,2; may "
             "be repeated.",
         ),
     ] = None,
     pressures: Annotated[
         str | None,
-        typer.Option(
-            metavar="LIST",
-            help="Pressures, '0,0.5,1 bar' or '0:1.5:0.5 bar'; by default seven up to the limit.",
+        option(
+            "LIST", "Pressures, '0,0.5,1 bar' or '0:1.5:0.5 bar'; by default seven up to the limit."
         ),
     ] = None,
     points: Annotated[
-        int | None, typer.Option(metavar="N", min=2, help="Points along the arm; by default 25.")
+        int | None, option("N", "Points along the arm; by default 25.", min=2)
     ] = None,
     over: Annotated[
-        str | None,
-        typer.Option(metavar="A,B", help="Instead: the tip over the pressures of two channels."),
+        str | None, option("A,B", "Instead: the tip over the pressures of two channels.")
     ] = None,
     levels: Annotated[
-        int | None,
-        typer.Option(
-            metavar="K", min=2, help="With --over: levels of each channel; by default 31."
-        ),
+        int | None, option("K", "With --over: levels of each channel; by default 31.", min=2)
     ] = None,
     boundary: BoundaryOption = "free",
     frame: FrameOption = "base",
-    plot: Annotated[str | None, typer.Option(metavar="FILE.png", help="Draw the map.")] = None,
-    csv: Annotated[
-        str | None, typer.Option(metavar="FILE.csv", help="Write the map as a table, in SI units.")
-    ] = None,
+    plot: Annotated[str | None, option("FILE.png", "Draw the map.")] = None,
+    csv: Annotated[str | None, option("FILE.csv", "Write the map as a table, in SI units.")] = None,
     as_json: Json = False,
     units: Units = None,
     quiet: Quiet = False,

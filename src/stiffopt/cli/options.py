@@ -40,6 +40,11 @@ def show_in_units(text: str | None) -> str | None:
     return text
 
 
+def option(metavar: str, about: str, *names: str, **limits: Any) -> Any:
+    """Return an option with a value; by default its name is that of the parameter."""
+    return typer.Option(*names, metavar=metavar, help=about, **limits)
+
+
 Version = Annotated[
     bool,
     typer.Option(
@@ -58,24 +63,19 @@ RobotArgument = Annotated[
 RigArgument = Annotated[str, typer.Argument(metavar="RIG", help="A rig file (.yaml).")]
 Units = Annotated[
     str | None,
-    typer.Option(
-        "--units",
-        metavar="UNITS",
-        callback=show_in_units,
-        help="Units of tables, figures and messages, such as 'mm, kPa, N/mm'; also by the variable "
+    option(
+        "UNITS",
+        "Units of tables, figures and messages, such as 'mm, kPa, N/mm'; also by the variable "
         "STIFFOPT_UNITS. JSON stays SI.",
+        "--units",
+        callback=show_in_units,
     ),
 ]
-BoundaryOption = Annotated[
-    str, typer.Option(metavar="BOUNDARY", help="free, guided or clamped: how the tip is held.")
-]
-FrameOption = Annotated[
-    str, typer.Option(metavar="FRAME", help="base or tip: the axes of the directions.")
-]
+BoundaryOption = Annotated[str, option("BOUNDARY", "free, guided or clamped: how the tip is held.")]
+FrameOption = Annotated[str, option("FRAME", "base or tip: the axes of the directions.")]
 ViewOption = Annotated[
     str | None,
-    typer.Option(
-        metavar="ANGLES",
-        help="Viewpoint of --plot: elevation, and azimuth about z from x, '20 deg, -60 deg'.",
+    option(
+        "ANGLES", "Viewpoint of --plot: elevation, and azimuth about z from x, '20 deg, -60 deg'."
     ),
 ]

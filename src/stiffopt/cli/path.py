@@ -5,7 +5,7 @@ from typing import Annotated
 import typer
 
 from stiffopt.cli.exits import with_exit_code
-from stiffopt.cli.options import Quiet, Units, ViewOption
+from stiffopt.cli.options import Quiet, Units, ViewOption, option
 
 PATH_HELP = """\
 Find the pressures with which the tip follows a path, as stiff as possible along it.
@@ -53,26 +53,23 @@ def path(
     ] = False,
     out: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="FILE.yaml|FILE.csv",
-            help="Write the answers to a result file or as CSV; may be given several times. Of "
+        option(
+            "FILE.yaml|FILE.csv",
+            "Write the answers to a result file or as CSV; may be given several times. Of "
             "several paths, each has a FILE-<path>.csv. Only results are overwritten.",
         ),
     ] = None,
     plot: Annotated[
         str | None,
-        typer.Option(
-            metavar="FILE.png",
-            help="Draw the arm along the path, its stiffness and its pressures; of several paths, "
+        option(
+            "FILE.png",
+            "Draw the arm along the path, its stiffness and its pressures; of several paths, "
             "each in FILE-<path>.png.",
         ),
     ] = None,
     view: ViewOption = None,
     seed: Annotated[
-        int,
-        typer.Option(
-            metavar="N", min=0, help="Seed of the global search; the same gives the same answer."
-        ),
+        int, option("N", "Seed of the global search; the same gives the same answer.", min=0)
     ] = 0,
     units: Units = None,
     quiet: Quiet = False,

@@ -2,10 +2,8 @@
 
 from typing import Annotated
 
-import typer
-
 from stiffopt.cli.exits import with_exit_code
-from stiffopt.cli.options import Json, Quiet, Units, ViewOption
+from stiffopt.cli.options import Json, Quiet, Units, ViewOption, option
 
 PLAN_HELP = """\
 Find a motion from one configuration to another with the whole body clear of a scene all the way.
@@ -33,55 +31,41 @@ Exit codes:
 
 @with_exit_code
 def plan(
-    start: Annotated[
-        str,
-        typer.Option("--from", metavar="A", help="Pressures such as '0.2, 0, 0.3 bar', or a task."),
-    ],
-    goals: Annotated[
-        list[str],
-        typer.Option("--to", metavar="B", help="The same; may be given several times."),
-    ],
+    start: Annotated[str, option("A", "Pressures such as '0.2, 0, 0.3 bar', or a task.", "--from")],
+    goals: Annotated[list[str], option("B", "The same; may be given several times.", "--to")],
     robot: Annotated[
         str | None,
-        typer.Option(
-            metavar="ROBOT", help="A built-in robot or a robot file; by default that of the tasks."
-        ),
+        option("ROBOT", "A built-in robot or a robot file; by default that of the tasks."),
     ] = None,
     scene: Annotated[
-        str | None,
-        typer.Option(metavar="FILE.yaml", help="A scene file, instead of the scene of the tasks."),
+        str | None, option("FILE.yaml", "A scene file, instead of the scene of the tasks.")
     ] = None,
     clearance: Annotated[
-        str | None,
-        typer.Option(metavar="LENGTH", help="Required clearance, replaces the scene's: '2 mm'."),
+        str | None, option("LENGTH", "Required clearance, replaces the scene's: '2 mm'.")
     ] = None,
     slew: Annotated[
         str | None,
-        typer.Option(
-            metavar="RATES",
-            help="Largest rates, one or one per channel, such as '2 bar/s'; besides the robot's.",
+        option(
+            "RATES",
+            "Largest rates, one or one per channel, such as '2 bar/s'; besides the robot's.",
         ),
     ] = None,
     as_json: Json = False,
     out: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="FILE.yaml|FILE.csv",
-            help="Write the motion to a result file or as CSV; may be given several times.",
+        option(
+            "FILE.yaml|FILE.csv",
+            "Write the motion to a result file or as CSV; may be given several times.",
         ),
     ] = None,
     plot: Annotated[
-        str | None,
-        typer.Option(metavar="FILE.png", help="Draw the arm on its way, and its pressures."),
+        str | None, option("FILE.png", "Draw the arm on its way, and its pressures.")
     ] = None,
     view: ViewOption = None,
     seed: Annotated[
-        int,
-        typer.Option(
-            metavar="N", min=0, help="Seed of the search; the same gives the same motion."
-        ),
+        int, option("N", "Seed of the search; the same gives the same motion.", min=0)
     ] = 0,
-    timeout: Annotated[str, typer.Option(metavar="TIME", help="Give up after this time.")] = "10 s",
+    timeout: Annotated[str, option("TIME", "Give up after this time.")] = "10 s",
     units: Units = None,
     quiet: Quiet = False,
 ) -> int:

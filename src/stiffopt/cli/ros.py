@@ -2,10 +2,8 @@
 
 from typing import Annotated
 
-import typer
-
 from stiffopt.cli.exits import with_exit_code
-from stiffopt.cli.options import RigArgument
+from stiffopt.cli.options import RigArgument, option
 
 ROS_HELP = """\
 Put the arm of RIG on a ROS 2 graph, as a node; no ROS need be installed. Needs the extra 'ros'.
@@ -35,24 +33,18 @@ Exit codes:
 def ros(
     rig: RigArgument,
     distro: Annotated[
-        str | None,
-        typer.Option(metavar="NAME", help="humble or jazzy: the distribution of ROS on the graph."),
+        str | None, option("NAME", "humble or jazzy: the distribution of ROS on the graph.")
     ] = None,
     domain: Annotated[
-        int | None,
-        typer.Option(metavar="ID", min=0, max=232, help="DDS domain; else ROS_DOMAIN_ID, else 0."),
+        int | None, option("ID", "DDS domain; else ROS_DOMAIN_ID, else 0.", min=0, max=232)
     ] = None,
-    namespace: Annotated[
-        str | None, typer.Option(metavar="NAMESPACE", help="Namespace of the node.")
-    ] = None,
-    node: Annotated[str | None, typer.Option(metavar="NAME", help="Name of the node.")] = None,
+    namespace: Annotated[str | None, option("NAMESPACE", "Namespace of the node.")] = None,
+    node: Annotated[str | None, option("NAME", "Name of the node.")] = None,
     remap: Annotated[
-        list[str] | None,
-        typer.Option("--remap", "-r", metavar="FROM:=TO", help="Rename a topic; may be repeated."),
+        list[str] | None, option("FROM:=TO", "Rename a topic; may be repeated.", "--remap", "-r")
     ] = None,
     token_file: Annotated[
-        str | None,
-        typer.Option(metavar="FILE", help="The daemon's token, if not where the rig file says."),
+        str | None, option("FILE", "The daemon's token, if not where the rig file says.")
     ] = None,
 ) -> int:
     """Run the node."""

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from stiffopt.cli.exits import with_exit_code
-from stiffopt.cli.options import Units
+from stiffopt.cli.options import Units, option
 
 RUN_HELP = """\
 Hold an arm at its task in closed loop: run the daemon of a rig in the foreground.
@@ -42,38 +42,29 @@ Exit codes:
 def run(
     rig: Annotated[str, typer.Argument(metavar="RIG", help="A rig file.")],
     task: Annotated[
-        str | None,
-        typer.Option(metavar="TASK", help="A task file to pursue once armed; needs --arm."),
+        str | None, option("TASK", "A task file to pursue once armed; needs --arm.")
     ] = None,
     play: Annotated[
         str | None,
-        typer.Option(
-            metavar="FILE",
-            help="What 'stiffopt path --out' or 'plan --out' wrote, to play once armed; needs "
-            "--arm.",
+        option(
+            "FILE",
+            "What 'stiffopt path --out' or 'plan --out' wrote, to play once armed; needs --arm.",
         ),
     ] = None,
     arm: Annotated[
         bool, typer.Option("--arm", help="Arm at once: the arm MOVES without anybody asking.")
     ] = False,
-    duration: Annotated[
-        str | None,
-        typer.Option(metavar="TIME", help="End after this time, such as '20 s'."),
-    ] = None,
+    duration: Annotated[str | None, option("TIME", "End after this time, such as '20 s'.")] = None,
     no_service: Annotated[
         bool,
         typer.Option("--no-service", help="Open no port: no control interface, no Foxglove."),
     ] = False,
     log_folder: Annotated[
-        str | None,
-        typer.Option(metavar="FOLDER", help="Record here, not where the rig file says."),
+        str | None, option("FOLDER", "Record here, not where the rig file says.")
     ] = None,
     plot: Annotated[
         str | None,
-        typer.Option(
-            metavar="FILE.png",
-            help="Draw the run into this file (.png, .pdf, .svg) when it has ended.",
-        ),
+        option("FILE.png", "Draw the run into this file (.png, .pdf, .svg) when it has ended."),
     ] = None,
     plain: Annotated[
         bool, typer.Option("--plain", help="Print lines for people, no live status.")

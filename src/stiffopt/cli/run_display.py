@@ -233,6 +233,10 @@ def _fields(now: Snapshot, armed: bool) -> list[tuple[str, RenderableType]]:
 
 def _shown(value: Any, entry: Entry) -> str:
     """Return a value as text in its display unit."""
+    if entry.kind is Kind.FLAG:
+        return "yes" if value else "no"
+    if entry.kind is Kind.FLAGS:  # the channels that have it
+        return ", ".join(str(k) for k, has in enumerate(value, start=1) if has) or "none"
     if entry.kind not in (Kind.NUMBERS, Kind.NUMBER):
         return printable(str(value))
     si = entry.shown.unit if isinstance(entry.shown.unit, str) else entry.shown.unit[0]

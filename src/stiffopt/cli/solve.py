@@ -5,7 +5,7 @@ from typing import Annotated
 import typer
 
 from stiffopt.cli.exits import with_exit_code
-from stiffopt.cli.options import Quiet, Units, Version, ViewOption
+from stiffopt.cli.options import Quiet, Units, Version, ViewOption, option
 
 HELP = """\
 Find the chamber pressures that reach a tip pose and meet its stiffness goal best.
@@ -56,33 +56,29 @@ def solve(
     ] = False,
     out: Annotated[
         str | None,
-        typer.Option(
-            metavar="FILE.yaml",
-            help="Write the answers to a result file. Only another result file is overwritten.",
+        option(
+            "FILE.yaml",
+            "Write the answers to a result file. Only another result file is overwritten.",
         ),
     ] = None,
     plot: Annotated[
         str | None,
-        typer.Option(
-            metavar="FILE.png",
-            help="Draw the arm and its pressures; of several tasks, each in FILE-<task>.png.",
+        option(
+            "FILE.png", "Draw the arm and its pressures; of several tasks, each in FILE-<task>.png."
         ),
     ] = None,
     view: ViewOption = None,
     pareto: Annotated[
         int | None,
-        typer.Option(
-            metavar="N",
+        option(
+            "N",
+            "Trade tip error against stiffness, at N tolerances from the task's own upwards.",
             min=2,
             max=1000,
-            help="Trade tip error against stiffness, at N tolerances from the task's own upwards.",
         ),
     ] = None,
     seed: Annotated[
-        int,
-        typer.Option(
-            metavar="N", min=0, help="Seed of the global search; the same gives the same answer."
-        ),
+        int, option("N", "Seed of the global search; the same gives the same answer.", min=0)
     ] = 0,
     units: Units = None,
     quiet: Quiet = False,

@@ -257,7 +257,7 @@ def _stiffnesses(solved: SolvedTask) -> list[Record] | None:
             "value": _quantity(value, measure.unit),
             "interval": None if ends is None else [_quantity(end, measure.unit) for end in ends],
             "plain": _quantity(at_plain, measure.unit),
-            **measure.said(),
+            **measure.task_keys(),
         }
         for measure, value, at_plain, ends in zip(
             solution.task.measures, solution.stiffnesses, plain, intervals, strict=False

@@ -5,7 +5,7 @@ from typing import Annotated
 import typer
 
 from stiffopt.cli.exits import with_exit_code
-from stiffopt.cli.options import Units
+from stiffopt.cli.options import Units, option
 
 STUDIO_HELP = """\
 Open a page in the browser in which a robot and a task are seen and changed by hand.
@@ -35,31 +35,19 @@ Exit codes:
 def studio(
     file: Annotated[str, typer.Argument(metavar="[FILE]", help="What is shown.")] = "stiff-flop-2",
     robot: Annotated[
-        str | None,
-        typer.Option(metavar="ROBOT", help="For a FILE that names none; else stiff-flop-2."),
+        str | None, option("ROBOT", "For a FILE that names none; else stiff-flop-2.")
     ] = None,
     map_file: Annotated[
-        str | None,
-        typer.Option(
-            "--map", metavar="MAP.zarr", help="Show a workspace map, coloured by stiffness."
-        ),
+        str | None, option("MAP.zarr", "Show a workspace map, coloured by stiffness.", "--map")
     ] = None,
     token_file: Annotated[
-        str | None,
-        typer.Option(
-            metavar="FILE", help="With a RIG: the daemon's token, to command; or STIFFOPT_TOKEN."
-        ),
+        str | None, option("FILE", "With a RIG: the daemon's token, to command; or STIFFOPT_TOKEN.")
     ] = None,
     units: Units = None,
     host: Annotated[
-        str,
-        typer.Option(
-            metavar="HOST", help="Address to listen on; the default admits only this machine."
-        ),
+        str, option("HOST", "Address to listen on; the default admits only this machine.")
     ] = "127.0.0.1",
-    port: Annotated[
-        int, typer.Option(metavar="PORT", min=0, max=65535, help="Port; 0 takes any free one.")
-    ] = 0,
+    port: Annotated[int, option("PORT", "Port; 0 takes any free one.", min=0, max=65535)] = 0,
     no_browser: Annotated[
         bool, typer.Option("--no-browser", help="Only print the address.")
     ] = False,

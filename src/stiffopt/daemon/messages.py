@@ -8,6 +8,8 @@ also in its message. Unknown keys, text instead of numbers, NaN and infinities a
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import reduce
+from operator import or_
 from types import UnionType
 from typing import (
     Annotated,
@@ -41,6 +43,7 @@ from stiffopt.documents import document_of
 from stiffopt.errors import InputError, Loc, dotted, shown
 from stiffopt.files import from_document
 from stiffopt.model.obstacles.mesh import Mesh
+from stiffopt.optimise.measure import Measure
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import Task
 from stiffopt.paths.trajectory import MAX_WAYPOINTS, Trajectory, Waypoint
@@ -153,7 +156,7 @@ def _json_of(value: Any, place: Loc, lost: list[Loc]) -> Any:
         fields = type(value).model_fields
         for name in (*fields, *(value.model_extra or ())):
             field = getattr(value, name)
-            if field is None or (name in fields and _is_left_out(fields[name])):
+            if field is None or (name in fields and _is_implied(fields[name])):
                 continue
             if name in message.names:
                 found[message.names[name]] = _json_of(field, (*place, name), lost)
@@ -211,11 +214,16 @@ def _with_fields_of(schema: type[Schema]) -> Callable[[ClassT], ClassT]:
     return lambda base: message_of(schema, base)
 
 
-def _is_left_out(info: FieldInfo) -> bool:
-    """Whether messages lack a field: it is a constant, a file, or read from a file."""
+def _is_implied(info: FieldInfo) -> bool:
+    """Whether messages do without a field: it has one value, or no key in files."""
     args = get_args(info.annotation)
     is_constant = get_origin(info.annotation) is Literal and len(args) == 1
-    return bool(info.exclude) or is_constant or Mesh in args
+    return bool(info.exclude) or (is_constant and not info.is_required())
+
+
+def _is_left_out(info: FieldInfo) -> bool:
+    """Whether messages lack a field: it is implied, or names a file."""
+    return _is_implied(info) or Mesh in get_args(info.annotation)
 
 
 def _unit(hint: Any) -> str:
@@ -231,6 +239,9 @@ def _type(hint: Any) -> Any:
     if isinstance(hint, type) and issubclass(hint, Schema):
         return message_of(hint)
     if origin is Annotated:
+        kinds = [get_args(each)[0] for each in get_args(args[0]) if get_origin(each) is Annotated]
+        if kinds and all(isinstance(kind, type) and issubclass(kind, Measure) for kind in kinds):
+            return _either(kinds)
         return _bounded(_type(args[0]), args[1:])
     if origin in (Union, UnionType):
         return Union[tuple(map(_type, args))]  # noqa: UP007 - made of a tuple
@@ -238,10 +249,34 @@ def _type(hint: Any) -> Any:
         if args[-1] is not Ellipsis:
             return Annotated[list[_type(args[0])], bounds.Len(len(args), len(args))]  # type: ignore[misc]
         item = _type(args[0])
-        is_model = isinstance(item, type) and issubclass(item, SchemaMessage)
-        most = MAX_WAYPOINTS if args[0] is Waypoint else _MAX_ITEMS if is_model else _MAX_NUMBERS
+        most = MAX_WAYPOINTS if args[0] is Waypoint else _MAX_ITEMS
+        if not _is_message(item):
+            most = _MAX_NUMBERS
         return Annotated[list[item], bounds.Len(0, most)]  # type: ignore[valid-type]
     return hint
+
+
+def _is_message(kind: Any) -> bool:
+    """Whether a JSON type is a message, or a choice of messages."""
+    if isinstance(kind, type):
+        return issubclass(kind, SchemaMessage)
+    return get_origin(kind) in (Annotated, Union) and _is_message(get_args(kind)[0])
+
+
+def _either(kinds: list[type[Measure]]) -> Any:
+    """Return the type of the messages of measures, which are told apart by their keys."""
+    messages = {kind.key: message_of(kind) for kind in kinds}
+
+    def which(value: Any) -> str:
+        given = value.names if isinstance(value, SchemaMessage) else value
+        for key, message in reversed(messages.items()):
+            name = key if given is not value else message.names[key]
+            if isinstance(given, Mapping) and name in given:
+                return f"<{key}>"
+        return f"<{kinds[0].key}>"
+
+    tagged = [Annotated[message, Tag(f"<{key}>")] for key, message in messages.items()]
+    return Annotated[reduce(or_, tagged), Discriminator(which)]
 
 
 def _bounded(kind: Any, metadata: tuple[Any, ...]) -> Any:

@@ -93,11 +93,11 @@ class Metrics:
                 continue
             if entry.kind is Kind.COUNT:
                 yield self._counter(name, about, value)
-            elif entry.kind is Kind.NUMBERS:
+            elif entry.kind in (Kind.NUMBERS, Kind.FLAGS):
                 labels = ("channel", "kind") if entry.shown.label else ("channel",)
                 about = _SHARED.get(name, about)
                 family = shared.setdefault(name, self._gauges(name, about, *labels))
-                for channel, number in enumerate(value.tolist(), start=1):
+                for channel, number in enumerate(map(float, value), start=1):
                     if isfinite(number):
                         of = (str(channel), entry.shown.label)[: len(labels)]
                         family.add_metric([self._name, *of], number)

@@ -37,8 +37,8 @@ class RunSpan:
 class RecordedRun:
     """A recorded run, in SI units; unknown values are NaN. Time 0 is the start of the recording.
 
-    Fields of `stiffopt.control.state.Snapshot` that are logged as numbers are attributes, with one
-    row per tick: ``run.commanded`` is (N, n), ``run.position_error`` is (N,).
+    Fields of `stiffopt.control.state.Snapshot` that are logged as numbers, flags or arrays are
+    attributes, with one row per tick: ``run.commanded`` is (N, n), ``run.position_error`` (N,).
 
     Attributes
     ----------
@@ -97,8 +97,8 @@ class RecordedRun:
             for name, entry in places.items():
                 value = self.fields[name][row]
                 known = not entry.optional or bool(np.isfinite(value).any())
-                if entry.kind in (Kind.NUMBER, Kind.COUNT):
-                    value = float(value)
+                if entry.kind in (Kind.NUMBER, Kind.COUNT, Kind.FLAG):
+                    value = value.item()
                 logged[name] = value if known else None
             state, reason = (State.UNCONFIGURED, "") if span is None else (span.kind, span.text)
             yield Snapshot(**{**logged, "time": time, "state": State(state), "reason": reason})
@@ -185,13 +185,14 @@ def _fields(found: McapContents, time: Array, begin: float, n: int) -> dict[str,
     fields: dict[str, Array] = {}
     for entry in entries(Snapshot):
         topic = entry.shown.topic
-        if not topic or entry.kind not in (Kind.NUMBER, Kind.COUNT, Kind.NUMBERS, Kind.FLAGS):
+        is_row = entry.in_array or entry.kind in (Kind.NUMBER, Kind.COUNT, Kind.FLAG)
+        if not topic or not is_row:  # texts, records, and lists of any length
             continue
         messages = found.of_topic(topic)
         moments = _scalars(messages, "time_s") - begin
         rows = (_held if topic in _HELD else _rows_of)(time, moments)
         values = _picked(_column(messages, entry, n), rows)
-        if entry.kind is Kind.FLAGS:
+        if entry.kind in (Kind.FLAG, Kind.FLAGS):
             values = values == 1
         elif entry.name.endswith("_time"):
             values = values - begin
@@ -201,7 +202,7 @@ def _fields(found: McapContents, time: Array, begin: float, n: int) -> dict[str,
 
 def _column(messages: Sequence[Mapping[str, Any]], entry: Entry, n: int) -> Array:
     """Return a field of messages, (N,) or (N, m); NaN where it is missing."""
-    if entry.kind in (Kind.NUMBERS, Kind.FLAGS):
+    if entry.in_array:
         return _vectors(messages, entry.key, entry.shown.size or n)
     return _scalars(messages, entry.key)
 

@@ -279,7 +279,7 @@ class Conductor:
             self.approach(target)
             if np.array_equal(self._commanded, target):
                 return
-        raise DeviceError("the pressures do not get to where they shall be: the gate limits them")
+        raise DeviceError("the commands do not reach their target: the gate limits them")
 
     def settle(
         self, target: ArrayLike, settled: Callable[[Sequence[TrackedFrame]], bool], timeout: float

@@ -39,7 +39,7 @@ class ProbeTuning:
     change: float = 0.01  # share by which a constant force may change
     timeout: float = 6.0  # longest time at a step, in s
     touch: float = 5.0  # smallest force of a contact, in standard deviations of the noise
-    least_touch: float = 1e-3  # smallest force of a contact, in N
+    min_touch: float = 1e-3  # smallest force of a contact, in N
 
 
 PROBE = ProbeTuning()
@@ -53,7 +53,7 @@ class Series:
     displacement: float  # travel of the stage beyond the first contact, and back, in m
     steps: int  # number of steps each way
     reach: float  # travel within which the stage searches for the tip, in m
-    most_force: float  # force at which the series ends, in N
+    max_force: float  # force at which the series ends, in N
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,7 @@ class Probing:
         places = [contact + series.displacement * k / series.steps for k in range(series.steps + 1)]
         reached = 0
         for place in places:
-            if not self._move(pressures, place, free.force + series.most_force):
+            if not self._move(pressures, place, free.force + series.max_force):
                 break
             points.append(self._point(pressures, series, free, contact))
             reached += 1
@@ -129,10 +129,10 @@ class Probing:
     def _touch(self, pressures: Array, series: Series, free: _Free) -> float:
         """Advance until the probe measures a contact; return the position of the stage."""
         begin = self._at
-        threshold = max(PROBE.touch * free.noise, PROBE.least_touch)
+        threshold = max(PROBE.touch * free.noise, PROBE.min_touch)
         step = min(PROBE.approach, series.displacement / 4)
         while self._at - begin < series.reach:
-            self._move(pressures, self._at + step, free.force + series.most_force)
+            self._move(pressures, self._at + step, free.force + series.max_force)
             if self._force() - free.force > threshold and self._force() - free.force > threshold:
                 return self._at
         raise DeviceError(
@@ -174,12 +174,12 @@ class Probing:
             position=position,
             measured=np.mean([row.measured for row in last], axis=0),
             touching=force
-            > max(PROBE.touch * free.noise / np.sqrt(len(last)), PROBE.least_touch / 2),
+            > max(PROBE.touch * free.noise / np.sqrt(len(last)), PROBE.min_touch / 2),
             settled=settled,
         )
 
-    def _move(self, pressures: Array, place: float, most_force: float) -> bool:
-        """Move in short pieces; stop and return False if the force exceeds `most_force`."""
+    def _move(self, pressures: Array, place: float, max_force: float) -> bool:
+        """Move in short pieces; stop and return False if the force exceeds `max_force`."""
         while self._at != place:
             far = PROBE.speed * PROBE.piece
             self._at += float(np.clip(place - self._at, -far, far))
@@ -187,7 +187,7 @@ class Probing:
                 self._at = place
             self.probe.move_to(self._at, PROBE.speed)
             self._conductor.tick(pressures)
-            if self._force() > most_force:
+            if self._force() > max_force:
                 return False
         return True
 

@@ -251,7 +251,7 @@ class _StiffnessRun:
             displacement=min(settings.displacement, settings.force / max(expected, 1e-9)),
             steps=settings.steps,
             reach=settings.reach,
-            most_force=HARD_STOP * settings.force,
+            max_force=HARD_STOP * settings.force,
         )
 
     def notes(self) -> list[str]:

@@ -10,9 +10,12 @@ from typing import Literal
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
 from stiffopt import lie
 from stiffopt.model.actuation import Section
+
+Vector = NDArray[np.float64]
 
 Frame = Literal["base", "tip"]
 Kind = Literal["translation", "rotation"]
@@ -146,6 +149,25 @@ def directional_stiffness(
         block = compliance[:3, :3] if kind == "translation" else compliance[3:, 3:]
         return 1 / (d.T @ block @ d)
     return d.T @ stiffness_block(compliance, kind, boundary) @ d
+
+
+def stiffness_of(C: Vector, d: Vector, kind: Kind, boundary: Boundary) -> Vector:
+    """Return `directional_stiffness` (...) of compliances (..., 6, 6) that are known as numbers.
+
+    The unit directions d (..., 3) are in the axes of the compliances.
+    """
+    own, other = slice(0, 3), slice(3, 6)
+    if kind == "rotation":
+        own, other = other, own
+    block, d = C[..., own, own], d[..., None]
+    if boundary == "free":
+        flexibility: Vector = np.sum(d * (block @ d), axis=(-2, -1))
+        return 1 / flexibility
+    if boundary == "clamped":
+        reaction = np.linalg.solve(C[..., other, other], C[..., other, own])
+        block = block - C[..., own, other] @ reaction
+    found: Vector = np.sum(d * np.linalg.solve(block, d), axis=(-2, -1))
+    return found
 
 
 def held_stiffness(

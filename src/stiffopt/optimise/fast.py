@@ -204,13 +204,13 @@ class FastSolver:
         self.targets = slice(first, first + len(program.target_parameters))
         self._radii = slice(setup.parameters, setup.parameters + len(constraints))
         limits = self._radii.stop + 2 * n
-        self._asked = limits + program.n_floors + _NEAR * setup.near
-        self._near = slice(limits + program.n_floors, self._asked)
-        self._width = self._asked + 1 + n
+        self._mode = limits + program.n_floors + _NEAR * setup.near
+        self._near = slice(limits + program.n_floors, self._mode)
+        self._width = self._mode + 1 + n
         ends = np.cumsum([_COUNTS + n, n, program.n_rows, 16, 36, len(program.measures)]).tolist()
         self._parts = [slice(start, end) for start, end in pairwise(ends)]
         self._answer_width = ends[-1]
-        self.guess = slice(self._asked + 1, self._width)
+        self.guess = slice(self._mode + 1, self._width)
         self._pressures = slice(self._width + _COUNTS, self._width + _COUNTS + n)
 
     def among(self, obstacles: Obstacles, robot: Manipulator) -> "FastSolver":
@@ -241,7 +241,7 @@ class FastSolver:
             near += term.nearness(self._length).numbers
         row[self._near] = near
         if guess is not None:
-            row[self._asked] = _GUESS_FIRST
+            row[self._mode] = _GUESS_FIRST
             row[self.guess] = guess
         return row
 
@@ -252,7 +252,7 @@ class FastSolver:
     def next_to(self, row: Vector, guess: Vector, lower: Vector, upper: Vector) -> Vector:
         """Return a row that requests the answer next to a guess (n,), within limits (n,)."""
         row = row.copy()
-        row[self._asked] = _GUESS_ALONE
+        row[self._mode] = _GUESS_ALONE
         row[self.guess] = guess
         self.limit(row, lower, upper)
         return row
@@ -260,7 +260,7 @@ class FastSolver:
     def judging(self, row: Vector, pressures: Vector) -> Vector:
         """Return a row that requests the judgement of pressures (n,)."""
         row = row.copy()
-        row[self._asked] = _JUDGE
+        row[self._mode] = _JUDGE
         row[self.guess] = pressures
         return row
 
@@ -299,7 +299,7 @@ class FastSolver:
     def block(self, row: Vector) -> Vector:
         """Return a row that requests the answer next to its guess, followed by memory for it."""
         block = np.concatenate([row, np.zeros(self._answer_width)])
-        block[self._asked] = _GUESS_ALONE
+        block[self._mode] = _GUESS_ALONE
         return block
 
     def call(self, block: Vector) -> tuple[Callable[[], int], ctypes.Structure]:
@@ -345,10 +345,10 @@ class FastSolver:
         parts = np.split(values[s.n :], np.cumsum(counts)[:-1])
         return [each.reshape(-1, s.n) if i % 2 else each for i, each in enumerate(parts)]
 
-    def _run_one(self, row: Vector, asked: int | None = None) -> Vector:
+    def _run_one(self, row: Vector, mode: int | None = None) -> Vector:
         numbers = np.empty(self._answer_width)
-        if asked is not None:
-            row[self._asked] = asked
+        if mode is not None:
+            row[self._mode] = mode
         with stop_flag() as stop:
             self._run(row, numbers, 0, 1, stop)
         return numbers

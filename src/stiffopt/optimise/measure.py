@@ -77,10 +77,10 @@ class Measure(Schema):
         """Return the message for a value that does not hold: the demand and the best value."""
         return ""
 
-    def said(self) -> dict[str, Any]:
+    def task_keys(self) -> dict[str, Any]:
         """Return its keys and values in the task file, without the required value and tolerance."""
-        said = self.model_dump(exclude={"value", "tolerance"})
-        return {key: list(v) if isinstance(v, tuple) else v for key, v in said.items()}
+        keys = self.model_dump(exclude={"value", "tolerance"})
+        return {key: list(v) if isinstance(v, tuple) else v for key, v in keys.items()}
 
     def words(self) -> str:
         """Describe the measure: ``against translation along (1, 0, 0), base axes, free``."""

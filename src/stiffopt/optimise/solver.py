@@ -38,7 +38,7 @@ from stiffopt.optimise.search import starts
 from stiffopt.optimise.solution import Judgement, PressureSolution, are_within
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import PressureRange, Task
-from stiffopt.optimise.warm import WarmAnswer, WarmCalls, asked_task
+from stiffopt.optimise.warm import WarmAnswer, WarmCalls, task_with_target
 
 Vector = NDArray[np.float64]
 
@@ -157,7 +157,7 @@ class PressureSolver:
             block = calls.next_to(guess, position, pointing, orientation, stop)
             if block is not None:
                 return WarmAnswer(calls.fast.pressures(block), self, block)
-        task = asked_task(self.task, position, pointing, orientation)
+        task = task_with_target(self.task, position, pointing, orientation)
         p = checked_vector("guess", guess, self.robot.n_pressures)
         return self._warm_otherwise(task, p, limits)
 
@@ -427,25 +427,25 @@ def solve_batch(
 
 
 def _solved(
-    asked: list[tuple[PressureSolver, Task, Vector | None]],
+    jobs: list[tuple[PressureSolver, Task, Vector | None]],
     threads: int | None,
     watch: Stopwatch,
 ) -> list[PressureSolution]:
     """Solve checked tasks; tasks of one structure are solved together."""
     found: dict[int, PressureSolution | None] = {}
     groups: dict[FastSolver, list[tuple[int, Vector, Program]]] = {}
-    for index, (solver, task, guess) in enumerate(asked):
+    for index, (solver, task, guess) in enumerate(jobs):
         fast = solver._search.fast(task, guess)
         if fast is not None:
             groups.setdefault(fast[0], []).append((index, *fast[1:]))
     for fast_solver, members in groups.items():
         answers = fast_solver.solve_all(np.stack([row for _, row, _ in members]), threads)
         for (index, _, program), answer in zip(members, answers, strict=True):
-            solver, task, _ = asked[index]
+            solver, task, _ = jobs[index]
             found[index] = solver._answers.if_it_holds(task, program, answer)
-    shares = {name: time / max(1, len(asked)) for name, time in watch.timings().items()}
+    shares = {name: time / max(1, len(jobs)) for name, time in watch.timings().items()}
     solutions = []
-    for index, (solver, task, guess) in enumerate(asked):
+    for index, (solver, task, guess) in enumerate(jobs):
         watch = Stopwatch()
         solution = found.get(index)
         if index not in found:  # machine code may have become ready meanwhile

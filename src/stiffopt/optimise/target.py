@@ -42,7 +42,7 @@ class Target(_Keys):
     Attributes
     ----------
     position : x, y, z in m, None for an axis that is free; or None if all are.
-    pointing : unit vector along which the tip's z axis shall point, or None.
+    pointing : unit vector along which the tip's z axis is to point, or None.
     orientation : unit quaternion (w, x, y, z) with w >= 0, or None.
     above : plane above which the tip stays, or None.
     tolerance : largest errors.
@@ -74,7 +74,7 @@ class Target(_Keys):
         )
 
     def __repr__(self) -> str:
-        parts = [f"{term.key} {term.asked()}" for term in self.terms]
+        parts = [f"{term.key} {term.condition()}" for term in self.terms]
         return f"Target({', '.join(parts)})"
 
     __str__ = __repr__

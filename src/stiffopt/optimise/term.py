@@ -13,7 +13,7 @@ import hashlib
 import inspect
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Hashable
+from collections.abc import Hashable, Mapping
 from copy import copy
 from functools import cache
 from typing import Annotated, Any, ClassVar, NamedTuple
@@ -177,13 +177,22 @@ class Term(ABC):
         unit = display_units().of_si(self.unit)
         return unit.of(value), unit.name
 
-    def asked(self) -> str:
-        """Describe the condition: ``(-30, free, 190) mm within 0.1 mm``."""
-        return f"{numbers_shown(self.value)} within {self.words(self.radius)}"
+    def condition(self) -> str:
+        """Describe the condition: ``(-30, free, 190) mm within 0.1 mm``.
+
+        By default a mapping, or a list of them, is described as in a task file.
+        """
+        if isinstance(self.value, tuple) and not isinstance(self.value[0], Schema):
+            return f"{numbers_shown(self.value)} within {self.words(self.radius)}"
+        return _as_in_file(self.value)
 
     def words(self, value: float) -> str:
-        """Format an error or margin for display: ``0.35 mm``."""
-        return display_units().of_si(self.unit).text(value, ".3g" if self.unit == "rad" else ".4g")
+        """Format an error or margin for display: ``0.35 mm``, ``2 mm short in above``."""
+        unit, digits = display_units().of_si(self.unit), ".3g" if self.unit == "rad" else ".4g"
+        if not self.is_inequality:
+            return unit.text(value, digits)
+        size = unit.text(abs(value), digits)
+        return f"{size} {'to spare' if value >= 0 else 'short'} in {self.name}"
 
 
 def numbers_shown(values: Any, unit: DisplayUnit = PLAIN) -> str:
@@ -191,6 +200,17 @@ def numbers_shown(values: Any, unit: DisplayUnit = PLAIN) -> str:
     digits = 3 + unit.more_decimals
     shown = ("free" if x is None else f"{round(unit.of(x), digits) + 0.0:g}" for x in values)
     return f"({', '.join(shown)})"
+
+
+def _as_in_file(value: Any) -> str:
+    if isinstance(value, Schema):
+        value = value.model_dump(mode="json", exclude_none=True)
+    if isinstance(value, Mapping):
+        return ", ".join(f"{key} {_as_in_file(part)}" for key, part in value.items())
+    if isinstance(value, list | tuple):
+        separator = "; " if value and isinstance(value[0], Schema) else ", "
+        return f"({separator.join(map(_as_in_file, value))})"
+    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 @cache

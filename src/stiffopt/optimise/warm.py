@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 Vector = NDArray[np.float64]
 
 
-def asked_task(
+def task_with_target(
     task: Task,
     position: ArrayLike | None,
     pointing: ArrayLike | None,

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from stiffopt.display import display_units
 from stiffopt.errors import EquilibriumError, InputError, StoppedError
 from stiffopt.model.compiled import Stopwatch
+from stiffopt.model.compliance import stiffness_of
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.motion_clearance import MOTION_ERROR, ClearMotions
 from stiffopt.model.scene import Scene
@@ -33,7 +34,6 @@ from stiffopt.paths.motion_request import MotionRequest
 from stiffopt.paths.rates import least_times
 from stiffopt.paths.shortening import rounded, shortened
 from stiffopt.paths.solution import PathSolution
-from stiffopt.paths.stiffness import least_stiffness
 from stiffopt.paths.tree_search import TreeSearch
 
 Vector = NDArray[np.float64]
@@ -367,7 +367,7 @@ class _Planner:
             pressures=p,
             tip_poses=robot.pose(p, robot.length),
             slew=request.slew,
-            stiffness=least_stiffness(robot, p, measures) if measures else None,
+            stiffness=_least_stiffness(robot, p, measures) if measures else None,
             stiffness_unit=measures[0].unit if measures else None,
             clearance=clearance,
             confidence=self._confidence(),
@@ -395,6 +395,19 @@ class _Planner:
         how = "RRTConnect" if self.searched else "a straight way in pressures"
         kept = f"the way between them is clear to {display_units().length.text(MOTION_ERROR, 'g')}"
         return f"{how}{goals}, {self.poses} poses looked at; {kept}"
+
+
+def _least_stiffness(robot: Manipulator, p: Vector, measures: Sequence[StiffnessMeasure]) -> Vector:
+    """Return the smallest (N,) of several stiffnesses of the tip at pressures (N, n)."""
+    C = robot.compliance_between(p, robot.length, robot.length)  # base axes
+    R = robot.pose(p, robot.length)[:, :3, :3]
+    directions = [
+        R @ each.direction if each.frame == "tip" else np.broadcast_to(each.direction, (len(p), 3))
+        for each in measures
+    ]
+    pairs = zip(measures, directions, strict=True)
+    found: Vector = np.min([stiffness_of(C, d, each.kind, each.boundary) for each, d in pairs], 0)
+    return found
 
 
 def timed(way: Vector, rates: Vector) -> tuple[Vector, Vector]:

@@ -127,14 +127,14 @@ def _(task: Task) -> _Page:
     return _Page(_title(task, "Task"), "", _task_rows(task), draw)
 
 
-def _title(asked: ForRobot, kind: str) -> str:
-    return kind if asked.source is None else asked.source.stem
+def _title(given: ForRobot, kind: str) -> str:
+    return kind if given.source is None else given.source.stem
 
 
 def _task_rows(task: Task) -> Iterable[Row]:
     yield "robot", task.robot or "the one that the solver is given"
     for term in task.target.terms:
-        yield term.key, term.asked()
+        yield term.key, term.condition()
     if task.stiffness is not None:
         yield "stiffness", repr(task.stiffness).partition("(")[2].removesuffix(")")
     if task.press is not None:
@@ -144,12 +144,12 @@ def _task_rows(task: Task) -> Iterable[Row]:
     yield from _condition_rows(task)
 
 
-def _condition_rows(asked: ForRobot) -> Iterable[Row]:
-    if asked.load is not None:
-        force = display_units().force.text(float(np.linalg.norm(asked.load.force)), ".3g")
-        yield "load", f"{force}, {asked.load.frame} axes"
-    if asked.scene is not None:
-        yield "scene", ", ".join(item.name for item in asked.scene.objects)
+def _condition_rows(given: ForRobot) -> Iterable[Row]:
+    if given.load is not None:
+        force = display_units().force.text(float(np.linalg.norm(given.load.force)), ".3g")
+        yield "load", f"{force}, {given.load.frame} axes"
+    if given.scene is not None:
+        yield "scene", ", ".join(item.name for item in given.scene.objects)
 
 
 @_page_of.register

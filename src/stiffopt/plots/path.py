@@ -206,7 +206,7 @@ def draw_path(
     drawing.explain_segments()
     tips = drawing.unit.of(solution.tip_poses[:, :3, 3].T)
     if path is not None:
-        _draw_asked(drawing, path)
+        _draw_requested(drawing, path)
     axes.plot(*tips, color=style.DARK, linewidth=2.2, zorder=8)
     drawing.add_line(style.DARK, "tip")
     drawing.add_body(tips.T)
@@ -255,17 +255,17 @@ def draw_asked_path(
     drawing.draw_base()
     drawing.draw_tube(robot.pressure_min)
     drawing.explain_segments()
-    _draw_asked(drawing, path)
+    _draw_requested(drawing, path)
     if path.scene is not None:
         drawing.draw_objects(path.scene)
     return drawing.finish(view)
 
 
-def _draw_asked(drawing: ArmDrawing, path: Path) -> None:
-    asked = drawing.unit.of(path.points().positions)
-    drawing.axes.plot(*asked.T, color=style.TARGET, linewidth=1.4, linestyle=":", zorder=9)
+def _draw_requested(drawing: ArmDrawing, path: Path) -> None:
+    points = drawing.unit.of(path.points().positions)
+    drawing.axes.plot(*points.T, color=style.TARGET, linewidth=1.4, linestyle=":", zorder=9)
     drawing.add_line(style.TARGET, "path that is asked for", ":")
-    drawing.corners.append(asked)
+    drawing.corners.append(points)
 
 
 def _label_stiffness(drawing: ArmDrawing, solution: PathSolution, tips: Vector) -> None:

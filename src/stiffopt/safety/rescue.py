@@ -8,12 +8,15 @@ import select
 import threading
 import time
 from contextlib import ExitStack, suppress
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 from stiffopt.errors import DeviceError
 from stiffopt.rig.interface import PressureSupply
 from stiffopt.safety.claim import Claim
 from stiffopt.safety.settings import CLIENT
+
+if TYPE_CHECKING:
+    from stiffopt.safety.guard_client import GuardLink
 
 _log = logging.getLogger(__name__)
 
@@ -42,28 +45,6 @@ def vent_directly(supply: PressureSupply) -> bool:
     return alone
 
 
-class WatchedGuard(Protocol):
-    """The part of a `stiffopt.safety.guard_client.GuardLink` that a watch needs."""
-
-    @property
-    def pid(self) -> int | None:
-        """Process id; None if unknown."""
-
-    @property
-    def alive(self) -> bool:
-        """Whether the process runs."""
-
-    @property
-    def hung(self) -> bool:
-        """Whether it has not answered for too long."""
-
-    def ping(self) -> None:
-        """Request a sign of life."""
-
-    def kill(self) -> None:
-        """Kill the process."""
-
-
 class GuardWatch:
     """Watches a guard in a separate thread and vents the supply when the guard has ended or hangs.
 
@@ -83,7 +64,7 @@ class GuardWatch:
         Why venting has failed so far; empty if it has not.
     """
 
-    def __init__(self, guard: WatchedGuard, supply: PressureSupply | None) -> None:
+    def __init__(self, guard: GuardLink, supply: PressureSupply | None) -> None:
         self.rescued = threading.Event()
         self.error = ""
         self._guard, self._supply = guard, supply

@@ -56,7 +56,7 @@ class RigWatch:
     state : the latest state, or None.
     events : the latest events, the newest last.
     trouble : why there is no state, or an empty text.
-    said : outcome of the last command.
+    outcome : of the last command.
     """
 
     def __init__(
@@ -81,7 +81,7 @@ class RigWatch:
         self._quick = Client(url, given, name=NAME, heartbeat="manual", timeout=_QUICK)
         self.state: Snapshot | None = None
         self.events: deque[Event] = deque(maxlen=_EVENTS)
-        self.trouble, self.said = "asking the daemon ...", ""
+        self.trouble, self.outcome = "asking the daemon ...", ""
         self._next = 0
         self._is_known = False
         self._lock = threading.Lock()  # one command at a time, except for venting
@@ -125,7 +125,7 @@ class RigWatch:
             self.events.extend(events)
             self.trouble = ""
         except CommandError as error:
-            self.said = str(error)  # control was lost
+            self.outcome = str(error)  # control was lost
         except StiffoptError as error:
             self.state, self.trouble = None, str(error)
 
@@ -165,11 +165,11 @@ class RigWatch:
         """Send the task of the preview, if it has a valid solution."""
         answer, design = bench.answer, bench.design
         if design.has_own_robot:
-            self.said = "not sent: gravity or tip mass of the preview are not those of the rig"
+            self.outcome = "not sent: gravity or tip mass of the preview are not those of the rig"
         elif answer is None or answer.design != design or bench.trouble:
-            self.said = "not sent: wait until the preview is solved"
+            self.outcome = "not sent: wait until the preview is solved"
         elif not answer.solution.found:
-            self.said = f"not sent: the preview is {answer.solution.status}"
+            self.outcome = f"not sent: the preview is {answer.solution.status}"
         else:
             task = design.task.model_copy(update={"robot": None, "scene": None, "source": None})
             self._do("going to the target", lambda: self._client.set_task(task))
@@ -177,25 +177,25 @@ class RigWatch:
     def vent(self) -> None:
         """Vent at once through the daemon, or through the guard if the daemon does not answer."""
         if not self.may_command:
-            self.said = "venting needs the token; 'stiffopt vent RIG' needs none"
+            self.outcome = "venting needs the token; 'stiffopt vent RIG' needs none"
             return
         try:
             self._quick.vent()
-            self.said = "vented"
+            self.outcome = "vented"
         except StiffoptError as error:
-            self.said = f"the daemon did not vent ({error}); asking the guard ..."
+            self.outcome = f"the daemon did not vent ({error}); asking the guard ..."
             try:
-                self.said = vent_rig(self._file)
+                self.outcome = vent_rig(self._file)
             except StiffoptError as failed:
-                self.said = f"THE ARM MAY BE UNDER PRESSURE: {failed}"
+                self.outcome = f"THE ARM MAY BE UNDER PRESSURE: {failed}"
 
     def _do(self, done: str, command: Callable[[], None]) -> None:
         if not self.may_command:
-            self.said = "this needs the token: start the studio with --token-file"
+            self.outcome = "this needs the token: start the studio with --token-file"
             return
         with self._lock:
             try:
                 command()
-                self.said = done
+                self.outcome = done
             except StiffoptError as error:
-                self.said = str(error)
+                self.outcome = str(error)

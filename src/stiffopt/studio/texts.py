@@ -347,7 +347,7 @@ _STATES = {"active": "#2a7f3f", "holding": "#b35c00", "fault": "#b00020"}
 
 def rig_html(watch: RigWatch) -> str:
     """Return the panel's view of a rig's state."""
-    said = f"<div style='font-size:0.85em;color:#666'>{escape(watch.said)}</div>"
+    said = f"<div style='font-size:0.85em;color:#666'>{escape(watch.outcome)}</div>"
     if not watch.may_command:
         said = "<div style='font-size:0.85em;color:#666'>read only: no token was given</div>"
     state = watch.state

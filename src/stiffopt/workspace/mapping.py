@@ -183,7 +183,7 @@ class _MapRun:
             begun = MapPart(0, 0, np.full(3, np.inf), np.full(3, -np.inf), none)
         self._plan, self._store, self._report = plan, store, report
         self._state, self._begun = begun, begun.blocks
-        self._gathering = Gathering(begun.table, TUNING.most_cells)
+        self._gathering = Gathering(begun.table, TUNING.max_cells)
         self._saved = begun.blocks
         self._whole = True  # False during an update, in case it is interrupted
         self._next_save = monotonic() + TUNING.checkpoint

@@ -57,7 +57,7 @@ class MapTuning:
     # number of samples from which machine code pays for its compilation
     compiled_from: int = 50_000
     # cells that one map may fill; each takes about 0.5 kB while it is made
-    most_cells: int = 1_500_000
+    max_cells: int = 1_500_000
     checkpoint: float = 5.0  # time between two checkpoints on disk, in s
     checkpoint_share: float = 0.05  # share of the time that checkpoints may take
     # time to wait for a scheduler, and for workers while there are none, in s

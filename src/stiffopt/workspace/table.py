@@ -97,13 +97,13 @@ def merged(tables: Sequence[CellTable]) -> CellTable:
 
 
 class Gathering:
-    """A table that grows to at most `most_cells`; added tables are merged in batches."""
+    """A table that grows to at most `max_cells`; added tables are merged in batches."""
 
     _ENOUGH = 1 << 18  # rows
 
-    def __init__(self, table: CellTable, most_cells: int) -> None:
+    def __init__(self, table: CellTable, max_cells: int) -> None:
         self._table = table
-        self._most_cells = most_cells
+        self._max_cells = max_cells
         self._waiting: list[CellTable] = []
         self._rows = 0
 
@@ -118,9 +118,9 @@ class Gathering:
         """Return the table of everything added so far."""
         self._table = merged([self._table, *self._waiting])
         self._waiting, self._rows = [], 0
-        if len(self._table) > self._most_cells:
+        if len(self._table) > self._max_cells:
             raise InputError(
-                f"the workspace fills more than {self._most_cells:,} cells, which is more than a "
+                f"the workspace fills more than {self._max_cells:,} cells, which is more than a "
                 "map may have; choose larger cells"
             )
         return self._table

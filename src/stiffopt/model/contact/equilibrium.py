@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
+from typing import TYPE_CHECKING, Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,7 +13,7 @@ from stiffopt import lie
 from stiffopt.errors import EquilibriumError, InputError
 from stiffopt.model.arguments import check_choice, checked_measure
 from stiffopt.model.arm_clearance import SceneKey, measured_scene
-from stiffopt.model.compliance import Boundary, Frame, Kind
+from stiffopt.model.compliance import Boundary, Frame, Kind, stiffness_of
 from stiffopt.model.contact.push import ContactLoss, GrowingPush
 from stiffopt.model.contact.rod import Condition, Rod, hat, rotations
 from stiffopt.model.contact.solve import ContactProblem
@@ -202,8 +202,10 @@ class ContactEquilibrium:
 
         See `Manipulator.stiffness` for the arguments and `compliance` for `contacts`.
         """
-        return _stiffness(self.compliance(contacts), self._arm.shape.rotation[0],
-                          checked_measure(direction, kind, boundary, frame))  # fmt: skip
+        d = np.asarray(checked_measure(direction, kind, boundary, frame).direction)
+        if frame == "base":
+            d = self._arm.shape.rotation[0].T @ d
+        return float(stiffness_of(self.compliance(contacts), d, kind, boundary))
 
     @property
     def friction(self) -> FrictionBounds:
@@ -394,18 +396,3 @@ def _problem(rod: Rod, key: SceneKey) -> ContactProblem:
             if item.contact is not None and item.contact.allowed
         ),
     )
-
-
-def _stiffness(C: Vector, R: Vector, measure: Any) -> float:
-    """Return the stiffness of a compliance (6, 6) in axes R; see `Manipulator.stiffness`."""
-    d = np.asarray(measure.direction)
-    d = R.T @ d if measure.frame == "base" else d
-    own, other = slice(0, 3), slice(3, 6)
-    if measure.kind == "rotation":
-        own, other = other, own
-    if measure.boundary == "free":
-        return float(1 / (d @ C[own, own] @ d))
-    block = C[own, own]
-    if measure.boundary == "clamped":
-        block = block - C[own, other] @ np.linalg.solve(C[other, other], C[other, own])
-    return float(d @ np.linalg.solve(block, d))

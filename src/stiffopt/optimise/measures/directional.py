@@ -140,7 +140,7 @@ class AtLeast(_ValuedMeasure):
 
 
 class MatchValue(_ValuedMeasure):
-    """A stiffness that shall be `value` (N/m, for a rotation N m/rad).
+    """A stiffness to be matched, `value` (N/m, for a rotation N m/rad).
 
     Attributes
     ----------

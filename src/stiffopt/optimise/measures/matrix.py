@@ -18,7 +18,7 @@ from stiffopt.units import Number, Ratio, parse_quantity, read_from_file
 
 
 class MatchMatrix(Measure):
-    """A translational stiffness matrix that the tip shall have.
+    """A translational stiffness matrix to be matched by the tip.
 
     Attributes
     ----------

@@ -67,7 +67,7 @@ static int closest(Program *P, const double *from, double *x, double *slope, Fou
         x[i] = clip(from[i] / s->unit[i], P->lower[i], P->upper[i]);
     const ClosestSettings *set = &s->closest;
     Setup own = *s;
-    const double *asked = P->radius;
+    const double *tolerances = P->radius;
     own.terms = 1, own.floors = 0, own.precision = set->precision, own.same_optimum = set->same;
     int64_t n = own.n, balls = own.balls, stages = 0, good = 0;
     double radius[balls], optima[set->most_descents * n];
@@ -77,10 +77,10 @@ static int closest(Program *P, const double *from, double *x, double *slope, Fou
     int64_t count = nearest_samples(P, nearest, &effort);
     memset(found, 0, sizeof *found);
     for (int64_t k = 0; k < balls; k++) {
-        radius[k] = own.stage[k] < 0 ? asked[k] : FREE; /* obstacles hold in every stage */
+        radius[k] = own.stage[k] < 0 ? tolerances[k] : FREE; /* obstacles hold in every stage */
         stages = own.stage[k] + 1 > stages ? own.stage[k] + 1 : stages;
     }
-    Stage stage = {0, asked};
+    Stage stage = {0, tolerances};
     P->setup = &own, P->radius = radius, P->stage = &stage;
     NEW_POINT(p, &own);
     for (; stage.number < stages; stage.number++) {
@@ -94,7 +94,7 @@ static int closest(Program *P, const double *from, double *x, double *slope, Fou
         for (int64_t k = 0; k < balls; k++)
             if (own.stage[k] == stage.number) least = fmax(least, p.error[k]);
         for (int64_t k = 0; k < balls && stage.number + 1 < stages; k++)
-            if (own.stage[k] == stage.number) radius[k] = fmax(asked[k], least * (1 + 1e-6) + 1e-7);
+            if (own.stage[k] == stage.number) radius[k] = fmax(tolerances[k], least * (1 + 1e-6) + 1e-7);
     }
     if (good) { /* descend once more from the end, for its multipliers */
         stage.number = stages - 1;
@@ -104,7 +104,7 @@ static int closest(Program *P, const double *from, double *x, double *slope, Fou
         memcpy(x, p.x, (size_t)n * sizeof(double));
         P->slope = NULL;
     }
-    P->setup = s, P->radius = asked, P->stage = NULL;
+    P->setup = s, P->radius = tolerances, P->stage = NULL;
     return good;
 }
 

@@ -49,7 +49,7 @@ static void solve_row(Program *P, const double *task, double *answer) {
     P->lower = lower, P->upper = upper, task += 2 * s->n;
     P->floor = task, task += s->floors;
     P->near = task, task += 18 * s->near;
-    int64_t asked = (int64_t)*task++, outcome = NEEDS_GENERAL_METHOD;
+    int64_t mode = (int64_t)*task++, outcome = NEEDS_GENERAL_METHOD;
     P->poses = P->points = P->programs = 0;
     P->sight = NEAR;
 
@@ -60,16 +60,16 @@ static void solve_row(Program *P, const double *task, double *answer) {
     memset(slope, 0, sizeof slope);
     if (!all_finite(P->parameters, s->parameters) || !all_finite(task, s->n))
         outcome = NOT_FINITE;
-    else if (asked == JUDGE)
+    else if (mode == JUDGE)
         outcome = JUDGED;
-    else if (asked == REACH_ONLY)
+    else if (mode == REACH_ONLY)
         outcome = can_reach(P, &p, s->least_effort.screened) ? REACHED : NEEDS_GENERAL_METHOD;
-    else if (asked == CLOSEST || asked == CLOSEST_FROM)
-        outcome = closest(P, asked == CLOSEST ? NULL : task, p.x, slope, &found)
+    else if (mode == CLOSEST || mode == CLOSEST_FROM)
+        outcome = closest(P, mode == CLOSEST ? NULL : task, p.x, slope, &found)
             ? NEAREST : NEEDS_GENERAL_METHOD;
-    else if (asked != SEARCH && from_guess(P, task, &p, &end, &found))
+    else if (mode != SEARCH && from_guess(P, task, &p, &end, &found))
         outcome = LOCAL;
-    else if (asked != GUESS_ALONE && search(P, &p, &end, &found))
+    else if (mode != GUESS_ALONE && search(P, &p, &end, &found))
         outcome = end.violation < 0.5 * s->descent.floor_margin ? GLOBAL : TOO_SOFT;
     double *out = answer;
     *out++ = (double)outcome, *out++ = end.value, *out++ = end.violation, *out++ = end.converged;
@@ -82,7 +82,7 @@ static void solve_row(Program *P, const double *task, double *answer) {
         *out++ = outcome == JUDGED ? task[i] : clip(p.x[i] * s->unit[i], low[i], high[i]);
     memcpy(out, slope, sizeof slope), out += s->n;
     int judged = outcome == GLOBAL || outcome == NEAREST || outcome == JUDGED || outcome == TOO_SOFT ||
-                 (outcome == LOCAL && (asked != GUESS_ALONE || P->around));
+                 (outcome == LOCAL && (mode != GUESS_ALONE || P->around));
     if (judged && !judge_at(P, pressures, out)) answer[0] = NEEDS_GENERAL_METHOD;
 }
 

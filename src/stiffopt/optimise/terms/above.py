@@ -57,8 +57,8 @@ class AboveTerm(Term):
         height = display_units().length.text(abs(value))
         return f"{height} {'above' if value >= 0 else 'below'} the plane"
 
-    def asked(self) -> str:
-        """See `Term.asked`."""
+    def condition(self) -> str:
+        """See `Term.condition`."""
         unit = display_units().length
         point = numbers_shown(self.value.point, unit)
         return f"{point} {unit}, normal {numbers_shown(self.value.normal)}"

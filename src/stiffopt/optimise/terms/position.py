@@ -73,8 +73,8 @@ class PositionTerm(Term):
             limit=self.radius / length,
         )
 
-    def asked(self) -> str:
-        """See `Term.asked`."""
+    def condition(self) -> str:
+        """See `Term.condition`."""
         unit = display_units().length
         return f"{numbers_shown(self.value, unit)} {unit} within {self.words(self.radius)}"
 
