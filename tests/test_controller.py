@@ -251,7 +251,7 @@ def test_a_trajectory_that_begins_at_full_speed_begins_later_and_is_met_from_the
         bench.run(bench.period)
         wanted = np.array(course.at(bench.rig.clock.now()).position)
         worst = max(worst, float(np.linalg.norm(bench.tip[:3, 3] - wanted)))
-    assert worst < 2.5e-3  # one that began at once would be missed by 4 mm and more
+    assert worst < 2.5e-3  # 1.4 mm; 3.4 mm if it began at once
     now = bench.rig.clock.now()
     controller.follow(from_time(0.0), now - 0.1)  # while the last one is under way
     controller.follow(from_time(0.2), now - 0.1)
