@@ -152,7 +152,7 @@ def path_rows(follows: Sequence[Follow], dynamics: str) -> list[tuple[str, str]]
     return [
         ("RMS, mm, median / p90", _quantiles(1e3 * of("plain"), (0.5, 0.9), 2)),
         (
-            f"RMS after 70 ms, mm, median / p90 (bar {bar:g})",
+            f"RMS after the known delay, mm, median / p90 (bar {bar:g})",
             _quantiles(1e3 * of("known"), (0.5, 0.9), 2),
         ),
         ("RMS after the best latency, mm", _quantiles(1e3 * of("best"), (0.5, 0.9), 2)),

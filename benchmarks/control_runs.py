@@ -31,7 +31,7 @@ AWAY = 0.030  # m beyond the step
 FROM = 6.0  # s, from which on the tip's motion is looked at
 SLACK = 1.0  # Pa
 FAR = 3e-4  # m; further from the target, a channel at its limit must be said to be
-LATENCY = 0.07  # s; lag and dead time of the regulators
+LATENCY = 0.07  # s; lag and dead time of the regulators, for a controller that begins at once
 CONNECTED = 0.5  # s until the tracker's rate is known
 SETTLE_FIRST = 6.0  # s at the beginning of a path before it is followed
 
@@ -92,7 +92,8 @@ class Follow:
     ----------
     seed, dynamics, controller : which one.
     plain : error at the time.
-    known : against where it should have been `LATENCY` before.
+    known : against where it should have been by its known delay before: that of the beginning of a
+        trajectory, or `LATENCY`.
     best, latency : against where it should have been by that time before, which is the best time.
     """
 
@@ -149,6 +150,10 @@ class Run:
     def follow(self, trajectory: Trajectory) -> None:
         """Follow a trajectory."""
         self._controller.follow(trajectory, self.rig.clock.now())
+
+    def delay(self) -> float:
+        """By how much a trajectory is known to be late, in s."""
+        return float(getattr(self._controller, "trajectory_delay", LATENCY))
 
     def notices(self) -> tuple[Notice, ...]:
         """What the controller says is wrong."""
@@ -333,11 +338,13 @@ def run_path(
     with started(case, make, dynamics, in_loop) as run:
         run.set_task(case.task(path.positions[0], "axial"))
         run.go(SETTLE_FIRST)
+        known = run.delay()
         run.follow(Trajectory(waypoints=points))
-        trace = run.go(float(path.times[-1]))
+        end = float(path.times[-1])
+        trace = run.go(end + known)
 
     def rms(latency: float) -> float:
-        there = trace.times >= latency
+        there = (trace.times >= latency) & (trace.times <= end + latency)
         error = trace.tips[there] - path.at(trace.times[there] - latency)
         return float(np.sqrt((error**2).sum(axis=1).mean()))
 
@@ -345,5 +352,5 @@ def run_path(
     errors = [rms(latency) for latency in latencies]
     best = int(np.argmin(errors))
     return Follow(
-        case.seed, dynamics, name, errors[0], rms(LATENCY), errors[best], float(latencies[best])
+        case.seed, dynamics, name, errors[0], rms(known), errors[best], float(latencies[best])
     )

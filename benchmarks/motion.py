@@ -10,8 +10,8 @@ larger of 5 % of the step and 0.5 mm. *Doubts* are steps after which the motion 
 
 ``commissioned`` is the loop after ``stiffopt commission --quick`` of that arm, with the measured
 frequency and damping of its swing, and the moduli and gains that its steps imply. ``--speeds`` also
-follows figures-of-eight of 40 mm at these speeds in m/s: root mean square error at the time, for
-the regulators' latency of 70 ms, and for the best latency.
+follows figures-of-eight of 40 mm at these speeds in m/s: root mean square error at the time,
+for the known delay of a trajectory's beginning, and for the best latency.
 """
 
 from __future__ import annotations
@@ -205,7 +205,13 @@ def tables(found: list[Any]) -> str:
             ),
         ))  # fmt: skip
     if rows:
-        titles_of_paths = ("loop", "RMS, mm", "after 70 ms", "after the best", "best latency, ms")
+        titles_of_paths = (
+            "loop",
+            "RMS, mm",
+            "after the known delay",
+            "after the best",
+            "best latency, ms",
+        )
         lines += ["", *table(titles_of_paths, rows)]
     return "\n".join(lines)
 

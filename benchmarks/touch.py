@@ -123,7 +123,7 @@ class Arm:
 
     def felt_part(self, force: Array) -> Array:
         """The part (3,) of a force that acts where the tip is soft."""
-        tip = self.controller._tip
+        tip = self.controller._arm.modelled
         R = tip.pose[:3, :3]
         return soft_directions(R @ tip.compliance[:3, :3] @ R.T) @ force
 

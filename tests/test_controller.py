@@ -227,6 +227,41 @@ def test_trajectory_is_followed():
     assert np.linalg.norm(bench.tip[:3, 3] - way[-1]) < 5e-4
 
 
+def test_a_trajectory_that_begins_at_full_speed_begins_later_and_is_met_from_the_start():
+    bench = Bench(HANGING, "full")
+    x, y, z = bench.settled(duration=3.0)
+    speed = 0.03  # m/s
+    points = [Target(position=(x, y + speed * t, z)) for t in (0.0, 0.1, 0.2, 0.3, 0.4)]
+
+    def from_time(first: float) -> Trajectory:
+        return Trajectory(
+            waypoints=tuple(
+                Waypoint(time=first + 0.1 * k, target=point) for k, point in enumerate(points)
+            )
+        )
+
+    controller, now = bench.controller, bench.rig.clock.now()
+    delay = controller.trajectory_delay
+    assert 0.1 < delay < 0.5  # four lags of an arm at 1.7 Hz
+    controller.follow(from_time(0.0), now)
+    course = controller.replanner.pursuit.course
+    assert course.begin == pytest.approx(now + delay)
+    worst = 0.0
+    for _ in range(round((delay + 0.4) / bench.period)):
+        bench.run(bench.period)
+        wanted = np.array(course.at(bench.rig.clock.now()).position)
+        worst = max(worst, float(np.linalg.norm(bench.tip[:3, 3] - wanted)))
+    assert worst < 2.5e-3  # 1.4 mm; 3.4 mm if it began at once
+    now = bench.rig.clock.now()
+    controller.follow(from_time(0.0), now - 0.1)  # while the last one is under way
+    controller.follow(from_time(0.2), now - 0.1)
+    assert controller.replanner.pursuit.course.begin == now - 0.1
+    bench.run(1.5)
+    now = bench.rig.clock.now()
+    controller.follow(from_time(1.0), now)  # from rest, with time to reach the first waypoint
+    assert controller.replanner.pursuit.course.begin == now
+
+
 # -- what goes wrong ----------------------------------------------------------------------------
 
 

@@ -172,8 +172,13 @@ class TipController:
                 self._follow_posture(trajectory, trajectory.pressures, now)
             else:
                 estimate = self._arm.tip.estimate
-                course = Course(trajectory, now, estimate.position, estimate.rotation)
                 last = self.replanner.pursuit
+                course = last.course
+                on_the_way = isinstance(course, Course) and now < course.end
+                # from rest the tip cannot be sooner at the first waypoint than the reference
+                late = 0.0 if on_the_way else self.trajectory_delay - trajectory.waypoints[0].time
+                begin = now + max(0.0, late)
+                course = Course(trajectory, begin, estimate.position, estimate.rotation)
                 self._pursue(self._requests.of_target(course.at(now), last, course))
             self._arm.watch.forgive()
 
@@ -186,6 +191,12 @@ class TipController:
         """Do without some channels; see `Controller.set_channels`."""
         self._arm.channels.take_out(without)
 
+    @property
+    def trajectory_delay(self) -> float:
+        """Time by which the reference is late, and with it a trajectory's beginning, in s."""
+        self._set_reference_rate()
+        return self._reference.delay + self._lead
+
     def _follow_posture(self, trajectory: Trajectory, pressures: Array, now: float) -> None:
         """Follow a trajectory of pressures (k, n) as the posture.
 
@@ -196,8 +207,7 @@ class TipController:
             self.forecast.confirm(trajectory, start[:n])
         last, model = self.replanner.pursuit, self._arm.compiled.waypoints
         self._requests.check_posture(trajectory, pressures, start[:n], last.task)
-        self._set_reference_rate()
-        begin = now + self._reference.delay + self._lead
+        begin = now + self.trajectory_delay
         course = PostureCourse(trajectory, begin, start, lambda p: model.at(p).pose)
         self._pursue(self._requests.of_target(course.at(now), last, course))
         self._computed_at, self._led_to = now, None

@@ -153,8 +153,8 @@ class VibrationFilter:
         if omega != self._omega:
             self._omega, self._weights = omega, self._shape(omega)
         past = self._past[self._newest : self._newest + self._weights.shape[1]]
-        self.value, *motion = self._weights @ past
-        self.motion = np.stack(motion)
+        averaged = self._weights @ past
+        self.value, self.motion = averaged[0], averaged[1:]
 
     def _shape(self, omega: float) -> Array:
         """Return weights (3, k) of average, path and speed, for the newest value first."""

@@ -161,8 +161,8 @@ class Replanner:
         """
         task, target = self.pursuit.task, self.pursuit.target
         interval = self._tuning.interval
-        self._note_available(available)
         if task is not None and target is not None and now - self._requested_at >= interval - 1e-6:
+            self._note_available(available)
             search = self._search and self.pursuit.course is None
             self._requested_at, self._search = now, False
             course, later = self.pursuit.course, now + delay + self._lead

@@ -324,7 +324,7 @@ class Client:
         times: Sequence[float] | None = None,
         positions: ArrayLike | Sequence[Sequence[float | None]] | None = None,
     ) -> None:
-        """Go through waypoints; time begins now.
+        """Go through waypoints; time begins now, or when the arm can be at the first one.
 
         Parameters
         ----------

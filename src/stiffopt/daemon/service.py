@@ -269,7 +269,7 @@ def _moving(operations: Operations) -> APIRouter:
     async def follow_trajectory(
         request: Annotated[TrajectoryMessage, _UNREAD], lease: LeaseHeader = None
     ) -> DoneReport:
-        """Go through waypoints; time begins now."""
+        """Go through waypoints; time begins now, or when the arm can be at the first one."""
         return await operations.command(
             lease, lambda: loop.follow_trajectory(trajectory_of(request))
         )
