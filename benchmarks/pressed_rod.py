@@ -1,9 +1,13 @@
 """An independent model of an arm pressed on objects: a discrete rod with penalty contact.
 
 It does not import stiffopt. The rod has elements of constant strain. Many stiff springs between its
-body and the surfaces model contact: tenths of newtons enter a surface by hundredths of a
-millimetre. JAX differentiates the energy; Newton's method minimises it while pressures and load
-grow from rest in small steps.
+body and the surfaces model contact. JAX differentiates the energy; Newton's method minimises it
+while pressures and load grow from rest in small steps.
+
+Then elements are made short near the contacts, and springs stiff. Both matter for the tip's
+stiffness: an element of constant strain that is longer than the length on which a force is spread
+resists the contact's motion along it, and springs that yield by micrometres add to the compliance
+of a tip that is held by contacts.
 """
 
 from __future__ import annotations
@@ -22,8 +26,13 @@ from independent import Arm, rod_section
 jax.config.update("jax_enable_x64", True)
 
 Array = Any
-SPRINGS = {"coarse": (8, 6.4e6), "fine": (24, 2e7)}
-"""Springs along an element, and their stiffness in N/m per m along the arm."""
+_FEW, _MANY = 8, 24
+"""Springs along an element: on the way from rest, and then."""
+_SPRING, _STIFFER = 6.4e6, (2e7, 2.5e8, 3e9)
+"""Their stiffness in N/m per m along the arm: on the way from rest, and then one after another."""
+_ELEMENTS = 80  # in the end
+_SHORTEST, _LONGEST = 1.5e-4, 4e-3  # m, about the lengths of elements in contact and far from it
+_GROWTH = 0.35  # of their lengths, per distance
 _OF_TIP = 0.003  # m along the arm, that the spring of the hemisphere at the tip stands for
 _ENERGY_LEFT = 1e-17  # J
 _FAR = (1, [0.0, 0.0, -10.0, 0.0, 0.0, 1.0, 0.0])
@@ -40,6 +49,7 @@ class Rod(NamedTuple):
     connector: Array
     radius: Array
     force: Array
+    spring: Array
 
 
 @dataclass(frozen=True)
@@ -71,6 +81,7 @@ def make_rod(arm: Arm, p: Array, n: int, force: Array) -> Rod:
         connector=connector,
         radius=np.repeat([tube.outer_radius for tube in arm.tubes], n),
         force=np.asarray(force, float) + arm.tip_mass * gravity,
+        spring=np.float64(_SPRING),
     )
 
 
@@ -129,18 +140,17 @@ def _chain(rod: Rod, y: Array, samples: int) -> tuple[Array, Array, Array, Array
     return places, tip, R, energy + 0.5 * (y**2).sum() - tip @ rod.force
 
 
-def _springs(rod: Rod, y: Array, objects: Array, fineness: str) -> tuple[Array, ...]:
-    samples, stiffness = SPRINGS[fineness]
+def _springs(rod: Rod, y: Array, objects: Array, samples: int) -> tuple[Array, ...]:
     places, tip, R, energy = _chain(rod, y, samples)
     points = jnp.concatenate([places.reshape(-1, 3), tip[None]])
     radii = jnp.concatenate([jnp.repeat(rod.radius, samples), rod.radius[-1:]])
     depths = jax.vmap(lambda kind, numbers: radii - _distance(kind, numbers, points))(*objects)
-    own = jnp.concatenate([jnp.repeat(rod.h / samples, samples), jnp.array([_OF_TIP])]) * stiffness
+    own = jnp.concatenate([jnp.repeat(rod.h / samples, samples), jnp.array([_OF_TIP])]) * rod.spring
     return own * jnp.maximum(depths, 0), jnp.maximum(depths, 0), tip, R, energy
 
 
-def _energy(y: Array, rod: Rod, objects: Array, fineness: str) -> Array:
-    forces, depths, _, _, energy = _springs(rod, y.reshape(-1, 6), objects, fineness)
+def _energy(y: Array, rod: Rod, objects: Array, samples: int) -> Array:
+    forces, depths, _, _, energy = _springs(rod, y.reshape(-1, 6), objects, samples)
     return energy + 0.5 * (forces * depths).sum()
 
 
@@ -155,7 +165,13 @@ def _near(R: Array, r: Array) -> Array:
 
 
 def _part(
-    twist: Array, y: Array, item: Array, beyond: tuple[Array, Array], objects: Array, fineness: str
+    twist: Array,
+    y: Array,
+    item: Array,
+    beyond: tuple[Array, Array],
+    objects: Array,
+    stiffness: Array,
+    samples: int,
 ) -> tuple[Array, Array]:
     """Energy of an element and, to second order, of all beyond; and the twist of its end.
 
@@ -163,7 +179,6 @@ def _part(
     wrench (6,) on the end at its present pose, with a stiffness (6, 6).
     """
     R, r, R_end, r_end, free, root, h, weight, centroid, connector, radius = item
-    samples, stiffness = SPRINGS[fineness]
     turn, way = _exponential(twist[:3], twist[3:])
     R, r = turn @ R, turn @ r + way
     xi = free + root @ y
@@ -191,7 +206,7 @@ def _tip_part(
 
 
 @partial(jax.jit, static_argnums=3)
-def _derivatives(y: Array, rod: Rod, objects: Array, fineness: str) -> tuple[Array, ...]:
+def _derivatives(y: Array, rod: Rod, objects: Array, samples: int) -> tuple[Array, ...]:
     """Energy, gradient and Hessian; moving an element's end moves all beyond rigidly."""
     y = y.reshape(-1, 6)
     strains = rod.free + jnp.einsum("kij,kj->ki", rod.root, y)
@@ -209,12 +224,10 @@ def _derivatives(y: Array, rod: Rod, objects: Array, fineness: str) -> tuple[Arr
     zero, none = jnp.zeros(6), (jnp.zeros(6), jnp.zeros((6, 6)))
 
     def own(twist: Array, y: Array, item: Array) -> Array:
-        return _part(twist, y, item, none, objects, fineness)[0]
+        return _part(twist, y, item, none, objects, rod.spring, samples)[0]
 
     def last(twist: Array) -> Array:
-        return _tip_part(
-            twist, tip, rod.force, rod.radius[-1], objects, _OF_TIP * SPRINGS[fineness][1]
-        )
+        return _tip_part(twist, tip, rod.force, rod.radius[-1], objects, _OF_TIP * rod.spring)
 
     wrenches = jax.vmap(lambda y, item: jax.grad(own)(zero, y, item))(y, items)
     stiffnesses = jax.vmap(lambda y, item: jax.hessian(own)(zero, y, item))(y, items)
@@ -225,11 +238,11 @@ def _derivatives(y: Array, rod: Rod, objects: Array, fineness: str) -> tuple[Arr
 
     def second(y: Array, item: Array, after: tuple[Array, Array]) -> tuple[Array, ...]:
         def both(y: Array) -> tuple[Array, Array]:
-            return jax.grad(lambda *x: _part(*x, item, after, objects, fineness)[0], (0, 1))(
-                zero, y
-            )
+            return jax.grad(
+                lambda *x: _part(*x, item, after, objects, rod.spring, samples)[0], (0, 1)
+            )(zero, y)
 
-        S = jax.jacfwd(lambda y: _part(zero, y, item, after, objects, fineness)[1])(y)
+        S = jax.jacfwd(lambda y: _part(zero, y, item, after, objects, rod.spring, samples)[1])(y)
         return (*jax.jacfwd(both)(y), both(y)[1], S)
 
     coupled, D, g, S = jax.vmap(second)(y, items, beyond)
@@ -238,13 +251,13 @@ def _derivatives(y: Array, rod: Rod, objects: Array, fineness: str) -> tuple[Arr
     H = H * (jnp.arange(count)[:, None] < jnp.arange(count))[:, None, :, None]
     H = H.reshape(6 * count, -1)
     own_blocks = jnp.einsum("ij,iab->iajb", jnp.eye(count), D).reshape(6 * count, -1)
-    return _energy(y.ravel(), rod, objects, fineness), g.ravel(), H + H.T + own_blocks
+    return _energy(y.ravel(), rod, objects, samples), g.ravel(), H + H.T + own_blocks
 
 
-def _minimum(y: Array, rod: Rod, objects: Array, fineness: str) -> Array:
+def _minimum(y: Array, rod: Rod, objects: Array, samples: int) -> Array:
     """Newton's method with a line search, shifted where the energy is not convex."""
     for _ in range(300):
-        f, g, H = (np.asarray(each) for each in _derivatives(y, rod, objects, fineness))
+        f, g, H = (np.asarray(each) for each in _derivatives(y, rod, objects, samples))
         shift = 0.0
         while True:
             try:
@@ -257,7 +270,7 @@ def _minimum(y: Array, rod: Rod, objects: Array, fineness: str) -> Array:
         if -slope < _ENERGY_LEFT and shift == 0:
             return y
         size = min(1.0, 0.02 / float(np.linalg.norm(step)))
-        while _value(y + size * step, rod, objects, fineness) > f + 1e-4 * size * slope + 1e-18:
+        while _value(y + size * step, rod, objects, samples) > f + 1e-4 * size * slope + 1e-18:
             size /= 2
             if size < 1e-6:
                 return y
@@ -265,15 +278,18 @@ def _minimum(y: Array, rod: Rod, objects: Array, fineness: str) -> Array:
     raise ArithmeticError("no minimum was found")
 
 
-def _read(y: Array, rod: Rod, objects: Array, fineness: str, count: int) -> Pressed:
-    seen = _seen(rod, y.reshape(-1, 6), objects, fineness)
-    loads, _, tip, R, _ = (np.asarray(each) for each in seen)
-    samples = SPRINGS[fineness][0]
+def _stations(rod: Rod, samples: int) -> Array:
+    """Arc lengths of the springs along the elements and of that at the tip."""
     ends = np.cumsum(rod.h + rod.connector)
     shares = (np.arange(samples) + 0.5) / samples
     at = ((ends - rod.h - rod.connector)[:, None] + rod.h[:, None] * shares).ravel()
-    at = np.append(at, ends[-1])
-    forces = loads.sum(axis=1)
+    return np.append(at, ends[-1])
+
+
+def _read(y: Array, rod: Rod, objects: Array, count: int) -> Pressed:
+    seen = _seen(rod, y.reshape(-1, 6), objects, _MANY)
+    loads, _, tip, R, _ = (np.asarray(each) for each in seen)
+    at, forces = _stations(rod, _MANY), loads.sum(axis=1)
     mean = np.divide(loads @ at, forces, out=np.full(len(forces), np.nan), where=forces > 0)
     return Pressed(tip, R, forces[:count], mean[:count], y, rod)
 
@@ -298,8 +314,39 @@ def pressed(
     known, y = _numbers(objects), np.zeros(6 * n * len(arm.tubes))
     for share in np.arange(steps + 1) / steps:
         rod = make_rod(arm, share * np.asarray(p), n, share * np.asarray(force, float))
-        y = _minimum(y, rod, known, "coarse")
-    return _read(_minimum(y, rod, known, "fine"), rod, known, "fine", len(objects))
+        y = _minimum(y, rod, known, _FEW)
+    for spring in _STIFFER:
+        rod, y = _refined(rod, y, known, len(arm.tubes))
+        rod = rod._replace(spring=np.float64(spring))
+        y = _minimum(y, rod, known, _MANY)
+    return _read(y, rod, known, len(objects))
+
+
+def _refined(rod: Rod, y: Array, objects: Array, segments: int) -> tuple[Rod, Array]:
+    """The same at the same strains, with more elements, which are short where springs push."""
+    n, many = len(rod.h) // segments, _ELEMENTS // segments
+    strains = rod.free + np.einsum("kij,kj->ki", rod.root, y.reshape(-1, 6))
+    loads = np.asarray(_seen(rod, y.reshape(-1, 6), objects, _MANY)[0]).sum(axis=0)
+    where = _stations(rod, _MANY)[loads > 0]
+    ends = np.cumsum(rod.h + rod.connector) - rod.connector
+    h, old = [], []
+    for first in range(0, n * segments, n):
+        own = slice(first, first + n)
+        fine = np.linspace(ends[first] - rod.h[first], ends[first + n - 1], 4001)
+        away = np.abs(fine[:, None] - where).min(axis=1, initial=np.inf)
+        size = np.minimum(_SHORTEST + _GROWTH * away, _LONGEST)
+        count = np.append(0, np.cumsum((1 / size[1:] + 1 / size[:-1]) / 2))
+        marks = np.interp(np.linspace(0, count[-1], many + 1), count, fine)
+        h.append(np.diff(marks))
+        middles = (marks[1:] + marks[:-1]) / 2
+        old.append(first + np.minimum(np.searchsorted(ends[own], middles), n - 1))
+    lengths, of = np.concatenate(h), np.concatenate(old)
+    connector = np.zeros(len(lengths))
+    connector[many - 1 :: many] = rod.connector[n - 1 :: n]
+    root = rod.root[of] * np.sqrt(rod.h[of] / lengths)[:, None, None]
+    same = {name: getattr(rod, name)[of] for name in ("free", "weight", "centroid", "radius")}
+    there = rod._replace(h=lengths, root=root, connector=connector, **same)
+    return there, np.linalg.solve(root, (strains[of] - there.free)[..., None]).ravel()
 
 
 def pushed(
@@ -309,5 +356,5 @@ def pushed(
     known, y = _numbers(objects), state.strains
     for share in np.arange(1, steps + 1) / steps:
         rod = state.rod._replace(force=state.rod.force + share * np.asarray(force, float))
-        y = _minimum(y, rod, known, "fine")
-    return _read(y, rod, known, "fine", len(objects))
+        y = _minimum(y, rod, known, _MANY)
+    return _read(y, rod, known, len(objects))
