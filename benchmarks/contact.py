@@ -11,9 +11,10 @@ again with four times as many steps from rest.
 
 Metrics, each the largest over a case's objects or directions: the error of the tip, over the arm's
 length; the error of the contact forces, over the largest force; the error of the tip's stiffness
-along a random direction, where the rod's stiffness is that between two pushes of 1 mN; contacts
-above 1 mN that only one of the two has. If a push below 0.3 N loses a contact of more than 2 mN:
-whether the independent rod still has the contact at 0.9 of that push and has lost it at 1.1.
+along a random direction, where the rod's stiffness is extrapolated to no push from pairs of pushes
+of 1 and of 0.5 mN; contacts above 1 mN that only one of the two has. If a push below 0.3 N loses a
+contact of more than 2 mN: whether the independent rod still has the contact at 0.9 of that push and
+has lost it at 1.1.
 """
 
 from __future__ import annotations
@@ -201,7 +202,10 @@ def found_by_rod(case: dict[str, Any], lost_at: float | None, steps: int) -> dic
     n, objects, d = _ELEMENTS[case["arm"]], case["objects"], np.array(case["direction"])
     try:
         state = pressed(arm_of(case), case["pressures"], objects, case["force"], n, steps)
-        ends = [pushed(state, objects, sign * _PUSH * d) for sign in (1, -1)]
+        secants = []
+        for push in (_PUSH, _PUSH / 2):
+            ends = [pushed(state, objects, sign * push * d).tip for sign in (1, -1)]
+            secants.append(float(2 * push / ((ends[0] - ends[1]) @ d)))
         around = []
         if lost_at is not None and lost_at < 0.3:
             first = pushed(state, objects, 0.9 * lost_at * d, steps=4)
@@ -211,7 +215,7 @@ def found_by_rod(case: dict[str, Any], lost_at: float | None, steps: int) -> dic
         return {"error": str(error)}
     return {
         "tip": state.tip.tolist(), "forces": state.forces.tolist(), "at": state.at.tolist(),
-        "stiffness": float(2 * _PUSH / ((ends[0].tip - ends[1].tip) @ d)), "around": around,
+        "stiffness": (4 * secants[1] - secants[0]) / 3, "around": around,
     }  # fmt: skip
 
 
