@@ -20,6 +20,7 @@ from stiffopt.cli.main import main
 from stiffopt.cli.solve_report import block
 from stiffopt.cli.solved_task import SolvedTask
 from stiffopt.errors import DerivativeError, InputError
+from stiffopt.model.calibration import Calibration
 from stiffopt.optimise import braced
 from stiffopt.optimise.leaning import MARGIN_ON, BracedProblem
 from stiffopt.optimise.local import LocalResult
@@ -157,6 +158,30 @@ def test_a_margin_that_no_contact_holds_leaves_the_free_answer(robot, task):
     assert not found.contacts
     assert found.stiffness == found.stiffness_free
     assert "leans on 'post'" in found.message
+
+
+def test_a_calibrated_arm_holds_back_forces_that_are_in_doubt(robot, task):
+    known = Calibration(position_residual=2e-3)
+    arm = stiffopt.Manipulator(robot.description.model_copy(update={"calibration": known}))
+    found = stiffopt.solve_pressure(arm, task)
+    assert found.contacts
+    problem, eq = BracedProblem(arm, task), found.equilibrium
+    doubt = problem.doubt(eq)
+    assert f"smaller by {doubt.max():.2g} N, by errors of the calibration" in found.message
+    for push in problem.pushes(eq):
+        assert (eq.shifted(push=task.brace.margin * push).normal_forces >= doubt).all()
+    # pressures that move the free tip by two standard deviations change no force by more
+    J = arm.tip_pose(eq.pressures)[:3, :3] @ arm.tip_jacobian(eq.pressures)[:3]
+    ways = np.random.default_rng(0).normal(size=(50, 3))
+    ways *= 2 * known.position_residual / np.linalg.norm(ways, axis=1, keepdims=True)
+    changes = np.abs([eq.force_gradients @ np.linalg.pinv(J) @ way for way in ways]).max(axis=0)
+    assert changes == pytest.approx(doubt, rel=0.1)
+    assert (changes <= doubt).all()
+
+
+def test_without_a_calibration_no_force_is_in_doubt(robot, task, solution):
+    assert not BracedProblem(robot, task).doubt(solution.equilibrium).any()
+    assert "calibration" not in solution.message
 
 
 def test_objects_that_are_not_named_keep_their_clearance(robot, solution, tmp_path):

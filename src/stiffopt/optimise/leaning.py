@@ -206,13 +206,14 @@ class BracedProblem(PressureProblem):
         checkpoint()
         eq = self.equilibrium(x)
         pushes = [] if self.only_target else list(self.pushes(eq))
+        doubt = self.doubt(eq) if pushes else np.zeros(len(eq.contacts))
         near = self._nearest(eq, quickly=True)
-        base = self._seen(eq, pushes, near, full)
+        base = self._seen(eq, pushes, doubt, near, full)
         differences = []
         for k, inwards in enumerate(x > (self.lower + self.upper) / 2):
             step = (-1.0 if inwards else 1.0) * BRACE.step
             change = step * self.unit[k] * np.eye(len(x))[k]
-            seen = self._seen(eq.shifted(change), pushes, near, full)
+            seen = self._seen(eq.shifted(change), pushes, doubt, near, full)
             differences.append([(b - a) / step for a, b in zip(base, seen, strict=True)])
         slopes = Quantities(
             *(np.stack(columns, axis=-1) for columns in zip(*differences, strict=True))
@@ -234,17 +235,32 @@ class BracedProblem(PressureProblem):
             d = np.array(measure.direction)
             yield sign * (R @ d if measure.frame == "tip" else d)
 
+    def doubt(self, eq: ContactEquilibrium) -> Vector:
+        """Return by how much the normal forces (contacts,) may be smaller, in N.
+
+        That is `BRACE.sure` standard deviations, by the errors that a calibration foretells for the
+        free tip, to first order: as if wrong pressures caused them.  Zero without a calibration.
+        """
+        if self.robot.description.calibration is None:
+            return np.zeros(len(eq.contacts))
+        R = self.robot.tip_pose(eq.pressures)[:3, :3]
+        per_tip = eq.force_gradients @ np.linalg.pinv(R @ self.robot.tip_jacobian(eq.pressures)[:3])
+        covariance = self.robot.tip_uncertainty(eq.pressures).covariance
+        variances = np.einsum("ci,ij,cj->c", per_tip, covariance, per_tip)
+        return BRACE.sure * np.sqrt(np.maximum(variances, 0.0))
+
     def _seen(
         self,
         eq: ContactEquilibrium,
         pushes: list[Vector],
+        doubt: Vector,
         near: list[Nearest],
         full: bool,
     ) -> Quantities:
         C = eq.compliance(self.brace.contacts) if full else np.eye(6)
         residuals, values = self.judged_by(eq, C)
         margin = (1 + BRACE.spare) * self.brace.margin
-        pushed = np.array([eq.shifted(push=margin * push).normal_forces for push in pushes])
+        pushed = np.array([eq.shifted(push=margin * push).normal_forces - doubt for push in pushes])
         slips = np.zeros(0)
         if self.brace.contacts == "sticking" and pushes:
             slips = np.array([self._slip(eq, push) for push in pushes])
@@ -346,6 +362,26 @@ class BracedProblem(PressureProblem):
                 f"a push of {unit.text(least)} takes a contact away; the margin is "
                 f"{unit.text(self.brace.margin)}"
             )
+            return
+        left, doubt = self._left_in_doubt(eq)
+        if left < -1e-6:
+            yield (
+                f"a push of the margin leaves a contact force of {unit.text(left + doubt)}, less "
+                f"than the {unit.text(doubt)} that the calibration leaves in doubt"
+            )
+
+    def _left_in_doubt(self, eq: ContactEquilibrium) -> tuple[float, float]:
+        """Return the least force that a push of the margin leaves in doubt, and that doubt, in N."""
+        doubt = self.doubt(eq)
+        if not doubt.any():
+            return np.inf, 0.0
+        try:
+            pushed = [eq.shifted(push=self.brace.margin * d) for d in self.pushes(eq)]
+        except EquilibriumError:  # other contacts take over before
+            return np.inf, 0.0
+        least = np.min([each.normal_forces - doubt for each in pushed], axis=0)
+        worst = int(least.argmin())
+        return float(least[worst]), float(doubt[worst])
 
     def preloads(self, eq: ContactEquilibrium) -> Iterator[Preload]:
         """Yield the push by which the first contact is lost, both ways along each direction.
