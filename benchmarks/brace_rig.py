@@ -13,11 +13,11 @@ creep, hysteresis and its own contact with friction.
 
 The stiffness is that of a push and a pull at the tip, each settled without remaining creep,
 hysteresis or friction (`Plant.settle`). Their force is half of what the solution says that the
-contacts hold, at most 0.1 N. Unless `--settled`, the same pushes are also applied for two seconds each with all effects
-of silicone and friction: then contacts stick, small pushes do not overcome the hysteresis, and the
-arm is stiffer. The reference is the free solution for the same target, on the same arm. Metrics:
-measured over predicted stiffness, and the same for the multiple of the free stiffness; predictions
-are those for sliding contacts.
+contacts hold, at most 0.1 N. Unless `--settled`, the same pushes are also applied for two seconds
+each with all effects of silicone and friction: then contacts stick, small pushes do not overcome
+the hysteresis, and the arm is stiffer. The reference is the free solution for the same target, on
+the same arm. Metrics: measured over predicted stiffness, and the same for the multiple of the free
+stiffness; predictions are those for sliding contacts.
 """
 
 from __future__ import annotations

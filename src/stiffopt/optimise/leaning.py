@@ -247,7 +247,7 @@ class BracedProblem(PressureProblem):
         per_tip = eq.force_gradients @ np.linalg.pinv(R @ self.robot.tip_jacobian(eq.pressures)[:3])
         covariance = self.robot.tip_uncertainty(eq.pressures).covariance
         variances = np.einsum("ci,ij,cj->c", per_tip, covariance, per_tip)
-        return BRACE.sure * np.sqrt(np.maximum(variances, 0.0))
+        return np.asarray(BRACE.sure * np.sqrt(np.maximum(variances, 0.0)))
 
     def _seen(
         self,
@@ -371,7 +371,7 @@ class BracedProblem(PressureProblem):
             )
 
     def _left_in_doubt(self, eq: ContactEquilibrium) -> tuple[float, float]:
-        """Return the least force that a push of the margin leaves in doubt, and that doubt, in N."""
+        """Return the force that a push of the margin leaves beyond the doubt, and that, in N."""
         doubt = self.doubt(eq)
         if not doubt.any():
             return np.inf, 0.0
