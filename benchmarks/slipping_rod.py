@@ -21,6 +21,7 @@ from pressed_rod import MANY, Anchors, Pressed, distance, exponential, minimum, 
 Array = Any
 _HOLD = 1e6  # N/m
 _FIRST_STEP, _STEPS = 2e-3, 12  # N; and steps up to the push that the first step foretells
+_NEW_CONTACT = 0.01  # longest step in which a contact begins, over the push
 _LEAST_FORCE = 1e-6  # N
 
 
@@ -45,13 +46,18 @@ def slip(
     """
     known, begun, start, push = numbers(objects), state.rod.force, state.tip, 0.0
     carried, step, left = np.zeros((3, 3)), _FIRST_STEP, friction * state.forces
+    longest = _FIRST_STEP
     while push < limit:
         step = min(step, limit - push)
         rod = _anchored(state, known, carried)
         rod = rod._replace(force=begun + (push + step) * np.asarray(direction))
         y = minimum(state.strains, rod, known, MANY)
-        state = read(y, rod, known, len(objects))
-        forces = _held_forces(rod, y)
+        after = read(y, rod, known, len(objects))
+        begins = ((after.forces > _LEAST_FORCE) & (state.forces <= _LEAST_FORCE)).any()
+        if begins and step > _NEW_CONTACT * (push + step):
+            step /= 4
+            continue
+        state, forces = after, _held_forces(rod, y)
         count = len(objects)
         size = np.linalg.norm(forces[:count], axis=1)
         now = friction * state.forces - size
@@ -62,11 +68,9 @@ def slip(
             return Slip(push + share * step, lost, moved)
         if push == 0:  # long steps only where nothing slips soon
             rates = np.where(left > now, (left - now) / step, 1e-12)
-            step = float(np.clip((now / rates)[left > 0].min() / _STEPS, _FIRST_STEP / 4, 0.03))
-            push += _FIRST_STEP
-        else:
-            push += step
-        carried, left = forces, np.where(left > 0, now, 0.0)
+            longest = float(np.clip((now / rates)[left > 0].min() / _STEPS, _FIRST_STEP / 4, 0.03))
+        push, step = push + step, longest
+        carried, left = forces, now  # contacts that are new stick from here on
     return Slip(np.inf, None, float(np.linalg.norm(state.tip - start)))
 
 
