@@ -36,7 +36,7 @@ from brace import MARGIN, TOLERANCE, _object
 from calibration import with_true_values
 from control_cases import calibrated_file, draw_case
 from report import table
-from stiffopt.optimise.leaning import BracedProblem
+from stiffopt.optimise.brace_uncertainty import forces_in_doubt, stiffness_interval
 from stiffopt.paths.configurations import Unsolved
 from stiffopt.paths.leaning import approach_to
 from stiffopt.plant.plant import Plant
@@ -142,7 +142,10 @@ def measured(
         "sticking": sticking(robot, found, direction),
         "quick": quick, "quick_free": quick_free, "measured": own, "measured_free": bare,
         "force": float(np.linalg.norm(found.contacts[0].force)),
-        "doubt": float(BracedProblem(robot, task).doubt(found.equilibrium).max()),
+        "doubt": float(forces_in_doubt(robot, found.equilibrium).max()),
+        "interval": stiffness_interval(
+            robot, found.equilibrium, task.stiffness.maximise[0], task.brace.contacts
+        ),
         "force_measured": sum(float(np.linalg.norm(each.force)) for each in on),
         "at": found.contacts[0].at, "at_measured": on[0].at if on else None,
         "limited_by": list(found.limited_by),

@@ -22,6 +22,7 @@ from stiffopt.cli.solved_task import SolvedTask
 from stiffopt.errors import DerivativeError, InputError
 from stiffopt.model.calibration import Calibration
 from stiffopt.optimise import braced
+from stiffopt.optimise.brace_uncertainty import forces_in_doubt, stiffness_interval
 from stiffopt.optimise.leaning import MARGIN_ON, BracedProblem
 from stiffopt.optimise.local import LocalResult
 from stiffopt.optimise.search import Search
@@ -166,7 +167,7 @@ def test_a_calibrated_arm_holds_back_forces_that_are_in_doubt(robot, task):
     found = stiffopt.solve_pressure(arm, task)
     assert found.contacts
     problem, eq = BracedProblem(arm, task), found.equilibrium
-    doubt = problem.doubt(eq)
+    doubt = forces_in_doubt(arm, eq)
     assert f"smaller by {doubt.max():.2g} N, by errors of the calibration" in found.message
     for push in problem.pushes(eq):
         assert (eq.shifted(push=task.brace.margin * push).normal_forces >= doubt).all()
@@ -177,10 +178,17 @@ def test_a_calibrated_arm_holds_back_forces_that_are_in_doubt(robot, task):
     changes = np.abs([eq.force_gradients @ np.linalg.pinv(J) @ way for way in ways]).max(axis=0)
     assert changes == pytest.approx(doubt, rel=0.1)
     assert (changes <= doubt).all()
+    # and the stiffness with them
+    low, high = stiffness_interval(arm, eq, task.stiffness.maximise[0], "sliding")
+    assert low * high == pytest.approx(found.stiffness**2)
+    seen = [eq.shifted(np.linalg.pinv(J) @ way).stiffness([1, 0, 0]) for way in 0.1 * ways]
+    assert np.log(np.array(seen) / found.stiffness).max() == pytest.approx(
+        0.1 * np.log(high / found.stiffness), rel=0.15
+    )
 
 
-def test_without_a_calibration_no_force_is_in_doubt(robot, task, solution):
-    assert not BracedProblem(robot, task).doubt(solution.equilibrium).any()
+def test_without_a_calibration_no_force_is_in_doubt(robot, solution):
+    assert not forces_in_doubt(robot, solution.equilibrium).any()
     assert "calibration" not in solution.message
 
 

@@ -25,6 +25,7 @@ from stiffopt.model.arm_clearance import measured_scene
 from stiffopt.model.contact.equilibrium import ContactEquilibrium
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.optimise.brace import quoted
+from stiffopt.optimise.brace_uncertainty import forces_in_doubt
 from stiffopt.optimise.leaning import FORCE_ON, MARGIN_ON, BracedProblem
 from stiffopt.optimise.local import LocalResult, descend
 from stiffopt.optimise.prices import prices_at
@@ -359,7 +360,7 @@ def _size(problem: BracedProblem, name: str, radius: float) -> float:
 
 def _doubt(problem: BracedProblem, eq: ContactEquilibrium) -> str:
     """Return how far a calibrated arm's contact forces are in doubt, or ""."""
-    doubt = float(problem.doubt(eq).max())
+    doubt = float(forces_in_doubt(problem.robot, eq).max())
     if doubt == 0.0:
         return ""
     by = display_units().force.text(doubt, ".2g")

@@ -30,6 +30,7 @@ from stiffopt.model.scene import Scene, SceneObject
 from stiffopt.model.shape import PointOfArm
 from stiffopt.model.stopping import checkpoint
 from stiffopt.optimise.brace import Brace, kept_clear_of, leant_on
+from stiffopt.optimise.brace_uncertainty import forces_in_doubt
 from stiffopt.optimise.measures.directional import StiffnessMeasure
 from stiffopt.optimise.problem import Objective, PressureProblem, ProgramPoint
 from stiffopt.optimise.program import Constraint, Program
@@ -206,7 +207,7 @@ class BracedProblem(PressureProblem):
         checkpoint()
         eq = self.equilibrium(x)
         pushes = [] if self.only_target else list(self.pushes(eq))
-        doubt = self.doubt(eq) if pushes else np.zeros(len(eq.contacts))
+        doubt = forces_in_doubt(self.robot, eq) if pushes else np.zeros(len(eq.contacts))
         near = self._nearest(eq, quickly=True)
         base = self._seen(eq, pushes, doubt, near, full)
         differences = []
@@ -234,20 +235,6 @@ class BracedProblem(PressureProblem):
         for measure, sign in product(self.directions, (1.0, -1.0)):
             d = np.array(measure.direction)
             yield sign * (R @ d if measure.frame == "tip" else d)
-
-    def doubt(self, eq: ContactEquilibrium) -> Vector:
-        """Return by how much the normal forces (contacts,) may be smaller, in N.
-
-        That is `BRACE.sure` standard deviations, by the errors that a calibration foretells for the
-        free tip, to first order: as if wrong pressures caused them.  Zero without a calibration.
-        """
-        if self.robot.description.calibration is None:
-            return np.zeros(len(eq.contacts))
-        R = self.robot.tip_pose(eq.pressures)[:3, :3]
-        per_tip = eq.force_gradients @ np.linalg.pinv(R @ self.robot.tip_jacobian(eq.pressures)[:3])
-        covariance = self.robot.tip_uncertainty(eq.pressures).covariance
-        variances = np.einsum("ci,ij,cj->c", per_tip, covariance, per_tip)
-        return np.asarray(BRACE.sure * np.sqrt(np.maximum(variances, 0.0)))
 
     def _seen(
         self,
@@ -372,7 +359,7 @@ class BracedProblem(PressureProblem):
 
     def _left_in_doubt(self, eq: ContactEquilibrium) -> tuple[float, float]:
         """Return the force that a push of the margin leaves beyond the doubt, and that, in N."""
-        doubt = self.doubt(eq)
+        doubt = forces_in_doubt(self.robot, eq)
         if not doubt.any():
             return np.inf, 0.0
         try:
