@@ -18,7 +18,7 @@ import stiffopt
 from conftest import use_compiler
 from stiffopt.cli.main import main
 from stiffopt.cli.solve_report import block
-from stiffopt.cli.solved_task import SolvedTask
+from stiffopt.cli.solved_task import SolvedTask, with_uncertainty
 from stiffopt.errors import DerivativeError, InputError
 from stiffopt.model.calibration import Calibration
 from stiffopt.optimise import braced
@@ -185,6 +185,10 @@ def test_a_calibrated_arm_holds_back_forces_that_are_in_doubt(robot, task):
     assert np.log(np.array(seen) / found.stiffness).max() == pytest.approx(
         0.1 * np.log(high / found.stiffness), rel=0.15
     )
+    text = StringIO()
+    told = with_uncertainty(SolvedTask("lean.yaml", arm, found))
+    Console(file=text, width=200).print(block(told))
+    assert f"(95 %: {low:.3f} to {high:.3f}" in text.getvalue()
 
 
 def test_without_a_calibration_no_force_is_in_doubt(robot, solution):

@@ -58,7 +58,7 @@ def solve_file(file: str, *, seed: int, pareto: int | None) -> SolvedTask:
         except EquilibriumError as error:
             solution = PressureSolution("failed", str(error), task)
         answer = SolvedTask(file, solver.robot, solution, _plain(solver, solution))
-        answer = _with_uncertainty(answer)
+        answer = with_uncertainty(answer)
     except FileError:
         raise
     except InputError as error:
@@ -72,7 +72,8 @@ def solve_file(file: str, *, seed: int, pareto: int | None) -> SolvedTask:
     return replace(answer, front=front)
 
 
-def _with_uncertainty(answer: SolvedTask) -> SolvedTask:
+def with_uncertainty(answer: SolvedTask) -> SolvedTask:
+    """Return an answer with what is known of its errors, if its robot was calibrated."""
     pressures = answer.solution.pressures
     if answer.robot.description.calibration is None or pressures is None:
         return answer
