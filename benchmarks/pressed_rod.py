@@ -33,8 +33,8 @@ _SPRING, _STIFFER = 6.4e6, (2e7, 2.5e8, 3e9)
 _ELEMENTS = 80  # in the end
 _SHORTEST, _LONGEST = 1.5e-4, 4e-3  # m, about the lengths of elements in contact and far from it
 _GROWTH = 0.35  # of their lengths, per distance
-_OF_TIP = 0.003  # m along the arm, that the spring of the hemisphere at the tip stands for
-_ENERGY_LEFT = 1e-17  # J
+_OF_TIP = 3e-4  # m along the arm, that the spring of the hemisphere at the tip stands for
+_ENERGY_LEFT, _STUCK = 1e-17, 1e-11  # J, of a step: at a minimum; too much where none succeeds
 _FAR = (1, [0.0, 0.0, -10.0, 0.0, 0.0, 1.0, 0.0])
 
 
@@ -306,6 +306,8 @@ def minimum(y: Array, rod: Rod, objects: Array, samples: int) -> Array:
         while _value(y + size * step, rod, objects, samples) > f + 1e-4 * size * slope + 1e-18:
             size /= 2
             if size < 1e-6:
+                if -slope > _STUCK:
+                    raise ArithmeticError("the energy does not fall along Newton's direction")
                 return y
         y = y + size * step
     raise ArithmeticError("no minimum was found")
