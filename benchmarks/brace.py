@@ -248,10 +248,10 @@ class Reference:
         return np.array([*eq.tip_pose[:3, 3], eq.stiffness(self.d), *rest])
 
 
-def run(cases: int, starts: int, folder: Path) -> Iterator[dict[str, Any]]:
+def run(seeds: range, starts: int, folder: Path) -> Iterator[dict[str, Any]]:
     """All cases; the reference from the folder where it is there, the answer always anew."""
     folder.mkdir(parents=True, exist_ok=True)
-    for seed in range(cases):
+    for seed in seeds:
         file = folder / f"{seed}.json"
         case = json.loads(file.read_text()) if file.exists() else draw(seed)
         case["answer"] = answered(case)
@@ -319,13 +319,15 @@ def main() -> None:
     """Run, and print the report."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--cases", type=int, default=50)
+    parser.add_argument("--first", type=int, default=0, metavar="SEED")
     parser.add_argument("--starts", type=int, default=200, help="of the reference; 0: none")
     parser.add_argument("--out", type=Path, default=Path("out/brace"))
     parser.add_argument("--keep", type=Path, help="write the report here too")
     arguments = parser.parse_args()
     warnings.simplefilter("ignore")
     cases = []
-    for case in run(arguments.cases, arguments.starts, arguments.out):
+    seeds = range(arguments.first, arguments.first + arguments.cases)
+    for case in run(seeds, arguments.starts, arguments.out):
         cases.append(case)
         answer = case["answer"]
         print(

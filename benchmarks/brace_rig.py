@@ -13,11 +13,11 @@ creep, hysteresis and its own contact with friction.
 
 The stiffness is that of a push and a pull at the tip, each settled without remaining creep,
 hysteresis or friction (`Plant.settle`). Their force is half of what the solution says that the
-contacts hold, at most 0.1 N. The same pushes are also applied for two seconds each with all effects
-of silicone and friction: then contacts stick, small pushes do not overcome the hysteresis, and the
-arm is stiffer. The reference is the free solution for the same target, on the same arm. Metrics:
-measured over predicted stiffness, and the same for the multiple of the free stiffness; predictions
-are those for sliding contacts.
+contacts hold, at most 0.1 N. Unless `--settled`, the same pushes are also applied for two seconds
+each with all effects of silicone and friction: then contacts stick, small pushes do not overcome
+the hysteresis, and the arm is stiffer. The reference is the free solution for the same target, on
+the same arm. Metrics: measured over predicted stiffness, and the same for the multiple of the free
+stiffness; predictions are those for sliding contacts.
 """
 
 from __future__ import annotations
@@ -36,6 +36,7 @@ from brace import MARGIN, TOLERANCE, _object
 from calibration import with_true_values
 from control_cases import calibrated_file, draw_case
 from report import table
+from stiffopt.optimise.brace_uncertainty import forces_in_doubt, stiffness_interval
 from stiffopt.paths.configurations import Unsolved
 from stiffopt.paths.leaning import approach_to
 from stiffopt.plant.plant import Plant
@@ -108,7 +109,9 @@ class Arm:
         return 2 * push / (places[-2] - places[-1])
 
 
-def measured(case: Any, believed: Any, seed: list[int]) -> dict[str, Any] | None:
+def measured(
+    case: Any, believed: Any, seed: list[int], *, settled: bool = False
+) -> dict[str, Any] | None:
     """What one task gives; None if its answer does not lean, or for little."""
     robot = stiffopt.Manipulator(believed)
     task = draw_task(robot, seed)
@@ -129,7 +132,9 @@ def measured(case: Any, believed: Any, seed: list[int]) -> dict[str, Any] | None
     arm.go(way.times, way.pressures)
     on = arm.plant.object_forces()
     loose.go(np.array([0.0, 5.0]), np.stack([np.zeros(6), free.pressures]))
-    quick, quick_free = arm.stiffness(direction, push), loose.stiffness(direction, push)
+    quick = quick_free = np.nan
+    if not settled:
+        quick, quick_free = arm.stiffness(direction, push), loose.stiffness(direction, push)
     own = arm.settled_stiffness(direction, push)
     bare = loose.settled_stiffness(direction, push)
     return {
@@ -137,6 +142,10 @@ def measured(case: Any, believed: Any, seed: list[int]) -> dict[str, Any] | None
         "sticking": sticking(robot, found, direction),
         "quick": quick, "quick_free": quick_free, "measured": own, "measured_free": bare,
         "force": float(np.linalg.norm(found.contacts[0].force)),
+        "doubt": float(forces_in_doubt(robot, found.equilibrium).max()),
+        "interval": stiffness_interval(
+            robot, found.equilibrium, task.stiffness.maximise[0], task.brace.contacts
+        ),
         "force_measured": sum(float(np.linalg.norm(each.force)) for each in on),
         "at": found.contacts[0].at, "at_measured": on[0].at if on else None,
         "limited_by": list(found.limited_by),
@@ -156,11 +165,12 @@ def main() -> None:
     parser.add_argument("--tasks", type=int, default=4)
     parser.add_argument("--keep", type=Path, default=Path("out/calibrated"))
     parser.add_argument("--out", type=Path)
+    parser.add_argument("--settled", action="store_true", help="no pushes as they come")
     parser.add_argument("--true", action="store_true", help="believe the true values instead")
     given = parser.parse_args()
     rows: list[dict[str, Any]] = []
     for arm in given.arms:
-        case = draw_case(arm)
+        case = draw_case(arm, ranked=False)
         mismatch = case.description.plant.mismatch
         believed = (
             with_true_values(case.robot, mismatch)
@@ -170,7 +180,7 @@ def main() -> None:
         count = number = 0
         while count < given.tasks and number < 8 * given.tasks:
             began, number = time.perf_counter(), number + 1
-            row = measured(case, believed, [arm, number, 24])
+            row = measured(case, believed, [arm, number, 24], settled=given.settled)
             if row is None:
                 continue
             count += 1

@@ -1,9 +1,13 @@
 """An independent model of an arm pressed on objects: a discrete rod with penalty contact.
 
 It does not import stiffopt. The rod has elements of constant strain. Many stiff springs between its
-body and the surfaces model contact: tenths of newtons enter a surface by hundredths of a
-millimetre. JAX differentiates the energy; Newton's method minimises it while pressures and load
-grow from rest in small steps.
+body and the surfaces model contact. JAX differentiates the energy; Newton's method minimises it
+while pressures and load grow from rest in small steps.
+
+Then elements are made short near the contacts, and springs stiff. Both matter for the tip's
+stiffness: an element of constant strain that is longer than the length on which a force is spread
+resists the contact's motion along it, and springs that yield by micrometres add to the compliance
+of a tip that is held by contacts.
 """
 
 from __future__ import annotations
@@ -22,11 +26,26 @@ from independent import Arm, rod_section
 jax.config.update("jax_enable_x64", True)
 
 Array = Any
-SPRINGS = {"coarse": (8, 6.4e6), "fine": (24, 2e7)}
-"""Springs along an element, and their stiffness in N/m per m along the arm."""
-_OF_TIP = 0.003  # m along the arm, that the spring of the hemisphere at the tip stands for
-_ENERGY_LEFT = 1e-17  # J
+_FEW, MANY = 8, 24
+"""Springs along an element: on the way from rest, and then."""
+_SPRING, _STIFFER = 6.4e6, (2e7, 2.5e8, 3e9)
+"""Their stiffness in N/m per m along the arm: on the way from rest, and then one after another."""
+_ELEMENTS = 80  # in the end
+_SHORTEST, _LONGEST = 1.5e-4, 4e-3  # m, about the lengths of elements in contact and far from it
+_GROWTH = 0.35  # of their lengths, per distance
+_OF_TIP = 3e-4  # m along the arm, that the spring of the hemisphere at the tip stands for
+_ENERGY_LEFT, _STUCK = 1e-17, 1e-11  # J, of a step: at a minimum; too much where none succeeds
 _FAR = (1, [0.0, 0.0, -10.0, 0.0, 0.0, 1.0, 0.0])
+
+
+class Anchors(NamedTuple):
+    """Points of the body that stick to a surface each, three of them; see `slipping_rod.py`."""
+
+    share: Array  # of their element
+    lever: Array  # from the centre line there, in the axes of the section
+    at: Array  # where they were
+    normal: Array  # of the surface
+    carried: Array  # force on the body there
 
 
 class Rod(NamedTuple):
@@ -40,6 +59,9 @@ class Rod(NamedTuple):
     connector: Array
     radius: Array
     force: Array
+    spring: Array
+    hold: Array  # (k, 3), stiffness of the anchors in N/m along their surfaces
+    anchors: Anchors
 
 
 @dataclass(frozen=True)
@@ -71,10 +93,13 @@ def make_rod(arm: Arm, p: Array, n: int, force: Array) -> Rod:
         connector=connector,
         radius=np.repeat([tube.outer_radius for tube in arm.tubes], n),
         force=np.asarray(force, float) + arm.tip_mass * gravity,
+        spring=np.float64(_SPRING),
+        hold=np.zeros((len(h), 3)),
+        anchors=Anchors(np.zeros(3), *np.zeros((4, 3, 3))),
     )
 
 
-def _exponential(v: Array, w: Array) -> tuple[Array, Array]:
+def exponential(v: Array, w: Array) -> tuple[Array, Array]:
     """Rotation and way of a small twist, by power series."""
     x, zero = w @ w, 0.0 * w[0]
     first = 1 - x / 6 * (1 - x / 20 * (1 - x / 42 * (1 - x / 72)))
@@ -85,7 +110,7 @@ def _exponential(v: Array, w: Array) -> tuple[Array, Array]:
     return jnp.eye(3) + first * W + second * W2, v + second * (W @ v) + third * (W2 @ v)
 
 
-def _distance(kind: Array, numbers: Array, x: Array) -> Array:
+def distance(kind: Array, numbers: Array, x: Array) -> Array:
     """Of points (k, 3) from a capsule (kind 0), half-space (1), inside of a tube (2), ring (3)."""
     a, b, radius, c = numbers[:3], numbers[3:6], numbers[6], numbers[7:]
     height = (x - a) @ b
@@ -106,6 +131,19 @@ def _length(x: Array) -> Array:
     return jnp.sqrt((x**2).sum(-1) + 1e-24)
 
 
+def _held(R: Array, r: Array, xi: Array, h: Array, hold: Array, anchors: Anchors) -> Array:
+    """Energy of an element's anchors."""
+
+    def one(share: Array, lever: Array, at: Array, normal: Array, carried: Array) -> Array:
+        turn, way = exponential(xi[:3] * h * share, xi[3:] * h * share)
+        moved = r + R @ (way + turn @ lever) - at
+        across = moved - normal * (normal @ moved)
+        return across @ across / 2, -carried @ moved
+
+    elastic, carried = jax.vmap(one)(*anchors)
+    return (hold * elastic + (hold > 0) * carried).sum()
+
+
 def _chain(rod: Rod, y: Array, samples: int) -> tuple[Array, Array, Array, Array]:
     """Places of samples (k, samples, 3), tip, its rotation, and the energy without springs."""
     strains = rod.free + jnp.einsum("kij,kj->ki", rod.root, y)
@@ -113,34 +151,34 @@ def _chain(rod: Rod, y: Array, samples: int) -> tuple[Array, Array, Array, Array
 
     def along(carry: Array, item: Array) -> tuple[Array, Array]:
         R, r, energy = carry
-        xi, h, f, c, connector = item
+        xi, h, f, c, connector, hold = item
         places = jax.vmap(
-            lambda s: r + R @ _exponential(xi[:3] * h * s, xi[3:] * h * s)[1]
+            lambda s: r + R @ exponential(xi[:3] * h * s, xi[3:] * h * s)[1]
         )(shares)  # fmt: skip
-        R_half, half = _exponential(xi[:3] * h / 2, xi[3:] * h / 2)
-        R_whole, whole = _exponential(xi[:3] * h, xi[3:] * h)
+        R_half, half = exponential(xi[:3] * h / 2, xi[3:] * h / 2)
+        R_whole, whole = exponential(xi[:3] * h, xi[3:] * h)
         middle = r + R @ (half + R_half @ c)
         R_next = R @ R_whole
-        return (R_next, r + R @ whole + connector * R_next[:, 2], energy - h * middle @ f), places
+        energy = energy - h * middle @ f + _held(R, r, xi, h, hold, rod.anchors)
+        return (R_next, r + R @ whole + connector * R_next[:, 2], energy), places
 
     start = (jnp.eye(3), jnp.zeros(3), 0.0)
-    items = (strains, rod.h, rod.weight, rod.centroid, rod.connector)
+    items = (strains, rod.h, rod.weight, rod.centroid, rod.connector, rod.hold)
     (R, tip, energy), places = jax.lax.scan(along, start, items)
     return places, tip, R, energy + 0.5 * (y**2).sum() - tip @ rod.force
 
 
-def _springs(rod: Rod, y: Array, objects: Array, fineness: str) -> tuple[Array, ...]:
-    samples, stiffness = SPRINGS[fineness]
+def _springs(rod: Rod, y: Array, objects: Array, samples: int) -> tuple[Array, ...]:
     places, tip, R, energy = _chain(rod, y, samples)
     points = jnp.concatenate([places.reshape(-1, 3), tip[None]])
     radii = jnp.concatenate([jnp.repeat(rod.radius, samples), rod.radius[-1:]])
-    depths = jax.vmap(lambda kind, numbers: radii - _distance(kind, numbers, points))(*objects)
-    own = jnp.concatenate([jnp.repeat(rod.h / samples, samples), jnp.array([_OF_TIP])]) * stiffness
+    depths = jax.vmap(lambda kind, numbers: radii - distance(kind, numbers, points))(*objects)
+    own = jnp.concatenate([jnp.repeat(rod.h / samples, samples), jnp.array([_OF_TIP])]) * rod.spring
     return own * jnp.maximum(depths, 0), jnp.maximum(depths, 0), tip, R, energy
 
 
-def _energy(y: Array, rod: Rod, objects: Array, fineness: str) -> Array:
-    forces, depths, _, _, energy = _springs(rod, y.reshape(-1, 6), objects, fineness)
+def _energy(y: Array, rod: Rod, objects: Array, samples: int) -> Array:
+    forces, depths, _, _, energy = _springs(rod, y.reshape(-1, 6), objects, samples)
     return energy + 0.5 * (forces * depths).sum()
 
 
@@ -155,25 +193,31 @@ def _near(R: Array, r: Array) -> Array:
 
 
 def _part(
-    twist: Array, y: Array, item: Array, beyond: tuple[Array, Array], objects: Array, fineness: str
+    twist: Array,
+    y: Array,
+    item: Array,
+    beyond: tuple[Array, Array],
+    objects: Array,
+    rod: Rod,
+    samples: int,
 ) -> tuple[Array, Array]:
     """Energy of an element and, to second order, of all beyond; and the twist of its end.
 
     Twists are in base axes about the base, that of the start is given. What is beyond exerts a
     wrench (6,) on the end at its present pose, with a stiffness (6, 6).
     """
-    R, r, R_end, r_end, free, root, h, weight, centroid, connector, radius = item
-    samples, stiffness = SPRINGS[fineness]
-    turn, way = _exponential(twist[:3], twist[3:])
+    R, r, R_end, r_end, free, root, h, weight, centroid, connector, radius, hold = item
+    turn, way = exponential(twist[:3], twist[3:])
     R, r = turn @ R, turn @ r + way
     xi = free + root @ y
     shares = (jnp.arange(samples) + 0.5) / samples
-    places = jax.vmap(lambda s: r + R @ _exponential(xi[:3] * h * s, xi[3:] * h * s)[1])(shares)
-    depths = jax.vmap(lambda kind, numbers: radius - _distance(kind, numbers, places))(*objects)
-    R_half, half = _exponential(xi[:3] * h / 2, xi[3:] * h / 2)
+    places = jax.vmap(lambda s: r + R @ exponential(xi[:3] * h * s, xi[3:] * h * s)[1])(shares)
+    depths = jax.vmap(lambda kind, numbers: radius - distance(kind, numbers, places))(*objects)
+    R_half, half = exponential(xi[:3] * h / 2, xi[3:] * h / 2)
     energy = 0.5 * y @ y - h * (r + R @ (half + R_half @ centroid)) @ weight
-    energy += 0.5 * h / samples * stiffness * (jnp.maximum(depths, 0) ** 2).sum()
-    R_whole, whole = _exponential(xi[:3] * h, xi[3:] * h)
+    energy += 0.5 * h / samples * rod.spring * (jnp.maximum(depths, 0) ** 2).sum()
+    energy += _held(R, r, xi, h, hold, rod.anchors)
+    R_whole, whole = exponential(xi[:3] * h, xi[3:] * h)
     R_next = R @ R_whole
     change = R_next @ R_end.T
     moved = _near(change, r + R @ whole + connector * R_next[:, 2] - change @ r_end)
@@ -184,37 +228,36 @@ def _part(
 def _tip_part(
     twist: Array, r: Array, force: Array, radius: Array, objects: Array, k: Array
 ) -> Array:
-    turn, way = _exponential(twist[:3], twist[3:])
+    turn, way = exponential(twist[:3], twist[3:])
     x = (turn @ r + way)[None]
-    depths = jax.vmap(lambda kind, numbers: radius - _distance(kind, numbers, x))(*objects)
+    depths = jax.vmap(lambda kind, numbers: radius - distance(kind, numbers, x))(*objects)
     return 0.5 * k * (jnp.maximum(depths, 0) ** 2).sum() - x[0] @ force
 
 
 @partial(jax.jit, static_argnums=3)
-def _derivatives(y: Array, rod: Rod, objects: Array, fineness: str) -> tuple[Array, ...]:
+def _derivatives(y: Array, rod: Rod, objects: Array, samples: int) -> tuple[Array, ...]:
     """Energy, gradient and Hessian; moving an element's end moves all beyond rigidly."""
     y = y.reshape(-1, 6)
     strains = rod.free + jnp.einsum("kij,kj->ki", rod.root, y)
 
     def along(pose: Array, item: Array) -> tuple[Array, Array]:
         (R, r), (xi, h, connector) = pose, item
-        turn, way = _exponential(xi[:3] * h, xi[3:] * h)
+        turn, way = exponential(xi[:3] * h, xi[3:] * h)
         end = R @ turn, r + R @ way + connector * (R @ turn)[:, 2]
         return end, (R, r, *end)
 
     (_, tip), poses = jax.lax.scan(
         along, (jnp.eye(3), jnp.zeros(3)), (strains, rod.h, rod.connector)
     )
-    items = (*poses, rod.free, rod.root, rod.h, rod.weight, rod.centroid, rod.connector, rod.radius)
+    own_items = (rod.free, rod.root, rod.h, rod.weight, rod.centroid, rod.connector, rod.radius)
+    items = (*poses, *own_items, rod.hold)
     zero, none = jnp.zeros(6), (jnp.zeros(6), jnp.zeros((6, 6)))
 
     def own(twist: Array, y: Array, item: Array) -> Array:
-        return _part(twist, y, item, none, objects, fineness)[0]
+        return _part(twist, y, item, none, objects, rod, samples)[0]
 
     def last(twist: Array) -> Array:
-        return _tip_part(
-            twist, tip, rod.force, rod.radius[-1], objects, _OF_TIP * SPRINGS[fineness][1]
-        )
+        return _tip_part(twist, tip, rod.force, rod.radius[-1], objects, _OF_TIP * rod.spring)
 
     wrenches = jax.vmap(lambda y, item: jax.grad(own)(zero, y, item))(y, items)
     stiffnesses = jax.vmap(lambda y, item: jax.hessian(own)(zero, y, item))(y, items)
@@ -225,11 +268,11 @@ def _derivatives(y: Array, rod: Rod, objects: Array, fineness: str) -> tuple[Arr
 
     def second(y: Array, item: Array, after: tuple[Array, Array]) -> tuple[Array, ...]:
         def both(y: Array) -> tuple[Array, Array]:
-            return jax.grad(lambda *x: _part(*x, item, after, objects, fineness)[0], (0, 1))(
+            return jax.grad(lambda *x: _part(*x, item, after, objects, rod, samples)[0], (0, 1))(
                 zero, y
             )
 
-        S = jax.jacfwd(lambda y: _part(zero, y, item, after, objects, fineness)[1])(y)
+        S = jax.jacfwd(lambda y: _part(zero, y, item, after, objects, rod, samples)[1])(y)
         return (*jax.jacfwd(both)(y), both(y)[1], S)
 
     coupled, D, g, S = jax.vmap(second)(y, items, beyond)
@@ -238,13 +281,16 @@ def _derivatives(y: Array, rod: Rod, objects: Array, fineness: str) -> tuple[Arr
     H = H * (jnp.arange(count)[:, None] < jnp.arange(count))[:, None, :, None]
     H = H.reshape(6 * count, -1)
     own_blocks = jnp.einsum("ij,iab->iajb", jnp.eye(count), D).reshape(6 * count, -1)
-    return _energy(y.ravel(), rod, objects, fineness), g.ravel(), H + H.T + own_blocks
+    return _energy(y.ravel(), rod, objects, samples), g.ravel(), H + H.T + own_blocks
 
 
-def _minimum(y: Array, rod: Rod, objects: Array, fineness: str) -> Array:
-    """Newton's method with a line search, shifted where the energy is not convex."""
+def minimum(y: Array, rod: Rod, objects: Array, samples: int) -> Array:
+    """Strains (6 k,) of the nearest minimum of the energy.
+
+    Newton's method with a line search, shifted where the energy is not convex.
+    """
     for _ in range(300):
-        f, g, H = (np.asarray(each) for each in _derivatives(y, rod, objects, fineness))
+        f, g, H = (np.asarray(each) for each in _derivatives(y, rod, objects, samples))
         shift = 0.0
         while True:
             try:
@@ -257,28 +303,34 @@ def _minimum(y: Array, rod: Rod, objects: Array, fineness: str) -> Array:
         if -slope < _ENERGY_LEFT and shift == 0:
             return y
         size = min(1.0, 0.02 / float(np.linalg.norm(step)))
-        while _value(y + size * step, rod, objects, fineness) > f + 1e-4 * size * slope + 1e-18:
+        while _value(y + size * step, rod, objects, samples) > f + 1e-4 * size * slope + 1e-18:
             size /= 2
             if size < 1e-6:
+                if -slope > _STUCK:
+                    raise ArithmeticError("the energy does not fall along Newton's direction")
                 return y
         y = y + size * step
     raise ArithmeticError("no minimum was found")
 
 
-def _read(y: Array, rod: Rod, objects: Array, fineness: str, count: int) -> Pressed:
-    seen = _seen(rod, y.reshape(-1, 6), objects, fineness)
-    loads, _, tip, R, _ = (np.asarray(each) for each in seen)
-    samples = SPRINGS[fineness][0]
+def _stations(rod: Rod, samples: int) -> Array:
+    """Arc lengths of the springs along the elements and of that at the tip."""
     ends = np.cumsum(rod.h + rod.connector)
     shares = (np.arange(samples) + 0.5) / samples
     at = ((ends - rod.h - rod.connector)[:, None] + rod.h[:, None] * shares).ravel()
-    at = np.append(at, ends[-1])
-    forces = loads.sum(axis=1)
+    return np.append(at, ends[-1])
+
+
+def read(y: Array, rod: Rod, objects: Array, count: int) -> Pressed:
+    """What is seen of strains (6 k,) among so many objects."""
+    seen = _seen(rod, y.reshape(-1, 6), objects, MANY)
+    loads, _, tip, R, _ = (np.asarray(each) for each in seen)
+    at, forces = _stations(rod, MANY), loads.sum(axis=1)
     mean = np.divide(loads @ at, forces, out=np.full(len(forces), np.nan), where=forces > 0)
     return Pressed(tip, R, forces[:count], mean[:count], y, rod)
 
 
-def _numbers(objects: Sequence[tuple[int, Sequence[float]]]) -> Array:
+def numbers(objects: Sequence[tuple[int, Sequence[float]]]) -> Array:
     """Kinds and numbers of at least three objects, so that JAX compiles once."""
     known = [*objects, *[_FAR] * (3 - len(objects))]
     padded = [[*each, *[0.0] * (10 - len(each))] for _, each in known]
@@ -295,19 +347,51 @@ def pressed(
     two points, radius, a third point) of a tube that the arm is in, (3, centre, axis, radius) of a
     ring about it.
     """
-    known, y = _numbers(objects), np.zeros(6 * n * len(arm.tubes))
+    known, y = numbers(objects), np.zeros(6 * n * len(arm.tubes))
     for share in np.arange(steps + 1) / steps:
         rod = make_rod(arm, share * np.asarray(p), n, share * np.asarray(force, float))
-        y = _minimum(y, rod, known, "coarse")
-    return _read(_minimum(y, rod, known, "fine"), rod, known, "fine", len(objects))
+        y = minimum(y, rod, known, _FEW)
+    for spring in _STIFFER:
+        rod, y = refined(rod, y, known, len(arm.tubes))
+        rod = rod._replace(spring=np.float64(spring))
+        y = minimum(y, rod, known, MANY)
+    return read(y, rod, known, len(objects))
+
+
+def refined(rod: Rod, y: Array, objects: Array, segments: int) -> tuple[Rod, Array]:
+    """The same at the same strains, with more elements, which are short where springs push."""
+    n, many = len(rod.h) // segments, _ELEMENTS // segments
+    strains = rod.free + np.einsum("kij,kj->ki", rod.root, y.reshape(-1, 6))
+    loads = np.asarray(_seen(rod, y.reshape(-1, 6), objects, MANY)[0]).sum(axis=0)
+    where = _stations(rod, MANY)[loads > 0]
+    ends = np.cumsum(rod.h + rod.connector) - rod.connector
+    h, old = [], []
+    for first in range(0, n * segments, n):
+        own = slice(first, first + n)
+        fine = np.linspace(ends[first] - rod.h[first], ends[first + n - 1], 4001)
+        away = np.abs(fine[:, None] - where).min(axis=1, initial=np.inf)
+        size = np.minimum(_SHORTEST + _GROWTH * away, _LONGEST)
+        count = np.append(0, np.cumsum((1 / size[1:] + 1 / size[:-1]) / 2))
+        marks = np.interp(np.linspace(0, count[-1], many + 1), count, fine)
+        h.append(np.diff(marks))
+        middles = (marks[1:] + marks[:-1]) / 2
+        old.append(first + np.minimum(np.searchsorted(ends[own], middles), n - 1))
+    lengths, of = np.concatenate(h), np.concatenate(old)
+    connector = np.zeros(len(lengths))
+    connector[many - 1 :: many] = rod.connector[n - 1 :: n]
+    root = rod.root[of] * np.sqrt(rod.h[of] / lengths)[:, None, None]
+    same = {name: getattr(rod, name)[of] for name in ("free", "weight", "centroid", "radius")}
+    hold = np.zeros((len(lengths), 3))
+    there = rod._replace(h=lengths, root=root, connector=connector, hold=hold, **same)
+    return there, np.linalg.solve(root, (strains[of] - there.free)[..., None]).ravel()
 
 
 def pushed(
     state: Pressed, objects: Sequence[tuple[int, Sequence[float]]], force: Array, steps: int = 1
 ) -> Pressed:
     """The same with one more force at the tip, grown in steps."""
-    known, y = _numbers(objects), state.strains
+    known, y = numbers(objects), state.strains
     for share in np.arange(1, steps + 1) / steps:
         rod = state.rod._replace(force=state.rod.force + share * np.asarray(force, float))
-        y = _minimum(y, rod, known, "fine")
-    return _read(y, rod, known, "fine", len(objects))
+        y = minimum(y, rod, known, MANY)
+    return read(y, rod, known, len(objects))

@@ -18,9 +18,11 @@ import stiffopt
 from conftest import use_compiler
 from stiffopt.cli.main import main
 from stiffopt.cli.solve_report import block
-from stiffopt.cli.solved_task import SolvedTask
+from stiffopt.cli.solved_task import SolvedTask, with_uncertainty
 from stiffopt.errors import DerivativeError, InputError
+from stiffopt.model.calibration import Calibration
 from stiffopt.optimise import braced
+from stiffopt.optimise.brace_uncertainty import forces_in_doubt, stiffness_interval
 from stiffopt.optimise.leaning import MARGIN_ON, BracedProblem
 from stiffopt.optimise.local import LocalResult
 from stiffopt.optimise.search import Search
@@ -157,6 +159,41 @@ def test_a_margin_that_no_contact_holds_leaves_the_free_answer(robot, task):
     assert not found.contacts
     assert found.stiffness == found.stiffness_free
     assert "leans on 'post'" in found.message
+
+
+def test_a_calibrated_arm_holds_back_forces_that_are_in_doubt(robot, task):
+    known = Calibration(position_residual=2e-3)
+    arm = stiffopt.Manipulator(robot.description.model_copy(update={"calibration": known}))
+    found = stiffopt.solve_pressure(arm, task)
+    assert found.contacts
+    problem, eq = BracedProblem(arm, task), found.equilibrium
+    doubt = forces_in_doubt(arm, eq)
+    assert f"smaller by {doubt.max():.2g} N, by errors of the calibration" in found.message
+    for push in problem.pushes(eq):
+        assert (eq.shifted(push=task.brace.margin * push).normal_forces >= doubt).all()
+    # pressures that move the free tip by two standard deviations change no force by more
+    J = arm.tip_pose(eq.pressures)[:3, :3] @ arm.tip_jacobian(eq.pressures)[:3]
+    ways = np.random.default_rng(0).normal(size=(50, 3))
+    ways *= 2 * known.position_residual / np.linalg.norm(ways, axis=1, keepdims=True)
+    changes = np.abs([eq.force_gradients @ np.linalg.pinv(J) @ way for way in ways]).max(axis=0)
+    assert changes == pytest.approx(doubt, rel=0.1)
+    assert (changes <= doubt).all()
+    # and the stiffness with them
+    low, high = stiffness_interval(arm, eq, task.stiffness.maximise[0], "sliding")
+    assert low * high == pytest.approx(found.stiffness**2)
+    seen = [eq.shifted(np.linalg.pinv(J) @ way).stiffness([1, 0, 0]) for way in 0.1 * ways]
+    assert np.log(np.array(seen) / found.stiffness).max() == pytest.approx(
+        0.1 * np.log(high / found.stiffness), rel=0.15
+    )
+    text = StringIO()
+    told = with_uncertainty(SolvedTask("lean.yaml", arm, found))
+    Console(file=text, width=200).print(block(told))
+    assert f"(95 %: {low:.3f} to {high:.3f}" in text.getvalue()
+
+
+def test_without_a_calibration_no_force_is_in_doubt(robot, solution):
+    assert not forces_in_doubt(robot, solution.equilibrium).any()
+    assert "calibration" not in solution.message
 
 
 def test_objects_that_are_not_named_keep_their_clearance(robot, solution, tmp_path):

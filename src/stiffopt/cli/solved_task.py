@@ -1,10 +1,12 @@
 """Solve a task file: the solution with everything else that is printed, written and drawn."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from stiffopt.errors import EquilibriumError, FileError, InputError
 from stiffopt.model.manipulator import Manipulator, load_robot
 from stiffopt.model.uncertainty import TipUncertainty
+from stiffopt.optimise.brace_uncertainty import stiffness_interval
 from stiffopt.optimise.goal import StiffnessMeasure
 from stiffopt.optimise.pareto import pareto_front
 from stiffopt.optimise.solution import PressureSolution, judge
@@ -22,9 +24,9 @@ class SolvedTask:
     robot : the arm under the task's load.
     solution : of the task.
     plain : the task's stiffnesses at the plain solution, which ignores stiffness; empty if unknown.
-    uncertainty : of the tip; None for a robot without calibration.
+    uncertainty : of the tip; None for a robot without calibration, and for an arm that leans.
     intervals : 95 % intervals of the task's stiffnesses, None for those that are not along a
-        direction; empty without `uncertainty`.
+        direction; empty for a robot without calibration.
     front : the trade-off between tip error and stiffness; None without --pareto or if it failed.
     no_front : why --pareto failed; else empty.
     """
@@ -56,7 +58,7 @@ def solve_file(file: str, *, seed: int, pareto: int | None) -> SolvedTask:
         except EquilibriumError as error:
             solution = PressureSolution("failed", str(error), task)
         answer = SolvedTask(file, solver.robot, solution, _plain(solver, solution))
-        answer = _with_uncertainty(answer)
+        answer = with_uncertainty(answer)
     except FileError:
         raise
     except InputError as error:
@@ -70,14 +72,16 @@ def solve_file(file: str, *, seed: int, pareto: int | None) -> SolvedTask:
     return replace(answer, front=front)
 
 
-def _with_uncertainty(answer: SolvedTask) -> SolvedTask:
+def with_uncertainty(answer: SolvedTask) -> SolvedTask:
+    """Return an answer with what is known of its errors, if its robot was calibrated."""
     pressures = answer.solution.pressures
-    leans = answer.solution.contacts  # the uncertainty is known only for a free arm
-    if answer.robot.description.calibration is None or pressures is None or leans:
+    if answer.robot.description.calibration is None or pressures is None:
         return answer
+    measures = answer.solution.task.measures[: len(answer.solution.stiffnesses)]
     try:
+        if answer.solution.contacts:  # that of the tip is known only for a free arm
+            return replace(answer, intervals=_braced_intervals(answer, measures))
         uncertainty = answer.robot.tip_uncertainty(pressures)
-        measures = answer.solution.task.measures[: len(answer.solution.stiffnesses)]
         intervals = tuple(
             uncertainty.stiffness_interval(m.direction, m.kind, m.boundary, m.frame)
             if isinstance(m, StiffnessMeasure)
@@ -87,6 +91,20 @@ def _with_uncertainty(answer: SolvedTask) -> SolvedTask:
     except EquilibriumError:  # near a limit of stability, its errors are unknown
         return answer
     return replace(answer, uncertainty=uncertainty, intervals=intervals)
+
+
+def _braced_intervals(
+    answer: SolvedTask, measures: Sequence[object]
+) -> tuple[tuple[float, float] | None, ...]:
+    brace, eq = answer.solution.task.brace, answer.solution.equilibrium
+    assert brace is not None
+    assert eq is not None
+    return tuple(
+        stiffness_interval(answer.robot, eq, measure, brace.contacts)
+        if isinstance(measure, StiffnessMeasure)
+        else None
+        for measure in measures
+    )
 
 
 def _plain(solver: PressureSolver, solution: PressureSolution) -> tuple[float, ...]:

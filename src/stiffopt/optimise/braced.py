@@ -25,6 +25,7 @@ from stiffopt.model.arm_clearance import measured_scene
 from stiffopt.model.contact.equilibrium import ContactEquilibrium
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.optimise.brace import quoted
+from stiffopt.optimise.brace_uncertainty import forces_in_doubt
 from stiffopt.optimise.leaning import FORCE_ON, MARGIN_ON, BracedProblem
 from stiffopt.optimise.local import LocalResult, descend
 from stiffopt.optimise.prices import prices_at
@@ -327,7 +328,7 @@ def _braced_answer(
     problem.here = eq
     return PressureSolution(
         status="solved",
-        message=_other_equilibrium(problem, eq),
+        message="; ".join(filter(None, (_doubt(problem, eq), _other_equilibrium(problem, eq)))),
         task=task,
         pressures=eq.pressures,
         tip_pose=judgement.tip_pose,
@@ -355,6 +356,15 @@ def _size(problem: BracedProblem, name: str, radius: float) -> float:
     forces = {f"{FORCE_ON}{item.name}": item.contact for item in problem.scene.objects}
     contact = forces.get(name)
     return radius if contact is None or contact.max_force is None else contact.max_force
+
+
+def _doubt(problem: BracedProblem, eq: ContactEquilibrium) -> str:
+    """Return how far a calibrated arm's contact forces are in doubt, or ""."""
+    doubt = float(forces_in_doubt(problem.robot, eq).max())
+    if doubt == 0.0:
+        return ""
+    by = display_units().force.text(doubt, ".2g")
+    return f"contact forces may be smaller by {by}, by errors of the calibration"
 
 
 def _other_equilibrium(problem: BracedProblem, eq: ContactEquilibrium) -> str:

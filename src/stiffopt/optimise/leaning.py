@@ -30,6 +30,7 @@ from stiffopt.model.scene import Scene, SceneObject
 from stiffopt.model.shape import PointOfArm
 from stiffopt.model.stopping import checkpoint
 from stiffopt.optimise.brace import Brace, kept_clear_of, leant_on
+from stiffopt.optimise.brace_uncertainty import forces_in_doubt
 from stiffopt.optimise.measures.directional import StiffnessMeasure
 from stiffopt.optimise.problem import Objective, PressureProblem, ProgramPoint
 from stiffopt.optimise.program import Constraint, Program
@@ -206,13 +207,14 @@ class BracedProblem(PressureProblem):
         checkpoint()
         eq = self.equilibrium(x)
         pushes = [] if self.only_target else list(self.pushes(eq))
+        doubt = forces_in_doubt(self.robot, eq) if pushes else np.zeros(len(eq.contacts))
         near = self._nearest(eq, quickly=True)
-        base = self._seen(eq, pushes, near, full)
+        base = self._seen(eq, pushes, doubt, near, full)
         differences = []
         for k, inwards in enumerate(x > (self.lower + self.upper) / 2):
             step = (-1.0 if inwards else 1.0) * BRACE.step
             change = step * self.unit[k] * np.eye(len(x))[k]
-            seen = self._seen(eq.shifted(change), pushes, near, full)
+            seen = self._seen(eq.shifted(change), pushes, doubt, near, full)
             differences.append([(b - a) / step for a, b in zip(base, seen, strict=True)])
         slopes = Quantities(
             *(np.stack(columns, axis=-1) for columns in zip(*differences, strict=True))
@@ -238,13 +240,14 @@ class BracedProblem(PressureProblem):
         self,
         eq: ContactEquilibrium,
         pushes: list[Vector],
+        doubt: Vector,
         near: list[Nearest],
         full: bool,
     ) -> Quantities:
         C = eq.compliance(self.brace.contacts) if full else np.eye(6)
         residuals, values = self.judged_by(eq, C)
         margin = (1 + BRACE.spare) * self.brace.margin
-        pushed = np.array([eq.shifted(push=margin * push).normal_forces for push in pushes])
+        pushed = np.array([eq.shifted(push=margin * push).normal_forces - doubt for push in pushes])
         slips = np.zeros(0)
         if self.brace.contacts == "sticking" and pushes:
             slips = np.array([self._slip(eq, push) for push in pushes])
@@ -346,6 +349,26 @@ class BracedProblem(PressureProblem):
                 f"a push of {unit.text(least)} takes a contact away; the margin is "
                 f"{unit.text(self.brace.margin)}"
             )
+            return
+        left, doubt = self._left_in_doubt(eq)
+        if left < -1e-6:
+            yield (
+                f"a push of the margin leaves a contact force of {unit.text(left + doubt)}, less "
+                f"than the {unit.text(doubt)} that the calibration leaves in doubt"
+            )
+
+    def _left_in_doubt(self, eq: ContactEquilibrium) -> tuple[float, float]:
+        """Return the force that a push of the margin leaves beyond the doubt, and that, in N."""
+        doubt = forces_in_doubt(self.robot, eq)
+        if not doubt.any():
+            return np.inf, 0.0
+        try:
+            pushed = [eq.shifted(push=self.brace.margin * d) for d in self.pushes(eq)]
+        except EquilibriumError:  # other contacts take over before
+            return np.inf, 0.0
+        least = np.min([each.normal_forces - doubt for each in pushed], axis=0)
+        worst = int(least.argmin())
+        return float(least[worst]), float(doubt[worst])
 
     def preloads(self, eq: ContactEquilibrium) -> Iterator[Preload]:
         """Yield the push by which the first contact is lost, both ways along each direction.

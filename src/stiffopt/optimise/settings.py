@@ -184,6 +184,7 @@ class BraceSettings:
     stiffer : share by which an optimum that does not hold is stiffer than the answer, to be told.
     least_price : gain from a whole tolerance or limit, as a share of the stiffness, to be reported.
     largest_push : largest push that is tested, in N.
+    sure : standard deviations of a contact force, by a calibration's errors, that are held back.
     """
 
     force: float = 5e-3
@@ -200,6 +201,7 @@ class BraceSettings:
     stiffer: float = 0.01
     least_price: float = 1e-3
     largest_push: float = 1.0
+    sure: float = 2.0
 
 
 @dataclass(frozen=True)

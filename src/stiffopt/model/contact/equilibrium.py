@@ -321,7 +321,8 @@ class ContactEquilibrium:
             Largest push that is tested, in N.
         contacts : {"sliding", "sticking"}
             "sliding": without friction, and exact for large pushes.  "sticking": with the scene's
-            friction; contacts stick until one slips or lifts off, linear about this equilibrium.
+            friction; contacts carry no tangential force at first, and roll without slipping until
+            one slips or lifts off.
 
         Returns
         -------

@@ -6,13 +6,17 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.model.contact.rod import TURN
 from stiffopt.model.contact.solve import ContactProblem
-from stiffopt.model.contact.system import ContactSystem, LeaningArm
+from stiffopt.model.contact.system import Contacts, ContactSystem, LeaningArm
 
 Vector = NDArray[np.float64]
 
+_TILT = 0.5  # rad, largest turn of a contact's normal in a step of a push that slips
 _LARGEST_SWING = 0.2  # rad, largest turn of the tip in a step of a push
 _FORCE_LEFT = 1e-7  # N; a contact with less force has lifted off
+_SAME_LOSS = 0.01  # share by which two foretold losses may differ
+_NEW_CONTACT = 0.02  # longest step that adds a contact, over the loss that is foretold
 _SHORTEST = 1e-6  # share of the largest push; with a shorter step the equilibrium is lost
 
 
@@ -37,6 +41,26 @@ class ContactLoss(NamedTuple):
     stiffness_after: float
 
 
+class _Tangent(NamedTuple):
+    """The equations for forces at the tip, and what follows for a push.
+
+    Attributes
+    ----------
+    system, solution : the equations, and their unknowns (u, 6) for each component of a wrench.
+    rates : of the unknowns (u,) per push.
+    moves : of the nodes (N + 1, 3) per push.
+    turn : of the tip per push, in rad/N.
+    stiffness : along the push, in N/m.
+    """
+
+    system: ContactSystem
+    solution: Vector
+    rates: Vector
+    moves: Vector
+    turn: float
+    stiffness: float
+
+
 class GrowingPush:
     """A push at the tip that grows from zero, along a unit direction (3,) in base axes."""
 
@@ -44,54 +68,71 @@ class GrowingPush:
         self._problem, self._direction, self._limit = problem, direction, limit
 
     def slip(self, arm: LeaningArm) -> ContactLoss:
-        """Return the first contact that slips or lifts off, linear about an equilibrium.
+        """Return the first contact that slips or lifts off as the push grows from an equilibrium.
 
-        Contacts with friction stick, and carry no tangential force at first. One
+        Contacts with friction stick, and carry no tangential force at first.  One
         slips when the tangential force reaches the coefficient of friction times the normal
-        force.
+        force.  The push goes half of the way to the loss that the tangent foretells, until that no
+        longer changes.
         """
-        touches = arm.state.touches
-        friction = [self._problem.surfaces[touch.surface].friction for touch in touches]
+        friction = self._friction(arm.state)
         sticking = [j for j, each in enumerate(friction) if each > 0]
-        system, solution, stiffness = self._tangent(arm, sticking)
-        _, moves = system.along(solution)
-        first, lost, how = self._limit, None, "holds"
-        for j, touch in enumerate(touches):
-            own = solution[3 + 7 * j : 6 + 7 * j, :3] @ self._direction
-            change = float(solution[system.linear.unknowns + j, :3] @ self._direction)
-            point = arm.rows[j].point
-            moved = moves[arm.state.mesh.node[j]][:, :3] @ self._direction
-            turned = touch.normal_force * point.curvature @ moved
-            across = float(np.linalg.norm(own - change * point.normal - turned))
-            ways = [("lifts off", -change, touch.normal_force)]
-            if friction[j] > 0:
-                limit = friction[j] * touch.normal_force
-                ways.append(("slips", across - friction[j] * change, limit))
-            for name, rate, limit in ways:
-                if rate > 0 and limit / rate < first:
-                    first, lost, how = limit / rate, j, name
+        force, step, foretold, begin = 0.0, np.inf, -1.0, None
+        while True:
+            tangent = self._tangent(arm, sticking)
+            begin = begin if begin is not None else tangent.stiffness
+            left, lost, how = _first_loss(arm, tangent, friction, self._limit - force)
+            total = force + left
+            if left == 0.0:
+                break
+            is_known = abs(total - foretold) <= _SAME_LOSS * total
+            step = min(step, left if is_known else left / 2)
+            step = min(step, _LARGEST_SWING / max(tangent.turn, 1e-9))
+            push = step * np.concatenate([self._direction, np.zeros(3)])
+            found = self._problem.pushed(arm, tangent.system, tangent.solution, push)
+            missed = None if found is None else self._problem.missed(found)
+            if found is None or missed is None or _has_tilted(arm, found):
+                step /= 2
+                if step < _SHORTEST * self._limit:
+                    return ContactLoss(force, None, None, "snaps", begin, 0.0)
+                continue
+            if missed and step > _NEW_CONTACT * total:
+                step /= 2
+                continue
+            if is_known and not missed and step == left:
+                break
+            if missed:
+                touches = (*found.state.touches, *missed)
+                state = self._problem.with_touches(found.state, touches)
+                friction = self._friction(state)
+                sticking = [j for j, each in enumerate(friction) if each > 0]
+                found = self._problem.correct(state, sticking) or found
+            arm, force, step, foretold = found, force + step, np.inf, total
         if lost is None:
-            return ContactLoss(np.inf, None, None, how, stiffness, stiffness)
+            return ContactLoss(np.inf, None, None, how, begin, begin)
+        touches = arm.state.touches
         if how == "slips":
-            after = self._tangent(arm, [j for j in sticking if j != lost])[2]
+            after = self._tangent(arm, [j for j in sticking if j != lost]).stiffness
         else:
             rest = (*touches[:lost], *touches[lost + 1 :])
-            found = self._problem.correct(self._problem.with_touches(arm.state, rest))
             kept = [j - (j > lost) for j in sticking if j != lost]
-            after = 0.0 if found is None else self._tangent(found, kept)[2]
+            found = self._problem.correct(self._problem.with_touches(arm.state, rest), kept)
+            after = 0.0 if found is None else self._tangent(found, kept).stiffness
         name = self._problem.surfaces[touches[lost].surface].name
-        return ContactLoss(first, name, touches[lost].station, how, stiffness, after)
+        return ContactLoss(total, name, touches[lost].station, how, begin, after)
 
-    def _tangent(
-        self, arm: LeaningArm, sticking: Collection[int]
-    ) -> tuple[ContactSystem, Vector, float]:
-        """Return the equations for forces at the tip, their solution (u, 6), and a stiffness."""
+    def _friction(self, state: Contacts) -> list[float]:
+        return [self._problem.surfaces[touch.surface].friction for touch in state.touches]
+
+    def _tangent(self, arm: LeaningArm, sticking: Collection[int]) -> _Tangent:
         sections = arm.shape.sections
         system = ContactSystem(self._problem, arm.state, sections, "tip wrench", sticking)
         solution = system.solution()
-        _, moves = system.along(solution)
-        way = float(self._direction @ moves[0][:, :3] @ self._direction)
-        return system, solution, 1 / way
+        changes, moves = system.along(solution)
+        along = moves[..., :3] @ self._direction
+        turn = float(np.linalg.norm(changes[0, TURN, :3] @ self._direction))
+        rates = solution[:, :3] @ self._direction
+        return _Tangent(system, solution, rates, along, turn, 1 / float(self._direction @ along[0]))
 
     def loss(self, arm: LeaningArm) -> ContactLoss:
         """Return the first contact that is lost as the push grows from an equilibrium."""
@@ -142,3 +183,46 @@ class GrowingPush:
 
 def _forces(arm: LeaningArm) -> Vector:
     return np.array([touch.normal_force for touch in arm.state.touches])
+
+
+def _has_tilted(before: LeaningArm, after: LeaningArm) -> bool:
+    """Return whether the normal of a contact has turned too much for a step."""
+    rows = zip(before.rows, after.rows, strict=True)
+    return any(old.point.normal @ new.point.normal < np.cos(_TILT) for old, new in rows)
+
+
+def _first_loss(
+    arm: LeaningArm, tangent: _Tangent, friction: list[float], limit: float
+) -> tuple[float, int | None, str]:
+    """Return the further push, below a limit, at which the tangent foretells a loss.
+
+    Also the contact that is lost, or None, and how.
+    """
+    first, lost, how = limit, None, "holds"
+    for j, (touch, row) in enumerate(zip(arm.state.touches, arm.rows, strict=True)):
+        n, N = row.point.normal, touch.normal_force
+        own = tangent.rates[3 + 7 * j : 6 + 7 * j]
+        rate = float(tangent.rates[tangent.system.linear.unknowns + j])
+        ways = [("lifts off", -N / rate if rate < 0 else np.inf)]
+        if friction[j] > 0:
+            across = touch.force - N * n
+            turning = N * row.point.curvature @ tangent.moves[arm.state.mesh.node[j]]
+            changing = own - rate * n - turning
+            ways.append(
+                ("slips", _until_equal(across, changing, friction[j] * N, friction[j] * rate))
+            )
+        for name, push in ways:
+            if push < first:
+                first, lost, how = push, j, name
+    return first, lost, how
+
+
+def _until_equal(a: Vector, b: Vector, c: float, d: float) -> float:
+    """Return the least x > 0 at which ``|a + b x| = c + d x``; infinite if there is none."""
+    square, double, rest = b @ b - d * d, a @ b - c * d, a @ a - c * c
+    if rest >= 0:
+        return 0.0
+    root = double * double - square * rest
+    if root < 0 or double + np.sqrt(root) <= 0:
+        return np.inf
+    return float(-rest / (double + np.sqrt(root)))

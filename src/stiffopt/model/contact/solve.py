@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from functools import cached_property
 
@@ -64,16 +64,19 @@ class ContactProblem:
 
     # -- Newton's method --------------------------------------------------------------------
 
-    def correct(self, state: Contacts) -> LeaningArm | None:
-        """Find the equilibrium in which exactly the given contacts are closed; None if not near."""
+    def correct(self, state: Contacts, sticking: Collection[int] = ()) -> LeaningArm | None:
+        """Find the equilibrium in which exactly the given contacts are closed; None if not near.
+
+        The points of the body at sticking contacts do not slip on the way there, to first order.
+        """
         sections = self.rod.sections(state.condition)
         native = self._native
-        if native is not None and len(state.touches) <= MOST_CONTACTS:
+        if native is not None and len(state.touches) <= MOST_CONTACTS and not sticking:
             return self._correct_in_c(native, state, sections)
         previous = np.inf
         for iteration in range(_MAX_ITERATIONS):
             with np.errstate(over="ignore", invalid="ignore"):  # where it diverges; refused below
-                system = ContactSystem(self, state, sections)
+                system = ContactSystem(self, state, sections, sticking=sticking)
                 try:
                     solution = system.solution()
                 except np.linalg.LinAlgError:
@@ -83,27 +86,49 @@ class ContactProblem:
             if not size <= _FARTHEST_TURN or (iteration > 3 and size > previous):  # NaN too
                 return None
             share = min(1.0, _LARGEST_TURN / max(size, _TURN_LEFT))
-            changes, solution = share * changes, share * solution
-            turns = changes[:, TURN, 0]
-            q = turned(state.nodes.quaternion, turns)
-            nodes = RodNodes(q, state.nodes.moment + changes[:, MOMENT, 0])
-            touches, slide = self._moved(state, system, solution[:, 0])
-            is_same = _is_same(touches, state.touches)
-            before, stations = (
-                np.array([t.station for t in each]) for each in (state.touches, touches)
+            state, slide, is_same = self._stepped(
+                system, share * changes[..., 0], share * solution[:, 0]
             )
-            mesh = self.rod.moved(state.mesh, stations - before) if is_same else None
-            if mesh is None:
-                mesh = self.rod.mesh(stations)
-                nodes = interpolated(nodes, _at_moved(state, touches), mesh)
-                previous = np.inf
-            else:
-                previous = max(size, _TURN_LEFT)
-            state = Contacts(state.condition, mesh, nodes, touches)
+            previous = max(size, _TURN_LEFT) if is_same else np.inf
             if is_same and size < _TURN_LEFT and slide < _SLIDE_LEFT:
                 system.state = state
                 return system
         return None
+
+    def _stepped(
+        self, system: ContactSystem, changes: Vector, solution: Vector
+    ) -> tuple[Contacts, float, bool]:
+        """Return the state after changes (N + 1, 9) of nodes and (u,) of the unknowns.
+
+        Also how far contacts should move along the arm, and whether the mesh is still the same.
+        """
+        state = system.state
+        q = turned(state.nodes.quaternion, changes[:, TURN])
+        nodes = RodNodes(q, state.nodes.moment + changes[:, MOMENT])
+        touches, slide = self._moved(state, system, solution)
+        before, stations = (
+            np.array([t.station for t in each]) for each in (state.touches, touches)
+        )
+        is_same = _is_same(touches, state.touches)
+        mesh = self.rod.moved(state.mesh, stations - before) if is_same else None
+        if mesh is None:
+            is_same, mesh = False, self.rod.mesh(stations)
+            nodes = interpolated(nodes, _at_moved(state, touches), mesh)
+        return Contacts(state.condition, mesh, nodes, touches), slide, is_same
+
+    def pushed(
+        self, arm: LeaningArm, system: ContactSystem, solution: Vector, push: Vector
+    ) -> LeaningArm | None:
+        """Find the equilibrium after a small push (6,) at the tip, with contacts that stick.
+
+        Parameters
+        ----------
+        system, solution : the equations for forces at the tip, and their solution (u, 6).
+        """
+        changes, _ = system.along(solution)
+        state, _, _ = self._stepped(system, changes @ push, solution @ push)
+        condition = state.condition._replace(dead=state.condition.dead + push)
+        return self.correct(state._replace(condition=condition), system.sticking)
 
     @property
     def _native(self) -> NativeContacts | None:
@@ -143,6 +168,7 @@ class ContactProblem:
             moved = replace(
                 touch,
                 force=touch.force + solution[first : first + 3],
+                moment=touch.moment + solution[first + 3 : first + 6],
                 normal_force=touch.normal_force + float(solution[u + j]),
                 station=touch.station + slides[-1],
             )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -45,6 +45,7 @@ class Touch:
     force : on the arm (3,), in N.
     normal_force : in N.
     drag : friction's force (3,) per normal force, for a sliding contact.
+    moment : on the centre line (3,), in N m, of a force that a sticking contact has at the surface.
     crossings : how often it moved from one range to the next during the search.
     """
 
@@ -55,6 +56,7 @@ class Touch:
     force: Vector
     normal_force: float
     drag: Vector
+    moment: Vector = field(default_factory=lambda: np.zeros(3))
     crossings: int = 0
 
 
@@ -180,12 +182,14 @@ class ContactSystem(LeaningArm):
     ) -> None:
         touches, k = state.touches, len(state.touches)
         forces = np.array([touch.force for touch in touches]).reshape(k, 3)
-        self.loads = PointLoads(forces, np.zeros((k, 3)))
+        moments = np.array([touch.moment for touch in touches]).reshape(k, 3)
+        self.loads = PointLoads(forces, moments)
         self.linear = linear = LinearRod(
             problem.rod, state.condition, sections, state.mesh, state.nodes, self.loads, extras
         )
         u = linear.unknowns
         size, width = u + k, linear.changes.shape[2] - u
+        self._seeks, self.sticking = extras == "defects", sticking
         self.matrix, self.right = np.zeros((size, size)), np.zeros((size, width))
         super().__init__(problem, state, linear, [])
         changes = []
@@ -213,8 +217,9 @@ class ContactSystem(LeaningArm):
             if linear.section_slopes is not None:
                 here = problem.rod.ranges[touch.range]
                 self.right[u + j] += linear.section_slopes[2][here.segment]
-            if extras == "defects":
+            if self._seeks:
                 self.right[force, 0] += touch.normal_force * (n + touch.drag) - touch.force
+                self.right[moment, 0] -= touch.moment
                 self.right[first + 6, 0] -= 0 if touch.pinned else row.slope
                 self.right[u + j, 0] -= row.gap
             if j in sticking:
@@ -253,6 +258,7 @@ class ContactSystem(LeaningArm):
         across = np.linalg.svd(n[None])[2][1:]
         force, moment = slice(first, first + 3), slice(first + 3, first + 6)
         self.matrix[force], self.matrix[moment] = 0, 0
+        self.right[force], self.right[moment] = 0, 0
         # the normal force is the component along the normal, which turns
         along = touch.force @ H @ linear.moves[node]
         self._require(first, along)
@@ -261,9 +267,12 @@ class ContactSystem(LeaningArm):
         self._require(slice(first + 1, first + 3), across @ slip)
         # the force acts at the surface
         turning = -row.radius * hat(touch.force) @ H @ linear.moves[node]
-        self._require(moment, -turning)
+        self._require(moment, turning)
         self.matrix[moment, moment] += np.eye(3)
         self.matrix[moment, force] -= hat(lever)
+        if self._seeks:
+            self.right[first, 0] += touch.normal_force - n @ touch.force
+            self.right[moment, 0] += np.cross(lever, touch.force) - touch.moment
 
     def solution(self) -> Vector:
         """Return the unknowns (u, e) for each extra."""
