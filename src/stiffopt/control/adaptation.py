@@ -239,17 +239,17 @@ class Adaptation:
         """Return the relative standard deviation of the model's stiffness at pressures (n,).
 
         It contains the difference between the estimate and the model, which has the `applied`
-        coordinates (k,), and the error of the strain law. That error is of second order in the
-        strains, which are larger in an arm that is softer than its file says.
+        coordinates (k,), and the error of the strain law. That error grows with the strains, which
+        are larger in an arm that is softer than its file says.
         """
-        count = len(self._parameters)
+        t, count = self._tuning, len(self._parameters)
         k, _, slopes = self._arm.stiffnesses(pressures[None], self.estimate[:count], measure)
         present, _, _ = self._arm.stiffnesses(pressures[None], applied[:count], measure)
         slope, pending = slopes[0] / k[0], math.log(present[0] / k[0])
         variance = max(float(slope @ self.covariance[:count, :count] @ slope), 0.0)
         weights = np.abs(slope[self._moduli])
         softer = -float(weights @ self.estimate[self._moduli]) / max(float(weights.sum()), 1e-12)
-        law = self._tuning.stiffness_error * math.exp(2 * max(softer, 0.0))
+        law = t.stiffness_error * math.exp(t.strain_power * max(softer, 0.0))
         return math.sqrt(variance + law**2 + pending**2)
 
     def _linearised(

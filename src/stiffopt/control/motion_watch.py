@@ -259,12 +259,13 @@ class MotionWatch:
         least = self._min_motion / 2
         rests = float(np.linalg.norm(way[_INTENDED])) < least  # then the offset moves the arm
         explained = math.hypot(least, own) if rests else least + own
-        wrong = False
-        if float(np.linalg.norm(moved)) > explained + 6 * tuning.scatter:
+        distance, wrong = float(np.linalg.norm(moved)), False
+        if distance > explained + 6 * tuning.scatter:
             bent = turn_of_a_push(tip) @ moved
             missing = float(np.linalg.norm(bent - turned))
             size = float(np.linalg.norm(bent))
-            wrong = missing > tuning.slip * size and missing > tuning.least_turn
+            least_turn = math.hypot(tuning.least_turn, size * own / distance)
+            wrong = missing > tuning.slip * size and missing > least_turn
         self._slips = self._slips + 1 if wrong else 0
         if self._slips < tuning.slips:
             return None
@@ -275,12 +276,11 @@ class MotionWatch:
                 f"file is too {'high' if share > 0 else 'low'}, or the chambers do not get the "
                 "pressures that the gauges read; run 'stiffopt commission', then calibrate",
             )
-        distance = 1e3 * float(np.linalg.norm(moved))
         return Doubt(
             "slip",
-            f"the tip seems to have been displaced by {distance:.1f} mm without being turned, as "
-            "no push or payload does it: the sensor has slipped, or tracker or base have been "
-            "moved; run 'stiffopt commission'",
+            f"the tip seems to have been displaced by {1e3 * distance:.1f} mm without being "
+            "turned, as no push or payload does it: the sensor has slipped, or tracker or base have "
+            "been moved; run 'stiffopt commission'",
         )
 
     def _share(self, moved: Array, way: Array) -> float:

@@ -155,7 +155,10 @@ class AdaptationTuning:
     position_error: float = 1e-3
     model_error: float = 0.04
     angle_error: float = 0.02
-    stiffness_error: float = 0.05  # of the stiffness at the strains of the file's arm, relative
+    # of the stiffness at the strains of the file's arm, relative; power of the strains with which
+    # it grows, from simulated silicone
+    stiffness_error: float = 0.05
+    strain_power: float = 3.0
     reach: float = 5e4  # distance in pressure over which the discrepancy is correlated, in Pa
     memory: float = 1800.0  # time in which the deviation of a window's error grows e-fold, in s
     # change of an applied number, in prior deviations, below which it stays; largest one in a step
