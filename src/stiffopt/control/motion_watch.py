@@ -273,14 +273,15 @@ class MotionWatch:
             return Doubt(
                 "weak",
                 f"the tip moves {1 + share:.2f} times as far as modelled: the modulus in the robot "
-                f"file is too {'high' if share > 0 else 'low'}, or the chambers do not get the "
-                "pressures that the gauges read; run 'stiffopt commission', then calibrate",
+                f"file is too {'high' if share > 0 else 'low'}, the chambers do not get the "
+                "pressures that the gauges read, or channels are swapped; run 'stiffopt "
+                "commission'",
             )
         return Doubt(
             "slip",
             f"the tip seems to have been displaced by {1e3 * distance:.1f} mm without being "
-            "turned, as no push or payload does it: the sensor has slipped, or tracker or base have "
-            "been moved; run 'stiffopt commission'",
+            "turned, as no push or payload does it: the sensor has slipped, or tracker or base "
+            "have been moved; run 'stiffopt commission'",
         )
 
     def _share(self, moved: Array, way: Array) -> float:
