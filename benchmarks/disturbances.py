@@ -49,6 +49,7 @@ AFTER, END = 3.0, 16.0  # s: at the second target, and until a hold has ended
 DOUBTS = (
     "no-response",
     "slip",
+    "weak",
     "drift",
     "swing",
     "implausible",
@@ -262,7 +263,8 @@ def run_row(case: Case, row: Row, dynamics: str) -> Outcome:
             if run.loop.snapshot().state is State.HOLDING:
                 run.go(1.0)
         events, _ = run.loop.events.since(0)
-        told = [event for event in events if event.kind in DOUBTS]
+        kinds = DOUBTS if row.is_fault else DOUBTS[:-1]  # what is pushed may reach less
+        told = [event for event in events if event.kind in kinds]
         return Outcome(
             told=told[0].time - begin if told else np.inf,
             kind=told[0].kind if told else "",

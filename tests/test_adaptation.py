@@ -136,12 +136,15 @@ def test_numbers_come_nearer_to_those_of_the_arm_and_their_intervals_hold_them()
     assert told["base.tilt_x"].deviation == pytest.approx(deviations[11])
     assert "tip_mass" not in told  # without gravity it is not seen
     there, true = adaptation._with(adaptation.estimate), arm_at(TRUTH)
+    applied, p = adaptation.estimate, POSTURES[0]
+    narrow = adaptation.deviation(p, LATERAL, applied)
+    assert adaptation.deviation(p, LATERAL, 0.8 * applied) > narrow  # not applied yet
     for p in POSTURES:
         pose, _, compliance = true.at(p)
         k = so.load_robot(there).stiffness(p, LATERAL.direction)
         ratio = k * (pose[0, :3] @ compliance[:3, :3] @ pose[0, :3])
         assert ratio == pytest.approx(1, abs=0.1)
-        assert abs(np.log(ratio)) < 2 * adaptation.deviation(p, LATERAL)
+        assert abs(np.log(ratio)) < 2 * adaptation.deviation(p, LATERAL, applied)
 
 
 def test_one_posture_tells_no_more_a_thousand_times() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -98,6 +99,20 @@ def test_a_hold_stops_the_arm_where_the_chambers_are_and_not_where_the_commands_
     arm.ticks(30)
     assert held < 1.0
     assert arm.world.pressures[0] < inside[0] + 1e4
+
+
+def test_a_doubt_undoes_the_latest_motion_or_a_share_of_it() -> None:
+    held = []
+    for undo in (0.0, 0.5, 1.0):
+        arm = Lab(safety={"hold_timeout": TIMEOUT}, supply={"driver": "simulated", "lag": 0.1})
+        arm.controller.wanted = np.array([1e5, 0.0, 0.0])
+        arm.ticks(10)
+        arm.controller.said = (replace(DOUBT[0], undo=undo),)
+        arm.until(State.HOLDING)
+        arm.ticks(30)
+        held.append(arm.loop.snapshot().commanded[0])
+    assert held[1] == pytest.approx((held[0] + held[2]) / 2, rel=0.2)
+    assert held[2] < 0.5 * held[0]
 
 
 def test_a_hold_never_commands_more_than_was_commanded_whatever_a_gauge_reads() -> None:

@@ -108,7 +108,17 @@ def test_a_tip_that_does_not_move_when_it_should_is_doubted_after_a_few_millimet
     assert doubt is not None
     assert doubt.kind == "no-response"
     assert "sensor has come off" in doubt.text
+    assert doubt.undo < 1
     assert moved(time) < 0.018
+
+
+def test_a_tip_that_moves_along_its_axis_does_not_lie_still() -> None:
+    axis, aside, moved = TIP.pose[:3, 2], TIP.pose[:3, 0], step(1.0, lag=0.3)
+
+    def model(t: float) -> Array:
+        return moved(t) * (0.06 * axis + 0.008 * aside)
+
+    assert watched(4, lambda t: moved(t) * 0.06 * axis, model, model)[1] is None
 
 
 def test_the_swing_that_a_motion_excites_does_not_excuse_a_tip_that_lies_still() -> None:
@@ -134,6 +144,7 @@ def test_feedback_that_moves_the_tip_away_is_doubted() -> None:
     )  # fmt: skip
     assert doubt is not None
     assert doubt.kind == "no-response"
+    assert doubt.undo == 1
     assert away(time) < 0.009
 
 
@@ -234,6 +245,22 @@ def test_a_displacement_that_turns_nothing_is_a_slip(turned: float) -> None:
     assert "sensor has slipped" in doubt.text
 
 
+@pytest.mark.parametrize(("response", "words"), [(0.5, "too low"), (1.6, "too high")])
+def test_an_arm_that_moves_less_or_farther_than_modelled_is_no_slipped_sensor(
+    response: float, words: str
+) -> None:
+    moved, watch = step(0.06, lag=0.3), MotionWatch(ROBOT.description, MotionTuning())
+    for time in np.arange(0.0, 4.0, FRAME):
+        way = moved(time) * X
+        offset = np.concatenate([(response - 1) * way, np.zeros(3)])
+        watch.intend(time, way)
+        take(watch, time, response * way, way, offset)
+    assert watch.doubt is not None
+    assert watch.doubt.kind == "weak"
+    assert f"{response:.2f} times as far" in watch.doubt.text
+    assert words in watch.doubt.text
+
+
 def slowly(t: float) -> float:
     return min(max(t - 1.0, 0.0) / 2.0, 1.0)
 
@@ -241,6 +268,24 @@ def slowly(t: float) -> float:
 @pytest.mark.parametrize(("turned", "force"), [(0.0, 0.7), (1.0, 2.0)])
 def test_a_displacement_that_grows_as_no_usual_push_is_doubted(turned: float, force: float) -> None:
     assert displaced(turned, force, slowly) is not None
+
+
+def test_a_drift_that_turns_nothing_is_doubted_though_the_posture_follows_it() -> None:
+    """The plan moves the segments against each other while feedback makes up for the drift."""
+    proximal = np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
+    way = np.linalg.pinv(J * proximal) @ X - np.linalg.pinv(J * (1 - proximal)) @ X
+    watch = MotionWatch(ROBOT.description, MotionTuning())
+    for time in np.arange(0.0, 4.0, FRAME):
+        drift = 5e-3 * max(time - 1.0, 0.0)
+        offset = np.concatenate([drift * Y, [0.0, 0.0, 1e-9]])
+        pressures = np.linalg.pinv(J) @ -offset[:3] + way * 0.8 * drift
+        watch.intend(time, np.zeros(3))
+        watch.take(time, np.zeros(3), -offset[:3], offset, pressures, TIP, turns=True)
+        if watch.doubt is not None:
+            break
+    assert watch.doubt is not None
+    assert watch.doubt.kind == "slip"
+    assert time < 2.0
 
 
 def test_a_push_that_grows_slowly_is_no_drift() -> None:

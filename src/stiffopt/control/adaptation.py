@@ -93,6 +93,7 @@ class Learning:
         self._description, self._tuning = description, tuning
         self._adaptation: Adaptation | None = None
         self._last: tuple[tuple[Window, ...], Adapted | None] = (), None  # of `estimate`
+        self._applied: Array = np.zeros(0)  # coordinates (k,) of the present model
         self._deviation = math.nan
         self._deviation_of: tuple[DirectionalMeasure, Array] | None = None  # and pressures (n,)
         self._last_plan: Array | None = None  # pressures (n,)
@@ -109,13 +110,12 @@ class Learning:
             return None
         if self._adaptation is None:
             self._adaptation = Adaptation(self._description, self._tuning)
-        adaptation = self._adaptation
+        adaptation, self._deviation_of = self._adaptation, None
         if windows is not before[0]:
-            self._deviation_of = None
             with suppress(StiffoptError, LinAlgError):  # numbers without an equilibrium
                 adaptation.take(windows, tip)
-        applied = adaptation.none_applied if adapted is None else adapted.applied
-        return Estimate(adaptation.report(), adaptation.step_from(applied))
+        self._applied = adaptation.none_applied if adapted is None else adapted.applied
+        return Estimate(adaptation.report(), adaptation.step_from(self._applied))
 
     def deviation(self, pressures: Array, measure: DirectionalMeasure) -> float:
         """Return the relative deviation of a stiffness at a plan's pressures (n,); NaN if unknown.
@@ -132,7 +132,7 @@ class Learning:
         if last is None or last[0] != measure or far > self._tuning.elsewhere:
             self._deviation_of, self._deviation = (measure, pressures), math.nan
             with suppress(StiffoptError):
-                self._deviation = self._adaptation.deviation(pressures, measure)
+                self._deviation = self._adaptation.deviation(pressures, measure, self._applied)
         return self._deviation
 
 
@@ -155,6 +155,7 @@ class Adaptation:
         self._gravity = np.array(description.gravity)
         self._has_mass = bool(self._gravity.any())
         gains = not is_as_drawn(description)
+        self._moduli = [index for index, key in enumerate(keys) if key.endswith(_APPLIED[0])]
         self._applies = np.zeros(len(self._prior), dtype=bool)
         for index, key in enumerate(keys):
             name = key.split("].", 1)[1]
@@ -234,15 +235,22 @@ class Adaptation:
             found.append(AdaptedNumber(name, float(self.estimate[at]), deviations[at]))
         return tuple(found)
 
-    def deviation(self, pressures: Array, measure: DirectionalMeasure) -> float:
-        """Return the relative standard deviation of the stiffness at pressures (n,)."""
-        k, _, slopes = self._arm.stiffnesses(
-            pressures[None], self.estimate[: len(self._parameters)], measure
-        )
-        slope = slopes[0] / k[0]
-        count = len(slope)
-        variance = slope @ self.covariance[:count, :count] @ slope
-        return math.sqrt(max(float(variance), 0.0) + self._tuning.stiffness_error**2)
+    def deviation(self, pressures: Array, measure: DirectionalMeasure, applied: Array) -> float:
+        """Return the relative standard deviation of the model's stiffness at pressures (n,).
+
+        It contains the difference between the estimate and the model, which has the `applied`
+        coordinates (k,), and the error of the strain law. That error grows with the strains, which
+        are larger in an arm that is softer than its file says.
+        """
+        t, count = self._tuning, len(self._parameters)
+        k, _, slopes = self._arm.stiffnesses(pressures[None], self.estimate[:count], measure)
+        present, _, _ = self._arm.stiffnesses(pressures[None], applied[:count], measure)
+        slope, pending = slopes[0] / k[0], math.log(present[0] / k[0])
+        variance = max(float(slope @ self.covariance[:count, :count] @ slope), 0.0)
+        weights = np.abs(slope[self._moduli])
+        softer = -float(weights @ self.estimate[self._moduli]) / max(float(weights.sum()), 1e-12)
+        law = t.stiffness_error * math.exp(t.strain_power * max(softer, 0.0))
+        return math.sqrt(variance + law**2 + pending**2)
 
     def _linearised(
         self, windows: Sequence[Window], z: Array, tip: TipModel

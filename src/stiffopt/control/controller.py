@@ -562,7 +562,8 @@ class TipController:
             )
             notices = (*notices, Notice("implausible", text, Severity.ERROR, standing=True))
         if doubt := self._arm.watch.doubt:
-            notices = (*notices, Notice(doubt.kind, doubt.text, Severity.ERROR, True, hold=True))
+            held = Notice(doubt.kind, doubt.text, Severity.ERROR, True, True, doubt.undo)
+            notices = (*notices, held)
         return notices
 
     def _away(self) -> tuple[float, float] | None:

@@ -53,6 +53,7 @@ class Notice:
     severity: Severity = Severity.WARNING  # how bad it is
     standing: bool = False  # an alarm while the controller repeats it; otherwise an event
     hold: bool = False  # whether to hold the pressures until there is a new task
+    undo: float = 1.0  # share of the latest motion that this hold undoes
 
 
 class Controller(Protocol):

@@ -5,7 +5,8 @@ look for what no push, payload or model error explains:
 
 * response: r has moved, but y has not moved along with s, or has moved elsewhere;
 * slip: the estimator's offset d has changed, but the orientation's offset has not turned as
-  bending by d turns an arm: by about 3 d / (2 length), or at least two thirds of that;
+  bending by d turns an arm: by about 3 d / (2 length), or at least two thirds of that; if d has
+  changed along the motion of s, the arm is weaker or softer than modelled;
 * drift: y - s keeps moving, faster than the model's error can change while s moves;
 * swing: y - r oscillates, and does not decay.
 
@@ -16,6 +17,7 @@ even if segments move the tip in opposite directions.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from dataclasses import dataclass
 from itertools import pairwise
@@ -42,12 +44,14 @@ class Doubt:
 
     Attributes
     ----------
-    kind : ``no-response``, ``slip``, ``drift`` or ``swing``.
+    kind : ``no-response``, ``slip``, ``weak``, ``drift`` or ``swing``.
     text : the likeliest causes and what to do, for people.
+    undo : share of the latest motion that a hold should undo.
     """
 
     kind: str
     text: str
+    undo: float = 1.0
 
 
 class MotionWatch:
@@ -202,16 +206,17 @@ class MotionWatch:
         most, moved = 1e3 * missed[0], 1e3 * missed[1]
         text = f"the tip should have moved by {most:.1f} mm and was seen to move by {moved:.1f} mm"
         if moved < most / 2:
-            causes = (
-                "its sensor has come off, the tracker is late, the arm is blocked, or it does not "
-                "get its pressures; look at the sensor and the tubes"
+            return Doubt(
+                "no-response",
+                f"{text}: its sensor has come off, the tracker is late, the arm is blocked, or it "
+                "does not get its pressures; look at the sensor and the tubes",
+                self._tuning.undo_unseen,
             )
-        else:
-            causes = (
-                "another way: channels are swapped, the tracker's frame is turned, the sensor has "
-                "slipped, or something pushes the arm; run 'stiffopt commission'"
-            )
-        return Doubt("no-response", f"{text}{':' if moved < most / 2 else ''} {causes}")
+        return Doubt(
+            "no-response",
+            f"{text} another way: channels are swapped, the tracker's frame is turned, the sensor "
+            "has slipped, or something pushes the arm; run 'stiffopt commission'",
+        )
 
     def _missed(self, rows: Array, jacobian: Array, P: Array) -> tuple[float, float] | None:
         """Return lengths of the model's way and of the seen one where they do not fit, in m.
@@ -237,9 +242,8 @@ class MotionWatch:
         swing = tuning.swing_error * driven + rows[suspects, _FREE]
         # summed along the way, on which segments may have moved the tip in opposite directions
         own = np.cumsum(self._explained(steps, jacobian)[::-1])[::-1][suspects]
-        moved = np.sqrt((seen[suspects] ** 2).sum(axis=1))
-        lies = moved < tuning.still * distance[suspects]
-        own[lies] = 0.0  # a wrong model would move it somewhere
+        moved, model = ((ways[suspects, part] ** 2).sum(axis=1) for part in (_SEEN, _PREDICTED))
+        own[moved < tuning.still**2 * model] = 0.0  # a wrong model would move it somewhere
         explained = own + late + swing + tuning.noise + 6 * tuning.scatter
         missed = suspects[off > explained]
         if not len(missed):
@@ -252,22 +256,44 @@ class MotionWatch:
         way = rows[-1] - rows[0]
         moved, turned = way[_OFFSET], way[_TURN]
         own = float(self._explained(np.diff(rows, axis=0), jacobian).sum())
-        wrong = False
-        if float(np.linalg.norm(moved)) > self._min_motion / 2 + own + 6 * tuning.scatter:
+        least = self._min_motion / 2
+        rests = float(np.linalg.norm(way[_INTENDED])) < least  # then the offset moves the arm
+        explained = math.hypot(least, own) if rests else least + own
+        distance, wrong = float(np.linalg.norm(moved)), False
+        if distance > explained + 6 * tuning.scatter:
             bent = turn_of_a_push(tip) @ moved
             missing = float(np.linalg.norm(bent - turned))
             size = float(np.linalg.norm(bent))
-            wrong = missing > tuning.slip * size and missing > tuning.least_turn
+            least_turn = math.hypot(tuning.least_turn, size * own / distance)
+            wrong = missing > tuning.slip * size and missing > least_turn
         self._slips = self._slips + 1 if wrong else 0
         if self._slips < tuning.slips:
             return None
-        distance = 1e3 * float(np.linalg.norm(moved))
+        if share := self._share(moved, way[_PREDICTED]):
+            return Doubt(
+                "weak",
+                f"the tip moves {1 + share:.2f} times as far as modelled: the modulus in the robot "
+                f"file is too {'high' if share > 0 else 'low'}, the chambers do not get the "
+                "pressures that the gauges read, or channels are swapped; run 'stiffopt "
+                "commission'",
+            )
         return Doubt(
             "slip",
-            f"the tip seems to have been displaced by {distance:.1f} mm without being turned, as "
-            "no push or payload does it: the sensor has slipped, or tracker or base have been "
-            "moved; run 'stiffopt commission'",
+            f"the tip seems to have been displaced by {1e3 * distance:.1f} mm without being "
+            "turned, as no push or payload does it: the sensor has slipped, or tracker or base "
+            "have been moved; run 'stiffopt commission'",
         )
+
+    def _share(self, moved: Array, way: Array) -> float:
+        """Return the change of the offset (3,) as a share of the model's way (3,).
+
+        0 if it is not mostly along that way, or too large for an error of the model: feedback that
+        makes up for a slip moves s by as much.
+        """
+        tuning, share = self._tuning, float(moved @ way) / max(float(way @ way), 1e-12)
+        aside = float(np.linalg.norm(moved - share * way))
+        is_along = aside < tuning.aside * float(np.linalg.norm(moved))
+        return share if is_along and abs(share) < tuning.largest_error else 0.0
 
     def _drift(self, jacobian: Array, bending: Array | None) -> Doubt | None:
         """Test whether the tip keeps moving without a cause in the pressures.

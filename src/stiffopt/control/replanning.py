@@ -228,6 +228,8 @@ class Replanner:
             message, task = plan.message, self.pursuit.task
             if plan.far and away is not None and task is not None:
                 message = nearest_words(*away, task.target.tolerance)
+            elif plan.far:
+                message += " by the model"
             text = f"the target cannot be reached: {message}"
             notices = (*notices, Notice("unreachable", text, standing=True))
         if plan is not None and plan.doubt:

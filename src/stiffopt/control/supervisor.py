@@ -37,10 +37,14 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class _Hold:
-    """The reason for holding the pressures; only a request ends a `lasting` hold."""
+    """The reason for holding the pressures; only a request ends a `lasting` hold.
+
+    `undo` is the share of the latest motion to undo.
+    """
 
     reason: str
     lasting: bool = False
+    undo: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -326,13 +330,13 @@ class Supervisor:
 
         Chambers lag behind rising commands, so these are the measured pressures. Whatever the
         gauges read, none is above the last command or below all recent ones. A motion that is
-        doubted is undone: the pressures are the lowest of the recent ones.
+        doubted is undone, wholly or by a share: the pressures are nearer to the lowest recent ones.
         """
         last, lowest = np.minimum(self._requested, self.commanded), np.min(self._recent, axis=0)
-        if "doubt" in self._holds:
-            return np.asarray(np.minimum(last, lowest))
         measured = np.maximum(self.reading.pressures, lowest)
         held: Array = np.fmin(measured, last)  # ignores NaN: not measured
+        if (doubt := self._holds.get("doubt")) is not None:
+            held = held + doubt.undo * (np.minimum(last, lowest) - held)
         return held
 
     def _end_a_long_hold(self, now: float) -> None:
@@ -385,7 +389,7 @@ class Supervisor:
             else:
                 self.events.add(now, notice.kind, notice.text, notice.severity)
             if notice.hold and self.lifecycle.armed and "doubt" not in self._holds:
-                self._hold(now, "doubt", notice.text)
+                self._hold(now, "doubt", notice.text, undo=notice.undo)
                 if now - self._doubted_at < self._tuning.doubt_memory:
                     self._let_down(now, "doubt-again", f"again: {notice.text}")
                 self._doubted_at = now
@@ -395,12 +399,14 @@ class Supervisor:
 
     # -- transitions --------------------------------------------------------------------------
 
-    def _hold(self, now: float, kind: str, reason: str, *, lasting: bool = False) -> None:
+    def _hold(
+        self, now: float, kind: str, reason: str, *, lasting: bool = False, undo: float = 0.0
+    ) -> None:
         if kind not in self._holds:
             self.events.add(now, f"hold-{kind}", f"pressures are held: {reason}", Severity.WARNING)
         if not lasting and now - self._held_until > self._tuning.hold_memory:
             self._held_since = now
-        self._holds[kind] = _Hold(reason, lasting)
+        self._holds[kind] = _Hold(reason, lasting, undo)
         if self.lifecycle.state is State.ACTIVE:
             self._held = None
             self.lifecycle.change(State.HOLDING, reason)

@@ -55,7 +55,7 @@ class RegulatorTuning:
     make_up_share: float = 0.8
     # its time constant, in s: slower than the pressure monitor, which finds sudden leaks
     make_up_time: float = 1.0
-    alarm_share: float = 0.5  # share of that shortfall above which there is an alarm
+    alarm_share: float = 0.3  # share of that shortfall above which there is an alarm
     reading_time: float = 0.1  # time constant that smooths readings, in s
     patience: float = 0.5  # time for which a channel must be short, or above, in s
     follows: float = 3e3  # distance from a command, in Pa, at which a regulator follows
@@ -155,7 +155,10 @@ class AdaptationTuning:
     position_error: float = 1e-3
     model_error: float = 0.04
     angle_error: float = 0.02
-    stiffness_error: float = 0.05  # of the stiffness, relative
+    # of the stiffness at the strains of the file's arm, relative; power of the strains with which
+    # it grows, from simulated silicone
+    stiffness_error: float = 0.05
+    strain_power: float = 3.0
     reach: float = 5e4  # distance in pressure over which the discrepancy is correlated, in Pa
     memory: float = 1800.0  # time in which the deviation of a window's error grows e-fold, in s
     # change of an applied number, in prior deviations, below which it stays; largest one in a step
@@ -270,6 +273,9 @@ class MotionTuning:
     # share of the amplitude of the vibration that the pressures excite, whose phase may be wrong
     swing_error: float = 0.35
     misses: int = 2  # successive samples that show no response
+    # share of the latest motion that a hold undoes where the tip was not seen to move: the arm has
+    # followed its pressures about so far, and then swings least
+    undo_unseen: float = 0.5
     slip_window: float = 1.0  # in which a slip is looked for, in s
     # share of the turn that a push would cause by which the measured turn must miss it
     slip: float = 0.7
@@ -277,6 +283,10 @@ class MotionTuning:
     # displacement up to which a drift that turns the tip as a push does is a push that grows, in m
     largest_push: float = 8e-3
     slips: int = 4  # successive samples that show a slip
+    # an arm that responds otherwise than modelled explains a displacement: share of it that may be
+    # across the model's motion, and its largest share of that motion
+    aside: float = 0.5
+    largest_error: float = 0.85
     scales: tuple[DriftScale, ...] = (
         DriftScale(0.25, 5, 2e-3),
         DriftScale(1.0, 5, 6e-4),
