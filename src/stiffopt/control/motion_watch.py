@@ -197,9 +197,11 @@ class MotionWatch:
         Motion is compared in space, and then without its part along the tip's axis (3,), so that a
         long elongation does not hide a wrong direction across it.
         """
-        rows = self._since(self._tuning.response_window)
-        across = np.eye(3) - np.outer(axis, axis)
-        missed = self._missed(rows, jacobian, np.eye(3)) or self._missed(rows, jacobian, across)
+        rows, missed = self._since(self._tuning.response_window), None
+        ways = rows[-1, _PREDICTED] - rows[:-1, _PREDICTED]
+        if ((ways**2).sum(axis=1) > self._min_motion**2).any():  # projections are no longer
+            across = np.eye(3) - np.outer(axis, axis)
+            missed = self._missed(rows, jacobian, np.eye(3)) or self._missed(rows, jacobian, across)
         self._misses = self._misses + 1 if missed else 0
         if missed is None or self._misses < self._tuning.misses:
             return None
@@ -255,12 +257,14 @@ class MotionWatch:
         tuning, rows = self._tuning, self._since(self._tuning.slip_window)
         way = rows[-1] - rows[0]
         moved, turned = way[_OFFSET], way[_TURN]
-        own = float(self._explained(np.diff(rows, axis=0), jacobian).sum())
         least = self._min_motion / 2
-        rests = float(np.linalg.norm(way[_INTENDED])) < least  # then the offset moves the arm
-        explained = math.hypot(least, own) if rests else least + own
         distance, wrong = float(np.linalg.norm(moved)), False
-        if distance > explained + 6 * tuning.scatter:
+        if distance > least + 6 * tuning.scatter:
+            own = float(self._explained(np.diff(rows, axis=0), jacobian).sum())
+            rests = float(np.linalg.norm(way[_INTENDED])) < least  # then the offset moves the arm
+            explained = math.hypot(least, own) if rests else least + own
+            wrong = distance > explained + 6 * tuning.scatter
+        if wrong:
             bent = turn_of_a_push(tip) @ moved
             missing = float(np.linalg.norm(bent - turned))
             size = float(np.linalg.norm(bent))
@@ -323,9 +327,11 @@ class MotionWatch:
         offsets = marks[:, _SEEN] - marks[:, _PREDICTED]
         drift = offsets[-1] - offsets[0]
         size = float(np.linalg.norm(drift))
+        least = scale.least_speed * scale.interval + 2 * self._tuning.scatter
+        if size < scale.count * least:  # the sum of the parts along it
+            return 0.0
         along = np.diff(offsets, axis=0) @ drift / max(size, 1e-9)
         explained = self._explained(np.diff(marks, axis=0), jacobian)
-        least = scale.least_speed * scale.interval + 2 * self._tuning.scatter
         if (along - explained < least).any() or self._is_push(marks[-1] - marks[0], bending):
             return 0.0
         return size / duration
