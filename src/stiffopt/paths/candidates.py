@@ -97,6 +97,8 @@ def lanes(
                 share = (point - here) / (there - here)
                 points.append(np.full(len(own), point))
                 guesses.append(live[kept] + share * (own - live[kept]))
+            if there in knots:  # leave room for new ones
+                own = own[: LANES.kept // 2]
             live = _spread(tasks, own, np.concatenate([born[there], new]))
             points.append(np.full(len(live), there))
             guesses.append(live)

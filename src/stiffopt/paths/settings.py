@@ -68,6 +68,7 @@ class RouteSettings:
     nearest : number of candidates to which crossings lead from another, for each length.
     rounds, rounds_in_scene : largest number of rounds in which crossings are computed, without and
         with a scene.
+    few_rounds : the same with a scene if a sequence is known already.
     first_rounds : the same before further configurations are added.
     repeats, few_repeats : largest number of searches for a sequence on which the body keeps clear:
         for the best one, and for any.
@@ -91,7 +92,8 @@ class RouteSettings:
     lengths: tuple[float, ...] = (1.0, 1.5, 2.5)
     nearest: int = 6
     rounds: int = 300
-    rounds_in_scene: int = 16
+    rounds_in_scene: int = 100
+    few_rounds: int = 16
     first_rounds: int = 8
     repeats: int = 100
     few_repeats: int = 20

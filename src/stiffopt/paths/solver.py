@@ -225,8 +225,7 @@ class _PathSolver:
         found: list[tuple[float, Route, Vector]] = []
         for route in routes:
             pressures = np.array([each.pressures for each in route.candidates])
-            near = route.value(self._over) > join(alone) + np.log(ROUTE.nearly_all)
-            if near or (self._path.scene is not None and self._over == "worst"):
+            if route.value(self._over) > join(alone) + np.log(ROUTE.nearly_all):
                 return route, pressures
             pressures = refined(
                 tasks, pressures, steps, self._over, self._fixed, self._body_check(tasks)
@@ -256,20 +255,22 @@ class _PathSolver:
             search = self._search(tasks, layers, steps)
             rounds = ROUTE.first_rounds
             if is_last and not any_will_do:
-                rounds = ROUTE.rounds_in_scene if has_scene else ROUTE.rounds
+                rounds = ROUTE.rounds
+                if has_scene:
+                    rounds = ROUTE.few_rounds if known else ROUTE.rounds_in_scene
             share = ROUTE.enough if attempt else None
             best = search.best(rounds, share=share, any_will_do=any_will_do)
             if best is not None:
                 best = search.relaxed(best, self._fixed)
                 if any_will_do or search.comes_up_to(best, ROUTE.enough):
                     return [best]
-            before = known[0].value(self._over) if known else -np.inf
             known += [each for each in (best, search.first) if each is not None]
             known.sort(key=lambda each: -each.value(self._over))
-            if is_last or (attempt > 1 and known and before > known[0].value(self._over) - 1e-2):
+            if is_last:
                 break
             regions = search.gaps(known[0] if known else None, attempt)
-            is_last = attempt == len(ROUTE.widths) - 1 or len(regions[0]) == len(tasks)
+            is_whole = len(regions[0]) == len(tasks)
+            is_last = attempt == len(ROUTE.widths) - 1 or (attempt > 0 and is_whole)
             self._set_lanes(tasks, layers, regions, attempt, known[:1])
         # another one, once refined, may become better than the best
         return known[: 1 if has_scene else ROUTE.refined]
@@ -482,8 +483,8 @@ class _PathSolver:
         if scene is not None and least is not None:
             length = display_units().length
             message += (
-                f" with the body clear. Between points {index + 1} and {index + 2} the clearance of "
-                f"the body falls to {length.text(least, '.3g')}; the scene asks for "
+                f" with the body clear. Between points {index + 1} and {index + 2} the clearance "
+                f"of the body falls to {length.text(least, '.3g')}; the scene asks for "
                 f"{length.text(scene.clearance, 'g')}"
             )
         else:
