@@ -56,21 +56,27 @@ def distinct(tasks: PathTasks, some: Iterable[PathCandidate]) -> list[PathCandid
 
 
 def lanes(
-    tasks: PathTasks, layers: Sequence[Sequence[PathCandidate]], region: range, attempt: int
+    tasks: PathTasks,
+    layers: Sequence[Sequence[PathCandidate]],
+    region: range,
+    attempt: int,
+    is_last: bool,
 ) -> list[list[PathCandidate]]:
     """Return further candidates of a free arm at each point, which need not be optimal.
 
     They lie in a region of the path.  At a few of its points, configurations are spread over all
     that reach the target, others for each attempt.  These and the local optima of all marks follow
-    the path, from mark to mark, with as little change as possible.  They connect branches where
-    the direct crossing would leave the path or touch an object.
+    the path, from mark to mark, with as little change as possible; those beside them are added,
+    unless this is the last attempt, which leaves more room for others.  They connect branches
+    where the direct crossing would leave the path or touch an object.
     """
     count = len(tasks)
     if tasks.robot.is_loaded:
         return [[] for _ in range(count)]
     many = min(len(region), LANES.marks, max(2 * LANES.knots, len(region) // LANES.every))
     marks = np.unique(np.linspace(region[0], region[-1], many).round().astype(int))
-    knots = marks[np.unique(np.linspace(0, len(marks) - 1, LANES.knots).round().astype(int))]
+    n_knots = LANES.last_knots if is_last else LANES.knots
+    knots = marks[np.unique(np.linspace(0, len(marks) - 1, n_knots).round().astype(int))]
     born = {
         mark: np.array([each.pressures for each in layers[mark]]).reshape(-1, len(tasks.unit))
         for mark in marks.tolist()
@@ -90,7 +96,8 @@ def lanes(
         for here, there in itertools.pairwise(order):
             checkpoint()
             aside = live + LANES.aside * tasks.unit * rng.uniform(-1, 1, live.shape)
-            came, arrived = tasks.clear(there, np.concatenate([live, aside]))
+            guess = live if is_last else np.concatenate([live, aside])
+            came, arrived = tasks.clear(there, guess)
             kept = arrived[: len(live)]
             own, new = came[: kept.sum()], came[kept.sum() :]
             for point in range(here, there, 1 if there > here else -1)[1:]:

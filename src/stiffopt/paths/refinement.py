@@ -59,11 +59,11 @@ def refined(
     passes = REFINEMENT.passes if body is None else 1  # longer windows come too near, as a rule
     for _ in range(passes):  # a window may be held back at its ends: a wider one then
         windows = [each for each in _windows(pressures, steps) if not _is_within(each, done)]
-        if done or body is not None:
-            if over == "worst":  # a window is worth its time where the worst point is in it
-                slopes = tasks.slopes(range(len(tasks)), pressures)
-                worst = -1 if slopes is None else int(slopes.costs.max(axis=1).argmax())
-                windows = [each for each in windows if worst in each]
+        if over == "worst" and (done or body is not None):
+            # a window is worth its time where the worst point is in it
+            slopes = tasks.slopes(range(len(tasks)), pressures)
+            worst = -1 if slopes is None else int(slopes.costs.max(axis=1).argmax())
+            windows = [each for each in windows if worst in each]
         if done:
             windows = [_wider(each, len(pressures)) for each in windows]
         for window in windows:

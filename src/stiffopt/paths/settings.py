@@ -33,8 +33,8 @@ class LaneSettings:
 
     Attributes
     ----------
-    knots : number of points of a region at which new configurations are spread over all that reach
-        the target.
+    knots, last_knots : number of points of a region at which new configurations are spread over all
+        that reach the target; the second in the last attempt.
     starts : number of samples that are brought to the target at each knot.
     kept : largest number of configurations that are followed in either direction.
     marks : largest number of points of a region at which they are followed, one after another.
@@ -46,8 +46,9 @@ class LaneSettings:
     """
 
     knots: int = 4
+    last_knots: int = 8
     starts: int = 128
-    kept: int = 32
+    kept: int = 40
     aside: float = 0.15
     apart: float = 0.1
     alike: float = 0.02

@@ -271,7 +271,7 @@ class _PathSolver:
             regions = search.gaps(known[0] if known else None, attempt)
             is_whole = len(regions[0]) == len(tasks)
             is_last = attempt == len(ROUTE.widths) - 1 or (attempt > 0 and is_whole)
-            self._set_lanes(tasks, layers, regions, attempt, known[:1])
+            self._set_lanes(tasks, layers, regions, attempt, is_last, known[:1])
         # another one, once refined, may become better than the best
         return known[: 1 if has_scene else ROUTE.refined]
 
@@ -304,6 +304,7 @@ class _PathSolver:
         layers: Sequence[Sequence[PathCandidate]],
         regions: Sequence[range],
         attempt: int,
+        is_last: bool,
         known: Sequence[Route],
     ) -> None:
         """Add further candidates in regions of the path, none where the pressures are given.
@@ -315,7 +316,7 @@ class _PathSolver:
             self._further = [[] for _ in layers]
             least = known[0].value("worst") if self._over == "worst" else least
         for region in regions:
-            for index, new in enumerate(lanes(tasks, layers, region, attempt)):
+            for index, new in enumerate(lanes(tasks, layers, region, attempt, is_last)):
                 if index not in self._fixed:
                     self._further[index] += [each for each in new if each.value > least]
         for route in known:
