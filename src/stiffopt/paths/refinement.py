@@ -170,7 +170,8 @@ class _Window:
         best, radius = state, REFINEMENT.radius
         weights = np.full(state.slopes.costs.shape, self._weight)
         pulls = np.zeros(state.slopes.residuals.shape)
-        for _ in range(REFINEMENT.iterations):
+        few = REFINEMENT.iterations_in_scene
+        for _ in range(REFINEMENT.iterations if self._scene is None else few):
             checkpoint()
             curvature = self._curvature(state, weights, pulls)
             found = self._step(state, curvature, radius)

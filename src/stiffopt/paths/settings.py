@@ -120,7 +120,7 @@ class RefinementSettings:
     ----------
     near : share of a rate from which on the rate counts as binding.
     margin : number of points added on either side of those where a rate binds.
-    iterations : largest number.
+    iterations, iterations_in_scene : largest number, without and with a scene.
     corrections : largest number for each step.
     radius : initial radius of the trust region, as a share of a channel's range.
     last_radius : radius below which the method stops.
@@ -138,6 +138,7 @@ class RefinementSettings:
     near: float = 0.9
     margin: int = 8
     iterations: int = 60
+    iterations_in_scene: int = 10
     corrections: int = 2
     radius: float = 0.1
     last_radius: float = 1e-3
