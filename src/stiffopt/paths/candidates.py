@@ -55,22 +55,38 @@ def distinct(tasks: PathTasks, some: Iterable[PathCandidate]) -> list[PathCandid
     return sorted(kept, key=lambda each: -each.value)[:most]
 
 
-def lanes(tasks: PathTasks) -> list[list[PathCandidate]]:
-    """Return further candidates at each point of a free arm, which need not be optimal.
+def lanes(
+    tasks: PathTasks,
+    layers: Sequence[Sequence[PathCandidate]],
+    region: range,
+    attempt: int,
+    is_last: bool,
+) -> list[list[PathCandidate]]:
+    """Return further candidates of a free arm at each point, which need not be optimal.
 
-    At a few points, configurations are spread over all that reach the target.  From there they
-    follow the path, from mark to mark, with as little change as possible.  They connect branches
-    where the direct crossing would leave the path.
+    They lie in a region of the path.  At a few of its points, configurations are spread over all
+    that reach the target, others for each attempt.  These and the local optima of all marks follow
+    the path, from mark to mark, with as little change as possible; those beside them are added,
+    unless this is the last attempt, which leaves more room for others.  They connect branches
+    where the direct crossing would leave the path or touch an object.
     """
     count = len(tasks)
     if tasks.robot.is_loaded:
         return [[] for _ in range(count)]
-    marks = np.unique(np.linspace(0, count - 1, min(count, LANES.marks)).round().astype(int))
-    knots = marks[np.unique(np.linspace(0, len(marks) - 1, LANES.knots).round().astype(int))]
+    many = min(len(region), LANES.marks, max(2 * LANES.knots, len(region) // LANES.every))
+    marks = np.unique(np.linspace(region[0], region[-1], many).round().astype(int))
+    n_knots = LANES.last_knots if is_last else LANES.knots
+    knots = marks[np.unique(np.linspace(0, len(marks) - 1, n_knots).round().astype(int))]
     born = {
-        knot: tasks.brought(np.full(LANES.starts, knot), tasks.near(knot, LANES.starts))[0]
-        for knot in knots.tolist()
+        mark: np.array([each.pressures for each in layers[mark]]).reshape(-1, len(tasks.unit))
+        for mark in marks.tolist()
     }
+    starts = LANES.starts * (attempt + 1)
+    for knot in knots.tolist():
+        near = tasks.near(knot, starts)[-LANES.starts :]
+        new, _ = tasks.clear(knot, near)
+        born[knot] = np.concatenate([born[knot], new])
+    rng = np.random.default_rng(attempt)
     points: list[NDArray[np.intp]] = []
     guesses: list[Vector] = []
     for order in (marks.tolist(), marks[::-1].tolist()):
@@ -79,13 +95,18 @@ def lanes(tasks: PathTasks) -> list[list[PathCandidate]]:
         guesses.append(live)
         for here, there in itertools.pairwise(order):
             checkpoint()
-            came, arrived = tasks.brought(np.full(len(live), there), live)
-            live = live[arrived]
+            aside = live + LANES.aside * tasks.unit * rng.uniform(-1, 1, live.shape)
+            guess = live if is_last else np.concatenate([live, aside])
+            came, arrived = tasks.clear(there, guess)
+            kept = arrived[: len(live)]
+            own, new = came[: kept.sum()], came[kept.sum() :]
             for point in range(here, there, 1 if there > here else -1)[1:]:
                 share = (point - here) / (there - here)
-                points.append(np.full(len(live), point))
-                guesses.append(live + share * (came - live))
-            live = _spread(tasks, came, born[there]) if there in born else came
+                points.append(np.full(len(own), point))
+                guesses.append(live[kept] + share * (own - live[kept]))
+            if there in knots:  # leave room for new ones
+                own = own[: LANES.kept // 2]
+            live = _spread(tasks, own, np.concatenate([born[there], new]))
             points.append(np.full(len(live), there))
             guesses.append(live)
     where = np.concatenate(points)

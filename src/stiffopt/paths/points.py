@@ -247,6 +247,19 @@ class PathTasks:
             x[going] = np.clip(x[going] + bounded_steps(J, -r, D, low, high), lower, upper)
         return x[is_at] * self.unit, is_at
 
+    def clear(self, index: int, pressures: Vector) -> tuple[Vector, Mask]:
+        """Move pressures (k, n) of a free arm to a nearby target; drop those in the scene's way.
+
+        Returns those that arrive, and a mask (k,) of which these are.
+        """
+        found, arrived = self.brought(np.full(len(pressures), index), pressures)
+        scene = self.tasks[0].scene
+        if scene is not None and len(found):
+            clear = self.robot.clearance(found, scene) >= scene.clearance
+            found = found[clear]
+            arrived[arrived] = clear
+        return found, arrived
+
     def _values(self, indices: NDArray[np.intp], pressures: Vector) -> Vector:
         """Return `PathCandidate.value` of pressures (k, n) of a free arm, each at its point."""
         if not self.programs[0].measures:

@@ -56,13 +56,15 @@ def refined(
         A window in which the body would not keep clear is left as it was.
     """
     done: list[range] = []
-    for _ in range(REFINEMENT.passes):  # a window may be held back at its ends: a wider one then
+    passes = REFINEMENT.passes if body is None else 1  # longer windows come too near, as a rule
+    for _ in range(passes):  # a window may be held back at its ends: a wider one then
         windows = [each for each in _windows(pressures, steps) if not _is_within(each, done)]
+        if over == "worst" and (done or body is not None):
+            # a window is worth its time where the worst point is in it
+            slopes = tasks.slopes(range(len(tasks)), pressures)
+            worst = -1 if slopes is None else int(slopes.costs.max(axis=1).argmax())
+            windows = [each for each in windows if worst in each]
         if done:
-            if over == "worst":  # a wider window is worth its time where the worst point is in it
-                slopes = tasks.slopes(range(len(tasks)), pressures)
-                worst = -1 if slopes is None else int(slopes.costs.max(axis=1).argmax())
-                windows = [each for each in windows if worst in each]
             windows = [_wider(each, len(pressures)) for each in windows]
         for window in windows:
             new = _Window(tasks, pressures, steps, over, window, set(fixed)).optimised()
@@ -168,7 +170,8 @@ class _Window:
         best, radius = state, REFINEMENT.radius
         weights = np.full(state.slopes.costs.shape, self._weight)
         pulls = np.zeros(state.slopes.residuals.shape)
-        for _ in range(REFINEMENT.iterations):
+        few = REFINEMENT.iterations_in_scene
+        for _ in range(REFINEMENT.iterations if self._scene is None else few):
             checkpoint()
             curvature = self._curvature(state, weights, pulls)
             found = self._step(state, curvature, radius)

@@ -174,6 +174,7 @@ class RouteSearch:
         self._ends: Sequence[int | None] = range(len(layers[0])) if is_closed else [None]
         self._usable = self._values
         self.first: Route | None = None
+        self._repeats = ROUTE.repeats
         self._set_links(self._all_steps())
 
     def best(
@@ -184,6 +185,7 @@ class RouteSearch:
         Crossings are computed in at most `rounds` rounds, until a sequence is about as good as
         possible, or has the given share of the single points' stiffness.
         """
+        self._repeats = ROUTE.repeats if not any_will_do else ROUTE.few_repeats
         hope = self._hope()
         best = self._best_of_ends(0, hope, share, any_will_do)
         if best is None or not (any_will_do or self._is_enough(best, hope, share)):
@@ -253,11 +255,142 @@ class RouteSearch:
         best = hope.worst if self._over == "worst" else hope.mean
         return route is not None and route.value(self._over) > best + np.log(share)
 
-    @property
-    def furthest(self) -> int:
-        """The last point that a sequence reaches."""
-        reached = np.isfinite(self._reached(-np.inf, bottleneck=True, computed=True)[0])
-        return int(self._point[reached].max(initial=0))
+    def beginning(self) -> list[PathCandidate]:
+        """Return the longest sequence of candidates from the first point on."""
+        links: list[int] = []
+        for _ in range(ROUTE.repeats):
+            reached, last = self._reached(-np.inf, bottleneck=False, computed=True)
+            known = np.flatnonzero(np.isfinite(reached))
+            known = known[self._point[known] == self._point[known[-1]]]
+            at = int(known[reached[known].argmax()])
+            links = []
+            while at >= self._first[1]:
+                links.append(int(last[at]))
+                at = int(self._links.origin[links[-1]])
+            links.reverse()
+            if not self._drops_blocked(links):
+                break
+        else:  # the part of the last one up to the first blocked link
+            kept = [self._links.worst[each] > -np.inf for each in links]
+            links = links[: kept.index(False)]
+        return self._route(_Sequence(at, links, -np.inf, 0.0)).candidates
+
+    def gaps(self, best: Route | None, attempt: int) -> list[range]:
+        """Return regions of the path in which no steps lead from candidate to candidate.
+
+        Only candidates count with which a sequence would be better than the best one so far.  In
+        the first attempt a region is where those that end and those that go on are nearest to each
+        other; later it has all points where there are both.  It is long enough for a change
+        between any two, and longer in later attempts.
+        """
+        alone = np.maximum.reduceat(self._values, self._first[:-1])
+        bar = np.full(len(alone), -np.inf)
+        if best is not None and self._over == "worst":
+            found = best.value("worst")
+            bar[:] = found + ROUTE.better * (alone.min() - found)
+        elif best is not None:
+            bar = alone - (alone.mean() - best.value("mean")) / ROUTE.better
+        usable = self._values >= bar[self._point]
+        widest = self._tasks.unit / np.median(self._steps, axis=0)
+        margin = ROUTE.widths[attempt] * max(ROUTE.margin, math.ceil(2 * widest.max()))
+        count = len(self._first) - 1
+        regions: list[range] = []
+        (ends, before), (begins, after) = (self._breaks(usable, way) for way in (1, -1))
+        for begin, end in zip(begins[::-1], ends, strict=False):
+            if begin + 1 < end and not attempt:
+                begin = end = self._nearest(range(begin + 1, end), before, after)
+            first, last = sorted((begin, end))
+            begin, stop = max(0, first - margin), min(count, last + margin + 1)
+            if regions and begin <= regions[-1].stop:
+                regions[-1] = range(regions[-1].start, max(stop, regions[-1].stop))
+            else:
+                regions.append(range(begin, stop))
+        return regions or [range(count)]
+
+    def _nearest(self, points: range, before: NDArray[np.bool_], after: NDArray[np.bool_]) -> int:
+        """Return the point at which two sets of candidates are nearest to each other."""
+        apart = []
+        for point in points:
+            own = slice(self._first[point], self._first[point + 1])
+            x = self._pressures[own]
+            gaps = np.abs(x[before[own]][:, np.newaxis] - x[after[own]]).max(axis=2)
+            apart.append(gaps.min(initial=np.inf))
+        return points[int(np.argmin(apart))]
+
+    def _breaks(self, usable: NDArray[np.bool_], way: int) -> tuple[list[int], NDArray[np.bool_]]:
+        """Return the points at which every sequence of usable candidates has ended.
+
+        They are counted from the first point (`way` 1) or the last (-1), anew after each.  The
+        second array marks the candidates that are on a sequence.
+        """
+        links, count = self._links, len(self._first) - 1
+        is_step = self._point[links.goal] == self._point[links.origin] + 1
+        is_step &= links.known & (links.worst > -np.inf)
+        origin, goal = links.origin[is_step], links.goal[is_step]
+        heads = np.searchsorted(goal, self._first)
+        alive, found = usable.copy(), []
+        for k in range(1, count) if way > 0 else range(count - 1, 0, -1):
+            some = slice(heads[k], heads[k + 1])
+            before, after = origin[some], goal[some]
+            point = k if way > 0 else k - 1
+            if way < 0:
+                before, after = after, before
+            came = np.zeros(len(alive), bool)
+            came[after[alive[before]]] = True
+            own = slice(self._first[point], self._first[point + 1])
+            if (came[own] & usable[own]).any():
+                alive[own] &= came[own]
+            else:
+                found.append(point)
+        return found, alive
+
+    def relaxed(self, route: Route, fixed: Sequence[int]) -> Route:
+        """Return a sequence whose points are moved one by one, each between its neighbours.
+
+        A point moves to a local optimum that the rates allow, if the body keeps clear on the way.
+        """
+        found = list(route.candidates)
+        best = np.maximum.reduceat(self._values, self._first[:-1])
+        movable = np.ones(len(found), dtype=bool)
+        movable[list(fixed)] = False
+        for _ in range(ROUTE.sweeps if self._tasks.is_compiled else 0):
+            checkpoint()
+            values = np.array([each.value for each in found])
+            poor = movable & (values < best - ROUTE.hardly / 2)
+            moved = np.zeros(len(found), dtype=bool)
+            for odd in (0, 1):
+                points = np.flatnonzero(poor[odd::2]) * 2 + odd
+                moved[points] = self._move(found, points.tolist())
+            movable = np.zeros(len(found), dtype=bool)
+            for aside in (slice(1, None), slice(0, -1)), (slice(0, -1), slice(1, None)):
+                movable[aside[0]] |= moved[aside[1]]
+            movable |= moved
+            movable[list(fixed)] = False
+            if not moved.any():
+                break
+        return Route(found, route.crossings)
+
+    def _move(self, found: list[PathCandidate], points: Sequence[int]) -> list[bool]:
+        """Move some points of a sequence, in place, if they become stiffer; return which moved."""
+        p, steps, tasks = [each.pressures for each in found], self._steps, self._tasks
+        questions = []
+        for k in points:
+            lower, upper = tasks.lower, tasks.upper
+            for other, step in ((k - 1, k - 1), (k + 1, k)):
+                if 0 <= other < len(p):
+                    lower = np.maximum(lower, p[other] - steps[step])
+                    upper = np.minimum(upper, p[other] + steps[step])
+            questions.append(Local(k, np.clip(p[k], lower, upper), lower, upper))
+        moved = []
+        for k, new in zip(points, tasks.locals(questions), strict=True):
+            is_better = new is not None and new.value > found[k].value + ROUTE.hardly / 10
+            if new is not None and is_better and self._body is not None:
+                way = [*p[max(k - 1, 0) : k], new.pressures, *p[k + 1 : k + 2]]
+                is_better = self._body.motion(np.array(way)).clear
+            if new is not None and is_better:
+                found[k] = new
+            moved.append(is_better)
+        return moved
 
     # -- dynamic programming ------------------------------------------------------------------
 
@@ -270,7 +403,7 @@ class RouteSearch:
 
         The body keeps clear of the scene along its computed links.
         """
-        for _ in range(ROUTE.repeats):
+        for _ in range(self._repeats):
             checkpoint()
             found = self._unchecked_sequence(computed)
             if found is None or not self._drops_blocked(found.links):

@@ -33,21 +33,27 @@ class LaneSettings:
 
     Attributes
     ----------
-    knots : number of points at which new configurations are spread over all that reach the target.
+    knots, last_knots : number of points of a region at which new configurations are spread over all
+        that reach the target; the second in the last attempt.
     starts : number of samples that are brought to the target at each knot.
     kept : largest number of configurations that are followed in either direction.
-    marks : number of points along the path at which they are followed, one after another.
+    marks : largest number of points of a region at which they are followed, one after another.
+    every : number of points from one mark to the next, if that makes fewer marks.
     iterations : largest number, to bring configurations to a target.
+    aside : largest distance of new ones sought beside each, as a share of a channel's range.
     apart : smallest distance of a new one from the others, as a share of a channel's range.
     alike : distance below which one of two followed configurations is dropped.
     """
 
-    knots: int = 8
+    knots: int = 4
+    last_knots: int = 8
     starts: int = 128
     kept: int = 40
+    aside: float = 0.15
     apart: float = 0.1
     alike: float = 0.02
-    marks: int = 48
+    marks: int = 32
+    every: int = 4
     iterations: int = 4
 
 
@@ -63,14 +69,23 @@ class RouteSettings:
     nearest : number of candidates to which crossings lead from another, for each length.
     rounds, rounds_in_scene : largest number of rounds in which crossings are computed, without and
         with a scene.
+    few_rounds : the same with a scene if a sequence is known already.
     first_rounds : the same before further configurations are added.
-    repeats : largest number of searches for a sequence on which the body keeps clear.
+    repeats, few_repeats : largest number of searches for a sequence on which the body keeps clear:
+        for the best one, and for any.
+    few_further : largest number of further candidates at a point where slower paths are sought.
     refined : largest number of sequences that are refined where there is no scene.
     price : small penalty on a crossing, which prevents useless ones.
     within : share of a rate that crossings use.
+    sweeps : largest number of times that the points of a sequence are moved one by one.
     hardly : gain in the logarithm of stiffness for which no crossing is computed.
     hardly_on_average : the same for the mean, where the worst value is maximised.
     enough : share of the single points' stiffness from which the search stops.
+    nearly_all : the same, from which a sequence is not refined.
+    margin : smallest number of points on both sides of a gap between branches, at which further
+        configurations are sought.
+    widths : of the regions in each attempt, relative to that.
+    better : share of the missing stiffness by which a sequence should become better at once.
     """
 
     crossings: int = 40
@@ -79,14 +94,22 @@ class RouteSettings:
     nearest: int = 6
     rounds: int = 300
     rounds_in_scene: int = 100
+    few_rounds: int = 16
     first_rounds: int = 8
     repeats: int = 100
+    few_repeats: int = 20
+    few_further: int = 30
     refined: int = 2
     price: float = 1e-3
     within: float = 0.98
+    sweeps: int = 6
     hardly: float = 2e-3
     hardly_on_average: float = 2e-2
     enough: float = 0.99
+    nearly_all: float = 0.999
+    margin: int = 8
+    widths: tuple[int, ...] = (1, 2, 5, 10)
+    better: float = 0.3
 
 
 @dataclass(frozen=True)
@@ -97,7 +120,7 @@ class RefinementSettings:
     ----------
     near : share of a rate from which on the rate counts as binding.
     margin : number of points added on either side of those where a rate binds.
-    iterations : largest number.
+    iterations, iterations_in_scene : largest number, without and with a scene.
     corrections : largest number for each step.
     radius : initial radius of the trust region, as a share of a channel's range.
     last_radius : radius below which the method stops.
@@ -115,6 +138,7 @@ class RefinementSettings:
     near: float = 0.9
     margin: int = 8
     iterations: int = 60
+    iterations_in_scene: int = 10
     corrections: int = 2
     radius: float = 0.1
     last_radius: float = 1e-3

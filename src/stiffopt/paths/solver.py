@@ -83,7 +83,7 @@ class _PathSolver:
         self._slew = slew_limits(robot.description, path.pressure.slew)
         self._over = "mean" if path.stiffness is None else path.stiffness.over
         self._unreachable: tuple[int, str] | None = None  # the first point, and why
-        self._lanes: list[list[PathCandidate]] | None = None
+        self._further: list[list[PathCandidate]] = [[] for _ in self._tasks]
         self._body: BodyCheck | None = None
 
     def solve(self) -> PathSolution:
@@ -179,19 +179,19 @@ class _PathSolver:
     def _answer(
         self, tasks: PathTasks, layers: list[list[PathCandidate]], starts: int
     ) -> PathSolution:
+        alone = np.array([max((c.value for c in layer), default=np.nan) for layer in layers])
         times = self._points.times
         slowed = 1.0
         steps = self._steps(tasks, times)
         routes = self._best_routes(tasks, layers, steps)
         stuck = None
         if not routes and times is not None and all(layers):
-            stuck = RouteSearch(tasks, layers, steps, self._over).furthest
+            stuck = len(self._search(tasks, layers, steps).beginning()) - 1
             slowed, routes = self._slower(tasks, layers, steps)
-            times = times * slowed
-            steps = steps * slowed
+            if routes:
+                times, steps = times * slowed, steps * slowed
         if not routes:
-            return self._without_route(tasks, layers, steps)
-        alone = np.array([max((c.value for c in layer), default=np.nan) for layer in layers])
+            return self._without_route(tasks, layers, steps, alone)
         route, pressures = self._refined(tasks, routes, steps, alone)
         if times is None:
             times = self._fastest(pressures)
@@ -221,16 +221,15 @@ class _PathSolver:
 
         Others are refined only if the first does not become about as stiff as single points.
         """
-        fixed = [
-            index % len(tasks)
-            for index, end in zip((0, -1), self._ends, strict=True)
-            if end is not None or self._path.closed
-        ]
         join = np.min if self._over == "worst" else np.mean
         found: list[tuple[float, Route, Vector]] = []
         for route in routes:
             pressures = np.array([each.pressures for each in route.candidates])
-            pressures = refined(tasks, pressures, steps, self._over, fixed, self._body_check(tasks))
+            if route.value(self._over) > join(alone) + np.log(ROUTE.nearly_all):
+                return route, pressures
+            pressures = refined(
+                tasks, pressures, steps, self._over, self._fixed, self._body_check(tasks)
+            )
             slopes = tasks.slopes(range(len(tasks)), pressures)
             value = -np.inf if slopes is None else float(join(-slopes.costs.max(axis=1)))
             found.append((value, route, pressures))
@@ -239,40 +238,57 @@ class _PathSolver:
         return max(found, key=lambda each: each[0])[1:]
 
     def _best_routes(
-        self, tasks: PathTasks, layers: list[list[PathCandidate]], steps: Vector
-    ) -> list[Route]:
-        """Return the best sequences, with further configurations if local optima do not suffice."""
-        if not all(layers):
-            return []
-        body = self._body_check(tasks)
-        routes = self._best_clear_routes(tasks, layers, steps, body)
-        if not routes and body is not None:  # the judgement names the obstacle
-            return self._best_clear_routes(tasks, layers, steps, None)
-        return routes
-
-    def _best_clear_routes(
         self,
         tasks: PathTasks,
         layers: list[list[PathCandidate]],
         steps: Vector,
-        body: BodyCheck | None,
         *,
         any_will_do: bool = False,
     ) -> list[Route]:
-        closed = self._path.closed
-        search = RouteSearch(tasks, layers, steps, self._over, is_closed=closed, body=body)
-        best = search.best(ROUTE.first_rounds, any_will_do=any_will_do)
-        if best is not None and (any_will_do or search.comes_up_to(best, ROUTE.enough)):
-            return [best]
-        further = self._further(tasks)
-        search = RouteSearch(tasks, layers, steps, self._over, further, is_closed=closed, body=body)
-        rounds = ROUTE.rounds if body is None else ROUTE.rounds_in_scene
-        rounds = ROUTE.first_rounds if any_will_do else rounds
-        last = search.best(rounds, share=ROUTE.enough, any_will_do=any_will_do)
-        known = [each for each in (last, best, search.first) if each is not None]
-        ranked = sorted({each.value(self._over): each for each in known}.items(), reverse=True)
+        """Return the best sequences, with further configurations if local optima do not suffice."""
+        if not all(layers):
+            return []
+        has_scene = self._path.scene is not None
+        known: list[Route] = []
+        is_last = any_will_do
+        for attempt in range(len(ROUTE.widths) + 1):
+            search = self._search(tasks, layers, steps)
+            rounds = ROUTE.first_rounds
+            if is_last and not any_will_do:
+                rounds = ROUTE.rounds
+                if has_scene:
+                    rounds = ROUTE.few_rounds if known else ROUTE.rounds_in_scene
+            share = ROUTE.enough if attempt else None
+            best = search.best(rounds, share=share, any_will_do=any_will_do)
+            if best is not None:
+                best = search.relaxed(best, self._fixed)
+                if any_will_do or search.comes_up_to(best, ROUTE.enough):
+                    return [best]
+            known += [each for each in (best, search.first) if each is not None]
+            known.sort(key=lambda each: -each.value(self._over))
+            if is_last:
+                break
+            regions = search.gaps(known[0] if known else None, attempt)
+            is_whole = len(regions[0]) == len(tasks)
+            is_last = attempt == len(ROUTE.widths) - 1 or (attempt > 0 and is_whole)
+            self._set_lanes(tasks, layers, regions, attempt, is_last, known[:1])
         # another one, once refined, may become better than the best
-        return [each for _, each in ranked[: ROUTE.refined if body is None else 1]]
+        return known[: 1 if has_scene else ROUTE.refined]
+
+    def _search(
+        self, tasks: PathTasks, layers: Sequence[Sequence[PathCandidate]], steps: Vector
+    ) -> RouteSearch:
+        """Return a search over local optima and the further candidates that there are."""
+        body, closed = self._body_check(tasks), self._path.closed
+        return RouteSearch(
+            tasks, layers, steps, self._over, self._further, is_closed=closed, body=body
+        )
+
+    @property
+    def _fixed(self) -> list[int]:
+        """Points at which the pressures are given."""
+        ends = zip((0, len(self._tasks) - 1), self._ends, strict=True)
+        return [index for index, end in ends if end is not None or self._path.closed]
 
     def _body_check(self, tasks: PathTasks) -> BodyCheck | None:
         """Return the check of the body between points; None without a scene or machine code."""
@@ -282,40 +298,48 @@ class _PathSolver:
             self._body = BodyCheck(tasks.robot, self._path.scene)
         return self._body
 
-    def _further(self, tasks: PathTasks) -> list[list[PathCandidate]]:
-        """Return further candidates, none where the pressures are given."""
-        if self._lanes is None:
-            self._lanes = lanes(tasks)
-            for index, end in ((0, self._ends[0]), (-1, self._ends[1])):
-                if end is not None or self._path.closed:
-                    self._lanes[index] = []
-        return self._lanes
+    def _set_lanes(
+        self,
+        tasks: PathTasks,
+        layers: Sequence[Sequence[PathCandidate]],
+        regions: Sequence[range],
+        attempt: int,
+        is_last: bool,
+        known: Sequence[Route],
+    ) -> None:
+        """Add further candidates in regions of the path, none where the pressures are given.
+
+        They replace earlier ones once a sequence is known, which is kept.
+        """
+        least = -np.inf
+        if known:
+            self._further = [[] for _ in layers]
+            least = known[0].value("worst") if self._over == "worst" else least
+        for region in regions:
+            for index, new in enumerate(lanes(tasks, layers, region, attempt, is_last)):
+                if index not in self._fixed:
+                    self._further[index] += [each for each in new if each.value > least]
+        for route in known:
+            for index, each in enumerate(route.candidates):
+                self._further[index].append(each)
 
     def _slower(
         self, tasks: PathTasks, layers: list[list[PathCandidate]], steps: Vector
     ) -> tuple[float, list[Route]]:
         """Find the smallest slow-down, to 5 %, with which the path can be followed, and how."""
-        factor: float = 1.0
-        routes: list[Route] = []
-        for body in dict.fromkeys(
-            (self._body_check(tasks), None)
-        ):  # clear of the scene if possible
-            follow = partial(self._best_clear_routes, tasks, layers, body=body)
-            factor = 1.0
-            while not routes and (steps * factor < tasks.unit).any():
-                factor *= 8
-                routes = follow(steps=steps * factor, any_will_do=True)
-            low = factor / 8
-            while routes and factor / low > 1.05:
-                middle = (low * factor) ** 0.5
-                quicker = follow(steps=steps * middle, any_will_do=True)
-                if quicker:
-                    factor, routes = middle, quicker
-                else:
-                    low = middle
-            if routes:
-                return factor, follow(steps=steps * factor) or routes
-        return factor, []
+        few = ROUTE.few_further  # with long steps, every candidate has steps to every other
+        self._further = [some[:: 1 + len(some) // few] for some in self._further]
+        follow = partial(self._best_routes, tasks, layers)
+        factor, low = float((tasks.unit / steps).max()), 1.0
+        routes = follow(steps=steps * factor, any_will_do=True) if factor > 1 else []
+        while routes and factor / low > 1.05:
+            middle = (low * factor) ** 0.5
+            quicker = follow(steps=steps * middle, any_will_do=True)
+            if quicker:
+                factor, routes = middle, quicker
+            else:
+                low = middle
+        return factor, routes and (follow(steps=steps * factor) or routes)
 
     def _fastest(self, pressures: Vector) -> Vector:
         """Return the earliest times (N,) of the points that the rates allow."""
@@ -405,7 +429,8 @@ class _PathSolver:
             notes.append("No rate of change is known, of the robot or of the path; none was kept.")
         middle = (solution.pressures[1:] + solution.pressures[:-1]) / 2
         if len(middle) and self._points.targets[0].position is not None:
-            lengths = (self._points.lengths[1:] + self._points.lengths[:-1]) / 2
+            lengths = self._points.lengths[: len(solution.pressures)]
+            lengths = (lengths[1:] + lengths[:-1]) / 2
             tips = solution.robot.tip_pose(middle)[:, :3, 3]
             off = np.linalg.norm(tips - self._points.at(lengths), axis=1)
             index, allowed = int(off.argmax()), self._path.tolerance.position
@@ -440,9 +465,9 @@ class _PathSolver:
         return f"; {name} with {rate}/s holds it back most"
 
     def _without_route(
-        self, tasks: PathTasks, layers: Sequence[Sequence[PathCandidate]], steps: Vector
+        self, tasks: PathTasks, layers: list[list[PathCandidate]], steps: Vector, alone: Vector
     ) -> PathSolution:
-        """Return the answer when there is no sequence of pressures without a jump."""
+        """Return the answer when no sequence was found: the path up to where it ends."""
         empty = next((i for i, layer in enumerate(layers) if not layer), None)
         if self._unreachable is not None:
             point, why = self._unreachable
@@ -451,16 +476,46 @@ class _PathSolver:
             return replace(unreachable, first_failure=point)
         if empty is not None:
             return self._failed(f"{self._name(empty)}: no pressures were found near the target")
-        index = RouteSearch(tasks, list(map(list, layers)), steps, self._over).furthest
-        return replace(
-            self._failed(
-                f"{self._name(index)} is the last that pressures follow without a jump: beyond "
-                "it the arm would have to change to another configuration while the tip stays "
-                "on the path"
-            ),
-            status="unreachable",
-            first_failure=index,
-        )
+        begin = self._search(tasks, layers, steps).beginning()
+        index, pressures = len(begin) - 1, np.array([each.pressures for each in begin])
+        message = f"{self._name(index)} is the last that pressures were found to follow"
+        least = self._clearance_beyond(layers, pressures, steps)
+        scene = self._path.scene
+        if scene is not None and least is not None:
+            length = display_units().length
+            message += (
+                f" with the body clear. Between points {index + 1} and {index + 2} the clearance "
+                f"of the body falls to {length.text(least, '.3g')}; the scene asks for "
+                f"{length.text(scene.clearance, 'g')}"
+            )
+        else:
+            message += " without a jump"
+            if scene is not None:
+                near = tasks.robot.clearances(pressures[-1], scene)
+                message += f", and clear of '{near.names[int(np.argmin(near.distances))]}'"
+            message += (
+                ": beyond it the arm would have to change to another configuration while the tip "
+                "stays on the path"
+            )
+        times = self._points.times
+        times = self._fastest(pressures) if times is None else times[: len(begin)]
+        solution = self._judged(tasks, pressures, times, alone[: len(begin)])
+        message += ". The path up to there is given."
+        return replace(solution, status="unreachable", message=message, first_failure=index)
+
+    def _clearance_beyond(
+        self, layers: Sequence[Sequence[PathCandidate]], pressures: Vector, steps: Vector
+    ) -> float | None:
+        """Return the largest clearance with which steps go on after the last of some points.
+
+        None without a scene, or if the rates allow no step.
+        """
+        index, last = len(pressures) - 1, pressures[-1]
+        next_ones = [*layers[index + 1], *self._further[index + 1]]
+        near = [p for p, _ in next_ones if (np.abs(p - last) <= steps[index]).all()]
+        if self._body is None or not near:
+            return None
+        return max(self._body.motion(np.array([last, p])).least for p in near)
 
     def _failed(self, message: str) -> PathSolution:
         n = self._robot.n_pressures
