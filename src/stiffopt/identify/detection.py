@@ -105,14 +105,15 @@ def _regressed(known: Array, tip: Array, rounds: int = 1) -> tuple[Array, Array]
 
     From the second round on, rows count the less the farther they were from the one before.
     """
-    weight, coefficients, distances = np.ones(len(tip)), np.zeros(0), np.zeros(0)
+    weight: Array = np.ones(len(tip))
+    coefficients = distances = np.zeros(0)
     for _ in range(rounds):
         weighted = known * weight[:, np.newaxis]
         normal = weighted.T @ known + DETECTION.ridge * np.eye(known.shape[1])
-        coefficients = np.linalg.solve(normal, weighted.T @ tip)
-        distances = np.linalg.norm(tip - known @ coefficients, axis=1)
+        coefficients = np.asarray(np.linalg.solve(normal, weighted.T @ tip))
+        distances = np.asarray(np.linalg.norm(tip - known @ coefficients, axis=1))
         weight = 1 / np.sqrt(1 + (distances / max(float(np.median(distances)), 1e-9)) ** 2)
-    return np.asarray(distances), np.asarray(coefficients)
+    return distances, coefficients
 
 
 # -- the beginning ---------------------------------------------------------------------------------

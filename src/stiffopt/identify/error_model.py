@@ -153,15 +153,16 @@ class _Fold:
         rows = held.rows & np.isfinite(predicted.errors[0]).all(axis=1)
         counted = np.concatenate([sample.weight for sample in problem.samples]) > 0
         channels = _channels(fit)
-        distances = distances_from(channels, predicted.effective[rows], pressures[counted])
-        share = growth(distances, reaches[:, np.newaxis, np.newaxis])
+        kept, spacing = representatives(channels, pressures[counted])  # as in a robot file
+        distances = distances_from(channels, predicted.effective[rows], kept) - spacing
+        share = growth(np.maximum(distances, 0.0), reaches[:, np.newaxis, np.newaxis])
         acting = predicted.per_pressure[0][rows]
-        kept = kept_unknowns(problem)
-        slope = slopes[rows][:, :, kept]
-        added = _influence(problem, fit.x, fit.gain, reaches)[:, kept[:, np.newaxis], kept]
+        numbers = kept_unknowns(problem)
+        slope = slopes[rows][:, :, numbers]
+        added = _influence(problem, fit.x, fit.gain, reaches)[:, numbers[:, np.newaxis], numbers]
         return cls(
             errors=predicted.errors[0][rows],
-            parameters=_spread(slope, fit.covariance[np.ix_(kept, kept)]),
+            parameters=_spread(slope, fit.covariance[np.ix_(numbers, numbers)]),
             through_fit=np.stack([_spread(slope, each) for each in added]),
             direct=even_variance(acting, np.repeat(share, channels, axis=2)),
             weight=np.stack([_weights(pressures[rows], reach, independent) for reach in reaches]),
