@@ -147,6 +147,33 @@ def test_pressures_that_change_make_a_larger_region() -> None:
     assert not held.hysteresis.any()  # this arm has no play
 
 
+def test_a_discrepancy_moves_the_tip_as_far_in_all_directions() -> None:
+    """It does so by where the arm is, with its history, not by where it is commanded to be."""
+    robot = ONE.model_copy(update={"calibration": Calibration(errors=KNOWN)})
+    away, source = np.array([[1.6e5, 1.4e5, 1.2e5]]), Uncertainty(robot)
+    slopes = Manipulator(ONE).tip_pose(away[0])[:3, :3] @ Manipulator(ONE).tip_jacobian(away[0])[:3]
+    by_pressures = KNOWN.variances([3], away)[0, 0] * slopes @ slopes.T
+    one = np.trace(by_pressures) / 3
+    np.testing.assert_allclose(source.errors(away).discrepancy[0], one * np.eye(3), rtol=1e-9)
+    followed = source.errors(CIRCLE[:1], effective=away)
+    np.testing.assert_allclose(followed.discrepancy[0], one * np.eye(3), rtol=1e-9)
+    assert not source.errors(away, effective=CIRCLE[:1]).discrepancy.any()
+
+
+def test_what_was_not_tested_is_as_wrong_as_a_multiple_of_what_was() -> None:
+    rng = np.random.default_rng(2)
+    problem = problem_of(CIRCLE, rng, 1e-3)
+    found = fit(problem, [np.zeros(problem.size)], rounds=0)
+    tips = found.predicted.read[0].position
+    way = np.linalg.norm(tips - tips.mean(axis=0), axis=1).mean()
+    parts = held_back(found, 2.0, lambda: None)
+    missed = np.mean([each.errors.mean for each in parts.values()])
+    assert error_model(found, parts).gain == pytest.approx(ERRORS.untested * missed / way, rel=0.01)
+    fitted = np.linalg.norm(found.predicted.errors[0], axis=1).mean()
+    alone = ERRORS.untested * ERRORS.residual * fitted / way
+    assert error_model(found, {}).gain == pytest.approx(alone, rel=0.01)
+
+
 def test_frames_move_what_the_tracker_reads() -> None:
     """Slopes by the twists of base and sensor, against differences of the readings."""
     registration = {"tracker_in_base": {"position": [0.01, 0.02, 0.03]},

@@ -96,9 +96,24 @@ def _quadratics(pressures: Array) -> Array:
 
 def _unexplained(pressures: Array, tip: Array) -> float:
     """Return the RMS residual, in m, of positions (N, 3) regressed on quadratics of pressures."""
-    known = _quadratics(pressures)
-    solution = np.linalg.lstsq(known, tip, rcond=1e-8)[0]
-    return float(np.sqrt(np.mean(np.sum((tip - known @ solution) ** 2, axis=1))))
+    distances, _ = _regressed(_quadratics(pressures), tip)
+    return float(np.sqrt(np.mean(distances**2)))
+
+
+def _regressed(known: Array, tip: Array, rounds: int = 1) -> tuple[Array, Array]:
+    """Return distances (N,) of positions (N, 3) from a ridge regression, and its coefficients.
+
+    From the second round on, rows count the less the farther they were from the one before.
+    """
+    weight: Array = np.ones(len(tip))
+    coefficients = distances = np.zeros(0)
+    for _ in range(rounds):
+        weighted = known * weight[:, np.newaxis]
+        normal = weighted.T @ known + DETECTION.ridge * np.eye(known.shape[1])
+        coefficients = np.asarray(np.linalg.solve(normal, weighted.T @ tip))
+        distances = np.asarray(np.linalg.norm(tip - known @ coefficients, axis=1))
+        weight = 1 / np.sqrt(1 + (distances / max(float(np.median(distances)), 1e-9)) ** 2)
+    return distances, coefficients
 
 
 # -- the beginning ---------------------------------------------------------------------------------
@@ -123,10 +138,12 @@ def begun(recording: Recording, span: Array) -> Recording:
     if not steps or np.isnan(tip[0]).any() or len(rows) < 2 * at.shape[1]:
         return recording
     known = _quadratics(lagged(recording.time, recording.pressures / span, DETECTION.clock_lag))
-    solution = np.linalg.lstsq(known[rows], tip[rows], rcond=1e-8)[0]
-    error = float(np.median(np.linalg.norm(tip[rows] - known[rows] @ solution, axis=1)))
-    rest, first = np.linalg.norm(at @ solution - tip[0], axis=1)
-    if first < DETECTION.begins_apart * error or rest > DETECTION.begins_share * first:
+    distances, coefficients = _regressed(known[rows], tip[rows])
+    rest, first = np.linalg.norm(at @ coefficients - tip[0], axis=1)
+    if (
+        first < DETECTION.begins_apart * np.median(distances)
+        or rest > DETECTION.begins_share * first
+    ):
         return recording
     return replace(recording, before=np.zeros_like(recording.before))
 
@@ -159,8 +176,9 @@ def without_drift(recording: Recording) -> Recording:
         return recording
     smooth = np.column_stack([np.ones(len(rows)), smooth_functions(acting)])
     hats = np.column_stack([np.interp(time, knots, hat) for hat in np.eye(len(knots))[1:]])
-    fixed, _ = _regressed(smooth, tip)
-    left, found = _regressed(np.column_stack([smooth, hats]), tip)
+    without, _ = _regressed(smooth, tip, DETECTION.drift_rounds)
+    with_drift, found = _regressed(np.column_stack([smooth, hats]), tip, DETECTION.drift_rounds)
+    fixed, left = float(np.median(without)), float(np.median(with_drift))
     if left > DETECTION.drift_left * fixed:
         return recording
     drift = np.vstack([np.zeros(3), found[smooth.shape[1] :]])
@@ -180,19 +198,6 @@ def without_drift(recording: Recording) -> Recording:
         tracks=(replace(tip_track, position=tip_track.position - moved), *others),
         remarks=(*recording.remarks, remark),
     )
-
-
-def _regressed(known: Array, tip: Array) -> tuple[float, Array]:
-    """Return the median residual, in m, and the coefficients of a robust ridge regression."""
-    weight, solution, middle = np.ones(len(tip)), np.zeros((known.shape[1], 3)), 0.0
-    for _ in range(DETECTION.drift_rounds):
-        weighted = known * weight[:, np.newaxis]
-        normal = weighted.T @ known + DETECTION.drift_ridge * np.eye(known.shape[1])
-        solution = np.asarray(np.linalg.solve(normal, weighted.T @ tip))
-        distance = np.linalg.norm(tip - known @ solution, axis=1)
-        middle = float(np.median(distance))
-        weight = 1 / np.sqrt(1 + (distance / max(middle, 1e-9)) ** 2)
-    return middle, solution
 
 
 # -- axes, channels and lines ----------------------------------------------------------------------

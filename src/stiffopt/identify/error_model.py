@@ -1,16 +1,18 @@
 """Estimate the prediction error of a calibrated arm from its errors on held-back data.
 
 The arm is modelled as if the effective pressures of each segment were wrong by a discrepancy, a
-Gaussian process in that segment's pressures with covariance ``s^2 exp(-|p - p'| / l)`` for each
-channel.  The discrepancy has two effects.  First, it correlates the errors of nearby rows, so that
-a fit is less certain than their number suggests.  With the covariance C of the fit without it, the
-gain N^-1 of the fit, its weighted slopes A (of all rows, by the unknowns), the slopes J_p of
-positions by effective pressures and the correlation K of the rows, ::
+Gaussian process in that segment's effective pressures with covariance ``s^2 exp(-|p - p'| / l)``
+for each channel.  The discrepancy has two effects.  First, it correlates the errors of nearby rows,
+so that a fit is less certain than their number suggests.  With the covariance C of the fit without
+it, the gain N^-1 of the fit, its weighted slopes A (of all rows, by the unknowns), the slopes J_p
+of positions by effective pressures and the correlation K of the rows, ::
 
     cov(x) = C + s^2 N^-1 (A' J_p) K (A' J_p)' N^-1.
 
 Second, it acts on predictions: at a distance d from the nearest recorded pressure its variance is
-``s^2 (1 - exp(-2 d / l))``, that of the process given its value there.
+``s^2 (1 - exp(-2 d / l))``, that of the process given its value there.  It moves the tip as far as
+such pressures would, but equally in all directions: a model of bending and elongation may be wrong
+in either, whatever a single pressure does.
 
 s, l, the residual and the tail of the errors maximise the probability of the held-back errors, with
 weak priors.  Rows are weighted so that many rows in one region of pressures count little more than
@@ -32,7 +34,7 @@ from stiffopt.identify.fit import Fit
 from stiffopt.identify.problem import CalibrationProblem, Sample
 from stiffopt.identify.results import Errors
 from stiffopt.identify.settings import ERRORS, FIT
-from stiffopt.model.calibration import ErrorModel, distances_from, growth
+from stiffopt.model.calibration import ErrorModel, distances_from, even_variance, growth
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.bool_]
@@ -71,7 +73,7 @@ def error_model(
         residual=float(f"{residual:.4g}"),
         discrepancy=float(f"{discrepancy:.4g}"),
         reach=float(f"{reaches[index]:.4g}"),
-        gain=ERRORS.gain,
+        gain=float(f"{_untested_gain(found, held_back):.3g}"),
         degrees_of_freedom=float(f"{_MIN_FREEDOM + tail:.3g}"),
         settled=settled,
         moving=moving,
@@ -132,8 +134,9 @@ class _Fold:
     errors : (N, 3), in the frame of the recordings, in m.
     parameters : covariance (N, 3, 3) of the errors due to uncertain parameters, in m^2, without
         discrepancy.
-    through_fit, direct : covariances (R, N, 3, 3) due to a discrepancy of variance 1 Pa^2, for each
-        reach: through its effect on the fit, and of the discrepancy itself.
+    through_fit : covariances (R, N, 3, 3) due to a discrepancy of variance 1 Pa^2, for each reach,
+        through its effect on the fit.
+    direct : variances (R, N) of each axis due to that discrepancy itself.
     weight : (R, N), of the rows, see `_weights`.
     """
 
@@ -150,18 +153,18 @@ class _Fold:
         rows = held.rows & np.isfinite(predicted.errors[0]).all(axis=1)
         counted = np.concatenate([sample.weight for sample in problem.samples]) > 0
         channels = _channels(fit)
-        distances = distances_from(channels, pressures[rows], pressures[counted])
-        share = growth(distances, reaches[:, np.newaxis, np.newaxis])
+        kept, spacing = representatives(channels, pressures[counted])  # as in a robot file
+        distances = distances_from(channels, predicted.effective[rows], kept) - spacing
+        share = growth(np.maximum(distances, 0.0), reaches[:, np.newaxis, np.newaxis])
         acting = predicted.per_pressure[0][rows]
-        direct = np.repeat(share, channels, axis=2)[:, :, np.newaxis] * acting
-        kept = kept_unknowns(problem)
-        slope = slopes[rows][:, :, kept]
-        added = _influence(problem, fit.x, fit.gain, reaches)[:, kept[:, np.newaxis], kept]
+        numbers = kept_unknowns(problem)
+        slope = slopes[rows][:, :, numbers]
+        added = _influence(problem, fit.x, fit.gain, reaches)[:, numbers[:, np.newaxis], numbers]
         return cls(
             errors=predicted.errors[0][rows],
-            parameters=_spread(slope, fit.covariance[np.ix_(kept, kept)]),
+            parameters=_spread(slope, fit.covariance[np.ix_(numbers, numbers)]),
             through_fit=np.stack([_spread(slope, each) for each in added]),
-            direct=direct @ np.swapaxes(acting, 1, 2),
+            direct=even_variance(acting, np.repeat(share, channels, axis=2)),
             weight=np.stack([_weights(pressures[rows], reach, independent) for reach in reaches]),
         )
 
@@ -171,8 +174,9 @@ class _Fold:
 
         covariance = (
             self.parameters
-            + discrepancy**2 * (self.through_fit[index] + self.direct[index])
-            + residual**2 * np.eye(3)
+            + discrepancy**2 * self.through_fit[index]
+            + (discrepancy**2 * self.direct[index] + residual**2)[:, np.newaxis, np.newaxis]
+            * np.eye(3)
         )
         v = _MIN_FREEDOM + tail
         squares = np.einsum(
@@ -232,6 +236,22 @@ def _most_probable(
     discrepancy, residual, tail = np.exp(result.x).tolist()
     reach_prior = 0.5 * float(np.log(ERRORS.reaches[index] / ERRORS.reach) ** 2)
     return float(result.fun) + reach_prior, index, (discrepancy, residual, tail)
+
+
+def _untested_gain(found: Fit, held_back: Mapping[str, HeldBack]) -> float:
+    """Return the relative error of the effect of pressures in directions that were not recorded.
+
+    No recording shows it. It is taken as a multiple of the relative error that shows: mean error on
+    held-back rows (or else in the fit) over the mean distance of the tip from its mean.
+    """
+    tips = found.predicted.read[0].position
+    way = float(np.linalg.norm(tips - tips.mean(axis=0), axis=1).mean())
+    if held_back:
+        error = float(np.mean([each.errors.mean for each in held_back.values()]))
+    else:
+        distances = np.linalg.norm(found.predicted.errors[0], axis=1)
+        error = ERRORS.residual * Errors.of(distances, None).mean
+    return ERRORS.untested * error / way if way > 0 else ERRORS.untested
 
 
 def _influence(problem: CalibrationProblem, x: Array, gain: Array, reaches: Array) -> Array:

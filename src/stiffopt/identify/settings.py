@@ -240,8 +240,8 @@ class ErrorSettings:
     per_cell : number of rows that count in a cell of pressures as wide as the reach.
     reaches, reach : candidates for the distance over which the discrepancy grows, and its prior
         median, as shares of the range of recorded pressures.
-    gain : relative error of the effect of pressures in directions that were not recorded; no
-        recording can show it.
+    untested : relative error of the effect of pressures in directions that were not recorded, over
+        the relative error on held-back data; no recording can show it.
     rows : largest number of rows in the estimate of the discrepancy's effect on a fit.
     representatives, spacing : largest number of a segment's pressures kept to represent all
         recorded ones, and the spacing, as a share of the pressure range, at which fewer suffice.
@@ -259,7 +259,7 @@ class ErrorSettings:
     per_cell: float = 1.0
     reaches: tuple[float, ...] = (0.2, 0.4, 0.8)
     reach: float = 0.4
-    gain: float = 0.1
+    untested: float = 1.5
     rows: int = 800
     representatives: int = 60
     spacing: float = 0.04
@@ -328,6 +328,7 @@ class DetectionSettings:
     off, frame : mean error of a log, in lengths of the arm, beyond which its frame is suspected to
         differ from the calibration's; and the share of it that a correction may leave.
     known_turn : spread of the tip, in lengths of the arm, that determines a turn.
+    ridge : added to the diagonal of the normal equations of regressions.
     clock_rows : number of rows in the regression for the clocks.
     clock_lag : lag of an arm, in s.
     clock_usual : longest delay that the arm itself may have, in s.
@@ -343,7 +344,7 @@ class DetectionSettings:
     drift_near, drift_visits : a part visits the pressures of a row if it comes this near to them,
         as a share of their range; and share of the parts that must do so.
     drift_left : largest share of the median error that an accepted drift leaves.
-    drift_ridge, drift_rounds : of the robust regression.
+    drift_rounds : of the robust regression.
     unit : largest factor between the arm's observed and expected motion with the right unit.
     """
 
@@ -357,6 +358,7 @@ class DetectionSettings:
     off: float = 0.1
     frame: float = 0.3
     known_turn: float = 0.02
+    ridge: float = 0.01
     clock_rows: int = 600
     clock_lag: float = 0.3
     clock_usual: float = 2.0
@@ -373,7 +375,6 @@ class DetectionSettings:
     drift_visits: float = 0.75
     drift_spread: float = 0.5
     drift_left: float = 0.7
-    drift_ridge: float = 0.01
     drift_rounds: int = 8
     unit: float = 2.3
 

@@ -73,7 +73,8 @@ class ErrorModel(Schema):
     """Model of the tip's prediction errors, near recorded pressures and far from them.
 
     The arm behaves as if its effective pressures were off by a discrepancy, a Gaussian process in
-    the pressures of each segment.  At a distance d from the nearest recorded pressure, the variance
+    the pressures of each segment, which moves the tip equally in all directions (`even_variance`).
+    At a distance d from the nearest recorded pressure, the variance
     of each channel is ``discrepancy^2 (1 - exp(-2 d / reach)) + (gain d_u)^2``.  Here d_u is the
     part of the displacement x from there in directions that were not recorded: ``d_u^2 = x' (I - S
     (S + e I)^-1) x``, with S the mean square of the displacements from the nearest to the other
@@ -149,6 +150,15 @@ class ErrorModel(Schema):
 def growth(distances: Array, reach: float | Array) -> Array:
     """Return the share of the discrepancy's variance at distances from recorded pressures."""
     return np.asarray(-np.expm1(-2 * distances / reach))
+
+
+def even_variance(per_pressure: Array, variances: Array) -> Array:
+    """Return the variance (..., N) of each axis of the tip, in m^2, the same for all directions.
+
+    It is a third of the mean square by which pressures of these variances (..., N, n), in Pa^2,
+    would move the tip, with its derivatives (N, 3, n), in m/Pa.
+    """
+    return np.asarray((variances * (per_pressure**2).sum(axis=1)).sum(axis=-1) / 3)
 
 
 def distances_from(channels: Sequence[int], pressures: Array, recorded: Array) -> Array:

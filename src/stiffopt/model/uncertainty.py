@@ -4,8 +4,8 @@ There are four independent sources: the parameters, whose covariance the calibra
 hysteresis, since at the same pressures the arm may rest anywhere between its loading and unloading
 curves; the discrepancy between model and arm, which grows with the distance from recorded
 pressures; and the residual that no parameter explained in the recordings.  All but the last are
-propagated to the tip by their Jacobians, to first order.  Together they follow a multivariate
-t-distribution.
+propagated to the tip by their Jacobians, to first order; the discrepancy in its size alone, for it
+may move the tip in any direction.  Together they follow a multivariate t-distribution.
 
 Hysteresis is bounded: no play operator was ever dragged beyond the robot's pressure
 limits, so less hysteresis is possible near the limits than between them.  Its mean square is
@@ -25,7 +25,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from stiffopt.errors import InputError
 from stiffopt.model.arguments import checked_measure
-from stiffopt.model.calibration import Calibration
+from stiffopt.model.calibration import Calibration, even_variance
 from stiffopt.model.compliance import Boundary, Frame, Kind
 from stiffopt.model.description import RobotDescription
 from stiffopt.model.history import NO_HISTORY, History, part_of
@@ -220,7 +220,8 @@ class Uncertainty:
             position=position,
             parameters=per_number @ self._covariance @ np.swapaxes(per_number, 1, 2),
             hysteresis=(per_pressure * acting[:, np.newaxis]) @ transposed,
-            discrepancy=(per_pressure * self._discrepancy(pressures)[:, np.newaxis]) @ transposed,
+            discrepancy=even_variance(per_pressure, self._discrepancy(u))[:, np.newaxis, np.newaxis]
+            * np.eye(3),
             residual=np.broadcast_to(np.eye(3) * residual**2, (len(u), 3, 3)),
         )
 

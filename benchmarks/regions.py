@@ -1,0 +1,173 @@
+"""Measure how often the tips of calibrated simulated arms lie in the regions of their predictions.
+
+    python benchmarks/regions.py [--first SEED] [--arms N] [--rig NAME] [--auto]
+
+Each seed gives another arm: mismatch (of every second one as `Spread` says, of the others as the
+rig file says), silicone (drawn for two of four), lag and dead time. It is simulated without inertia
+and with simple regulators, at a second of processor time. Its logs are one sweep of each channel
+and five rounds of six held poses. Robot files are fitted to the sweeps and two rounds, and to the
+sweeps alone, so that all rounds are extrapolated. Prints the share of readings of the other rounds
+within the regions of 50, 68, 90, 95 and 99 %, all arms together.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from calibration import CASES, described
+from report import table
+from stiffopt import CalibrationSettings, Log, RobotDescription, calibrate, validate
+from stiffopt.experiments.coverage import spread_pressures
+from stiffopt.identify.results import LEVELS, Comparison, coverage
+from stiffopt.plant.plant import Plant
+from stiffopt.plant.settings import (
+    Discretisation,
+    PlantSettings,
+    Silicone,
+    SiliconeCreep,
+    SiliconeHysteresis,
+    Spread,
+)
+
+Array = NDArray[np.float64]
+
+STEP = 0.02  # s, of the simulation
+EVERY = 3  # steps per row of a log
+PEAKS = (0.4e5, 0.8e5, 1.0e5)  # Pa, of the sweeps' teeth
+HALF_TOOTH = 2.2  # s
+POSES, ROUND = 30, 6
+NOISE, ANGLE_NOISE = 1e-4, 3e-3  # m, rad
+QUICK = CalibrationSettings(
+    sequence=True, structure="hysteresis", strain_law="keep", rows=800, trial_rows=400,
+    start_evaluations=10,
+)  # fmt: skip
+
+
+@dataclass
+class Arm:
+    """A simulated arm with its regulators, and what it draws its numbers from."""
+
+    plant: Plant
+    rng: np.random.Generator
+    lag: float
+    dead_time: float
+    chambers: Array = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.chambers = np.zeros(self.plant.robot.n_pressures)
+
+    def recorded(self, times: Array, pressures: Array) -> Log:
+        """Log of commands that are linear between pressures (K, n) at times (K,)."""
+        time = np.arange(STEP, times[-1], STEP)
+        commands, late = (
+            np.stack([np.interp(t, times, column) for column in pressures.T], axis=1)
+            for t in (time, time - self.dead_time)
+        )
+        share = -np.expm1(-STEP / self.lag)
+        rows = np.arange(EVERY - 1, len(time), EVERY)
+        back = np.linalg.inv(self.plant.mismatch.registration.transform())
+        poses = []
+        for row in rows:
+            inside = []
+            for command in late[row - EVERY + 1 : row + 1]:
+                self.chambers = self.chambers + share * (command - self.chambers)
+                inside.append(self.chambers)
+            self.plant.follow(np.array(inside))
+            poses.append(back @ self.plant.tip_pose())
+        turns = Rotation.from_matrix([pose[:3, :3] for pose in poses])
+        turns *= Rotation.from_rotvec(self.rng.normal(0, ANGLE_NOISE, (len(rows), 3)))
+        tips = np.array([pose[:3, 3] for pose in poses])
+        return Log(
+            time=time[rows],
+            commanded=np.round(commands[rows], -1),
+            tip_position=tips + self.rng.normal(0, NOISE, tips.shape),
+            tip_quaternion=turns.as_quat()[:, [3, 0, 1, 2]],
+        )
+
+
+def made(rig: str, seed: int) -> tuple[RobotDescription, Arm]:
+    """The robot file of a rig, and an arm that differs from it."""
+    description, robot = described(CASES[rig], seed)
+    rng = np.random.default_rng([seed, 77])
+    update: dict[str, object] = {
+        "dynamics": "quasi-static",
+        "discretisation": Discretisation(step=STEP),
+    }
+    if seed % 2:
+        update["spread"] = Spread()
+    if seed % 4 >= 2:
+        creep = [SiliconeCreep(share=rng.uniform(0.02, 0.1), time=time) for time in (2.0, 20.0)]
+        slip = [
+            SiliconeHysteresis(share=rng.uniform(0.02, 0.1), strain=strain)
+            for strain in (0.01, 0.04)
+        ]
+        update["silicone"] = Silicone(
+            stiffening=rng.uniform(0.02, 0.3), creep=tuple(creep), hysteresis=tuple(slip)
+        )
+    settings = (description.plant or PlantSettings()).model_copy(update=update)
+    return robot, Arm(Plant(robot, settings), rng, rng.uniform(0.1, 0.3), rng.uniform(0.02, 0.08))
+
+
+def logs(robot: RobotDescription, arm: Arm) -> Iterator[tuple[str, Log]]:
+    """The sweeps of all channels, then the rounds of held poses."""
+    n = robot.n_pressures
+    rest, teeth = np.zeros(n), [peak * own for own in np.eye(n) for peak in PEAKS]
+    knots = np.array([rest, *(p for tooth in teeth for p in (tooth, rest))])
+    yield "sweeps", arm.recorded(HALF_TOOTH * np.arange(len(knots)), knots)
+    poses = spread_pressures(POSES, rest, robot.pressure_max)
+    for begin in range(0, POSES, ROUND):
+        times, visited = [0.0], [rest]
+        for pose in (*poses[begin : begin + ROUND], rest):
+            way = float(np.abs(pose - visited[-1]).max())
+            times.append(times[-1] + way / arm.rng.uniform(2e4, 6e4))
+            times.append(times[-1] + arm.rng.uniform(2.5, 6.0))
+            visited += [pose, pose]
+        name = f"round {begin // ROUND + 1}"
+        yield name, arm.recorded(np.array(times), np.array(visited))
+
+
+def markdown(title: str, found: list[Comparison]) -> str:
+    """Table of the coverage of all comparisons together."""
+    rows = [
+        (name, str(each.n), *(f"{100 * share:.0f}" for share in each.shares))
+        for name, each in coverage(found).items()
+        if each.n
+    ]
+    header = ("readings", "rows", *(f"{100 * level:.0f} %" for level in LEVELS))
+    error = np.nanmean(np.concatenate([each.distance for each in found]))
+    return "\n".join([f"### {title}, mean error {1e3 * error:.2f} mm", "", *table(header, rows)])
+
+
+def main() -> int:
+    """Command line."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--first", type=int, default=1000, help="the first of the seeds")
+    parser.add_argument("--arms", type=int, default=40)
+    parser.add_argument("--rig", choices=list(CASES), default="sim")
+    parser.add_argument("--auto", action="store_true", help="default settings: models are compared")
+    given = parser.parse_args()
+    settings = CalibrationSettings(sequence=True) if given.auto else QUICK
+    found: dict[str, list[Comparison]] = {"sweeps and two rounds": [], "sweeps alone": []}
+    for seed in range(given.first, given.first + given.arms):
+        robot, arm = made(given.rig, seed)
+        recorded = list(logs(robot, arm))
+        for (_, comparisons), fitted in zip(found.items(), (3, 1), strict=True):
+            result = calibrate(robot, recorded[:fitted], settings=settings)
+            comparisons += validate(result.robot, recorded[fitted:], settings)
+        print(f"arm {seed}: done", file=sys.stderr, flush=True)
+    for title, comparisons in found.items():
+        print(markdown(title, comparisons), end="\n\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
