@@ -444,6 +444,13 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert "too near 'table'" in " ".join(capsys.readouterr().out.split())
 
 
+def test_each_goal_has_a_line(capsys: pytest.CaptureFixture[str]) -> None:
+    assert planned("--robot", "stiff-flop-2", "--to", A) == 0
+    lines = [line.split() for line in capsys.readouterr().out.splitlines()]
+    assert ["to", *B.split()] in lines
+    assert lines.count(A.split()) == 1
+
+
 @needs_ompl
 def test_the_program_ends_without_a_word_of_ompl() -> None:
     code = """
@@ -466,9 +473,12 @@ main()
         ((), "--robot: name a robot"),
         (("--robot", "stiff-flop-2", "--to", "2 bar"), "--to: expected one pressure for each"),
         (("--robot", "stiff-flop-2", "--to", "0, 0 mm"), "--to: "),
+        (("--robot", "stiff-flop-2", "--to", "9, 0, 0, 0, 0, 0 bar"), "--to: segment 1 channel 1"),
         (("--robot", "stiff-flop-2", "--slew", "2 bar"), "--slew: "),
+        (("--robot", "stiff-flop-2", "--slew", "0 bar/s"), "--slew: must be greater than 0"),
         (("--robot", "stiff-flop-2", "--slew", "2, 1 bar/s"), "--slew: expected one rate"),
         (("--robot", "stiff-flop-2", "--clearance", "2 mm"), "a clearance needs a scene"),
+        (("--robot", "stiff-flop-2", "--clearance", "-1 mm"), "--clearance: must be at least 0"),
         (("--robot", "stiff-flop-2", "--to", "missing.yaml"), "missing.yaml"),
         (("--robot", "stiff-flop-2", "--timeout", "-1 s"), "timeout must be"),
     ],

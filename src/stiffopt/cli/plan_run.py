@@ -24,6 +24,7 @@ from stiffopt.errors import InputError, StiffoptError, printable, shown
 from stiffopt.model.manipulator import Manipulator, load_robot
 from stiffopt.model.scene import Scene, load_scene
 from stiffopt.optimise.task import Task, load_task
+from stiffopt.paths.configurations import checked_pressures
 from stiffopt.paths.motion import plan_motion
 from stiffopt.paths.motion_file import RESULT_FORMAT
 from stiffopt.paths.solution import PathSolution
@@ -78,7 +79,7 @@ class PlanCommand:
         tasks = [each for each in given if isinstance(each, Task)]
         robot = self._robot(tasks)
         ends = [
-            each if isinstance(each, Task) else _of_channels(robot, option, each, "Pa", "pressure")
+            each if isinstance(each, Task) else _pressures(robot, option, each)
             for option, each in zip(["--from"] + ["--to"] * len(self.goals), given, strict=True)
         ]
         own = [each.scene for each in (*ends[1:], ends[0]) if isinstance(each, Task)]
@@ -88,6 +89,8 @@ class PlanCommand:
         clearance = None
         if self.clearance is not None:
             clearance = quantity("--clearance", self.clearance, "m", "length")
+            if clearance < 0:
+                raise InputError(f"--clearance: must be at least 0, not {shown(self.clearance)}")
         solution = plan_motion(
             robot, ends[0], ends[1:], scene=scene, clearance=clearance, slew=self._slew(robot),
             seed=self.seed, timeout=quantity("--timeout", self.timeout, "s", "time"),
@@ -106,12 +109,16 @@ class PlanCommand:
             raise InputError("--robot: the tasks name different robots; say which one is meant")
         return load_robot(descriptions[0])
 
-    def _slew(self, robot: Manipulator) -> float | NDArray[np.float64] | None:
+    def _slew(self, robot: Manipulator) -> NDArray[np.float64] | None:
         if self.slew is None:
             return None
         if "," in self.slew:
-            return _of_channels(robot, "--slew", self.slew, "Pa/s", "rate of pressure")
-        return quantity("--slew", self.slew, "Pa/s", "rate of pressure")
+            rates = _of_channels(robot, "--slew", self.slew, "Pa/s", "rate of pressure")
+        else:
+            rates = np.array(quantity("--slew", self.slew, "Pa/s", "rate of pressure"))
+        if not (rates > 0).all():
+            raise InputError(f"--slew: must be greater than 0, not {shown(self.slew)}")
+        return rates
 
     def _write(
         self,
@@ -163,7 +170,7 @@ class PlanCommand:
         if solution.message:
             yield "note", Text(solution.message)
         yield "from", Text(printable(self.start))
-        yield "to", Text(printable("\n".join(self.goals)))
+        yield "to", Text("\n".join(map(printable, self.goals)))
         if not len(solution.times):
             return
         yield "time", Text(f"{solution.times[-1]:.4g} s, {len(solution.times)} points")
@@ -184,6 +191,11 @@ def _of_channels(
             f"'{printable(robot.description.name)}'; got {len(values)}: {shown(text)}"
         )
     return values
+
+
+def _pressures(robot: Manipulator, option: str, text: str) -> NDArray[np.float64]:
+    """Return the pressures of an option, within the limits of the robot."""
+    return checked_pressures(option, robot, _of_channels(robot, option, text, "Pa", "pressure"))
 
 
 def _is_file(text: str) -> bool:
