@@ -3,7 +3,7 @@
 They differ only in target and stiffness direction.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import cached_property
 from typing import NamedTuple
@@ -71,6 +71,17 @@ class Slopes(NamedTuple):
     jacobians: Vector
     costs: Vector
     gradients: Vector
+
+
+def joined(ranges: Iterable[range]) -> list[range]:
+    """Return ranges of points, in order of their starts, with those joined that overlap or meet."""
+    found: list[range] = []
+    for each in ranges:
+        if found and each.start <= found[-1].stop:
+            found[-1] = range(found[-1].start, max(each.stop, found[-1].stop))
+        else:
+            found.append(each)
+    return found
 
 
 class BodyCheck:
@@ -253,12 +264,16 @@ class PathTasks:
         Returns those that arrive, and a mask (k,) of which these are.
         """
         found, arrived = self.brought(np.full(len(pressures), index), pressures)
+        clear = self._are_clear(found)
+        arrived[arrived] = clear
+        return found[clear], arrived
+
+    def _are_clear(self, pressures: Vector) -> Mask:
+        """Return whether the body keeps the scene's clearance at pressures (k, n)."""
         scene = self.tasks[0].scene
-        if scene is not None and len(found):
-            clear = self.robot.clearance(found, scene) >= scene.clearance
-            found = found[clear]
-            arrived[arrived] = clear
-        return found, arrived
+        if scene is None or not len(pressures):
+            return np.ones(len(pressures), bool)
+        return np.asarray(self.robot.clearance(pressures, scene) >= scene.clearance)
 
     def _values(self, indices: NDArray[np.intp], pressures: Vector) -> Vector:
         """Return `PathCandidate.value` of pressures (k, n) of a free arm, each at its point."""
@@ -270,10 +285,8 @@ class PathTasks:
     def assessed(self, indices: NDArray[np.intp], pressures: Vector) -> list[list[PathCandidate]]:
         """Return candidates at each point, from pressures (k, n) on target with a clear body."""
         found: list[list[PathCandidate]] = [[] for _ in range(len(self))]
-        scene = self.tasks[0].scene
-        if scene is not None and len(pressures):
-            clear = self.robot.clearance(pressures, scene) >= scene.clearance
-            indices, pressures = indices[clear], pressures[clear]
+        clear = self._are_clear(pressures)
+        indices, pressures = indices[clear], pressures[clear]
         values = self._values(indices, pressures).tolist()
         for index, p, value in zip(indices.tolist(), pressures, values, strict=True):
             found[index].append(PathCandidate(p, value))

@@ -25,7 +25,7 @@ from scipy import sparse
 from stiffopt.model.stopping import checkpoint
 from stiffopt.optimise.program import Constraint
 from stiffopt.optimise.settings import DESCENT
-from stiffopt.paths.points import BodyCheck, PathTasks, Slopes
+from stiffopt.paths.points import BodyCheck, PathTasks, Slopes, joined
 from stiffopt.paths.settings import REFINEMENT
 
 Vector = NDArray[np.float64]
@@ -87,15 +87,9 @@ def _wider(window: range, count: int) -> range:
 def _windows(pressures: Vector, steps: Vector) -> list[range]:
     """Return windows of points about steps that are near the rates; overlapping ones are joined."""
     near = (np.abs(np.diff(pressures, axis=0)) > REFINEMENT.near * steps).any(axis=1)
-    found: list[range] = []
-    for index in np.flatnonzero(near).tolist():
-        begin = max(0, index + 1 - REFINEMENT.margin)
-        end = min(len(pressures), index + 1 + REFINEMENT.margin)
-        if found and begin <= found[-1].stop:
-            found[-1] = range(found[-1].start, end)
-        else:
-            found.append(range(begin, end))
-    return found
+    margin, count = REFINEMENT.margin, len(pressures)
+    middles = (np.flatnonzero(near) + 1).tolist()
+    return joined(range(max(0, k - margin), min(count, k + margin)) for k in middles)
 
 
 @dataclass

@@ -20,6 +20,7 @@ from stiffopt.paths.path import Path
 from stiffopt.paths.points import BodyCheck, PathCandidate, PathTasks
 from stiffopt.paths.rates import least_times, slew_limits, step_limits
 from stiffopt.paths.refinement import refined
+from stiffopt.paths.relaxation import relaxed
 from stiffopt.paths.route import Route, RouteSearch
 from stiffopt.paths.settings import RATES, ROUTE
 from stiffopt.paths.solution import PathSolution
@@ -224,7 +225,7 @@ class _PathSolver:
         join = np.min if self._over == "worst" else np.mean
         found: list[tuple[float, Route, Vector]] = []
         for route in routes:
-            pressures = np.array([each.pressures for each in route.candidates])
+            pressures = route.pressures
             if route.value(self._over) > join(alone) + np.log(ROUTE.nearly_all):
                 return route, pressures
             pressures = refined(
@@ -261,7 +262,8 @@ class _PathSolver:
             share = ROUTE.enough if attempt else None
             best = search.best(rounds, share=share, any_will_do=any_will_do)
             if best is not None:
-                best = search.relaxed(best, self._fixed)
+                own = search.layers.best
+                best = relaxed(tasks, best, steps, own, self._fixed, self._body_check(tasks))
                 if any_will_do or search.comes_up_to(best, ROUTE.enough):
                     return [best]
             known += [each for each in (best, search.first) if each is not None]
