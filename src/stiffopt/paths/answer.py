@@ -102,22 +102,135 @@ class PathAnswers:
         message = f"{self._cannot_be_reached(index, why)}, and no path near it can be followed"
         return _unreachable(self.failed(message), index, message)
 
-    def cut_short(self, solution: PathSolution, beyond: float | None) -> PathSolution:
-        """Return the solution of a path's beginning, beyond which no pressures were found.
+    def cut_short(
+        self, solution: PathSolution, pressures: Vector, beyond: float | None
+    ) -> PathSolution:
+        """Return the solution of a path's beginning, beyond whose pressures (k, n) none were found.
 
         `beyond` is the largest clearance with which steps go on, if known.
         """
-        index, scene = len(solution.pressures) - 1, self._path.scene
+        index, scene = len(pressures) - 1, self._path.scene
         message = f"{self.name(index)} is the last that pressures were found to follow"
         if scene is not None and beyond is not None:
             message += f" with the body clear. {self._falls(index, beyond)}"
         else:
             message += " without a jump"
             if scene is not None:
-                nearest = self._robot_of(solution).clearances(solution.pressures[-1], scene).nearest
+                nearest = solution.robot.clearances(pressures[-1], scene).nearest
                 message += f", and clear of '{nearest}'"
             message += (
                 ": beyond it the arm would have to change to another configuration while the tip "
                 "stays on the path"
             )
         return _unreachable(solution, index, f"{message}. The path up to there is given.")
+
+    # -- what fails ---------------------------------------------------------------------------
+
+    def _failure(
+        self,
+        tasks: PathTasks,
+        solution: PathSolution,
+        judgements: Sequence[Judgement],
+        unreachable: Failure | None,
+    ) -> Failure | None:
+        """Return the first point at which a solution does not keep the path, and why; or None."""
+        if unreachable is not None:
+            text = self._cannot_be_reached(*unreachable)
+            return unreachable[0], f"{text}. The nearest path that can be followed is given."
+        for index, judgement in enumerate(judgements):
+            if not judgement.holds:
+                return index, f"{self.name(index)} does not hold: {_what_is_wrong(judgement)}"
+        if self._slew is not None and self._points.times is not None:
+            limits = step_limits(solution.times, self._slew)
+            assert (np.abs(np.diff(solution.pressures, axis=0)) <= limits * (1 + 1e-6) + 1e-6).all()
+        return self._blocked(tasks, solution.pressures)
+
+    def _blocked(self, tasks: PathTasks, p: Vector) -> Failure | None:
+        """Return the first point after which the body is too near the scene, and why; or None."""
+        if tasks.scene is None or len(p) < 2:
+            return None
+        body = tasks.body or BodyCheck(tasks.robot, tasks.scene)
+        whole = body.motion(p)
+        if whole.clear:
+            return None
+        found = ((k, body.motion(p[k : k + 2])) for k in range(len(p) - 1))
+        index, motion = next(((k, each) for k, each in found if not each.clear), (0, whole))
+        if not np.isfinite(motion.least):
+            return index, (
+                f"{_after(index)} the arm has no stable equilibrium, or snaps to another."
+            )
+        return index, (
+            f"{self._falls(index, motion.least)}. With more points, or lower rates, it may keep "
+            "clear."
+        )
+
+    # -- words --------------------------------------------------------------------------------
+
+    def _along(self, index: int) -> str:
+        return display_units().length.text(self._points.lengths[index])
+
+    def _cannot_be_reached(self, index: int, why: str) -> str:
+        return f"{self.name(index)} cannot be reached: {why.removeprefix('unreachable: ')}"
+
+    def _falls(self, index: int, least: float) -> str:
+        """Say what the clearance falls to after a point."""
+        scene, length = self._path.scene, display_units().length
+        assert scene is not None
+        return (
+            f"{_after(index)} the clearance of the body falls to {length.text(least, '.3g')}; "
+            f"the scene asks for {length.text(scene.clearance, 'g')}"
+        )
+
+    def _binding(self, solution: PathSolution) -> str:
+        """Name the channel that uses most of its rate."""
+        if self._slew is None:
+            return ""
+        rates = np.abs(np.diff(solution.pressures, axis=0)) / np.diff(solution.times)[:, np.newaxis]
+        share = rates / self._slew
+        channel = int(np.unravel_index(share.argmax(), share.shape)[1])
+        name = self._robot.description.channel_name(channel)
+        rate = display_units().pressure.text(self._slew[channel], "g")
+        return f"; {name} with {rate}/s holds it back most"
+
+    def _notes(self, solution: PathSolution) -> str:
+        """Return remarks for the user on a path that can be followed."""
+        notes: list[str] = []
+        if self._slew is None:
+            notes.append("No rate of change is known, of the robot or of the path; none was kept.")
+        middle = (solution.pressures[1:] + solution.pressures[:-1]) / 2
+        if len(middle) and self._points.targets[0].position is not None:
+            lengths = self._points.lengths[: len(solution.pressures)]
+            lengths = (lengths[1:] + lengths[:-1]) / 2
+            tips = solution.robot.tip_pose(middle)[:, :3, 3]
+            off = np.linalg.norm(tips - self._points.curve.at(lengths), axis=1)
+            index, allowed = int(off.argmax()), self._path.tolerance.position
+            if off[index] > 2 * allowed:
+                error = display_units().length.text(off[index], ".2g")
+                notes.append(
+                    f"{_after(index)} the tip is up to {error} off the path; with more points, or "
+                    "lower rates, it stays nearer."
+                )
+        return " ".join(notes)
+
+
+def _after(index: int) -> str:
+    return f"Between points {index + 1} and {index + 2}"
+
+
+def _unreachable(solution: PathSolution, index: int, message: str) -> PathSolution:
+    return replace(solution, status="unreachable", message=message, first_failure=index)
+
+
+def _errors(judgements: Sequence[Judgement], name: str) -> Vector | None:
+    if name not in judgements[0].errors:
+        return None
+    return np.array([judgement.errors[name] for judgement in judgements])
+
+
+def _what_is_wrong(judgement: Judgement) -> str:
+    if not judgement.is_clear:
+        name, missing = max(judgement.intruders.items(), key=lambda item: item[1])
+        return f"the body is {display_units().length.text(missing, '.3g')} too near to '{name}'"
+    if not judgement.limits_hold:
+        return "a pressure is beyond its limits"
+    return "the tip is off its target"

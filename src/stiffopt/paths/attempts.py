@@ -23,7 +23,8 @@ class RouteAttempts:
     layers : list of list of PathCandidate
         Local optima at each of N points.
     over : "worst" or "mean"
-    fixed : indices of points at which the pressures are given.
+    fixed : set of int
+        Points at which the pressures are given.
     is_closed : whether sequences end with the pressures with which they begin.
     """
 
@@ -32,7 +33,7 @@ class RouteAttempts:
         tasks: PathTasks,
         layers: Sequence[Sequence[PathCandidate]],
         over: str,
-        fixed: Sequence[int],
+        fixed: set[int],
         is_closed: bool,
     ) -> None:
         self._tasks, self._layers, self._over = tasks, layers, over
@@ -40,9 +41,9 @@ class RouteAttempts:
         self._further: list[list[PathCandidate]] = [[] for _ in layers]
 
     def best(self, steps: Vector, *, any_will_do: bool = False) -> list[Route]:
-        """Return the best sequences within steps (N - 1, n), the best first; none if a layer is empty.
+        """Return the best sequences within steps (N - 1, n), the best first, or none.
 
-        Several only where another one, once refined, may become better than the best.
+        There are several only if another one, once refined, may become better than the best.
         """
         if not all(self._layers):
             return []

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -94,7 +95,8 @@ class Links:
         order = np.argsort(np.concatenate([self.goal, others.goal]), kind="stable")
         names = [each.name for each in fields(Links) if each.name != "between"]
         pairs = ((getattr(self, name), getattr(others, name)) for name in names)
-        return Links(*(np.concatenate(pair)[order] for pair in pairs))
+        sorted_: list[Any] = [np.concatenate(pair)[order] for pair in pairs]
+        return Links(*sorted_)
 
     def exclude(self, numbers: Indices) -> None:
         """Let no sequence use some links."""

@@ -117,12 +117,13 @@ class PathTasks:
         The arm, which carries the load.
     lower, upper, unit : ndarray (n,)
         Limits, and ranges of the channels, in Pa.
+    scene : Scene or None
     is_compiled : bool
         Whether they are solved by machine code.
     """
 
     def __init__(self, robot: Manipulator, tasks: Sequence[Task], seed: int) -> None:
-        self.tasks = tuple(tasks)
+        self.tasks, self.scene = tuple(tasks), tasks[0].scene
         # the robot carries the load
         plain = {"load": None}
         self._without_load = [t if t.load is None else t.model_copy(update=plain) for t in tasks]
@@ -143,6 +144,13 @@ class PathTasks:
         self.is_compiled = self._fast is not None
         self._functions = functions(self.robot, self.programs[0])
         self._rows: dict[int, Vector] = {}
+
+    @cached_property
+    def body(self) -> BodyCheck | None:
+        """The check of the body between points; None without a scene or machine code."""
+        if self.scene is None or not self.is_compiled:
+            return None
+        return BodyCheck(self.robot, self.scene)
 
     @cached_property
     def _bounding(self) -> Bounding:
@@ -270,10 +278,9 @@ class PathTasks:
 
     def _are_clear(self, pressures: Vector) -> Mask:
         """Return whether the body keeps the scene's clearance at pressures (k, n)."""
-        scene = self.tasks[0].scene
-        if scene is None or not len(pressures):
+        if self.scene is None or not len(pressures):
             return np.ones(len(pressures), bool)
-        return np.asarray(self.robot.clearance(pressures, scene) >= scene.clearance)
+        return np.asarray(self.robot.clearance(pressures, self.scene) >= self.scene.clearance)
 
     def _values(self, indices: NDArray[np.intp], pressures: Vector) -> Vector:
         """Return `PathCandidate.value` of pressures (k, n) of a free arm, each at its point."""

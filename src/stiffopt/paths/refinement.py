@@ -13,7 +13,7 @@ Lagrangian enter as a convex quadratic term; Clarabel solves the program, a seco
 each tolerance.  A trust region and an exact penalty decide whether a step is taken.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -25,7 +25,7 @@ from scipy import sparse
 from stiffopt.model.stopping import checkpoint
 from stiffopt.optimise.program import Constraint
 from stiffopt.optimise.settings import DESCENT
-from stiffopt.paths.points import BodyCheck, PathTasks, Slopes, joined
+from stiffopt.paths.points import PathTasks, Slopes, joined
 from stiffopt.paths.settings import REFINEMENT
 
 Vector = NDArray[np.float64]
@@ -38,10 +38,11 @@ def refined(
     pressures: Vector,
     steps: Vector,
     over: str,
-    fixed: Sequence[int] = (),
-    body: BodyCheck | None = None,
+    fixed: Collection[int] = (),
 ) -> Vector:
     """Return pressures (N, n) that are better where the rates bind.
+
+    A window in which the body would not keep clear is left as it was.
 
     Parameters
     ----------
@@ -52,10 +53,9 @@ def refined(
         Largest changes from point to point, in Pa.
     over : "worst" or "mean"
     fixed : indices of points that must not change.
-    body : BodyCheck, optional
-        A window in which the body would not keep clear is left as it was.
     """
     done: list[range] = []
+    body = tasks.body
     passes = REFINEMENT.passes if body is None else 1  # longer windows come too near, as a rule
     for _ in range(passes):  # a window may be held back at its ends: a wider one then
         windows = [each for each in _windows(pressures, steps) if not _is_within(each, done)]
@@ -67,7 +67,7 @@ def refined(
         if done:
             windows = [_wider(each, len(pressures)) for each in windows]
         for window in windows:
-            new = _Window(tasks, pressures, steps, over, window, set(fixed)).optimised()
+            new = _Window(tasks, pressures, steps, over, window, fixed).optimised()
             near = new[max(window.start - 1, 0) : window.stop + 1]
             if body is None or body.motion(near).clear:
                 pressures = new
@@ -133,7 +133,7 @@ class _Window:
         steps: Vector,
         over: str,
         window: range,
-        fixed: set[int],
+        fixed: Collection[int],
     ) -> None:
         self._tasks, self._pressures, self._over = tasks, pressures, over
         free = [index for index in window if index not in fixed]
@@ -147,7 +147,7 @@ class _Window:
         own = tasks.programs[0].n_own_rows
         self._balls = [c for c in constraints if not c.one_sided]
         self._one_sided = [c for c in constraints if c.one_sided and c.first < own]
-        self._scene = tasks.tasks[0].scene
+        self._scene = tasks.scene
         others = [i for i in range(len(pressures)) if i not in self._free]
         self._floor = -np.inf
         if over == "worst" and others:

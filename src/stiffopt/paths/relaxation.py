@@ -1,13 +1,13 @@
 """Move the points of a sequence one by one, each to the local optimum between its neighbours."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt.model.stopping import checkpoint
-from stiffopt.paths.points import BodyCheck, Local, PathCandidate, PathTasks
+from stiffopt.paths.points import Local, PathCandidate, PathTasks
 from stiffopt.paths.route import Route
 from stiffopt.paths.settings import ROUTE
 
@@ -15,12 +15,7 @@ Vector = NDArray[np.float64]
 
 
 def relaxed(
-    tasks: PathTasks,
-    route: Route,
-    steps: Vector,
-    best: Vector,
-    fixed: Sequence[int],
-    body: BodyCheck | None,
+    tasks: PathTasks, route: Route, steps: Vector, best: Vector, fixed: Collection[int]
 ) -> Route:
     """Return a sequence whose points are moved one by one, each between its neighbours.
 
@@ -35,7 +30,6 @@ def relaxed(
     best : (N,)
         Best values of the single points.
     fixed : indices of points that must not change.
-    body : BodyCheck, optional
     """
     found = list(route.candidates)
     free = np.ones(len(found), dtype=bool)
@@ -48,7 +42,7 @@ def relaxed(
         moved = np.zeros(len(found), dtype=bool)
         for odd in (0, 1):
             points = np.flatnonzero(poor[odd::2]) * 2 + odd
-            moved[points] = _move(tasks, found, points.tolist(), steps, body)
+            moved[points] = _move(tasks, found, points.tolist(), steps)
         if not moved.any():
             break
         movable = moved.copy()  # these and their neighbours
@@ -59,11 +53,7 @@ def relaxed(
 
 
 def _move(
-    tasks: PathTasks,
-    found: list[PathCandidate],
-    points: Sequence[int],
-    steps: Vector,
-    body: BodyCheck | None,
+    tasks: PathTasks, found: list[PathCandidate], points: Sequence[int], steps: Vector
 ) -> list[bool]:
     """Move some points of a sequence, in place, if they become stiffer; return which moved."""
     p = [each.pressures for each in found]
@@ -80,7 +70,7 @@ def _move(
         is_better = new is not None and new.value > found[k].value + ROUTE.hardly / 10
         if new is not None and is_better:
             way = [*p[max(k - 1, 0) : k], new.pressures, *p[k + 1 : k + 2]]
-            is_better = body is None or body.motion(np.array(way)).clear
+            is_better = tasks.body is None or tasks.body.motion(np.array(way)).clear
         if new is not None and is_better:
             found[k] = new
         moved.append(is_better)

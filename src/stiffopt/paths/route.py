@@ -51,7 +51,7 @@ class Route:
 
 
 class RouteSearch:
-    """Searches for the best sequence of candidates.
+    """Searches for the best sequence of candidates along which the body keeps clear.
 
     Parameters
     ----------
@@ -65,8 +65,6 @@ class RouteSearch:
     lanes : list of list of PathCandidate, optional
         Further candidates at each point.
     is_closed : whether sequences end with the pressures with which they begin.
-    body : BodyCheck, optional
-        Excludes links on which the body does not keep clear.
 
     Attributes
     ----------
@@ -82,9 +80,8 @@ class RouteSearch:
         over: str,
         lanes: Sequence[Sequence[PathCandidate]] | None = None,
         is_closed: bool = False,
-        body: BodyCheck | None = None,
     ) -> None:
-        self._tasks, self._steps, self._over, self._body = tasks, steps, over, body
+        self._tasks, self._steps, self._over = tasks, steps, over
         if is_closed:
             layers = [*layers[:-1], layers[0]]
         self._ends: Sequence[int | None] = range(len(layers[0])) if is_closed else [None]
@@ -164,7 +161,7 @@ class RouteSearch:
     def comes_up_to(self, route: Route, share: float) -> bool:
         """Whether a sequence has this share of the upper bound, the single points' stiffness."""
         best = self._hope.worst if self._over == "worst" else self._hope.mean
-        return route.value(self._over) > best + np.log(share)
+        return route.value(self._over) > best + math.log(share)
 
     def beginning(self) -> list[PathCandidate]:
         """Return the longest sequence of candidates from the first point on."""
@@ -197,18 +194,18 @@ class RouteSearch:
 
     def _drops_blocked(self, numbers: Sequence[int]) -> bool:
         """Exclude links on which the body does not keep clear; return whether there were any."""
-        links, blocked = self._links, False
+        links, body, blocked = self._links, self._tasks.body, False
         for number in numbers:
-            if self._body is None or links.checked[number] or not links.known[number]:
+            if body is None or links.checked[number] or not links.known[number]:
                 continue
             between = [each.pressures for each in links.between.get(number, [])]
             start, end = self.layers.pressures[[links.origin[number], links.goal[number]]]
             links.checked[number] = True
-            if not self._body.motion(np.array([start, *between, end])).clear:
+            if not body.motion(np.array([start, *between, end])).clear:
                 blocked = True
                 links.exclude(np.array([number]))
                 if not between:
-                    self._exclude_others(int(self.layers.point[links.origin[number]]), self._body)
+                    self._exclude_others(int(self.layers.point[links.origin[number]]), body)
         return blocked
 
     def _exclude_others(self, point: int, body: BodyCheck) -> None:
