@@ -21,14 +21,7 @@ Failure = tuple[int, str]
 
 
 class PathAnswers:
-    """The solutions of one path on one arm, with their messages.
-
-    Parameters
-    ----------
-    robot, path, points :
-    slew : (n,) or None
-        Largest rates, in Pa/s.
-    """
+    """The solutions of one path on one arm, with their messages; `slew` (n,) is in Pa/s or None."""
 
     def __init__(
         self, robot: Manipulator, path: Path, points: PathPoints, slew: Vector | None
@@ -202,7 +195,7 @@ class PathAnswers:
             lengths = self._points.lengths[: len(solution.pressures)]
             lengths = (lengths[1:] + lengths[:-1]) / 2
             tips = solution.robot.tip_pose(middle)[:, :3, 3]
-            off = np.linalg.norm(tips - self._points.curve.at(lengths), axis=1)
+            off = np.linalg.norm(tips - self._points.at(lengths), axis=1)
             index, allowed = int(off.argmax()), self._path.tolerance.position
             if off[index] > 2 * allowed:
                 error = display_units().length.text(off[index], ".2g")

@@ -5,7 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from stiffopt.paths.candidates import lanes
+from stiffopt.paths.gaps import gaps
+from stiffopt.paths.lanes import lanes
 from stiffopt.paths.points import PathCandidate, PathTasks
 from stiffopt.paths.relaxation import relaxed
 from stiffopt.paths.route import Route, RouteSearch
@@ -17,15 +18,7 @@ Vector = NDArray[np.float64]
 class RouteAttempts:
     """Searches for sequences, with further candidates if local optima do not suffice.
 
-    Parameters
-    ----------
-    tasks : PathTasks
-    layers : list of list of PathCandidate
-        Local optima at each of N points.
-    over : "worst" or "mean"
-    fixed : set of int
-        Points at which the pressures are given.
-    is_closed : whether sequences end with the pressures with which they begin.
+    Pressures are given at the `fixed` points; other arguments are those of `RouteSearch`.
     """
 
     def __init__(
@@ -52,6 +45,7 @@ class RouteAttempts:
         is_last = any_will_do
         for attempt in range(len(ROUTE.widths) + 1):
             search = self._search(steps)
+            alone = search.layers.best
             rounds = ROUTE.first_rounds
             if is_last and not any_will_do:
                 rounds = ROUTE.rounds
@@ -60,14 +54,16 @@ class RouteAttempts:
             share = ROUTE.enough if attempt else None
             best = search.best(rounds, share=share, any_will_do=any_will_do)
             if best is not None:
-                best = relaxed(tasks, best, steps, search.layers.best, self._fixed)
-                if any_will_do or search.comes_up_to(best, ROUTE.enough):
+                best = relaxed(tasks, best, steps, alone, self._fixed)
+                if any_will_do or best.comes_up_to(ROUTE.enough, alone, self._over):
                     return [best]
             known += [each for each in (best, search.first) if each is not None]
             known.sort(key=lambda each: -each.value(self._over))
             if is_last:
                 break
-            regions = search.gaps(known[0] if known else None, attempt)
+            value = known[0].value(self._over) if known else None
+            change = float((tasks.unit / np.median(steps, axis=0)).max())
+            regions = gaps(search.layers, search.links, self._over, value, change, attempt)
             is_whole = len(regions[0]) == len(tasks)
             is_last = attempt == len(ROUTE.widths) - 1 or (attempt > 0 and is_whole)
             self._add_lanes(regions, attempt, is_last, known[0] if known else None)

@@ -18,14 +18,8 @@ _NONE = np.zeros(0, dtype=np.intp)
 def crossings(layers: Layers, steps: Vector, over: str) -> Links:
     """Return crossings from some points between candidates that are too far apart for a step.
 
-    Their values are estimates.
-
-    Parameters
-    ----------
-    layers : Layers
-    steps : (N - 1, n)
-        Largest changes from point to point, in Pa.
-    over : "worst" or "mean"
+    Their values are estimates.  `steps` (N - 1, n) are the largest changes from point to point, in
+    Pa; the `over` value ("worst" or "mean") is to be maximised.
     """
     count = len(layers)
     reach = np.concatenate([np.zeros((1, steps.shape[1])), steps.cumsum(axis=0)])

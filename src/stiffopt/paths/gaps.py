@@ -19,15 +19,8 @@ def gaps(
     Only candidates count with which a sequence would be better than the best one so far.  In the
     first attempt a region is where those that end and those that go on are nearest to each other;
     later it has all points where there are both.  It is long enough for a change between any two,
-    and longer in later attempts.
-
-    Parameters
-    ----------
-    layers, links :
-    over : "worst" or "mean"
-    best : value of the best sequence so far, or None.
-    longest_change : number of steps in which the rates allow any change of pressures.
-    attempt : from 0.
+    and longer in later attempts.  `best` is the value of the best sequence so far, and
+    `longest_change` the number of steps in which the rates allow any change of pressures.
     """
     bar = np.full(len(layers), -np.inf)
     if best is not None and over == "worst":

@@ -193,7 +193,10 @@ class PathTasks:
             return [None for _ in indices]
         rows = np.stack([self._row(index) for index in indices])
         answers = self._fast[0].solve_all(rows)
-        return [self._accepted(i, answer) for i, answer in zip(indices, answers, strict=True)]
+        return [
+            None if a is None else self.accepted(i, a.pressures, self._judgement(i, a))
+            for i, a in zip(indices, answers, strict=True)
+        ]
 
     def _row(self, index: int) -> Vector:
         """Return the numbers of a point's task, as machine code expects them."""
@@ -204,20 +207,20 @@ class PathTasks:
             self._rows[index] = solver.with_target(row, program, None)
         return self._rows[index]
 
-    def _accepted(self, index: int, answer: CompiledAnswer | None) -> PathCandidate | None:
-        if answer is None:
-            return None
+    def _judgement(self, index: int, answer: CompiledAnswer) -> Judgement:
         within = are_within(answer.pressures, self.lower, self.upper)
-        judgement = Judgement.of(self.programs[index], answer.judged, within)
-        if not judgement.holds:
-            return None
-        return PathCandidate(answer.pressures, self.value(index, judgement, answer.pressures))
+        return Judgement.of(self.programs[index], answer.judged, within)
 
-    def value(self, index: int, judgement: Judgement, pressures: Vector) -> float:
-        """Return `PathCandidate.value` of judged pressures."""
-        if self.programs[index].measures:
-            return float(np.log(min(judgement.stiffnesses)))
-        return -float(np.mean((pressures / self.programs[index].reference) ** 2))
+    def accepted(
+        self, index: int, pressures: Vector, judgement: Judgement | None
+    ) -> PathCandidate | None:
+        """Return judged pressures (n,) as a candidate at a point, or None if they miss its task."""
+        if judgement is None or not judgement.holds:
+            return None
+        program = self.programs[index]
+        if program.measures:
+            return PathCandidate(pressures, float(np.log(min(judgement.stiffnesses))))
+        return PathCandidate(pressures, -float(np.mean((pressures / program.reference) ** 2)))
 
     def _general(self, question: Local) -> PathCandidate | None:
         """Search a local optimum without machine code."""
@@ -305,12 +308,8 @@ class PathTasks:
             return [self.judged_at(index, p) for index, p in enumerate(pressures)]
         solver = self._fast[0]
         rows = [solver.judging(self._row(index), p) for index, p in enumerate(pressures)]
-        found: list[Judgement | None] = []
-        for index, answer in enumerate(solver.solve_all(np.stack(rows))):
-            within = are_within(pressures[index], self.lower, self.upper)
-            program = self.programs[index]
-            found.append(answer and Judgement.of(program, answer.judged, within))
-        return found
+        answers = enumerate(solver.solve_all(np.stack(rows)))
+        return [answer and self._judgement(index, answer) for index, answer in answers]
 
     def judged_at(self, index: int, pressures: Vector) -> Judgement | None:
         """Judge pressures (n,) at one point; None if there is no equilibrium."""
@@ -321,10 +320,7 @@ class PathTasks:
 
     def candidate(self, index: int, pressures: Vector) -> PathCandidate | None:
         """Return pressures (n,) as a candidate at a point, or None if they miss its task."""
-        judgement = self.judged_at(index, pressures)
-        if judgement is None or not judgement.holds:
-            return None
-        return PathCandidate(pressures, self.value(index, judgement, pressures))
+        return self.accepted(index, pressures, self.judged_at(index, pressures))
 
     def slopes(self, indices: Sequence[int], pressures: Vector) -> Slopes | None:
         """Linearise the tasks at some points about pressures (k, n); None without equilibrium."""

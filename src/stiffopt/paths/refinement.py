@@ -251,23 +251,19 @@ class _Window:
         k, n = state.x.shape
         h = REFINEMENT.difference
 
-        def gradients(x: Vector) -> Vector | None:
-            slopes = self._tasks.slopes(self._free, x * self._tasks.unit)
-            if slopes is None:
-                return None
+        def gradients(slopes: Slopes) -> Vector:
             found: Vector = np.einsum("kt,ktn->kn", weights, slopes.gradients)
             found += np.einsum("km,kmn->kn", pulls, slopes.jacobians)
             return found
 
-        here = gradients(state.x)
-        columns = []
+        here, columns = gradients(state.slopes), []
         for index in range(n):
             shifted = state.x.copy()
             shifted[:, index] += h
-            there = gradients(shifted)
-            if here is None or there is None:
+            there = self._tasks.slopes(self._free, shifted * self._tasks.unit)
+            if there is None:
                 return np.tile(1e-3 * np.eye(n), (k, 1, 1))
-            columns.append((there - here) / h)
+            columns.append((gradients(there) - here) / h)
         H = np.stack(columns, axis=2)
         values, vectors = np.linalg.eigh((H + H.swapaxes(1, 2)) / 2)
         values = np.maximum(values, 1e-6)
@@ -285,39 +281,21 @@ class _Window:
         size = k * n + 2 * k + worst
         e, slack = k * n, k * n + k
         rows = _Rows(size)
-        identity = np.arange(k * n)
+        every, point = np.arange(k * n), np.arange(k)
         low = np.maximum(self._lower - state.x, -radius).ravel()
         high = np.minimum(self._upper - state.x, radius).ravel()
-        rows.add(high, (np.arange(k * n), identity, np.ones(k * n)))
-        rows.add(-low, (np.arange(k * n), identity, -np.ones(k * n)))
+        rows.add(high, (every, every, np.ones(k * n)))
+        rows.add(-low, (every, every, -np.ones(k * n)))
         self._add_rates(rows, state.x)
-        rows.add(np.zeros(k), (np.arange(k), slack + np.arange(k), -np.ones(k)))
+        rows.add(np.zeros(k), (point, slack + point, -np.ones(k)))
         if worst:
-            index = np.arange(k)
-            rows.add(
-                np.zeros(k),
-                (index, e + index, np.ones(k)),
-                (index, np.full(k, size - 1), -np.ones(k)),
-            )
+            last = np.full(k, size - 1)
+            rows.add(np.zeros(k), (point, e + point, np.ones(k)), (point, last, -np.ones(k)))
             if np.isfinite(self._floor):
-                rows.add(np.array([-self._floor]), (np.zeros(1), np.array([size - 1]), -np.ones(1)))
-        b = state.near.shape[1]
-        if b:
-            point = np.repeat(np.arange(k), b)
-            index = np.arange(k * b)
-            rows.add(
-                -state.near.ravel(),
-                (np.repeat(index, n), _columns(point, n), state.near_slopes.ravel()),
-                (index, slack + point, -np.ones(k * b)),
-            )
+                rows.add(np.array([-self._floor]), (np.zeros(1), last[:1], -np.ones(1)))
+        rows.add_upper(state.near, state.near_slopes, slack)
         costs_from = rows.count
-        t = costs.shape[1]
-        point, index = np.repeat(np.arange(k), t), np.arange(k * t)
-        rows.add(
-            -costs.ravel(),
-            (np.repeat(index, n), _columns(point, n), state.slopes.gradients.ravel()),
-            (index, e + point, -np.ones(k * t)),
-        )
+        rows.add_upper(costs, state.slopes.gradients, e)
         cones: list[object] = [clarabel.NonnegativeConeT(rows.count)]
         balls_from = rows.count
         for ball in self._balls:
@@ -348,7 +326,7 @@ class _Window:
             own = z[at : at + k * width].reshape(k, width)
             pulls[:, ball.first : ball.end] = -own[:, 1:] / ball.scale
             at += k * width
-        weights = z[costs_from : costs_from + k * t].reshape(k, t)
+        weights = z[costs_from : costs_from + costs.size].reshape(costs.shape)
         hoped = float(q @ x)
         return _Step(d, weights, pulls, state.merit - hoped)
 
@@ -414,6 +392,20 @@ class _Rows:
         self._bounds.append(bounds)
         self._entries += [(row + self.count, column, value) for row, column, value in entries]
         self.count += len(bounds)
+
+    def add_upper(self, values: Vector, slopes: Vector, bound: int) -> None:
+        """Bound linearised values (k, b) of k points, with slopes (k, b, n), each by a variable.
+
+        The bounds are the k variables from column `bound` on.
+        """
+        k, b, n = slopes.shape
+        if b:
+            point, index = np.repeat(np.arange(k), b), np.arange(k * b)
+            self.add(
+                -values.ravel(),
+                (np.repeat(index, n), _columns(point, n), slopes.ravel()),
+                (index, bound + point, -np.ones(k * b)),
+            )
 
     def matrix(self) -> tuple[sparse.csc_matrix, Vector]:
         """Return A and b."""

@@ -19,17 +19,9 @@ def relaxed(
 ) -> Route:
     """Return a sequence whose points are moved one by one, each between its neighbours.
 
-    A point moves to a local optimum that the rates allow, if the body keeps clear on the way.
-
-    Parameters
-    ----------
-    tasks : PathTasks
-    route : Route
-    steps : (N - 1, n)
-        Largest changes from point to point, in Pa.
-    best : (N,)
-        Best values of the single points.
-    fixed : indices of points that must not change.
+    A point moves to a local optimum that the rates allow, if the body keeps clear on the way; the
+    `fixed` ones do not move.  `steps` (N - 1, n) are the largest changes from point to point in Pa,
+    and `best` (N,) the best values of the single points.
     """
     found = list(route.candidates)
     free = np.ones(len(found), dtype=bool)

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from stiffopt.model.stopping import checkpoint
 from stiffopt.paths.crossings import crossed, crossings
-from stiffopt.paths.gaps import gaps
 from stiffopt.paths.links import Layers, Links, all_steps
 from stiffopt.paths.points import BodyCheck, PathCandidate, PathTasks
 from stiffopt.paths.sequences import LinkedSequence, Sequences, compiled
@@ -48,6 +47,11 @@ class Route:
         """Return the worst value of the sequence, or the mean."""
         values = [each.value for each in self.candidates]
         return float(min(values) if over == "worst" else np.mean(values))
+
+    def comes_up_to(self, share: float, alone: Vector, over: str) -> bool:
+        """Whether it has more than this share of the single points' stiffness, values (N,)."""
+        best = float(alone.min() if over == "worst" else alone.mean())
+        return self.value(over) > best + math.log(share)
 
 
 class RouteSearch:
@@ -93,7 +97,8 @@ class RouteSearch:
         self.first: Route | None = None
 
     @property
-    def _links(self) -> Links:
+    def links(self) -> Links:
+        """The links between candidates."""
         return self._sequences.links
 
     def best(
@@ -108,7 +113,7 @@ class RouteSearch:
         best = self._best_of_ends(0, share, any_will_do)
         if best is None or not (any_will_do or self._is_enough(best, self._hope, share)):
             new = crossings(self.layers, self._steps, self._over)
-            self._sequences.use(self._links.with_crossings(new))
+            self._sequences.use(self.links.with_crossings(new))
             best = self._best_of_ends(rounds, share, any_will_do)
         return None if best is None else self._route(best)
 
@@ -133,13 +138,13 @@ class RouteSearch:
             hoped = self._sequence(computed=False)
             if hoped is None:
                 return None
-            unknown = [each for each in hoped.links if not self._links.known[each]]
+            unknown = [each for each in hoped.links if not self.links.known[each]]
             if not unknown or (known is not None and self._is_enough(known, hoped, None)):
                 return known
             for number in unknown:
                 checkpoint()
                 self._compute(number)
-            if any(number in self._links.between for number in unknown):
+            if any(number in self.links.between for number in unknown):
                 known = self._sequence(computed=True)
         return known
 
@@ -158,11 +163,6 @@ class RouteSearch:
             return gain < -math.log(share)
         return gain < ROUTE.hardly and (not over or on_average < ROUTE.hardly_on_average)
 
-    def comes_up_to(self, route: Route, share: float) -> bool:
-        """Whether a sequence has this share of the upper bound, the single points' stiffness."""
-        best = self._hope.worst if self._over == "worst" else self._hope.mean
-        return route.value(self._over) > best + math.log(share)
-
     def beginning(self) -> list[PathCandidate]:
         """Return the longest sequence of candidates from the first point on."""
         for _ in range(ROUTE.repeats):
@@ -170,15 +170,9 @@ class RouteSearch:
             if not self._drops_blocked(found.links):
                 break
         else:  # the part of the last one up to the first blocked link
-            kept = [self._links.worst[each] > -np.inf for each in found.links]
+            kept = [self.links.worst[each] > -np.inf for each in found.links]
             found = found._replace(links=found.links[: kept.index(False)])
         return self._route(found).candidates
-
-    def gaps(self, best: Route | None, attempt: int) -> list[range]:
-        """Return regions to seek further candidates in; see `stiffopt.paths.gaps`."""
-        value = None if best is None else best.value(self._over)
-        change = float((self._tasks.unit / np.median(self._steps, axis=0)).max())
-        return gaps(self.layers, self._links, self._over, value, change, attempt)
 
     def _sequence(self, *, computed: bool) -> LinkedSequence | None:
         """Return the best sequence, of computed links alone if asked; None if there is none.
@@ -194,7 +188,7 @@ class RouteSearch:
 
     def _drops_blocked(self, numbers: Sequence[int]) -> bool:
         """Exclude links on which the body does not keep clear; return whether there were any."""
-        links, body, blocked = self._links, self._tasks.body, False
+        links, body, blocked = self.links, self._tasks.body, False
         for number in numbers:
             if body is None or links.checked[number] or not links.known[number]:
                 continue
@@ -210,7 +204,7 @@ class RouteSearch:
 
     def _exclude_others(self, point: int, body: BodyCheck) -> None:
         """Exclude steps from a point half-way along which the body is too near."""
-        links, at, p = self._links, self.layers.point, self.layers.pressures
+        links, at, p = self.links, self.layers.point, self.layers.pressures
         is_step = (at[links.origin] == point) & (at[links.goal] == point + 1)
         steps = np.flatnonzero(is_step & ~links.checked)
         if len(steps):
@@ -219,7 +213,7 @@ class RouteSearch:
 
     def _compute(self, number: int) -> None:
         """Compute the values along a crossing; minus infinity if it cannot be followed."""
-        links = self._links
+        links = self.links
         ends = [links.origin[number], links.goal[number]]
         (begin, end), (start, goal) = self.layers.point[ends], self.layers.pressures[ends]
         between = crossed(self._tasks, int(begin), start, goal, self._steps[begin:end])
@@ -235,7 +229,7 @@ class RouteSearch:
         candidates = [self.layers.candidates[found.first]]
         count = 0
         for each in found.links:
-            between = self._links.between.get(each, [])
-            candidates += [*between, self.layers.candidates[self._links.goal[each]]]
+            between = self.links.between.get(each, [])
+            candidates += [*between, self.layers.candidates[self.links.goal[each]]]
             count += bool(between)
         return Route(candidates, count)

@@ -111,9 +111,9 @@ class _PathSolver:
             if pressures is None:
                 continue
             judgement = tasks.judged_at(index, pressures)
-            if judgement is not None and judgement.pose_holds and judgement.is_clear:
-                value = tasks.value(index, judgement, pressures)
-                found[index] = PathCandidate(pressures, value)
+            candidate = tasks.accepted(index, pressures, judgement)
+            if candidate is not None:
+                found[index] = candidate
                 continue
             where = "the arm does not stand at these pressures"
             if judgement is not None and not judgement.pose_holds:
@@ -243,7 +243,7 @@ class _PathSolver:
         found: list[tuple[float, Route, Vector]] = []
         for route in routes:
             pressures = route.pressures
-            if route.value(self._over) > join(alone) + np.log(ROUTE.nearly_all):
+            if route.comes_up_to(ROUTE.nearly_all, alone, self._over):
                 return route, pressures
             pressures = refined(tasks, pressures, steps, self._over, fixed)
             slopes = tasks.slopes(range(len(tasks)), pressures)
