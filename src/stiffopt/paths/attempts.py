@@ -3,22 +3,26 @@
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stiffopt.paths.gaps import gaps
 from stiffopt.paths.lanes import lanes
+from stiffopt.paths.links import Vector
 from stiffopt.paths.points import PathCandidate, PathTasks
+from stiffopt.paths.refinement import refined
 from stiffopt.paths.relaxation import relaxed
 from stiffopt.paths.route import Route, RouteSearch
 from stiffopt.paths.settings import ROUTE
-
-Vector = NDArray[np.float64]
 
 
 class RouteAttempts:
     """Searches for sequences, with further candidates if local optima do not suffice.
 
     Pressures are given at the `fixed` points; other arguments are those of `RouteSearch`.
+
+    Attributes
+    ----------
+    alone : ndarray (N,)
+        Largest values of the local optima; not a number where there is none.
     """
 
     def __init__(
@@ -31,6 +35,7 @@ class RouteAttempts:
     ) -> None:
         self._tasks, self._layers, self._over = tasks, layers, over
         self._fixed, self._is_closed = fixed, is_closed
+        self.alone = np.array([max((c.value for c in layer), default=np.nan) for layer in layers])
         self._further: list[list[PathCandidate]] = [[] for _ in layers]
 
     def best(self, steps: Vector, *, any_will_do: bool = False) -> list[Route]:
@@ -45,7 +50,7 @@ class RouteAttempts:
         is_last = any_will_do
         for attempt in range(len(ROUTE.widths) + 1):
             search = self._search(steps)
-            alone = search.layers.best
+            alone = search.layers.best  # further candidates included
             rounds = ROUTE.first_rounds
             if is_last and not any_will_do:
                 rounds = ROUTE.rounds
@@ -83,6 +88,24 @@ class RouteAttempts:
             else:
                 low = middle
         return factor, routes and (self.best(steps * factor) or routes)
+
+    def refined(self, routes: Sequence[Route], steps: Vector) -> tuple[Route, Vector]:
+        """Return the sequence that is best when refined, and its pressures.
+
+        Others are refined only if the first does not become about as stiff as single points.
+        """
+        tasks, join = self._tasks, np.min if self._over == "worst" else np.mean
+        found: list[tuple[float, Route, Vector]] = []
+        for route in routes:
+            if route.comes_up_to(ROUTE.nearly_all, self.alone, self._over):
+                return route, route.pressures
+            pressures = refined(tasks, route.pressures, steps, self._over, self._fixed)
+            slopes = tasks.slopes(range(len(tasks)), pressures)
+            value = -np.inf if slopes is None else float(join(-slopes.costs.max(axis=1)))
+            found.append((value, route, pressures))
+            if value > join(self.alone) + np.log(ROUTE.enough):
+                break
+        return max(found, key=lambda each: each[0])[1:]
 
     def beginning(self, steps: Vector) -> list[PathCandidate]:
         """Return the longest sequence of candidates from the first point on."""

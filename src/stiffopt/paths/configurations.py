@@ -50,7 +50,7 @@ def several(goal: End | Sequence[End]) -> list[End]:
         return [goal]
     if isinstance(goal, np.ndarray):
         return list(goal) if goal.ndim == 2 and len(goal) else [goal]
-    kinds = Task | Sequence | np.ndarray
+    kinds = (Task, Sequence, np.ndarray)
     if isinstance(goal, Sequence) and (
         not goal or any(isinstance(each, kinds) and not isinstance(each, str) for each in goal)
     ):

@@ -34,11 +34,7 @@ Entries = tuple[NDArray[Any], NDArray[Any], NDArray[Any]]
 
 
 def refined(
-    tasks: PathTasks,
-    pressures: Vector,
-    steps: Vector,
-    over: str,
-    fixed: Collection[int] = (),
+    tasks: PathTasks, pressures: Vector, steps: Vector, over: str, fixed: Collection[int] = ()
 ) -> Vector:
     """Return pressures (N, n) that are better where the rates bind.
 
@@ -343,10 +339,7 @@ class _Window:
                 (index, index + n, np.full(len(index), side)),
                 (index, index, np.full(len(index), -side)),
             )
-        for outside, inside, step in (
-            (first - 1, 0, first - 1),
-            (last + 1, k - 1, last),
-        ):
+        for outside, inside, step in ((first - 1, 0, first - 1), (last + 1, k - 1, last)):
             if not 0 <= outside < len(self._x):
                 continue
             own = inside * n + np.arange(n)

@@ -4,14 +4,12 @@ from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stiffopt.model.stopping import checkpoint
+from stiffopt.paths.links import Vector
 from stiffopt.paths.points import Local, PathCandidate, PathTasks
 from stiffopt.paths.route import Route
 from stiffopt.paths.settings import ROUTE
-
-Vector = NDArray[np.float64]
 
 
 def relaxed(

@@ -13,16 +13,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stiffopt.model.stopping import checkpoint
 from stiffopt.paths.crossings import crossed, crossings
-from stiffopt.paths.links import Layers, Links, all_steps
+from stiffopt.paths.links import Layers, Links, Vector, all_steps
 from stiffopt.paths.points import BodyCheck, PathCandidate, PathTasks
 from stiffopt.paths.sequences import LinkedSequence, Sequences, compiled
 from stiffopt.paths.settings import ROUTE
-
-Vector = NDArray[np.float64]
 
 
 @dataclass

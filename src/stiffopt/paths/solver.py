@@ -1,6 +1,5 @@
 """`solve_path`: find the stiffest pressures with which the tip follows a path within the rates."""
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -19,9 +18,7 @@ from stiffopt.paths.candidates import candidates
 from stiffopt.paths.path import Path
 from stiffopt.paths.points import PathCandidate, PathTasks
 from stiffopt.paths.rates import least_times, slew_limits, step_limits
-from stiffopt.paths.refinement import refined
-from stiffopt.paths.route import Route
-from stiffopt.paths.settings import RATES, ROUTE
+from stiffopt.paths.settings import RATES
 from stiffopt.paths.solution import PathSolution
 
 Vector = NDArray[np.float64]
@@ -172,7 +169,6 @@ class _PathSolver:
         fixed: set[int],
     ) -> PathSolution:
         """Return the solution; `moved` are the tasks with unreachable points moved."""
-        alone = np.array([max((c.value for c in layer), default=np.nan) for layer in layers])
         times, slowed, stuck = self._points.times, 1.0, None
         steps = self._steps(tasks, times)
         attempts = RouteAttempts(moved, layers, self._over, fixed, self._path.closed)
@@ -183,11 +179,11 @@ class _PathSolver:
             if routes:
                 times, steps = times * slowed, steps * slowed
         if not routes:
-            return self._without_route(moved, layers, attempts, steps, alone)
-        route, pressures = self._refined(moved, routes, steps, alone, fixed)
+            return self._without_route(moved, layers, attempts, steps)
+        route, pressures = attempts.refined(routes, steps)
         if times is None:
             times = self._fastest(pressures)
-        solution = self._answers.judged(tasks, pressures, times, alone, self._unreachable)
+        solution = self._answers.judged(tasks, pressures, times, attempts.alone, self._unreachable)
         branches = max(map(len, layers))
         confidence = (
             f"{starts} starts found at most {branches} local optima at a point; "
@@ -204,7 +200,6 @@ class _PathSolver:
         layers: list[list[PathCandidate]],
         attempts: RouteAttempts,
         steps: Vector,
-        alone: Vector,
     ) -> PathSolution:
         """Return the answer when no sequence was found: the path up to where it ends."""
         if self._unreachable is not None:
@@ -218,7 +213,7 @@ class _PathSolver:
         beyond = attempts.clearance_beyond(begin[-1], count - 1, steps[count - 1])
         times = self._points.times
         times = self._fastest(pressures) if times is None else times[:count]
-        solution = self._answers.judged(tasks, pressures, times, alone[:count], None)
+        solution = self._answers.judged(tasks, pressures, times, attempts.alone[:count], None)
         return self._answers.cut_short(solution, pressures, beyond)
 
     def _steps(self, tasks: PathTasks, times: Vector | None) -> Vector:
@@ -226,32 +221,6 @@ class _PathSolver:
         if times is None or self._slew is None:
             return np.tile(RATES.largest_step * tasks.unit, (len(tasks) - 1, 1))
         return step_limits(times, self._slew)
-
-    def _refined(
-        self,
-        tasks: PathTasks,
-        routes: Sequence[Route],
-        steps: Vector,
-        alone: Vector,
-        fixed: set[int],
-    ) -> tuple[Route, Vector]:
-        """Return the sequence that is best when refined, and its pressures.
-
-        Others are refined only if the first does not become about as stiff as single points.
-        """
-        join = np.min if self._over == "worst" else np.mean
-        found: list[tuple[float, Route, Vector]] = []
-        for route in routes:
-            pressures = route.pressures
-            if route.comes_up_to(ROUTE.nearly_all, alone, self._over):
-                return route, pressures
-            pressures = refined(tasks, pressures, steps, self._over, fixed)
-            slopes = tasks.slopes(range(len(tasks)), pressures)
-            value = -np.inf if slopes is None else float(join(-slopes.costs.max(axis=1)))
-            found.append((value, route, pressures))
-            if value > join(alone) + np.log(ROUTE.enough):
-                break
-        return max(found, key=lambda each: each[0])[1:]
 
     def _fastest(self, pressures: Vector) -> Vector:
         """Return the earliest times (N,) of the points that the rates allow."""
