@@ -287,6 +287,17 @@ def test_a_task_as_start_and_goal(two: Manipulator, compiled: Path) -> None:
     )
 
 
+@needs_ompl
+def test_a_way_that_ends_in_another_configuration_than_the_stiffest(compiled: Path) -> None:
+    robot = load_robot("stiff-flop-2")
+    robot._body.machine_code(10_000)
+    scene, start, end = cluttered(robot, np.random.default_rng(12))
+    with compiling_at_once():
+        motion = plan_motion(robot, start, task_at(robot, end), scene=scene, timeout=None)
+    check(motion, scene)
+    assert "to one of 3 goal configurations" in motion.confidence
+
+
 def test_of_several_goals_one_that_is_clear(two: Manipulator) -> None:
     scene = scene_of(post_between(two))
     blocked = (LEFT + RIGHT) / 2

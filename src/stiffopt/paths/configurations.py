@@ -26,7 +26,7 @@ _NEARNESS = 0.4  # half width of the box about such a guess, as a share of a cha
 _ALIKE = 0.02  # of the ranges; configurations that differ by less count as one
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Configuration:
     """Pressures at which a motion may end.
 
@@ -50,11 +50,9 @@ def several(goal: End | Sequence[End]) -> list[End]:
         return [goal]
     if isinstance(goal, np.ndarray):
         return list(goal) if goal.ndim == 2 and len(goal) else [goal]
-    if isinstance(goal, Sequence) and not len(goal):
-        return []
-    if isinstance(goal, Sequence) and any(
-        isinstance(each, Task | Sequence | np.ndarray) and not isinstance(each, str)
-        for each in goal
+    kinds = (Task, Sequence, np.ndarray)
+    if isinstance(goal, Sequence) and (
+        not goal or any(isinstance(each, kinds) and not isinstance(each, str) for each in goal)
     ):
         return list(goal)
     return [cast(End, goal)]

@@ -70,11 +70,11 @@ class Polyline(Curve):
 
     def at(self, lengths: ArrayLike) -> Vector:
         """See `Curve.at`."""
-        return _interpolated(lengths, self.knots, self.points)
+        return interpolated(lengths, self.knots, self.points)
 
     def tangents(self, lengths: ArrayLike) -> Vector:
         """See `Curve.tangents`."""
-        return _unit(_interpolated(lengths, self.knots, self._tangents))
+        return _unit(interpolated(lengths, self.knots, self._tangents))
 
 
 class ArcCurve(Curve):
@@ -229,7 +229,7 @@ class PathPoints:
         return self.curve.at(length)
 
 
-def _interpolated(lengths: ArrayLike, knots: Vector, rows: Vector) -> Vector:
+def interpolated(lengths: ArrayLike, knots: Vector, rows: Vector) -> Vector:
     """Interpolate rows (k, 3) at knots (k,) linearly at arc lengths (...)."""
     x = np.asarray(lengths, float)
     return np.stack([np.interp(x, knots, column) for column in rows.T], axis=-1)

@@ -208,13 +208,15 @@ class _Planner:
         start = self._start()
         tasks, goals = self._first_goals()
         self.timings["goals"] = perf_counter() - begin
-        way, end = self._straight(start, goals)
-        if way is None or end is None:
+        end = self._straight_to(start, goals)
+        if end is not None:
+            way = np.stack([start, end.pressures])
+        else:
             begin = perf_counter()
             goals = [*goals, *(each for task in tasks for each in task.others(start))]
             self.known = len(goals)
             self.timings["goals"] += perf_counter() - begin
-            way, end = self._search(start, goals, tasks)
+            way = self._search(start, goals, tasks)
         begin = perf_counter()
         if len(way) > 2:
             way = shortened(way, self.is_still_clear, self.request.slew, self.request.seed)
@@ -279,52 +281,46 @@ class _Planner:
 
     # -- ways -------------------------------------------------------------------------------
 
-    def _straight(
-        self, start: Vector, goals: list[Configuration]
-    ) -> tuple[Vector | None, Configuration | None]:
-        """Return the straight way to the best goal for which it is clear."""
-        for goal in sorted(goals, key=lambda each: -each.worth):
-            way = np.stack([start, goal.pressures])
-            if self.is_clear(way):
-                return way, goal
-        return None, None
+    def _straight_to(self, start: Vector, goals: list[Configuration]) -> Configuration | None:
+        """Return the best goal to which the straight way is clear."""
+        best_first = sorted(goals, key=lambda each: -each.worth)
+        ways = ((each, np.stack([start, each.pressures])) for each in best_first)
+        return next((each for each, way in ways if self.is_clear(way)), None)
 
     def _search(
         self, start: Vector, goals: list[Configuration], tasks: list[TaskConfigurations]
-    ) -> tuple[Vector, Configuration]:
+    ) -> Vector:
         """Search a way around obstacles; `plan_motion` says to which goal."""
         begin = perf_counter()
         assert self.motions is not None  # or the straight way was clear
         weights = self.motions.bounds.speeds.max(axis=0)[self.motions.piece_of]
         limits = self._limits(start, goals, tasks)
         search = TreeSearch(self.is_still_clear, *limits, weights, self.request.seed)
-        way, end = self._straight(start, goals)
-        if way is None or end is None:
+        end = self._straight_to(start, goals)
+        between = np.zeros((0, len(start)))
+        if end is None:
             self.searched = True
-            way, reached = search.way(start, _all(goals), np.inf)
-            if way is None:
+            found, reached = search.way(start, _all(goals), np.inf)
+            if found is None:
                 raise Unsolved(self._no_way(reached))
-            end = _nearest(goals, way[-1])
-            way = np.concatenate([[start], way[1:-1], [end.pressures]])
+            end, between = _nearest(goals, found[-1]), found[1:-1]
+        way = np.concatenate([[start], between, [end.pressures]])
         best = max(goal.worth for goal in goals)
         stiff = [goal for goal in goals if goal.worth >= _NEARLY_AS_STIFF * best]
         if end not in stiff:
-            way, end = self._stiffer(search, way, end, stiff)
+            way = self._stiffer(search, way, stiff)
         self.timings["search"] = perf_counter() - begin
-        return way, end
+        return way
 
-    def _stiffer(
-        self, search: TreeSearch, way: Vector, end: Configuration, stiff: list[Configuration]
-    ) -> tuple[Vector, Configuration]:
+    def _stiffer(self, search: TreeSearch, way: Vector, stiff: list[Configuration]) -> Vector:
         """Extend the way to one of the stiff goals, if a short search finds how."""
-        further, goal = self._straight(end.pressures, stiff)
-        if further is not None and goal is not None:
-            return np.concatenate([way, further[1:]]), goal
-        found, _ = search.way(end.pressures, _all(stiff), search.tried + _MORE)
+        goal = self._straight_to(way[-1], stiff)
+        if goal is not None:
+            return np.concatenate([way, [goal.pressures]])
+        found, _ = search.way(way[-1], _all(stiff), search.tried + _MORE)
         if found is None:
-            return way, end
-        goal = _nearest(stiff, found[-1])
-        return np.concatenate([way, found[1:-1], [goal.pressures]]), goal
+            return way
+        return np.concatenate([way, found[1:-1], [_nearest(stiff, found[-1]).pressures]])
 
     def _limits(
         self, start: Vector, goals: list[Configuration], tasks: list[TaskConfigurations]

@@ -103,11 +103,7 @@ class MotionRequest:
 
     def without_answer(self, message: str, status: Status) -> PathSolution:
         """Return a solution with a message alone."""
-        n = self.robot.n_pressures
-        return PathSolution(
-            status, message, self.robot, np.empty(0), np.empty((0, n)), np.empty((0, 4, 4)),
-            slew=self.slew,
-        )  # fmt: skip
+        return PathSolution.without_answer(status, message, self.robot, self.slew)
 
 
 def _load_of(tasks: list[Task], load: Load | None) -> Load | None:

@@ -20,12 +20,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import (
-    Field,
-    ValidationInfo,
-    field_validator,
-    model_validator,
-)
+from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from stiffopt.directions import Direction, Quaternion
 from stiffopt.files import read_file
@@ -33,12 +28,7 @@ from stiffopt.model.description import PerChannelRate, RobotDescription
 from stiffopt.optimise.goal import MIXED, OneOrMore, StiffnessGoal, StiffnessMeasure
 from stiffopt.optimise.target import Target, Tolerance
 from stiffopt.optimise.task import ForRobot, PressureRange, Task
-from stiffopt.paths.geometry import (
-    Curve,
-    PathPoints,
-    Polyline,
-    path_axes,
-)
+from stiffopt.paths.geometry import Curve, PathPoints, Polyline, path_axes
 from stiffopt.paths.shapes import PathShape, check_one_key, fault_of_times, mm_text
 from stiffopt.schema import BadKeyError, Items, Schema
 from stiffopt.units import Duration, Length, Pressure, Speed

@@ -3,7 +3,7 @@
 They differ only in target and stiffness direction.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import cached_property
 from typing import NamedTuple
@@ -73,6 +73,17 @@ class Slopes(NamedTuple):
     gradients: Vector
 
 
+def joined(ranges: Iterable[range]) -> list[range]:
+    """Return ranges of points, in order of their starts, with those joined that overlap or meet."""
+    found: list[range] = []
+    for each in ranges:
+        if found and each.start <= found[-1].stop:
+            found[-1] = range(found[-1].start, max(each.stop, found[-1].stop))
+        else:
+            found.append(each)
+    return found
+
+
 class BodyCheck:
     """Checks that the body keeps the clearance of a scene between the points of a path.
 
@@ -106,12 +117,13 @@ class PathTasks:
         The arm, which carries the load.
     lower, upper, unit : ndarray (n,)
         Limits, and ranges of the channels, in Pa.
+    scene : Scene or None
     is_compiled : bool
         Whether they are solved by machine code.
     """
 
     def __init__(self, robot: Manipulator, tasks: Sequence[Task], seed: int) -> None:
-        self.tasks = tuple(tasks)
+        self.tasks, self.scene = tuple(tasks), tasks[0].scene
         # the robot carries the load
         plain = {"load": None}
         self._without_load = [t if t.load is None else t.model_copy(update=plain) for t in tasks]
@@ -132,6 +144,13 @@ class PathTasks:
         self.is_compiled = self._fast is not None
         self._functions = functions(self.robot, self.programs[0])
         self._rows: dict[int, Vector] = {}
+
+    @cached_property
+    def body(self) -> BodyCheck | None:
+        """The check of the body between points; None without a scene or machine code."""
+        if self.scene is None or not self.is_compiled:
+            return None
+        return BodyCheck(self.robot, self.scene)
 
     @cached_property
     def _bounding(self) -> Bounding:
@@ -174,7 +193,10 @@ class PathTasks:
             return [None for _ in indices]
         rows = np.stack([self._row(index) for index in indices])
         answers = self._fast[0].solve_all(rows)
-        return [self._accepted(i, answer) for i, answer in zip(indices, answers, strict=True)]
+        return [
+            None if a is None else self.accepted(i, a.pressures, self._judgement(i, a))
+            for i, a in zip(indices, answers, strict=True)
+        ]
 
     def _row(self, index: int) -> Vector:
         """Return the numbers of a point's task, as machine code expects them."""
@@ -185,20 +207,20 @@ class PathTasks:
             self._rows[index] = solver.with_target(row, program, None)
         return self._rows[index]
 
-    def _accepted(self, index: int, answer: CompiledAnswer | None) -> PathCandidate | None:
-        if answer is None:
-            return None
+    def _judgement(self, index: int, answer: CompiledAnswer) -> Judgement:
         within = are_within(answer.pressures, self.lower, self.upper)
-        judgement = Judgement.of(self.programs[index], answer.judged, within)
-        if not judgement.holds:
-            return None
-        return PathCandidate(answer.pressures, self.value(index, judgement, answer.pressures))
+        return Judgement.of(self.programs[index], answer.judged, within)
 
-    def value(self, index: int, judgement: Judgement, pressures: Vector) -> float:
-        """Return `PathCandidate.value` of judged pressures."""
-        if self.programs[index].measures:
-            return float(np.log(min(judgement.stiffnesses)))
-        return -float(np.mean((pressures / self.programs[index].reference) ** 2))
+    def accepted(
+        self, index: int, pressures: Vector, judgement: Judgement | None
+    ) -> PathCandidate | None:
+        """Return judged pressures (n,) as a candidate at a point, or None if they miss its task."""
+        if judgement is None or not judgement.holds:
+            return None
+        program = self.programs[index]
+        if program.measures:
+            return PathCandidate(pressures, float(np.log(min(judgement.stiffnesses))))
+        return PathCandidate(pressures, -float(np.mean((pressures / program.reference) ** 2)))
 
     def _general(self, question: Local) -> PathCandidate | None:
         """Search a local optimum without machine code."""
@@ -253,12 +275,15 @@ class PathTasks:
         Returns those that arrive, and a mask (k,) of which these are.
         """
         found, arrived = self.brought(np.full(len(pressures), index), pressures)
-        scene = self.tasks[0].scene
-        if scene is not None and len(found):
-            clear = self.robot.clearance(found, scene) >= scene.clearance
-            found = found[clear]
-            arrived[arrived] = clear
-        return found, arrived
+        clear = self._are_clear(found)
+        arrived[arrived] = clear
+        return found[clear], arrived
+
+    def _are_clear(self, pressures: Vector) -> Mask:
+        """Return whether the body keeps the scene's clearance at pressures (k, n)."""
+        if self.scene is None or not len(pressures):
+            return np.ones(len(pressures), bool)
+        return np.asarray(self.robot.clearance(pressures, self.scene) >= self.scene.clearance)
 
     def _values(self, indices: NDArray[np.intp], pressures: Vector) -> Vector:
         """Return `PathCandidate.value` of pressures (k, n) of a free arm, each at its point."""
@@ -270,10 +295,8 @@ class PathTasks:
     def assessed(self, indices: NDArray[np.intp], pressures: Vector) -> list[list[PathCandidate]]:
         """Return candidates at each point, from pressures (k, n) on target with a clear body."""
         found: list[list[PathCandidate]] = [[] for _ in range(len(self))]
-        scene = self.tasks[0].scene
-        if scene is not None and len(pressures):
-            clear = self.robot.clearance(pressures, scene) >= scene.clearance
-            indices, pressures = indices[clear], pressures[clear]
+        clear = self._are_clear(pressures)
+        indices, pressures = indices[clear], pressures[clear]
         values = self._values(indices, pressures).tolist()
         for index, p, value in zip(indices.tolist(), pressures, values, strict=True):
             found[index].append(PathCandidate(p, value))
@@ -285,12 +308,8 @@ class PathTasks:
             return [self.judged_at(index, p) for index, p in enumerate(pressures)]
         solver = self._fast[0]
         rows = [solver.judging(self._row(index), p) for index, p in enumerate(pressures)]
-        found: list[Judgement | None] = []
-        for index, answer in enumerate(solver.solve_all(np.stack(rows))):
-            within = are_within(pressures[index], self.lower, self.upper)
-            program = self.programs[index]
-            found.append(answer and Judgement.of(program, answer.judged, within))
-        return found
+        answers = enumerate(solver.solve_all(np.stack(rows)))
+        return [answer and self._judgement(index, answer) for index, answer in answers]
 
     def judged_at(self, index: int, pressures: Vector) -> Judgement | None:
         """Judge pressures (n,) at one point; None if there is no equilibrium."""
@@ -301,10 +320,7 @@ class PathTasks:
 
     def candidate(self, index: int, pressures: Vector) -> PathCandidate | None:
         """Return pressures (n,) as a candidate at a point, or None if they miss its task."""
-        judgement = self.judged_at(index, pressures)
-        if judgement is None or not judgement.holds:
-            return None
-        return PathCandidate(pressures, self.value(index, judgement, pressures))
+        return self.accepted(index, pressures, self.judged_at(index, pressures))
 
     def slopes(self, indices: Sequence[int], pressures: Vector) -> Slopes | None:
         """Linearise the tasks at some points about pressures (k, n); None without equilibrium."""

@@ -13,19 +13,10 @@ Vector = NDArray[np.float64]
 def slew_limits(
     description: RobotDescription, path_slew: float | tuple[float, ...] | None = None
 ) -> Vector | None:
-    """Return the largest rate of change of each channel.
+    """Return the largest rates (n,) of a robot's channels, in Pa/s.
 
-    Parameters
-    ----------
-    description :
-        The robot, with n channels.
-    path_slew : float or (n,), optional
-        Of a path, in Pa/s.
-
-    Returns
-    -------
-    (n,) array or None
-        The smaller of the robot's and the path's, in Pa/s; None if neither gives one.
+    They are the smaller of the robot's and those of a path, (n,) or one for all; None if neither
+    gives any.
     """
     known = [rates for rates in (description.pressure_slew, path_slew) if rates is not None]
     if not known:
@@ -36,19 +27,9 @@ def slew_limits(
 
 
 def least_times(pressures: ArrayLike, slew: ArrayLike) -> Vector:
-    """Return the shortest time of each step between pressures.
+    """Return the shortest times (N - 1,) between pressures (N, n) in Pa, at rates (n,) in Pa/s.
 
-    Parameters
-    ----------
-    pressures : (N, n)
-        In Pa.
-    slew : (n,)
-        Largest rates, in Pa/s.
-
-    Returns
-    -------
-    (N - 1,) array
-        In s: ``max_i |p_{k+1,i} - p_{k,i}| / slew_i``.
+    In s: ``max_i |p_{k+1,i} - p_{k,i}| / slew_i``.
     """
     steps = np.abs(np.diff(np.asarray(pressures, float), axis=0))
     times: Vector = (steps / np.asarray(slew, float)).max(axis=1)
@@ -56,18 +37,5 @@ def least_times(pressures: ArrayLike, slew: ArrayLike) -> Vector:
 
 
 def step_limits(times: ArrayLike, slew: ArrayLike) -> Vector:
-    """Return the largest change of each pressure between consecutive times.
-
-    Parameters
-    ----------
-    times : (N,)
-        In s, increasing.
-    slew : (n,)
-        Greatest rates, in Pa/s.
-
-    Returns
-    -------
-    (N - 1, n) array
-        In Pa.
-    """
+    """Return the largest changes (N - 1, n) in Pa between times (N,) in s at rates (n,) in Pa/s."""
     return np.outer(np.diff(np.asarray(times, float)), np.asarray(slew, float))

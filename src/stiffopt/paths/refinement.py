@@ -13,7 +13,7 @@ Lagrangian enter as a convex quadratic term; Clarabel solves the program, a seco
 each tolerance.  A trust region and an exact penalty decide whether a step is taken.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -25,7 +25,7 @@ from scipy import sparse
 from stiffopt.model.stopping import checkpoint
 from stiffopt.optimise.program import Constraint
 from stiffopt.optimise.settings import DESCENT
-from stiffopt.paths.points import BodyCheck, PathTasks, Slopes
+from stiffopt.paths.points import PathTasks, Slopes, joined
 from stiffopt.paths.settings import REFINEMENT
 
 Vector = NDArray[np.float64]
@@ -34,14 +34,11 @@ Entries = tuple[NDArray[Any], NDArray[Any], NDArray[Any]]
 
 
 def refined(
-    tasks: PathTasks,
-    pressures: Vector,
-    steps: Vector,
-    over: str,
-    fixed: Sequence[int] = (),
-    body: BodyCheck | None = None,
+    tasks: PathTasks, pressures: Vector, steps: Vector, over: str, fixed: Collection[int] = ()
 ) -> Vector:
     """Return pressures (N, n) that are better where the rates bind.
+
+    A window in which the body would not keep clear is left as it was.
 
     Parameters
     ----------
@@ -52,10 +49,9 @@ def refined(
         Largest changes from point to point, in Pa.
     over : "worst" or "mean"
     fixed : indices of points that must not change.
-    body : BodyCheck, optional
-        A window in which the body would not keep clear is left as it was.
     """
     done: list[range] = []
+    body = tasks.body
     passes = REFINEMENT.passes if body is None else 1  # longer windows come too near, as a rule
     for _ in range(passes):  # a window may be held back at its ends: a wider one then
         windows = [each for each in _windows(pressures, steps) if not _is_within(each, done)]
@@ -67,7 +63,7 @@ def refined(
         if done:
             windows = [_wider(each, len(pressures)) for each in windows]
         for window in windows:
-            new = _Window(tasks, pressures, steps, over, window, set(fixed)).optimised()
+            new = _Window(tasks, pressures, steps, over, window, fixed).optimised()
             near = new[max(window.start - 1, 0) : window.stop + 1]
             if body is None or body.motion(near).clear:
                 pressures = new
@@ -87,15 +83,9 @@ def _wider(window: range, count: int) -> range:
 def _windows(pressures: Vector, steps: Vector) -> list[range]:
     """Return windows of points about steps that are near the rates; overlapping ones are joined."""
     near = (np.abs(np.diff(pressures, axis=0)) > REFINEMENT.near * steps).any(axis=1)
-    found: list[range] = []
-    for index in np.flatnonzero(near).tolist():
-        begin = max(0, index + 1 - REFINEMENT.margin)
-        end = min(len(pressures), index + 1 + REFINEMENT.margin)
-        if found and begin <= found[-1].stop:
-            found[-1] = range(found[-1].start, end)
-        else:
-            found.append(range(begin, end))
-    return found
+    margin, count = REFINEMENT.margin, len(pressures)
+    middles = (np.flatnonzero(near) + 1).tolist()
+    return joined(range(max(0, k - margin), min(count, k + margin)) for k in middles)
 
 
 @dataclass
@@ -139,7 +129,7 @@ class _Window:
         steps: Vector,
         over: str,
         window: range,
-        fixed: set[int],
+        fixed: Collection[int],
     ) -> None:
         self._tasks, self._pressures, self._over = tasks, pressures, over
         free = [index for index in window if index not in fixed]
@@ -153,7 +143,7 @@ class _Window:
         own = tasks.programs[0].n_own_rows
         self._balls = [c for c in constraints if not c.one_sided]
         self._one_sided = [c for c in constraints if c.one_sided and c.first < own]
-        self._scene = tasks.tasks[0].scene
+        self._scene = tasks.scene
         others = [i for i in range(len(pressures)) if i not in self._free]
         self._floor = -np.inf
         if over == "worst" and others:
@@ -257,23 +247,19 @@ class _Window:
         k, n = state.x.shape
         h = REFINEMENT.difference
 
-        def gradients(x: Vector) -> Vector | None:
-            slopes = self._tasks.slopes(self._free, x * self._tasks.unit)
-            if slopes is None:
-                return None
+        def gradients(slopes: Slopes) -> Vector:
             found: Vector = np.einsum("kt,ktn->kn", weights, slopes.gradients)
             found += np.einsum("km,kmn->kn", pulls, slopes.jacobians)
             return found
 
-        here = gradients(state.x)
-        columns = []
+        here, columns = gradients(state.slopes), []
         for index in range(n):
             shifted = state.x.copy()
             shifted[:, index] += h
-            there = gradients(shifted)
-            if here is None or there is None:
+            there = self._tasks.slopes(self._free, shifted * self._tasks.unit)
+            if there is None:
                 return np.tile(1e-3 * np.eye(n), (k, 1, 1))
-            columns.append((there - here) / h)
+            columns.append((gradients(there) - here) / h)
         H = np.stack(columns, axis=2)
         values, vectors = np.linalg.eigh((H + H.swapaxes(1, 2)) / 2)
         values = np.maximum(values, 1e-6)
@@ -291,39 +277,21 @@ class _Window:
         size = k * n + 2 * k + worst
         e, slack = k * n, k * n + k
         rows = _Rows(size)
-        identity = np.arange(k * n)
+        every, point = np.arange(k * n), np.arange(k)
         low = np.maximum(self._lower - state.x, -radius).ravel()
         high = np.minimum(self._upper - state.x, radius).ravel()
-        rows.add(high, (np.arange(k * n), identity, np.ones(k * n)))
-        rows.add(-low, (np.arange(k * n), identity, -np.ones(k * n)))
+        rows.add(high, (every, every, np.ones(k * n)))
+        rows.add(-low, (every, every, -np.ones(k * n)))
         self._add_rates(rows, state.x)
-        rows.add(np.zeros(k), (np.arange(k), slack + np.arange(k), -np.ones(k)))
+        rows.add(np.zeros(k), (point, slack + point, -np.ones(k)))
         if worst:
-            index = np.arange(k)
-            rows.add(
-                np.zeros(k),
-                (index, e + index, np.ones(k)),
-                (index, np.full(k, size - 1), -np.ones(k)),
-            )
+            last = np.full(k, size - 1)
+            rows.add(np.zeros(k), (point, e + point, np.ones(k)), (point, last, -np.ones(k)))
             if np.isfinite(self._floor):
-                rows.add(np.array([-self._floor]), (np.zeros(1), np.array([size - 1]), -np.ones(1)))
-        b = state.near.shape[1]
-        if b:
-            point = np.repeat(np.arange(k), b)
-            index = np.arange(k * b)
-            rows.add(
-                -state.near.ravel(),
-                (np.repeat(index, n), _columns(point, n), state.near_slopes.ravel()),
-                (index, slack + point, -np.ones(k * b)),
-            )
+                rows.add(np.array([-self._floor]), (np.zeros(1), last[:1], -np.ones(1)))
+        rows.add_upper(state.near, state.near_slopes, slack)
         costs_from = rows.count
-        t = costs.shape[1]
-        point, index = np.repeat(np.arange(k), t), np.arange(k * t)
-        rows.add(
-            -costs.ravel(),
-            (np.repeat(index, n), _columns(point, n), state.slopes.gradients.ravel()),
-            (index, e + point, -np.ones(k * t)),
-        )
+        rows.add_upper(costs, state.slopes.gradients, e)
         cones: list[object] = [clarabel.NonnegativeConeT(rows.count)]
         balls_from = rows.count
         for ball in self._balls:
@@ -354,7 +322,7 @@ class _Window:
             own = z[at : at + k * width].reshape(k, width)
             pulls[:, ball.first : ball.end] = -own[:, 1:] / ball.scale
             at += k * width
-        weights = z[costs_from : costs_from + k * t].reshape(k, t)
+        weights = z[costs_from : costs_from + costs.size].reshape(costs.shape)
         hoped = float(q @ x)
         return _Step(d, weights, pulls, state.merit - hoped)
 
@@ -371,10 +339,7 @@ class _Window:
                 (index, index + n, np.full(len(index), side)),
                 (index, index, np.full(len(index), -side)),
             )
-        for outside, inside, step in (
-            (first - 1, 0, first - 1),
-            (last + 1, k - 1, last),
-        ):
+        for outside, inside, step in ((first - 1, 0, first - 1), (last + 1, k - 1, last)):
             if not 0 <= outside < len(self._x):
                 continue
             own = inside * n + np.arange(n)
@@ -420,6 +385,20 @@ class _Rows:
         self._bounds.append(bounds)
         self._entries += [(row + self.count, column, value) for row, column, value in entries]
         self.count += len(bounds)
+
+    def add_upper(self, values: Vector, slopes: Vector, bound: int) -> None:
+        """Bound linearised values (k, b) of k points, with slopes (k, b, n), each by a variable.
+
+        The bounds are the k variables from column `bound` on.
+        """
+        k, b, n = slopes.shape
+        if b:
+            point, index = np.repeat(np.arange(k), b), np.arange(k * b)
+            self.add(
+                -values.ravel(),
+                (np.repeat(index, n), _columns(point, n), slopes.ravel()),
+                (index, bound + point, -np.ones(k * b)),
+            )
 
     def matrix(self) -> tuple[sparse.csc_matrix, Vector]:
         """Return A and b."""

@@ -14,7 +14,6 @@ class CandidateSettings:
         free and for a loaded arm; half of them where each optimum is found more than once.
     kept : largest number of candidates at a point.
     same : candidates that differ by less than this share of the range in all channels count as one.
-    general_knots, general_starts, general_kept : the same without machine code.
     """
 
     knots: int = 24
@@ -22,14 +21,11 @@ class CandidateSettings:
     starts_loaded: int = 8
     kept: int = 6
     same: float = 0.01
-    general_knots: int = 3
-    general_starts: int = 2
-    general_kept: int = 2
 
 
 @dataclass(frozen=True)
 class LaneSettings:
-    """Further configurations along a path (`stiffopt.paths.candidates.lanes`).
+    """Further configurations along a path (`stiffopt.paths.lanes`).
 
     Attributes
     ----------
@@ -174,6 +170,7 @@ class RateSettings:
 
 
 CANDIDATES = CandidateSettings()
+WITHOUT_MACHINE_CODE = CandidateSettings(knots=3, starts=2, starts_loaded=2, kept=2)
 LANES = LaneSettings()
 ROUTE = RouteSettings()
 REFINEMENT = RefinementSettings()

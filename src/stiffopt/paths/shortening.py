@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.paths.geometry import interpolated
 from stiffopt.paths.tree_search import IsClear
 
 Vector = NDArray[np.float64]
@@ -39,7 +40,7 @@ def shortened(way: Vector, is_clear: IsClear, scale: Vector, seed: int) -> Vecto
         failed += 1
         if i == j:
             continue
-        a, b = _at(way, marks, first), _at(way, marks, second)
+        a, b = interpolated([first, second], marks, way)
         saved = (second - first) - float(np.linalg.norm((b - a) / scale))
         if saved > _GAIN * marks[-1] and is_clear(np.stack([a, b])):
             way, failed = np.concatenate([way[: i + 1], [a, b], way[j + 1 :]]), 0
@@ -63,10 +64,6 @@ def _marks(way: Vector, scale: Vector) -> Vector:
     """Return the length (m,) from the start to each point."""
     steps = np.linalg.norm(np.diff(way, axis=0) / scale, axis=1)
     return np.concatenate([[0.0], np.cumsum(steps)])
-
-
-def _at(way: Vector, marks: Vector, length: float) -> Vector:
-    return np.array([np.interp(length, marks, column) for column in way.T])
 
 
 def rounded(way: Vector, is_clear: IsClear, scale: Vector) -> Vector:

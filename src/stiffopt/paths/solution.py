@@ -73,6 +73,14 @@ class PathSolution(ShownInNotebook):
     confidence: str = ""
     timings: dict[str, float] = field(default_factory=dict)
 
+    @classmethod
+    def without_answer(
+        cls, status: Status, message: str, robot: Manipulator, slew: Vector | None
+    ) -> "PathSolution":
+        """Return a solution with a message alone."""
+        none = np.zeros((0, robot.n_pressures))
+        return cls(status, message, robot, np.zeros(0), none, np.zeros((0, 4, 4)), slew)
+
     @property
     def found(self) -> bool:
         """Whether every point meets its requirements, and every step the rates."""

@@ -1,4 +1,4 @@
-/* Dynamic programming over the candidates of a path; see RouteSearch in route.py. */
+/* Dynamic programming over the candidates of a path; see Sequences in sequences.py. */
 #include <math.h>
 #include <stdint.h>
 
