@@ -188,6 +188,27 @@ def test_steps_lead_to_the_estimate_and_end_there() -> None:
     assert not applied[8:].any()  # nor frames: the offset has them
 
 
+def test_after_a_model_without_equilibrium_steps_do_not_lead_there_again() -> None:
+    adaptation = Adaptation(FREE, TUNING)
+    good = Adapted(FREE, np.zeros(K))
+    failed = Adapted(FREE, np.where(np.arange(K) == 4, -0.5, 0.0))
+    good = good.short_of(failed)
+    adaptation.estimate[[0, 4]] = -0.2, -0.7  # the second segment's modulus has failed, lower
+    step = adaptation.step_from(good.applied, good.limits)
+    assert step is not None
+    assert step.applied[[0, 4]] == pytest.approx([-0.2, 0.0])
+    assert step.limits is good.limits
+    assert adaptation.is_beyond(good.limits)
+    adaptation.estimate[[0, 4]] = -0.2, 0.2
+    step = adaptation.step_from(step.applied, step.limits)
+    assert step is not None
+    assert step.applied[[0, 4]] == pytest.approx([-0.2, 0.2])
+    assert not adaptation.is_beyond(step.limits)
+    again = good.short_of(Adapted(FREE, good.applied + 0.1, good.limits)).limits
+    assert again is not None
+    assert again[0, 4] == again[1, 4] == 0.0  # neither lower nor higher
+
+
 def test_the_prior_of_a_calibrated_file_is_its_covariance() -> None:
     keys = ("segments[0].material.youngs_modulus", "segments[1].material.youngs_modulus")
     fitted = [FittedParameter(key=key, deviation=0.02, prior=0.3) for key in keys]
@@ -292,6 +313,60 @@ def test_a_change_of_the_model_moves_nothing() -> None:
     assert np.abs(bench.command - last).max() < 0.02 * BAR
     assert bench.run(1.5, position).max() < 1e-3
     assert [notice.kind for notice in controller.notices()] == []
+
+
+SOFT = {f"segments[{k}].material.youngs_modulus": 1e5 * m for k, m in enumerate((0.782, 0.586))}
+"""Moduli with which the hanging arm rests where it does in most postures, but not in this one:"""
+TOO_MUCH = np.array([1.376, 0.286, 0.291, 0.014, 0.916, 1.467]) * BAR
+
+
+def too_soft(pressures: Array) -> Bench:
+    """A hanging arm at rest at the tip of some pressures, and a controller that has it too soft."""
+    bench = Bench(HANGING.name, control=ControlSettings(adaptation="none"), spread=0.0)
+    bench.settled(pressures / BAR, duration=1.5)
+    soft = with_values(HANGING, {Parameter(key): value for key, value in SOFT.items()})
+    applied = np.zeros(K + 1)
+    applied[[0, 4]] = np.log([0.782, 0.586])
+    bench.controller._go_on_with(Adapted(soft, applied))
+    adapted = bench.controller.replanner.adapted
+    assert adapted is not None
+    assert adapted.limits is None
+    return bench
+
+
+@pytest.mark.usefixtures("compiled")
+def test_an_arm_goes_on_where_its_adapted_model_has_no_equilibrium() -> None:
+    bench = too_soft(0.6 * TOO_MUCH)
+    position = tuple(map(float, bench.pose_at(TOO_MUCH)[:3, 3]))
+    bench.controller.set_target(so.Target(position=position))
+    assert bench.run(4.0, position)[-20:].max() < 1e-3
+    adapted = bench.controller.replanner.adapted
+    assert adapted is not None
+    assert adapted.limits is not None
+    assert not adapted.applied.any()
+    assert adapted.limits[0, [0, 4]].tolist() == [0.0, 0.0]  # no softer
+    (notice,) = bench.controller.notices()
+    assert (notice.kind, notice.standing, notice.hold) == ("too-soft", True, False)
+    assert "softer" in notice.text
+    status = bench.controller.status(bench.rig.clock.now())
+    own = so.load_robot(HANGING).tip_pose(bench.controller._arm.pressures.effective)
+    assert status.model_position == pytest.approx(own[:3, 3], abs=2e-4)
+
+
+@pytest.mark.usefixtures("compiled")
+def test_going_back_to_an_earlier_model_moves_nothing() -> None:
+    bench = too_soft(0.6 * TOO_MUCH)
+    controller = bench.controller
+    before = controller.status(bench.rig.clock.now())
+    controller._arm.on_path(TOO_MUCH)
+    after = controller.status(bench.rig.clock.now())
+    assert after.tip_position == pytest.approx(before.tip_position, abs=1e-9)
+    assert after.tip_quaternion == pytest.approx(before.tip_quaternion, abs=1e-9)
+    assert np.linalg.norm(after.disturbance - before.disturbance) > 1e-3
+    last = bench.command
+    bench.run(bench.period)
+    assert np.abs(bench.command - last).max() < 0.02 * BAR
+    assert not controller._go_back(TOO_MUCH)  # the robot file's own model is all that is left
 
 
 def true_stiffness(bench: Bench, force: float = 2e-3) -> float:

@@ -263,3 +263,20 @@ def test_a_distance_is_that_of_the_tip_itself() -> None:
     assert away > 5e-3
     told = 1e-3 * float(said.split(" mm")[0].split()[-1])
     assert told == pytest.approx(away, abs=max(1e-3, 0.1 * away))
+
+
+@pytest.mark.usefixtures("compiled")
+def test_a_distance_is_that_of_the_tip_while_it_is_held_on_its_way() -> None:
+    bench = Bench(HANGING)
+    position = (0.15, 0.0, 0.1)  # out of reach
+    bench.controller.set_task(bench.task(position=position))
+    bench.run(0.15)
+    (before,) = bench.controller.notices()
+    assert before.text.endswith("by the model")
+    away = bench.run(1.0, position, steer=False)[-1]  # the pressures are held
+    (said,) = (notice.text for notice in bench.controller.notices())
+    told, modelled = (
+        1e-3 * float(text.split(" mm")[0].split()[-1]) for text in (said, before.text)
+    )
+    assert told == pytest.approx(away, abs=1e-3)
+    assert away > modelled + 5e-3

@@ -25,7 +25,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -66,6 +66,24 @@ class Adapted:
 
     description: RobotDescription  # with the applied numbers
     applied: Array  # their coordinates (k,); zero for numbers that are not applied
+    # least and greatest applied coordinates (2, k) of later models, since one beyond them had no
+    # equilibrium; None: there was none
+    limits: Array | None = None
+
+    def short_of(self, failed: Adapted | None) -> Adapted:
+        """Return this arm, limited so that no later one is as far from it as one that failed.
+
+        A number in which they differ does not pass its value here in the direction of that one.
+        """
+        if failed is None:
+            return self
+        low, high = np.full((2, len(self.applied)), [[-np.inf], [np.inf]])
+        if failed.limits is not None:
+            low, high = failed.limits
+        here, there = self.applied, failed.applied
+        low = np.where(there < here, np.maximum(low, here), low)
+        high = np.where(there > here, np.minimum(high, here), high)
+        return replace(self, limits=np.stack([low, high]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,6 +92,7 @@ class Estimate:
 
     numbers: tuple[AdaptedNumber, ...]
     proposal: Adapted | None  # to use from now on; None: the present model will do
+    is_limited: bool = False  # whether `Adapted.limits` keep the model short of the numbers
 
 
 class Learning:
@@ -115,7 +134,9 @@ class Learning:
             with suppress(StiffoptError, LinAlgError):  # numbers without an equilibrium
                 adaptation.take(windows, tip)
         self._applied = adaptation.none_applied if adapted is None else adapted.applied
-        return Estimate(adaptation.report(), adaptation.step_from(self._applied))
+        limits = None if adapted is None else adapted.limits
+        step = adaptation.step_from(self._applied, limits)
+        return Estimate(adaptation.report(), step, adaptation.is_beyond(limits))
 
     def deviation(self, pressures: Array, measure: DirectionalMeasure) -> float:
         """Return the relative deviation of a stiffness at a plan's pressures (n,); NaN if unknown.
@@ -188,14 +209,15 @@ class Adaptation:
         limit = self._tuning.bound * np.sqrt(np.diag(self._prior))
         return np.asarray(np.clip(z, -limit, limit))
 
-    def step_from(self, applied: Array) -> Adapted | None:
+    def step_from(self, applied: Array, limits: Array | None = None) -> Adapted | None:
         """Return the arm with numbers nearer to the estimate; None if they are near enough.
 
         The step is limited, so that the model changes slowly. `applied` are the present coordinates
-        (k,).
+        (k,), and `limits` those of `Adapted`.
         """
         deviations = np.sqrt(np.diag(self._prior))
-        change = np.where(self._applies, self.estimate - applied, 0.0)
+        goal = self.estimate if limits is None else np.clip(self.estimate, *limits)
+        change = np.where(self._applies, goal - applied, 0.0)
         share = np.max(np.abs(change) / np.maximum(deviations, 1e-12), initial=0.0)
         if share < self._tuning.least_step:
             return None
@@ -205,7 +227,15 @@ class Adaptation:
             TipModel(Manipulator(description)).at(np.zeros(description.n_pressures))
         except StiffoptError:  # such an arm has no equilibrium, or breaks its strain law
             return None
-        return Adapted(description, after)
+        return Adapted(description, after, limits)
+
+    def is_beyond(self, limits: Array | None) -> bool:
+        """Whether limits (2, k) keep the applied numbers away from the estimate."""
+        if limits is None:
+            return False
+        beyond = np.abs(self.estimate - np.clip(self.estimate, *limits))[self._applies]
+        deviations = np.sqrt(np.diag(self._prior))[self._applies]
+        return bool((beyond > self._tuning.least_step * deviations).any())
 
     def _with(self, z: Array) -> RobotDescription:
         """Return the arm with those of the coordinates (k,) that are applied."""

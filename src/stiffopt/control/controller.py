@@ -101,7 +101,11 @@ class TipController:
         if control.vibration != "auto":
             vibrates = control.vibration == "modelled"
         mode = BendingMode.of(robot.description) if vibrates else None
-        self._arm = ArmObserver(robot, limits, slew, period, mode, control, safety, tuning)
+        self._arm = ArmObserver(
+            robot, limits, slew, period, mode, control, safety, tuning, self._go_back
+        )
+        # models before the present one: the robot file's, and the newest ones
+        self._earlier: list[Adapted] = []
         lag, dead_time = self._arm.pressures.lag, self._arm.pressures.dead_time
         self._reference = Reference(
             period, slew, lag, control.damping, 6, tuning.reference.slew_share
@@ -139,6 +143,7 @@ class TipController:
         self._at_rest = True  # the reference begins at the present pressures
         self._computed_at = now
         self._adapted_at = -math.inf  # last adaptation of the model since the last request
+        self._went_back_at = -math.inf  # last return to an earlier model
         self._watched_at = -math.inf  # last check whether the tip rests
         self._lost = self._arm.channels.lost
         self._windows.begin()
@@ -321,8 +326,9 @@ class TipController:
         reference.advance(plan)
         if self._arm.leaning is not None:
             return self._feedforward(reference.command - pressures.command_offset, last)
-        tip = self._arm.compiled.path.at(reference.path[:n])
-        self._arm.watch.intend(now, tip.pose[:3, 3] + reference.path[n : n + 3])
+        tip = self._arm.on_path(reference.path[:n])
+        if now - self._went_back_at > self._tuning.adaptation.blind_time:
+            self._arm.watch.intend(now, tip.pose[:3, 3] + reference.path[n : n + 3])
         course = self.replanner.pursuit.course
         self._led_to = None
         if isinstance(course, PostureCourse):
@@ -470,9 +476,33 @@ class TipController:
         """Change the model's numbers so that nothing moves at this time."""
         change = self._arm.change_robot(adapted.description)
         if change is not None:
-            self._shift(change)
-            self._adapted_at = self._now
-            self.replanner.go_on_with(adapted, change)
+            none = Adapted(self.robot.description, np.zeros_like(adapted.applied))
+            earlier = [*self._earlier, self.replanner.adapted or none]
+            self._earlier = earlier[:1] + earlier[1:][-self._tuning.adaptation.kept :]
+            self._adopt(adapted, change)
+
+    def _go_back(self, pressures: Array) -> bool:
+        """Go back to the last model that has an equilibrium at pressures (n,), without a jump.
+
+        Return whether there is one. Later models keep short of the one that has none.
+        """
+        for index in reversed(range(len(self._earlier))):
+            adapted = self._earlier[index]
+            change = self._arm.change_robot(adapted.description, pressures)
+            if change is not None:
+                del self._earlier[index:]
+                self._adopt(adapted.short_of(self.replanner.adapted), change)
+                if self._arm.watch.doubt is None:  # the tip of the other model ran away
+                    self._arm.watch.begin()
+                self._went_back_at = self._now
+                return True
+        return False
+
+    def _adopt(self, adapted: Adapted, change: Array) -> None:
+        """Go on with a model, whose offset of the tip differs by a change (6,)."""
+        self._shift(change)
+        self._adapted_at = self._now
+        self.replanner.go_on_with(adapted, change)
 
     def _has_arrived(self) -> bool:
         """Whether the reference rests on the plan."""
@@ -567,9 +597,14 @@ class TipController:
         return notices
 
     def _away(self) -> tuple[float, float] | None:
-        """Return distance and angle from the target, in m and rad, if the tip rests short of it."""
+        """Return distance and angle from the target, in m and rad, if the tip rests short of it.
+
+        So it does if it has arrived, and if the pressures are held: then the plan is an old one.
+        """
         plan, pursuit = self.replanner.plan, self.replanner.pursuit
-        if plan is None or plan.reached or pursuit.course is not None or not self._has_arrived():
+        if plan is None or plan.reached or pursuit.course is not None:
+            return None
+        if not self._is_held(self._now) and not self._has_arrived():
             return None
         estimate = self._arm.tip.estimate
         return self._errors.at(pursuit.target, estimate.position, estimate.rotation)

@@ -77,12 +77,20 @@ class ArmModel:
                 "install one (Debian: apt install gcc) or set STIFFOPT_COMPILER"
             )
 
-    def change(self, robot: Manipulator, pressures: Array) -> None:
-        """Change to another arm; `StiffoptError`, and no change, if it is unstable at (n,) Pa."""
+    def change(self, robot: Manipulator, pressures: Array, ahead: Array | None = None) -> TipAt:
+        """Change to another arm, and return its tip at pressures (n,), in Pa.
+
+        `StiffoptError`, and no change, if it is unstable there, or at the pressures `ahead` (n,),
+        to which the arm goes.
+        """
         last = self._robot
         try:
             self._take(robot)
-            self.chambers.at(pressures)
+            tip = self.chambers.at(pressures)
+            if ahead is not None:
+                self.chambers.at(ahead)
+                self.path.at(ahead)
+            return tip
         except StiffoptError:
             self._take(last)
             raise

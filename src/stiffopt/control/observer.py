@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +13,7 @@ from stiffopt.control.bracing import Bracing
 from stiffopt.control.channels import Channels
 from stiffopt.control.estimator import TipEstimator
 from stiffopt.control.interface import SampleCounts
-from stiffopt.control.linearised_tip import ArmModel, LeaningTip
+from stiffopt.control.linearised_tip import ArmModel, LeaningTip, LinearisedTip
 from stiffopt.control.motion_watch import MotionWatch
 from stiffopt.control.pressing import Pressing
 from stiffopt.control.regulators import PressureEstimator
@@ -42,6 +42,9 @@ class ArmObserver:
         See `TipController`; slew (n,), in Pa/s.
     mode :
         The arm's first bending mode; None for an arm that does not vibrate.
+    go_back :
+        Called with pressures (n,) at which the model has no equilibrium; changes to a model that
+        has one, by `change_robot`, and returns whether there is one.
 
     Attributes
     ----------
@@ -65,7 +68,9 @@ class ArmObserver:
         control: ControlSettings,
         safety: Safety,
         tuning: ControlTuning,
+        go_back: Callable[[Array], bool],
     ) -> None:
+        self._go_back = go_back
         n = robot.n_pressures
         self._robot, self._period, self._tuning = robot, period, tuning
         self._frequency = control.frequency
@@ -91,7 +96,7 @@ class ArmObserver:
             robot.description, replace(tuning.motion, scatter=control.tracker_noise)
         )
         self.model: ArmModel | None = None
-        self._now = 0.0
+        self._now, self._modelled_at = 0.0, np.zeros(n)
 
     def check(self) -> None:
         """Compile and try the model; raises the errors of `ArmModel`."""
@@ -125,7 +130,7 @@ class ArmObserver:
         self._looked_at = now  # capture time of the last sample, in s
         if self.model is not None:
             self.model.chambers.lean(None)
-            zero = self.pressures.command
+            self._modelled_at = zero = self.pressures.command
             self.modelled = self.model.chambers.at(zero)
             self.tip.advance(now, zero, self.modelled)
 
@@ -142,7 +147,8 @@ class ArmObserver:
         self._now = now
         self.pressures.advance(steps, commanded, reading.pressures)
         effective = self.pressures.effective
-        self.modelled = tip = self.compiled.chambers.at(effective)
+        tip = self._at(self.compiled.chambers, effective)
+        self.modelled, self._modelled_at = tip, effective
         for step in range(steps):
             moment = now - (steps - 1 - step) * self._period
             self.tip.advance(moment, effective, tip)
@@ -156,6 +162,19 @@ class ArmObserver:
             else:
                 self._feel(sample, effective, tip, course)
         return counts
+
+    def on_path(self, pressures: Array) -> TipAt:
+        """Return the model's tip at pressures (n,) on the reference's path."""
+        return self._at(self.compiled.path, pressures)
+
+    def _at(self, model: LinearisedTip, pressures: Array) -> TipAt:
+        """Return a model's tip at pressures (n,), of an arm that has an equilibrium there."""
+        try:
+            return model.at(pressures)
+        except StiffoptError:
+            if not self._go_back(pressures):
+                raise
+            return model.at(pressures)
 
     def _feel(
         self, sample: PoseSample, effective: Array, tip: TipAt, course: AnyCourse | None
@@ -189,19 +208,22 @@ class ArmObserver:
         self.watch.go_on()
         return change
 
-    def change_robot(self, description: RobotDescription) -> Array | None:
+    def change_robot(
+        self, description: RobotDescription, ahead: Array | None = None
+    ) -> Array | None:
         """Change the model's numbers; None, and no change, if such an arm has no equilibrium.
 
-        Return the change (6,) of the tip's offset, which takes up the change of the model.
+        It must have one where the tip was last modelled, and at the pressures `ahead` (n,). Return
+        the change (6,) of the tip's offset, which takes up the change of the model.
         """
-        model, effective = self.compiled, self.pressures.effective
-        before = model.chambers.at(effective)
+        model, before = self.compiled, self.modelled
+        assert before is not None  # compiled
         try:
-            model.change(Manipulator(description), effective)
+            after = model.change(Manipulator(description), self._modelled_at, ahead)
         except StiffoptError:
             return None
         self._set_frequency()
-        return self._shift(before, model.chambers.at(effective))
+        return self._shift(before, after)
 
     def _shift(self, before: TipAt, after: TipAt) -> Array:
         """Let the offset (6,) take up the difference between two models."""

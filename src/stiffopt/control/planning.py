@@ -22,7 +22,7 @@ from stiffopt.control.adaptation import Adapted, Estimate, Learning, Window
 from stiffopt.control.tip_errors import TipErrors
 from stiffopt.control.tuning import AdaptationTuning, FeedbackTuning, NearestTuning, PlanningTuning
 from stiffopt.control.ways import Ways
-from stiffopt.errors import InputError
+from stiffopt.errors import InputError, StiffoptError
 from stiffopt.model.arguments import checked_measure
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.scene import Scene
@@ -301,9 +301,11 @@ class Planning:
         return np.array([0.0 if a is None or b is None else b - a for a, b in pairs])
 
 
-def nearest_words(distance: float, angle: float, tolerance: Tolerance) -> str:
-    """Report how far a tip is from its target, in m and rad."""
-    words = f"the nearest pose is {1e3 * distance:.1f} mm away"
+def nearest_words(
+    distance: float, angle: float, tolerance: Tolerance, what: str = "the nearest pose"
+) -> str:
+    """Report how far the tip, or a pose of it, is from its target, in m and rad."""
+    words = f"{what} is {1e3 * distance:.1f} mm away"
     if angle > tolerance.angle:
         words += f" and {math.degrees(angle):.1f} deg"
     return words
@@ -339,7 +341,10 @@ class NearestSearch:
         tuning = self._tuning
         low, high = bounds[0] / _BAR, bounds[1] / _BAR
         x = np.clip(start / _BAR, low, high)
-        error, rows, distance, angle = self._error(target, x)
+        found = self._error(target, x)
+        if found is None:  # an answer of another model
+            x, found = low, self._errors.weighted(target, self._tip.at(low * _BAR), self._lever)
+        error, rows, distance, angle = found
         no_rows, max_step = np.zeros((0, len(x))), tuning.max_step / _BAR
         for _ in range(tuning.iterations):
             J = rows * _BAR
@@ -352,7 +357,7 @@ class NearestSearch:
             while share > 1e-3:
                 trial = np.clip(x + share * np.asarray(step), low, high)
                 found = self._error(target, trial)
-                if float(found[0] @ found[0]) < value:
+                if found is not None and float(found[0] @ found[0]) < value:
                     break
                 share *= 0.5
             else:
@@ -364,5 +369,9 @@ class NearestSearch:
         result: Array = x * _BAR
         return result, distance, angle
 
-    def _error(self, target: Target, x: Array) -> tuple[Array, Array, float, float]:
-        return self._errors.weighted(target, self._tip.at(x * _BAR), self._lever)
+    def _error(self, target: Target, x: Array) -> tuple[Array, Array, float, float] | None:
+        """Return the error at x (n,), in bar, as `TipErrors.weighted`; None: no equilibrium."""
+        try:
+            return self._errors.weighted(target, self._tip.at(x * _BAR), self._lever)
+        except StiffoptError:
+            return None

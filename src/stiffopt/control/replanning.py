@@ -26,6 +26,13 @@ from stiffopt.optimise.task import Task
 Array = NDArray[np.float64]
 AnyCourse = Course | PostureCourse | Pressing | Bracing
 
+_TOO_SOFT = (
+    "the arm is softer than can be modelled: with the numbers that fit its tip at rest, the "
+    "model has no equilibrium where the arm goes; earlier numbers are used, and the stiffness "
+    "may be less than reported. Run 'stiffopt calibrate', or correct moduli, gains and tip mass in "
+    "the robot file"
+)
+
 
 @dataclass(frozen=True, eq=False)
 class Pursuit:
@@ -190,7 +197,8 @@ class Replanner:
         """Plan with an adapted model, whose offset differs by a change (6,)."""
         self.adapted = adapted
         if self.known is not None:
-            self.known = replace(self.known, proposal=None)
+            limited = adapted.limits is not None
+            self.known = replace(self.known, proposal=None, is_limited=limited)
         self._offset = self._offset + change
         if self.plan is not None:
             self.plan = replace(self.plan, offset=self.plan.offset + change, adapted=adapted)
@@ -221,17 +229,20 @@ class Replanner:
         """Return what is wrong with the planner and its plan.
 
         `away` is the measured distance of the tip from its target, in m, and the angle, in rad, for
-        a tip at rest on its plan; None: use the plan's own.
+        a tip at rest on its plan, or off it under held pressures; None: use the plan's own.
         """
         notices, plan = self._planner.notices(), self.plan
         if plan is not None and plan.serial == self._serial and not plan.reached:
             message, task = plan.message, self.pursuit.task
             if plan.far and away is not None and task is not None:
-                message = nearest_words(*away, task.target.tolerance)
+                message = nearest_words(*away, task.target.tolerance, "the tip")
             elif plan.far:
                 message += " by the model"
             text = f"the target cannot be reached: {message}"
             notices = (*notices, Notice("unreachable", text, standing=True))
+        limited = self.adapted is not None and self.adapted.limits is not None
+        if limited and (self.known is None or self.known.is_limited):
+            notices = (*notices, Notice("too-soft", _TOO_SOFT, standing=True))
         if plan is not None and plan.doubt:
             notices = (*notices, Notice("extrapolating", plan.doubt, standing=True))
         if self._blocked:
