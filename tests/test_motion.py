@@ -304,6 +304,7 @@ def test_of_several_goals_one_that_is_clear(two: Manipulator) -> None:
     motion = plan_motion(two, LEFT, [blocked, 0.8 * LEFT], scene=scene)
     assert motion.found
     np.testing.assert_array_equal(motion.pressures[-1], 0.8 * LEFT)
+    assert motion.message.startswith("to goal 2 of 2; the body is at least")
     same = plan_motion(two, LEFT, np.stack([blocked, 0.8 * LEFT]), scene=scene)
     np.testing.assert_array_equal(same.pressures, motion.pressures)
 

@@ -84,7 +84,7 @@ class PathAnswers:
             return solution
         message = (
             f"The path is too fast for the rates: beyond point {index + 1} of {len(self._points)} "
-            f"({self._along(index)} along it) no pressures keep them"
+            f"({self._along(index)} along it) no pressures were found that keep them"
             f"{self._binding(solution)}. It can be followed {slowed:.3g} times slower, as given."
         )
         return _unreachable(solution, index, message)
@@ -92,7 +92,10 @@ class PathAnswers:
     def not_near(self, unreachable: Failure) -> PathSolution:
         """Return the answer when a point is out of reach and no path near it was found."""
         index, why = unreachable
-        message = f"{self._cannot_be_reached(index, why)}, and no path near it can be followed"
+        message = (
+            f"{self._cannot_be_reached(index, why)}, and no path near it was found that can be "
+            "followed"
+        )
         return _unreachable(self.failed(message), index, message)
 
     def cut_short(

@@ -34,10 +34,12 @@ class Configuration:
     ----------
     pressures : (n,), in Pa.
     worth : its stiffness as a share of the best known for its task; 1 if nothing is maximised.
+    name : of the end to which it belongs: "goal 2".
     """
 
     pressures: Vector
     worth: float = 1.0
+    name: str = ""
 
 
 class Unsolved(Exception):  # noqa: N818
@@ -102,7 +104,7 @@ class TaskConfigurations:
             raise StoppedError(f"{name}: {solution.message}")
         if not solution.found or solution.pressures is None:
             raise Unsolved(f"{name}: {solution.status}: {solution.message}")
-        self.best = Configuration(solution.pressures)
+        self.best = Configuration(solution.pressures, name=name)
         self._maximised = len(maximised(task))
         self._most = min(solution.stiffnesses[: self._maximised], default=None)
 
@@ -127,7 +129,7 @@ class TaskConfigurations:
                 worth = 1.0
                 if self._most is not None:
                     worth = min(answer.stiffnesses[: self._maximised]) / self._most
-                found.append(Configuration(p, worth))
+                found.append(Configuration(p, worth, self.best.name))
         return found
 
 

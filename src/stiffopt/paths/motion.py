@@ -179,7 +179,7 @@ class _Planner:
     request: MotionRequest
     timings: dict[str, float]
     poses: int = 0
-    known: int = 0
+    goals: list[Configuration] = field(default_factory=list)
     searched: bool = False
     motions: ClearMotions | None = field(init=False)
 
@@ -214,7 +214,7 @@ class _Planner:
         else:
             begin = perf_counter()
             goals = [*goals, *(each for task in tasks for each in task.others(start))]
-            self.known = len(goals)
+            self.goals = goals
             self.timings["goals"] += perf_counter() - begin
             way = self._search(start, goals, tasks)
         begin = perf_counter()
@@ -248,10 +248,10 @@ class _Planner:
                     goals.append(task.best)
                 else:
                     self._check(name, goal)
-                    goals.append(Configuration(goal))
+                    goals.append(Configuration(goal, name=name))
             except Unsolved as reason:
                 refused.append(str(reason))
-        self.known = len(goals)
+        self.goals = goals
         if not goals:
             raise Unsolved("; ".join(refused))
         return tasks, goals
@@ -357,7 +357,7 @@ class _Planner:
         clearance = None if request.scene is None else robot.clearance(p, request.scene)
         found = PathSolution(
             status="solved",
-            message=self._message(clearance),
+            message=self._message(way[-1], clearance),
             robot=robot,
             times=times,
             pressures=p,
@@ -371,9 +371,12 @@ class _Planner:
         self.timings["describe"] = perf_counter() - begin
         return found
 
-    def _message(self, clearance: Vector | None) -> str:
+    def _message(self, end: Vector, clearance: Vector | None) -> str:
+        reached = ""
+        if len(self.request.goals) > 1:
+            reached = f"to {_nearest(self.goals, end).name} of {len(self.request.goals)}"
         if clearance is None:
-            return ""
+            return reached
         margin, unit = self.request.margin, display_units().length
         counted = (
             "this counts no error of the model, as the robot is not calibrated"
@@ -382,12 +385,13 @@ class _Planner:
             "(95 %)"
         )
         least = unit.text(clearance.min(), ".3g")
-        return f"the body is at least {least} clear of the scene; {counted}"
+        kept = f"the body is at least {least} clear of the scene; {counted}"
+        return f"{reached}; {kept}" if reached else kept
 
     def _confidence(self) -> str:
         if self.motions is None:
             return "a straight way in pressures; there is no scene"
-        goals = "" if self.known == 1 else f" to one of {self.known} goal configurations"
+        goals = "" if len(self.goals) == 1 else f" to one of {len(self.goals)} goal configurations"
         how = "RRTConnect" if self.searched else "a straight way in pressures"
         kept = f"the way between them is clear to {display_units().length.text(MOTION_ERROR, 'g')}"
         return f"{how}{goals}, {self.poses} poses looked at; {kept}"

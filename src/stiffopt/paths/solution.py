@@ -49,7 +49,8 @@ class PathSolution(ShownInNotebook):
     clearance : ndarray (N,) or None
         Smallest distance between body and scene, in m; None without a scene.
     first_failure : int or None
-        Index of the first point whose requirements cannot be met.
+        Index of the first point that cannot be solved, or of the last from which no way on was
+        found.
     confidence : str
         How thorough the search was, in words.
     timings : dict of str to float
