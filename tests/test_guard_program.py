@@ -158,10 +158,12 @@ def test_a_simulated_rig_is_hosted_whole() -> None:
     rest = supply.hosted
     assert rest is not None
     assert supply.timeout == TIMEOUT
-    first = rest.poses()  # none yet, but on a machine that is busy
+    rest.poses()  # none yet, but on a machine that is busy
     time.sleep(0.2)
-    samples = (*first, *rest.poses())
-    assert [sample.frame for sample in samples][:3] == [1, 2, 3]
+    samples = rest.poses()
+    frames = [sample.frame for sample in samples]
+    assert len(frames) > 2
+    assert frames == list(range(frames[0], frames[0] + len(frames)))  # none is lost in between
     assert -0.1 < time.monotonic() - supply.epoch - samples[-1].received < 1.0
     assert np.shape(rest.ask("truth", {})) == (4, 4)
     assert np.shape(rest.ask("pressures", {})) == (6,)
