@@ -165,7 +165,7 @@ class AdaptationTuning:
     least_step: float = 0.05
     step: float = 1.0
     interval: float = 10.0  # between two changes of the model, in s, unless the target changes
-    kept: int = 3  # models to go back to, beside the robot file's
+    kept: int = 3  # models to go back to, in addition to the robot file's
     # time after going back in which the motion of the tip is not judged, in s: the offset still
     # changes after the model that ran away
     blind_time: float = 0.5
