@@ -22,7 +22,7 @@ from stiffopt.control.regulators import RegulatorModel
 from stiffopt.control.tip_errors import TipErrors
 from stiffopt.control.tuning import FeedbackTuning
 from stiffopt.model.compliance import directional_stiffness, stiffness_of
-from stiffopt.model.history import History, Memory
+from stiffopt.model.history import History, Memory, lagged
 from stiffopt.model.manipulator import load_robot
 from stiffopt.optimise.goal import StiffnessMeasure
 from stiffopt.optimise.target import Target
@@ -80,6 +80,18 @@ def test_four_models_of_a_regulator(seed, dead_steps, limited):
         effective = history.advance(STEP, command)
         if not limited:  # a history knows of no slew
             assert effective == pytest.approx(pressures, rel=1e-9, abs=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_lag_of_recorded_pressures(seed):
+    """What calibration and commissioning use on rows of any spacing is the lag of a history."""
+    rng = np.random.default_rng(seed)
+    time = np.cumsum(rng.uniform(1e-3, 0.2, 30))
+    inputs, lag = rng.uniform(0, 1e5, (30, 2)), rng.uniform(0.02, 0.5)
+    history = Memory([History(lag=lag), History(lag=lag)])
+    history.advance(10.0, inputs[0])
+    exact = [history.advance(step, row) for step, row in zip(np.diff(time), inputs, strict=False)]
+    assert lagged(time, inputs, lag, inputs[0])[1:] == pytest.approx(np.array(exact), rel=1e-6)
 
 
 @pytest.mark.parametrize("seed", range(3))

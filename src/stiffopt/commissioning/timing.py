@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt.commissioning.procedure import StepReadings
+from stiffopt.model.history import lagged
 
 Array = NDArray[np.float64]
 
@@ -198,12 +199,7 @@ def _delay(r: StepReadings, channel: int, begin: float, end: float) -> tuple[flo
 
 def _followed(time: Array, command: Array, lag: float) -> Array:
     """Return pressures (m,) behind a lag in s; each command holds until the next."""
-    if lag == 0:
-        return command
-    found = command.copy()
-    for i, share in enumerate(-np.expm1(-np.diff(time) / lag), start=1):
-        found[i] = found[i - 1] + share * (command[i - 1] - found[i - 1])
-    return found
+    return command if lag == 0 else lagged(time, command, lag, command[0])
 
 
 # -- the tip ---------------------------------------------------------------------------------------

@@ -23,7 +23,7 @@ from pydantic import Field
 from stiffopt.errors import InputError, require_package
 from stiffopt.files import read_file
 from stiffopt.identify.calibration import calibrate
-from stiffopt.identify.detection import lagged
+from stiffopt.identify.detection import lagged_pressures
 from stiffopt.identify.recording import Recording
 from stiffopt.identify.results import Comparison
 from stiffopt.identify.settings import START, CalibrationSettings
@@ -199,7 +199,7 @@ class BenchTask:
         """
         rows = chosen_rows(recording, limit)
         p = recording.pressures / np.max(self.robot.pressure_max)
-        return lagged(recording.time, p, _LAG)[rows], recording.tracks[0].position[rows]
+        return lagged_pressures(recording.time, p, _LAG)[rows], recording.tracks[0].position[rows]
 
 
 Method = Callable[[BenchTask], dict[str, BenchErrors]]

@@ -24,6 +24,7 @@ from stiffopt.identify.settings import DETECTION, PLAUSIBLE, Finding
 from stiffopt.identify.tracker_faults import CUBE_ROTATIONS, whole
 from stiffopt.model.calibration import distances_from
 from stiffopt.model.description import RobotDescription, Tolerances
+from stiffopt.model.history import lagged
 from stiffopt.model.manipulator import Manipulator
 
 Array = NDArray[np.float64]
@@ -47,7 +48,7 @@ def on_one_clock(recording: Recording, span: Array) -> Recording:
     time, tip = recording.time, recording.tracks[0].position
     seen = np.flatnonzero(whole(tip))
     rows = seen[np.linspace(0, len(seen) - 1, min(len(seen), DETECTION.clock_rows)).astype(int)]
-    followed = lagged(time, recording.pressures / span, DETECTION.clock_lag)
+    followed = lagged_pressures(time, recording.pressures / span, DETECTION.clock_lag)
 
     def misfits(shifts: Array) -> Array:
         moved = (
@@ -79,12 +80,9 @@ def on_one_clock(recording: Recording, span: Array) -> Recording:
     )
 
 
-def lagged(time: Array, pressures: Array, lag: float) -> Array:
-    """Return pressures (N, n) behind a first-order lag of `lag` s."""
-    followed = pressures.copy()
-    for i, share in enumerate(-np.expm1(-np.diff(time) / lag), start=1):
-        followed[i] = followed[i - 1] + share * (pressures[i] - followed[i - 1])
-    return followed
+def lagged_pressures(time: Array, pressures: Array, lag: float) -> Array:
+    """Return pressures (N, n) behind a lag in s; each acts from the time of the one before."""
+    return lagged(time, np.roll(pressures, -1, axis=0), lag, pressures[0])
 
 
 def _quadratics(pressures: Array) -> Array:
@@ -137,7 +135,9 @@ def begun(recording: Recording, span: Array) -> Recording:
     steps = (np.abs(recording.before) > PLAUSIBLE.late * span).any()
     if not steps or np.isnan(tip[0]).any() or len(rows) < 2 * at.shape[1]:
         return recording
-    known = _quadratics(lagged(recording.time, recording.pressures / span, DETECTION.clock_lag))
+    known = _quadratics(
+        lagged_pressures(recording.time, recording.pressures / span, DETECTION.clock_lag)
+    )
     distances, coefficients = _regressed(known[rows], tip[rows])
     rest, first = np.linalg.norm(at @ coefficients - tip[0], axis=1)
     if (
@@ -162,7 +162,7 @@ def without_drift(recording: Recording) -> Recording:
     seen = np.flatnonzero(whole(recording.tracks[0].position))
     rows = seen[np.linspace(0, len(seen) - 1, min(len(seen), DETECTION.drift_rows)).astype(int)]
     time, tip = recording.time[rows], recording.tracks[0].position[rows]
-    acting = lagged(recording.time, recording.pressures, DETECTION.clock_lag)[rows]
+    acting = lagged_pressures(recording.time, recording.pressures, DETECTION.clock_lag)[rows]
     ends = np.linspace(time[0], time[-1], DETECTION.drift_parts + 1)
     knots = (ends[1:] + ends[:-1]) / 2
     part = np.searchsorted(ends[1:-1], time)
@@ -316,7 +316,9 @@ class Comparer:
         for each in recordings:
             seen = np.flatnonzero(np.logical_and.reduce([whole(t.position) for t in each.tracks]))
             rows = seen[np.unique(np.linspace(0, len(seen) - 1, count).astype(int))]
-            self._pressures.append(lagged(each.time, each.pressures, DETECTION.clock_lag)[rows])
+            self._pressures.append(
+                lagged_pressures(each.time, each.pressures, DETECTION.clock_lag)[rows]
+            )
             self._measured.append(np.stack([t.position[rows] for t in each.tracks], axis=1))
         self._from_frame = to_base[:3, :3], to_base[:3, 3]
         self._kept: dict[tuple[int, ...], list[list[Array]]] = {}

@@ -436,3 +436,15 @@ class Memory:
         if not np.isfinite(p).all():
             raise InputError("expected finite pressures")
         return p
+
+
+def lagged(time: Array, inputs: Array, lag: float, start: ArrayLike) -> Array:
+    """Return the outputs (N, ...) of a first-order lag at times (N,), from `start` on.
+
+    Each of the inputs (N, ...) holds until the next time; the last one has no effect.
+    """
+    outputs = np.empty_like(inputs)
+    outputs[0] = start
+    for i, share in enumerate(-np.expm1(-np.diff(time) / lag)):
+        outputs[i + 1] = outputs[i] + share * (inputs[i] - outputs[i])
+    return outputs
