@@ -149,6 +149,7 @@ def test_a_sigterm_before_there_is_a_supply_ends(
 RIGS = Path(__file__).parent.parent / "rig"
 
 
+@pytest.mark.real_time
 def test_a_simulated_rig_is_hosted_whole() -> None:
     supply = owned(
         load_rig_description(RIGS / "sim-two-segment.yaml"),
@@ -158,12 +159,10 @@ def test_a_simulated_rig_is_hosted_whole() -> None:
     rest = supply.hosted
     assert rest is not None
     assert supply.timeout == TIMEOUT
-    rest.poses()  # none yet, but on a machine that is busy
+    first = rest.poses()  # none yet, but on a machine that is busy
     time.sleep(0.2)
-    samples = rest.poses()
-    frames = [sample.frame for sample in samples]
-    assert len(frames) > 2
-    assert frames == list(range(frames[0], frames[0] + len(frames)))  # none is lost in between
+    samples = (*first, *rest.poses())
+    assert [sample.frame for sample in samples][:3] == [1, 2, 3]
     assert -0.1 < time.monotonic() - supply.epoch - samples[-1].received < 1.0
     assert np.shape(rest.ask("truth", {})) == (4, 4)
     assert np.shape(rest.ask("pressures", {})) == (6,)

@@ -74,7 +74,7 @@ def export(
     ] = False,
     out: Annotated[
         str | None,
-        option("FILE.csv", "Write here, or into this folder; else beside the recording."),
+        option("FILE.csv", "Write here, or into this folder; otherwise next to the recording."),
     ] = None,
     quiet: Quiet = False,
 ) -> None:
@@ -133,7 +133,7 @@ def plot(
     out: Annotated[
         str | None,
         option(
-            "FILE.png", "Draw into this file (.png, .pdf, .svg); by default beside the recording."
+            "FILE.png", "Draw into this file (.png, .pdf, .svg); by default next to the recording."
         ),
     ] = None,
     units: Units = None,

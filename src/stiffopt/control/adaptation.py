@@ -230,7 +230,7 @@ class Adaptation:
         return Adapted(description, after, limits)
 
     def is_beyond(self, limits: Array | None) -> bool:
-        """Whether limits (2, k) keep the applied numbers away from the estimate."""
+        """Return whether the estimate lies outside of limits (2, k), by more than a step."""
         if limits is None:
             return False
         beyond = np.abs(self.estimate - np.clip(self.estimate, *limits))[self._applies]

@@ -38,6 +38,7 @@ from stiffopt.control.windows import WindowWatch
 from stiffopt.errors import InputError
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.scene import Scene
+from stiffopt.model.uncertainty import NORMAL_QUANTILE
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import Task
 from stiffopt.paths.trajectory import Trajectory
@@ -46,7 +47,6 @@ from stiffopt.rig.settings import ControlSettings, Safety
 
 Array = NDArray[np.float64]
 
-_NORMAL = 1.959963984540054  # 97.5 % quantile of the normal distribution
 _HELD = 2.5  # periods without `compute`, after which others have commanded the pressures
 
 
@@ -540,7 +540,7 @@ class TipController:
         stiffness = math.nan
         if pursuit.stiffness is not None:
             stiffness = pursuit.stiffness(tip.compliance, tip.pose[:3, :3])
-        ratio = math.exp(_NORMAL * self.replanner.deviation)  # NaN if unknown
+        ratio = math.exp(NORMAL_QUANTILE * self.replanner.deviation)  # NaN if unknown
         planned = np.full(n, np.nan)
         if self._led_to is not None:
             planned = self._reference.goal[:n] - self._arm.pressures.history_offset

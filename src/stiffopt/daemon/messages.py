@@ -215,14 +215,14 @@ def _with_fields_of(schema: type[Schema]) -> Callable[[ClassT], ClassT]:
 
 
 def _is_implied(info: FieldInfo) -> bool:
-    """Whether messages do without a field: it has one value, or no key in files."""
+    """Return whether a field is not part of messages: it has one value, or no key in files."""
     args = get_args(info.annotation)
     is_constant = get_origin(info.annotation) is Literal and len(args) == 1
     return bool(info.exclude) or (is_constant and not info.is_required())
 
 
 def _is_left_out(info: FieldInfo) -> bool:
-    """Whether messages lack a field: it is implied, or names a file."""
+    """Return whether messages do not carry a field: it is implied, or names a file."""
     return _is_implied(info) or Mesh in get_args(info.annotation)
 
 
@@ -257,7 +257,7 @@ def _type(hint: Any) -> Any:
 
 
 def _is_message(kind: Any) -> bool:
-    """Whether a JSON type is a message, or a choice of messages."""
+    """Return whether a JSON type is a message, or a choice of messages."""
     if isinstance(kind, type):
         return issubclass(kind, SchemaMessage)
     return get_origin(kind) in (Annotated, Union) and _is_message(get_args(kind)[0])

@@ -15,12 +15,12 @@ from stiffopt.identify.fit import Fit
 from stiffopt.identify.settings import REPORT
 from stiffopt.identify.unknowns import BASE, SENSOR
 from stiffopt.model.parameters import Parameter
+from stiffopt.model.uncertainty import NORMAL_QUANTILE
 
 Array = NDArray[np.float64]
 
 TIED = "hardly told apart"
 """Beginning of the remark on two numbers that the data cannot distinguish."""
-_NORMAL = 1.959963984540054  # 97.5 % quantile
 _PLACED = {
     BASE: "the base tracked too, or touched with a pointer",
     SENSOR: "the tip's orientation recorded while it bends in all directions",
@@ -218,7 +218,7 @@ def estimates(found: Fit) -> tuple[FittedEstimate, ...]:
     variance = np.diag(found.covariance)
     listed = []
     for unknown, x, v in zip(found.problem.unknowns.all, found.x, variance, strict=True):
-        middle, half = x * unknown.deviation, _NORMAL * math.sqrt(v) * unknown.deviation
+        middle, half = x * unknown.deviation, NORMAL_QUANTILE * math.sqrt(v) * unknown.deviation
         ends = [max(middle - half, unknown.low), middle, min(middle + half, unknown.high)]
         before, unit, key = 0.0, unknown.unit, ""
         if unknown.parameter is not None:

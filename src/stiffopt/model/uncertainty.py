@@ -36,7 +36,7 @@ Vector = NDArray[np.float64]
 Part = Literal["parameters", "hysteresis", "discrepancy", "residual"]
 
 _LEVEL = 0.95  # probability of the reported regions
-_NORMAL = 1.959963984540054  # 97.5 % quantile
+NORMAL_QUANTILE = 1.959963984540054  # of 97.5 %, for two-sided intervals of 95 %
 
 
 @dataclass(frozen=True, eq=False)
@@ -243,7 +243,9 @@ class Uncertainty:
         acting = self._hysteresis(p, np.zeros(1, dtype=bool)) + self._discrepancy(p)
         variance = g @ self._covariance[:size, :size] @ g + h**2 @ acting[0]
         deviation = float(np.sqrt(max(variance, 0.0)))
-        return float(k[0] * np.exp(-_NORMAL * deviation)), float(k[0] * np.exp(_NORMAL * deviation))
+        return float(k[0] * np.exp(-NORMAL_QUANTILE * deviation)), float(
+            k[0] * np.exp(NORMAL_QUANTILE * deviation)
+        )
 
     def _discrepancy(self, pressures: Vector) -> Vector:
         """Return variances (N, n) of the effective pressures due to the discrepancy, in Pa^2."""

@@ -1,7 +1,7 @@
-"""What errors of a calibration leave in doubt of an arm that leans on objects, to first order.
+"""Uncertainty of contact forces and braced stiffness by a calibration, to first order.
 
-A calibration foretells errors of the free tip.  The same errors would be caused by wrong pressures,
-of which those of least norm are taken; contact forces and stiffness follow their pressures.
+A calibration states the covariance of the free tip.  It is expressed as that of the pressures (of
+least norm) that would move the tip as much, and carried on to contact forces and stiffness.
 """
 
 from __future__ import annotations
@@ -11,12 +11,11 @@ from numpy.typing import NDArray
 
 from stiffopt.model.contact.equilibrium import ContactEquilibrium, Grip
 from stiffopt.model.manipulator import Manipulator
+from stiffopt.model.uncertainty import NORMAL_QUANTILE
 from stiffopt.optimise.goal import StiffnessMeasure
 from stiffopt.optimise.settings import BRACE
 
 Vector = NDArray[np.float64]
-
-_NORMAL = 1.959963984540054  # 97.5 % quantile
 
 
 def wrong_pressures(robot: Manipulator, p: Vector) -> Vector:
@@ -53,5 +52,5 @@ def stiffness_interval(
     given = (measure.direction, measure.kind, measure.boundary, measure.frame, contacts)
     k, slope = eq.stiffness(*given), eq.stiffness_gradient(*given)
     variance = float(slope @ wrong_pressures(robot, eq.pressures) @ slope)
-    ratio = float(np.exp(_NORMAL * np.sqrt(max(variance, 0.0)) / k))
+    ratio = float(np.exp(NORMAL_QUANTILE * np.sqrt(max(variance, 0.0)) / k))
     return k / ratio, k * ratio

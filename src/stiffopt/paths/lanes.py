@@ -30,8 +30,8 @@ def lanes(
 ) -> list[list[PathCandidate]]:
     """Return further candidates at each point, which lie in a region of the path.
 
-    New configurations are others for each attempt.  The last attempt adds none beside those that
-    are followed, which leaves more room for others.
+    Each attempt draws other configurations.  The last one adds no variants of those that are
+    carried along, which leaves room for more of them.
     """
     if tasks.robot.is_loaded:
         return [[] for _ in range(len(tasks))]
