@@ -166,6 +166,17 @@ def test_as_fast_as_the_rates_allow(robot, compiled):
     np.testing.assert_allclose(np.diff(solution.times), np.maximum(least, 1e-3))
 
 
+def test_points_far_apart_are_followed_as_fast_as_the_rates_allow(robot, compiled):
+    """Steps of a tenth of a channel's range cannot lead from one to the next."""
+    ends = np.array([[0.1, 0, 0, 0.1, 0, 0], [0, 1.2, 0.3, 0, 1.0, 0]]) * 1e5
+    tips = robot.tip_pose(np.linspace(*ends, 7))[:, :3, 3]
+    path = path_of(through(tips), points=None, timing={"fastest": True})
+    solution = solve_path(robot, path)
+    check(robot, path, solution)
+    assert np.abs(np.diff(solution.pressures, axis=0)).max() > 0.1 * robot.pressure_max.max()
+    assert "with more points, or lower rates, it stays nearer" in solution.message
+
+
 def test_a_speed_that_no_rate_allows_names_the_rate_and_what_can_be_followed(robot, compiled):
     path = path_of(timing={"speed": 1e4})
     solution = solve_path(robot, path)
@@ -256,6 +267,26 @@ def test_an_arm_under_gravity_follows_a_path(compiled):
     tip = robot.tip_pose(np.full(6, 0.3e5) + np.arange(6) * 1e4)[:3, 3]
     line = {"line": {"from": tuple(tip), "to": tuple(tip + np.array([0, 0.006, 0]))}}
     path = path_of(line, points=5)
+    check(robot, path, solve_path(robot, path))
+
+
+@pytest.mark.parametrize("timing", ["rates nearly used up", "fastest"])
+def test_pressures_of_a_hanging_arm_that_are_not_optimal_are_found(timing, compiled):
+    """Points of a curve of pressures; local optima alone do not lead along it."""
+    robot = so.load_robot("stiff-flop-2-hanging")
+    rng = np.random.default_rng(1)
+    for _ in range(8):
+        knots = 1.5e5 * rng.uniform(0.03, 0.9, (4, 6))
+    curve = np.clip(CubicSpline(np.arange(4), knots)(np.linspace(0, 3, 40)[:14]), 0, 1.5e5)
+    rate = np.abs(np.diff(curve, axis=0)).max(axis=1) / 0.95
+    times = np.append(0, np.cumsum(rate / 5e5))
+    path = path_of(
+        through(robot.tip_pose(curve)[:, :3, 3]),
+        points=None,
+        timing={"fastest": True} if timing == "fastest" else {"times": times},
+        tolerance={"position": 5e-4},
+        pressure={"slew": 5e5},
+    )
     check(robot, path, solve_path(robot, path))
 
 

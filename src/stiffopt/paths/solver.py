@@ -173,11 +173,12 @@ class _PathSolver:
         steps = self._steps(tasks, times)
         attempts = RouteAttempts(moved, layers, self._over, fixed, self._path.closed)
         routes = attempts.best(steps)
-        if not routes and times is not None and all(layers):
-            stuck = len(attempts.beginning(steps)) - 1
+        if not routes and all(layers):
+            if times is not None:
+                stuck = len(attempts.beginning(steps)) - 1
             slowed, routes = attempts.slower(steps)
             if routes:
-                times, steps = times * slowed, steps * slowed
+                times, steps = None if times is None else times * slowed, steps * slowed
         if not routes:
             return self._without_route(moved, layers, attempts, steps)
         route, pressures = attempts.refined(routes, steps)
