@@ -41,6 +41,8 @@ Vector = NDArray[np.float64]
 _NEARLY_AS_STIFF = 0.95  # share of the best stiffness from which no stiffer goal is sought
 _MORE = 50  # motions checked for a stiffer goal, in addition to as many as for the first
 _LEAST_STEP = 1.1e-3  # s, shortest time between points that a trajectory accepts
+_MARGINS = 5  # largest number of ways sought for the margin of a calibrated arm
+_GROWTH = 1.02  # of the margin over the uncertainty along the last way
 _STEPS = 50  # smallest number of steps in a motion, unless they would be shorter than ...
 _SHORT = 5e-3  # ... this, in s
 
@@ -124,9 +126,8 @@ def plan_motion(
         if isinstance(end, Task):
             PressureSolver(request.bare, request.posed(end), seed=request.seed).compile()
     try:
-        planner = _Planner(request, timings)
         with giving_up(timeout, cancel):
-            way = planner.way()
+            planner, way = _with_margin(request, timings)
         found = planner.described(way)
     except Unsolved as reason:
         found = request.without_answer(str(reason), "unreachable")
@@ -134,6 +135,29 @@ def plan_motion(
         found = request.without_answer(str(error), "failed")
     found.timings.update(timings | watch.timings())
     return found
+
+
+def _with_margin(request: MotionRequest, timings: dict[str, float]) -> tuple[_Planner, Vector]:
+    """Return a way whose margin is at least the calibrated uncertainty along it, and its planner.
+
+    The margin begins at zero and grows to the uncertainty along the last way that was found.
+    """
+    for _ in range(_MARGINS):
+        planner = _Planner(request, timings)
+        way = planner.way()
+        if request.margin is None:
+            break
+        left_open = request.uncertainty(way)
+        if left_open <= request.margin:
+            break
+        request = replace(request, margin=_GROWTH * left_open)
+    else:
+        unit = display_units().length
+        raise Unsolved(
+            "no way was found on which the body keeps clear by as much as the calibration leaves "
+            f"open there; on the last one that is {unit.text(left_open, '.3g')}"
+        )
+    return planner, way
 
 
 def _leaning(
