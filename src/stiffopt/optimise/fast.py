@@ -32,7 +32,9 @@ Vector = NDArray[np.float64]
 _NEAR = 18  # numbers of a term's `Nearness`
 _COUNTS = 14  # numbers of an answer before its pressures
 # requests and outcomes, as in solver.c
-_SEARCH, _GUESS_FIRST, _GUESS_ALONE, _JUDGE, _REACH_ONLY, _CLOSEST, _CLOSEST_FROM, _BROUGHT = range(8)
+_SEARCH, _GUESS_FIRST, _GUESS_ALONE, _JUDGE, _REACH_ONLY, _CLOSEST, _CLOSEST_FROM, _BROUGHT = range(
+    8
+)
 _UNSOLVED, ANSWERED, _GLOBAL, _JUDGED, _REACHED, _NEAREST, _NOT_FINITE, _TOO_SOFT = range(8)
 
 _integer, _double, _pointer = ctypes.c_int64, ctypes.c_double, ctypes.c_void_p

@@ -1,6 +1,7 @@
 """Search for the best sequences of candidates in several attempts, each with further candidates."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -8,6 +9,7 @@ from stiffopt.paths.gaps import gaps
 from stiffopt.paths.lanes import lanes
 from stiffopt.paths.links import Vector
 from stiffopt.paths.points import PathCandidate, PathTasks
+from stiffopt.paths.quickening import quickened, share_of
 from stiffopt.paths.refinement import refined
 from stiffopt.paths.relaxation import relaxed
 from stiffopt.paths.route import Route, RouteSearch
@@ -75,7 +77,10 @@ class RouteAttempts:
         return known[: 1 if has_scene else ROUTE.refined]
 
     def slower(self, steps: Vector) -> tuple[float, list[Route]]:
-        """Find the smallest slow-down, to 5 %, with which the path can be followed, and how."""
+        """Find a small slow-down with which the path can be followed, and how; 1 if none is needed.
+
+        The first sequence is found with one that is right to 5 %, and then quickened.
+        """
         few = ROUTE.few_further  # with long steps, every candidate has steps to every other
         self._further = [some[:: 1 + len(some) // few] for some in self._further]
         factor, low = float((self._tasks.unit / steps).max()), 1.0
@@ -87,7 +92,12 @@ class RouteAttempts:
                 factor, routes = middle, quicker
             else:
                 low = middle
-        return factor, routes and (self.best(steps * factor) or routes)
+        routes = routes and (self.best(steps * factor) or routes)
+        for route in routes[:1]:
+            own = quickened(self._tasks, route.candidates, steps, self._fixed)
+            routes = [replace(route, candidates=own)]
+            factor = max(1.0, share_of(steps, routes[0].pressures))
+        return factor, routes
 
     def refined(self, routes: Sequence[Route], steps: Vector) -> tuple[Route, Vector]:
         """Return the sequence that is best when refined, and its pressures.

@@ -20,7 +20,7 @@ from stiffopt.optimise.functions import functions
 from stiffopt.optimise.local import descend
 from stiffopt.optimise.prepared import prepared
 from stiffopt.optimise.problem import PressureProblem
-from stiffopt.optimise.program import Program, pressure_ranges
+from stiffopt.optimise.program import Constraint, Program, pressure_ranges
 from stiffopt.optimise.reach import reach
 from stiffopt.optimise.solution import Judgement, are_within, judge
 from stiffopt.optimise.task import Task
@@ -176,6 +176,18 @@ class PathTasks:
         """Parameters of the compiled functions at each point."""
         return np.array([self.robot.parameters(each.parameters) for each in self.programs])
 
+    @cached_property
+    def own_constraints(self) -> list[Constraint]:
+        """The bounds on the residuals but those of obstacles; their radii are those at point 0."""
+        first = self.programs[0]
+        return [c for c in first.constraints(self.robot.length) if c.first < first.n_own_rows]
+
+    @cached_property
+    def radii(self) -> Vector:
+        """Radii (N, c) of the own constraints at each point."""
+        count = len(self.own_constraints)
+        return np.array([each.radii[:count] for each in self.programs])
+
     def __len__(self) -> int:
         return len(self.tasks)
 
@@ -285,6 +297,15 @@ class PathTasks:
     def candidate(self, index: int, pressures: Vector) -> PathCandidate | None:
         """Return pressures (n,) as a candidate at a point, or None if they miss its task."""
         return self.accepted(index, pressures, self.judged_at(index, pressures))
+
+    def hold(self, slopes: Slopes) -> bool:
+        """Whether all points are within their tolerances; `slopes` are those of all points."""
+        for c, radii in zip(self.own_constraints, self.radii.T, strict=True):
+            r = slopes.residuals[:, c.first : c.end]
+            sizes = r[:, 0] if c.one_sided else np.linalg.norm(r, axis=1)
+            if (sizes > radii).any():
+                return False
+        return True
 
     def slopes(self, indices: Sequence[int], pressures: Vector) -> Slopes | None:
         """Linearise the tasks at some points about pressures (k, n); None without equilibrium."""

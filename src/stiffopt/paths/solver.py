@@ -177,6 +177,8 @@ class _PathSolver:
             if times is not None:
                 stuck = len(attempts.beginning(steps)) - 1
             slowed, routes = attempts.slower(steps)
+            if slowed <= 1:
+                stuck = None
             if routes:
                 times, steps = None if times is None else times * slowed, steps * slowed
         if not routes:
