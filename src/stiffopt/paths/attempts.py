@@ -79,25 +79,24 @@ class RouteAttempts:
     def slower(self, steps: Vector) -> tuple[float, list[Route]]:
         """Find a small slow-down with which the path can be followed, and how; 1 if none is needed.
 
-        The first sequence is found with one that is right to 5 %, and then quickened.
+        Any sequence will do at first; it is then quickened as a whole.
         """
         few = ROUTE.few_further  # with long steps, every candidate has steps to every other
         self._further = [some[:: 1 + len(some) // few] for some in self._further]
-        factor, low = float((self._tasks.unit / steps).max()), 1.0
-        routes = self.best(steps * factor, any_will_do=True) if factor > 1 else []
-        while routes and factor / low > 1.05:
-            middle = (low * factor) ** 0.5
-            quicker = self.best(steps * middle, any_will_do=True)
-            if quicker:
-                factor, routes = middle, quicker
-            else:
-                low = middle
-        routes = routes and (self.best(steps * factor) or routes)
-        for route in routes[:1]:
-            own = quickened(self._tasks, route.candidates, steps, self._fixed)
-            routes = [replace(route, candidates=own)]
-            factor = max(1.0, share_of(steps, routes[0].pressures))
-        return factor, routes
+        most, factor = float((self._tasks.unit / steps).max()), 1.0
+        routes: list[Route] = []
+        while not routes and factor < most:
+            factor = min(2 * factor, most)
+            routes = self.best(steps * factor, any_will_do=True)
+        if not routes:
+            return factor, []
+        own = quickened(self._tasks, routes[0].candidates, steps, self._fixed)
+        routes = [replace(routes[0], candidates=own)]
+        for index, each in enumerate(own):
+            if index not in self._fixed:
+                self._further[index].append(each)
+        factor = max(1.0, share_of(steps, routes[0].pressures))
+        return factor, self.best(steps * factor) or routes
 
     def refined(self, routes: Sequence[Route], steps: Vector) -> tuple[Route, Vector]:
         """Return the sequence that is best when refined, and its pressures.
