@@ -170,7 +170,7 @@ def test_as_fast_as_the_rates_allow(robot, compiled):
 def test_points_far_apart_are_followed_as_fast_as_the_rates_allow(robot, compiled):
     """Steps of a tenth of a channel's range cannot lead from one to the next."""
     ends = np.array([[0.1, 0, 0, 0.1, 0, 0], [0, 1.2, 0.3, 0, 1.0, 0]]) * 1e5
-    tips = robot.tip_pose(np.linspace(*ends, 7))[:, :3, 3]
+    tips = robot.tip_pose(np.linspace(*ends, 4))[:, :3, 3]
     path = path_of(through(tips), points=None, timing={"fastest": True})
     solution = solve_path(robot, path)
     check(robot, path, solution)
