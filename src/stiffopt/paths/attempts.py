@@ -19,7 +19,7 @@ from stiffopt.paths.settings import ROUTE
 class RouteAttempts:
     """Searches for sequences, with further candidates if local optima do not suffice.
 
-    Pressures are given at the `fixed` points; other arguments are those of `RouteSearch`.
+    Pressures are given at the `given` points; other arguments are those of `RouteSearch`.
 
     Attributes
     ----------
@@ -32,11 +32,13 @@ class RouteAttempts:
         tasks: PathTasks,
         layers: Sequence[Sequence[PathCandidate]],
         over: str,
-        fixed: set[int],
+        given: set[int],
         is_closed: bool,
     ) -> None:
-        self._tasks, self._layers, self._over = tasks, layers, over
-        self._fixed, self._is_closed = fixed, is_closed
+        self._tasks, self._over = tasks, over
+        self._layers = [list(layer) for layer in layers]
+        self._given, self._is_closed = given, is_closed
+        self._fixed = {0, len(tasks) - 1} if is_closed else given  # when points move one by one
         self.alone = np.array([max((c.value for c in layer), default=np.nan) for layer in layers])
         self._further: list[list[PathCandidate]] = [[] for _ in layers]
 
@@ -90,13 +92,18 @@ class RouteAttempts:
             routes = self.best(steps * factor, any_will_do=True)
         if not routes:
             return factor, []
-        own = quickened(self._tasks, routes[0].candidates, steps, self._fixed)
+        own = quickened(self._tasks, routes[0].candidates, steps, self._given, self._is_closed)
         routes = [replace(routes[0], candidates=own)]
         for index, each in enumerate(own):
-            if index not in self._fixed:
+            if index in self._fixed:
+                self._layers[index].append(each)
+            else:
                 self._further[index].append(each)
         factor = max(1.0, share_of(steps, routes[0].pressures))
-        return factor, self.best(steps * factor) or routes
+        best = self._search(steps * factor).best(ROUTE.first_rounds)
+        if best is None:
+            return factor, routes
+        return factor, [relaxed(self._tasks, best, steps * factor, self.alone, self._fixed)]
 
     def refined(self, routes: Sequence[Route], steps: Vector) -> tuple[Route, Vector]:
         """Return the sequence that is best when refined, and its pressures.

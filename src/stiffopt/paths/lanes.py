@@ -1,4 +1,4 @@
-"""Lanes: further configurations along a path, which need not be optimal.
+"""Lanes: further configurations of a free arm along a path, which need not be optimal.
 
 At a few points of a region, configurations are spread over all that reach the target.  These and
 the local optima follow the path, from mark to mark, with as little change as possible.  They
@@ -34,7 +34,7 @@ def lanes(
     carried along, which leaves room for more of them.
     """
     found: list[list[PathCandidate]] = [[] for _ in range(len(tasks))]
-    if not tasks.is_compiled:
+    if not tasks.is_compiled or tasks.robot.is_loaded:
         return found
     many = min(len(region), LANES.marks, max(2 * LANES.knots, len(region) // LANES.every))
     marks = spaced(region[0], region[-1], many)

@@ -140,24 +140,25 @@ def plan_motion(
 def _with_margin(request: MotionRequest, timings: dict[str, float]) -> tuple[_Planner, Vector]:
     """Return a way whose margin is at least the calibrated uncertainty along it, and its planner.
 
-    The margin begins at zero and grows to the uncertainty along the last way that was found.
+    The margin begins with the uncertainty at given ends, and grows to that along the last way.
     """
+    ends = [each for each in (request.start, *request.goals) if not isinstance(each, Task)]
+    if request.margin is not None and len(ends) == 1 + len(request.goals):
+        nearest = min(request.uncertainty(each[np.newaxis]) for each in ends[1:])
+        margin = max(request.uncertainty(ends[0][np.newaxis]), nearest)
+        request = replace(request, margin=_GROWTH * margin)
     for _ in range(_MARGINS):
         planner = _Planner(request, timings)
         way = planner.way()
-        if request.margin is None:
-            break
-        left_open = request.uncertainty(way)
-        if left_open <= request.margin:
-            break
+        left_open = 0.0 if request.margin is None else request.uncertainty(way)
+        if request.margin is None or left_open <= request.margin:
+            return planner, planner.shorter(way)
         request = replace(request, margin=_GROWTH * left_open)
-    else:
-        unit = display_units().length
-        raise Unsolved(
-            "no way was found on which the body keeps clear by as much as the calibration leaves "
-            f"open there; on the last one that is {unit.text(left_open, '.3g')}"
-        )
-    return planner, way
+    unit = display_units().length
+    raise Unsolved(
+        "no way was found on which the body keeps clear by as much as the calibration leaves open "
+        f"there; on the last one that is {unit.text(left_open, '.3g')}"
+    )
 
 
 def _leaning(
@@ -227,7 +228,7 @@ class _Planner:
             return False
 
     def way(self) -> Vector:
-        """Return a way (k, n) in pressures, or raise `Unsolved` with the reason."""
+        """Return a way (k, n) in pressures, not yet shortened; raise `Unsolved` with a reason."""
         begin = perf_counter()
         start = self._start()
         tasks, goals = self._first_goals()
@@ -241,12 +242,22 @@ class _Planner:
             self.goals = goals
             self.timings["goals"] += perf_counter() - begin
             way = self._search(start, goals, tasks)
-        begin = perf_counter()
-        if len(way) > 2:
-            way = shortened(way, self.is_still_clear, self.request.slew, self.request.seed)
-            way = rounded(way, self.is_still_clear, self.request.slew)
-        self.timings["shorten"] = perf_counter() - begin
         return way
+
+    def shorter(self, way: Vector) -> Vector:
+        """Return a shorter and rounder way, if its margin suffices; after the time the given one."""
+        begin, found = perf_counter(), way
+        try:
+            if len(way) > 2:
+                found = shortened(way, self.is_still_clear, self.request.slew, self.request.seed)
+                found = rounded(found, self.is_still_clear, self.request.slew)
+                margin = self.request.margin
+                if margin is not None and self.request.uncertainty(found) > margin:
+                    found = way
+        except StoppedError:
+            found = way
+        self.timings["shorten"] = perf_counter() - begin
+        return found
 
     # -- ends -------------------------------------------------------------------------------
 

@@ -28,31 +28,35 @@ def share_of(steps: Vector, pressures: Vector) -> float:
 
 
 def quickened(
-    tasks: PathTasks, found: list[PathCandidate], steps: Vector, fixed: Collection[int]
+    tasks: PathTasks,
+    found: list[PathCandidate],
+    steps: Vector,
+    fixed: Collection[int],
+    is_closed: bool = False,
 ) -> list[PathCandidate]:
     """Return candidates at all points that use a smaller share of steps (N - 1, n), in Pa.
 
     The share is at most that of the given ones, and need not be less than one; `fixed` points do
-    not change.
+    not change. The last point of a closed path stays where the first one is.
     """
     free = np.ones(len(found), dtype=bool)
     free[list(fixed)] = False
-    every = np.arange(len(found))
+    every = range(len(found))
     pressures = np.array([each.pressures for each in found])
-    slopes = tasks.slopes(every.tolist(), pressures)
+    slopes = tasks.slopes(every, pressures)
     share, radius = share_of(steps, pressures), QUICKENING.radius
     for _ in range(QUICKENING.iterations):
         if slopes is None or share <= QUICKENING.enough or radius < QUICKENING.last_radius:
             break
         checkpoint()
-        program = _Program(tasks, slopes, pressures, steps, radius * free)
+        program = _Program(tasks, slopes, pressures, steps, radius * free, is_closed)
         trial = program.solved()
-        there = None if trial is None else tasks.slopes(every.tolist(), trial)
+        there = None if trial is None else tasks.slopes(every, trial)
         for _ in range(QUICKENING.corrections):
             if trial is None or there is None or tasks.hold(there):
                 break
             trial = program.solved(trial, there)
-            there = None if trial is None else tasks.slopes(every.tolist(), trial)
+            there = None if trial is None else tasks.slopes(every, trial)
         if (
             trial is not None
             and there is not None
@@ -64,21 +68,25 @@ def quickened(
             radius *= 2
         else:
             radius *= 0.3
-    judged = tasks.brought(every, pressures)  # it leaves them where they are: on target
-    pairs = zip(judged.pressures, judged.values.tolist(), strict=True)
-    return [
-        PathCandidate(p, value) if is_free and np.isfinite(value) else old
-        for old, is_free, (p, value) in zip(found, free, pairs, strict=True)
-    ]
+    judgements = enumerate(zip(pressures, tasks.judged(pressures), strict=True))
+    new = [tasks.accepted(index, *each) for index, each in judgements]
+    return found if None in new else [each for each in new if each is not None]
 
 
 class _Program:
     """The linearised program at pressures (N, n) in Pa; `move` (N,) are the greatest changes."""
 
     def __init__(
-        self, tasks: PathTasks, slopes: Slopes, pressures: Vector, steps: Vector, move: Vector
+        self,
+        tasks: PathTasks,
+        slopes: Slopes,
+        pressures: Vector,
+        steps: Vector,
+        move: Vector,
+        is_closed: bool,
     ) -> None:
         self._tasks, self._slopes, self._pressures = tasks, slopes, pressures
+        self._is_fixed, self._is_closed = move == 0, is_closed
         unit = tasks.unit
         x = pressures / unit
         high = np.clip(tasks.upper / unit - x, 0, move[:, np.newaxis]).ravel()
@@ -94,6 +102,11 @@ class _Program:
         ]  # fmt: skip
         self._bounds = [high, -low, -apart, apart]
         self._cones: list[object] = [clarabel.NonnegativeConeT(sum(map(len, self._bounds)))]
+        if is_closed:
+            n = x.shape[1]
+            self._rows.append(sparse.hstack([same[-n:] - same[:n], still[:n]]))
+            self._bounds.append(np.zeros(n))
+            self._cones.append(clarabel.ZeroConeT(n))
         for c in tasks.own_constraints:
             rows = slopes.jacobians[:, c.first : c.end] / c.scale
             if not c.one_sided:  # |r| <= radius: the first row of a cone is the radius
@@ -113,17 +126,21 @@ class _Program:
         Linear constraints are exact at pressures `at`, whose residuals are those of `there`; by
         default at the program's own.
         """
-        tasks, residuals = self._tasks, self._slopes.residuals
+        tasks = self._tasks
+        residuals = own = self._slopes.residuals
         if at is not None and there is not None:
             d = (at - self._pressures) / tasks.unit
             residuals = there.residuals - np.einsum("kmn,kn->km", self._slopes.jacobians, d)
         bounds = list(self._bounds)
         for c, radii in zip(tasks.own_constraints, tasks.radii.T, strict=True):
-            r, within = residuals[:, c.first : c.end] / c.scale, REFINEMENT.of_tolerance * radii
+            r, here = (each[:, c.first : c.end] / c.scale for each in (residuals, own))
+            sizes = here[:, 0] if c.one_sided else np.linalg.norm(here, axis=1)
+            # points at the border of a tolerance may stay there
+            within = np.maximum(REFINEMENT.of_tolerance * radii / c.scale, sizes)
             if c.one_sided:
-                bounds.append(within / c.scale - r[:, 0])
+                bounds.append(within - r[:, 0])
             else:
-                bounds.append(np.column_stack([within / c.scale, r]).ravel())
+                bounds.append(np.column_stack([within, r]).ravel())
         size = self._pressures.size + 1
         P = sparse.diags(np.append(np.full(size - 1, QUICKENING.damping), 0.0), format="csc")
         q = np.append(np.zeros(size - 1), 1.0)
@@ -136,4 +153,8 @@ class _Program:
         if str(solution.status) not in ("Solved", "AlmostSolved"):
             return None
         d = np.array(solution.x)[:-1].reshape(self._pressures.shape)
-        return np.clip(self._pressures + d * tasks.unit, tasks.lower, tasks.upper)
+        found = np.clip(self._pressures + d * tasks.unit, tasks.lower, tasks.upper)
+        found[self._is_fixed] = self._pressures[self._is_fixed]
+        if self._is_closed:
+            found[-1] = found[0]
+        return found
