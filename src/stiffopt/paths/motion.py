@@ -245,7 +245,7 @@ class _Planner:
         return way
 
     def shorter(self, way: Vector) -> Vector:
-        """Return a shorter and rounder way, if its margin suffices; after the time the given one."""
+        """Return a shorter and rounder way if its margin suffices, else the given one."""
         begin, found = perf_counter(), way
         try:
             if len(way) > 2:
