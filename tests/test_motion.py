@@ -6,6 +6,7 @@ Distances are measured once more, with formulas in NumPy on many stations of the
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from importlib.util import find_spec
@@ -347,13 +348,21 @@ def test_a_motion_that_nobody_wants_any_more(two: Manipulator) -> None:
     assert "cancelled" in motion.message
 
 
-def test_the_margin_of_a_calibrated_robot(two: Manipulator, monkeypatch: Any) -> None:
-    from stiffopt.paths import motion_request
-
-    monkeypatch.setattr(motion_request, "_margin", lambda robot: 3e-3)
-    table = {"name": "table", "half_space": {"point": (0, 0, 0.3), "normal": (0, 0, -1)}}
-    motion = plan_motion(two, LEFT, RIGHT, scene=scene_of(table))
-    assert "3 mm of it are kept for what the calibration leaves open" in motion.message
+def test_the_margin_of_a_calibrated_robot() -> None:
+    """It is the uncertainty along the way, which grows with the distance to what was recorded."""
+    robot = load_robot("ucl-2x55-calibrated")
+    low, high = np.zeros(6), np.full(6, 0.05e5)
+    table = {"name": "table", "half_space": {"point": (0, 0, 0.2), "normal": (0, 0, -1)}}
+    motion = plan_motion(robot, low, high, scene=scene_of(table), slew=1e5)
+    assert motion.found, motion.message
+    largest = max(robot.tip_uncertainty(p).semi_axes[0] for p in motion.pressures)
+    kept = re.search(r"([\d.]+) mm of it are kept for what the calibration", motion.message)
+    assert kept
+    assert largest <= 1e-3 * float(kept[1]) * 1.005 < 1.1 * largest
+    near = {"name": "near", "half_space": {"point": (0, 0, 0.13), "normal": (0, 0, -1)}}
+    refused = plan_motion(robot, low, high, scene=scene_of(near), slew=1e5)
+    assert refused.status == "unreachable"
+    assert "of them for what the calibration leaves open" in refused.message
 
 
 # -- shorter, rounder, timed ----------------------------------------------------------------

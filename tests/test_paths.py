@@ -11,7 +11,8 @@ from stiffopt.errors import InputError
 from stiffopt.optimise.solver import PressureSolver
 from stiffopt.paths.candidates import candidates
 from stiffopt.paths.path import Path
-from stiffopt.paths.points import PathTasks
+from stiffopt.paths.points import PathCandidate, PathTasks
+from stiffopt.paths.quickening import quickened, share_of
 from stiffopt.paths.refinement import refined
 from stiffopt.paths.route import RouteSearch
 from stiffopt.paths.solver import solve_path
@@ -166,6 +167,17 @@ def test_as_fast_as_the_rates_allow(robot, compiled):
     np.testing.assert_allclose(np.diff(solution.times), np.maximum(least, 1e-3))
 
 
+def test_points_far_apart_are_followed_as_fast_as_the_rates_allow(robot, compiled):
+    """Steps of a tenth of a channel's range cannot lead from one to the next."""
+    ends = np.array([[0.1, 0, 0, 0.1, 0, 0], [0, 1.2, 0.3, 0, 1.0, 0]]) * 1e5
+    tips = robot.tip_pose(np.linspace(*ends, 4))[:, :3, 3]
+    path = path_of(through(tips), points=None, timing={"fastest": True})
+    solution = solve_path(robot, path)
+    check(robot, path, solution)
+    assert np.abs(np.diff(solution.pressures, axis=0)).max() > 0.1 * robot.pressure_max.max()
+    assert "with more points, or lower rates, it stays nearer" in solution.message
+
+
 def test_a_speed_that_no_rate_allows_names_the_rate_and_what_can_be_followed(robot, compiled):
     path = path_of(timing={"speed": 1e4})
     solution = solve_path(robot, path)
@@ -257,6 +269,96 @@ def test_an_arm_under_gravity_follows_a_path(compiled):
     line = {"line": {"from": tuple(tip), "to": tuple(tip + np.array([0, 0.006, 0]))}}
     path = path_of(line, points=5)
     check(robot, path, solve_path(robot, path))
+
+
+def test_the_common_end_of_a_closed_path_is_found_where_rates_bind(robot, compiled):
+    """Tips of a periodic curve of pressures, at 0.98 of the rate; its start is no local optimum."""
+    rng = np.random.default_rng(4)
+    angle = np.linspace(0, 2 * np.pi, 41)
+    waves = rng.normal(size=(2, 6, 2))
+    shape = sum(
+        np.cos((k + 1) * angle)[:, None] * a + np.sin((k + 1) * angle)[:, None] * b
+        for k, (a, b) in enumerate(waves.transpose(0, 2, 1))
+    )
+    curve = 0.7e5 + 0.5e5 * shape / np.abs(shape).max()
+    tips = robot.tip_pose(curve)[:, :3, 3]
+    tips[-1] = tips[0]
+    rate = np.abs(np.diff(curve, axis=0)).max(axis=1) / 0.98
+    path = path_of(
+        through(tips),
+        points=None,
+        closed=True,
+        timing={"times": np.append(0, np.cumsum(rate / 5e5))},
+        pressure={"slew": 5e5},
+    )
+    solution = solve_path(robot, path)
+    check(robot, path, solution)
+    np.testing.assert_array_equal(solution.pressures[0], solution.pressures[-1])
+
+
+@pytest.mark.parametrize("timing", ["rates nearly used up", "fastest"])
+def test_pressures_of_a_hanging_arm_that_are_not_optimal_are_found(timing, compiled):
+    """Points of a curve of pressures; local optima alone do not lead along it."""
+    robot = so.load_robot("stiff-flop-2-hanging")
+    curve = smooth_curve(robot, 0, 40)[:14]
+    rate = np.abs(np.diff(curve, axis=0)).max(axis=1) / 0.95
+    times = np.append(0, np.cumsum(rate / 5e5))
+    path = path_of(
+        through(robot.tip_pose(curve)[:, :3, 3]),
+        points=None,
+        timing={"fastest": True} if timing == "fastest" else {"times": times},
+        tolerance={"position": 5e-4},
+        pressure={"slew": 5e5},
+    )
+    check(robot, path, solve_path(robot, path))
+
+
+def smooth_curve(robot, seed, count):
+    """Pressures (count, n) on a smooth curve through random ones."""
+    knots = np.random.default_rng(seed).uniform(0.05, 0.9, (4, robot.n_pressures)) * 1.5e5
+    return np.clip(CubicSpline(np.arange(4), knots)(np.linspace(0, 3, count)), 0, 1.5e5)
+
+
+def test_points_may_differ_in_tolerance_where_rates_bind(robot, compiled):
+    curve = smooth_curve(robot, 5, 40)
+    tips = robot.tip_pose(curve)[:, :3, 3]
+    wide, narrow = ({"position": each} for each in (2e-3, 2e-4))
+    points = [
+        {"position": tuple(x), "tolerance": narrow if k % 2 else wide}
+        for k, x in enumerate(tips.tolist())
+    ]
+    rate = np.abs(np.diff(curve, axis=0)).max(axis=1) / 0.8
+    path = path_of(
+        {"through": points},
+        points=None,
+        timing={"times": np.append(0, np.cumsum(rate / 5e5))},
+        tolerance=wide,
+        pressure={"slew": 5e5},
+    )
+    solution = solve_path(robot, path)
+    check(robot, path, solution)
+    assert solution.position_errors[1::2].max() <= 2e-4
+
+
+def test_a_sequence_is_quickened_to_what_is_known_to_be_possible(robot, compiled):
+    """Off a smooth curve at random by its null space, the steps are larger than along it."""
+    curve = smooth_curve(robot, 8, 30)
+    path = path_of(through(robot.tip_pose(curve)[:, :3, 3]), points=None)
+    points = path.points()
+    pairs = zip(points.targets, points.goals, strict=True)
+    tasks = PathTasks(robot, [path.task(target, goal) for target, goal in pairs], 0)
+    aside = 0.2e5 * np.random.default_rng(1).normal(size=curve.shape)
+    aside[0] = 0.0
+    given = tasks.brought(np.arange(30), curve + aside)
+    assert given.arrived.all()
+    rough = list(map(PathCandidate, given.pressures, given.values))
+    steps = np.abs(np.diff(curve, axis=0)).max(axis=1, keepdims=True) * np.ones(6)
+    assert share_of(steps, given.pressures) > 1.5
+    found = np.array([each.pressures for each in quickened(tasks, rough, steps, {0})])
+    np.testing.assert_array_equal(found[0], given.pressures[0])
+    assert share_of(steps, found) < 1.02
+    tips = robot.tip_pose(found)[:, :3, 3]
+    assert np.linalg.norm(tips - points.positions, axis=1).max() <= path.tolerance.position
 
 
 def test_giving_up_says_so(robot, compiled):

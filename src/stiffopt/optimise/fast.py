@@ -32,7 +32,9 @@ Vector = NDArray[np.float64]
 _NEAR = 18  # numbers of a term's `Nearness`
 _COUNTS = 14  # numbers of an answer before its pressures
 # requests and outcomes, as in solver.c
-_SEARCH, _GUESS_FIRST, _GUESS_ALONE, _JUDGE, _REACH_ONLY, _CLOSEST, _CLOSEST_FROM = range(7)
+_SEARCH, _GUESS_FIRST, _GUESS_ALONE, _JUDGE, _REACH_ONLY, _CLOSEST, _CLOSEST_FROM, _BROUGHT = range(
+    8
+)
 _UNSOLVED, ANSWERED, _GLOBAL, _JUDGED, _REACHED, _NEAREST, _NOT_FINITE, _TOO_SOFT = range(8)
 
 _integer, _double, _pointer = ctypes.c_int64, ctypes.c_double, ctypes.c_void_p
@@ -269,9 +271,26 @@ class FastSolver:
 
         An objective is infinite where there is no answer.
         """
+        return self._pressures_and_values(rows, threads, ANSWERED)
+
+    def brought(self, rows: Vector, guesses: Vector) -> tuple[Vector, Vector]:
+        """Return pressures (N, n) on target near guesses (N, n), which need not be optimal.
+
+        The second array are their objectives (N,), infinite where a guess is not brought there.
+        Within the rows' limits, and clear of their scene.
+        """
+        rows = rows.copy()
+        rows[:, self._mode] = _BROUGHT
+        rows[:, self.guess] = guesses
+        return self._pressures_and_values(rows, 1 if len(rows) < 64 else None, _REACHED)
+
+    def _pressures_and_values(
+        self, rows: Vector, threads: int | None, outcome: int
+    ) -> tuple[Vector, Vector]:
+        """Return pressures (N, n) and objectives (N,) of rows; infinite without that outcome."""
         numbers = self._numbers_of(np.ascontiguousarray(rows), threads)
         n = self.guess.stop - self.guess.start
-        values = np.where(numbers[:, 0] == ANSWERED, numbers[:, 1], np.inf)
+        values = np.where(numbers[:, 0] == outcome, numbers[:, 1], np.inf)
         return numbers[:, _COUNTS : _COUNTS + n], values
 
     def solve(self, row: Vector) -> CompiledAnswer | None:

@@ -199,8 +199,10 @@ class PathAnswers:
             lengths = (lengths[1:] + lengths[:-1]) / 2
             tips = solution.robot.tip_pose(middle)[:, :3, 3]
             off = np.linalg.norm(tips - self._points.at(lengths), axis=1)
-            index, allowed = int(off.argmax()), self._path.tolerance.position
-            if off[index] > 2 * allowed:
+            own = [target.tolerance.position for target in self._points.targets]
+            allowed = 2 * np.maximum(own[1:], own[:-1])[: len(off)]
+            index = int((off / allowed).argmax())
+            if off[index] > allowed[index]:
                 error = display_units().length.text(off[index], ".2g")
                 notes.append(
                     f"{_after(index)} the tip is up to {error} off the path; with more points, or "

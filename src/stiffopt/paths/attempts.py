@@ -1,6 +1,7 @@
 """Search for the best sequences of candidates in several attempts, each with further candidates."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -8,6 +9,7 @@ from stiffopt.paths.gaps import gaps
 from stiffopt.paths.lanes import lanes
 from stiffopt.paths.links import Vector
 from stiffopt.paths.points import PathCandidate, PathTasks
+from stiffopt.paths.quickening import quickened, share_of
 from stiffopt.paths.refinement import refined
 from stiffopt.paths.relaxation import relaxed
 from stiffopt.paths.route import Route, RouteSearch
@@ -17,7 +19,7 @@ from stiffopt.paths.settings import ROUTE
 class RouteAttempts:
     """Searches for sequences, with further candidates if local optima do not suffice.
 
-    Pressures are given at the `fixed` points; other arguments are those of `RouteSearch`.
+    Pressures are given at the `given` points; other arguments are those of `RouteSearch`.
 
     Attributes
     ----------
@@ -30,11 +32,13 @@ class RouteAttempts:
         tasks: PathTasks,
         layers: Sequence[Sequence[PathCandidate]],
         over: str,
-        fixed: set[int],
+        given: set[int],
         is_closed: bool,
     ) -> None:
-        self._tasks, self._layers, self._over = tasks, layers, over
-        self._fixed, self._is_closed = fixed, is_closed
+        self._tasks, self._over = tasks, over
+        self._layers = [list(layer) for layer in layers]
+        self._given, self._is_closed = given, is_closed
+        self._fixed = {0, len(tasks) - 1} if is_closed else given  # when points move one by one
         self.alone = np.array([max((c.value for c in layer), default=np.nan) for layer in layers])
         self._further: list[list[PathCandidate]] = [[] for _ in layers]
 
@@ -75,19 +79,31 @@ class RouteAttempts:
         return known[: 1 if has_scene else ROUTE.refined]
 
     def slower(self, steps: Vector) -> tuple[float, list[Route]]:
-        """Find the smallest slow-down, to 5 %, with which the path can be followed, and how."""
+        """Find a small slow-down with which the path can be followed, and how; 1 if none is needed.
+
+        Any sequence will do at first; it is then quickened as a whole.
+        """
         few = ROUTE.few_further  # with long steps, every candidate has steps to every other
         self._further = [some[:: 1 + len(some) // few] for some in self._further]
-        factor, low = float((self._tasks.unit / steps).max()), 1.0
-        routes = self.best(steps * factor, any_will_do=True) if factor > 1 else []
-        while routes and factor / low > 1.05:
-            middle = (low * factor) ** 0.5
-            quicker = self.best(steps * middle, any_will_do=True)
-            if quicker:
-                factor, routes = middle, quicker
+        most, factor = float((self._tasks.unit / steps).max()), 1.0
+        routes: list[Route] = []
+        while not routes and factor < most:
+            factor = min(2 * factor, most)
+            routes = self.best(steps * factor, any_will_do=True)
+        if not routes:
+            return factor, []
+        own = quickened(self._tasks, routes[0].candidates, steps, self._given, self._is_closed)
+        routes = [replace(routes[0], candidates=own)]
+        for index, each in enumerate(own):
+            if index in self._fixed:
+                self._layers[index].append(each)
             else:
-                low = middle
-        return factor, routes and (self.best(steps * factor) or routes)
+                self._further[index].append(each)
+        factor = max(1.0, share_of(steps, routes[0].pressures))
+        best = self._search(steps * factor).best(ROUTE.first_rounds)
+        if best is None:
+            return factor, routes
+        return factor, [relaxed(self._tasks, best, steps * factor, self.alone, self._fixed)]
 
     def refined(self, routes: Sequence[Route], steps: Vector) -> tuple[Route, Vector]:
         """Return the sequence that is best when refined, and its pressures.

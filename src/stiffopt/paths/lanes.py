@@ -33,8 +33,9 @@ def lanes(
     Each attempt draws other configurations.  The last one adds no variants of those that are
     carried along, which leaves room for more of them.
     """
-    if tasks.robot.is_loaded:
-        return [[] for _ in range(len(tasks))]
+    found: list[list[PathCandidate]] = [[] for _ in range(len(tasks))]
+    if not tasks.is_compiled or tasks.robot.is_loaded:
+        return found
     many = min(len(region), LANES.marks, max(2 * LANES.knots, len(region) // LANES.every))
     marks = spaced(region[0], region[-1], many)
     knots = marks[spaced(0, len(marks) - 1, LANES.last_knots if is_last else LANES.knots)].tolist()
@@ -44,15 +45,19 @@ def lanes(
     }
     starts = LANES.starts * (attempt + 1)
     for knot in knots:
-        new, _ = tasks.clear(knot, tasks.near(knot, starts)[-LANES.starts :])
-        born[knot] = np.concatenate([born[knot], new])
+        near = tasks.near(knot, starts)[-LANES.starts :]
+        new = tasks.brought(np.full(len(near), knot), near)
+        born[knot] = np.concatenate([born[knot], new.pressures[new.arrived]])
     rng = None if is_last else np.random.default_rng(attempt)
     guesses: Guesses = []
     for order in (marks.tolist(), marks[::-1].tolist()):
         guesses += _followed(tasks, order, knots, born, rng)
     where = np.concatenate([np.full(len(some), point) for point, some in guesses])
-    pressures, arrived = tasks.brought(where, np.concatenate([some for _, some in guesses]))
-    return tasks.assessed(where[arrived], pressures)
+    here = tasks.brought(where, np.concatenate([some for _, some in guesses]))
+    for point, p, value in zip(where.tolist(), here.pressures, here.values.tolist(), strict=True):
+        if value > -np.inf:
+            found[point].append(PathCandidate(p, value))
+    return found
 
 
 def _followed(
@@ -75,9 +80,9 @@ def _followed(
         if rng is not None:
             aside = LANES.aside * tasks.unit * rng.uniform(-1, 1, live.shape)
             guess = np.concatenate([live, live + aside])
-        came, arrived = tasks.clear(there, guess)
-        kept = arrived[: len(live)]
-        own, new = came[: kept.sum()], came[kept.sum() :]
+        came = tasks.brought(np.full(len(guess), there), guess)
+        kept, is_new = np.split(came.arrived, [len(live)])
+        own, new = came.pressures[: len(live)][kept], came.pressures[len(live) :][is_new]
         for point in range(here, there, 1 if there > here else -1)[1:]:
             share = (point - here) / (there - here)
             guesses.append((point, live[kept] + share * (own - live[kept])))

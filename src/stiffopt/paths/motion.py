@@ -41,6 +41,8 @@ Vector = NDArray[np.float64]
 _NEARLY_AS_STIFF = 0.95  # share of the best stiffness from which no stiffer goal is sought
 _MORE = 50  # motions checked for a stiffer goal, in addition to as many as for the first
 _LEAST_STEP = 1.1e-3  # s, shortest time between points that a trajectory accepts
+_MARGINS = 5  # largest number of ways sought for the margin of a calibrated arm
+_GROWTH = 1.02  # of the margin over the uncertainty along the last way
 _STEPS = 50  # smallest number of steps in a motion, unless they would be shorter than ...
 _SHORT = 5e-3  # ... this, in s
 
@@ -124,9 +126,8 @@ def plan_motion(
         if isinstance(end, Task):
             PressureSolver(request.bare, request.posed(end), seed=request.seed).compile()
     try:
-        planner = _Planner(request, timings)
         with giving_up(timeout, cancel):
-            way = planner.way()
+            planner, way = _with_margin(request, timings)
         found = planner.described(way)
     except Unsolved as reason:
         found = request.without_answer(str(reason), "unreachable")
@@ -134,6 +135,30 @@ def plan_motion(
         found = request.without_answer(str(error), "failed")
     found.timings.update(timings | watch.timings())
     return found
+
+
+def _with_margin(request: MotionRequest, timings: dict[str, float]) -> tuple[_Planner, Vector]:
+    """Return a way whose margin is at least the calibrated uncertainty along it, and its planner.
+
+    The margin begins with the uncertainty at given ends, and grows to that along the last way.
+    """
+    ends = [each for each in (request.start, *request.goals) if not isinstance(each, Task)]
+    if request.margin is not None and len(ends) == 1 + len(request.goals):
+        nearest = min(request.uncertainty(each[np.newaxis]) for each in ends[1:])
+        margin = max(request.uncertainty(ends[0][np.newaxis]), nearest)
+        request = replace(request, margin=_GROWTH * margin)
+    for _ in range(_MARGINS):
+        planner = _Planner(request, timings)
+        way = planner.way()
+        left_open = 0.0 if request.margin is None else request.uncertainty(way)
+        if request.margin is None or left_open <= request.margin:
+            return planner, planner.shorter(way)
+        request = replace(request, margin=_GROWTH * left_open)
+    unit = display_units().length
+    raise Unsolved(
+        "no way was found on which the body keeps clear by as much as the calibration leaves open "
+        f"there; on the last one that is {unit.text(left_open, '.3g')}"
+    )
 
 
 def _leaning(
@@ -203,7 +228,7 @@ class _Planner:
             return False
 
     def way(self) -> Vector:
-        """Return a way (k, n) in pressures, or raise `Unsolved` with the reason."""
+        """Return a way (k, n) in pressures, not yet shortened; raise `Unsolved` with a reason."""
         begin = perf_counter()
         start = self._start()
         tasks, goals = self._first_goals()
@@ -217,12 +242,22 @@ class _Planner:
             self.goals = goals
             self.timings["goals"] += perf_counter() - begin
             way = self._search(start, goals, tasks)
-        begin = perf_counter()
-        if len(way) > 2:
-            way = shortened(way, self.is_still_clear, self.request.slew, self.request.seed)
-            way = rounded(way, self.is_still_clear, self.request.slew)
-        self.timings["shorten"] = perf_counter() - begin
         return way
+
+    def shorter(self, way: Vector) -> Vector:
+        """Return a shorter and rounder way if its margin suffices, else the given one."""
+        begin, found = perf_counter(), way
+        try:
+            if len(way) > 2:
+                found = shortened(way, self.is_still_clear, self.request.slew, self.request.seed)
+                found = rounded(found, self.is_still_clear, self.request.slew)
+                margin = self.request.margin
+                if margin is not None and self.request.uncertainty(found) > margin:
+                    found = way
+        except StoppedError:
+            found = way
+        self.timings["shorten"] = perf_counter() - begin
+        return found
 
     # -- ends -------------------------------------------------------------------------------
 

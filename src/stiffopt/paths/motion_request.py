@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,7 +19,7 @@ from stiffopt.paths.solution import PathSolution, Status
 
 Vector = NDArray[np.float64]
 
-_MARGIN_SAMPLES = 12  # pressures at which the calibrated uncertainty is evaluated
+_PER_PIECE = 6  # pressures on each piece of a way at which the calibrated uncertainty is evaluated
 
 
 @dataclass(frozen=True)
@@ -28,7 +29,8 @@ class MotionRequest:
     Attributes
     ----------
     bare, robot : the robot without and with the load of the motion.
-    margin : clearance added for the calibrated uncertainty, in m; None without a calibration.
+    margin : clearance added for the calibrated uncertainty, in m; None without a calibration or a
+        scene.
     """
 
     bare: Manipulator
@@ -84,7 +86,7 @@ class MotionRequest:
             goals=ends[1:],
             scene=scene,
             clearance=0.0 if scene is None else scene.clearance,
-            margin=None if scene is None else _margin(bearer),
+            margin=None if scene is None or robot.description.calibration is None else 0.0,
             slew=_rates(robot, slew),
             seed=seed,
         )
@@ -93,6 +95,13 @@ class MotionRequest:
     def asked(self) -> float:
         """Clearance required of the model's body, in m, margin included."""
         return self.clearance + (self.margin or 0.0)
+
+    def uncertainty(self, way: Vector) -> float:
+        """Return the largest calibrated uncertainty of the tip along a way (k, n), in m."""
+        shares = np.linspace(0.0, 1.0, _PER_PIECE)[:, None]
+        pieces = [a + shares * (b - a) for a, b in pairwise(way)]
+        rows = np.unique(np.concatenate([way, *pieces]), axis=0)
+        return max(float(self.robot.tip_uncertainty(p).semi_axes[0]) for p in rows)
 
     def posed(self, task: Task) -> Task:
         """Return a task with the load, the scene and the clearance of the motion."""
@@ -144,19 +153,3 @@ def _rates(robot: Manipulator, slew: float | ArrayLike | None) -> Vector:
             "the robot file"
         )
     return rates
-
-
-def _margin(robot: Manipulator) -> float | None:
-    """Return the largest calibrated uncertainty of the tip over sampled pressures, in m."""
-    if robot.description.calibration is None:
-        return None
-
-    def find() -> float:
-        rng = np.random.default_rng(0)
-        shares = rng.random((_MARGIN_SAMPLES, robot.n_pressures))
-        shares[:2] = [[0.0], [1.0]]
-        low, high = robot.pressure_min, robot.pressure_max
-        pressures = low + shares * (high - low)
-        return max(float(robot.tip_uncertainty(p).semi_axes[0]) for p in pressures)
-
-    return robot.kept(("margin of motions", robot.tip_load), find)

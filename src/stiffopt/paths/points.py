@@ -19,13 +19,12 @@ from stiffopt.optimise.fast import CompiledAnswer
 from stiffopt.optimise.functions import functions
 from stiffopt.optimise.local import descend
 from stiffopt.optimise.prepared import prepared
-from stiffopt.optimise.problem import Bounding, PressureProblem
-from stiffopt.optimise.program import Program, pressure_ranges
-from stiffopt.optimise.reach import bounded_steps, reach
-from stiffopt.optimise.settings import REACH
+from stiffopt.optimise.problem import PressureProblem
+from stiffopt.optimise.program import Constraint, Program, pressure_ranges
+from stiffopt.optimise.reach import reach
 from stiffopt.optimise.solution import Judgement, are_within, judge
 from stiffopt.optimise.task import Task
-from stiffopt.paths.settings import LANES, RATES
+from stiffopt.paths.settings import RATES
 
 Vector = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -54,6 +53,21 @@ class Local(NamedTuple):
     guess: Vector
     lower: Vector
     upper: Vector
+
+
+class Brought(NamedTuple):
+    """Pressures (k, n) brought to targets, in Pa, and their values (k,) as in `PathCandidate`.
+
+    A value is minus infinity where the target was not reached.
+    """
+
+    pressures: Vector
+    values: Vector
+
+    @property
+    def arrived(self) -> Mask:
+        """Which of them (k,) reached their targets."""
+        return np.isfinite(self.values)
 
 
 class Slopes(NamedTuple):
@@ -153,14 +167,26 @@ class PathTasks:
         return BodyCheck(self.robot, self.scene)
 
     @cached_property
-    def _bounding(self) -> Bounding:
-        """Bounds on the terms' residuals."""
-        return PressureProblem(self.robot, self._without_load[0]).terms_bounding
+    def _all_rows(self) -> Vector:
+        """The rows (N, w) of all points."""
+        return np.array([self._row(index) for index in range(len(self))])
 
     @cached_property
     def _parameters(self) -> Vector:
         """Parameters of the compiled functions at each point."""
         return np.array([self.robot.parameters(each.parameters) for each in self.programs])
+
+    @cached_property
+    def own_constraints(self) -> list[Constraint]:
+        """The bounds on the residuals but those of obstacles; their radii are those at point 0."""
+        first = self.programs[0]
+        return [c for c in first.constraints(self.robot.length) if c.first < first.n_own_rows]
+
+    @cached_property
+    def radii(self) -> Vector:
+        """Radii (N, c) of the own constraints at each point."""
+        count = len(self.own_constraints)
+        return np.array([each.radii[:count] for each in self.programs])
 
     def __len__(self) -> int:
         return len(self.tasks)
@@ -242,65 +268,15 @@ class PathTasks:
 
     # -- evaluation -------------------------------------------------------------------------
 
-    def brought(self, indices: NDArray[np.intp], pressures: Vector) -> tuple[Vector, Mask]:
-        """Move pressures (k, n) of a free arm to nearby targets, each to that of its point.
+    def brought(self, indices: NDArray[np.intp], pressures: Vector) -> Brought:
+        """Bring pressures (k, n) to the targets of points (k,) nearby, clear of the scene.
 
-        Returns those that arrive, and a mask (k,) of which these are.
+        They need not be optimal there.  Without machine code, none arrives.
         """
-        lower, upper = self.lower / self.unit, self.upper / self.unit
-        bounding = self._bounding
-        x, is_at = np.clip(pressures / self.unit, lower, upper), np.zeros(len(pressures), bool)
-        parameters = self._parameters[indices]
-        going = np.arange(len(x))
-        for left in range(LANES.iterations, -1, -1):
-            r, J = self._functions["pose"].many(x[going] * self.unit, parameters[going], threads=1)
-            r, J = r[:, bounding.rows, 0], J.swapaxes(1, 2)[:, bounding.rows] * self.unit
-            arrived = bounding.errors(r) <= 1
-            is_at[going[arrived]] = True
-            going, r, J = going[~arrived], r[~arrived], J[~arrived]
-            if not left or not len(going):
-                break
-            r, J = bounding.missing(r, J)
-            D = np.broadcast_to(
-                REACH.least_damping * bounding.far_damping, (len(r), r.shape[1], r.shape[1])
-            )
-            step = REACH.longest_step
-            low, high = np.maximum(lower - x[going], -step), np.minimum(upper - x[going], step)
-            x[going] = np.clip(x[going] + bounded_steps(J, -r, D, low, high), lower, upper)
-        return x[is_at] * self.unit, is_at
-
-    def clear(self, index: int, pressures: Vector) -> tuple[Vector, Mask]:
-        """Move pressures (k, n) of a free arm to a nearby target; drop those in the scene's way.
-
-        Returns those that arrive, and a mask (k,) of which these are.
-        """
-        found, arrived = self.brought(np.full(len(pressures), index), pressures)
-        clear = self._are_clear(found)
-        arrived[arrived] = clear
-        return found[clear], arrived
-
-    def _are_clear(self, pressures: Vector) -> Mask:
-        """Return whether the body keeps the scene's clearance at pressures (k, n)."""
-        if self.scene is None or not len(pressures):
-            return np.ones(len(pressures), bool)
-        return np.asarray(self.robot.clearance(pressures, self.scene) >= self.scene.clearance)
-
-    def _values(self, indices: NDArray[np.intp], pressures: Vector) -> Vector:
-        """Return `PathCandidate.value` of pressures (k, n) of a free arm, each at its point."""
-        if not self.programs[0].measures:
-            return np.asarray(-np.mean((pressures / self.programs[0].reference) ** 2, axis=1))
-        judged = self._functions["judge"].many(pressures, self._parameters[indices], threads=1)
-        return np.asarray(judged[3][..., 0].min(axis=1))
-
-    def assessed(self, indices: NDArray[np.intp], pressures: Vector) -> list[list[PathCandidate]]:
-        """Return candidates at each point, from pressures (k, n) on target with a clear body."""
-        found: list[list[PathCandidate]] = [[] for _ in range(len(self))]
-        clear = self._are_clear(pressures)
-        indices, pressures = indices[clear], pressures[clear]
-        values = self._values(indices, pressures).tolist()
-        for index, p, value in zip(indices.tolist(), pressures, values, strict=True):
-            found[index].append(PathCandidate(p, value))
-        return found
+        if self._fast is None or not len(indices):
+            return Brought(pressures, np.full(len(pressures), -np.inf))
+        found, objectives = self._fast[0].brought(self._all_rows[indices], pressures)
+        return Brought(found, -objectives)
 
     def judged(self, pressures: Vector) -> list[Judgement | None]:
         """Judge pressures (N, n), one row for each point; None where there is no equilibrium."""
@@ -321,6 +297,15 @@ class PathTasks:
     def candidate(self, index: int, pressures: Vector) -> PathCandidate | None:
         """Return pressures (n,) as a candidate at a point, or None if they miss its task."""
         return self.accepted(index, pressures, self.judged_at(index, pressures))
+
+    def hold(self, slopes: Slopes) -> bool:
+        """Whether all points are within their tolerances; `slopes` are those of all points."""
+        for c, radii in zip(self.own_constraints, self.radii.T, strict=True):
+            r = slopes.residuals[:, c.first : c.end]
+            sizes = r[:, 0] if c.one_sided else np.linalg.norm(r, axis=1)
+            if (sizes > radii).any():
+                return False
+        return True
 
     def slopes(self, indices: Sequence[int], pressures: Vector) -> Slopes | None:
         """Linearise the tasks at some points about pressures (k, n); None without equilibrium."""

@@ -138,11 +138,9 @@ class _Window:
         self._x = pressures / unit
         self._steps = steps / unit * REFINEMENT.inside
         self._lower, self._upper = tasks.lower / unit, tasks.upper / unit
-        length = tasks.robot.length
-        constraints = tasks.programs[0].constraints(length)
-        own = tasks.programs[0].n_own_rows
-        self._balls = [c for c in constraints if not c.one_sided]
-        self._one_sided = [c for c in constraints if c.one_sided and c.first < own]
+        bounds = list(zip(tasks.own_constraints, tasks.radii[list(self._free)].T, strict=True))
+        self._balls = [(c, radii) for c, radii in bounds if not c.one_sided]
+        self._one_sided = [(c, radii) for c, radii in bounds if c.one_sided]
         self._scene = tasks.scene
         others = [i for i in range(len(pressures)) if i not in self._free]
         self._floor = -np.inf
@@ -214,10 +212,9 @@ class _Window:
             return None
         near, near_slopes = self._near(slopes, pressures)
         excess = float(np.maximum(near, 0.0).sum())
-        for ball in self._balls:
-            radius = ball.radius * DESCENT.inside
+        for ball, radii in self._balls:
             sizes = np.linalg.norm(slopes.residuals[:, ball.first : ball.end], axis=1)
-            excess += float(np.maximum(sizes - radius, 0.0).sum()) / ball.scale
+            excess += float(np.maximum(sizes - radii * DESCENT.inside, 0.0).sum()) / ball.scale
         costs = slopes.costs.max(axis=1)
         merit = float(costs.mean())
         if self._over == "worst":
@@ -229,8 +226,8 @@ class _Window:
         k, n = pressures.shape
         values: list[Vector] = []
         derivatives: list[Vector] = []
-        for c in self._one_sided:
-            values.append((slopes.residuals[:, c.first] - c.radius) / c.scale)
+        for c, radii in self._one_sided:
+            values.append((slopes.residuals[:, c.first] - radii) / c.scale)
             derivatives.append(slopes.jacobians[:, c.first] / c.scale)
         if self._scene is not None:
             robot = self._tasks.robot
@@ -294,8 +291,8 @@ class _Window:
         rows.add_upper(costs, state.slopes.gradients, e)
         cones: list[object] = [clarabel.NonnegativeConeT(rows.count)]
         balls_from = rows.count
-        for ball in self._balls:
-            self._add_ball(rows, state, ball, slack)
+        for ball, radii in self._balls:
+            self._add_ball(rows, state, ball, radii, slack)
             cones += [clarabel.SecondOrderConeT(1 + ball.end - ball.first)] * k
         row, column = np.triu_indices(n)
         corner = n * np.arange(k)[:, np.newaxis]
@@ -317,7 +314,7 @@ class _Window:
         d = x[: k * n].reshape(k, n)
         pulls = np.zeros(state.slopes.residuals.shape)
         at = balls_from
-        for ball in self._balls:
+        for ball, _ in self._balls:
             width = 1 + ball.end - ball.first
             own = z[at : at + k * width].reshape(k, width)
             pulls[:, ball.first : ball.end] = -own[:, 1:] / ball.scale
@@ -350,13 +347,15 @@ class _Window:
                     (np.arange(n), own, np.full(n, side)),
                 )
 
-    def _add_ball(self, rows: "_Rows", state: _State, ball: Constraint, slack: int) -> None:
-        """Add the scaled cones ``(radius + slack, r + J d)`` of one constraint."""
+    def _add_ball(
+        self, rows: "_Rows", state: _State, ball: Constraint, radii: Vector, slack: int
+    ) -> None:
+        """Add the scaled cones ``(radius + slack, r + J d)`` of one constraint, radii (k,)."""
         k, n = state.x.shape
         width = 1 + ball.end - ball.first
         own = slice(ball.first, ball.end)
         bounds = np.zeros((k, width))
-        bounds[:, 0] = ball.radius * REFINEMENT.of_tolerance / ball.scale
+        bounds[:, 0] = radii * REFINEMENT.of_tolerance / ball.scale
         bounds[:, 1:] = state.slopes.residuals[:, own] / ball.scale
         tops = np.arange(k) * width
         below = (tops[:, np.newaxis] + np.arange(1, width)).ravel()

@@ -149,6 +149,30 @@ class RefinementSettings:
 
 
 @dataclass(frozen=True)
+class QuickeningSettings:
+    """Smaller steps for a path that is too fast (`stiffopt.paths.quickening`).
+
+    Attributes
+    ----------
+    iterations : largest number.
+    radius, last_radius : of the trust region at first, and at which the method stops, as shares of
+        a channel's range.
+    last_gain : gain in the share of the steps below which the region shrinks.
+    enough : share of the steps at which the method stops.
+    corrections : largest number for each step.
+    damping : weight of the squared change of a pressure, as a share of its range.
+    """
+
+    iterations: int = 40
+    radius: float = 0.05
+    last_radius: float = 1e-3
+    last_gain: float = 1e-3
+    enough: float = 0.995
+    corrections: int = 3
+    damping: float = 1e-4
+
+
+@dataclass(frozen=True)
 class RateSettings:
     """Rates and times.
 
@@ -174,4 +198,5 @@ WITHOUT_MACHINE_CODE = CandidateSettings(knots=3, starts=2, starts_loaded=2, kep
 LANES = LaneSettings()
 ROUTE = RouteSettings()
 REFINEMENT = RefinementSettings()
+QUICKENING = QuickeningSettings()
 RATES = RateSettings()

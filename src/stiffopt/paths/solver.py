@@ -93,8 +93,7 @@ class _PathSolver:
             moved, layers = self._with_reachable(tasks, layers)
             for index, end in ends.items():
                 layers[index] = [end]
-            fixed = {0, len(layers) - 1} if self._path.closed else set(ends)
-            return self._answer(tasks, moved, layers, starts, fixed)
+            return self._answer(tasks, moved, layers, starts, set(ends))
         except (StoppedError, EquilibriumError) as error:
             return self._answers.failed(str(error))
 
@@ -166,18 +165,21 @@ class _PathSolver:
         moved: PathTasks,
         layers: list[list[PathCandidate]],
         starts: int,
-        fixed: set[int],
+        given: set[int],
     ) -> PathSolution:
         """Return the solution; `moved` are the tasks with unreachable points moved."""
         times, slowed, stuck = self._points.times, 1.0, None
         steps = self._steps(tasks, times)
-        attempts = RouteAttempts(moved, layers, self._over, fixed, self._path.closed)
+        attempts = RouteAttempts(moved, layers, self._over, given, self._path.closed)
         routes = attempts.best(steps)
-        if not routes and times is not None and all(layers):
-            stuck = len(attempts.beginning(steps)) - 1
+        if not routes and all(layers):
+            if times is not None:
+                stuck = len(attempts.beginning(steps)) - 1
             slowed, routes = attempts.slower(steps)
+            if slowed <= 1:
+                stuck = None
             if routes:
-                times, steps = times * slowed, steps * slowed
+                times, steps = None if times is None else times * slowed, steps * slowed
         if not routes:
             return self._without_route(moved, layers, attempts, steps)
         route, pressures = attempts.refined(routes, steps)

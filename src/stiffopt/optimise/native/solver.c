@@ -16,16 +16,28 @@ void point_rows(void); /* marks the end of the code of `point` */
 #define MOST_CODE 400000 /* bytes */
 
 /* Requests and outcomes, as in fast.py. */
-enum { SEARCH, GUESS_FIRST, GUESS_ALONE, JUDGE, REACH_ONLY, CLOSEST, CLOSEST_FROM };
+enum { SEARCH, GUESS_FIRST, GUESS_ALONE, JUDGE, REACH_ONLY, CLOSEST, CLOSEST_FROM, BROUGHT };
 enum { NEEDS_GENERAL_METHOD, LOCAL, GLOBAL, JUDGED, REACHED, NEAREST, NOT_FINITE, TOO_SOFT };
+
+/* Start a point at a guess (n) in Pa. */
+static void start_at(Program *P, const double *guess, Point *p) {
+    const Setup *s = P->setup;
+    for (int64_t i = 0; i < s->n; i++)
+        p->x[i] = clip(guess[i] / s->unit[i], P->lower[i], P->upper[i]);
+    forget_state(s, p);
+}
+
+/* Bring a guess (n) in Pa to the target; 0 if that fails or ends where the body is not clear. */
+static int brought(Program *P, const double *guess, Point *p) {
+    start_at(P, guess, p);
+    return reach_blindly(P, p, P->setup->reach.iterations) && evaluate(P, p, 1) && p->reached;
+}
 
 /* Descend from a guess (n) in Pa; return whether the end meets the floors and is an optimum, or was
  * stopped. */
 static int from_guess(Program *P, const double *guess, Point *p, Descent *end, Found *found) {
     const Setup *s = P->setup;
-    for (int64_t i = 0; i < s->n; i++)
-        p->x[i] = clip(guess[i] / s->unit[i], P->lower[i], P->upper[i]);
-    forget_state(s, p);
+    start_at(P, guess, p);
     if (!reach(P, p, s->reach.iterations) || !evaluate(P, p, 1)) return 0;
     *end = descend(P, p, NULL);
     *found = (Found){1, 1, 1, 1, 1, 0, end->iterations};
@@ -67,6 +79,8 @@ static void solve_row(Program *P, const double *task, double *answer) {
     else if (mode == CLOSEST || mode == CLOSEST_FROM)
         outcome = closest(P, mode == CLOSEST ? NULL : task, p.x, slope, &found)
             ? NEAREST : NEEDS_GENERAL_METHOD;
+    else if (mode == BROUGHT)
+        outcome = brought(P, task, &p) ? REACHED : NEEDS_GENERAL_METHOD, end.value = objective(s, &p);
     else if (mode != SEARCH && from_guess(P, task, &p, &end, &found))
         outcome = LOCAL;
     else if (mode != GUESS_ALONE && search(P, &p, &end, &found))
