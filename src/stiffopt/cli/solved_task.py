@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from stiffopt.errors import EquilibriumError, FileError, InputError
 from stiffopt.model.manipulator import Manipulator, load_robot
 from stiffopt.model.uncertainty import TipUncertainty
-from stiffopt.optimise.brace_uncertainty import stiffness_interval
+from stiffopt.optimise.brace_uncertainty import BraceUncertainty
 from stiffopt.optimise.goal import StiffnessMeasure
 from stiffopt.optimise.pareto import pareto_front
 from stiffopt.optimise.solution import PressureSolution, judge
@@ -99,8 +99,9 @@ def _braced_intervals(
     brace, eq = answer.solution.task.brace, answer.solution.equilibrium
     assert brace is not None
     assert eq is not None
+    known = BraceUncertainty(answer.robot, eq)
     return tuple(
-        stiffness_interval(answer.robot, eq, measure, brace.contacts)
+        known.stiffness_interval(measure, brace.contacts)
         if isinstance(measure, StiffnessMeasure)
         else None
         for measure in measures
