@@ -37,6 +37,7 @@ from stiffopt.rig.assembly import make_rig
 from stiffopt.rig.config import limits_of, slew_of
 
 HOLD, APPROACH, RELEASE = 20.0, 60.0, 60.0  # s
+CREEPS = 3.0  # s at rest, in which silicone that was bent goes back
 FADES = 1.0  # s, of the push, when the loss is reported
 LONGEST = 3.0  # times the foretold loss, at most
 
@@ -162,7 +163,7 @@ def held(
         loop.controller.set_task(stiffopt.Task(robot=task.robot, target=rest))
     before = loop.most = loop.force
     row["release"] = loop.go(RELEASE, lambda: loop.status.brace not in ("held", "releasing"))
-    loop.go(0.5)
+    loop.go(CREEPS)
     row |= {"ends": loop.status.brace, "left": loop.force, "most_in_release": loop.most - before}
     loop.controller.close()
     return row
