@@ -36,11 +36,12 @@ from brace import MARGIN, TOLERANCE, _object
 from calibration import with_true_values
 from control_cases import calibrated_file, draw_case
 from report import table
-from stiffopt.optimise.brace_uncertainty import forces_in_doubt, stiffness_interval
+from stiffopt.optimise.brace_uncertainty import BraceUncertainty
 from stiffopt.paths.configurations import Unsolved
 from stiffopt.paths.leaning import approach_to
 from stiffopt.plant.plant import Plant
 from stiffopt.plant.settings import PlantLoad
+from stiffopt.registration import Placement
 
 Array = NDArray[np.float64]
 
@@ -75,11 +76,21 @@ def draw_task(robot: stiffopt.Manipulator, seed: list[int]) -> stiffopt.Task:
 
 
 class Arm:
-    """A simulated arm that follows pressures."""
+    """A simulated arm that follows pressures, in the base frame of its calibrated file.
 
-    def __init__(self, case: Any, scene: stiffopt.Scene | None) -> None:
-        plant = case.description.plant.model_copy(update={"dynamics": "full", "scene": scene})
-        self.plant = Plant(case.robot, plant)
+    That frame differs from the nominal one by the registration that the calibration found. Task,
+    scene and pushes are meant in it, as on a rig whose objects were measured with its tracker.
+    """
+
+    def __init__(self, case: Any, believed: Any, scene: stiffopt.Scene | None) -> None:
+        settings = case.description.plant
+        frame = believed.recordings.registration.tracker_in_base.transform()
+        base = Placement.of(frame @ settings.mismatch.base.transform())
+        self.plant = Plant(case.robot, settings.model_copy(update={
+            "dynamics": "full", "scene": scene,
+            "mismatch": settings.mismatch.model_copy(update={"base": base}),
+            "gravity": tuple((frame[:3, :3] @ case.robot.gravity).tolist()),
+        }))  # fmt: skip
 
     def go(self, times: Array, pressures: Array) -> None:
         """Follow pressures (k, n) at times (k,) in s, and rest at the last."""
@@ -128,7 +139,7 @@ def measured(
     direction = np.array(task.stiffness.maximise[0].direction)
     holds = min(each.loss.force for each in found.preloads)
     push = min(PUSH, SHARE * holds)
-    arm, loose = Arm(case, task.scene), Arm(case, None)
+    arm, loose = Arm(case, believed, task.scene), Arm(case, believed, None)
     arm.go(way.times, way.pressures)
     on = arm.plant.object_forces()
     loose.go(np.array([0.0, 5.0]), np.stack([np.zeros(6), free.pressures]))
@@ -137,15 +148,14 @@ def measured(
         quick, quick_free = arm.stiffness(direction, push), loose.stiffness(direction, push)
     own = arm.settled_stiffness(direction, push)
     bare = loose.settled_stiffness(direction, push)
+    known = BraceUncertainty(robot, found.equilibrium)
     return {
         "seed": seed, "push": push, "promised": found.stiffness, "promised_free": free.stiffness,
         "sticking": sticking(robot, found, direction),
         "quick": quick, "quick_free": quick_free, "measured": own, "measured_free": bare,
         "force": float(np.linalg.norm(found.contacts[0].force)),
-        "doubt": float(forces_in_doubt(robot, found.equilibrium).max()),
-        "interval": stiffness_interval(
-            robot, found.equilibrium, task.stiffness.maximise[0], task.brace.contacts
-        ),
+        "doubt": float(known.forces.max()),
+        "interval": known.stiffness_interval(task.stiffness.maximise[0], task.brace.contacts),
         "force_measured": sum(float(np.linalg.norm(each.force)) for each in on),
         "at": found.contacts[0].at, "at_measured": on[0].at if on else None,
         "limited_by": list(found.limited_by),

@@ -22,7 +22,7 @@ from stiffopt.cli.solved_task import SolvedTask, with_uncertainty
 from stiffopt.errors import DerivativeError, InputError
 from stiffopt.model.calibration import Calibration
 from stiffopt.optimise import braced
-from stiffopt.optimise.brace_uncertainty import forces_in_doubt, stiffness_interval
+from stiffopt.optimise.brace_uncertainty import BraceUncertainty
 from stiffopt.optimise.leaning import MARGIN_ON, BracedProblem
 from stiffopt.optimise.local import LocalResult
 from stiffopt.optimise.search import Search
@@ -167,10 +167,18 @@ def test_a_calibrated_arm_holds_back_forces_that_are_in_doubt(robot, task):
     found = stiffopt.solve_pressure(arm, task)
     assert found.contacts
     problem, eq = BracedProblem(arm, task), found.equilibrium
-    doubt = forces_in_doubt(arm, eq)
-    assert f"smaller by {doubt.max():.2g} N, by errors of the calibration" in found.message
+    uncertainty = BraceUncertainty(arm, eq)
+    doubt = uncertainty.forces
+    assert (
+        f"smaller or larger by {doubt.max():.2g} N, by errors of the calibration" in found.message
+    )
     for push in problem.pushes(eq):
         assert (eq.shifted(push=task.brace.margin * push).normal_forces >= doubt).all()
+    # the limit of the force binds, and keeps room for the doubt
+    assert "force on post" in found.limited_by
+    largest = eq.normal_forces + doubt
+    assert (largest <= 0.3).all()
+    assert largest.max() == pytest.approx(0.3, rel=0.02)
     # pressures that move the free tip by two standard deviations change no force by more
     J = arm.tip_pose(eq.pressures)[:3, :3] @ arm.tip_jacobian(eq.pressures)[:3]
     ways = np.random.default_rng(0).normal(size=(50, 3))
@@ -179,7 +187,7 @@ def test_a_calibrated_arm_holds_back_forces_that_are_in_doubt(robot, task):
     assert changes == pytest.approx(doubt, rel=0.1)
     assert (changes <= doubt).all()
     # and the stiffness with them
-    low, high = stiffness_interval(arm, eq, task.stiffness.maximise[0], "sliding")
+    low, high = uncertainty.stiffness_interval(task.stiffness.maximise[0], "sliding")
     assert low * high == pytest.approx(found.stiffness**2)
     seen = [eq.shifted(np.linalg.pinv(J) @ way).stiffness([1, 0, 0]) for way in 0.1 * ways]
     assert np.log(np.array(seen) / found.stiffness).max() == pytest.approx(
@@ -191,8 +199,35 @@ def test_a_calibrated_arm_holds_back_forces_that_are_in_doubt(robot, task):
     assert f"(95 %: {low:.3f} to {high:.3f}" in text.getvalue()
 
 
+def test_where_forces_are_in_doubt_slips_come_sooner(robot, task, solution):
+    """The push that loses a sticking contact is in proportion to the contact's force."""
+    known = Calibration(position_residual=8e-3)
+    arm = stiffopt.Manipulator(robot.description.model_copy(update={"calibration": known}))
+    given = task.model_copy(
+        update={"brace": task.brace.model_copy(update={"contacts": "sticking"})}
+    )
+    problem, way = BracedProblem(arm, given), [1.0, 0.0, 0.0]
+    eq = arm.contact_equilibrium(solution.pressures, problem.scene)
+    uncertainty = BraceUncertainty(arm, eq)
+    slopes = eq.force_gradients[0]
+    less = -slopes * uncertainty.forces[0] / (slopes @ slopes)
+    weaker = arm.contact_equilibrium(eq.pressures + less, problem.scene)
+    share = weaker.lift_off(way, contacts="sticking").force / (
+        eq.lift_off(way, contacts="sticking").force
+    )
+    assert 0.5 < uncertainty.grip < 0.95
+    assert uncertainty.grip == pytest.approx(share, abs=0.1)
+    held = min(each.loss.force for each in problem.preloads(eq) if each.contacts == "sticking")
+    room = 0.5 * (1 + uncertainty.grip)
+    asked = given.brace.model_copy(update={"margin": room * held})
+    refused = BracedProblem(arm, given.model_copy(update={"brace": asked})).refusals(eq)
+    assert any("takes a contact away" in why for why in refused)
+    without = BracedProblem(robot, given.model_copy(update={"brace": asked}))
+    assert not any("takes a contact away" in why for why in without.refusals(eq))
+
+
 def test_without_a_calibration_no_force_is_in_doubt(robot, solution):
-    assert not forces_in_doubt(robot, solution.equilibrium).any()
+    assert not BraceUncertainty(robot, solution.equilibrium).forces.any()
     assert "calibration" not in solution.message
 
 

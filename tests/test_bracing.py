@@ -165,6 +165,41 @@ def test_it_goes_to_rest_leans_holds_and_goes_back(approach):
     assert [notice.kind for notice in course.notices()] == ["release"]
 
 
+def test_the_way_begins_and_ends_gradually(approach):
+    """Its pace changes by no more than a second's worth, both ways, and it arrives."""
+    course = Bracing(TASK, BracingTuning())
+    course.begin(approach, np.zeros(6))
+    course.advance(0.0, True)
+    for end in ("held", "released"):
+        shares = [course.pressures @ approach.pressures[-1]]
+        while course.phase.value != end:
+            course.advance(PERIOD, True)
+            shares.append(course.pressures @ approach.pressures[-1])
+            assert len(shares) * PERIOD < approach.times[-1] + 4.0
+        full = approach.pressures[-1] @ approach.pressures[-1]
+        at = np.interp(shares, np.linspace(0, full, len(approach.times)), approach.times)
+        pace = np.abs(np.diff(at)) / PERIOD
+        assert pace.max() > 0.8
+        assert pace[0] < 0.05
+        moving = pace[: np.flatnonzero(pace > 1e-6)[-1] + 1]
+        assert moving[-3] < 0.25
+        assert np.abs(np.diff(moving[:-2])).max() < 0.06
+        course.release()
+
+
+def test_a_push_that_grows_slowly_is_felt(approach):
+    course = held(approach)
+    samples(course, approach, np.zeros(3), 40)
+    hold, way = approach.hold, np.array([1.0, 0.0, 0.0])
+    lifts = float(-hold.forces[0] / (hold.per_push @ way)[0])
+    most = 0.7 * lifts * way
+    rate = 2.5e-4 / np.linalg.norm(pushed(approach, most))  # 0.25 mm/s
+    for number in range(int(1 / (0.025 * rate))):
+        assert samples(course, approach, 0.025 * number * rate * pushed(approach, most), 1) is None
+    assert np.linalg.norm(course.push - most) < 0.5 * np.linalg.norm(most)
+    assert course.force < 0.7 * hold.forces[0]
+
+
 def test_a_lift_off_is_told_within_300_ms_and_less_is_not(approach):
     hold = approach.hold
     way = np.array([1.0, 0.0, 0.0])

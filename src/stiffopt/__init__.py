@@ -69,6 +69,7 @@ if TYPE_CHECKING:
     from stiffopt.optimise.solver import PressureSolver as PressureSolver
     from stiffopt.optimise.solver import solve_batch as solve_batch
     from stiffopt.optimise.solver import solve_pressure as solve_pressure
+    from stiffopt.optimise.supports import suggest_supports as suggest_supports
     from stiffopt.optimise.target import Target as Target
     from stiffopt.optimise.target import Tolerance as Tolerance
     from stiffopt.optimise.task import Load as Load
@@ -133,6 +134,7 @@ _NAMES = {
     "stiffopt.optimise.pareto": ("pareto_front",),
     "stiffopt.optimise.solution": ("PressureSolution",),
     "stiffopt.optimise.solver": ("PressureSolver", "solve_batch", "solve_pressure"),
+    "stiffopt.optimise.supports": ("suggest_supports",),
     "stiffopt.optimise.target": ("Target", "Tolerance"),
     "stiffopt.optimise.brace": ("Brace",),
     "stiffopt.optimise.press": ("Press",),

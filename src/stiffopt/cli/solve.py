@@ -23,6 +23,7 @@ Examples:
   {command} --json problems/*.yaml | jq .stiffness
   {command} task.yaml --out answer.yaml --plot answer.png
   {command} task.yaml --pareto 12 --plot trade-off.png
+  {command} task.yaml --suggest-post post.png --post-force '0.2 N'
 
 \b
 Exit codes (of several files the most serious: 2, then 4, then 3):
@@ -77,6 +78,17 @@ def solve(
             max=1000,
         ),
     ] = None,
+    suggest_post: Annotated[
+        str | None,
+        option(
+            "FILE.png",
+            "Find where a post or a wall would make the arm stiffest, and draw a map of it; of "
+            "several tasks, each in FILE-<task>.png.",
+        ),
+    ] = None,
+    post_force: Annotated[
+        str, option("FORCE", "Largest contact force on such a post or wall.")
+    ] = "0.3 N",
     seed: Annotated[
         int, option("N", "Seed of the global search; the same gives the same answer.", min=0)
     ] = 0,
@@ -87,4 +99,6 @@ def solve(
     """Solve task files."""
     from stiffopt.cli.solve_run import TaskBatch  # here, so that --help waits for no numerics
 
-    return TaskBatch(as_json, out, plot, pareto, seed, quiet, view).run(tasks)
+    return TaskBatch(as_json, out, plot, pareto, seed, quiet, view, suggest_post, post_force).run(
+        tasks
+    )

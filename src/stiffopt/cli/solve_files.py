@@ -137,6 +137,16 @@ def write_results(path: str, solved: Sequence[SolvedTask]) -> None:
     write_file(path, {"format": RESULT_FORMAT, "results": results})
 
 
+def draw_supports(solved: SolvedTask, path: str | None, view: Sequence[float] | None) -> None:
+    """Draw where a post or a wall would help."""
+    from stiffopt.plots import save_figure
+    from stiffopt.plots.supports import plot_supports
+
+    if solved.supports is not None and path is not None:
+        title = Path(solved.file).stem
+        save_figure(plot_supports(solved.robot, solved.supports, title=title, view=view), path)
+
+
 def draw(solved: SolvedTask, path: str, view: Sequence[float] | None) -> None:
     """Draw a solved task; raise `InputError` if the solver failed and there is nothing to draw."""
     from stiffopt.plots import plot_solution, save_figure

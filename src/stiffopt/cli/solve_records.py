@@ -79,6 +79,20 @@ def json_record(solved: SolvedTask) -> Record:
     }
     if solved.front is not None:
         record["pareto"] = [_json_point(point) for point in solved.front]
+    if solved.supports is not None:
+        record["supports"] = [
+            {
+                "kind": each.kind,
+                "at_m": each.at,
+                "side_rad": each.side,
+                "force_n": each.force,
+                "stiffnesses": each.solution.stiffnesses,
+                "times": solved.supports.times(each),
+                "pressures_pa": each.solution.pressures,
+                "object": each.object.model_dump(mode="json", by_alias=True, exclude_none=True),
+            }
+            for each in solved.supports.supports
+        ]
     return record
 
 

@@ -19,6 +19,7 @@ from stiffopt.optimise.goal import MatchMatrix, StiffnessMeasure
 from stiffopt.optimise.press import POSITION_ERROR, Feeling
 from stiffopt.optimise.settings import BRACE, OBSTACLES
 from stiffopt.optimise.solution import PressureSolution
+from stiffopt.optimise.supports import SupportMap
 from stiffopt.optimise.term import Term
 from stiffopt.plots.wording import (
     gain_text,
@@ -70,6 +71,8 @@ def _lines(solved: SolvedTask) -> Iterable[Line]:
         yield "search", Text(str(solution.confidence))
     if solved.front is not None:
         yield "trade-off", _front(solved)
+    if solved.supports is not None:
+        yield from _supports(solved.supports)
 
 
 def _robot(solved: SolvedTask) -> str:
@@ -329,6 +332,27 @@ def _vented(solution: PressureSolution) -> set[str]:
     description = solution.robot.description
     lower, _ = solution.task.pressure_bounds(description)
     return {f"{description.channel_name(k)} min" for k, limit in enumerate(lower) if limit <= 0}
+
+
+def _supports(found: SupportMap) -> Iterable[Line]:
+    """Yield where a post or a wall would help, best first."""
+    length, unit = display_units().length, display_units().of_si(found.free.stiffness_unit)
+    if not found.supports:
+        yield "would help", "no post and no wall, of those that were tested"
+    for number, each in enumerate(found.supports, start=1):
+        stiffness = unit.text(min(each.solution.stiffnesses), FIGURES)
+        post, wall, where = each.object.capsule, each.object.half_space, ""
+        if post is not None:
+            ends = [vector_text(np.round(end, 4), length) for end in (post.start, post.end)]
+            where = f"from {ends[0]} to {ends[1]} {length}, radius {length.text(post.radius, 'g')}"
+        elif wall is not None:
+            point, normal = vector_text(np.round(wall.point, 4), length), vector_text(wall.normal)
+            where = f"through {point} {length}, normal {normal}"
+        yield (
+            "" if number > 1 else "would help",
+            f"{number} {each.kind}: {stiffness}, {found.times(each):.3g} times as stiff; "
+            f"{each.touched}; {where}",
+        )
 
 
 def _front(solved: SolvedTask) -> RenderableType:

@@ -27,8 +27,13 @@ class TaskBatch(Batch[SolvedTask]):
         seed: int,
         quiet: bool,
         view: str | None = None,
+        suggest_post: str | None = None,
+        post_force: str = "0.3 N",
     ) -> None:
-        super().__init__(as_json, quiet, writes_files=out is not None or plot is not None)
+        written = (out, plot, suggest_post)
+        super().__init__(as_json, quiet, writes_files=any(each is not None for each in written))
+        self.suggest_post = suggest_post
+        self.post_force = quantities.quantity("--post-force", post_force, "N", "force")
         self.out, self.plot, self.pareto, self.seed = out, plot, pareto, seed
         self.view = quantities.view(view)
 
@@ -39,6 +44,9 @@ class TaskBatch(Batch[SolvedTask]):
         if out is not None:
             solve_files.check_result_file(out, files)
         pictures = solve_files.picture_names(self.plot, files)
+        self.maps = dict(
+            zip(files, solve_files.picture_names(self.suggest_post, files), strict=True)
+        )
         with interruptible() as check, warnings_as_notes(quiet=self.quiet):
             for bad in found.errors:
                 self.refuse(bad.path, str(bad))
@@ -54,7 +62,8 @@ class TaskBatch(Batch[SolvedTask]):
 
     def answer(self, file: str) -> SolvedTask:
         """See `Batch.answer`."""
-        return solve_file(file, seed=self.seed, pareto=self.pareto)
+        force = None if self.suggest_post is None else self.post_force
+        return solve_file(file, seed=self.seed, pareto=self.pareto, post_force=force)
 
     def take(self, answer: SolvedTask, seconds: float) -> None:
         """See `Batch.take`."""
@@ -66,9 +75,11 @@ class TaskBatch(Batch[SolvedTask]):
 
             self.rows.append(summary_row(answer, seconds))
             self.print(lambda: show(block(answer)))
-        if answer.no_front:
-            report_error(f"{answer.file}: {answer.no_front}")
+        for failed in filter(None, (answer.no_front, answer.no_supports)):
+            report_error(f"{answer.file}: {failed}")
             self.codes.append(exits.BAD_INPUT)
+        if answer.supports is not None:
+            solve_files.draw_supports(answer, self.maps[answer.file], self.view)
 
     def draw(self, answer: SolvedTask, picture: str) -> None:
         """See `Batch.draw`."""

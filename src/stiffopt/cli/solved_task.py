@@ -6,11 +6,12 @@ from dataclasses import dataclass, replace
 from stiffopt.errors import EquilibriumError, FileError, InputError
 from stiffopt.model.manipulator import Manipulator, load_robot
 from stiffopt.model.uncertainty import TipUncertainty
-from stiffopt.optimise.brace_uncertainty import stiffness_interval
+from stiffopt.optimise.brace_uncertainty import BraceUncertainty
 from stiffopt.optimise.goal import StiffnessMeasure
 from stiffopt.optimise.pareto import pareto_front
 from stiffopt.optimise.solution import PressureSolution, judge
 from stiffopt.optimise.solver import PressureSolver, stiffness_blind
+from stiffopt.optimise.supports import SupportMap, suggest_supports
 from stiffopt.optimise.task import load_task
 
 
@@ -29,6 +30,8 @@ class SolvedTask:
         direction; empty for a robot without calibration.
     front : the trade-off between tip error and stiffness; None without --pareto or if it failed.
     no_front : why --pareto failed; else empty.
+    supports : where a post or a wall would help; None without --suggest-post or if it failed.
+    no_supports : why --suggest-post failed; else empty.
     """
 
     file: str
@@ -39,10 +42,16 @@ class SolvedTask:
     intervals: tuple[tuple[float, float] | None, ...] = ()
     front: tuple[PressureSolution, ...] | None = None
     no_front: str = ""
+    supports: SupportMap | None = None
+    no_supports: str = ""
 
 
-def solve_file(file: str, *, seed: int, pareto: int | None) -> SolvedTask:
+def solve_file(
+    file: str, *, seed: int, pareto: int | None, post_force: float | None = None
+) -> SolvedTask:
     """Solve a task file; with `pareto`, also a trade-off with that number of points.
+
+    With `post_force`, the largest contact force in N, also suggest where to lean on a new object.
 
     Raises
     ------
@@ -63,6 +72,8 @@ def solve_file(file: str, *, seed: int, pareto: int | None) -> SolvedTask:
         raise
     except InputError as error:
         raise FileError(file, str(error)) from None
+    if post_force is not None:
+        answer = _with_supports(answer, post_force, seed)
     if pareto is None or solution.status == "failed":
         return answer
     try:
@@ -70,6 +81,14 @@ def solve_file(file: str, *, seed: int, pareto: int | None) -> SolvedTask:
     except (InputError, EquilibriumError) as error:
         return replace(answer, no_front=str(error))
     return replace(answer, front=front)
+
+
+def _with_supports(answer: SolvedTask, force: float, seed: int) -> SolvedTask:
+    try:
+        found = suggest_supports(answer.robot, answer.solution.task, force, seed=seed)
+    except (InputError, EquilibriumError) as error:
+        return replace(answer, no_supports=str(error))
+    return replace(answer, supports=found)
 
 
 def with_uncertainty(answer: SolvedTask) -> SolvedTask:
@@ -99,8 +118,9 @@ def _braced_intervals(
     brace, eq = answer.solution.task.brace, answer.solution.equilibrium
     assert brace is not None
     assert eq is not None
+    known = BraceUncertainty(answer.robot, eq)
     return tuple(
-        stiffness_interval(answer.robot, eq, measure, brace.contacts)
+        known.stiffness_interval(measure, brace.contacts)
         if isinstance(measure, StiffnessMeasure)
         else None
         for measure in measures

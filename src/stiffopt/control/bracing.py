@@ -79,6 +79,7 @@ class Bracing:
         self._start: Array = np.zeros(0)  # pressures (n,) from which the arm goes to rest
         self._left = 1.0  # share of `_start` that is left
         self._time = 0.0  # along the approach, in s
+        self._pace = 0.0  # of that time, from 0 to 1
         self._waited = 0.0  # at its end, in s
         self._change: Array = np.zeros(0)  # of the planned pressures (n,), to correct the tip
         self._free = 0  # successive samples at which the tip is nearer to a free arm's
@@ -120,7 +121,7 @@ class Bracing:
         """Release the contacts, then pursue the task `then`; `why` is the reason for a failure."""
         self.next = then or self.next
         if self.phase in (BracePhase.APPROACHING, BracePhase.HELD):
-            self.phase, self._why = BracePhase.RELEASING, why
+            self.phase, self._why, self._pace = BracePhase.RELEASING, why, 0.0
             self.force = self.margin = math.nan
             self.push = self.displacement = np.zeros(3)
             text = "goes back on the way that it came"
@@ -142,16 +143,27 @@ class Bracing:
             if not self._left and is_there:
                 self.phase = BracePhase.APPROACHING
         elif self.phase is BracePhase.APPROACHING:
-            self._time = min(self._time + elapsed, float(approach.times[-1]))
+            left = float(approach.times[-1]) - self._time
+            self._time = float(approach.times[-1]) - max(0.0, left - self._moved(elapsed, left))
             done = is_there and self._time >= approach.times[-1]
             self._waited = self._waited + elapsed if done else 0.0
             if self._waited >= t.settle:
                 self.phase = BracePhase.HELD
                 self._notify("braced", self._words(approach))
         elif self.phase is BracePhase.RELEASING:
-            self._time = max(0.0, self._time - elapsed)
+            self._time = max(0.0, self._time - self._moved(elapsed, self._time))
             if not self._time and is_there:
                 self.phase = BracePhase.RELEASED
+
+    def _moved(self, elapsed: float, left: float) -> float:
+        """Return how far the way goes on in a tick, in s, of the time that is left.
+
+        It begins and ends gradually, so that the arm does not swing into contact.
+        """
+        t = self._tuning
+        slowing = math.sqrt(2 * max(left, 0.0) / t.gradual) + t.least_pace
+        self._pace = min(self._pace + elapsed / t.gradual, slowing, 1.0)
+        return elapsed * self._pace
 
     def _words(self, approach: BraceApproach) -> str:
         where = [

@@ -384,6 +384,9 @@ class BracingTuning:
 
     at_rest: float = 2e3  # pressure below which the arm is at rest, in Pa
     to_rest: float = 3.0  # time in which it goes to rest, in s
+    # time in which the way into contact and back gets its speed or loses it, in s; least pace of it
+    gradual: float = 1.0
+    least_pace: float = 0.02
     settle: float = 1.0  # time at the end of the approach before the brace counts as held, in s
     # distance between the tips of the braced and the free arm that the tracker can distinguish, in
     # m; share of it beyond which the arm is free; and successive samples
@@ -395,7 +398,7 @@ class BracingTuning:
     # displacement of the tip above which a push is felt, in m; time constant with which a smaller
     # one becomes the model's error, in s
     felt: float = 6e-4
-    error_time: float = 2.0
+    error_time: float = 5.0
     # at first, while the tip goes to its target and the arm creeps most: duration and such a time
     # constant, in s
     settling: float = 8.0

@@ -6,6 +6,8 @@ least norm) that would move the tip as much, and carried on to contact forces an
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,40 +19,56 @@ from stiffopt.optimise.settings import BRACE
 
 Vector = NDArray[np.float64]
 
+_LEAST_GRIP = 0.05  # where the contact itself is in doubt; its normal force is a demand of its own
 
-def wrong_pressures(robot: Manipulator, p: Vector) -> Vector:
-    """Return the mean square (n, n) of pressures with the errors of the free tip, in Pa^2.
 
-    Zero for a robot that is not calibrated.
+class BraceUncertainty:
+    """What the calibration of an arm leaves in doubt of an equilibrium in contact.
+
+    All of it is zero for a robot that is not calibrated.
     """
-    if robot.description.calibration is None:
-        return np.zeros((len(p), len(p)))
-    R = robot.tip_pose(p)[:3, :3]
-    per_tip = np.linalg.pinv(R @ robot.tip_jacobian(p)[:3])
-    return np.asarray(per_tip @ robot.tip_uncertainty(p).covariance @ per_tip.T)
 
+    def __init__(self, robot: Manipulator, eq: ContactEquilibrium) -> None:
+        self._robot, self._eq = robot, eq
 
-def forces_in_doubt(robot: Manipulator, eq: ContactEquilibrium) -> Vector:
-    """Return by how much the normal forces (contacts,) may be smaller, in N.
+    @cached_property
+    def pressures(self) -> Vector:
+        """Mean square (n, n) of pressures with the errors of the free tip, in Pa^2."""
+        robot, p = self._robot, self._eq.pressures
+        if robot.description.calibration is None:
+            return np.zeros((len(p), len(p)))
+        R = robot.tip_pose(p)[:3, :3]
+        per_tip = np.linalg.pinv(R @ robot.tip_jacobian(p)[:3])
+        return np.asarray(per_tip @ robot.tip_uncertainty(p).covariance @ per_tip.T)
 
-    That is `BRACE.sure` standard deviations.
-    """
-    if robot.description.calibration is None:
-        return np.zeros(len(eq.contacts))
-    slopes = eq.force_gradients
-    variances = np.einsum("ci,ij,cj->c", slopes, wrong_pressures(robot, eq.pressures), slopes)
-    return np.asarray(BRACE.sure * np.sqrt(np.maximum(variances, 0.0)))
+    @cached_property
+    def forces(self) -> Vector:
+        """By how much normal forces (contacts,) may be smaller or larger, in N.
 
+        That is `BRACE.sure` standard deviations.
+        """
+        if self._robot.description.calibration is None:
+            return np.zeros(len(self._eq.contacts))
+        slopes = self._eq.force_gradients
+        variances = np.einsum("ci,ij,cj->c", slopes, self.pressures, slopes)
+        return np.asarray(BRACE.sure * np.sqrt(np.maximum(variances, 0.0)))
 
-def stiffness_interval(
-    robot: Manipulator, eq: ContactEquilibrium, measure: StiffnessMeasure, contacts: Grip
-) -> tuple[float, float]:
-    """Return the 95 % interval of a braced stiffness, in N/m or N m/rad.
+    @property
+    def grip(self) -> float:
+        """Share of the push that loses a sticking contact which is left if forces are smaller.
 
-    On a logarithmic scale, and for contacts that stay.
-    """
-    given = (measure.direction, measure.kind, measure.boundary, measure.frame, contacts)
-    k, slope = eq.stiffness(*given), eq.stiffness_gradient(*given)
-    variance = float(slope @ wrong_pressures(robot, eq.pressures) @ slope)
-    ratio = float(np.exp(NORMAL_QUANTILE * np.sqrt(max(variance, 0.0)) / k))
-    return k / ratio, k * ratio
+        To first order, such a push is in proportion to the normal force; the least share counts.
+        """
+        lost = np.max(self.forces / self._eq.normal_forces, initial=0.0)
+        return max(1.0 - float(lost), _LEAST_GRIP)
+
+    def stiffness_interval(self, measure: StiffnessMeasure, contacts: Grip) -> tuple[float, float]:
+        """Return the 95 % interval of a braced stiffness, in N/m or N m/rad.
+
+        On a logarithmic scale, and for contacts that stay.
+        """
+        given = (measure.direction, measure.kind, measure.boundary, measure.frame, contacts)
+        k, slope = self._eq.stiffness(*given), self._eq.stiffness_gradient(*given)
+        variance = float(slope @ self.pressures @ slope)
+        ratio = float(np.exp(NORMAL_QUANTILE * np.sqrt(max(variance, 0.0)) / k))
+        return k / ratio, k * ratio

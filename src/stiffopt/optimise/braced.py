@@ -25,7 +25,7 @@ from stiffopt.model.arm_clearance import measured_scene
 from stiffopt.model.contact.equilibrium import ContactEquilibrium
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.optimise.brace import quoted
-from stiffopt.optimise.brace_uncertainty import forces_in_doubt
+from stiffopt.optimise.brace_uncertainty import BraceUncertainty
 from stiffopt.optimise.leaning import FORCE_ON, MARGIN_ON, BracedProblem
 from stiffopt.optimise.local import LocalResult, descend
 from stiffopt.optimise.prices import prices_at
@@ -360,11 +360,11 @@ def _size(problem: BracedProblem, name: str, radius: float) -> float:
 
 def _doubt(problem: BracedProblem, eq: ContactEquilibrium) -> str:
     """Return how far a calibrated arm's contact forces are in doubt, or ""."""
-    doubt = float(forces_in_doubt(problem.robot, eq).max())
+    doubt = float(BraceUncertainty(problem.robot, eq).forces.max())
     if doubt == 0.0:
         return ""
     by = display_units().force.text(doubt, ".2g")
-    return f"contact forces may be smaller by {by}, by errors of the calibration"
+    return f"contact forces may be smaller or larger by {by}, by errors of the calibration"
 
 
 def _other_equilibrium(problem: BracedProblem, eq: ContactEquilibrium) -> str:

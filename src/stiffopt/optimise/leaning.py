@@ -2,10 +2,10 @@
 
 All quantities are evaluated at the equilibrium in contact. The rows of the terms, and of the
 objects that the body keeps clear of, are followed by these rows for each object that it may lean
-on: the largest contact force, ``|f| <= max_force``; and, for both signs of each direction that is
-maximised, the normal force that remains under a push of the margin, ``f(push) >= 0``, with sticking
-contacts also the push at which one slips. Derivatives are differences of equilibria with the same
-contacts.
+on: the largest contact force, ``|f| + e <= max_force``; and, for both signs of each direction that
+is maximised, the normal force that remains under a push of the margin, ``f(push) - e >= 0``, with
+sticking contacts also the push at which one slips if forces are smaller by e. The doubt e is that
+of a calibration. Derivatives are differences of equilibria with the same contacts, at constant e.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from stiffopt.model.scene import Scene, SceneObject
 from stiffopt.model.shape import PointOfArm
 from stiffopt.model.stopping import checkpoint
 from stiffopt.optimise.brace import Brace, kept_clear_of, leant_on
-from stiffopt.optimise.brace_uncertainty import forces_in_doubt
+from stiffopt.optimise.brace_uncertainty import BraceUncertainty
 from stiffopt.optimise.measures.directional import StiffnessMeasure
 from stiffopt.optimise.problem import Objective, PressureProblem, ProgramPoint
 from stiffopt.optimise.program import Constraint, Program
@@ -107,7 +107,7 @@ class Quantities(NamedTuple):
     residuals: Vector
     values: Vector
     distances: Vector
-    forces: Vector
+    forces: Vector  # along the normals, as large as they may be
     pushed: Vector
     slips: Vector
 
@@ -207,14 +207,14 @@ class BracedProblem(PressureProblem):
         checkpoint()
         eq = self.equilibrium(x)
         pushes = [] if self.only_target else list(self.pushes(eq))
-        doubt = forces_in_doubt(self.robot, eq) if pushes else np.zeros(len(eq.contacts))
+        known = BraceUncertainty(self.robot, eq)
         near = self._nearest(eq, quickly=True)
-        base = self._seen(eq, pushes, doubt, near, full)
+        base = self._seen(eq, pushes, known, near, full)
         differences = []
         for k, inwards in enumerate(x > (self.lower + self.upper) / 2):
             step = (-1.0 if inwards else 1.0) * BRACE.step
             change = step * self.unit[k] * np.eye(len(x))[k]
-            seen = self._seen(eq.shifted(change), pushes, doubt, near, full)
+            seen = self._seen(eq.shifted(change), pushes, known, near, full)
             differences.append([(b - a) / step for a, b in zip(base, seen, strict=True)])
         slopes = Quantities(
             *(np.stack(columns, axis=-1) for columns in zip(*differences, strict=True))
@@ -240,29 +240,34 @@ class BracedProblem(PressureProblem):
         self,
         eq: ContactEquilibrium,
         pushes: list[Vector],
-        doubt: Vector,
+        known: BraceUncertainty,
         near: list[Nearest],
         full: bool,
     ) -> Quantities:
         C = eq.compliance(self.brace.contacts) if full else np.eye(6)
         residuals, values = self.judged_by(eq, C)
-        margin = (1 + BRACE.spare) * self.brace.margin
-        pushed = np.array([eq.shifted(push=margin * push).normal_forces - doubt for push in pushes])
+        margin, forces = (1 + BRACE.spare) * self.brace.margin, eq.normal_forces
+        pushed = [eq.shifted(push=margin * push).normal_forces - known.forces for push in pushes]
         slips = np.zeros(0)
-        if self.brace.contacts == "sticking" and pushes:
-            slips = np.array([self._slip(eq, push) for push in pushes])
+        if pushes:
+            forces = forces + known.forces
+            if self.brace.contacts == "sticking":
+                slips = np.array([self._slip(eq, push, known.grip) for push in pushes])
         at = np.array([each.s for each in near])
         points, _, radii = eq.line(at) if near else (np.zeros((0, 3)), None, np.zeros(0))
         distances = np.array(
             [each.normal @ x - each.radius_share * r
              for each, x, r in zip(near, points, radii, strict=True)]
         )  # fmt: skip
-        return Quantities(residuals, values, distances, eq.normal_forces, pushed, slips)
+        return Quantities(residuals, values, distances, forces, np.array(pushed), slips)
 
-    def _slip(self, eq: ContactEquilibrium, push: Vector) -> float:
-        """Return the push at which a sticking contact is lost, at most twice the margin."""
-        largest = 2 * self.brace.margin
-        return min(largest, eq.lift_off(push, largest, "sticking").force)
+    def _slip(self, eq: ContactEquilibrium, push: Vector, grip: float) -> float:
+        """Return the push at which a sticking contact is lost, at most twice the margin.
+
+        `grip` is the share of it that is sure.
+        """
+        largest = 2 * self.brace.margin / grip
+        return grip * min(largest, eq.lift_off(push, largest, "sticking").force)
 
     def _rows(self, eq: ContactEquilibrium, seen: Quantities, near: list[Nearest]) -> Vector:
         rows = self.obstacle_rows(near)
@@ -331,18 +336,24 @@ class BracedProblem(PressureProblem):
 
     def refusals(self, eq: ContactEquilibrium) -> Iterator[str]:
         """Yield the reasons why an equilibrium is not acceptable."""
-        unit = display_units().force
-        for each in eq.contacts:
+        unit, known = display_units().force, BraceUncertainty(self.robot, eq)
+        for each, doubt in zip(eq.contacts, known.forces, strict=True):
             force = float(np.linalg.norm(each.force))
-            if force > each.max_force * (1 + 1e-9):
+            if force + doubt > each.max_force * (1 + 1e-9):
+                more = f", and {unit.text(doubt)} that the calibration leaves in doubt"
                 yield (
-                    f"the arm leans on '{each.object}' with {unit.text(force)}; at most "
-                    f"{unit.text(each.max_force)} is allowed"
+                    f"the arm leans on '{each.object}' with {unit.text(force)}"
+                    f"{more if doubt else ''}; at most {unit.text(each.max_force)} is allowed"
                 )
         if not eq.stable:
             yield "the equilibrium is not stable"
         grips = _GRIPS[: 1 + (self.brace.contacts == "sticking")]
-        kept = (each.loss.force for each in self.preloads(eq) if each.contacts in grips)
+        sure = {"sliding": 1.0, "sticking": known.grip}
+        kept = (
+            sure[each.contacts] * each.loss.force
+            for each in self.preloads(eq)
+            if each.contacts in grips
+        )
         least = min(kept, default=np.inf)
         if least < self.brace.margin * (1 - 1e-6):
             yield (
@@ -350,16 +361,15 @@ class BracedProblem(PressureProblem):
                 f"{unit.text(self.brace.margin)}"
             )
             return
-        left, doubt = self._left_in_doubt(eq)
+        left, doubt = self._left_in_doubt(eq, known.forces)
         if left < -1e-6:
             yield (
                 f"a push of the margin leaves a contact force of {unit.text(left + doubt)}, less "
                 f"than the {unit.text(doubt)} that the calibration leaves in doubt"
             )
 
-    def _left_in_doubt(self, eq: ContactEquilibrium) -> tuple[float, float]:
+    def _left_in_doubt(self, eq: ContactEquilibrium, doubt: Vector) -> tuple[float, float]:
         """Return the force that a push of the margin leaves beyond the doubt, and that, in N."""
-        doubt = forces_in_doubt(self.robot, eq)
         if not doubt.any():
             return np.inf, 0.0
         try:

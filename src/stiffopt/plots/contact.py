@@ -57,7 +57,7 @@ def draw_contact(
     free = drawing.unit.of(robot.backbone(equilibrium.pressures, 60)[:, :3, 3])
     axes.plot(*free.T, color=style.DARK, linewidth=1.2, linestyle="--", zorder=3)
     drawing.add_body(free)
-    drawing.add_line(style.DARK, "free", "--")
+    drawing.add_line(style.DARK, "without contact", "--")
     drawing.draw_objects(scene)
     draw_forces(drawing, equilibrium)
     return drawing.finish(view)
