@@ -210,10 +210,10 @@ class TipController:
         start, n = self._start(now), pressures.shape[1]
         if self.forecast is not None:
             self.forecast.confirm(trajectory, start[:n])
-        last, model = self.replanner.pursuit, self._arm.compiled.waypoints
+        last = self.replanner.pursuit
         self._requests.check_posture(trajectory, pressures, start[:n], last.task)
         begin = now + self.trajectory_delay
-        course = PostureCourse(trajectory, begin, start, lambda p: model.at(p).pose)
+        course = PostureCourse(trajectory, begin, start, lambda p: self._arm.at_waypoint(p).pose)
         self._pursue(self._requests.of_target(course.at(now), last, course))
         self._computed_at, self._led_to = now, None
 
@@ -247,7 +247,8 @@ class TipController:
 
     def check_ahead(self, request: Task | Target | Trajectory) -> None:
         """Refuse a request that leads the arm too near to the scene; for any thread."""
-        self._requests.check_ahead(request, self.forecast, self._bracing is not None)
+        leans, adapted = self._bracing is not None, self.replanner.adapted
+        self._requests.check_ahead(request, self.forecast, leans, adapted)
 
     def resume(self, now: float) -> None:
         """Resume control from the present pressures.

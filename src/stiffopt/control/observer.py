@@ -24,7 +24,7 @@ from stiffopt.control.vibration import BendingMode
 from stiffopt.errors import StiffoptError
 from stiffopt.model.description import RobotDescription
 from stiffopt.model.manipulator import Manipulator
-from stiffopt.optimise.tip import TipAt
+from stiffopt.optimise.tip import TipAt, TipModel
 from stiffopt.rig.interface import PoseSample, PressureLimits, PressureReading
 from stiffopt.rig.settings import ControlSettings, Safety
 
@@ -167,7 +167,11 @@ class ArmObserver:
         """Return the model's tip at pressures (n,) on the reference's path."""
         return self._at(self.compiled.path, pressures)
 
-    def _at(self, model: LinearisedTip, pressures: Array) -> TipAt:
+    def at_waypoint(self, pressures: Array) -> TipAt:
+        """Return the model's tip at pressures (n,) of a trajectory's waypoint."""
+        return self._at(self.compiled.waypoints, pressures)
+
+    def _at(self, model: LinearisedTip | TipModel, pressures: Array) -> TipAt:
         """Return a model's tip at pressures (n,), of an arm that has an equilibrium there."""
         try:
             return model.at(pressures)

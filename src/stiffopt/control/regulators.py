@@ -75,6 +75,33 @@ class RegulatorModel:
         return self.pressures
 
 
+class HealthyRange:
+    """Least and greatest pressures of n regulators that are not slower than a model.
+
+    Each may follow at once, or as slowly as this lag (n,), dead time, in s, and slew (n,), in Pa/s,
+    let it; in steps of `period`, in s. Readings do not correct the range.
+    """
+
+    def __init__(self, period: float, lag: Array, dead_time: float, slew: Array) -> None:
+        share = 1 - np.exp(-period / np.maximum(lag, 1e-6))
+        self._depth = round(dead_time / period) + 1
+        self._step = _range_step(share, slew * period, self._depth)
+        self.begin(np.zeros(len(slew)))
+
+    def begin(self, pressures: Array) -> None:
+        """Restart, settled at pressures (n,)."""
+        self._range = np.stack([pressures, pressures])
+        self._sent = np.tile(pressures, (self._depth, 1))  # commands under way, the oldest first
+
+    def advance(self, commanded: Array) -> Array:
+        """Take a step with commands (n,); return the range (2, n) after it, in Pa."""
+        sent = self._sent
+        sent[:-1] = sent[1:]
+        sent[-1] = commanded
+        (self._range,) = self._step(self._range, sent)
+        return self._range
+
+
 class PressureEstimator:
     """Commanded, chamber and effective pressures of an arm, in steps of `period`, in s.
 
@@ -94,6 +121,7 @@ class PressureEstimator:
         self.lag = float(np.mean(lag))  # of all channels, in s
         self._robot, self._period, self.channels = robot, period, channels
         self._regulators = RegulatorModel(period, lag, self.dead_time, slew, tuning)
+        self._healthy = HealthyRange(period, tuning.slow * lag, tuning.slow * self.dead_time, slew)
         self.begin()
 
     def begin(self) -> None:
@@ -101,6 +129,7 @@ class PressureEstimator:
         zero = np.zeros(self._robot.n_pressures)
         self._memory = _memory(self._robot)
         self._regulators.begin(zero)
+        self._healthy.begin(zero)
         self.channels.begin()
         self.command = zero  # last commanded pressures, in Pa
         self.chamber = zero  # pressures in the chambers
@@ -110,8 +139,9 @@ class PressureEstimator:
         """Take steps with commands (n,) and readings (n,) in Pa; NaN: not measured."""
         for _ in range(steps):
             self.chamber = self._regulators.advance(commanded, reading)
+            healthy = self._healthy.advance(commanded)
         elapsed, offset = steps * self._period, self._regulators.offset
-        self.channels.update(elapsed, commanded, reading, offset)
+        self.channels.update(elapsed, commanded, reading, offset, healthy)
         self.command = commanded.copy()
         self.effective = self.chamber
         if self._memory is not None:
@@ -159,6 +189,23 @@ def _step(
     for k in range(1, depth):
         ahead = lagged(ahead, offset_after, sent[k, :])
     return Formula([x, offset, sent, reading], [now, offset_after, ahead], [sent])
+
+
+def _range_step(share: Array, reach: Array, depth: int) -> Formula:
+    """Return the formula of a step of the range (2, n), from the range and the commands under way.
+
+    The commands are (depth, n).
+    """
+    n = len(share)
+    bounds, sent = ca.SX.sym("bounds", 2, n), ca.SX.sym("sent", depth, n)
+    least, most = (
+        ca.horzcat(*(choose(sent[:, k]) for k in range(n))) for choose in (ca.mmin, ca.mmax)
+    )
+    slow, most_step = ca.DM(share).T, ca.DM(reach).T
+    low = ca.fmin(least, bounds[0, :] + ca.fmin(slow * (least - bounds[0, :]), most_step))
+    high = ca.fmax(most, bounds[1, :] + ca.fmax(slow * (most - bounds[1, :]), -most_step))
+    after = ca.vertcat(low, high)
+    return Formula([bounds, sent], [after], [bounds, sent, after])
 
 
 def _regulation(robot: RobotDescription, control: ControlSettings) -> tuple[Array, float]:

@@ -233,12 +233,11 @@ class Replanner:
         """
         notices, plan = self._planner.notices(), self.plan
         if plan is not None and plan.serial == self._serial and not plan.reached:
-            message, task = plan.message, self.pursuit.task
-            if plan.far and away is not None and task is not None:
+            message, task = f"{plan.message} by the model", self.pursuit.task
+            if away is not None and task is not None:
                 message = nearest_words(*away, task.target.tolerance, "the tip")
-            elif plan.far:
-                message += " by the model"
-            text = f"the target cannot be reached: {message}"
+            with_what = "" if plan.far else " with the stiffness that is asked for"
+            text = f"the target cannot be reached{with_what}: {message}"
             notices = (*notices, Notice("unreachable", text, standing=True))
         limited = self.adapted is not None and self.adapted.limits is not None
         if limited and (self.known is None or self.known.is_limited):

@@ -62,9 +62,10 @@ class RegulatorTuning:
     # distance of the command from the pressure of a channel that does not follow, as a share of
     # `Safety.max_pressure_error`: less than the half at which the monitor looks for leaks
     probe_share: float = 0.4
-    # change of a reading, in Pa, below which it does not move; time for which it must not, in s
-    unmoved: float = 1e3
-    unmoved_time: float = 0.1
+    unmoved: float = 1e3  # change of a reading below which it does not move, in Pa
+    # lag and dead time of a slow regulator, as multiples of those of the rig file: its pressure is
+    # the least by which a reading must have moved
+    slow: float = 2.0
     let_down_share: float = 0.1  # share of the slew with which a removed channel is let down
 
 
@@ -149,7 +150,10 @@ class AdaptationTuning:
 
     bound: float = 3.0  # of each coordinate, in prior deviations
     mass: float = 0.01  # deviation of the tip mass that the file does not have, in kg
-    iterations: int = 2  # of Gauss-Newton
+    heavier: float = 2e-5  # mass by which the slope of the pose by the mass is taken, in kg
+    iterations: int = 10  # of Gauss-Newton, at most
+    halvings: int = 5  # of a step that does not improve the fit
+    converged: float = 0.02  # largest change of a number that ends the search, in prior deviations
     # discrepancy of the model: of the position, in m, and as a share of its displacement from rest;
     # of the orientation, in rad
     position_error: float = 1e-3
