@@ -92,9 +92,10 @@ class ArmObserver:
             damping=control.damping,
             tuning=replace(tuning.touch, noise=max(tuning.touch.noise, 2 * control.tracker_noise)),
         )
-        self.watch = MotionWatch(
-            robot.description, replace(tuning.motion, scatter=control.tracker_noise)
-        )
+        motion = replace(tuning.motion, scatter=control.tracker_noise)
+        if mode is None:  # it stops where its chambers stop
+            motion = replace(motion, undo_unseen=0.0)
+        self.watch = MotionWatch(robot.description, motion)
         self.model: ArmModel | None = None
         self._now, self._modelled_at = 0.0, np.zeros(n)
 

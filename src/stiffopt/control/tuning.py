@@ -161,8 +161,8 @@ class AdaptationTuning:
     angle_error: float = 0.02
     # of the stiffness at the strains of the file's arm, relative; power of the strains with which
     # it grows, from simulated silicone
-    stiffness_error: float = 0.05
-    strain_power: float = 3.0
+    stiffness_error: float = 0.07
+    strain_power: float = 2.0
     reach: float = 5e4  # distance in pressure over which the discrepancy is correlated, in Pa
     memory: float = 1800.0  # time in which the deviation of a window's error grows e-fold, in s
     # change of an applied number, in prior deviations, below which it stays; largest one in a step
@@ -282,7 +282,7 @@ class MotionTuning:
     swing_error: float = 0.35
     misses: int = 2  # successive samples that show no response
     # share of the latest motion that a hold undoes where the tip was not seen to move: the arm has
-    # followed its pressures about so far, and then swings least
+    # followed its pressures about so far, and then swings least; 0 for an arm that does not vibrate
     undo_unseen: float = 0.5
     slip_window: float = 1.0  # in which a slip is looked for, in s
     # share of the turn that a push would cause by which the measured turn must miss it
