@@ -77,7 +77,7 @@ class ArmObserver:
         tolerance = np.broadcast_to(np.asarray(safety.max_pressure_error, dtype=float), n)
         self.channels = Channels(limits, slew, tolerance, tuning.regulators)
         self.pressures = PressureEstimator(
-            robot.description, control, period, slew, tuning.regulators, self.channels
+            robot.description, control, period, slew, tuning.regulators, self.channels, tuning.lags
         )
         filter_tuning = replace(
             tuning.estimator,

@@ -70,6 +70,20 @@ class RegulatorTuning:
 
 
 @dataclass(frozen=True)
+class LagTuning:
+    """How the lags of the regulators are adapted (`LagEstimator`)."""
+
+    deviation: float = 0.3  # of the rig file's lag, relative
+    least_deviation: float = 0.03  # below which it does not fall, so that changes are followed
+    bound: float = math.log(2)  # largest logarithm of a lag over the rig file's
+    noise: float = 5e3  # of a reading, with what the model of the regulator lacks, in Pa
+    offset: float = 3e3  # deviation of a gauge from its command at rest, in Pa
+    offset_drift: float = 3e3  # its growth, in Pa / sqrt(s)
+    gate: float = 4.0  # deviations of a reading beyond which it tells nothing about the lag
+    change: float = 0.05  # relative change of a lag below which the model keeps its own
+
+
+@dataclass(frozen=True)
 class ReferenceTuning:
     """Bandwidth of the reference filter."""
 
@@ -432,6 +446,7 @@ class ControlTuning:
     """Tuning of `TipController`, by part; noise, speed and damping come from the rig file."""
 
     regulators: RegulatorTuning = field(default_factory=RegulatorTuning)
+    lags: LagTuning = field(default_factory=LagTuning)
     estimator: EstimatorTuning = field(default_factory=EstimatorTuning)
     reference: ReferenceTuning = field(default_factory=ReferenceTuning)
     feedback: FeedbackTuning = field(default_factory=FeedbackTuning)
