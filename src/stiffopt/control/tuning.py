@@ -252,6 +252,7 @@ class SupervisionTuning:
     force_alarm: float = 0.5
     max_failures: int = 3  # successive failures of the controller after which pressures are held
     chamber_lag: float = 0.3  # by which the pressures in the chambers may lag behind commands, in s
+    falls: float = 3e3  # above its command, in Pa, at which a chamber is on its way down
     # time of control after which a hold is a new one, and its timeout starts again, in s
     hold_memory: float = 2.0
     # time after a doubt in which another one lets the pressures down at once, in s
