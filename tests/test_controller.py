@@ -6,6 +6,7 @@ what the controller reaches is measured by the benchmark.
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import numpy as np
@@ -357,6 +358,22 @@ def test_target_out_of_reach_is_said():
     bench.controller.set_target(Target(position=middle(bench)))
     bench.run(0.3)
     assert bench.controller.notices() == ()
+
+
+def test_a_stiffness_out_of_reach_is_said_with_the_distance_of_the_tip():
+    bench = Bench(HANGING)
+    most = StiffnessGoal(at_least={"direction": (1.0, 0.0, 0.0), "value": 1e4})
+    target = Target(position=middle(bench))
+    bench.controller.set_task(Task(robot=bench.name, target=target, stiffness=most))
+    bench.run(0.1)
+    words = "the target cannot be reached with the stiffness that is asked for: the "
+    (notice,) = bench.controller.notices()
+    assert re.match(words + r"nearest pose is 0\.\d mm away by the model", notice.text)
+    away = 1e3 * bench.run(2.0, target.position)[-1]
+    (notice,) = bench.controller.notices()
+    found = re.match(words + r"tip is (\d\.\d) mm away", notice.text)
+    assert found
+    assert float(found[1]) == pytest.approx(away, abs=0.15)
 
 
 def test_limit_that_keeps_it_from_the_target_is_said():

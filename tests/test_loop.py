@@ -88,6 +88,32 @@ def test_hold_keeps_the_pressures_until_there_is_something_to_do() -> None:
     np.testing.assert_allclose(lab.ticks(100).commanded, 1e5)
 
 
+def test_a_hold_stops_falling_pressures_where_the_chambers_are() -> None:
+    lab = Lab()
+    lab.controller.wanted = np.full(3, 1e5)
+    lab.ticks(100)
+    lab.controller.wanted = np.zeros(3)
+    before = lab.ticks(10).commanded
+    chambers = lab.world.pressures.copy()
+    assert (chambers - before).min() > 1e4  # on their way down
+    lab.loop.hold("lunch")
+    held = lab.ticks(100).commanded
+    assert np.abs(held - chambers).max() < 1e4
+    assert np.abs(lab.world.pressures - chambers).max() < 1e4
+
+
+def test_a_hold_never_exceeds_the_latest_commands_whatever_the_gauges_read() -> None:
+    lab = Lab()
+    lab.controller.wanted = np.full(3, 0.5e5)
+    lab.ticks(100)
+    commanded = lab.loop.snapshot().commanded
+    measured = lab.world.measured
+    lab.world.measured = lambda: measured() + 1e4  # within the monitor's tolerance
+    lab.ticks(20)
+    lab.loop.hold("lunch")
+    np.testing.assert_array_equal(lab.ticks(3).commanded, commanded)
+
+
 def test_a_hold_that_was_asked_for_outlasts_that_of_the_tracker() -> None:
     lab = Lab().under_pressure()
     lab.world.inject("tracker", "off")

@@ -23,7 +23,6 @@ from stiffopt.control.tuning import AdaptationTuning
 from stiffopt.optimise.goal import StiffnessGoal, StiffnessMeasure
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import Task
-from stiffopt.optimise.tip import TipModel
 
 ROBOT = "stiff-flop-1"
 OFFSET = np.array([1e-3, -2e-3, 0.1 + 0.2, -0.0, 5e-324, 1 / 3])
@@ -198,7 +197,7 @@ def test_windows_and_what_is_learned_from_them_arrive(ends: Ends) -> None:
     got = ends.passes(asked)
     assert got.windows[0].position.tolist() == seen.position.tolist()
     learning = Learning(robot.description, AdaptationTuning(least_step=1e-6))
-    estimate = learning.estimate(got.windows, got.adapted, TipModel(robot))
+    estimate = learning.estimate(got.windows, got.adapted)
     assert estimate is not None
     ends.theirs.answer(
         Plan(1, BESIDE, got.offset, got.target, True, 1.0, "", deviation=0.1, estimate=estimate)
@@ -216,8 +215,8 @@ def test_windows_and_what_is_learned_from_them_arrive(ends: Ends) -> None:
     there = ends.passes(replace(asked, adapted=proposal))
     assert there.adapted is not None
     assert there.adapted.description == proposal.description
-    again = learning.estimate(there.windows, there.adapted, TipModel(robot))
+    again = learning.estimate(there.windows, there.adapted)
     assert again is not None
     assert again.proposal is None  # it is there already
     assert ends.passes(replace(asked, adapted=proposal)).adapted is there.adapted
-    assert learning.estimate(there.windows, there.adapted, TipModel(robot)) is None
+    assert learning.estimate(there.windows, there.adapted) is None

@@ -35,7 +35,7 @@ from numpy.typing import NDArray
 from stiffopt import lie
 from stiffopt.control.state import AdaptedNumber
 from stiffopt.control.tuning import AdaptationTuning
-from stiffopt.errors import StiffoptError
+from stiffopt.errors import EquilibriumError, StiffoptError
 from stiffopt.model.arguments import DirectionalMeasure
 from stiffopt.model.description import RobotDescription, Tolerances
 from stiffopt.model.layout import is_as_drawn
@@ -117,12 +117,10 @@ class Learning:
         self._deviation_of: tuple[DirectionalMeasure, Array] | None = None  # and pressures (n,)
         self._last_plan: Array | None = None  # pressures (n,)
 
-    def estimate(
-        self, windows: tuple[Window, ...], adapted: Adapted | None, tip: TipModel
-    ) -> Estimate | None:
+    def estimate(self, windows: tuple[Window, ...], adapted: Adapted | None) -> Estimate | None:
         """Return the estimate of the arm's numbers; None if there is no news.
 
-        `adapted` is the present arm, and `tip` its model.
+        `adapted` is the present arm.
         """
         before, self._last = self._last, (windows, adapted)
         if not windows or (windows is before[0] and adapted is before[1]):
@@ -131,8 +129,8 @@ class Learning:
             self._adaptation = Adaptation(self._description, self._tuning)
         adaptation, self._deviation_of = self._adaptation, None
         if windows is not before[0]:
-            with suppress(StiffoptError, LinAlgError):  # numbers without an equilibrium
-                adaptation.take(windows, tip)
+            with suppress(StiffoptError, LinAlgError):  # beyond the strain law
+                adaptation.take(windows)
         self._applied = adaptation.none_applied if adapted is None else adapted.applied
         limits = None if adapted is None else adapted.limits
         step = adaptation.step_from(self._applied, limits)
@@ -187,23 +185,49 @@ class Adaptation:
         self.covariance: Array = self._prior
         self.none_applied: Array = np.zeros(len(self._prior))
 
-    def take(self, windows: Sequence[Window], tip: TipModel) -> None:
-        """Update the estimate from all windows; `tip` is the present model, for its compliance.
+    def take(self, windows: Sequence[Window]) -> None:
+        """Update the estimate from all windows.
 
-        Raises
-        ------
-        StiffoptError
-            If the arm has no equilibrium with numbers that the search tried.
+        Windows in which the arm of the last estimate has no equilibrium are left out.
         """
-        z, prior = self.estimate, self._prior
+        z, noise = self.estimate, self._noise(windows)
+        errors, slopes = self._linearised(windows, z)
         for _ in range(self._tuning.iterations):
-            errors, slopes = self._linearised(windows, z, tip)
-            noise = self._noise(windows)
             seen = np.isfinite(errors)
             e, S, R = errors[seen], slopes[seen], noise[np.ix_(seen, seen)]
-            gain = np.linalg.solve(S @ prior @ S.T + R, S @ prior).T
-            z = self._bounded(gain @ (e + S @ z))
-        self.estimate, self.covariance = z, prior - gain @ S @ prior
+            gain = np.linalg.solve(S @ self._prior @ S.T + R, S @ self._prior).T
+            self.covariance = self._prior - gain @ S @ self._prior
+            step = self._bounded(gain @ (e + S @ z)) - z
+            found = self._shortened(windows, z, step, errors, noise)
+            if found is None:
+                return
+            z, errors, slopes = found
+            self.estimate = z
+            moved = np.abs(step) / np.sqrt(np.diag(self._prior))
+            if moved.max() < self._tuning.converged:
+                return
+
+    def _shortened(
+        self, windows: Sequence[Window], z: Array, step: Array, before: Array, noise: Array
+    ) -> tuple[Array, Array, Array] | None:
+        """Return likelier coordinates (k,), with errors and slopes; None: there are none.
+
+        `before` (6 w,) are the errors at z. A full step of a soft arm may lead to numbers that fit
+        worse, or that have no equilibrium in a window.
+        """
+        seen = np.isfinite(before)
+        R = noise[np.ix_(seen, seen)]
+
+        def cost(errors: Array, z: Array) -> float:
+            e = errors[seen]
+            return float(e @ np.linalg.solve(R, e) + z @ np.linalg.solve(self._prior, z))
+
+        for share in 0.5 ** np.arange(self._tuning.halvings):
+            trial = z + share * step
+            errors, slopes = self._linearised(windows, trial)
+            if np.isfinite(errors[seen]).all() and cost(errors, trial) < cost(before, z):
+                return trial, errors, slopes
+        return None
 
     def _bounded(self, z: Array) -> Array:
         limit = self._tuning.bound * np.sqrt(np.diag(self._prior))
@@ -282,40 +306,57 @@ class Adaptation:
         law = t.stiffness_error * math.exp(t.strain_power * max(softer, 0.0))
         return math.sqrt(variance + law**2 + pending**2)
 
-    def _linearised(
-        self, windows: Sequence[Window], z: Array, tip: TipModel
-    ) -> tuple[Array, Array]:
+    def _linearised(self, windows: Sequence[Window], z: Array) -> tuple[Array, Array]:
         """Return errors (6 w,) of the model at coordinates (k,) and their slopes (6 w, k).
 
         Each of the w windows has errors of position, in m, and of orientation, as a rotation vector
-        in base axes; NaN if not measured.
+        in base axes; NaN if not measured, or if the model has no equilibrium there.
         """
-        count = len(self._parameters)
-        if self._has_mass:
-            force = z[count] * self._gravity
-            self._arm.set_tip_load((*force, *np.zeros(9)))
+        errors = np.full((len(windows), 6), np.nan)
+        slopes = np.zeros((len(windows), 6, len(z)))
         p = np.array([window.pressures for window in windows])
-        poses = self._arm.poses(p, z[:count])
-        errors, slopes = [], []
+        heavier = self._poses(p, z, self._tuning.heavier) if self._has_mass else None
+        poses = self._poses(p, z)
         for k, window in enumerate(windows):
-            R, y = poses.transforms[k, :3, :3], poses.transforms[k, :3, 3]
-            turn = np.full(3, np.nan)
+            here, there = poses[k], None if heavier is None else heavier[k]
+            if here is None or (self._has_mass and there is None):
+                continue
+            T, per_coordinate = here
+            R, y = T[:3, :3], T[:3, 3]
+            errors[k, :3] = window.position - y
             if window.rotation is not None:
-                turn = np.asarray(lie.log(_homogeneous(window.rotation @ R.T)))[3:]
-            errors.append(np.concatenate([window.position - y, turn]))
+                errors[k, 3:] = _turn(R, window.rotation)
             axes = lie.rotate_blocks(R)
-            columns = [axes @ poses.per_coordinate[k]]
-            if self._has_mass:
-                wrench = np.concatenate([R.T @ self._gravity, np.zeros(3)])
-                compliance = tip.at(window.pressures).compliance
-                columns.append((axes @ compliance @ wrench)[:, None])
+            columns = [axes @ per_coordinate]
+            if there is not None:
+                change = np.concatenate([there[0][:3, 3] - y, _turn(R, there[0][:3, :3])])
+                columns.append(change[:, None] / self._tuning.heavier)
             columns.append(np.block([[np.eye(3), -_cross(y)], [np.zeros((3, 3)), np.eye(3)]]))
             if self._frames == 12:
                 columns.append(np.asarray(axes))
-            slopes.append(np.hstack(columns))
-        S = np.vstack(slopes)
+            slopes[k] = np.hstack(columns)
+        S = slopes.reshape(-1, len(z))
         frames = z[len(z) - self._frames :]
-        return np.concatenate(errors) - S[:, len(z) - self._frames :] @ frames, S
+        return errors.ravel() - S[:, len(z) - self._frames :] @ frames, S
+
+    def _poses(
+        self, pressures: Array, z: Array, heavier: float = 0.0
+    ) -> list[tuple[Array, Array] | None]:
+        """Return poses (4, 4) at pressures (w, n), and their slopes (6, k); None: no equilibrium.
+
+        The arm has the coordinates (k,), and a mass more in kg.
+        """
+        count = len(self._parameters)
+        if self._has_mass:
+            force = (z[count] + heavier) * self._gravity
+            self._arm.set_tip_load((*force, *np.zeros(9)))
+        try:
+            found = self._arm.poses(pressures, z[:count])
+        except EquilibriumError:
+            if len(pressures) == 1:
+                return [None]
+            return [self._poses(each[None], z, heavier)[0] for each in pressures]
+        return list(zip(found.transforms, found.per_coordinate, strict=True))
 
     def _noise(self, windows: Sequence[Window]) -> Array:
         """Return the covariance (6 w, 6 w) of discrepancies; it grows with displacement and age."""
@@ -392,7 +433,8 @@ def _cross(v: Array) -> Array:
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
-def _homogeneous(rotation: Array) -> Array:
+def _turn(before: Array, after: Array) -> Array:
+    """Return the rotation vector (3,), in base axes, from one orientation (3, 3) to another."""
     T = np.eye(4)
-    T[:3, :3] = rotation
-    return T
+    T[:3, :3] = after @ before.T
+    return np.asarray(lie.log(T))[3:]

@@ -6,7 +6,7 @@ monitor's tolerance. If the channel is still short by more, it is *limited*: its
 becomes the plan's upper bound, and the command stays just above it, where more pressure shows as
 soon as there is some. If a limited channel does not follow its command down either, it is *stuck*:
 the plan takes its pressure as fixed, and the command stays just below it. A reading that does not
-move at all, although the command has left it, shows both within a fraction of a second. Faults of
+move at all, although even a slow regulator would have moved it, shows both at once. Faults of
 the pressure monitor remain faults: none of these commands exceeds the limits, nor differs from the
 reading by more than the monitor tolerates.
 
@@ -73,9 +73,10 @@ class Channels:
         self.shortfall: Array = np.zeros(n)
         self._allowed: Array = self._min_allowed.copy()  # shortfall to compensate, in Pa
         self._held: Array = np.zeros(n)  # pressure of a limited or stuck channel, in Pa
+        self._found: Array = np.zeros(n)  # the same when it was found, in Pa
         self._durations: Array = np.zeros((2, n))  # durations of being short, and too high, in s
-        self._unmoved: Array = np.zeros(n)  # time for which a reading ignores its command, in s
-        self._followed: Array = np.zeros(n)  # last readings that followed, in Pa
+        # last readings that followed, and these without the regulators' offset (2, n), in Pa
+        self._followed: Array = np.zeros((2, n))
         self._smoothed: Array = np.zeros(n)  # smoothed readings, in Pa
         self._ceiling: Array = np.where(self.out, self._empty, self._limits.high)
         self._quiet = True  # whether no channel is short, or was until now
@@ -98,11 +99,21 @@ class Channels:
         """Channels (n,) that the plan does without, or uses below their usual limit."""
         return self.limited | self.stuck | self.out
 
-    def update(self, elapsed: float, command: Array, reading: Array, offset: Array) -> None:
-        """Take in commands and readings (n,), in Pa; NaN: not measured.
+    def update(
+        self, elapsed: float, command: Array, reading: Array, offset: Array, healthy: Array
+    ) -> None:
+        """Take in the latest commands and readings.
 
-        `offset` (n,) are settled pressures relative to commands, in Pa; `elapsed` is the time since
-        the last call, in s.
+        Parameters
+        ----------
+        elapsed :
+            Time since the last call, in s.
+        command, reading :
+            Commands and readings (n,), in Pa; NaN: not measured.
+        offset :
+            Settled pressures relative to commands (n,), in Pa.
+        healthy :
+            Least and greatest pressures (2, n) that regulators without a fault have now, in Pa.
         """
         self.shortfall = -offset
         share = -math.expm1(-elapsed / self._tuning.reading_time)
@@ -114,48 +125,57 @@ class Channels:
                 self.out, np.maximum(self._ceiling - self._let_down * elapsed, self._empty),
                 self._limits.high,
             )  # fmt: skip
-        short = self.shortfall
+        short, unmoved = self.shortfall, self._tuning.unmoved
         follows = np.abs(short) <= self._min_allowed
-        if self._quiet and follows.all():
-            self._followed = reading
+        settled = reading + short
+        strays = (healthy[0] - settled > unmoved) | (settled - healthy[1] > unmoved)
+        now = np.stack([reading, settled])
+        if self._quiet and follows.all() and not strays.any():
+            self._followed = now
             return
-        self._followed = np.where(follows, reading, self._followed)
-        still = np.abs(reading - self._followed) < self._tuning.unmoved  # False for NaN
-        size = np.abs(short) / self._probe
-        self._unmoved = np.where(still & (size > 1), self._unmoved + size * elapsed, 0.0)
-        self._smoothed = np.where(self._unmoved > 0, reading, self._smoothed)
+        self._followed = np.where(follows & ~strays, now, self._followed)
+        # a reading that has moved must not count as still when it comes by again
+        still = np.abs(reading - self._followed[0]) < unmoved
+        self._followed[0, ~still] = np.nan
+        above, below = self._followed[1] - healthy[1], healthy[0] - self._followed[1]
+        falls = above > self._probe
+        ignores = still & np.stack([falls | (below > self._probe), falls])
+        self._smoothed = np.where(ignores[0], reading, self._smoothed)
         share = -math.expm1(-elapsed / self._tuning.make_up_time)
         wanted = np.minimum(np.maximum(short, self._min_allowed), self._max_allowed)
         self._allowed = self._allowed + share * (wanted - self._allowed)
-        self._judge(elapsed, short, command)
+        self._judge(elapsed, short, command, ignores)
         self._quiet = not (
             self._durations.any()
-            or self._unmoved.any()
             or self.limited.any()
             or (self._allowed > self._min_allowed + 1.0).any()
         )
 
-    def _judge(self, elapsed: float, short: Array, command: Array) -> None:
-        """Find channels that are limited or stuck, and those that follow again."""
+    def _judge(self, elapsed: float, short: Array, command: Array, ignores: Flags) -> None:
+        """Find channels that are limited or stuck, and those that follow again.
+
+        `ignores` (2, n) are readings that keep still, and those that should have fallen.
+        """
         follows, patience = self._tuning.follows, self._tuning.patience
         wrong = np.stack([short > self._max_allowed, self.limited & (-short > follows)])
         self._durations = np.clip(
             self._durations + np.where(wrong, elapsed, -elapsed), 0.0, patience
         )
-        lasting = self._durations >= patience
-        ignores = self._unmoved >= self._tuning.unmoved_time
-        lasting |= np.stack([ignores, ignores & (short < 0)])
-        moved = self._smoothed - self._held
+        lasting = (self._durations >= patience) | ignores
+        moved = self._smoothed - self._found
         again = np.where(self.stuck, np.abs(moved) > follows, (moved > follows) & (short < follows))
         before = self.limited
         self.limited = (before & ~again) | (~before & lasting[0])
         found = self.limited & ~before
-        self._held = np.where(found, self._smoothed, self._held)
+        self._found = np.where(found, self._smoothed, self._found)
+        rising = np.minimum(self._smoothed, self._found + follows / 2)  # it may not rest yet
+        self._held = np.where(found, self._smoothed, np.maximum(self._held, rising))
         pressed = np.minimum(short, command - self._smoothed) > self._max_allowed
-        pressed &= self.limited & ~self.stuck
-        self._held = np.where(pressed, np.minimum(self._held, self._smoothed), self._held)
+        pressed &= self.limited & ~self.stuck & (self._smoothed < self._held)
         stuck = self.limited & lasting[1] & ~self.stuck
-        self._held = np.where(stuck, self._smoothed, self._held)
+        self._held, self._found = (
+            np.where(pressed | stuck, self._smoothed, past) for past in (self._held, self._found)
+        )
         self.stuck = (self.stuck | stuck) & self.limited
 
     def compensated(self, offset: Array) -> Array:

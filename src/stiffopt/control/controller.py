@@ -29,7 +29,7 @@ from stiffopt.control.pressing import Phase, Pressing
 from stiffopt.control.reference import Reference
 from stiffopt.control.replanning import Pursuit, Replanner
 from stiffopt.control.requests import Requests
-from stiffopt.control.state import ControllerStatus, Severity
+from stiffopt.control.state import AdaptedNumber, ControllerStatus, Severity
 from stiffopt.control.tip_errors import TipErrors, target_arrays
 from stiffopt.control.tip_feedback import TipFeedback
 from stiffopt.control.tuning import ControlTuning
@@ -210,10 +210,10 @@ class TipController:
         start, n = self._start(now), pressures.shape[1]
         if self.forecast is not None:
             self.forecast.confirm(trajectory, start[:n])
-        last, model = self.replanner.pursuit, self._arm.compiled.waypoints
+        last = self.replanner.pursuit
         self._requests.check_posture(trajectory, pressures, start[:n], last.task)
         begin = now + self.trajectory_delay
-        course = PostureCourse(trajectory, begin, start, lambda p: model.at(p).pose)
+        course = PostureCourse(trajectory, begin, start, lambda p: self._arm.at_waypoint(p).pose)
         self._pursue(self._requests.of_target(course.at(now), last, course))
         self._computed_at, self._led_to = now, None
 
@@ -247,7 +247,8 @@ class TipController:
 
     def check_ahead(self, request: Task | Target | Trajectory) -> None:
         """Refuse a request that leads the arm too near to the scene; for any thread."""
-        self._requests.check_ahead(request, self.forecast, self._bracing is not None)
+        leans, adapted = self._bracing is not None, self.replanner.adapted
+        self._requests.check_ahead(request, self.forecast, leans, adapted)
 
     def resume(self, now: float) -> None:
         """Resume control from the present pressures.
@@ -455,6 +456,8 @@ class TipController:
             windows.look(now, self._arm.pressures.effective, self._arm.tip)
         else:
             windows.begin()
+        if windows.has_rested(now) and self._arm.pressures.adapt():
+            self._reference.set_lag(self._arm.pressures.lag)
         if known is None or known.proposal is None or not windows.has_rested(now):
             return
         if now - self._adapted_at > self._tuning.adaptation.interval:
@@ -560,7 +563,7 @@ class TipController:
             stiffness=stiffness,
             stiffness_low=stiffness / ratio,
             stiffness_high=stiffness * ratio,
-            adapted=() if self.replanner.known is None else self.replanner.known.numbers,
+            adapted=self._adapted_numbers(),
             best_stiffness=math.nan if plan is None else plan.stiffness,
             disturbance=estimate.offset,
             touches=touches,
@@ -576,6 +579,16 @@ class TipController:
             model_position=estimate.static,
             lost=self._arm.channels.lost,
             shortfall=self._arm.channels.shortfall,
+        )
+
+    def _adapted_numbers(self) -> tuple[AdaptedNumber, ...]:
+        known, lags = self.replanner.known, self._arm.pressures.lags
+        numbers = () if known is None else known.numbers
+        if lags is None:
+            return numbers
+        found = zip(lags.lag.tolist(), lags.deviation.tolist(), strict=True)
+        return *numbers, *(
+            AdaptedNumber(f"regulator_lag[{channel}]", *each) for channel, each in enumerate(found)
         )
 
     def notices(self) -> tuple[Notice, ...]:

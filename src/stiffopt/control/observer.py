@@ -24,7 +24,7 @@ from stiffopt.control.vibration import BendingMode
 from stiffopt.errors import StiffoptError
 from stiffopt.model.description import RobotDescription
 from stiffopt.model.manipulator import Manipulator
-from stiffopt.optimise.tip import TipAt
+from stiffopt.optimise.tip import TipAt, TipModel
 from stiffopt.rig.interface import PoseSample, PressureLimits, PressureReading
 from stiffopt.rig.settings import ControlSettings, Safety
 
@@ -77,7 +77,7 @@ class ArmObserver:
         tolerance = np.broadcast_to(np.asarray(safety.max_pressure_error, dtype=float), n)
         self.channels = Channels(limits, slew, tolerance, tuning.regulators)
         self.pressures = PressureEstimator(
-            robot.description, control, period, slew, tuning.regulators, self.channels
+            robot.description, control, period, slew, tuning.regulators, self.channels, tuning.lags
         )
         filter_tuning = replace(
             tuning.estimator,
@@ -92,9 +92,10 @@ class ArmObserver:
             damping=control.damping,
             tuning=replace(tuning.touch, noise=max(tuning.touch.noise, 2 * control.tracker_noise)),
         )
-        self.watch = MotionWatch(
-            robot.description, replace(tuning.motion, scatter=control.tracker_noise)
-        )
+        motion = replace(tuning.motion, scatter=control.tracker_noise)
+        if mode is None:  # it stops where its chambers stop
+            motion = replace(motion, undo_unseen=0.0)
+        self.watch = MotionWatch(robot.description, motion)
         self.model: ArmModel | None = None
         self._now, self._modelled_at = 0.0, np.zeros(n)
 
@@ -167,7 +168,11 @@ class ArmObserver:
         """Return the model's tip at pressures (n,) on the reference's path."""
         return self._at(self.compiled.path, pressures)
 
-    def _at(self, model: LinearisedTip, pressures: Array) -> TipAt:
+    def at_waypoint(self, pressures: Array) -> TipAt:
+        """Return the model's tip at pressures (n,) of a trajectory's waypoint."""
+        return self._at(self.compiled.waypoints, pressures)
+
+    def _at(self, model: LinearisedTip | TipModel, pressures: Array) -> TipAt:
         """Return a model's tip at pressures (n,), of an arm that has an equilibrium there."""
         try:
             return model.at(pressures)

@@ -73,10 +73,10 @@ class Plan:
     target: Target | None
     reached: bool  # whether the model reaches the target
     stiffness: float  # along the task's first direction; NaN if it has none
-    message: str  # why the target is not reached
+    message: str  # how far the model stays from a target that is not reached
     blocked: str = ""  # why the way to the plan is not clear of the scene
     doubt: str = ""  # a warning if the model extrapolates there
-    far: bool = False  # whether `message` was made by `nearest_words`
+    far: bool = False  # whether it is the pose that is not reached, not only the stiffness
     adapted: Adapted | None = None  # the model that it was made with, as in the request
     deviation: float = math.nan  # of the stiffness there, relative
     estimate: Estimate | None = None  # of the model's numbers, if it is new
@@ -118,7 +118,7 @@ class Planning:
     def _deviation(self, plan: Plan, task: Task) -> float:
         """Return the relative deviation of a plan's stiffness; NaN if unknown."""
         measure = task.measures[0] if task.measures else None
-        if not plan.reached or not isinstance(measure, StiffnessMeasure):
+        if not isinstance(measure, StiffnessMeasure):
             return math.nan
         checked = checked_measure(measure.direction, measure.kind, measure.boundary, measure.frame)
         return self._learning.deviation(plan.pressures, checked)
@@ -134,7 +134,7 @@ class Planning:
         if request.task is None or request.target is None:
             return self._checked(request)
         plan = self._planned(request, request.task, request.target)
-        estimate = self._learning.estimate(request.windows, request.adapted, self._tip)
+        estimate = self._learning.estimate(request.windows, request.adapted)
         deviation = self._deviation(plan, request.task)
         plan = replace(plan, deviation=deviation, estimate=estimate)
         plan = replace(plan, doubt=self._robot.description.extrapolation(plan.pressures))
@@ -282,9 +282,7 @@ class Planning:
         pressures, distance, angle = self._search.find(target, self._limits, start)
         tolerance = task.target.tolerance
         far = distance > tolerance.position or angle > tolerance.angle
-        message = "the pose can be reached, but not with the stiffness that is asked for"
-        if far:
-            message = nearest_words(distance, angle, tolerance)
+        message = nearest_words(distance, angle, tolerance)
         return Plan(
             request.serial, pressures, request.offset, request.target, False, math.nan, message,
             far=far, adapted=request.adapted,

@@ -68,6 +68,10 @@ class Reference:
         self._states[:, n:] += change
         self.motion[0, n:] += change
 
+    def set_lag(self, lag: float) -> None:
+        """Change the regulators' lag, in s; without a jump if the path rests."""
+        self._lag, self._filter_of = lag, None
+
     @property
     def delay(self) -> float:
         """Delay of the path behind the plan, in s."""

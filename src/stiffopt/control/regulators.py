@@ -25,7 +25,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from stiffopt.control.channels import Channels
 from stiffopt.control.formula import Formula
-from stiffopt.control.tuning import RegulatorTuning
+from stiffopt.control.lags import LagEstimator
+from stiffopt.control.tuning import LagTuning, RegulatorTuning
 from stiffopt.model.description import RobotDescription
 from stiffopt.model.history import History, Memory
 from stiffopt.rig.settings import ControlSettings
@@ -47,12 +48,15 @@ class RegulatorModel:
         slew: Array,
         tuning: RegulatorTuning | None = None,
     ) -> None:
-        n = len(slew)
-        lags = np.broadcast_to(np.asarray(lag, dtype=float), n)
-        share = 1 - np.exp(-period / np.maximum(lags, 1e-6))
+        self._period = period
+        self.set_lag(np.broadcast_to(np.asarray(lag, dtype=float), len(slew)))
         self._depth = round(dead_time / period) + 1
-        self._step = _step(share, slew * period, self._depth, period, tuning or RegulatorTuning())
-        self.begin(np.zeros(n))
+        self._step = _step(slew * period, self._depth, period, tuning or RegulatorTuning())
+        self.begin(np.zeros(len(slew)))
+
+    def set_lag(self, lag: Array) -> None:
+        """Change the lags (n,), in s."""
+        self._share = 1 - np.exp(-self._period / np.maximum(lag, 1e-6))
 
     def begin(self, pressures: Array) -> None:
         """Restart, settled at pressures (n,)."""
@@ -70,9 +74,36 @@ class RegulatorModel:
         sent[:-1] = sent[1:]
         sent[-1] = commanded
         self.pressures, self.offset, self.ahead = self._step(
-            self.pressures, self.offset, sent, reading
+            self.pressures, self.offset, sent, reading, self._share
         )
         return self.pressures
+
+
+class HealthyRange:
+    """Least and greatest pressures of n regulators that are not slower than a model.
+
+    Each may follow at once, or as slowly as this lag (n,), dead time, in s, and slew (n,), in Pa/s,
+    let it; in steps of `period`, in s. Readings do not correct the range.
+    """
+
+    def __init__(self, period: float, lag: Array, dead_time: float, slew: Array) -> None:
+        share = 1 - np.exp(-period / np.maximum(lag, 1e-6))
+        self._depth = round(dead_time / period) + 1
+        self._step = _range_step(share, slew * period, self._depth)
+        self.begin(np.zeros(len(slew)))
+
+    def begin(self, pressures: Array) -> None:
+        """Restart, settled at pressures (n,)."""
+        self._range = np.stack([pressures, pressures])
+        self._sent = np.tile(pressures, (self._depth, 1))  # commands under way, the oldest first
+
+    def advance(self, commanded: Array) -> Array:
+        """Take a step with commands (n,); return the range (2, n) after it, in Pa."""
+        sent = self._sent
+        sent[:-1] = sent[1:]
+        sent[-1] = commanded
+        (self._range,) = self._step(self._range, sent)
+        return self._range
 
 
 class PressureEstimator:
@@ -89,18 +120,28 @@ class PressureEstimator:
         slew: Array,
         tuning: RegulatorTuning,
         channels: Channels,
+        lag_tuning: LagTuning | None = None,
     ) -> None:
         lag, self.dead_time = _regulation(robot, control)
         self.lag = float(np.mean(lag))  # of all channels, in s
         self._robot, self._period, self.channels = robot, period, channels
         self._regulators = RegulatorModel(period, lag, self.dead_time, slew, tuning)
+        self._healthy = HealthyRange(period, tuning.slow * lag, tuning.slow * self.dead_time, slew)
+        self._lag_tuning = lag_tuning or LagTuning()
+        self.lags: LagEstimator | None = None
+        if control.adaptation != "none" and not _has_lags(robot):
+            self.lags = LagEstimator(period, lag, self.dead_time, slew, self._lag_tuning)
+        self._modelled_lags = lag
         self.begin()
 
     def begin(self) -> None:
-        """Restart with a vented arm."""
+        """Restart with a vented arm; adapted lags stay."""
         zero = np.zeros(self._robot.n_pressures)
         self._memory = _memory(self._robot)
         self._regulators.begin(zero)
+        self._healthy.begin(zero)
+        if self.lags is not None:
+            self.lags.begin()
         self.channels.begin()
         self.command = zero  # last commanded pressures, in Pa
         self.chamber = zero  # pressures in the chambers
@@ -110,12 +151,26 @@ class PressureEstimator:
         """Take steps with commands (n,) and readings (n,) in Pa; NaN: not measured."""
         for _ in range(steps):
             self.chamber = self._regulators.advance(commanded, reading)
+            healthy = self._healthy.advance(commanded)
+            if self.lags is not None:
+                self.lags.advance(commanded, reading, self.channels.lost)
         elapsed, offset = steps * self._period, self._regulators.offset
-        self.channels.update(elapsed, commanded, reading, offset)
+        self.channels.update(elapsed, commanded, reading, offset, healthy)
         self.command = commanded.copy()
         self.effective = self.chamber
         if self._memory is not None:
             self.effective = self._memory.advance(steps * self._period, self.chamber)
+
+    def adapt(self) -> bool:
+        """Use the adapted lags from now on, at rest; return whether that changes anything."""
+        if self.lags is None:
+            return False
+        found = self.lags.lag
+        if (np.abs(np.log(found / self._modelled_lags)) < self._lag_tuning.change).all():
+            return False
+        self._modelled_lags, self.lag = found, float(np.mean(found))
+        self._regulators.set_lag(found)
+        return True
 
     @property
     def history_offset(self) -> Array:
@@ -136,29 +191,46 @@ class PressureEstimator:
         return self._regulators.ahead + self.history_offset
 
 
-def _step(
-    share: Array, reach: Array, depth: int, period: float, tuning: RegulatorTuning
-) -> Formula:
+def _step(reach: Array, depth: int, period: float, tuning: RegulatorTuning) -> Formula:
     """Return the formula of a step: pressures, offset and pressures ahead (n,) after it.
 
-    Inputs: pressures and offset (n,), the commands under way (depth, n) and readings (n,).
+    Inputs: pressures and offset (n,), the commands under way (depth, n), readings (n,), and the
+    share (n,) of its way that a pressure goes in a step.
     """
-    n = len(share)
+    n = len(reach)
+    share = ca.SX.sym("share", n)
     x, offset, reading = ca.SX.sym("x", n), ca.SX.sym("offset", n), ca.SX.sym("reading", n)
     sent = ca.SX.sym("sent", depth, n)
 
     def lagged(x: Any, offset: Any, command: Any) -> Any:
-        change = ca.DM(share) * (command.T + offset - x)
+        change = share * (command.T + offset - x)
         return x + ca.fmin(ca.fmax(change, -ca.DM(reach)), ca.DM(reach))
 
     now = lagged(x, offset, sent[0, :])
     error = ca.if_else(ca.fabs(reading) < np.inf, reading - now, 0)  # 0 for NaN
-    offset_after = offset + tuning.offset_gain * period**2 * error / ca.DM(share)
+    offset_after = offset + tuning.offset_gain * period**2 * error / share
     now = now + min(1.0, tuning.pressure_gain * period) * error
     ahead = now
     for k in range(1, depth):
         ahead = lagged(ahead, offset_after, sent[k, :])
-    return Formula([x, offset, sent, reading], [now, offset_after, ahead], [sent])
+    return Formula([x, offset, sent, reading, share], [now, offset_after, ahead], [sent])
+
+
+def _range_step(share: Array, reach: Array, depth: int) -> Formula:
+    """Return the formula of a step of the range (2, n), from the range and the commands under way.
+
+    The commands are (depth, n).
+    """
+    n = len(share)
+    bounds, sent = ca.SX.sym("bounds", 2, n), ca.SX.sym("sent", depth, n)
+    least, most = (
+        ca.horzcat(*(choose(sent[:, k]) for k in range(n))) for choose in (ca.mmin, ca.mmax)
+    )
+    slow, most_step = ca.DM(share).T, ca.DM(reach).T
+    low = ca.fmin(least, bounds[0, :] + ca.fmin(slow * (least - bounds[0, :]), most_step))
+    high = ca.fmax(most, bounds[1, :] + ca.fmax(slow * (most - bounds[1, :]), -most_step))
+    after = ca.vertcat(low, high)
+    return Formula([bounds, sent], [after], [bounds, sent, after])
 
 
 def _regulation(robot: RobotDescription, control: ControlSettings) -> tuple[Array, float]:
@@ -174,6 +246,11 @@ def _regulation(robot: RobotDescription, control: ControlSettings) -> tuple[Arra
         if own and history is not None:
             dead_time = history.dead_time or dead_time
     return np.array(lags), dead_time
+
+
+def _has_lags(robot: RobotDescription) -> bool:
+    """Whether the robot file has lags, which are those of the arm behind its gauges too."""
+    return any(s.history is not None and s.history.lag > 0 for s in robot.segments)
 
 
 def _memory(robot: RobotDescription) -> Memory | None:

@@ -233,12 +233,16 @@ class Replanner:
         """
         notices, plan = self._planner.notices(), self.plan
         if plan is not None and plan.serial == self._serial and not plan.reached:
-            message, task = plan.message, self.pursuit.task
-            if plan.far and away is not None and task is not None:
+            message, task = f"{plan.message} by the model", self.pursuit.task
+            if away is not None and task is not None:
                 message = nearest_words(*away, task.target.tolerance, "the tip")
-            elif plan.far:
-                message += " by the model"
-            text = f"the target cannot be reached: {message}"
+            text = "the target cannot be reached"
+            goal = None if task is None else task.stiffness
+            if not plan.far and goal is not None and (goal.at_least or goal.match):
+                text += " with the stiffness that is asked for"
+            elif not plan.far:
+                text = "no optimum is found for the target, only pressures that lead near it"
+            text = f"{text}: {message}"
             notices = (*notices, Notice("unreachable", text, standing=True))
         limited = self.adapted is not None and self.adapted.limits is not None
         if limited and (self.known is None or self.known.is_limited):

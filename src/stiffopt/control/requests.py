@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.control.adaptation import Adapted
 from stiffopt.control.bracing import Bracing
 from stiffopt.control.checks import check_press, check_rates, limited_range
 from stiffopt.control.course import Course
@@ -12,11 +13,12 @@ from stiffopt.control.forecast import Forecast
 from stiffopt.control.pressing import Pressing
 from stiffopt.control.replanning import AnyCourse, Pursuit
 from stiffopt.control.tuning import ControlTuning
-from stiffopt.errors import InputError, dotted
+from stiffopt.errors import EquilibriumError, InputError, dotted
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.scene import Scene
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import PressureRange, Task
+from stiffopt.optimise.tip import TipModel
 from stiffopt.paths.trajectory import Trajectory
 from stiffopt.rig.interface import PressureLimits
 from stiffopt.schema import BadKeyError
@@ -82,12 +84,19 @@ class Requests:
             _check_within(pressures, *task.pressure_bounds(self._robot.description))
 
     def check_ahead(
-        self, request: Task | Target | Trajectory, forecast: Forecast | None, leans: bool
+        self,
+        request: Task | Target | Trajectory,
+        forecast: Forecast | None,
+        leans: bool,
+        adapted: Adapted | None,
     ) -> None:
         """Refuse a request that leads the arm too near to the scene; for any thread.
 
         For a brace, or while the arm leans on objects, the way is checked when it is planned.
+        Waypoints with pressures must have an equilibrium by the present model, `adapted` or not.
         """
+        if isinstance(request, Trajectory) and request.pressures is not None:
+            self._check_equilibria(request.pressures, adapted)
         if isinstance(request, Task):
             check_press(self._robot, self._limits, request)
             if request.brace is not None:
@@ -126,6 +135,19 @@ class Requests:
         pressure = PressureRange(min=tuple(lower.tolist()), max=tuple(upper.tolist()))
         # without its load, whose actual effect is part of the tip's offset
         return task.model_copy(update={"pressure": pressure, "load": None, "press": None})
+
+    def _check_equilibria(self, pressures: Array, adapted: Adapted | None) -> None:
+        """Refuse waypoints' pressures (k, n) at which the model has no equilibrium."""
+        arm = self._robot if adapted is None else Manipulator(adapted.description)
+        model, tip = "adapted model" if adapted else "robot file", TipModel(arm)
+        for index, each in enumerate(pressures):
+            try:
+                tip.at(each)
+            except EquilibriumError as error:
+                raise InputError(
+                    f"waypoints[{index}].pressures: by the {model} the arm has no equilibrium "
+                    f"there ({error}); give this waypoint other pressures, or plan again"
+                ) from None
 
     def _check_first(self, first: Array, start: Array) -> None:
         """Refuse pressures (n,) of a waypoint at 0 s that differ from the arm's start (n,)."""

@@ -94,7 +94,10 @@ class SeenPose:
 class AdaptedNumber:
     """A number of the model as estimated during operation."""
 
-    key: Annotated[str, Shown("its key in the robot file; `base.` ones are tilts, in rad")]
+    key: Annotated[
+        str,
+        Shown("its key in the robot file; `base.`: tilts in rad; `regulator_lag`: of the rig file"),
+    ]
     value: Annotated[float, Shown("its value, in SI")]
     deviation: Annotated[float, Shown("its standard deviation, in SI")]
 

@@ -328,13 +328,14 @@ class Supervisor:
     def _present_pressures(self) -> Array:
         """Return pressures (n,) that stop the arm, in Pa.
 
-        Chambers lag behind rising commands, so these are the measured pressures. Whatever the
-        gauges read, none is above the last command or below all recent ones. A motion that is
-        doubted is undone, wholly or by a share: the pressures are nearer to the lowest recent ones.
+        Chambers lag behind commands, so these are the measured pressures. Whatever the gauges read,
+        none is above or below all recent commands. A motion that is doubted is undone, wholly or by
+        a share: the pressures are nearer to the lowest recent ones.
         """
         last, lowest = np.minimum(self._requested, self.commanded), np.min(self._recent, axis=0)
-        measured = np.maximum(self.reading.pressures, lowest)
-        held: Array = np.fmin(measured, last)  # ignores NaN: not measured
+        measured = np.clip(self.reading.pressures, lowest, np.max(self._recent, axis=0))
+        falls = measured - last > self._tuning.falls  # False for NaN: not measured
+        held: Array = np.where(falls, measured, np.fmin(measured, last))
         if (doubt := self._holds.get("doubt")) is not None:
             held = held + doubt.undo * (np.minimum(last, lowest) - held)
         return held

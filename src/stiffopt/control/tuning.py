@@ -62,10 +62,25 @@ class RegulatorTuning:
     # distance of the command from the pressure of a channel that does not follow, as a share of
     # `Safety.max_pressure_error`: less than the half at which the monitor looks for leaks
     probe_share: float = 0.4
-    # change of a reading, in Pa, below which it does not move; time for which it must not, in s
-    unmoved: float = 1e3
-    unmoved_time: float = 0.1
+    unmoved: float = 1e3  # change of a reading below which it does not move, in Pa
+    # lag and dead time of a slow regulator, as multiples of those of the rig file: its pressure is
+    # the least by which a reading must have moved
+    slow: float = 2.0
     let_down_share: float = 0.1  # share of the slew with which a removed channel is let down
+
+
+@dataclass(frozen=True)
+class LagTuning:
+    """How the lags of the regulators are adapted (`LagEstimator`)."""
+
+    deviation: float = 0.3  # of the rig file's lag, relative
+    least_deviation: float = 0.03  # below which it does not fall, so that changes are followed
+    bound: float = math.log(2)  # largest logarithm of a lag over the rig file's
+    noise: float = 5e3  # of a reading, with what the model of the regulator lacks, in Pa
+    offset: float = 3e3  # deviation of a gauge from its command at rest, in Pa
+    offset_drift: float = 3e3  # its growth, in Pa / sqrt(s)
+    gate: float = 4.0  # deviations of a reading beyond which it tells nothing about the lag
+    change: float = 0.05  # relative change of a lag below which the model keeps its own
 
 
 @dataclass(frozen=True)
@@ -149,7 +164,10 @@ class AdaptationTuning:
 
     bound: float = 3.0  # of each coordinate, in prior deviations
     mass: float = 0.01  # deviation of the tip mass that the file does not have, in kg
-    iterations: int = 2  # of Gauss-Newton
+    heavier: float = 2e-5  # mass by which the slope of the pose by the mass is taken, in kg
+    iterations: int = 10  # of Gauss-Newton, at most
+    halvings: int = 5  # of a step that does not improve the fit
+    converged: float = 0.02  # largest change of a number that ends the search, in prior deviations
     # discrepancy of the model: of the position, in m, and as a share of its displacement from rest;
     # of the orientation, in rad
     position_error: float = 1e-3
@@ -157,8 +175,8 @@ class AdaptationTuning:
     angle_error: float = 0.02
     # of the stiffness at the strains of the file's arm, relative; power of the strains with which
     # it grows, from simulated silicone
-    stiffness_error: float = 0.05
-    strain_power: float = 3.0
+    stiffness_error: float = 0.07
+    strain_power: float = 2.0
     reach: float = 5e4  # distance in pressure over which the discrepancy is correlated, in Pa
     memory: float = 1800.0  # time in which the deviation of a window's error grows e-fold, in s
     # change of an applied number, in prior deviations, below which it stays; largest one in a step
@@ -234,6 +252,7 @@ class SupervisionTuning:
     force_alarm: float = 0.5
     max_failures: int = 3  # successive failures of the controller after which pressures are held
     chamber_lag: float = 0.3  # by which the pressures in the chambers may lag behind commands, in s
+    falls: float = 3e3  # above its command, in Pa, at which a chamber is on its way down
     # time of control after which a hold is a new one, and its timeout starts again, in s
     hold_memory: float = 2.0
     # time after a doubt in which another one lets the pressures down at once, in s
@@ -278,7 +297,7 @@ class MotionTuning:
     swing_error: float = 0.35
     misses: int = 2  # successive samples that show no response
     # share of the latest motion that a hold undoes where the tip was not seen to move: the arm has
-    # followed its pressures about so far, and then swings least
+    # followed its pressures about so far, and then swings least; 0 for an arm that does not vibrate
     undo_unseen: float = 0.5
     slip_window: float = 1.0  # in which a slip is looked for, in s
     # share of the turn that a push would cause by which the measured turn must miss it
@@ -431,6 +450,7 @@ class ControlTuning:
     """Tuning of `TipController`, by part; noise, speed and damping come from the rig file."""
 
     regulators: RegulatorTuning = field(default_factory=RegulatorTuning)
+    lags: LagTuning = field(default_factory=LagTuning)
     estimator: EstimatorTuning = field(default_factory=EstimatorTuning)
     reference: ReferenceTuning = field(default_factory=ReferenceTuning)
     feedback: FeedbackTuning = field(default_factory=FeedbackTuning)
