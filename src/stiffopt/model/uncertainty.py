@@ -274,7 +274,8 @@ class Uncertainty:
         places = np.concatenate([np.arange(channels) for channels in self._channels])
         pressures = low + shares[:, places] * (high - low)
         _, _, per_pressure = self._slopes.at(pressures)
-        return squared_moves(per_pressure, self._discrepancy(pressures)).mean(axis=0)
+        moves = squared_moves(per_pressure, self._discrepancy(pressures))
+        return np.asarray(moves.mean(axis=0))
 
     def _hysteresis(self, pressures: Vector, moving: NDArray[np.bool_]) -> Vector:
         """Return mean squares (N, n) of effective minus commanded pressures (N, n), in Pa^2."""
