@@ -26,6 +26,7 @@ from stiffopt.identify.setup import Setup, recordings_of
 from stiffopt.identify.structures import STRUCTURES
 from stiffopt.logs import Log
 from stiffopt.model.calibration import Calibration, ErrorModel
+from stiffopt.model.history import History, Play
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.robot_files import load_description, save_robot
 from stiffopt.model.uncertainty import ReadingSlopes, Uncertainty, levels, squared_radius
@@ -158,6 +159,27 @@ def test_a_discrepancy_moves_the_tip_as_far_in_all_directions() -> None:
     followed = source.errors(CIRCLE[:1], effective=away)
     np.testing.assert_allclose(followed.discrepancy[0], one * np.eye(3), rtol=1e-9)
     assert not source.errors(away, effective=CIRCLE[:1]).discrepancy.any()
+
+
+def test_an_arm_with_hysteresis_keeps_a_share_of_what_was_wrong_before() -> None:
+    """At a recorded pressure it is as uncertain as where it came from, times its memory."""
+    history = History(play=(Play(width=2e4, share=0.1), Play(width=5e4, share=0.15)))
+    segment = ONE.segments[0].model_copy(update={"history": history})
+    update = {"segments": (segment,), "calibration": Calibration(errors=KNOWN)}
+    source = Uncertainty(ONE.model_copy(update=update))
+    away, back = np.array([1.6e5, 1.4e5, 1.2e5]), CIRCLE[0]
+    commands = np.array([back, away, back, back])
+    now = Uncertainty(ONE.model_copy(update={"calibration": Calibration(errors=KNOWN)}))
+    far = now.errors(away[np.newaxis]).discrepancy[0, 0, 0]
+    found = source.errors(commands, effective=commands).discrepancy[:, 0, 0]
+    expected = far * np.array([0.0, 0.75**2 + 0.25**2, 0.25**2, 0.25**2])
+    assert found == pytest.approx(expected, rel=1e-9)
+    # an unknown history may have led anywhere within the limits
+    levels = np.stack(np.meshgrid(*[(0.25, 0.75)] * 3), axis=-1).reshape(-1, 3)
+    limits = np.array(ONE.pressure_max)
+    typical = now.errors(levels * limits).discrepancy[:, 0, 0].mean()
+    unknown = source.errors(back[np.newaxis]).discrepancy[0, 0, 0]
+    assert unknown == pytest.approx(0.25**2 * typical, rel=1e-9)
 
 
 def test_what_was_not_tested_is_as_wrong_as_a_multiple_of_what_was() -> None:

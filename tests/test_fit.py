@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from itertools import pairwise
 from typing import Any
@@ -16,7 +17,7 @@ from stiffopt.errors import EquilibriumError, InputError
 from stiffopt.identify.calibration import CalibrationResult, calibrate
 from stiffopt.identify.fit import Fit, fit
 from stiffopt.identify.problem import CalibrationProblem
-from stiffopt.identify.settings import CalibrationSettings
+from stiffopt.identify.settings import FIT, CalibrationSettings
 from stiffopt.identify.setup import Setup, recordings_of
 from stiffopt.identify.structures import STRUCTURES
 from stiffopt.identify.validation import validate
@@ -175,6 +176,31 @@ def test_gross_outliers_change_little() -> None:
 
 
 # -- how well it is known -------------------------------------------------------------------
+
+
+def test_rows_in_which_pressures_change_count_less_if_they_are_wrong(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The tip swings aside whenever pressures change, which no model explains."""
+    log = log_of("lag", seed=5)
+    steps = np.abs(np.diff(log.commanded, axis=0, prepend=log.commanded[:1])).sum(axis=1)
+    swing = np.convolve(steps, np.ones(5))[: len(steps)] / 4e4
+    aside = swing[:, np.newaxis] * np.array([3e-3, -2e-3, 1e-3])
+    log = replace(log, tip_position=log.tip_position + aside)
+    held = np.random.default_rng(1).uniform(0, 1e5, (40, 3))
+    true = (BASE @ Manipulator(true_robot("lag")).tip_pose(held))[:, :3, 3]
+
+    def missed() -> float:
+        robot = calibrate(ONE, [("a.csv", log)], settings=settings("lag")).robot
+        assert robot.recordings is not None
+        base = robot.recordings.registration.tracker_in_base.inverse()
+        tips = (base @ Manipulator(robot).tip_pose(held))[:, :3, 3]
+        return float(np.linalg.norm(tips - true, axis=1).mean())
+
+    weighted = missed()
+    monkeypatch.setattr("stiffopt.identify.fit.FIT", replace(FIT, uneven=np.inf))
+    assert weighted < 0.7 * missed()
+
 
 KNOWN = ONE.model_copy(
     update={"tolerances": Tolerances(modulus_per_pressure=0.03, youngs_modulus=0.15, share=0.05)}

@@ -34,7 +34,14 @@ from stiffopt.identify.fit import Fit
 from stiffopt.identify.problem import CalibrationProblem, Sample
 from stiffopt.identify.results import Errors
 from stiffopt.identify.settings import ERRORS, FIT
-from stiffopt.model.calibration import ErrorModel, distances_from, even_variance, growth
+from stiffopt.model.calibration import (
+    ErrorModel,
+    distances_from,
+    even_variance,
+    growth,
+    squared_moves,
+)
+from stiffopt.model.history import NO_HISTORY
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.bool_]
@@ -154,9 +161,9 @@ class _Fold:
         counted = np.concatenate([sample.weight for sample in problem.samples]) > 0
         channels = _channels(fit)
         kept, spacing = representatives(channels, pressures[counted])  # as in a robot file
-        distances = distances_from(channels, predicted.effective[rows], kept) - spacing
+        distances = distances_from(channels, predicted.effective, kept) - spacing
         share = growth(np.maximum(distances, 0.0), reaches[:, np.newaxis, np.newaxis])
-        acting = predicted.per_pressure[0][rows]
+        moves = squared_moves(predicted.per_pressure[0], np.repeat(share, channels, axis=2))
         numbers = kept_unknowns(problem)
         slope = slopes[rows][:, :, numbers]
         added = _influence(problem, fit.x, fit.gain, reaches)[:, numbers[:, np.newaxis], numbers]
@@ -164,7 +171,7 @@ class _Fold:
             errors=predicted.errors[0][rows],
             parameters=_spread(slope, fit.covariance[np.ix_(numbers, numbers)]),
             through_fit=np.stack([_spread(slope, each) for each in added]),
-            direct=even_variance(acting, np.repeat(share, channels, axis=2)),
+            direct=_even_variance(moves, fit)[:, rows],
             weight=np.stack([_weights(pressures[rows], reach, independent) for reach in reaches]),
         )
 
@@ -187,6 +194,17 @@ class _Fold:
         norm = gammaln((v + 3) / 2) - gammaln(v / 2) - 1.5 * np.log(v - 2)
         each = 0.5 * (v + 3) * np.log1p(squares / (v - 2)) + 0.5 * logarithm - norm
         return float(self.weight[index] @ each)
+
+
+def _even_variance(moves: Array, fit: Fit) -> Array:
+    """Return the variance (R, M) of each axis of the tip, in m^2, by `squared_moves` (R, M, n)."""
+    memory = [
+        (segment.history or NO_HISTORY).remembered_shares(segment.n_channels)
+        for segment in fit.robot.segments
+    ]
+    logs = np.split(moves, fit.problem.starts[1:-1], axis=1)
+    worst = np.concatenate([np.maximum.accumulate(each, axis=1) for each in logs], axis=1)
+    return even_variance(moves, worst, np.concatenate(memory))
 
 
 def _spread(slope: Array, covariance: Array) -> Array:

@@ -1,11 +1,12 @@
 """Robust nonlinear least squares with priors, and the covariance of the result.
 
 Residuals of real arms are not white noise.  Rows at nearby pressures share the model's systematic
-error (`stiffopt.identify.discrepancy`), and the remaining errors are correlated in time.  The fit
-therefore alternates with an estimate of the noise: it divides the remaining errors by their robust
-spread, and weights the rows by the number of independent ones among them, from the errors'
-autocorrelation.  Only then are priors and covariance meaningful: numbers that a recorded curve in
-pressure space does not determine stay near the robot file, however often the curve was repeated.
+error (`stiffopt.identify.discrepancy`), the remaining errors are correlated in time, and they are
+larger where pressures have just changed.  The fit therefore alternates with an estimate of the
+noise: it divides the remaining errors by the robust spread of rows with as much change, and weights
+the rows by the number of independent ones among them, from the errors' autocorrelation.  Only then
+are priors and covariance meaningful: numbers that a recorded curve in pressure space does not
+determine stay near the robot file, however often the curve was repeated.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt.errors import InputError
-from stiffopt.identify.problem import CalibrationProblem, Noise, Predicted
+from stiffopt.identify.problem import CalibrationProblem, Noise, Predicted, Sample
 from stiffopt.identify.settings import FIT
 from stiffopt.model.description import RobotDescription
 
@@ -155,9 +156,14 @@ def _reweighted(
     read = [read.turn for read in predicted.read if read.turn is not None]
     turns = [problem.unshared(turn, "angle") for turn in read]
     angle = _spread(np.concatenate(turns), FIT.least_angle) if turns else problem.noise.angle
-    found = _rows_per_independent(problem, moves[0])
+    spread = _spread_by_change(problem, moves[0])
+    found = _rows_per_independent(problem, moves[0] / spread)
     factor = np.sqrt(independent / found)
-    samples = [replace(sample, weight=sample.weight * factor) for sample in problem.samples]
+    parts = np.split(spread[:, 0], problem.starts[1:-1])
+    samples = [
+        replace(sample, weight=sample.weight * factor * sample.spread / own, spread=own)
+        for sample, own in zip(problem.samples, parts, strict=True)
+    ]
     return problem.with_samples(samples, Noise(position, angle, FIT.systematic)), found
 
 
@@ -169,6 +175,40 @@ def _spread(errors: Array, least: float) -> float:
     middle = 1.4826 * float(np.median(np.abs(known)))
     kept = np.clip(known, -4 * middle, 4 * middle)
     return max(float(np.sqrt(np.mean(kept**2))), least)
+
+
+def _spread_by_change(problem: CalibrationProblem, errors: Array) -> Array:
+    """Return the spread (M, 1) of errors (M, 3), over that of all, by change of pressure.
+
+    A tracker that is read a moment late, or a lag that is not quite so, is wrong only where the
+    pressures have just changed. The rows are divided into classes of equal size by how much they
+    did; more change never means a smaller spread. All have the same if the classes hardly differ,
+    or contain too few independent rows to tell.
+    """
+    same = np.ones((len(errors), 1))
+    counted = problem.counted & np.isfinite(errors).all(axis=1)
+    independent = counted.sum() / _rows_per_independent(problem, errors)
+    classes = min(FIT.classes, int(independent / FIT.class_rows))
+    if classes < 2:
+        return same
+    change = np.concatenate([_recent_change(sample) for sample in problem.samples])
+    shares = np.arange(1, classes) / classes
+    edges = np.unique(np.quantile(change[counted], shares, method="lower"))
+    edges = edges[edges < change[counted].max()]  # so that no class is empty
+    own = np.searchsorted(edges, change)
+    members = [errors[counted & (own == each)] for each in range(len(edges) + 1)]
+    spreads = np.maximum.accumulate([_spread(each, FIT.least_position) for each in members])
+    if spreads[-1] < FIT.uneven * spreads[0]:
+        return same
+    return np.asarray(spreads[own][:, np.newaxis] / _spread(errors, FIT.least_position))
+
+
+def _recent_change(sample: Sample) -> Array:
+    """Return by how much the pressures changed, up and down, before each row (M,), in Pa."""
+    time, pressures = sample.recording.time, sample.recording.pressures
+    travelled = np.concatenate([[0.0], np.abs(np.diff(pressures, axis=0)).sum(axis=1).cumsum()])
+    before = np.maximum(np.searchsorted(time, time - FIT.recent) - 1, 0)
+    return np.asarray((travelled - travelled[before])[sample.rows])
 
 
 def _rows_per_independent(problem: CalibrationProblem, moves: Array) -> float:

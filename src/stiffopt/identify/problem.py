@@ -52,6 +52,7 @@ class Sample:
     recording : Recording
     rows : (M,), indices of rows, increasing.
     weight : factor (M,) on the residuals of each row.
+    spread : deviation (M,) of each row's noise over `Noise.position`; `weight` accounts for it.
     begin : state of the arm when the recording begins.
     """
 
@@ -59,6 +60,7 @@ class Sample:
     rows: NDArray[np.intp]
     weight: Array
     begin: Begin = "rest"
+    spread: Array | float = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,6 +182,11 @@ class CalibrationProblem:
         return {unknown.name: float(value) for unknown, value in pairs}
 
     @property
+    def counted(self) -> NDArray[np.bool_]:
+        """Which rows (M,) are not held back."""
+        return np.asarray(self._weights > 0)
+
+    @property
     def n_shared(self) -> int:
         """How many of the residuals, at the end, are coefficients of systematic errors."""
         if not (self.noise.systematic and self.samples):
@@ -201,6 +208,7 @@ class CalibrationProblem:
         other.samples, other.noise = tuple(samples), noise
         other._weights = np.concatenate([sample.weight for sample in samples])
         other._of_rows = {}
+        other.__dict__.pop("_functions", None)
         return other
 
     def robot(self, x: Array) -> RobotDescription:
@@ -324,6 +332,23 @@ class CalibrationProblem:
 
     @cached_property
     def _functions(self) -> Array:
+        """Functions (M, m) of the errors that rows share.
+
+        What noisier rows have wrong beyond the others, as while pressures change, returns whenever
+        these commands are repeated: that part is shared too.
+        """
+        rows = [np.broadcast_to(each.spread, each.rows.shape) for each in self.samples]
+        spread = np.concatenate(rows)
+        if not np.ptp(spread):
+            return self._smooth
+        shared = self.noise.systematic * self.description.length
+        excess = (
+            np.sqrt(np.maximum(spread**2 - spread.min() ** 2, 0)) * self.noise.position / shared
+        )
+        return np.hstack([self._smooth, self._smooth * excess[:, np.newaxis]])
+
+    @cached_property
+    def _smooth(self) -> Array:
         rows = [sample.recording.pressures[sample.rows] for sample in self.samples]
         return smooth_functions(np.concatenate(rows))
 

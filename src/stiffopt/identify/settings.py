@@ -177,6 +177,9 @@ class FitSettings:
     near : correlation length of these errors, as a share of the highest recorded pressure.
     centres_apart, most_centres : spacing of their centres, in correlation lengths, and largest
         number of centres.
+    recent, classes, class_rows, uneven : the noise of a row depends on how much the pressures
+        changed in the last `recent` s, by `classes` of rows, fewer if one had less than
+        `class_rows` independent ones; it does not if it grows by less than the factor `uneven`.
     """
 
     loss_scale: float = 2.0
@@ -196,6 +199,10 @@ class FitSettings:
     near: float = 0.3
     centres_apart: float = 0.7
     most_centres: int = 80
+    recent: float = 0.6
+    classes: int = 6
+    class_rows: int = 25
+    uneven: float = 1.5
 
 
 @dataclass(frozen=True)

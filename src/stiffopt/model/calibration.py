@@ -152,13 +152,30 @@ def growth(distances: Array, reach: float | Array) -> Array:
     return np.asarray(-np.expm1(-2 * distances / reach))
 
 
-def even_variance(per_pressure: Array, variances: Array) -> Array:
+def squared_moves(per_pressure: Array, variances: Array) -> Array:
+    """Return mean squares (..., N, n), in m^2, by which discrepancies of pressures move the tip.
+
+    Parameters
+    ----------
+    per_pressure : derivatives (N, 3, n) of the tip's position, in m/Pa.
+    variances : of the channels' discrepancies (..., N, n), in Pa^2.
+    """
+    return np.asarray(variances * (per_pressure**2).sum(axis=1))
+
+
+def even_variance(moves: Array, worst: Array, memory: Array) -> Array:
     """Return the variance (..., N) of each axis of the tip, in m^2, the same for all directions.
 
-    It is a third of the mean square by which pressures of these variances (..., N, n), in Pa^2,
-    would move the tip, with its derivatives (N, 3, n), in m/Pa.
+    An arm with hysteresis answers to former pressures too, and to what the model has wrong there.
+
+    Parameters
+    ----------
+    moves : by the discrepancy at the pressures of now, as `squared_moves` (..., N, n).
+    worst : largest of them where the arm was before.
+    memory : share (n,) of each channel's pressure that acts through hysteresis.
     """
-    return np.asarray((variances * (per_pressure**2).sum(axis=1)).sum(axis=-1) / 3)
+    found = (1 - memory) ** 2 * moves + memory**2 * np.maximum(worst, moves)
+    return np.asarray(found.sum(axis=-1) / 3)
 
 
 def distances_from(channels: Sequence[int], pressures: Array, recorded: Array) -> Array:

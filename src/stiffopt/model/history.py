@@ -153,6 +153,11 @@ class History(Schema):
         of_elongation, of_bending = self.shares
         return 1 - memory * (of_elongation + 2 * of_bending) / 3
 
+    def remembered_shares(self, n_channels: int) -> Array:
+        """Return the shares (c,) of the channels' pressures that act through play and creep."""
+        memory = np.array([self.memory_of(channel) for channel in range(n_channels)])
+        return np.asarray(max(self.shares) * memory)
+
     @property
     def n_states(self) -> int:
         """Number of states of one channel: x, each y and each z."""

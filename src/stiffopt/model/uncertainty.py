@@ -18,6 +18,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import product
 from typing import Literal
 
 import numpy as np
@@ -25,7 +26,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from stiffopt.errors import InputError
 from stiffopt.model.arguments import checked_measure
-from stiffopt.model.calibration import Calibration, even_variance
+from stiffopt.model.calibration import Calibration, even_variance, squared_moves
 from stiffopt.model.compliance import Boundary, Frame, Kind
 from stiffopt.model.description import RobotDescription
 from stiffopt.model.history import NO_HISTORY, History, part_of
@@ -203,8 +204,8 @@ class Uncertainty:
         Parameters
         ----------
         pressures : commanded (N, n), in Pa.
-        effective : effective pressures (N, n) in Pa after a known history; without these the
-            prediction is `tip_pose` at the commanded ones.
+        effective : effective pressures (N, n) in Pa after a known history, in order of time;
+            without these the prediction is `tip_pose` at the commanded ones.
         moving : which rows (N,) are not held; none by default.
         """
         u = pressures if effective is None else effective
@@ -214,13 +215,15 @@ class Uncertainty:
         if effective is None:
             still = moving if moving is not None else np.zeros(len(pressures), dtype=bool)
             acting = self._hysteresis(pressures, still)
+        moves = squared_moves(per_pressure, self._discrepancy(u))
+        worst = self._typical_moves if effective is None else np.maximum.accumulate(moves)
         errors = self._calibration.errors
         residual = self._calibration.position_residual if errors is None else errors.residual
         return PositionErrors(
             position=position,
             parameters=per_number @ self._covariance @ np.swapaxes(per_number, 1, 2),
             hysteresis=(per_pressure * acting[:, np.newaxis]) @ transposed,
-            discrepancy=even_variance(per_pressure, self._discrepancy(u))[:, np.newaxis, np.newaxis]
+            discrepancy=even_variance(moves, worst, self._memory)[:, np.newaxis, np.newaxis]
             * np.eye(3),
             residual=np.broadcast_to(np.eye(3) * residual**2, (len(u), 3, 3)),
         )
@@ -253,6 +256,26 @@ class Uncertainty:
         if errors is None:
             return np.zeros_like(pressures)
         return errors.variances(self._channels, pressures)
+
+    @cached_property
+    def _memory(self) -> Vector:
+        """Shares (n,) of the channels' pressures that act through hysteresis."""
+        shares = [
+            (segment.history or NO_HISTORY).remembered_shares(segment.n_channels)
+            for segment in self._description.segments
+        ]
+        return np.concatenate(shares)
+
+    @cached_property
+    def _typical_moves(self) -> Vector:
+        """Mean squares (n,) by which the discrepancy moves the tip within the limits, in m^2."""
+        low, high = np.array([self._description.pressure_min, self._description.pressure_max])
+        shares = np.array(list(product((0.25, 0.75), repeat=max(self._channels))))
+        places = np.concatenate([np.arange(channels) for channels in self._channels])
+        pressures = low + shares[:, places] * (high - low)
+        _, _, per_pressure = self._slopes.at(pressures)
+        moves = squared_moves(per_pressure, self._discrepancy(pressures))
+        return np.asarray(moves.mean(axis=0))
 
     def _hysteresis(self, pressures: Vector, moving: NDArray[np.bool_]) -> Vector:
         """Return mean squares (N, n) of effective minus commanded pressures (N, n), in Pa^2."""
