@@ -299,7 +299,7 @@ class PathTasks:
         return self.accepted(index, pressures, self.judged_at(index, pressures))
 
     def hold(self, slopes: Slopes) -> bool:
-        """Whether all points are within their tolerances; `slopes` are those of all points."""
+        """Return whether all points are within their tolerances, by the slopes of all points."""
         for c, radii in zip(self.own_constraints, self.radii.T, strict=True):
             r = slopes.residuals[:, c.first : c.end]
             sizes = r[:, 0] if c.one_sided else np.linalg.norm(r, axis=1)

@@ -17,6 +17,7 @@ import numpy as np
 from scipy import sparse
 
 from stiffopt.model.stopping import checkpoint
+from stiffopt.paths.cones import minimised
 from stiffopt.paths.links import Vector
 from stiffopt.paths.points import PathCandidate, PathTasks, Slopes
 from stiffopt.paths.settings import QUICKENING, REFINEMENT
@@ -144,15 +145,11 @@ class _Program:
         size = self._pressures.size + 1
         P = sparse.diags(np.append(np.full(size - 1, QUICKENING.damping), 0.0), format="csc")
         q = np.append(np.zeros(size - 1), 1.0)
-        settings = clarabel.DefaultSettings()
-        settings.verbose = False
-        settings.max_threads = 1
         A = sparse.csc_matrix(sparse.vstack(self._rows))
-        b = np.concatenate(bounds)
-        solution = clarabel.DefaultSolver(P, q, A, b, self._cones, settings).solve()
-        if str(solution.status) not in ("Solved", "AlmostSolved"):
+        solution = minimised(P, q, A, np.concatenate(bounds), self._cones)
+        if solution is None:
             return None
-        d = np.array(solution.x)[:-1].reshape(self._pressures.shape)
+        d = solution[0][:-1].reshape(self._pressures.shape)
         found = np.clip(self._pressures + d * tasks.unit, tasks.lower, tasks.upper)
         found[self._is_fixed] = self._pressures[self._is_fixed]
         if self._is_closed:

@@ -25,6 +25,7 @@ from scipy import sparse
 from stiffopt.model.stopping import checkpoint
 from stiffopt.optimise.program import Constraint
 from stiffopt.optimise.settings import DESCENT
+from stiffopt.paths.cones import minimised
 from stiffopt.paths.points import PathTasks, Slopes, joined
 from stiffopt.paths.settings import REFINEMENT
 
@@ -303,14 +304,11 @@ class _Window:
         q[slack : slack + k] = self._price
         if worst:
             q[-1] = 1.0
-        settings = clarabel.DefaultSettings()
-        settings.verbose = False
-        settings.max_threads = 1
         A, bounds = rows.matrix()
-        solution = clarabel.DefaultSolver(P, q, A, bounds, cones, settings).solve()
-        if str(solution.status) not in ("Solved", "AlmostSolved"):
+        solution = minimised(P, q, A, bounds, cones)
+        if solution is None:
             return None
-        x, z = np.array(solution.x), np.array(solution.z)
+        x, z = solution
         d = x[: k * n].reshape(k, n)
         pulls = np.zeros(state.slopes.residuals.shape)
         at = balls_from
