@@ -249,7 +249,7 @@ def _regulation(robot: RobotDescription, control: ControlSettings) -> tuple[Arra
 
 
 def _has_lags(robot: RobotDescription) -> bool:
-    """Whether the robot file has lags, which are those of the arm behind its gauges too."""
+    """Return whether the robot file has lags; such a lag includes that of the arm."""
     return any(s.history is not None and s.history.lag > 0 for s in robot.segments)
 
 

@@ -23,7 +23,7 @@ _LEAST_GRIP = 0.05  # where the contact itself is in doubt; its normal force is 
 
 
 class BraceUncertainty:
-    """What the calibration of an arm leaves in doubt of an equilibrium in contact.
+    """The uncertainty of an equilibrium in contact that remains after the arm's calibration.
 
     All of it is zero for a robot that is not calibrated.
     """

@@ -35,7 +35,6 @@ class LaneSettings:
     kept : largest number of configurations that are followed in either direction.
     marks : largest number of points of a region at which they are followed, one after another.
     every : number of points from one mark to the next, if that makes fewer marks.
-    iterations : largest number, to bring configurations to a target.
     aside : largest distance of new ones sought beside each, as a share of a channel's range.
     apart : smallest distance of a new one from the others, as a share of a channel's range.
     alike : distance below which one of two followed configurations is dropped.
@@ -50,7 +49,6 @@ class LaneSettings:
     alike: float = 0.02
     marks: int = 32
     every: int = 4
-    iterations: int = 4
 
 
 @dataclass(frozen=True)

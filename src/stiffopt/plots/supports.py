@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _COLOURS, _IMPOSSIBLE = "viridis", "#d5d9dd"
-_SHOWN = 3  # supports that are drawn beside the arm
+_SHOWN = 3  # supports listed in the title
 
 
 def plot_supports(
