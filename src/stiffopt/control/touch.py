@@ -249,7 +249,7 @@ class TouchEstimator:
 
     def _moved(self, pressures: Array, tip: TipAt) -> Array:
         """Return displacements (3, s) of the model's tip by segment since the last sample, in m."""
-        columns = tip.jacobian[:3] * (pressures - self._pressures)
+        columns = tip.pose[:3, :3] @ tip.jacobian[:3] * (pressures - self._pressures)
         self._pressures = pressures.copy()
         moved: Array = np.add.reduceat(columns, self._ends, axis=1)
         return moved
