@@ -28,6 +28,7 @@ from stiffopt.control.tuning import CreepTuning
 Array = NDArray[np.float64]
 
 _FAR = 25.0  # squared distance in deviations of a sample that is no creep
+_UNLIKELY = 3.0  # deviations of a share from what is believed that no arm has
 
 
 class CreepEstimator:
@@ -49,12 +50,10 @@ class CreepEstimator:
         self._states: Array = np.zeros((count, n))  # z, in Pa
         self._behind: Array = np.zeros((count, n))  # z - p
         self._phi: Array = np.zeros((3, count))
-        share, deviation = (0.0, tuning.known) if known else (tuning.share, tuning.deviation)
-        self._mean = np.concatenate([np.zeros(3), np.full(count, share)])  # e in m, and a
-        self._covariance = np.diag(
-            np.concatenate([np.full(3, tuning.first_error**2), np.full(count, deviation**2)])
-        )
-        self.begin()
+        # mean and deviation of the shares before anything is learned
+        self._prior = (0.0, tuning.known) if known else (tuning.share, tuning.deviation)
+        self._mean, self._covariance = np.zeros(3 + count), np.zeros((3 + count, 3 + count))
+        self._unlearn()
 
     def begin(self) -> None:
         """Forget the model's error; what is known about the arm's creep stays."""
@@ -63,6 +62,13 @@ class CreepEstimator:
         error[:, :3] = np.eye(3) * self._tuning.first_error**2
         self._sum, self._count, self._elapsed = np.zeros((3, 1 + len(self._times))), 0, 0.0
         self._noise = 0.0
+
+    def _unlearn(self) -> None:
+        """Restart from what is believed about any arm."""
+        share, deviation = self._prior
+        self._mean[3:] = share
+        self._covariance[:] = deviation**2 * np.eye(len(self._mean))
+        self.begin()
 
     @property
     def shares(self) -> Array:
@@ -153,6 +159,9 @@ class CreepEstimator:
         left = np.eye(len(m)) - gain @ H
         self._covariance = left @ P @ left.T + gain @ noise @ gain.T
         self._sum[:], self._count, self._elapsed, self._noise = 0.0, 0, 0.0, 0.0
+        share, deviation = self._prior
+        if (np.abs(self.shares - share) > _UNLIKELY * deviation).any():
+            self._unlearn()  # it was no creep, such as a contact that nobody noticed
 
     def skip(self) -> None:
         """Something touches the tip: the model's error may be another one afterwards."""
