@@ -4,12 +4,12 @@ Creep is what `stiffopt.model.history` says: a share a_k of the pressures p acts
 z_k, ``T_k z_k' = p - z_k``. For given time constants T_k it displaces the tip, relative to the
 model of an arm that does not creep, by
 
-    c = sum_k a_k phi_k,    phi_k = J (z_k - p),
+    q = sum_k a_k phi_k,    phi_k = J (z_k - p),
 
 with the Jacobian J of the tip. The pressures' past determines phi, so a few numbers a_k, the same
 for all motions and axes, describe the creep of the arm. A Kalman filter estimates them together
 with the remaining error e of the model, which changes with motion; what changes at rest in the
-directions and at the rates of phi is creep. It learns while nothing touches the tip. Then c is
+directions and at the rates of phi is creep. It learns while nothing touches the tip. Then q is
 known, with its covariance, also while something does.
 
 A robot file or a calibration may have a creep of its own: effective pressures contain it, and a_k
@@ -95,7 +95,7 @@ class CreepEstimator:
         return math.sqrt(change @ self._covariance[3:, 3:] @ change)
 
     def take_over(self, jacobian: Array) -> Array:
-        """Change to the Jacobian (3, n) of another model; return the change of c (3,), in m.
+        """Change to the Jacobian (3, n) of another model; return the change of q (3,), in m.
 
         The tip stays where it is: the model's error takes up the change.
         """

@@ -93,7 +93,8 @@ class ArmObserver:
             damping=control.damping,
             tuning=replace(tuning.touch, noise=max(tuning.touch.noise, 2 * control.tracker_noise)),
             creep=CreepEstimator(
-                n, any(s.history and s.history.creep for s in robot.description.segments),
+                n,
+                any(s.history and s.history.creep for s in robot.description.segments),
                 replace(tuning.creep, noise=max(tuning.creep.noise, 2 * control.tracker_noise)),
             ),
         )

@@ -10,11 +10,11 @@ e, and a speed eta of xi::
 
 A force F on the tip displaces it by u = C F in the directions in which it is soft; along a stiff
 axis no force can be felt. e is the error of the model. It changes with motion, by a share of the
-way, and creeps at the rate b, which motion sets off. xi is the part of the first bending mode's
-vibration that pressures do not explain. A force that begins displaces the equilibrium, not the tip:
-u + xi stays the same, so the following vibration shows its size before it has decayed. While the
-tip approaches something along n, g is the error per way s_n of the model's tip along n; it is
-learned before the contact.
+way, and creeps at the rate b, which motion sets off; the creep that can be predicted is part of s
+(`stiffopt.control.creep`). xi is the part of the first bending mode's vibration that pressures do
+not explain. A force that begins displaces the equilibrium, not the tip: u + xi stays the same, so
+the following vibration shows its size before it has decayed. While the tip approaches something
+along n, g is the error per way s_n of the model's tip along n; it is learned before the contact.
 
 In one sample, force and error look alike; they differ in how they begin. Without contact, u is
 zero. At intervals a hypothesis starts: a force has just begun, changed or gone. Each hypothesis is
