@@ -3,8 +3,9 @@
 A press starts at the task's target. From there the tip's position without contact, s(p) + d, is
 shifted by v along the direction n. The offset d is corrected across n only; along n it keeps its
 value from the beginning of the approach, plus the predicted creep since then. So the controller
-does not compensate what holds the tip back: the arm presses like a spring with its own compliance c along n. Until a force is felt, v
-grows with the speed of the approach. Then, with the wanted force F and the estimated force f::
+does not compensate what holds the tip back: the arm presses like a spring with its own compliance c
+along n. Until a force is felt, v grows with the speed of the approach. Then, with the wanted force
+F and the estimated force f::
 
     v' = c (F - f) / T,    not faster than the speed of the approach
 
