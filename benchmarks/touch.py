@@ -31,7 +31,13 @@ from stiffopt.model.robot_files import load_description
 from stiffopt.optimise.press import soft_directions
 from stiffopt.paths.trajectory import Trajectory, Waypoint
 from stiffopt.plant.plant import Plant
-from stiffopt.plant.settings import PlantLoad, PlantSettings, SoftSurface
+from stiffopt.plant.settings import (
+    PlantLoad,
+    PlantSettings,
+    Silicone,
+    SiliconeCreep,
+    SoftSurface,
+)
 from stiffopt.rig.assembly import make_rig
 from stiffopt.rig.config import limits_of, load_rig_description, slew_of
 
@@ -60,8 +66,21 @@ class Found:
     failed: list[str] = field(default_factory=list)
 
 
+def drawn_creep(seed: int) -> tuple[SiliconeCreep, ...]:
+    """Return an arm's creep: one term or two, of up to 8 % in all, within 1 to 40 s."""
+    rng = np.random.default_rng([seed, 23])
+    shares = rng.uniform(0, 0.08) * rng.dirichlet(np.ones(rng.integers(1, 3)))
+    times = np.exp(rng.uniform(0, np.log(40), len(shares)))
+    return tuple(
+        SiliconeCreep(share=float(share), time=float(time))
+        for share, time in zip(shares, times, strict=True)
+    )
+
+
 class Arm:
     """An arm under control, in simulated time."""
+
+    draws_creep = False
 
     def __init__(
         self, name: str, seed: int, dynamics: str, surface: SoftSurface | None = None
@@ -69,9 +88,11 @@ class Arm:
         description = load_rig_description(RIG)
         robot = load_description(name)
         rng = np.random.default_rng([seed, 21])
+        silicone = Silicone(creep=drawn_creep(seed)) if self.draws_creep else Silicone()
         plant = PlantSettings(
-            mismatch=_mismatch(robot, rng), seed=seed, dynamics=dynamics, surface=surface
-        )
+            mismatch=_mismatch(robot, rng), silicone=silicone, seed=seed, dynamics=dynamics,
+            surface=surface,
+        )  # fmt: skip
         tracker = description.tracker.model_copy(update={"noise": 5e-5})
         update = {"robot": name, "plant": plant, "tracker": tracker}
         description = description.model_copy(update=update)
@@ -230,7 +251,9 @@ def main() -> None:
     parser.add_argument("--robots", nargs="+", default=list(ROBOTS))
     parser.add_argument("--dynamics", choices=DYNAMICS, nargs="+", default=list(DYNAMICS))
     parser.add_argument("--what", nargs="+", default=["pushes", "free", "press"])
+    parser.add_argument("--draw-creep", action="store_true", help="another creep for each arm")
     given = parser.parse_args()
+    Arm.draws_creep = given.draw_creep
     rows = []
     for name in given.robots:
         for dynamics in given.dynamics:

@@ -14,9 +14,10 @@ from scipy.integrate import solve_ivp
 from conftest import is_long
 from stiffopt import Press, StiffnessGoal, StiffnessMeasure, Target, Task, load_robot, load_task
 from stiffopt.control.controller import TipController
+from stiffopt.control.creep import CreepEstimator
 from stiffopt.control.pressing import Phase, Pressing
 from stiffopt.control.touch import TipForce, TouchEstimator, _vibration
-from stiffopt.control.tuning import PressingTuning, TouchTuning
+from stiffopt.control.tuning import CreepTuning, PressingTuning, TouchTuning
 from stiffopt.control.vibration import transition
 from stiffopt.errors import InputError
 from stiffopt.model.robot_files import load_description
@@ -192,6 +193,7 @@ class Spring:
 
     def __init__(self, at: float, stiffness: float, press: Press = PRESS, late: int = 10) -> None:
         self.pressing = Pressing(press, TARGET, PressingTuning())
+        self.creep = CreepEstimator(3, False, CreepTuning())  # of an arm that has not moved
         self.at, self.stiffness, self.late = at, stiffness, late
         self.forces: list[float] = []
         self.kinds: list[str] = []
@@ -207,7 +209,9 @@ class Spring:
             seen = self.forces[-self.late] if len(self.forces) > self.late else 0.0
             force = TipForce(seen > 3e-3, -seen * N, 1e-6 * np.eye(3), -0.1 * seen * N)
             offset = np.concatenate([tip - [0.02 + free, 0.0, 0.1], np.zeros(3)])
-            self.pressing.advance(0.01, True, True, tip, offset, force, np.eye(3), COMPLIANCE)
+            self.pressing.advance(
+                0.01, True, True, tip, offset, force, self.creep, np.eye(3), COMPLIANCE
+            )
             self.kinds += [n.kind for n in self.pressing.notices() if n.kind not in self.kinds]
 
 
@@ -277,6 +281,54 @@ def test_the_offset_is_kept_along_the_direction_only() -> None:
     np.testing.assert_allclose(arm.pressing.corrected(offset), [0, *offset[1:]], atol=1e-12)
     waiting = Pressing(PRESS, TARGET, PressingTuning())
     assert waiting.corrected(offset) is offset
+
+
+def test_it_waits_until_the_creep_to_come_is_known_but_not_for_ever() -> None:
+    arm, t = Spring(0.003, 200.0), PressingTuning()
+    arm.creep.advance(np.inf, np.zeros(3), 4e-7 * np.eye(3))
+    arm.creep.advance(0.5, np.full(3, 2e5), 4e-7 * np.eye(3))  # 80 mm, whose creep is to come
+    arm.run(t.longest_rest - 0.5)
+    assert arm.pressing.phase is Phase.GOING
+    arm.run(1.0)
+    assert arm.pressing.phase is Phase.APPROACHING
+
+
+def test_it_does_not_begin_while_something_touches_the_tip() -> None:
+    pressing, force = (
+        Pressing(PRESS, TARGET, PressingTuning()),
+        TipForce(True, 0.05 * N, 1e-6 * np.eye(3), 5e-3 * N),
+    )
+    still, tip, offset = CreepEstimator(3, False, CreepTuning()), np.zeros(3), np.zeros(6)
+    for _ in range(900):
+        pressing.advance(0.01, True, True, tip, offset, force, still, np.eye(3), COMPLIANCE)
+    assert pressing.phase is Phase.GOING
+    assert pressing.begins_free
+    assert [notice.kind for notice in pressing.notices()] == ["press-waits"]
+
+
+def test_the_creep_that_is_predicted_moves_the_pressed_arm_back() -> None:
+    arm = Spring(0.003, 200.0)
+    arm.run(6.0)
+    offset = np.array([-3e-3, 1e-3, 2e-3, 0.1, 0.2, 0.3])
+    kept = arm.pressing.corrected(offset)
+    arm.creep.advance(np.inf, np.zeros(3), 4e-7 * np.eye(3))
+    arm.creep.advance(0.5, np.array([1e4, 2e4, 0]), 4e-7 * np.eye(3))
+    arm.run(0.01)
+    changed = arm.pressing.corrected(offset) - kept
+    np.testing.assert_allclose(changed[:3], N * arm.creep.displacement[0], atol=1e-12)
+    assert changed[0] < 0
+
+
+def test_a_force_that_is_forgotten_is_an_error_of_the_model() -> None:
+    estimator = TouchEstimator([3], vibrates=False, damping=0.04, tuning=TouchTuning())
+    rng = np.random.default_rng(3)
+    for time in np.arange(0, 8, FRAME):
+        away = C @ PUSH * (time > 2.0) + NOISE * rng.standard_normal(3)
+        if abs(time - 4.0) < FRAME / 2:
+            assert estimator.felt.touches
+            estimator.forget()
+        estimator.take(time, away, P, TIP)
+        assert not (time > 4.1 and estimator.felt.touches)
 
 
 @pytest.mark.usefixtures("compiled")

@@ -436,7 +436,8 @@ class TipController:
         elapsed = min(now - self._computed_at, _HELD * self._period)
         course.advance(
             elapsed, self._rests(now), self._is_known(now), self._arm.tip.estimate.position,
-            self._arm.tip.offset, self._arm.touch.felt, R, R @ tip.compliance[:3, :3] @ R.T,
+            self._arm.tip.offset, self._arm.touch.felt, self._arm.touch.creep,
+            R, R @ tip.compliance[:3, :3] @ R.T,
         )  # fmt: skip
 
     def _is_known(self, now: float) -> bool:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from stiffopt.control.bracing import Bracing
 from stiffopt.control.channels import Channels
+from stiffopt.control.creep import CreepEstimator
 from stiffopt.control.estimator import TipEstimator
 from stiffopt.control.interface import SampleCounts
 from stiffopt.control.linearised_tip import ArmModel, LeaningTip, LinearisedTip
@@ -91,6 +92,11 @@ class ArmObserver:
             vibrates=mode is not None,
             damping=control.damping,
             tuning=replace(tuning.touch, noise=max(tuning.touch.noise, 2 * control.tracker_noise)),
+            creep=CreepEstimator(
+                n,
+                any(s.history and s.history.creep for s in robot.description.segments),
+                replace(tuning.creep, noise=max(tuning.creep.noise, 2 * control.tracker_noise)),
+            ),
         )
         motion = replace(tuning.motion, scatter=control.tracker_noise)
         if mode is None:  # it stops where its chambers stop
@@ -191,6 +197,8 @@ class ArmObserver:
             self.touch.expect(course.direction, course.press.speed, presses=course.presses)
         else:
             self.touch.expect(None)
+            if isinstance(course, Pressing) and course.begins_free and self.touch.felt.touches:
+                self.touch.forget()
         self.touch.take(sample.time, sample.position - predicted, effective, tip, self.tip.omega)
         if presses:
             pushed = self.touch.felt.displacement

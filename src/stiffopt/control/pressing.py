@@ -2,9 +2,10 @@
 
 A press starts at the task's target. From there the tip's position without contact, s(p) + d, is
 shifted by v along the direction n. The offset d is corrected across n only; along n it keeps its
-value from the beginning of the approach. So the controller does not compensate what holds the tip
-back: the arm presses like a spring with its own compliance c along n. Until a force is felt, v
-grows with the speed of the approach. Then, with the wanted force F and the estimated force f::
+value from the beginning of the approach, plus the predicted creep since then. So the controller
+does not compensate what holds the tip back: the arm presses like a spring with its own compliance c
+along n. Until a force is felt, v grows with the speed of the approach. Then, with the wanted force
+F and the estimated force f::
 
     v' = c (F - f) / T,    not faster than the speed of the approach
 
@@ -21,11 +22,12 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.control.creep import CreepEstimator
 from stiffopt.control.interface import Notice
 from stiffopt.control.state import Severity
 from stiffopt.control.touch import TipForce
 from stiffopt.control.tuning import PressingTuning
-from stiffopt.optimise.press import Feeling, Press
+from stiffopt.optimise.press import FELT_FORCE, FELT_SHARE, Feeling, Press
 from stiffopt.optimise.target import Target
 
 Array = NDArray[np.float64]
@@ -64,8 +66,11 @@ class Pressing:
         self._shift = 0.0  # v, in m
         self._start: Array = np.zeros(3)  # tip (3,) when the approach began
         self._offset: Array = np.zeros(6)  # d at that time
+        self._crept: Array = np.zeros(3)  # creep (3,) at that time, and since then
+        self._creep: Array = np.zeros(3)
         # durations, in s: at rest, without a force, within and outside the tolerance
         self._waited = self._felt_nothing = self._within = self._off = 0.0
+        self._pushed = 0.0  # how long something has pushed the tip before the approach, in s
         self._touched, self._why = False, ""
         self._notices: list[Notice] = []
 
@@ -98,6 +103,11 @@ class Pressing:
         return self.phase is Phase.PRESSING and self._touched
 
     @property
+    def begins_free(self) -> bool:
+        """Whether the arm rests before the approach, where nothing must touch the tip."""
+        return self.phase is Phase.GOING and self._waited >= self._tuning.rest
+
+    @property
     def direction(self) -> Array:
         """Direction (3,) of the approach, base axes."""
         return self._direction
@@ -112,7 +122,7 @@ class Pressing:
         if not self.touches_on_purpose:
             return offset
         n, corrected = self._direction, offset.copy()
-        corrected[:3] += n * float(n @ (self._offset[:3] - offset[:3]))
+        corrected[:3] += n * float(n @ (self._offset[:3] + self._creep - offset[:3]))
         return corrected
 
     def change_model(self, change: Array) -> None:
@@ -127,6 +137,7 @@ class Pressing:
         tip: Array,
         offset: Array,
         felt: TipForce,
+        creep: CreepEstimator,
         rotation: Array,
         compliance: Array,
     ) -> None:
@@ -144,18 +155,26 @@ class Pressing:
             Position (3,) of the tip, in m, and its offset (6,) from the model.
         felt :
             Estimated force on the tip.
+        creep :
+            Estimator of the tip's creep.
         rotation, compliance :
             Rotation (3, 3) of the model's tip, and compliance (3, 3) of its position, in m/N, both
             in base axes.
         """
+        t = self._tuning
         if self.phase is Phase.GOING:
             self._waited = self._waited + elapsed if arrived else 0.0
-            if self._waited >= (self._tuning.rest if known else self._tuning.longest_rest):
-                self._direction = self.press.direction_in_base(rotation)
-                self._start, self._offset = tip.copy(), offset.copy()
+            self._pushed = self._pushed + elapsed if felt.touches else 0.0
+            n = self.press.direction_in_base(rotation)
+            deviation = creep.deviation(n, t.foresight) / float(n @ compliance @ n)
+            allowed = t.creep_share * (FELT_SHARE * self.press.force + FELT_FORCE)
+            known = known and deviation <= allowed
+            if self._waited >= (t.rest if known else t.longest_rest) and not felt.touches:
+                self._direction, self._start = n, tip.copy()
+                self._offset, self._crept = offset.copy(), creep.displacement.copy()
                 self.phase = Phase.APPROACHING
             return
-        n = self._direction
+        n, self._creep = self._direction, creep.displacement - self._crept
         feeling = Feeling.of(n, compliance)
         self.force = -float(n @ felt.force) / max(feeling.share, 0.1)
         gone = float(n @ (tip - self._start))
@@ -225,6 +244,9 @@ class Pressing:
         if self.phase in (Phase.RETREATING, Phase.ENDED):
             text = f"{self._why}; the tip goes back to where it began, until there is a new task"
             return (*found, Notice("press-failed", text, standing=True))
+        if self.phase is Phase.GOING and self._pushed > self._tuning.patience:
+            text = "something touches the tip already; it presses once nothing does"
+            return (*found, Notice("press-waits", text, standing=True))
         if self.phase is Phase.PRESSING and self._off > self._tuning.patience:
             text = (
                 f"the tip presses with {1e3 * self.force:.0f} mN instead of "

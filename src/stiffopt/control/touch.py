@@ -10,11 +10,11 @@ e, and a speed eta of xi::
 
 A force F on the tip displaces it by u = C F in the directions in which it is soft; along a stiff
 axis no force can be felt. e is the error of the model. It changes with motion, by a share of the
-way, and creeps at the rate b, which motion sets off. xi is the part of the first bending mode's
-vibration that pressures do not explain. A force that begins displaces the equilibrium, not the tip:
-u + xi stays the same, so the following vibration shows its size before it has decayed. While the
-tip approaches something along n, g is the error per way s_n of the model's tip along n; it is
-learned before the contact.
+way, and creeps at the rate b, which motion sets off; the creep that can be predicted is part of s
+(`stiffopt.control.creep`). xi is the part of the first bending mode's vibration that pressures do
+not explain. A force that begins displaces the equilibrium, not the tip: u + xi stays the same, so
+the following vibration shows its size before it has decayed. While the tip approaches something
+along n, g is the error per way s_n of the model's tip along n; it is learned before the contact.
 
 In one sample, force and error look alike; they differ in how they begin. Without contact, u is
 zero. At intervals a hypothesis starts: a force has just begun, changed or gone. Each hypothesis is
@@ -33,7 +33,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from stiffopt.control.tuning import TouchTuning
+from stiffopt.control.creep import CreepEstimator
+from stiffopt.control.tuning import CreepTuning, TouchTuning
 from stiffopt.optimise.press import SOFT_SHARE
 from stiffopt.optimise.tip import TipAt
 
@@ -100,22 +101,33 @@ class TouchEstimator:
         Damping ratio of the vibration.
     tuning :
         Noise, and thresholds of the force.
+    creep :
+        Estimates the creep of the tip; nothing of it is known by default.
 
     Attributes
     ----------
+    creep : estimates the creep of the tip.
     felt : the force at the last sample; NaN before the first.
     stiffness_error : relative deviation of the arm's stiffness; NaN if unknown.
     """
 
     def __init__(
-        self, segments: list[int], *, vibrates: bool, damping: float, tuning: TouchTuning
+        self,
+        segments: list[int],
+        *,
+        vibrates: bool,
+        damping: float,
+        tuning: TouchTuning,
+        creep: CreepEstimator | None = None,
     ) -> None:
+        self.creep = creep or CreepEstimator(sum(segments), False, CreepTuning())
         self._tuning, self._damping, self._vibrates = tuning, damping, vibrates
         self._ends = np.cumsum([0, *segments[:-1]])
         swings = float(vibrates)
         self._seen = np.array([1.0, 0.0, 1.0, 0.0, 0.0, swings, 0.0])  # row of y - s in the state
         # direction and speed of an approach, during which a force may begin at any time
         self._approach: tuple[Array, float] | None = None
+        self._changed = False  # whether the model has changed since the last sample
         self._approached = 0.0  # way of the model's tip since the approach began, in m
         self._presses = False
         # change of the state when a force begins
@@ -125,6 +137,7 @@ class TouchEstimator:
     def begin(self) -> None:
         """Restart, without contact."""
         t = self._tuning
+        self.creep.begin()
         deviations = [0.0, 0.0, t.first_error, t.first_rate, 0.0, 0.0, 0.0]
         if self._vibrates:
             deviations[_XI:] = [t.first_swing, t.first_speed]
@@ -165,15 +178,18 @@ class TouchEstimator:
         if direction is None:
             if self._approach is not None and not self._believed:
                 self._merge()
+            if self._approach is not None:
+                self.creep.skip()
             self._approach = None
             return
         if self._approach is None:
             self._believed, self._approached = False, 0.0
             self._merge()
             f = self._filters
-            for state in (_G, _B):  # the arm has rested, so creep has ended
+            for state in (_G, _B):  # the arm has rested: the creep that is left is predicted
                 f.means[:, state] = f.covariances[:, state] = f.covariances[:, :, state] = 0.0
             f.covariances[:, _G, _G] = self._tuning.approach_error**2
+            f.covariances[:, _B, _B] = self.creep.rate_deviation(direction) ** 2
         self._approach = direction, speed
 
     @property
@@ -185,6 +201,16 @@ class TouchEstimator:
     def change_model(self, change: Array) -> None:
         """Adjust to another model, for which the tip's offset changes by (6,)."""
         self._filters.means[:, _E] += change[:3]
+        self.creep.change_model(change[:3])
+        self._changed = True
+
+    def forget(self) -> None:
+        """Take a force that is felt for an error of the model, whose creep has ended."""
+        self._believed = False
+        self._merge()
+        f = self._filters
+        f.means[:, _B] = f.covariances[:, _B] = f.covariances[:, :, _B] = 0.0
+        self.creep.skip()
 
     def take(
         self, time: float, away: Array, pressures: Array, tip: TipAt, omega: float = math.inf
@@ -206,20 +232,31 @@ class TouchEstimator:
             Angular frequency of the vibration, in rad/s.
         """
         t = self._tuning
-        elapsed = time - self._time
+        elapsed = gap = time - self._time
         if not (elapsed > 0 and np.isfinite(away).all()):
             return
+        jacobian = tip.pose[:3, :3] @ tip.jacobian[:3]
+        if self._changed:
+            self._filters.means[:, _E] -= self.creep.take_over(jacobian)
+            self._changed = False
+        self.creep.advance(gap, pressures, jacobian)
         if elapsed > t.longest_gap:
             self.begin()
-            self._pressures, self._filters.means[0, _E], elapsed = pressures.copy(), away, 0.0
+            self._pressures, elapsed = pressures.copy(), 0.0
+            self._filters.means[0, _E] = away - self.creep.displacement
         self._look_at(tip)
-        moved = self._moved(pressures, tip)
+        moved, before = self._moved(pressures, jacobian), self._way
         self._time = time
         F, Q, pressed = self._process(elapsed, moved, omega)
         speed = _length(moved) / elapsed if elapsed > 0 else 0.0
         self._predict(elapsed, F, Q, pressed)
-        self._correct(away, t.noise**2 + (t.late * speed) ** 2)
+        self._correct(away - self.creep.displacement, t.noise**2 + (t.late * speed) ** 2)
         self._decide()
+        if self._believed:
+            self.creep.skip()
+        elif self._approach is None:
+            grown = self._way**2 - (before * math.exp(-elapsed / t.motion_time)) ** 2
+            self.creep.learn(elapsed, away - self._filters.means[0, _XI], grown, speed)
         self.felt = self._force()
 
     def _force(self) -> TipForce:
@@ -247,9 +284,9 @@ class TouchEstimator:
         self._softest, axes = float(compliances[2]), axes[:, soft]
         self._stiffness, self._felt_axes = axes / compliances[soft] @ axes.T, axes @ axes.T
 
-    def _moved(self, pressures: Array, tip: TipAt) -> Array:
+    def _moved(self, pressures: Array, jacobian: Array) -> Array:
         """Return displacements (3, s) of the model's tip by segment since the last sample, in m."""
-        columns = tip.jacobian[:3] * (pressures - self._pressures)
+        columns = jacobian * (pressures - self._pressures)
         self._pressures = pressures.copy()
         moved: Array = np.add.reduceat(columns, self._ends, axis=1)
         return moved

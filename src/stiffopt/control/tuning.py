@@ -323,6 +323,25 @@ class MotionTuning:
 
 
 @dataclass(frozen=True)
+class CreepTuning:
+    """What is believed about the creep of an arm, and how it is learned (`CreepEstimator`)."""
+
+    times: tuple[float, ...] = (1.5, 6.0, 25.0)  # time constants, in s
+    # shares that creep with each of them and their deviation; the latter for an arm whose creep
+    # was calibrated
+    share: float = 0.02
+    deviation: float = 0.025
+    known: float = 0.008
+    changes: float = 0.2  # growth of a share's deviation with the way, in 1/m
+    first_error: float = 0.02  # deviation of the model's error, in m
+    model_error: float = 0.05  # its growth, as a share of the recent way
+    drift: float = 5e-5  # its growth at rest, in m / sqrt(s)
+    noise: float = 1e-4  # of a mean of positions, in m
+    late: float = 0.02  # by which the tip may move later than the model's, in s
+    every: float = 0.1  # time over which samples are averaged, in s
+
+
+@dataclass(frozen=True)
 class TouchTuning:
     """Noise of the tip relative to the model, and thresholds of a force (`TouchEstimator`)."""
 
@@ -383,9 +402,12 @@ class PressingTuning:
     """How the tip presses on something (`Pressing`)."""
 
     # time at the target before the approach, in s; and its upper bound while a better estimate of
-    # the arm's stiffness is due
+    # the arm's stiffness is due, or the creep of the press to come is not known well enough: by its
+    # deviation within a time, in s, as a share of the error that a felt force may have
     rest: float = 0.5
     longest_rest: float = 8.0
+    foresight: float = 20.0
+    creep_share: float = 0.4
     time: float = 0.7  # time constant of the force against a rigid surface, in s
     touch_share: float = 0.2  # share of the force above which the approach becomes a press
     lost: float = 0.4  # time without a force after which the contact is lost, in s
@@ -461,6 +483,7 @@ class ControlTuning:
     adaptation: AdaptationTuning = field(default_factory=AdaptationTuning)
     windows: WindowTuning = field(default_factory=WindowTuning)
     motion: MotionTuning = field(default_factory=MotionTuning)
+    creep: CreepTuning = field(default_factory=CreepTuning)
     touch: TouchTuning = field(default_factory=TouchTuning)
     pressing: PressingTuning = field(default_factory=PressingTuning)
     bracing: BracingTuning = field(default_factory=BracingTuning)
