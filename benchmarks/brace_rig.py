@@ -155,7 +155,7 @@ def measured(
         "quick": quick, "quick_free": quick_free, "measured": own, "measured_free": bare,
         "force": float(np.linalg.norm(found.contacts[0].force)),
         "doubt": float(known.forces.max()),
-        "interval": known.stiffness_interval(task.stiffness.maximise[0], task.brace.contacts),
+        "interval": known.stiffness_interval(task.stiffness.maximise[0], task),
         "force_measured": sum(float(np.linalg.norm(each.force)) for each in on),
         "at": found.contacts[0].at, "at_measured": on[0].at if on else None,
         "limited_by": list(found.limited_by),

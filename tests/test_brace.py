@@ -187,7 +187,7 @@ def test_a_calibrated_arm_holds_back_forces_that_are_in_doubt(robot, task):
     assert changes == pytest.approx(doubt, rel=0.1)
     assert (changes <= doubt).all()
     # and the stiffness with them
-    low, high = uncertainty.stiffness_interval(task.stiffness.maximise[0], "sliding")
+    low, high = uncertainty.stiffness_interval(task.stiffness.maximise[0], task)
     assert low * high == pytest.approx(found.stiffness**2)
     seen = [eq.shifted(np.linalg.pinv(J) @ way).stiffness([1, 0, 0]) for way in 0.1 * ways]
     assert np.log(np.array(seen) / found.stiffness).max() == pytest.approx(
@@ -197,6 +197,23 @@ def test_a_calibrated_arm_holds_back_forces_that_are_in_doubt(robot, task):
     told = with_uncertainty(SolvedTask("lean.yaml", arm, found))
     Console(file=text, width=200).print(block(told))
     assert f"(95 %: {low:.3f} to {high:.3f}" in text.getvalue()
+
+
+def test_a_stiffness_that_moves_no_tip_is_in_doubt(robot, task, solution):
+    """All moduli and gains larger by the same factor make the braced arm stiffer by that factor."""
+    factor = 0.08
+    names = ["material.youngs_modulus", *(f"corrections.gain[{channel}]" for channel in range(3))]
+    fitted = [
+        {"key": f"segments[{k}].{name}", "deviation": factor, "prior": 1.0}
+        for k in range(2)
+        for name in names
+    ]
+    known = Calibration(parameters=fitted, correlation=np.ones((len(fitted),) * 2).tolist())
+    arm = stiffopt.Manipulator(robot.description.model_copy(update={"calibration": known}))
+    eq = arm.contact_equilibrium(solution.pressures, BracedProblem(robot, task).scene)
+    interval = BraceUncertainty(arm, eq).stiffness_interval(task.stiffness.maximise[0], task)
+    ratios = np.log(np.array(interval) / eq.stiffness([1, 0, 0]))
+    assert ratios == pytest.approx([-1.96 * factor, 1.96 * factor], rel=0.01)
 
 
 def test_where_forces_are_in_doubt_slips_come_sooner(robot, task, solution):

@@ -207,7 +207,11 @@ def test_a_lift_off_is_told_within_300_ms_and_less_is_not(approach):
     assert lifts > 0
     course = held(approach)
     samples(course, approach, np.zeros(3), 40)
+    assert samples(course, approach, pushed(approach, 0.5 * lifts * way), 40) is None
+    assert "brace-weak" not in [notice.kind for notice in course.notices()]
     assert samples(course, approach, pushed(approach, 0.7 * lifts * way), 40) is None
+    (weak,) = [notice for notice in course.notices() if notice.kind == "brace-weak"]
+    assert "the contact on 'post' may lift off: " in weak.text
     assert course.force == pytest.approx(0.3 * hold.forces[0], rel=0.15)
     assert course.margin == pytest.approx(0.3 * lifts, rel=0.15)
     assert np.linalg.norm(course.push - 0.7 * lifts * way) < 0.15 * lifts

@@ -115,14 +115,11 @@ def with_uncertainty(answer: SolvedTask) -> SolvedTask:
 def _braced_intervals(
     answer: SolvedTask, measures: Sequence[object]
 ) -> tuple[tuple[float, float] | None, ...]:
-    brace, eq = answer.solution.task.brace, answer.solution.equilibrium
-    assert brace is not None
+    task, eq = answer.solution.task, answer.solution.equilibrium
     assert eq is not None
     known = BraceUncertainty(answer.robot, eq)
     return tuple(
-        known.stiffness_interval(measure, brace.contacts)
-        if isinstance(measure, StiffnessMeasure)
-        else None
+        known.stiffness_interval(measure, task) if isinstance(measure, StiffnessMeasure) else None
         for measure in measures
     )
 

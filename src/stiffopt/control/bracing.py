@@ -83,7 +83,7 @@ class Bracing:
         self._waited = 0.0  # at its end, in s
         self._change: Array = np.zeros(0)  # of the planned pressures (n,), to correct the tip
         self._free = 0  # successive samples at which the tip is nearer to a free arm's
-        self._slips = False
+        self._warned: set[str] = set()  # kinds of warnings about the present push
         self._lost = 0  # successive checks at which the model's contacts do not hold
         self._unchecked = 0.0  # time since the last such check, in s
         self._why = ""
@@ -217,6 +217,7 @@ class Bracing:
             self._pushed = self._pushed * float(np.linalg.norm(off) > t.felt)
             self.push = self.displacement = np.zeros(3)
             self.force, self.margin = float(self._forces(pressures).min()), math.nan
+            self._warned.clear()
             return
         self._pushed += elapsed
         R = tip.pose[:3, :3]
@@ -257,9 +258,18 @@ class Bracing:
         words = f"under a push of {1e3 * size:.0f} mN"
         if self._lost >= self._tuning.looks:
             self.release(why=f"the contact {where} {how} {words}")
-        elif slip <= 0 and not self._slips:
-            self._notify("brace-slips", f"the contact {where} slips {words}", Severity.WARNING)
-        self._slips = slip <= 0
+            return
+        if slip <= 0:
+            self._warn("brace-slips", f"the contact {where} slips {words}")
+        if self.force < self._tuning.weak_share * before[weakest]:
+            left_over = f"{1e3 * max(self.force, 0.0):.0f} of {1e3 * before[weakest]:.0f} mN"
+            self._warn("brace-weak", f"the contact {where} may lift off: {left_over} left {words}")
+
+    def _warn(self, kind: str, text: str) -> None:
+        """Warn of a kind once during a push."""
+        if kind not in self._warned:
+            self._warned.add(kind)
+            self._notify(kind, text, Severity.WARNING)
 
     def _notify(self, kind: str, text: str, severity: Severity = Severity.INFO) -> None:
         self._notices.append(Notice(kind, text, severity))

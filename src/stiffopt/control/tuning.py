@@ -435,8 +435,9 @@ class BracingTuning:
     # deviation of that displacement, in m, and of pushes, in N
     deviation: float = 5e-4
     usual_push: float = 0.1
-    every: float = 0.05  # interval of checks of the contacts, in s
+    every: float = 0.03  # interval of checks of the contacts, in s
     looks: int = 2  # successive checks
+    weak_share: float = 0.4  # of its force, below which a contact that a push relieves may lift off
     time: float = 3.0  # time constant with which the tip goes to its target, in s
     force_weight: float = 0.1  # error of the tip equivalent to a change of contact force, in m/N
     pressure_weight: float = 2e-8  # the same for a pressure, in m/Pa

@@ -195,7 +195,7 @@ class Parameter:
     def at(self, nominal: float, coordinate: Any) -> Any:
         """Return the value at a coordinate, number or symbol."""
         if self.number.positive:
-            factor = ca.exp(coordinate) if isinstance(coordinate, ca.SX) else np.exp(coordinate)
+            factor = ca.exp(coordinate) if isinstance(coordinate, ca.SX) else math.exp(coordinate)
             return nominal * factor
         return nominal + coordinate
 

@@ -1,25 +1,32 @@
 """Uncertainty of contact forces and braced stiffness by a calibration, to first order.
 
 A calibration states the covariance of the free tip.  It is expressed as that of the pressures (of
-least norm) that would move the tip as much, and carried on to contact forces and stiffness.
+least norm) that would move the tip as much, and carried on to contact forces.  The stiffness also
+depends on parameters that move the tip little, such as moduli and gains that grow together; its
+derivatives by the calibration's parameters are differences of equilibria.
 """
 
 from __future__ import annotations
 
+import math
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stiffopt.model.contact.equilibrium import ContactEquilibrium, Grip
+from stiffopt.model.contact.equilibrium import ContactEquilibrium
 from stiffopt.model.manipulator import Manipulator
+from stiffopt.model.parameters import Parameter, varied
 from stiffopt.model.uncertainty import NORMAL_QUANTILE
+from stiffopt.optimise.brace import leant_on
 from stiffopt.optimise.goal import StiffnessMeasure
 from stiffopt.optimise.settings import BRACE
+from stiffopt.optimise.task import Task
 
 Vector = NDArray[np.float64]
 
 _LEAST_GRIP = 0.05  # where the contact itself is in doubt; its normal force is a demand of its own
+_STEP = 0.3  # standard deviations, of differences by parameters
 
 
 class BraceUncertainty:
@@ -31,15 +38,12 @@ class BraceUncertainty:
     def __init__(self, robot: Manipulator, eq: ContactEquilibrium) -> None:
         self._robot, self._eq = robot, eq
 
-    @cached_property
-    def pressures(self) -> Vector:
-        """Mean square (n, n) of pressures with the errors of the free tip, in Pa^2."""
+    def _pressures(self, squares: Vector) -> Vector:
+        """Return the mean square (n, n) of pressures that move the free tip with one (3, 3)."""
         robot, p = self._robot, self._eq.pressures
-        if robot.description.calibration is None:
-            return np.zeros((len(p), len(p)))
         R = robot.tip_pose(p)[:3, :3]
         per_tip = np.linalg.pinv(R @ robot.tip_jacobian(p)[:3])
-        return np.asarray(per_tip @ robot.tip_uncertainty(p).covariance @ per_tip.T)
+        return np.asarray(per_tip @ squares @ per_tip.T)
 
     @cached_property
     def forces(self) -> Vector:
@@ -50,7 +54,8 @@ class BraceUncertainty:
         if self._robot.description.calibration is None:
             return np.zeros(len(self._eq.contacts))
         slopes = self._eq.force_gradients
-        variances = np.einsum("ci,ij,cj->c", slopes, self.pressures, slopes)
+        squares = self._pressures(self._robot.tip_uncertainty(self._eq.pressures).covariance)
+        variances = np.einsum("ci,ij,cj->c", slopes, squares, slopes)
         return np.asarray(BRACE.sure * np.sqrt(np.maximum(variances, 0.0)))
 
     @property
@@ -62,13 +67,45 @@ class BraceUncertainty:
         lost = np.max(self.forces / self._eq.normal_forces, initial=0.0)
         return max(1.0 - float(lost), _LEAST_GRIP)
 
-    def stiffness_interval(self, measure: StiffnessMeasure, contacts: Grip) -> tuple[float, float]:
-        """Return the 95 % interval of a braced stiffness, in N/m or N m/rad.
+    def stiffness_interval(self, measure: StiffnessMeasure, task: Task) -> tuple[float, float]:
+        """Return the 95 % interval of a stiffness of the task's answer, in N/m or N m/rad.
 
         On a logarithmic scale, and for contacts that stay.
         """
-        given = (measure.direction, measure.kind, measure.boundary, measure.frame, contacts)
-        k, slope = self._eq.stiffness(*given), self._eq.stiffness_gradient(*given)
-        variance = float(slope @ self.pressures @ slope)
-        ratio = float(np.exp(NORMAL_QUANTILE * np.sqrt(max(variance, 0.0)) / k))
+        assert task.brace is not None
+        given = (
+            measure.direction, measure.kind, measure.boundary, measure.frame, task.brace.contacts
+        )  # fmt: skip
+        k, known = self._eq.stiffness(*given), self._robot.description.calibration
+        if known is None:
+            return k, k
+        errors = self._robot.tip_uncertainty(self._eq.pressures)
+        squares = self._pressures(errors.hysteresis + errors.discrepancy + errors.residual)
+        slope = self._eq.stiffness_gradient(*given) / k
+        parameters = [Parameter(fitted.key) for fitted in known.parameters]
+        covariance = known.covariance[: len(parameters), : len(parameters)]
+        own, deviations = np.zeros(len(parameters)), np.sqrt(np.diag(covariance))
+        for i in np.flatnonzero(deviations):
+            step = _STEP * float(deviations[i])
+            low, high = (self._varied(task, parameters[i], end) for end in (-step, step))
+            own[i] = math.log(high.stiffness(*given) / low.stiffness(*given)) / (2 * step)
+        variance = float(slope @ squares @ slope + own @ covariance @ own)
+        ratio = math.exp(NORMAL_QUANTILE * math.sqrt(max(variance, 0.0)))
         return k / ratio, k * ratio
+
+    def _varied(self, task: Task, parameter: Parameter, coordinate: float) -> ContactEquilibrium:
+        """Return the equilibrium of an arm with another parameter; the known one without contact.
+
+        Raises
+        ------
+        EquilibriumError
+            There is none.
+        """
+        assert task.scene is not None
+        assert task.brace is not None
+        robot = Manipulator(varied(self._robot.description, [parameter], [coordinate]))
+        load, scene = task.tip_load, leant_on(task.scene, task.brace)
+        if load is not None:
+            robot = robot.with_load(load.force, load.moment, load.frame)
+        eq = robot.contact_equilibrium(self._eq.pressures, scene, approach=task.brace.approach)
+        return eq if eq.contacts else self._eq
