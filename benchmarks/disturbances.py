@@ -7,9 +7,10 @@ Arms and targets are those of `control_cases.py`; the controller has the nominal
 run the arm goes to a first target and rests there; then a fault begins, and four seconds later a
 second target follows. Faults of the set-up are there from the beginning. Columns: number of runs
 that detected the fault, and as what; longest time from its beginning to detection (for faults that
-only show in motion, from the second target); largest distance of the tip from the way that it takes
-without a fault, over all runs, in mm; and the state in the end. A push or a payload must not be
-detected as a fault. With `--commission`, `stiffopt commission --quick` looks for the faults of the
+only show in motion, from the second target; negative if it was detected before); largest distance
+of the tip from the way that it takes without a fault, until it is vented, over all runs, in mm; and
+the state in the end. A push or a payload must not be detected as a fault. Below each row on the
+way, what was told. With `--commission`, `stiffopt commission --quick` looks for the faults of the
 set-up instead: its first finding, whether it permits arming, and how far the tip moved from rest.
 """
 
@@ -37,7 +38,7 @@ from stiffopt.commissioning.commission import commission
 from stiffopt.commissioning.expected import expected_steps
 from stiffopt.commissioning.procedure import DangerError
 from stiffopt.control.controller import TipController
-from stiffopt.control.state import State
+from stiffopt.control.state import Severity, State
 from stiffopt.errors import CommandError, InputError
 from stiffopt.plant.settings import PlantLoad
 from stiffopt.safety.rigs import gated_rig
@@ -57,7 +58,9 @@ DOUBTS = (
     "lost-channel",
     "shortfall",
     "regulator-stuck",
+    "pressure-reading",
     "tracker-jumps",
+    "tracker-lost",
     "unreachable",
 )
 
@@ -183,6 +186,141 @@ def _swapped(*order: int) -> Callable[[Any], object]:
     return swap
 
 
+def _seen_as(change: Callable[[Any, float, Array], Array]) -> Callable[[Any], object]:
+    """Replace the pose (4, 4) that the tracker sees by one of generator, elapsed time and pose."""
+
+    def begin(rig: Any) -> None:
+        camera, plant, rng = rig.world.camera, rig.world.plant, np.random.default_rng(20)
+        see, began = camera.sensor_in_tracker, plant.time
+        camera.sensor_in_tracker = lambda: change(rng, plant.time - began, see())
+
+    return begin
+
+
+def _moved(pose: Array, *way: float) -> Array:
+    moved = pose.copy()
+    moved[:3, 3] += way
+    return moved
+
+
+def _freezes_then_jumps(rig: Any) -> None:
+    """Repeat one pose for a second, with new times; then show the tip 8 mm aside."""
+    kept: list[Array] = []
+
+    def change(rng: Any, elapsed: float, pose: Array) -> Array:
+        kept.append(pose)
+        return kept[0] if elapsed < 1.0 else _moved(pose, 0.008, 0.0, 0.0)
+
+    _seen_as(change)(rig)
+
+
+def _outliers(rng: Any, elapsed: float, pose: Array) -> Array:
+    aside = rng.standard_normal(3)
+    return _moved(pose, *(0.02 * aside / np.linalg.norm(aside))) if rng.random() < 0.03 else pose
+
+
+def _jitter(most: float) -> Callable[[Any], object]:
+    """Show poses that are up to so much older than their times say, in s, at random."""
+
+    def begin(rig: Any) -> None:
+        poses: list[Array] = []
+
+        def change(rng: Any, elapsed: float, pose: Array) -> Array:
+            poses.append(pose)
+            age = int(rng.uniform(0, most) * rig.world.camera.settings.rate + 0.5)
+            return poses[max(-1 - age, -len(poses))]
+
+        _seen_as(change)(rig)
+
+    return begin
+
+
+def _shaken(rng: Any, elapsed: float, pose: Array) -> Array:
+    return _moved(pose, 0.0, 0.006 * np.sin(2 * np.pi * 5.0 * elapsed), 0.0)
+
+
+def _gauge(channel: int, read: Callable[[float, float], float]) -> Callable[[Any], object]:
+    """Make a gauge read a function of its reading, and of that before the fault, in Pa."""
+
+    def begin(rig: Any) -> None:
+        measure = rig.world.measured
+        before = measure()[channel]
+
+        def measured() -> Array:
+            readings = measure()
+            readings[channel] = read(readings[channel], before)
+            return readings
+
+        rig.world.measured = measured
+
+    return begin
+
+
+def _reversed(rig: Any) -> None:
+    """Turn the sign of a regulator's changes from where it is now."""
+    command, at, high = rig.world.command, rig.world.set_point[1], rig.supply.limits.high[1]
+
+    def reverse(pressures: Array) -> None:
+        p = np.array(pressures, dtype=float)
+        p[1] = np.clip(2 * at - p[1], 0.0, high) if p.any() else 0.0
+        command(p)
+
+    rig.world.command = reverse
+
+
+def _behind_gauge(change: Callable[[Array, float, dict[str, float]], Array]) -> Any:
+    """Change the pressures (k,) of a chamber behind its gauge, by step in s and a memory."""
+
+    def begin(rig: Any) -> None:
+        plant, memory = rig.world.plant, {"p": rig.world.pressures[1]}
+        follow = plant.follow
+
+        def changed(trace: Array) -> None:
+            trace = trace.copy()
+            trace[:, 1] = change(trace[:, 1], plant.step, memory)
+            follow(trace)
+
+        plant.follow = changed
+
+    return begin
+
+
+def _narrow(pressures: Array, step: float, memory: dict[str, float]) -> Array:
+    """A line that lets a chamber follow with a time constant of 1 s."""
+    slow = np.empty_like(pressures)
+    for k, p in enumerate(pressures):
+        memory["p"] += step * (p - memory["p"])
+        slow[k] = memory["p"]
+    return slow
+
+
+def _kinked(pressures: Array, step: float, memory: dict[str, float]) -> Array:
+    """A line that lets no more through than now, behind the gauge."""
+    return np.minimum(pressures, memory["p"])
+
+
+def _slow(rig: Any) -> None:
+    rig.world._regulators.lag[1] = 0.6
+
+
+def _saturates(rig: Any) -> None:
+    rig.world._regulators.saturation[1] = rig.world.pressures[1]
+
+
+def _burst(rig: Any) -> None:
+    rig.world._regulators.held[1] = 0.0
+
+
+def _caught(rig: Any) -> None:
+    """Put a wall of 2 kN/m just in the way of the tip's next motion."""
+    way = rig.next_goal - rig.world.plant.tip_pose()[:3, 3]
+    rig.world.stage.mount(-way)
+
+
+def _both(*begins: Callable[[Any], object]) -> Callable[[Any], object]:
+    return lambda rig: [begin(rig) for begin in begins]
+
+
 ROWS = (
     Row("channels 1 and 2 swapped", _swapped(1, 0), at_once=True),
     Row("channels 1 and 4 swapped", _swapped(3, 1, 2, 0), at_once=True),
@@ -199,6 +337,26 @@ ROWS = (
     Row("tip shakes by 10 mm at 3 Hz", _tracker("shaking")),
     Row("a regulator keeps its pressure", _stuck, shows_in_motion=True),
     Row("a leak that the regulator feeds", _leaking),
+    Row("tracker freezes for 1 s, then jumps by 8 mm", _freezes_then_jumps),
+    Row("a gauge reads 0.12 bar too much", _gauge(1, lambda p, _: p + 1.2e4)),
+    Row("a gauge keeps its reading", _gauge(1, lambda _, p: p), shows_in_motion=True),
+    Row("a regulator turns its sign", _reversed, shows_in_motion=True),
+    Row("a narrow line behind a gauge", _behind_gauge(_narrow), shows_in_motion=True),
+    Row("a kinked line behind a gauge", _behind_gauge(_kinked), shows_in_motion=True),
+    Row("a regulator of ten times the lag", _slow, shows_in_motion=True),
+    Row("a regulator without more pressure", _saturates, shows_in_motion=True),
+    Row("a chamber bursts", _burst),
+    Row("tip is shaken by 6 mm at 5 Hz", _seen_as(_shaken)),
+    Row("tracker drifts, and a leak", _both(_tracker("drifting"), _leaking)),
+    Row(
+        "a regulator keeps its pressure, and a push of 30 mN",
+        _both(_stuck, _push(0.03, 0.0, 0.0)),
+        shows_in_motion=True,
+    ),
+    Row("a wall in the way of the tip", _caught, shows_in_motion=True),
+    Row("tracker is late by 0 to 20 ms at random", _jitter(0.02), is_fault=False),
+    Row("tracker is late by 0 to 60 ms at random", _jitter(0.06), shows_in_motion=True),
+    Row("3 % of the samples are 20 mm off", _seen_as(_outliers), is_fault=False),
     Row("a push of 20 mN", _push(0.02, 0.0, 0.0), is_fault=False),
     Row("a push of 30 mN halfway along", _push_halfway(0.03), is_fault=False),
     Row("a push of 50 mN", _push(0.0, -0.05, 0.0), is_fault=False),
@@ -219,12 +377,14 @@ class Outcome:
     kind : as what it was detected.
     tips : of the arm (T, 3), from the beginning of the fault, in m.
     end : state in the end.
+    words : of what was told first.
     """
 
     told: float
     kind: str
     tips: Array
     end: str
+    words: str = ""
 
 
 def run_row(case: Case, row: Row, dynamics: str) -> Outcome:
@@ -233,7 +393,8 @@ def run_row(case: Case, row: Row, dynamics: str) -> Outcome:
     tracker = case.description.tracker.model_copy(update={"noise": row.noise})
     description = case.description.model_copy(update={"plant": plant, "tracker": tracker})
     case = replace(case, description=description)
-    rig = case.rig(dynamics)
+    rig: Any = case.rig(dynamics)
+    rig.next_goal = case.aims[1].position
     controller = TipController(
         load_robot(case.believed), rig.supply.limits, rig.slew, period=PERIOD,
         control=rig.settings.control, safety=rig.settings.safety, vibrates=dynamics == "full",
@@ -247,11 +408,11 @@ def run_row(case: Case, row: Row, dynamics: str) -> Outcome:
         except InputError:
             return Outcome(0.0, "refused", np.empty((0, 3)), "refused")
         run.go(0.3)
-        begin = rig.clock.now()
+        began = begin = rig.clock.now()
         _try_task(run, case, 0)
         tips = [run.go(REST).tips]
         if not row.at_once:
-            begin = rig.clock.now()
+            began = begin = rig.clock.now()
             row.begin(rig)
             tips = [*tips[: row.name == "nothing"], run.go(BEFORE).tips]
         if run.loop.snapshot().state is State.ACTIVE:
@@ -264,12 +425,17 @@ def run_row(case: Case, row: Row, dynamics: str) -> Outcome:
                 run.go(1.0)
         events, _ = run.loop.events.since(0)
         kinds = DOUBTS if row.is_fault else DOUBTS[:-1]  # what is pushed may reach less
-        told = [event for event in events if event.kind in kinds]
+        told = [event for event in events if event.kind in kinds and event.time >= began]
+        ways = np.concatenate(tips)
+        if run.loop.snapshot().state is State.FAULT:  # venting takes the arm to rest
+            after = rig.clock.now() - next(e.time for e in events if e.severity is Severity.ERROR)
+            ways = ways[: len(ways) - round(after / PERIOD)]
         return Outcome(
             told=told[0].time - begin if told else np.inf,
             kind=told[0].kind if told else "",
-            tips=np.concatenate(tips),
+            tips=ways,
             end=run.loop.snapshot().state.value,
+            words=told[0].text if told else "",
         )
     finally:
         run.close()
@@ -333,7 +499,7 @@ def _looped(cases: list[Case], rows: list[Row], dynamics: str) -> list[list[str]
             f"{1e3 * max(off, default=np.nan):.1f}",
             ", ".join(f"{end} {count}" for end, count in ends.most_common()),
         ])  # fmt: skip
-        print(lines[-1], flush=True)
+        print(lines[-1], *sorted({o.words[:160] for o in found}), sep="\n    ", flush=True)
     return lines
 
 

@@ -89,6 +89,30 @@ def test_a_leak_that_the_regulator_can_feed_is_fed() -> None:
     assert line.kinds == []
 
 
+@pytest.mark.parametrize("leak", [0.4, 0.8])
+def test_a_small_leak_is_told_within_a_second(leak: float) -> None:
+    line = Line()
+    line.to(0.5 * BAR, 0.6 * BAR, 0.2 * BAR)
+    assert line.kinds == []
+    line.leak[1] = leak  # 1/s: 2.4 and 4.8 % of the pressure
+    line.to(0.5 * BAR, 0.6 * BAR, 0.2 * BAR, seconds=1.0)
+    assert line.kinds == ["shortfall"]
+    assert f"channel 2 by 0.0{round(3.6 * leak)} bar below" in next(line.channels.notices()).text
+    line.to(0.5 * BAR, 0.4 * BAR, 0.2 * BAR)  # told in motion too
+    line.leak[1] = 0.0
+    line.to(0.5 * BAR, 0.4 * BAR, 0.2 * BAR)
+    assert line.kinds == []
+
+
+def test_a_channel_that_always_differs_is_usual() -> None:
+    line = Line()
+    line.leak[1] = 0.35  # 2.1 % of the pressure, as a wrong gain
+    for pressure in (0.8, 1.2, 0.3, 1.0):
+        for _ in range(60):
+            line.to(0.2 * BAR, pressure * BAR, 0.0, seconds=0.1)
+            assert line.kinds == []
+
+
 def test_a_leak_beyond_that_stays_a_fault() -> None:
     line = Line()
     line.leak[1] = 3.0  # it loses 15 %

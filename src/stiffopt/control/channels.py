@@ -10,6 +10,9 @@ move at all, although even a slow regulator would have moved it, shows both at o
 the pressure monitor remain faults: none of these commands exceeds the limits, nor differs from the
 reading by more than the monitor tolerates.
 
+A shortfall or an excess that grows while the command rests is reported long before it matters: the
+gain and the offset of a healthy regulator or gauge do not change within seconds.
+
 A channel that was *taken out* by request is let down and stays without pressure.
 """
 
@@ -79,6 +82,7 @@ class Channels:
         self._followed: Array = np.zeros((2, n))
         self._smoothed: Array = np.zeros(n)  # smoothed readings, in Pa
         self._ceiling: Array = np.where(self.out, self._empty, self._limits.high)
+        self._rest = _Rest(n, self._tuning)
         self._quiet = True  # whether no channel is short, or was until now
 
     def take_out(self, channels: Iterable[int]) -> None:
@@ -116,6 +120,7 @@ class Channels:
             Least and greatest pressures (2, n) that regulators without a fault have now, in Pa.
         """
         self.shortfall = -offset
+        self._rest.advance(elapsed, command, self.shortfall)
         share = -math.expm1(-elapsed / self._tuning.reading_time)
         change = share * (reading - self._smoothed)
         change[~np.isfinite(change)] = 0.0
@@ -221,12 +226,18 @@ class Channels:
         if not (self._quiet and not self._any_out) and self.lost.any():
             each = ", ".join(self._words(int(c)) for c in np.flatnonzero(self.lost))
             yield Notice("lost-channel", f"{each}; the plan goes on with the others", standing=True)
-        fed = ~self.limited & (self._allowed > self._tuning.alarm_share * self._max_allowed)
-        if not self._quiet and fed.any():
-            names = ", ".join(str(c + 1) for c in np.flatnonzero(fed))
+        fed = self._allowed > self._tuning.alarm_share * self._max_allowed
+        off = ~self.lost & (fed | self._rest.changed)
+        if off.any():
+            each = ", ".join(
+                f"channel {c + 1} by {abs(self.shortfall[c]) * 1e-5:.2f} bar "
+                + ("below" if self.shortfall[c] > 0 else "above")
+                for c in np.flatnonzero(off)
+            )
             text = (
-                f"channel {names} stays below its command, by "
-                f"{self.shortfall[fed].max() * 1e-5:.2f} bar, which is made up for; look for a leak"
+                f"pressures differ from their commands, {each}: look for a leak and check gauge "
+                "and regulator; up to "
+                f"{self._max_allowed[off].min() * 1e-5:.2f} bar below is made up for"
             )
             yield Notice("shortfall", text, Severity.WARNING, standing=True)
 
@@ -235,3 +246,40 @@ class Channels:
         if self.out[channel]:
             return f"{name} was taken out"
         return f"{name} is stuck at {has}" if self.stuck[channel] else f"{name} has {has} at most"
+
+
+class _Rest:
+    """Finds shortfalls of n channels that grow in size while their commands rest.
+
+    Attributes
+    ----------
+    changed : flags (n,) of these channels.
+    """
+
+    def __init__(self, n: int, tuning: RegulatorTuning) -> None:
+        self._tuning, self._elapsed = tuning, 0.0
+        self._near: Array = np.zeros(n)  # the commands when they came to rest, in Pa
+        self._rested: Array = np.zeros(n)  # for how long, in s
+        self._usual: Array = np.zeros(n)  # shortfall of the channel at rest, in Pa
+        self.changed: Flags = np.zeros(n, dtype=bool)
+
+    def advance(self, elapsed: float, command: Array, short: Array) -> None:
+        """Take in commands and shortfalls (n,), in Pa."""
+        tuning = self._tuning
+        self._elapsed += elapsed
+        if self._elapsed < tuning.rest_interval:
+            return
+        elapsed, self._elapsed = self._elapsed, 0.0
+        moved = np.abs(command - self._near) > tuning.rest_range
+        self._near = np.where(moved, command, self._near)
+        self._rested = np.where(moved, 0.0, self._rested + elapsed)
+        settled = self._rested > tuning.rest_time
+        least = tuning.unmoved + tuning.gain_error * np.abs(command - self._near)
+        change, size = np.abs(short - self._usual), np.abs(short)
+        grown = (change > least) & (size > least)
+        stays = self.changed & (change > least / 2) & (size > least / 2)
+        self.changed = (settled & grown) | stays
+        slow = -math.expm1(-elapsed / tuning.usual_time)
+        share = np.where(settled & (size > np.abs(self._usual)), slow, 1.0)
+        share[self.changed] = 0.0
+        self._usual = self._usual + share * (short - self._usual)

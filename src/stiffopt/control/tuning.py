@@ -66,6 +66,15 @@ class RegulatorTuning:
     # lag and dead time of a slow regulator, as multiples of those of the rig file: its pressure is
     # the least by which a reading must have moved
     slow: float = 2.0
+    # a shortfall that grows by more than `unmoved` while its command rests is reported: interval of
+    # checks and time at rest before the first one, in s; change of the command that ends the rest,
+    # in Pa, and share of it by which the shortfall may change; time constant with which larger
+    # shortfalls become usual, in s
+    rest_interval: float = 0.05
+    rest_time: float = 1.0
+    rest_range: float = 1e4
+    gain_error: float = 0.05
+    usual_time: float = 30.0
     let_down_share: float = 0.1  # share of the slew with which a removed channel is let down
 
 
