@@ -38,7 +38,7 @@ from stiffopt.model.calibration import (
     ErrorModel,
     distances_from,
     even_variance,
-    growth,
+    fading_mean,
     squared_moves,
 )
 from stiffopt.model.history import NO_HISTORY
@@ -71,7 +71,10 @@ def error_model(
     """
     pressures = commanded(found.problem.samples)
     reaches = np.array(ERRORS.reaches) * np.ptp(pressures, axis=0).max()
-    folds = [_Fold.of(each, pressures, reaches, found.independent) for each in held_back.values()]
+    gain = _untested_gain(found, held_back)
+    folds = [
+        _Fold.of(each, pressures, reaches, gain, found.independent) for each in held_back.values()
+    ]
     best = min((_most_probable(folds, i, found) for i in range(len(reaches))), key=lambda b: b[0])
     _, index, (discrepancy, residual, tail) = best
     kept, spacing = representatives(_channels(found), pressures if recorded is None else recorded)
@@ -80,7 +83,7 @@ def error_model(
         residual=float(f"{residual:.4g}"),
         discrepancy=float(f"{discrepancy:.4g}"),
         reach=float(f"{reaches[index]:.4g}"),
-        gain=float(f"{_untested_gain(found, held_back):.3g}"),
+        gain=float(f"{gain:.3g}"),
         degrees_of_freedom=float(f"{_MIN_FREEDOM + tail:.3g}"),
         settled=settled,
         moving=moving,
@@ -144,6 +147,7 @@ class _Fold:
     through_fit : covariances (R, N, 3, 3) due to a discrepancy of variance 1 Pa^2, for each reach,
         through its effect on the fit.
     direct : variances (R, N) of each axis due to that discrepancy itself.
+    untested : those (R, N), in m^2, due to the gain in directions that were not recorded.
     weight : (R, N), of the rows, see `_weights`.
     """
 
@@ -151,19 +155,35 @@ class _Fold:
     parameters: Array
     through_fit: Array
     direct: Array
+    untested: Array
     weight: Array
 
     @classmethod
-    def of(cls, held: HeldBack, pressures: Array, reaches: Array, independent: float) -> _Fold:
+    def of(
+        cls, held: HeldBack, pressures: Array, reaches: Array, gain: float, independent: float
+    ) -> _Fold:
         fit, problem = held.fit, held.fit.problem
         predicted, slopes = problem.with_slopes(fit.x)
         rows = held.rows & np.isfinite(predicted.errors[0]).all(axis=1)
         counted = np.concatenate([sample.weight for sample in problem.samples]) > 0
         channels = _channels(fit)
         kept, spacing = representatives(channels, pressures[counted])  # as in a robot file
-        distances = distances_from(channels, predicted.effective, kept) - spacing
-        share = growth(np.maximum(distances, 0.0), reaches[:, np.newaxis, np.newaxis])
-        moves = squared_moves(predicted.per_pressure[0], np.repeat(share, channels, axis=2))
+        known = {"residual": 0.0, "degrees_of_freedom": _MIN_FREEDOM, "spacing": spacing,
+                 "recorded": tuple(map(tuple, kept.tolist()))}  # fmt: skip
+        direct, untested = (
+            np.stack([
+                _even_variance(
+                    squared_moves(
+                        predicted.per_pressure[0],
+                        ErrorModel(reach=reach, discrepancy=size, gain=relative, **known)
+                        .variances(channels, predicted.effective),
+                    ),
+                    fit,
+                )[rows]
+                for reach in reaches
+            ])
+            for size, relative in ((1.0, 0.0), (0.0, gain))
+        )  # fmt: skip
         numbers = kept_unknowns(problem)
         slope = slopes[rows][:, :, numbers]
         added = _influence(problem, fit.x, fit.gain, reaches)[:, numbers[:, np.newaxis], numbers]
@@ -171,7 +191,8 @@ class _Fold:
             errors=predicted.errors[0][rows],
             parameters=_spread(slope, fit.covariance[np.ix_(numbers, numbers)]),
             through_fit=np.stack([_spread(slope, each) for each in added]),
-            direct=_even_variance(moves, fit)[:, rows],
+            direct=direct,
+            untested=untested,
             weight=np.stack([_weights(pressures[rows], reach, independent) for reach in reaches]),
         )
 
@@ -182,7 +203,9 @@ class _Fold:
         covariance = (
             self.parameters
             + discrepancy**2 * self.through_fit[index]
-            + (discrepancy**2 * self.direct[index] + residual**2)[:, np.newaxis, np.newaxis]
+            + (discrepancy**2 * self.direct[index] + self.untested[index] + residual**2)[
+                :, np.newaxis, np.newaxis
+            ]
             * np.eye(3)
         )
         v = _MIN_FREEDOM + tail
@@ -197,14 +220,25 @@ class _Fold:
 
 
 def _even_variance(moves: Array, fit: Fit) -> Array:
-    """Return the variance (R, M) of each axis of the tip, in m^2, by `squared_moves` (R, M, n)."""
+    """Return the variance (M,) of each axis of the tip, in m^2, by `squared_moves` (M, n)."""
     memory = [
         (segment.history or NO_HISTORY).remembered_shares(segment.n_channels)
         for segment in fit.robot.segments
     ]
-    logs = np.split(moves, fit.problem.starts[1:-1], axis=1)
-    worst = np.concatenate([np.maximum.accumulate(each, axis=1) for each in logs], axis=1)
-    return even_variance(moves, worst, np.concatenate(memory))
+    samples, starts = fit.problem.samples, fit.problem.starts[:-1]
+    breaks = [
+        start for each, start in zip(samples, starts, strict=True) if each.begin != "previous"
+    ]
+    time = in_turn([each.recording.time[each.rows] for each in samples])
+    runs = zip(np.split(time, breaks[1:]), np.split(moves, breaks[1:]), strict=True)
+    before = np.concatenate([fading_mean(*run) for run in runs])
+    return even_variance(moves, before, np.concatenate(memory))
+
+
+def in_turn(times: Sequence[Array]) -> Array:
+    """Return the times (N,) in s of logs that follow each other, from those of each (N_i,)."""
+    ends = np.cumsum([0.0, *(each[-1] - each[0] for each in times)])
+    return np.concatenate([each - each[0] + end for each, end in zip(times, ends, strict=False)])
 
 
 def _spread(slope: Array, covariance: Array) -> Array:
@@ -265,10 +299,10 @@ def _untested_gain(found: Fit, held_back: Mapping[str, HeldBack]) -> float:
     tips = found.predicted.read[0].position
     way = float(np.linalg.norm(tips - tips.mean(axis=0), axis=1).mean())
     if held_back:
-        error = float(np.mean([each.errors.mean for each in held_back.values()]))
+        error = float(np.mean([each.errors.median for each in held_back.values()]))
     else:
         distances = np.linalg.norm(found.predicted.errors[0], axis=1)
-        error = ERRORS.residual * Errors.of(distances, None).mean
+        error = ERRORS.residual * Errors.of(distances, None).median
     return ERRORS.untested * error / way if way > 0 else ERRORS.untested
 
 
