@@ -39,6 +39,7 @@ from stiffopt.model.calibration import (
     distances_from,
     even_variance,
     fading_mean,
+    growth,
     squared_moves,
 )
 from stiffopt.model.history import NO_HISTORY
@@ -71,10 +72,7 @@ def error_model(
     """
     pressures = commanded(found.problem.samples)
     reaches = np.array(ERRORS.reaches) * np.ptp(pressures, axis=0).max()
-    gain = _untested_gain(found, held_back)
-    folds = [
-        _Fold.of(each, pressures, reaches, gain, found.independent) for each in held_back.values()
-    ]
+    folds = [_Fold.of(each, pressures, reaches, found.independent) for each in held_back.values()]
     best = min((_most_probable(folds, i, found) for i in range(len(reaches))), key=lambda b: b[0])
     _, index, (discrepancy, residual, tail) = best
     kept, spacing = representatives(_channels(found), pressures if recorded is None else recorded)
@@ -83,7 +81,7 @@ def error_model(
         residual=float(f"{residual:.4g}"),
         discrepancy=float(f"{discrepancy:.4g}"),
         reach=float(f"{reaches[index]:.4g}"),
-        gain=float(f"{gain:.3g}"),
+        gain=float(f"{_untested_gain(found, held_back):.3g}"),
         degrees_of_freedom=float(f"{_MIN_FREEDOM + tail:.3g}"),
         settled=settled,
         moving=moving,
@@ -147,7 +145,6 @@ class _Fold:
     through_fit : covariances (R, N, 3, 3) due to a discrepancy of variance 1 Pa^2, for each reach,
         through its effect on the fit.
     direct : variances (R, N) of each axis due to that discrepancy itself.
-    untested : those (R, N), in m^2, due to the gain in directions that were not recorded.
     weight : (R, N), of the rows, see `_weights`.
     """
 
@@ -155,35 +152,22 @@ class _Fold:
     parameters: Array
     through_fit: Array
     direct: Array
-    untested: Array
     weight: Array
 
     @classmethod
-    def of(
-        cls, held: HeldBack, pressures: Array, reaches: Array, gain: float, independent: float
-    ) -> _Fold:
+    def of(cls, held: HeldBack, pressures: Array, reaches: Array, independent: float) -> _Fold:
         fit, problem = held.fit, held.fit.problem
         predicted, slopes = problem.with_slopes(fit.x)
         rows = held.rows & np.isfinite(predicted.errors[0]).all(axis=1)
         counted = np.concatenate([sample.weight for sample in problem.samples]) > 0
         channels = _channels(fit)
         kept, spacing = representatives(channels, pressures[counted])  # as in a robot file
-        known = {"residual": 0.0, "degrees_of_freedom": _MIN_FREEDOM, "spacing": spacing,
-                 "recorded": tuple(map(tuple, kept.tolist()))}  # fmt: skip
-        direct, untested = (
-            np.stack([
-                _even_variance(
-                    squared_moves(
-                        predicted.per_pressure[0],
-                        ErrorModel(reach=reach, discrepancy=size, gain=relative, **known)
-                        .variances(channels, predicted.effective),
-                    ),
-                    fit,
-                )[rows]
-                for reach in reaches
-            ])
-            for size, relative in ((1.0, 0.0), (0.0, gain))
-        )  # fmt: skip
+        distances = distances_from(channels, predicted.effective, kept) - spacing
+        shares = growth(np.maximum(distances, 0.0), reaches[:, np.newaxis, np.newaxis])
+        moves = [
+            squared_moves(predicted.per_pressure[0], share)
+            for share in np.repeat(shares, channels, axis=2)
+        ]
         numbers = kept_unknowns(problem)
         slope = slopes[rows][:, :, numbers]
         added = _influence(problem, fit.x, fit.gain, reaches)[:, numbers[:, np.newaxis], numbers]
@@ -191,8 +175,7 @@ class _Fold:
             errors=predicted.errors[0][rows],
             parameters=_spread(slope, fit.covariance[np.ix_(numbers, numbers)]),
             through_fit=np.stack([_spread(slope, each) for each in added]),
-            direct=direct,
-            untested=untested,
+            direct=np.stack([_even_variance(each, fit)[rows] for each in moves]),
             weight=np.stack([_weights(pressures[rows], reach, independent) for reach in reaches]),
         )
 
@@ -203,9 +186,7 @@ class _Fold:
         covariance = (
             self.parameters
             + discrepancy**2 * self.through_fit[index]
-            + (discrepancy**2 * self.direct[index] + self.untested[index] + residual**2)[
-                :, np.newaxis, np.newaxis
-            ]
+            + (discrepancy**2 * self.direct[index] + residual**2)[:, np.newaxis, np.newaxis]
             * np.eye(3)
         )
         v = _MIN_FREEDOM + tail
