@@ -38,6 +38,7 @@ from stiffopt.model.calibration import (
     ErrorModel,
     distances_from,
     even_variance,
+    fading_mean,
     growth,
     squared_moves,
 )
@@ -162,8 +163,11 @@ class _Fold:
         channels = _channels(fit)
         kept, spacing = representatives(channels, pressures[counted])  # as in a robot file
         distances = distances_from(channels, predicted.effective, kept) - spacing
-        share = growth(np.maximum(distances, 0.0), reaches[:, np.newaxis, np.newaxis])
-        moves = squared_moves(predicted.per_pressure[0], np.repeat(share, channels, axis=2))
+        shares = growth(np.maximum(distances, 0.0), reaches[:, np.newaxis, np.newaxis])
+        moves = [
+            squared_moves(predicted.per_pressure[0], share)
+            for share in np.repeat(shares, channels, axis=2)
+        ]
         numbers = kept_unknowns(problem)
         slope = slopes[rows][:, :, numbers]
         added = _influence(problem, fit.x, fit.gain, reaches)[:, numbers[:, np.newaxis], numbers]
@@ -171,7 +175,7 @@ class _Fold:
             errors=predicted.errors[0][rows],
             parameters=_spread(slope, fit.covariance[np.ix_(numbers, numbers)]),
             through_fit=np.stack([_spread(slope, each) for each in added]),
-            direct=_even_variance(moves, fit)[:, rows],
+            direct=np.stack([_even_variance(each, fit)[rows] for each in moves]),
             weight=np.stack([_weights(pressures[rows], reach, independent) for reach in reaches]),
         )
 
@@ -197,14 +201,25 @@ class _Fold:
 
 
 def _even_variance(moves: Array, fit: Fit) -> Array:
-    """Return the variance (R, M) of each axis of the tip, in m^2, by `squared_moves` (R, M, n)."""
+    """Return the variance (M,) of each axis of the tip, in m^2, by `squared_moves` (M, n)."""
     memory = [
         (segment.history or NO_HISTORY).remembered_shares(segment.n_channels)
         for segment in fit.robot.segments
     ]
-    logs = np.split(moves, fit.problem.starts[1:-1], axis=1)
-    worst = np.concatenate([np.maximum.accumulate(each, axis=1) for each in logs], axis=1)
-    return even_variance(moves, worst, np.concatenate(memory))
+    samples, starts = fit.problem.samples, fit.problem.starts[:-1]
+    breaks = [
+        start for each, start in zip(samples, starts, strict=True) if each.begin != "previous"
+    ]
+    time = in_turn([each.recording.time[each.rows] for each in samples])
+    runs = zip(np.split(time, breaks[1:]), np.split(moves, breaks[1:]), strict=True)
+    before = np.concatenate([fading_mean(*run) for run in runs])
+    return even_variance(moves, before, np.concatenate(memory))
+
+
+def in_turn(times: Sequence[Array]) -> Array:
+    """Return the times (N,) in s of logs that follow each other, from those of each (N_i,)."""
+    ends = np.cumsum([0.0, *(each[-1] - each[0] for each in times)])
+    return np.concatenate([each - each[0] + end for each, end in zip(times, ends, strict=False)])
 
 
 def _spread(slope: Array, covariance: Array) -> Array:
@@ -265,10 +280,10 @@ def _untested_gain(found: Fit, held_back: Mapping[str, HeldBack]) -> float:
     tips = found.predicted.read[0].position
     way = float(np.linalg.norm(tips - tips.mean(axis=0), axis=1).mean())
     if held_back:
-        error = float(np.mean([each.errors.mean for each in held_back.values()]))
+        error = float(np.mean([each.errors.median for each in held_back.values()]))
     else:
         distances = np.linalg.norm(found.predicted.errors[0], axis=1)
-        error = ERRORS.residual * Errors.of(distances, None).mean
+        error = ERRORS.residual * Errors.of(distances, None).median
     return ERRORS.untested * error / way if way > 0 else ERRORS.untested
 
 

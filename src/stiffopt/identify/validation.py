@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from stiffopt.errors import StiffoptError
 from stiffopt.identify.detection import replaced
-from stiffopt.identify.error_model import is_moving
+from stiffopt.identify.error_model import in_turn, is_moving
 from stiffopt.identify.fit import fit
 from stiffopt.identify.problem import CalibrationProblem, Noise, Predicted, Sample
 from stiffopt.identify.recording import Recording
@@ -126,12 +126,14 @@ def compare(
     unknowns, x = _beginnings(setup, samples, known or {}, on_evaluation)
     problem = CalibrationProblem(description, unknowns, samples, setup.points, setup.base, NOISE)
     predicted = problem.predict(x)
-    return tuple(
+    found = [
         _comparison(setup, recording, rows, sample, predicted, slice(begin, end))
         for recording, rows, sample, (begin, end) in zip(
             recordings, kept, samples, pairwise(problem.starts), strict=True
         )
-    )
+    ]
+    without_break = [found] if setup.settings.sequence else [[each] for each in found]
+    return tuple(each for logs in without_break for each in _with_levels(setup, logs))
 
 
 def _beginnings(
@@ -200,7 +202,6 @@ def _comparison(
         inside = description.calibration.covers(counts, pressures)
     position = predicted.read[0].position[own]
     moving = is_moving(recording.time, recording.pressures)[rows]
-    levels = _levels(setup, pressures, predicted.effective[own], predicted.errors[0][own], moving)
     return Comparison(
         name=recording.name,
         time=recording.time[rows],
@@ -211,35 +212,40 @@ def _comparison(
         angle=angle,
         inside=inside,
         moving=moving,
-        levels=levels[0] if levels else None,
-        unsettled_levels=levels[1] if levels else None,
+        levels=None,
+        unsettled_levels=None,
         remarks=recording.remarks,
     )
 
 
-def _levels(
-    setup: Setup, pressures: Array, effective: Array, errors: Array, moving: NDArray[np.bool_]
-) -> tuple[Array, Array] | None:
-    """Return the levels (N,) of the regions that contain the measured tip, see `Comparison`.
-
-    `errors` (N, 3) are those of the prediction with history, in the frame of the recordings.
-    """
+def _with_levels(setup: Setup, logs: Sequence[Comparison]) -> list[Comparison]:
+    """Return comparisons of logs without a break with the levels of their regions."""
     calibration = setup.description.calibration
     if calibration is None or calibration.errors is None:
-        return None
-    rows = np.linspace(0, len(errors) - 1, min(len(errors), ERRORS.compared)).astype(np.intp)
+        return list(logs)
+    ends = np.cumsum([0, *(len(each.time) for each in logs)])
+    rows = np.concatenate([
+        np.linspace(begin, end - 1, min(end - begin, ERRORS.compared)).astype(np.intp)
+        for begin, end in pairwise(ends)
+    ])  # fmt: skip
+    p, u = (np.concatenate([getattr(each, name) for each in logs])[rows]
+            for name in ("pressures", "effective"))  # fmt: skip
+    moving = np.concatenate([each.moving for each in logs])[rows]
+    time = in_turn([each.time for each in logs])[rows]
     source = Uncertainty(setup.description)
-    p, u = pressures[rows], effective[rows]
-    known = source.errors(p, effective=u)
-    unknown = source.errors(p, moving=moving[rows])
-    off = errors[rows] @ setup.base[:3, :3]
+    known, unknown = source.errors(p, effective=u, time=time), source.errors(p, moving=moving)
+    off = np.concatenate([each.measured - each.predicted for each in logs])[rows]
+    off = off @ setup.base[:3, :3]
     found = []
     for each, error in ((known, off), (unknown, off + known.position - unknown.position)):
         seen = np.isfinite(error).all(axis=1)
-        levels = np.full(len(errors), np.nan)
+        levels = np.full(ends[-1], np.nan)
         levels[rows[seen]] = source.levels(error[seen], each.covariance[seen])
-        found.append(levels)
-    return found[0], found[1]
+        found.append(np.split(levels, ends[1:-1]))
+    return [
+        replace(each, levels=known, unsettled_levels=unknown)
+        for each, known, unknown in zip(logs, *found, strict=True)
+    ]
 
 
 # measured stiffness -------------------------------------------------------------------------------

@@ -13,12 +13,15 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from stiffopt.errors import shown
+from stiffopt.model.history import lagged
 from stiffopt.schema import BadKeyError, Items, Schema
 from stiffopt.units import Angle, Length, Number, Pressure, Ratio
 
 Array = NDArray[np.float64]
 _POSITIVE = Field(ge=0)
 _ROUNDING = 1e-3  # of correlations, which are written with few digits
+_MORE_MEMORY = 0.12  # of the pressure acts through hysteresis that no model has
+_FADING = 30.0  # s in which an arm forgets former pressures, by creep
 _NEAR = 0.1  # distance within which a pressure counts as recorded, over the recorded range
 _SLACK = 0.02  # allowed excess over recorded pressures, as a share of the highest
 
@@ -163,7 +166,7 @@ def squared_moves(per_pressure: Array, variances: Array) -> Array:
     return np.asarray(variances * (per_pressure**2).sum(axis=1))
 
 
-def even_variance(moves: Array, worst: Array, memory: Array) -> Array:
+def even_variance(moves: Array, before: Array, memory: Array) -> Array:
     """Return the variance (..., N) of each axis of the tip, in m^2, the same for all directions.
 
     An arm with hysteresis answers to former pressures too, and to what the model has wrong there.
@@ -171,11 +174,19 @@ def even_variance(moves: Array, worst: Array, memory: Array) -> Array:
     Parameters
     ----------
     moves : by the discrepancy at the pressures of now, as `squared_moves` (..., N, n).
-    worst : largest of them where the arm was before.
-    memory : share (n,) of each channel's pressure that acts through hysteresis.
+    before : their mean where the arm was before, as `fading_mean` (..., N, n).
+    memory : share (n,) of each channel's pressure that acts through the model's hysteresis.
     """
-    found = (1 - memory) ** 2 * moves + memory**2 * np.maximum(worst, moves)
-    return np.asarray(found.sum(axis=-1) / 3)
+    share = memory + (1 - memory) * _MORE_MEMORY
+    return np.asarray(((1 - share) ** 2 * moves + share**2 * before).sum(axis=-1) / 3)
+
+
+def fading_mean(time: Array, moves: Array) -> Array:
+    """Return mean squares (N, ...), weighted by exp(-age / 30 s), of moves (N, ...) at times (N,).
+
+    Before the first time, the arm was where it was then.
+    """
+    return lagged(time, moves, _FADING, moves[0])
 
 
 def distances_from(channels: Sequence[int], pressures: Array, recorded: Array) -> Array:

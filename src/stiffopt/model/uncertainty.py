@@ -26,7 +26,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from stiffopt.errors import InputError
 from stiffopt.model.arguments import checked_measure
-from stiffopt.model.calibration import Calibration, even_variance, squared_moves
+from stiffopt.model.calibration import Calibration, even_variance, fading_mean, squared_moves
 from stiffopt.model.compliance import Boundary, Frame, Kind
 from stiffopt.model.description import RobotDescription
 from stiffopt.model.history import NO_HISTORY, History, part_of
@@ -197,6 +197,7 @@ class Uncertainty:
         pressures: Vector,
         *,
         effective: Vector | None = None,
+        time: Vector | None = None,
         moving: NDArray[np.bool_] | None = None,
     ) -> PositionErrors:
         """Return the errors of predictions.
@@ -204,8 +205,8 @@ class Uncertainty:
         Parameters
         ----------
         pressures : commanded (N, n), in Pa.
-        effective : effective pressures (N, n) in Pa after a known history, in order of time;
-            without these the prediction is `tip_pose` at the commanded ones.
+        effective, time : effective pressures (N, n) in Pa after a known history, and their times
+            (N,) in s, increasing; without these the prediction is `tip_pose` at the commanded ones.
         moving : which rows (N,) are not held; none by default.
         """
         u = pressures if effective is None else effective
@@ -216,14 +217,14 @@ class Uncertainty:
             still = moving if moving is not None else np.zeros(len(pressures), dtype=bool)
             acting = self._hysteresis(pressures, still)
         moves = squared_moves(per_pressure, self._discrepancy(u))
-        worst = self._typical_moves if effective is None else np.maximum.accumulate(moves)
+        before = self._typical_moves if time is None else fading_mean(time, moves)
         errors = self._calibration.errors
         residual = self._calibration.position_residual if errors is None else errors.residual
         return PositionErrors(
             position=position,
             parameters=per_number @ self._covariance @ np.swapaxes(per_number, 1, 2),
             hysteresis=(per_pressure * acting[:, np.newaxis]) @ transposed,
-            discrepancy=even_variance(moves, worst, self._memory)[:, np.newaxis, np.newaxis]
+            discrepancy=even_variance(moves, before, self._memory)[:, np.newaxis, np.newaxis]
             * np.eye(3),
             residual=np.broadcast_to(np.eye(3) * residual**2, (len(u), 3, 3)),
         )
