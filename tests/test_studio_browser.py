@@ -72,6 +72,7 @@ def test_the_arm_follows_a_target_that_is_dragged(browser_page: Any, compiled: P
         view, bench = studio.view, studio.view.bench
         start = view.target_position
 
+        page.wait_for_timeout(2500)  # until its handle is drawn; software renders slowly
         drag(page, client, start + X * 0.03, start + X * 0.045)  # its arrow along x
 
         until(lambda: bench.answer.is_best and bench.answer.design == bench.design)
@@ -120,6 +121,7 @@ def test_direction_and_objects_are_dragged(browser_page: Any, compiled: Path) ->
 
         handle = view.direction_position
         np.testing.assert_allclose(handle - view.arm_end, 0.045 * X, atol=1e-6)
+        page.wait_for_timeout(2500)  # until its handle is drawn; software renders slowly
         drag(page, client, handle + 0.016 * Z, handle + 0.046 * Z)  # its arrow along z
         until(lambda: bench.design.measure.direction[2] > 0)
         until(lambda: bench.answer.is_best and bench.answer.design == bench.design)
