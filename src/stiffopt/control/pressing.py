@@ -104,7 +104,7 @@ class Pressing:
 
     @property
     def begins_free(self) -> bool:
-        """Whether the arm rests before the approach, where nothing must touch the tip."""
+        """True while the arm rests before the approach; nothing may touch the tip then."""
         return self.phase is Phase.GOING and self._waited >= self._tuning.rest
 
     @property

@@ -333,7 +333,7 @@ class MotionTuning:
 
 @dataclass(frozen=True)
 class CreepTuning:
-    """What is believed about the creep of an arm, and how it is learned (`CreepEstimator`)."""
+    """Assumptions about the creep of an arm, and noise for learning it (`CreepEstimator`)."""
 
     times: tuple[float, ...] = (1.5, 6.0, 25.0)  # time constants, in s
     # shares that creep with each of them and their deviation; the latter for an arm whose creep

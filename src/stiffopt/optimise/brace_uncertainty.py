@@ -94,7 +94,7 @@ class BraceUncertainty:
         return k / ratio, k * ratio
 
     def _varied(self, task: Task, parameter: Parameter, coordinate: float) -> ContactEquilibrium:
-        """Return the equilibrium of an arm with another parameter; the known one without contact.
+        """Return the equilibrium with another parameter, or the known one if nothing is touched.
 
         Raises
         ------
