@@ -6,6 +6,10 @@ A plan is the local optimum next to the last plan. When the offset has changed m
 at rest, all configurations are searched again; the arm changes to another one only if that is
 clearly better. For a target that is out of reach, the plan is the nearest configuration.
 
+While the tip presses on something, plans follow the target by the least change of pressures
+instead: the error of the model, from which a force must be told, is another one elsewhere, and an
+optimum may jump when a channel reaches a limit.
+
 On a rig with a scene, a plan also reports whether the body keeps clear of it on the way.
 """
 
@@ -61,6 +65,7 @@ class PlanRequest:
     last: Plan | None = None  # replaces the planner's own last plan
     windows: tuple[Window, ...] = ()  # of the tip at rest, for adaptation
     adapted: Adapted | None = None  # the model that the offset refers to; None: the robot file's
+    stay: bool = False  # whether to follow the target by the least change of the last pressures
 
 
 @dataclass(frozen=True)
@@ -171,6 +176,9 @@ class Planning:
             self._searched_at = request.offset
             self._advantage, self._refused = self._tuning.advantage, 0
             solution = self._solve(target, None)
+        elif request.stay:
+            self._last = self._nearest(request, task, target, last.stiffness)
+            return self._last
         else:
             solution = self._next_to(last, target)
             solution = self._better(request, target, solution, last) if solution else None
@@ -274,18 +282,24 @@ class Planning:
             solution = PressureSolver(self._robot, task).solve(guess=np.clip(p, low, high))
         return solution if solution.found else None
 
-    def _nearest(self, request: PlanRequest, task: Task, target: Target) -> Plan:
-        """Plan for a target that is out of reach, or unreachable at the required stiffness."""
+    def _nearest(
+        self, request: PlanRequest, task: Task, target: Target, stiffness: float = math.nan
+    ) -> Plan:
+        """Plan for a target that is out of reach, or unreachable at the required stiffness.
+
+        It counts as reached, with the given stiffness, if `request.stay` asks for no optimum.
+        """
         start = 0.5 * (self._limits[0] + self._limits[1])
         if self._last is not None:
             start = np.clip(self._last.pressures, *self._limits)
         pressures, distance, angle = self._search.find(target, self._limits, start)
         tolerance = task.target.tolerance
         far = distance > tolerance.position or angle > tolerance.angle
-        message = nearest_words(distance, angle, tolerance)
+        reached = request.stay and not far
         return Plan(
-            request.serial, pressures, request.offset, request.target, False, math.nan, message,
-            far=far, adapted=request.adapted,
+            request.serial, pressures, request.offset, request.target, reached, stiffness,
+            "" if reached else nearest_words(distance, angle, tolerance), far=far,
+            adapted=request.adapted,
         )  # fmt: skip
 
     def _displacement(self, last: Plan, target: Target) -> Array:
