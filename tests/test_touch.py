@@ -411,7 +411,7 @@ def test_a_press_is_planned_as_its_reaction() -> None:
     ("press", "why"),
     [
         (Press(force=0.03, direction=(0, 0, 1)), "cannot feel"),
-        (Press(force=0.5, direction=(1, 0, 0)), "closest configuration"),
+        (Press(force=0.5, direction=(1, 0, 0)), "cannot hold 0.5 N there"),
     ],
 )
 def test_what_cannot_be_held_or_felt_is_refused(press: Press, why: str) -> None:
@@ -424,6 +424,14 @@ def test_what_cannot_be_held_or_felt_is_refused(press: Press, why: str) -> None:
     with pytest.raises(InputError, match="press: the arm cannot press like that"):
         controller.check_ahead(asked(press=press))
     controller.close()
+
+
+@pytest.mark.usefixtures("compiled")
+def test_a_pose_out_of_reach_is_no_fault_of_the_press() -> None:
+    solution = PressureSolver(HANGING, asked(target=Target(position=(0.2, 0.0, 0.195)))).solve()
+    assert not solution.found
+    assert "closest configuration" in solution.message
+    assert "hold" not in solution.message.partition(";")[0]
 
 
 def _rig() -> tuple[Any, Any]:

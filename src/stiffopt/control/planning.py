@@ -16,6 +16,7 @@ On a rig with a scene, a plan also reports whether the body keeps clear of it on
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import daqp
@@ -23,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt.control.adaptation import Adapted, Estimate, Learning, Window
-from stiffopt.control.tip_errors import TipErrors
+from stiffopt.control.tip_errors import TipErrors, stiffness_function
 from stiffopt.control.tuning import AdaptationTuning, FeedbackTuning, NearestTuning, PlanningTuning
 from stiffopt.control.ways import Ways
 from stiffopt.errors import InputError, StiffoptError
@@ -109,6 +110,7 @@ class Planning:
         self._ways = None if self._scene is None else Ways(robot, self._scene)
         self._search = NearestSearch(self._tip, FeedbackTuning().lever, NearestTuning())
         self._solver: PressureSolver | None = None
+        self._stiffness: Callable[[Array, Array], float] | None = None  # in the task's direction
 
     def _go_on_with(self, request: PlanRequest) -> None:
         """Use the model of a request, and carry the last plan over to it."""
@@ -169,6 +171,7 @@ class Planning:
             exact = asked.model_copy(update={"tolerance": _EXACT})
             self._solver = PressureSolver(self._robot, task.model_copy(update={"target": exact}))
             self._is_compiled = self._solver.compile()
+            self._stiffness = stiffness_function(task)
         target = model_target(asked, request.offset)
         self._limits = self._effective_limits(request)
         last = self._last = request.last or self._last
@@ -177,7 +180,7 @@ class Planning:
             self._advantage, self._refused = self._tuning.advantage, 0
             solution = self._solve(target, None)
         elif request.stay:
-            self._last = self._nearest(request, task, target, last.stiffness)
+            self._last = self._nearest(request, task, target)
             return self._last
         else:
             solution = self._next_to(last, target)
@@ -282,12 +285,10 @@ class Planning:
             solution = PressureSolver(self._robot, task).solve(guess=np.clip(p, low, high))
         return solution if solution.found else None
 
-    def _nearest(
-        self, request: PlanRequest, task: Task, target: Target, stiffness: float = math.nan
-    ) -> Plan:
+    def _nearest(self, request: PlanRequest, task: Task, target: Target) -> Plan:
         """Plan for a target that is out of reach, or unreachable at the required stiffness.
 
-        It counts as reached, with the given stiffness, if `request.stay` asks for no optimum.
+        It may count as reached only if `request.stay` asks for no optimum.
         """
         start = 0.5 * (self._limits[0] + self._limits[1])
         if self._last is not None:
@@ -295,7 +296,10 @@ class Planning:
         pressures, distance, angle = self._search.find(target, self._limits, start)
         tolerance = task.target.tolerance
         far = distance > tolerance.position or angle > tolerance.angle
-        reached = request.stay and not far
+        reached, stiffness = request.stay and not far, math.nan
+        if reached and self._stiffness is not None:
+            tip = self._tip.at(pressures)
+            stiffness = self._stiffness(tip.compliance, tip.pose[:3, :3])
         return Plan(
             request.serial, pressures, request.offset, request.target, reached, stiffness,
             "" if reached else nearest_words(distance, angle, tolerance), far=far,
