@@ -168,6 +168,23 @@ def test_a_model_that_changes_is_no_force() -> None:
         assert not estimator.felt.touches
 
 
+def test_creep_that_is_learned_is_no_force(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its shares change at once, and with them the creep that is predicted; the tip is at rest."""
+    estimator = TouchEstimator([3], vibrates=False, damping=0.04, tuning=TouchTuning())
+    creep, rng, moved = estimator.creep, np.random.default_rng(6), 0.0
+    monkeypatch.setattr(creep, "learn", lambda *_: None)
+    for time in np.arange(0.0, 6.0, FRAME).tolist():
+        if abs(time - 3.0) < FRAME / 2:
+            before = creep.displacement
+            monkeypatch.setattr(creep, "learn", lambda *_: setattr(creep, "_mean", taught))
+            taught = creep._mean + np.repeat([0.0, 0.08], 3)
+            moved = float(np.linalg.norm(creep._phi @ taught[3:] - before))
+        pressures = P * (1.0 + (time >= 1.0))
+        estimator.take(time, NOISE * rng.standard_normal(3), pressures, TIP, OMEGA)
+        assert time < 2.0 or not estimator.felt.touches
+    assert moved > 2e-3
+
+
 def test_after_a_long_gap_it_begins_anew() -> None:
     times, forces = felt(lambda t: C @ PUSH * (t > 2.0), 4.0)
     assert forces[-1].touches

@@ -257,7 +257,10 @@ class TouchEstimator:
             self.creep.skip()
         elif self._approach is None:
             grown = self._way**2 - (before * math.exp(-elapsed / t.motion_time)) ** 2
+            known = self.creep.displacement
             self.creep.learn(elapsed, away - self._filters.means[0, _XI], grown, speed)
+            # what is now taken for creep was taken for an error of the model: nothing has moved
+            self._filters.means[:, _E] -= self.creep.displacement - known
         self.felt = self._force()
 
     def _force(self) -> TipForce:
