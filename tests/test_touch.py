@@ -277,6 +277,11 @@ def test_it_goes_back_when_the_contact_is_lost() -> None:
     arm.run(4.0)
     assert arm.pressing.phase is Phase.ENDED
     assert "lost" in arm.pressing.notices()[0].text
+    near_its_end = Spring(0.003, 200.0, PRESS.model_copy(update={"travel": 4e-3}))
+    near_its_end.run(8.0)
+    near_its_end.at = 1.0
+    near_its_end.run(4.0)
+    assert "gave way, by more than the travel of 4 mm" in near_its_end.pressing.notices()[0].text
 
 
 def test_it_goes_back_when_too_much_is_felt_or_nothing_although_it_is_held_back() -> None:
