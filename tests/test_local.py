@@ -136,6 +136,17 @@ def test_search_is_over_when_nothing_new_is_found(without_compiler):
     assert short.confidence.reached == 1
 
 
+def test_a_search_may_have_to_find_the_best_several_times(without_compiler):
+    problem, x = program("position")
+    found = search(problem, x, Effort(len(x), 1, len(x)))
+    assert found.confidence.complete
+    longer = search(problem, x, Effort(len(x), 1, len(x)), best_found=found.confidence.agreeing + 1)
+    assert longer.confidence.reached > found.confidence.reached
+    assert longer.confidence.complete == (longer.confidence.agreeing > found.confidence.agreeing)
+    never = search(problem, x, Effort(len(x), 1, len(x)), best_found=len(x) + 1)
+    assert not never.confidence.complete
+
+
 def test_search_for_what_cannot_be_reached_says_where_it_ended(without_compiler):
     problem, x = program("unreachable")
     found = search(problem, x)

@@ -57,6 +57,7 @@ class Bracing:
     Attributes
     ----------
     phase : the present phase.
+    is_steered : whether the pressures follow this course; if not, they are held or let down.
     next : task to pursue after the release; None: the arm stays at rest.
     force : smallest normal force of the contacts, as estimated, in N; NaN without contact.
     margin : further push at the tip that would break a contact, in N; NaN while nothing pushes.
@@ -67,7 +68,7 @@ class Bracing:
 
     def __init__(self, task: Task, tuning: BracingTuning) -> None:
         self.task, self._tuning = task, tuning
-        self.phase = BracePhase.PLANNING
+        self.phase, self.is_steered = BracePhase.PLANNING, True
         self.next: Task | None = None
         self.force = self.margin = math.nan
         self.push, self.displacement = np.zeros(3), np.zeros(3)
@@ -192,7 +193,8 @@ class Bracing:
         t = self._tuning
         if self.phase is not BracePhase.HELD or self.approach is None:
             return
-        if float(np.abs(pressures - self.pressures).max()) > t.off_plan:  # being let down
+        off_plan = t.off_plan if self.is_steered else t.let_down
+        if float(np.abs(pressures - self.pressures).max()) > off_plan:
             return
         residual = seen - tip.pose[:3, 3]
         if self._error is None:

@@ -444,6 +444,7 @@ class BracingTuning:
     free_share: float = 0.6
     samples: int = 3
     off_plan: float = 1.5e4  # pressure error above which contacts are not judged, in Pa
+    let_down: float = 2e3  # the same while the pressures are held: then they are being let down
     swing_time: float = 0.08  # time constant of averaging the measured tip, in s
     # displacement of the tip above which a push is felt, in m; time constant with which a smaller
     # one becomes the model's error, in s

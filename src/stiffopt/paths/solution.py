@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from stiffopt.display import display_units
 from stiffopt.errors import InputError
+from stiffopt.model.contact.equilibrium import ContactEquilibrium
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.notebook import ShownInNotebook
 from stiffopt.paths.trajectory import Trajectory, trajectory_through
@@ -48,6 +49,8 @@ class PathSolution(ShownInNotebook):
         In m and rad; None where not asked for.
     clearance : ndarray (N,) or None
         Smallest distance between body and scene, in m; None without a scene.
+    equilibria : tuple of ContactEquilibrium
+        Of a motion into contact: those of its last points, from rest on; else empty.
     first_failure : int or None
         Index of the first point that cannot be solved, or of the last from which no way on was
         found.
@@ -70,6 +73,7 @@ class PathSolution(ShownInNotebook):
     position_errors: Vector | None = None
     angle_errors: Vector | None = None
     clearance: Vector | None = None
+    equilibria: tuple[ContactEquilibrium, ...] = ()
     first_failure: int | None = None
     confidence: str = ""
     timings: dict[str, float] = field(default_factory=dict)
@@ -86,6 +90,11 @@ class PathSolution(ShownInNotebook):
     def found(self) -> bool:
         """Whether every point meets its requirements, and every step the rates."""
         return self.status == "solved"
+
+    def equilibrium(self, index: int) -> ContactEquilibrium | None:
+        """Return the equilibrium in contact at a point, if the motion knows it."""
+        own = index - len(self.times) + len(self.equilibria)
+        return self.equilibria[own] if own >= 0 else None
 
     @property
     def worst_index(self) -> int | None:
