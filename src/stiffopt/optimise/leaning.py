@@ -291,8 +291,8 @@ class BracedProblem(PressureProblem):
         """Return rows for the objects that the body keeps clear of; see `Obstacles`."""
         if self.program.obstacles is None:
             return []
-        asked = self.program.obstacles.scene.clearance
-        return [OBSTACLES.margin - (each.distance - asked) for each in near]
+        required = self.program.obstacles.scene.clearance
+        return [OBSTACLES.margin - (each.distance - required) for each in near]
 
     def _slopes(self, eq: ContactEquilibrium, base: Quantities, slopes: Quantities) -> Vector:
         """Return derivatives (rows, n) of `_rows`; of several contacts on an object, the worst."""

@@ -227,7 +227,7 @@ class _Planner:
         """Whether the way along pressures (N, n) is clear."""
         if self.motions is None:
             return True
-        found = self.motions.along(rows, self.request.asked)
+        found = self.motions.along(rows, self.request.required)
         self.poses += found.poses
         return found.clear
 
@@ -316,10 +316,10 @@ class _Planner:
         distance, name = float(near.distances[index]), near.names[index]
         shape = next(item.shape for item in request.scene.objects if item.name == name)
         unit = display_units().length
-        missing = unit.text(request.asked - distance, ".3g")
+        missing = unit.text(request.required - distance, ".3g")
         text = f"the body is {missing} {shape.amiss} '{name}'"
-        if request.asked:
-            text += f", where {unit.text(request.asked, '.3g')} of clearance are asked"
+        if request.required:
+            text += f", where {unit.text(request.required, '.3g')} of clearance are required"
         if request.margin:
             kept = unit.text(request.margin, ".3g")
             text += f", {kept} of them for what the calibration leaves open"
