@@ -1,6 +1,7 @@
 """The local method in Python: its results hold, are optimal, and are those of compiled code."""
 
 import sys
+from dataclasses import replace
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
@@ -143,6 +144,11 @@ def test_a_search_may_have_to_find_the_best_several_times(without_compiler):
     longer = search(problem, x, Effort(len(x), 1, len(x)), best_found=found.confidence.agreeing + 1)
     assert longer.confidence.reached > found.confidence.reached
     assert longer.confidence.complete == (longer.confidence.agreeing > found.confidence.agreeing)
+    other = found.results[-1]
+    own = sum(abs(end.value - other.value) < found.same for end in found.ends)
+    needed = replace(found, best_found=own + 1)
+    assert found.confidence_in(other).complete
+    assert not needed.confidence_in(other).complete
     never = search(problem, x, Effort(len(x), 1, len(x)), best_found=len(x) + 1)
     assert not never.confidence.complete
 

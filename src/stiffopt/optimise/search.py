@@ -96,6 +96,8 @@ class Search:
         optimum.
     same : float
         Difference of values below which ends count as one optimum.
+    best_found : int
+        How many descents must have found an answer for a complete search.
     """
 
     results: tuple[LocalResult, ...]
@@ -103,11 +105,13 @@ class Search:
     confidence: Confidence
     ends: tuple[LocalResult, ...] = ()
     same: float = SEARCH.same_optimum
+    best_found: int = 1
 
     def confidence_in(self, result: LocalResult) -> Confidence:
         """Return how sure the search is of another result than the best, with its own descent."""
-        agreeing = sum(_agree(end, result, self.same) for end in self.ends)
-        return replace(self.confidence, agreeing=max(1, agreeing))
+        agreeing = max(1, sum(_agree(end, result, self.same) for end in self.ends))
+        complete = self.confidence.complete and agreeing >= self.best_found
+        return replace(self.confidence, agreeing=agreeing, complete=complete)
 
 
 def search(
@@ -198,7 +202,8 @@ class _Trail:
         confidence = Confidence(
             self.starts, len(ends), self._agreeing_on_best, len(self.optima), self.is_complete
         )
-        return Search(tuple(results), tuple(self.nearest), confidence, ends, self.same)
+        nearest = tuple(self.nearest)
+        return Search(tuple(results), nearest, confidence, ends, self.same, self._best_found)
 
 
 def _agree(a: LocalResult, b: LocalResult, same: float) -> bool:
