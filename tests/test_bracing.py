@@ -247,7 +247,7 @@ def test_a_slip_is_told_and_lets_go_where_contacts_are_to_stick(approach, contac
 
 def test_an_arm_without_contact_is_told_whatever_pushes_it(approach):
     course = held(approach)
-    apart = approach.free_tip - approach.tips[-1].pose[:3, 3]
+    apart = approach.free_tips[-1] - approach.tips[-1].pose[:3, 3]
     assert np.linalg.norm(apart) > 4e-3
     after = samples(course, approach, apart, 40)
     assert after is not None
@@ -273,7 +273,7 @@ def test_an_arm_that_is_let_down_is_not_told_to_slip(approach):
 
 def test_an_error_of_the_model_and_creep_are_no_push(approach):
     course = held(approach)
-    across = np.cross(approach.free_tip - approach.tips[-1].pose[:3, 3], [0.0, 0.0, 1.0])
+    across = np.cross(approach.free_tips[-1] - approach.tips[-1].pose[:3, 3], [0.0, 0.0, 1.0])
     across *= 3e-3 / np.linalg.norm(across)
     for step in range(400):  # 0.1 mm/s
         assert samples(course, approach, across * (1 + step * 0.025 / 30), 1) is None
@@ -300,8 +300,11 @@ def test_the_tip_goes_to_its_target_with_the_contact_force_as_it_is(approach):
 class Loop:
     """A controller and a simulated arm without inertia, beside the post or without it."""
 
-    def __init__(self, scene: stiffopt.Scene | None = TASK.scene, **plant: Any) -> None:
+    def __init__(
+        self, scene: stiffopt.Scene | None = TASK.scene, world: stiffopt.Scene | None = None
+    ) -> None:
         settings = PlantSettings(
+            scene=world,
             dynamics="quasi-static",
             silicone=Silicone(creep=(), hysteresis=()),
             discretisation={
@@ -310,7 +313,6 @@ class Loop:
                 "shear_degree": 1,
                 "sub_intervals": 3,
             },
-            **plant,
         )
         description = RigDescription(
             robot="stiff-flop-2",
@@ -407,6 +409,40 @@ def test_the_loop_leans_holds_tells_a_lift_off_and_lets_go(solution, approach, m
     loop.until(lambda s: s.task == "target", 20.0)
     assert "release" in loop.told
     assert loop.force == 0
+    loop.controller.close()
+
+
+def test_an_object_that_is_not_there_is_told_on_the_way(solution, monkeypatch):
+    """The object of the scene stands elsewhere on the rig, so that nothing is touched."""
+    known = SimpleNamespace(solve=lambda: solution)
+    monkeypatch.setattr(planning, "PressureSolver", lambda robot, task: known)
+    away = {"sphere": {"centre": (0.2, 0.2, 0.2), "radius": 0.01}, "contact": {"allowed": True}}
+    loop = Loop(world=stiffopt.Scene(objects=[{"name": "far", **away}]))
+    loop.wait(1.0)
+    loop.controller.set_task(TASK)
+    loop.until(lambda s: s.brace == "releasing", 20.0)
+    assert loop.told == ["brace-lost"]
+    assert loop.command.max() < 0.9 * solution.pressures.max(), "long before the end of the way"
+    loop.until(lambda s: s.brace == "released", 20.0)
+    loop.controller.close()
+
+
+def test_a_contact_that_friction_holds_is_brought_to_the_target(solution, monkeypatch):
+    """Friction withholds corrections at first; that is no push, so they go on."""
+    known = SimpleNamespace(solve=lambda: solution)
+    monkeypatch.setattr(planning, "PressureSolver", lambda robot, task: known)
+    rough = TASK.scene.objects[0].model_copy(
+        update={"contact": TASK.scene.objects[0].contact.model_copy(update={"friction": 0.4})}
+    )
+    loop = Loop(world=stiffopt.Scene(objects=[rough]))
+    loop.wait(1.0)
+    loop.controller.set_task(TASK)
+    loop.until(lambda s: s.brace == "held", 20.0)
+    missed = loop.status.position_error
+    loop.wait(40.0)
+    assert missed > 2e-3
+    assert loop.status.position_error < 0.3 * missed
+    assert set(loop.told) <= {"braced", "brace-off-target"}
     loop.controller.close()
 
 

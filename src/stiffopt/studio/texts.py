@@ -387,6 +387,10 @@ def _rig_rows(state: Snapshot) -> Iterable[tuple[str, str]]:
     if np.isfinite(state.stiffness):
         now = unit.number(state.stiffness, FIGURES)
         yield "stiffness", f"{now} of {unit.text(state.best_stiffness, FIGURES)}"
+    if state.brace:
+        yield "brace", state.brace
+    if np.isfinite(state.brace_force):
+        yield "contact force", display_units().force.text(state.brace_force, ".3g")
     for alarm in state.alarms:
         yield "alarm", f"<span style='color:#b35c00'>{escape(alarm.text)}</span>"
 
