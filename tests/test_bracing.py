@@ -21,13 +21,14 @@ from stiffopt.control.controller import TipController
 from stiffopt.control.linearised_tip import LeaningTip
 from stiffopt.control.state import ControllerStatus
 from stiffopt.control.tuning import BracingTuning
-from stiffopt.errors import InputError
+from stiffopt.errors import FileError, InputError
 from stiffopt.optimise import braced
 from stiffopt.optimise.settings import BRACE, Effort
 from stiffopt.optimise.solution import PressureSolution
 from stiffopt.optimise.solver import PressureSolver
 from stiffopt.paths.configurations import Unsolved
 from stiffopt.paths.leaning import FORCE_RATE, GRADUAL, SPEED, BraceApproach, approach_to, gradual
+from stiffopt.paths.motion_file import read_motion
 from stiffopt.paths.trajectory import Trajectory, Waypoint
 from stiffopt.plant.settings import PlantLoad, PlantSettings, Silicone
 from stiffopt.plots import plot_motion
@@ -500,6 +501,20 @@ def test_the_picture_of_a_motion_shows_the_arm_in_contact(solution):
     assert f"{np.linalg.norm(contact.force):.3g} N" in [
         text.get_text() for text in figure.findobj(Text)
     ]
+
+
+@pytest.mark.parametrize("name", ["motion.csv", "motion.yaml"])
+def test_a_written_motion_that_leans_is_not_played(tmp_path, name):
+    out, begin = tmp_path / name, "0,0,0,0,0,0 bar"
+    arguments = ["--to", "problems/braced/post.yaml", "--slew", "2 bar/s", "--quiet"]
+    assert main(["plan", "--from", begin, *arguments, "--out", str(out)]) == 0
+    with pytest.raises(FileError, match=r"leans on objects.*give the rig its task"):
+        read_motion(out, ROBOT.description)
+    found = stiffopt.plan_motion(ROBOT, np.zeros(6), [TASK], slew=2e5)
+    assert found.leans[-1]
+    assert not found.leans[0]
+    with pytest.raises(InputError, match="leans on objects"):
+        found.trajectory()
 
 
 def test_the_json_of_a_motion_names_its_contacts(capsys):

@@ -102,7 +102,7 @@ def _rows(answer: StudioAnswer) -> Iterable[tuple[str, str]]:
     if solution.contacts and solution.stiffness_free is not None:
         unit = units.of_si(solution.stiffness_unit)
         yield "clear of all", unit.text(solution.stiffness_free, FIGURES)
-    if solution.task.scene is not None:  # the exact clearance is too slow during a drag
+    elif solution.task.scene is not None:  # the exact clearance is too slow during a drag
         clear = solution.clearance if answer.is_best else None
         yield (
             "clearance",
