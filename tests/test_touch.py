@@ -176,8 +176,8 @@ def test_creep_that_is_learned_is_no_force(monkeypatch: pytest.MonkeyPatch) -> N
     for time in np.arange(0.0, 6.0, FRAME).tolist():
         if abs(time - 3.0) < FRAME / 2:
             before = creep.displacement
-            monkeypatch.setattr(creep, "learn", lambda *_: setattr(creep, "_mean", taught))
             taught = creep._mean + np.repeat([0.0, 0.08], 3)
+            monkeypatch.setattr(creep, "learn", lambda *_, to=taught: setattr(creep, "_mean", to))
             moved = float(np.linalg.norm(creep._phi @ taught[3:] - before))
         pressures = P * (1.0 + (time >= 1.0))
         estimator.take(time, NOISE * rng.standard_normal(3), pressures, TIP, OMEGA)
