@@ -21,9 +21,11 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator
 
+import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.control.formula import Formula
 from stiffopt.control.interface import Notice
 from stiffopt.control.state import Severity
 from stiffopt.control.tuning import RegulatorTuning
@@ -66,6 +68,8 @@ class Channels:
         self._empty = np.clip(0.0, limits.low, limits.high)
         self.out: Flags = np.zeros(limits.n, dtype=bool)
         self._any_out = False
+        self._none: Flags = np.zeros(limits.n, dtype=bool)
+        self._look = _look(limits.n, tuning)
         self.begin()
 
     def begin(self) -> None:
@@ -101,6 +105,8 @@ class Channels:
     @property
     def lost(self) -> Flags:
         """Channels (n,) that the plan does without, or uses below their usual limit."""
+        if self._quiet and not self._any_out:
+            return self._none
         return self.limited | self.stuck | self.out
 
     def update(
@@ -122,23 +128,19 @@ class Channels:
         self.shortfall = -offset
         self._rest.advance(elapsed, command, self.shortfall)
         share = -math.expm1(-elapsed / self._tuning.reading_time)
-        change = share * (reading - self._smoothed)
-        change[~np.isfinite(change)] = 0.0
-        self._smoothed = self._smoothed + change
+        self._smoothed, now, follows, strays, sound = self._look(
+            share, self._smoothed, reading, self.shortfall, healthy
+        )
         if self._any_out:
             self._ceiling = np.where(
                 self.out, np.maximum(self._ceiling - self._let_down * elapsed, self._empty),
                 self._limits.high,
             )  # fmt: skip
-        short, unmoved = self.shortfall, self._tuning.unmoved
-        follows = np.abs(short) <= self._min_allowed
-        settled = reading + short
-        strays = (healthy[0] - settled > unmoved) | (settled - healthy[1] > unmoved)
-        now = np.stack([reading, settled])
-        if self._quiet and follows.all() and not strays.any():
+        if self._quiet and sound[0]:
             self._followed = now
             return
-        self._followed = np.where(follows & ~strays, now, self._followed)
+        short, unmoved = self.shortfall, self._tuning.unmoved
+        self._followed = np.where((follows > 0) & (strays == 0), now, self._followed)
         # a reading that has moved must not count as still when it comes by again
         still = np.abs(reading - self._followed[0]) < unmoved
         self._followed[0, ~still] = np.nan
@@ -246,6 +248,31 @@ class Channels:
         if self.out[channel]:
             return f"{name} was taken out"
         return f"{name} is stuck at {has}" if self.stuck[channel] else f"{name} has {has} at most"
+
+
+def _look(n: int, tuning: RegulatorTuning) -> Formula:
+    """Return the formula of the checks that every tick makes.
+
+    Inputs: share by which smoothed readings (n,) follow; these; readings and shortfalls (n,); least
+    and greatest healthy pressures (2, n). Outputs: smoothed readings; readings, and these without
+    the regulators' offset (2, n); 1 for channels (n,) that follow; 1 for those (n,) that are beyond
+    the healthy pressures; and 1 if all follow and none is beyond them.
+    """
+    share, smoothed = ca.SX.sym("share"), ca.SX.sym("smoothed", n)
+    reading, short = ca.SX.sym("reading", n), ca.SX.sym("short", n)
+    healthy = ca.SX.sym("healthy", 2, n)
+    change = share * (reading - smoothed)
+    after = smoothed + ca.if_else(ca.fabs(change) < np.inf, change, 0)  # 0 for NaN
+    settled = reading + short
+    follows = ca.fabs(short) <= tuning.max_compensation
+    below, above = healthy[0, :].T - settled, settled - healthy[1, :].T
+    strays = ca.logic_or(below > tuning.unmoved, above > tuning.unmoved)
+    sound = ca.logic_and(ca.mmin(follows) > 0, ca.mmax(strays) < 1)
+    now = ca.vertcat(reading.T, settled.T)
+    return Formula(
+        [share, smoothed, reading, short, healthy], [after, now, follows, strays, sound],
+        [healthy, now],
+    )  # fmt: skip
 
 
 class _Rest:

@@ -128,6 +128,17 @@ class FeedbackTuning:
 
 
 @dataclass(frozen=True)
+class MotionErrorTuning:
+    """How the tip's offset changes with motion on a trajectory (`MotionErrorEstimator`)."""
+
+    deviation: float = 0.1  # of the share by which the tip moves farther than modelled
+    drift: float = 3e-4  # growth of the deviation of the rest of the offset, in m / sqrt(s)
+    noise: float = 3e-4  # of an offset, in m
+    late: float = 0.1  # error of an offset in motion, as the way of the tip in this time, in s
+    every: float = 0.1  # between two offsets that are taken in, in s
+
+
+@dataclass(frozen=True)
 class ReplanningTuning:
     """When to make new plans, and how quickly they follow the estimated offset."""
 
@@ -494,6 +505,7 @@ class ControlTuning:
     estimator: EstimatorTuning = field(default_factory=EstimatorTuning)
     reference: ReferenceTuning = field(default_factory=ReferenceTuning)
     feedback: FeedbackTuning = field(default_factory=FeedbackTuning)
+    motion_error: MotionErrorTuning = field(default_factory=MotionErrorTuning)
     replanning: ReplanningTuning = field(default_factory=ReplanningTuning)
     posture: PostureTuning = field(default_factory=PostureTuning)
     forecast: ForecastTuning = field(default_factory=ForecastTuning)
