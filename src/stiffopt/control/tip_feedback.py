@@ -119,13 +119,12 @@ class TipFeedback:
     def _correctable(self, offset: Array) -> Array:
         """Return the offset (6,) that feedback corrects now.
 
-        For an arm that vibrates it is averaged over a vibration, except along the stiff axis.
+        For an arm that vibrates it is averaged over a vibration, except along a stiff axis.
         """
         estimator = self._arm.tip
         self._averaged.advance(offset, estimator.omega)
         corrected = self._averaged.value.copy()
-        behind = offset[:3] - corrected[:3]
-        corrected[:3] += behind - estimator.soft_plane @ behind
+        corrected[:3] += estimator.stiff_axis @ (offset[:3] - corrected[:3])
         return corrected
 
     def _vibration_inputs(self, reference: Reference) -> tuple[ArrayLike, ...]:

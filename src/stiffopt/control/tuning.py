@@ -30,6 +30,8 @@ class EstimatorTuning:
     memory: float = 0.4  # age beyond which a sample is dropped, in s
     # compliance, as a share of the largest, below which a direction vibrates less
     soft_share: float = 0.15
+    # the same, above which a direction vibrates slowly enough for fast corrections to excite it
+    stiff_share: float = 0.05
     # lower bound of the vibration's angular frequency, in rad/s; it is 0 for an arm about to buckle
     least_frequency: float = 0.5
     # displacement of the model, in m, after which an exactly unchanged pose is a frozen reading
@@ -312,8 +314,11 @@ class MotionTuning:
     # share of the turn that a push would cause by which the measured turn must miss it
     slip: float = 0.7
     least_turn: float = 0.02  # by which it must miss it at least, in rad
-    # displacement up to which a drift that turns the tip as a push does is a push that grows, in m
+    bends: float = 0.5  # share below which a change that begins so is a push
+    further: float = 2.0  # multiple of that turn up to which a larger one in its direction fits
+    # displacement of a growing push, in m, above which it must miss it by less than another share
     largest_push: float = 8e-3
+    slip_of_large: float = 0.25
     slips: int = 4  # successive samples that show a slip
     # an arm that responds otherwise than modelled explains a displacement: share of it that may be
     # across the model's motion, and its largest share of that motion
