@@ -71,7 +71,7 @@ class Plan:
     pressures: Array  # effective (n,), in Pa
     offset: Array  # of the tip (6,), for which the plan was made
     target: Target | None
-    reached: bool  # whether the model reaches the target
+    reached: bool  # whether the model reaches the target, here or in a distant configuration
     stiffness: float  # along the task's first direction; NaN if it has none
     message: str  # how far the model stays from a target that is not reached
     blocked: str = ""  # why the way to the plan is not clear of the scene
@@ -166,7 +166,8 @@ class Planning:
             self._is_compiled = self._solver.compile()
         target = model_target(asked, request.offset)
         self._limits = self._effective_limits(request)
-        last = self._last = request.last or self._last
+        last, refused = request.last or self._last, self._refused
+        self._last = last
         if last is None or request.search:
             self._searched_at = request.offset
             self._advantage, self._refused = self._tuning.advantage, 0
@@ -182,7 +183,7 @@ class Planning:
                 adapted=request.adapted,
             )  # fmt: skip
         else:
-            self._last = self._nearest(request, task, target)
+            self._last = self._nearest(request, task, target, self._refused > refused)
         return self._last
 
     def _braced(self, request: PlanRequest, task: Task, asked: Target) -> Plan | None:
@@ -274,8 +275,11 @@ class Planning:
             solution = PressureSolver(self._robot, task).solve(guess=np.clip(p, low, high))
         return solution if solution.found else None
 
-    def _nearest(self, request: PlanRequest, task: Task, target: Target) -> Plan:
-        """Plan for a target that is out of reach, or unreachable at the required stiffness."""
+    def _nearest(self, request: PlanRequest, task: Task, target: Target, reached: bool) -> Plan:
+        """Plan for a target that is out of reach, or unreachable at the required stiffness.
+
+        `reached`: it can be reached in a distant configuration, which a later plan may take.
+        """
         start = 0.5 * (self._limits[0] + self._limits[1])
         if self._last is not None:
             start = np.clip(self._last.pressures, *self._limits)
@@ -284,7 +288,7 @@ class Planning:
         far = distance > tolerance.position or angle > tolerance.angle
         message = nearest_words(distance, angle, tolerance)
         return Plan(
-            request.serial, pressures, request.offset, request.target, False, math.nan, message,
+            request.serial, pressures, request.offset, request.target, reached, math.nan, message,
             far=far, adapted=request.adapted,
         )  # fmt: skip
 
