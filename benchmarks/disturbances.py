@@ -400,6 +400,7 @@ def run_row(case: Case, row: Row, dynamics: str) -> Outcome:
     controller = TipController(
         load_robot(case.believed), rig.supply.limits, rig.slew, period=PERIOD,
         control=rig.settings.control, safety=rig.settings.safety, vibrates=dynamics == "full",
+        commissioned=False,
     )  # fmt: skip
     run = LoopRun(rig, controller, case.point)
     try:

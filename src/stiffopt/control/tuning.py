@@ -113,6 +113,17 @@ class ReferenceTuning:
 
 
 @dataclass(frozen=True)
+class FirstMotionTuning:
+    """The first motion of an arm that is not known to respond as modelled (`FirstMotion`)."""
+
+    slew_share: float = 0.15  # share of the slew that the reference may take
+    # way of the model's tip after which it ends, in m, if the tip has followed with an error of at
+    # most a share of that way
+    way: float = 8e-3
+    error: float = 0.5
+
+
+@dataclass(frozen=True)
 class FeedbackTuning:
     """Feedback at the tip."""
 
@@ -490,6 +501,7 @@ class ControlTuning:
     lags: LagTuning = field(default_factory=LagTuning)
     estimator: EstimatorTuning = field(default_factory=EstimatorTuning)
     reference: ReferenceTuning = field(default_factory=ReferenceTuning)
+    first_motion: FirstMotionTuning = field(default_factory=FirstMotionTuning)
     feedback: FeedbackTuning = field(default_factory=FeedbackTuning)
     replanning: ReplanningTuning = field(default_factory=ReplanningTuning)
     posture: PostureTuning = field(default_factory=PostureTuning)
