@@ -18,6 +18,7 @@ from stiffopt.control.adaptation import Adapted
 from stiffopt.control.bracing import BracePhase, Bracing
 from stiffopt.control.checks import refusing
 from stiffopt.control.course import Course
+from stiffopt.control.first_motion import FirstMotion
 from stiffopt.control.forecast import Forecast, Present
 from stiffopt.control.interface import ControlOutput, Notice, SampleCounts
 from stiffopt.control.linearised_tip import LeaningTip
@@ -70,6 +71,8 @@ class TipController:
         Objects that the arm has to keep clear of; None: nothing is checked.
     plan_in_process :
         Whether to plan in a separate process; otherwise inline, for simulated time.
+    commissioned :
+        Whether the arm is known to respond as modelled; otherwise its first motion is slow.
     tuning :
         Tuning of the parts.
 
@@ -90,6 +93,7 @@ class TipController:
         vibrates: bool = True,
         scene: Scene | None = None,
         plan_in_process: bool = False,
+        commissioned: bool = True,
         tuning: ControlTuning | None = None,
     ) -> None:
         self.robot, self.limits = robot, limits
@@ -121,6 +125,7 @@ class TipController:
             tuning.feedback,
             tuning.motion_error,
         )
+        self._first_motion = FirstMotion(commissioned, tuning.first_motion)
         self._requests = Requests(robot, limits, slew, scene, tuning)
         Planner = ProcessPlanner if plan_in_process else InlinePlanner
         self.replanner = Replanner(Planner(robot, scene), tuning.replanning, period, dead_time)
@@ -145,6 +150,7 @@ class TipController:
         self._now = now
         self.replanner.begin()
         self._arm.begin(now)
+        self._first_motion.begin()
         self._reference.begin(np.concatenate([self._arm.pressures.command, np.zeros(6)]))
         self._feedback.begin()
         self._permitted = self.limits.low, self.limits.high  # commands (n,) that the task permits
@@ -290,6 +296,8 @@ class TipController:
         if isinstance(course, Bracing):
             course.is_steered = not self._is_held(now)
         counts = self._arm.observe(now, commanded, reading, samples, course)
+        if counts.used and (sample := self._arm.tip.sample) is not None:
+            self._first_motion.take(self._arm.tip.predicted, sample.position)
         if self.forecast is not None:
             self.forecast.present = self._present(now)
         return counts
@@ -379,7 +387,7 @@ class TipController:
             return self._brace(course, now)
         calm = now - self._adapted_at < tuning.adaptation.calm_time
         share = tuning.adaptation.slew_share if calm else tuning.reference.slew_share
-        reference.slew_share = share
+        reference.slew_share = min(share, self._first_motion.slew_share)
         way = None if self.forecast is None else self._way(now)
         found = replanner.update(
             now, self._offset, self._arm.pressures.command_offset, estimator.omega,

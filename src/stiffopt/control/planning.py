@@ -77,7 +77,7 @@ class Plan:
     pressures: Array  # effective (n,), in Pa
     offset: Array  # of the tip (6,), for which the plan was made
     target: Target | None
-    reached: bool  # whether the model reaches the target
+    reached: bool  # whether the model reaches the target, here or in a distant configuration
     stiffness: float  # along the task's first direction; NaN if it has none
     message: str  # how far the model stays from a target that is not reached
     blocked: str = ""  # why the way to the plan is not clear of the scene
@@ -174,13 +174,14 @@ class Planning:
             self._stiffness = stiffness_function(task)
         target = model_target(asked, request.offset)
         self._limits = self._effective_limits(request)
-        last = self._last = request.last or self._last
+        last, refused = request.last or self._last, self._refused
+        self._last = last
         if last is None or request.search:
             self._searched_at = request.offset
             self._advantage, self._refused = self._tuning.advantage, 0
             solution = self._solve(target, None)
         elif request.stay:
-            self._last = self._nearest(request, task, target)
+            self._last = self._nearest(request, task, target, distant=False)
             return self._last
         else:
             solution = self._next_to(last, target)
@@ -193,7 +194,9 @@ class Planning:
                 adapted=request.adapted,
             )  # fmt: skip
         else:
-            self._last = self._nearest(request, task, target)
+            self._last = self._nearest(
+                request, task, target, distant=self._refused > refused
+            )
         return self._last
 
     def _braced(self, request: PlanRequest, task: Task, asked: Target) -> Plan | None:
@@ -285,10 +288,11 @@ class Planning:
             solution = PressureSolver(self._robot, task).solve(guess=np.clip(p, low, high))
         return solution if solution.found else None
 
-    def _nearest(self, request: PlanRequest, task: Task, target: Target) -> Plan:
+    def _nearest(self, request: PlanRequest, task: Task, target: Target, *, distant: bool) -> Plan:
         """Plan for a target that is out of reach, or unreachable at the required stiffness.
 
-        It may count as reached only if `request.stay` asks for no optimum.
+        It counts as reached if `request.stay` asks for no optimum, or if it can be reached in a
+        `distant` configuration, which a later plan may take.
         """
         start = 0.5 * (self._limits[0] + self._limits[1])
         if self._last is not None:
@@ -296,13 +300,13 @@ class Planning:
         pressures, distance, angle = self._search.find(target, self._limits, start)
         tolerance = task.target.tolerance
         far = distance > tolerance.position or angle > tolerance.angle
-        reached, stiffness = request.stay and not far, math.nan
-        if reached and self._stiffness is not None:
+        stays, stiffness = request.stay and not far, math.nan
+        if stays and self._stiffness is not None:
             tip = self._tip.at(pressures)
             stiffness = self._stiffness(tip.compliance, tip.pose[:3, :3])
         return Plan(
-            request.serial, pressures, request.offset, request.target, reached, stiffness,
-            "" if reached else nearest_words(distance, angle, tolerance), far=far,
+            request.serial, pressures, request.offset, request.target, stays or distant, stiffness,
+            "" if stays else nearest_words(distance, angle, tolerance), far=far,
             adapted=request.adapted,
         )  # fmt: skip
 

@@ -132,7 +132,7 @@ class TipFeedback:
     def _correctable(self, offset: Array, tip: TipAt, reference: Reference) -> Array:
         """Return the offset (6,) that feedback corrects now.
 
-        For an arm that vibrates it is averaged over a vibration, except along the stiff axis, and
+        For an arm that vibrates it is averaged over a vibration, except along a stiff axis, and
         except for the part that is known to grow with the motion; the regulators delay that part.
         """
         arm, slope, position = self._arm, self._motion_error.slope, tip.pose[:3, 3]
@@ -148,7 +148,7 @@ class TipFeedback:
             velocity = tip.pose[:3, :3] @ (tip.jacobian[:3] @ reference.motion[1, :n])
             behind -= slope @ (position - self._averaged.value[6:])
             ahead = slope @ velocity * (arm.pressures.lag + arm.pressures.dead_time)
-        corrected[:3] = now[:3] - arm.tip.soft_plane @ behind + ahead
+        corrected[:3] = now[:3] - behind + arm.tip.stiff_axis @ behind + ahead
         return corrected
 
     def _vibration_inputs(self, reference: Reference) -> tuple[ArrayLike, ...]:
