@@ -38,7 +38,7 @@ class ContactSurface:
     friction : coefficient.
     softness : depth per normal force, in m/N.
     begin : arc length at rest from which the arm's body counts, in m.
-    key, pieces : kind of the object, and the numbers (k, size) of its formula.
+    key, pieces : kind of the object, and the numbers (k, size) of its formula for contacts.
     is_interpolated : whether its distances come from a grid instead.
     """
 
@@ -50,7 +50,7 @@ class ContactSurface:
         self.softness = 0.0 if item.contact.stiffness is None else 1 / item.contact.stiffness
         self.begin = begin
         self._shape = item.shape
-        self.key, self.pieces = item.shape.key, np.array(item.shape.pieces, dtype=float)
+        self.key, self.pieces = item.shape.key, np.array(item.shape.contact_pieces, dtype=float)
         self.is_interpolated = item.shape.is_interpolated
         self._function = None if self.is_interpolated else _second_order(type(item.shape))
 
@@ -60,7 +60,10 @@ class ContactSurface:
 
     def distances(self, points: Vector) -> Vector:
         """Return distances (k,) of points (k, 3), in m."""
-        return self._measured.distances(points).values
+        if self._function is None:
+            return self._measured.distances(points).values
+        found = [self._function.many(points, piece)[0][:, 0, 0] for piece in self.pieces]
+        return np.max(found, axis=0)
 
     def at(self, point: Vector) -> SurfacePoint:
         """Return the distance of one point (3,) with its derivatives."""
@@ -99,9 +102,9 @@ _FIT = np.linalg.pinv(
 
 def surface_function(kind: type[Obstacle]) -> ca.Function:
     """Return the function of a point and a piece to distance, gradient and second derivatives."""
-    point, q = ca.SX.sym("point", 3), ca.SX.sym("parameters", kind.n_parameters)
-    hessian, gradient = ca.hessian(kind.formula(point, q), point)
-    outputs = ca.cse([kind.formula(point, q), ca.densify(gradient), ca.densify(hessian)])
+    point, q, distance = kind.contact_formula()
+    hessian, gradient = ca.hessian(distance, point)
+    outputs = ca.cse([distance, ca.densify(gradient), ca.densify(hessian)])
     return dense(ca.Function(f"surface_{kind.key}", [point, q], outputs))
 
 
