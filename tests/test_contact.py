@@ -16,6 +16,7 @@ from independent import ARMS, FLOP, Arm, rod_section
 from stiffopt.errors import EquilibriumError, InputError
 from stiffopt.model.contact.solve import ContactProblem
 from stiffopt.model.contact.stability import stiffness_left
+from stiffopt.model.contact.surface import ContactSurface
 from stiffopt.model.scene import Scene
 
 TWO = Arm((FLOP, FLOP))
@@ -378,6 +379,107 @@ def test_bad_input_is_named():
         found.compliance("glued")
     with pytest.raises(InputError, match="limit"):
         found.lift_off(X, limit=0)
+
+
+# -- bent tubes -----------------------------------------------------------------------------------
+
+
+def bent_tube(bend_deg: float, at: float, radius: float, side: float = 0.0) -> dict[str, Any]:
+    """A tube along the straight arm, that turns in the plane at the angle `side` about z."""
+    bend = np.radians(bend_deg)
+    way = (np.sin(bend) * np.cos(side), np.sin(bend) * np.sin(side), np.cos(bend))
+    end = (0.2 * way[0], 0.2 * way[1], at + 0.2 * way[2])
+    return {"inside_tube": {"points": [(0, 0, -0.03), (0, 0, at), end], "radius": radius}}
+
+
+@pytest.mark.parametrize("bend_deg", [5, 30, 90])
+def test_the_wall_at_a_bend_is_as_far_as_its_points_are(bend_deg):
+    """Against the nearest of many points of the wall, in the axes of a bend at the origin."""
+    bend, radius, rng = np.radians(bend_deg), 0.02, np.random.default_rng(bend_deg)
+    surface = ContactSurface(scene(bent_tube(bend_deg, 0.1, radius)).objects[0], 0.0)
+    ways = np.array([[0, 0, -1], [np.sin(bend), 0, np.cos(bend)]])  # of both pieces, from the bend
+    turned = np.linspace(0, 2 * np.pi, 721)
+    ring = np.stack([np.cos(turned), np.sin(turned), 0 * turned], axis=1)
+    wall = []
+    for way, other in (ways, ways[::-1]):
+        across = np.cross([0, 1, 0], way)
+        frame = np.array([across, [0, 1, 0], way])
+        lines = np.arange(0, 0.03, 3e-4)[:, None, None] * [0, 0, 1] + radius * ring
+        points = lines.reshape(-1, 3) @ frame
+        share = np.maximum(points @ other, 0)[:, None]
+        wall.append(points[np.linalg.norm(points - share * other, axis=1) >= radius])
+    along = ways[1] - ways[0]
+    along /= np.linalg.norm(along)
+    inwards = np.cross([0, 1, 0], along)
+    angle = np.linspace(-np.pi / 2, np.pi / 2, 2001)[:, None]
+    wall.append(radius * (np.cos(angle) / np.cos(bend / 2) * inwards + np.sin(angle) * [0, 1, 0]))
+    for turn in np.linspace(-bend / 2, bend / 2, 100):  # the outer side is a part of a sphere
+        outwards = np.sin(turn) * along - np.cos(turn) * inwards
+        wall.append(radius * (np.cos(angle) * outwards + np.sin(angle) * [0, 1, 0]))
+    wall = np.concatenate(wall)
+    ridges, base = 0, np.array([0, 0, 0.1])
+    for _ in range(40):
+        flat = rng.uniform(0.001, 0.008) * np.array([np.cos(a := rng.uniform(-3, 3)), np.sin(a)])
+        place = flat[0] * inwards + flat[1] * np.array([0, 1, 0])
+        place += rng.uniform(-1, 1) * 0.02 * np.sin(bend / 2) * along
+        found = surface.at(place + base)
+        nearest = place - wall[np.linalg.norm(wall - place, axis=1).argmin()]
+        assert found.distance == pytest.approx(np.linalg.norm(nearest), abs=2e-6)
+        assert surface.distances(place[None] + base) == pytest.approx(found.distance)
+        assert np.linalg.norm(found.normal) == pytest.approx(1, abs=1e-5)
+        slope = [
+            (surface.at(base + place + step).distance - surface.at(base + place - step).distance)
+            / 2e-6
+            for step in 1e-6 * np.eye(3)
+        ]
+        assert slope == pytest.approx(found.normal, abs=2e-4)
+        ridges += np.linalg.eigvalsh(found.curvature)[-1] > 10
+    assert ridges >= 3
+
+
+@pytest.mark.parametrize("native", [True, False])
+def test_an_arm_leans_on_the_inner_side_of_a_bend_as_on_a_wire(native, compiled, monkeypatch):
+    """A wire along the ridge, if the arm bends in the plane of the bend."""
+    model = stiffopt.Manipulator(stiffopt.RobotDescription(**TWO.mapping()))
+    if not native:
+        monkeypatch.setattr(ContactProblem, "_native", None)
+    p = np.array([0.4e5, 0.0, 0.0, 0.4e5, 0.0, 0.0])
+    tip = model.pose(p, TWO.length)[:3, 3]
+    side = np.arctan2(tip[1], tip[0])
+    towards, across = (np.array([np.cos(a), np.sin(a), 0]) for a in (side, side + np.pi / 2))
+    bend, at, radius = np.radians(20), 0.14, 0.022
+    edge = np.array([0, 0, at]) + radius * (towards - np.tan(bend / 2) * np.array([0, 0, 1]))
+    wire = {"from": tuple(edge - 0.05 * across), "to": tuple(edge + 0.05 * across), "radius": 1e-9}
+    in_tube = model.contact_equilibrium(p, scene(bent_tube(20, at, radius, side)))
+    on_wire = model.contact_equilibrium(p, scene({"capsule": wire}))
+    (one,), (other,) = in_tube.contacts, on_wire.contacts
+    assert np.linalg.norm(one.force) > 0.05
+    assert one.force == pytest.approx(other.force, abs=1e-6)
+    assert one.at == pytest.approx(other.at, abs=1e-6)
+    assert one.position == pytest.approx(edge, abs=1e-6)
+    assert in_tube.tip_pose == pytest.approx(on_wire.tip_pose, abs=1e-7)
+    assert in_tube.stiffness(towards) == pytest.approx(on_wire.stiffness(towards), rel=1e-4)
+
+
+def test_an_arm_in_a_bent_tube_is_where_an_independent_rod_is():
+    """The rod: elements of 0.12 mm by IPOPT, the nearest points of ridges by Newton's method."""
+    points = [(0, 0, -0.02), (0, 0, 0.06), (0.00289, 0.00094, 0.12), (-0.00304, -0.00012, 0.24)]
+    tube = {"inside_tube": {"points": points, "radius": 0.02}}
+    found = robot().contact_equilibrium([26500.0, 0, 0, 0, 0, 0], scene(tube))
+    (contact,) = found.contacts
+    assert found.tip_pose[:3, 3] == pytest.approx([-4.8762e-3, 1.1548e-3, 181.1100e-3], abs=2e-6)
+    assert np.linalg.norm(contact.force) == pytest.approx(71.453e-3, rel=2e-3)
+    assert contact.at == pytest.approx(119.44e-3, abs=2e-4)
+    assert found.stiffness(X) == pytest.approx(17.313, rel=0.02)
+
+
+def test_a_contact_in_a_tube_opens_while_another_one_holds():
+    """Its force is then against that of the other contact, which must not seem to have turned."""
+    points = [(0, 0, -0.03), (0, 0, 0.106), (0.0012, -0.0005, 0.166), (0.0382, 0.0176, 0.3615)]
+    tube = {"inside_tube": {"points": points, "radius": 0.0203}}
+    p = [15e3, 28e3, 43e3, 0, 29e3, 99e3]
+    found = robot(TWO.under((6.0, 0, 5.0), 0.0)).contact_equilibrium(p, scene(tube))
+    assert sorted(each.at for each in found.contacts) == pytest.approx([0.1163, 0.18], abs=1e-4)
 
 
 # -- machine code ---------------------------------------------------------------------------------

@@ -208,14 +208,15 @@ class ContactProblem:
             if found is None or self.is_far(start, found):
                 return None
             changed = self._changed(found)
-            if changed is None:
-                missed = self.missed(found)
-                if missed is None:
-                    return None
-                if not missed:
-                    return found
-                changed = (*found.state.touches, *missed)
-            state = self.with_touches(found.state, changed)
+            if changed is not None:
+                start = state = self.with_touches(found.state, changed)
+                continue
+            missed = self.missed(found)
+            if missed is None:
+                return None
+            if not missed:
+                return found
+            state = self.with_touches(found.state, (*found.state.touches, *missed))
         return None
 
     def is_far(self, start: Contacts, arm: LeaningArm) -> bool:

@@ -35,7 +35,7 @@ typedef int (*SurfaceFormula)(const double **arg, double **res, casadi_int *iw, 
 
 /* Mirrored by `_Surface` in contact/native.py. */
 typedef struct {
-    SurfaceFormula formula;
+    SurfaceFormula distance, formula; /* the latter with normal and curvature */
     int64_t pieces, size;
     const double *parameters; /* (pieces, size) */
     double softness;
@@ -211,19 +211,26 @@ static int linearise(const Work *work, const Problem *p, Changes *c, int64_t ext
     return 1;
 }
 
+/* Return the distance of a point from a surface and its nearest piece; -INFINITY where it fails. */
+static double distance_from(const Work *work, const Surface *surface, const double *point,
+                            const double **piece) {
+    double largest = -INFINITY, value;
+    work->res[0] = &value;
+    for (int64_t i = 0; i < surface->pieces; i++) {
+        work->arg[0] = point, work->arg[1] = surface->parameters + i * surface->size;
+        if (surface->distance(work->arg, work->res, work->iw, work->w, 0)) return -INFINITY;
+        if (value > largest) largest = value, *piece = work->arg[1];
+    }
+    return largest;
+}
+
 /* Compute distance, normal and curvature of a surface at a point. */
 static int look_at(const Work *work, const Surface *surface, const double *point, Touch *to) {
-    to->distance = -INFINITY;
-    for (int64_t i = 0; i < surface->pieces; i++) {
-        double value, normal[3], curvature[9];
-        work->arg[0] = point, work->arg[1] = surface->parameters + i * surface->size;
-        work->res[0] = &value, work->res[1] = normal, work->res[2] = curvature;
-        if (surface->formula(work->arg, work->res, work->iw, work->w, 0)) return 0;
-        if (!(value > to->distance)) continue;
-        to->distance = value;
-        memcpy(to->normal, normal, sizeof normal), memcpy(to->curvature, curvature, sizeof curvature);
-    }
-    return isfinite(to->distance);
+    const double *piece;
+    if (!isfinite(distance_from(work, surface, point, &piece))) return 0;
+    work->arg[0] = point, work->arg[1] = piece;
+    work->res[0] = &to->distance, work->res[1] = to->normal, work->res[2] = to->curvature;
+    return !surface->formula(work->arg, work->res, work->iw, work->w, 0);
 }
 
 /* Compute the mean tangent at a contact, and its change. */
@@ -506,11 +513,9 @@ void stiffopt_contact_between(const Problem *first, const Problem *last, int64_t
 void stiffopt_contact_distances(const Surface *surface, int64_t count, const double *points,
                                 double *distances) {
     NEW_WORK(work);
-    Touch found;
-    for (int64_t k = 0; k < count; k++) {
-        look_at(&work, surface, points + 3 * k, &found);
-        distances[k] = found.distance;
-    }
+    const double *piece;
+    for (int64_t k = 0; k < count; k++)
+        distances[k] = distance_from(&work, surface, points + 3 * k, &piece);
 }
 
 /* -- stability ------------------------------------------------------------------------------- */
