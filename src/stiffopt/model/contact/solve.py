@@ -49,6 +49,7 @@ _SAME_CONTACT = 2e-4  # m; closer contacts on a surface are merged
 _INSET = 1e-5  # m, least distance of a contact from the end of a range
 _MAX_CROSSINGS = 3  # of an end of a range, after which a contact is pinned there
 _APART = 1e-4  # m between an arm and surfaces that are moved back from it
+_MOST_STEPS = 500  # of a path, with those that are repeated
 _SHORTEST_STEP = 1e-4  # share of the path from rest; below it the path has ended
 
 
@@ -319,7 +320,9 @@ class ContactProblem:
     def follow(self, start: LeaningArm, end: Condition) -> tuple[LeaningArm, float]:
         """Follow the equilibrium straight to a condition; return the last and its share."""
         arm, share, step, halved = start, 0.0, 1.0, False
-        while share < 1.0:
+        for _ in range(_MOST_STEPS):
+            if share >= 1.0:
+                break
             target = min(1.0, share + step)
             guess = self._guess(arm.state, start.state.condition.towards(end, target))
             self._deepest = None

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
 Vector = NDArray[np.float64]
 
+_LEAST_COMPLIANCE = 1e-6  # allowed below zero, as a share of the largest: the integrator's error
 _FLAT = 0.5  # 1/m, least second derivative of a gap in the estimate of a contact's length
 
 
@@ -100,8 +101,24 @@ class LeaningArm:
     @cached_property
     def is_stable(self) -> bool:
         """Whether the energy is at a minimum, see `stiffopt.model.contact.stability`."""
-        quickly = self.shape.is_stable() if self.state.condition.is_conservative else None
-        return is_stable(self) if quickly is None else quickly
+        conservative = self.state.condition.is_conservative
+        quickly = self.shape.is_stable() if conservative else None
+        if not (is_stable(self) if quickly is None else quickly):
+            return False
+        if not conservative or not self._is_flat:
+            return True
+        C = self.tangent[:3, :3]
+        values = np.linalg.eigvalsh((C + C.T) / 2)
+        return bool(values[0] > -_LEAST_COMPLIANCE * values[-1])
+
+    @property
+    def _is_flat(self) -> bool:
+        """Whether a contact's place along the arm is nearly undetermined.
+
+        The matrix of `stiffopt.model.contact.stability` is then too coarse to tell alone.
+        """
+        touches = enumerate(self.state.touches)
+        return any(self.bend(j) < 2 * _FLAT for j, touch in touches if not touch.pinned)
 
     @cached_property
     def tangent(self) -> Vector:
@@ -138,7 +155,10 @@ class LeaningArm:
         moment = R.T @ shape.moment_far[node]
         xi = shape.sections.strain[here.segment] + C @ np.concatenate([force, moment])
         v, u = xi[:3], xi[3:]
-        slope = np.concatenate([-np.cross(u, force), -np.cross(v, force) - np.cross(u, moment)])
+        weight = R.T @ shape.sections.weight[here.segment]  # reduces the force towards the tip
+        slope = np.concatenate(
+            [-np.cross(u, force) - weight, -np.cross(v, force) - np.cross(u, moment)]
+        )
         return own + float(n @ R @ (np.cross(u, v) + C[:3] @ slope))
 
     def kink(self, j: int) -> tuple[float, float]:
