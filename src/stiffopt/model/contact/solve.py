@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.model.contact.lines import ContactLines
 from stiffopt.model.contact.native import CONVERGED, LOST, MOST_CONTACTS, NativeContacts
 from stiffopt.model.contact.rod import (
     MOMENT,
@@ -32,7 +33,7 @@ _LARGEST_SLIDE = 0.02  # m, largest motion of a contact along the arm in one cor
 _TURN_LEFT, _SLIDE_LEFT = 1e-6, 1e-7  # rad and m; quadratic convergence: the error is 1e-12
 _MAX_ITERATIONS = 14
 _MAX_MESHES = 8  # rebuilt as contacts move from range to range
-_MAX_SETS = 10  # sets of contacts that are tried in a step
+_MAX_SETS = 40  # sets of contacts that are tried in a step
 _DEEPEST = 0.3  # largest penetration of a surface in a step, over the body's radius
 _ENTERED = 2e-3  # m, wanted penetration after a step that went too deep
 _TILT = 0.5  # rad, largest turn of a contact's normal in a step
@@ -62,6 +63,7 @@ class ContactProblem:
         self._deepest: tuple[int, float] | None = None  # surface and gap of a step that failed
         count = int(np.ceil(rod.arm.length / _SPACING))
         self.stations = np.linspace(0.0, rod.arm.length, count + 1)
+        self.lines = ContactLines(rod)
 
     # -- Newton's method --------------------------------------------------------------------
 
@@ -241,7 +243,12 @@ class ContactProblem:
         if touches and min(pull) < 0:
             del touches[pull.index(min(pull))]
             return tuple(touches)
+        changed = self.lines.changed(arm)
+        if changed is not None:
+            return changed
         for j, (touch, row) in enumerate(zip(touches, arm.rows, strict=True)):
+            if touch.line:
+                continue
             here = self.rod.ranges[touch.range]
             up = touch.station > (here.start + here.end) / 2
             inwards = row.slope if up else -row.slope
@@ -267,8 +274,13 @@ class ContactProblem:
             if gaps.min() > _SEEN_FROM:
                 continue
             own = [j for j, touch in enumerate(arm.state.touches) if touch.surface == index]
+            lines = [touch.station for touch in arm.state.touches if touch.surface == index and touch.line]
+            if lines:
+                found += self._missed_on_lines(arm, index)
             for i in dips(gaps):
                 if gaps[i] > _SEEN_FROM:
+                    continue
+                if gaps[i] > -_SEEN_FROM and self.lines.is_beside(self.stations[i], lines):
                     continue
                 ends = self.stations[[i - 1, min(i + 1, len(gaps) - 1)]]
                 around = np.linspace(ends[0], ends[1], _FINE_STATIONS)
@@ -282,6 +294,14 @@ class ContactProblem:
                     return None
                 found.append(self._touch(index, s))
         return found
+
+    def _missed_on_lines(self, arm: LeaningArm, index: int) -> list[Touch]:
+        """Return open contacts next to those of lines on a surface, where the body enters it."""
+        at = self.lines.next_to(arm.state.touches, index)
+        if not len(at):
+            return []
+        gaps = self._gaps_of(index, *arm.shape.body(at), at) + arm.state.condition.retreat[index]
+        return [self.lines.touch(index, float(s)) for s in at[gaps < -_PENETRATION]]
 
     def _is_of(self, arm: LeaningArm, j: int, s: float, gap: float) -> bool:
         """Return whether a penetration belongs to a contact that is closed."""

@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 Vector = NDArray[np.float64]
 
 _LEAST_COMPLIANCE = 1e-6  # allowed below zero, as a share of the largest: the integrator's error
+_FLATTEST = 1e-3  # 1/m; with less, a contact's place is undetermined
+_LIGHT = 1e-5  # N; a contact with less force is a point
 _FLAT = 0.5  # 1/m, least second derivative of a gap in the estimate of a contact's length
 
 
@@ -48,6 +50,7 @@ class Touch:
     drag : friction's force (3,) per normal force, for a sliding contact.
     moment : on the centre line (3,), in N m, of a force that a sticking contact has at the surface.
     crossings : how often it moved from one range to the next during the search.
+    line : whether it is one of the pinned contacts of a line along which the body lies.
     """
 
     surface: int
@@ -59,6 +62,7 @@ class Touch:
     drag: Vector
     moment: Vector = field(default_factory=lambda: np.zeros(3))
     crossings: int = 0
+    line: bool = False
 
 
 class Contacts(NamedTuple):
@@ -167,14 +171,27 @@ class LeaningArm:
         Shear bends the line into the surface on both sides of the force.  In reality the
         force is distributed over this length, along which the line follows the surface.
         """
-        shape, touch, row = self.shape, self.state.touches[j], self.rows[j]
-        here = self.problem.rod.ranges[touch.range]
-        if here.rigid:
+        if self.problem.rod.ranges[self.state.touches[j].range].rigid:
             return 0.0, 0.0
-        d = shape.rotation[self.state.mesh.node[j]].T @ row.point.normal
-        shear = touch.normal_force * float(d @ shape.sections.compliance[here.segment, :3, :3] @ d)
+        shear = self.shear(j)
         bend = max(self.bend(j), _FLAT)
         return shear**2 / (8 * bend), shear / bend
+
+    def reach(self, j: int) -> float:
+        """Return the length in m along which the body really lies on a surface at a contact."""
+        bend, touch = self.bend(j), self.state.touches[j]
+        if touch.normal_force < _LIGHT:
+            return 0.0
+        if bend < _FLATTEST:
+            return np.inf
+        return 0.0 if self.problem.rod.ranges[touch.range].rigid else self.shear(j) / bend
+
+    def shear(self, j: int) -> float:
+        """Return the angle of the centre line's kink at a contact on a soft range."""
+        touch, shape = self.state.touches[j], self.shape
+        d = shape.rotation[self.state.mesh.node[j]].T @ self.rows[j].point.normal
+        C = shape.sections.compliance[self.problem.rod.ranges[touch.range].segment]
+        return touch.normal_force * float(d @ C[:3, :3] @ d)
 
 
 class ContactSystem(LeaningArm):
