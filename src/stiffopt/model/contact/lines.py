@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 Vector = NDArray[np.float64]
 
-_SPACING = 1.0  # of the stations, over the least outer radius
+_SPACING = float(__import__("os").environ.get("SP","1"))  # of the stations, over the least outer radius
 _SHORTER = 0.7  # reach over the spacing, below which two stations become a point again
 _SNAPPED = 0.1  # of the spacing; stations that are nearer to an end of a range lie on it
 _MAX_CHANGES = 3  # from a point to a line, after which it stays one
@@ -47,7 +47,7 @@ class ContactLines:
         nearest = ends[np.abs(stations[:, None] - ends).argmin(axis=1)]
         close = np.abs(nearest - stations) < _SNAPPED * self.spacing
         self.stations = np.where(close, nearest, stations)
-        self._rod = rod
+        self._rod, self._ends = rod, set(ends.tolist())
 
     def touch(self, surface: int, station: float, force: Vector | float = 0.0) -> Touch:
         """Return a contact of a line, with a force (3,) along its normal."""
@@ -78,6 +78,8 @@ class ContactLines:
                 beside = self._beside(touches, j)
                 if touch.crossings >= _MAX_CHANGES or len(beside) > 1:
                     continue
+                if not beside and touch.station in self._ends and arm.is_let_go(j):
+                    continue
                 if not beside:
                     return (*touches[:j], self._point([touch]), *touches[j + 1 :])
                 (i,) = beside
@@ -88,7 +90,9 @@ class ContactLines:
                 if arm.shear(j) + arm.shear(i) < _SHORTER * self.spacing * bend:
                     rest = [each for k, each in enumerate(touches) if k not in (i, j)]
                     return (*rest, self._point(pair))
-            elif self._beside(touches, j) or arm.reach(j) > self.spacing:
+            elif self._beside(touches, j):
+                return self._spread(touches, j)
+            elif arm.reach(j) > self.spacing and (not touch.pinned or arm.is_let_go(j)):
                 return self._spread(touches, j)
         return None
 

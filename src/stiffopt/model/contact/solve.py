@@ -246,13 +246,12 @@ class ContactProblem:
         changed = self.lines.changed(arm)
         if changed is not None:
             return changed
-        for j, (touch, row) in enumerate(zip(touches, arm.rows, strict=True)):
+        for j, touch in enumerate(touches):
             if touch.line:
                 continue
-            here = self.rod.ranges[touch.range]
-            up = touch.station > (here.start + here.end) / 2
-            inwards = row.slope if up else -row.slope
-            if touch.pinned and touch.crossings < _MAX_CROSSINGS and inwards > 1e-9:
+            if touch.pinned and touch.crossings < _MAX_CROSSINGS and arm.is_let_go(j):
+                here = self.rod.ranges[touch.range]
+                up = touch.station > (here.start + here.end) / 2
                 station = here.end - 1e-4 if up else here.start + 1e-4
                 crossings = touch.crossings + 1
                 touches[j] = replace(touch, station=station, pinned=False, crossings=crossings)

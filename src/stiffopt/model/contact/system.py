@@ -31,6 +31,7 @@ Vector = NDArray[np.float64]
 
 _LEAST_COMPLIANCE = 1e-6  # allowed below zero, as a share of the largest: the integrator's error
 _FLATTEST = 1e-3  # 1/m; with less, a contact's place is undetermined
+_LEAST_SLOPE = 1e-9  # of the gap; with less, a pinned contact stays where it is
 _LIGHT = 1e-5  # N; a contact with less force is a point
 _FLAT = 0.5  # 1/m, least second derivative of a gap in the estimate of a contact's length
 
@@ -185,6 +186,13 @@ class LeaningArm:
         if bend < _FLATTEST:
             return np.inf
         return 0.0 if self.problem.rod.ranges[touch.range].rigid else self.shear(j) / bend
+
+    def is_let_go(self, j: int) -> bool:
+        """Return whether a contact at an end of its range would slide into the range."""
+        touch = self.state.touches[j]
+        here = self.problem.rod.ranges[touch.range]
+        up = touch.station > (here.start + here.end) / 2
+        return (self.rows[j].slope if up else -self.rows[j].slope) > _LEAST_SLOPE
 
     def shear(self, j: int) -> float:
         """Return the angle of the centre line's kink at a contact on a soft range."""
