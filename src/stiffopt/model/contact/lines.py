@@ -2,18 +2,19 @@
 
 A point contact stands where the gap is least along the arm.  Where the body lies along a surface
 that is nearly as straight as the arm, that place is undetermined, as the gap's second derivative
-vanishes.  The force is then carried by contacts that are pinned to fixed stations one outer radius
-apart.  Each acts for its share of the line; between them, shear bends the centre line into the
+vanishes.  The force is then carried by several contacts about one outer radius apart.  Those at the
+ends of the line slide to where the slope of the gap is zero, as every contact does; those between
+them are pinned, as is one at the tip.  Between contacts, shear bends the centre line into the
 surface by some micrometres.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stiffopt.model.contact.rod import Rod
 from stiffopt.model.contact.system import Touch
@@ -21,127 +22,142 @@ from stiffopt.model.contact.system import Touch
 if TYPE_CHECKING:
     from stiffopt.model.contact.system import LeaningArm
 
-Vector = NDArray[np.float64]
-
-_SPACING = float(__import__("os").environ.get("SP","1"))  # of the stations, over the least outer radius
-_SHORTER = 0.7  # reach over the spacing, below which two stations become a point again
-_SNAPPED = 0.1  # of the spacing; stations that are nearer to an end of a range lie on it
-_MAX_CHANGES = 3  # from a point to a line, after which it stays one
+_SPACING = float(__import__("os").environ.get("SP","1"))  # of the contacts, over the least outer radius
+_CLOSEST, _FARTHEST = 0.4, 1.6  # distances of neighbours on a line, over the spacing
+_BESIDE = 0.8  # over the spacing; the body may enter the surface a little so near to a line
+_SHORTER = 0.7  # reach over the spacing, below which two contacts become one
+_FLATTEST = 1e-3  # 1/m, second derivative of the gap with which an end begins to slide
+_MAX_SPLITS = 3  # of a point; then it stays one
 
 
 class ContactLines:
-    """The stations that carry lines of contact along an arm.
+    """How points of contact become lines, and lines points, along an arm.
 
     Attributes
     ----------
-    spacing : distance of the stations, in m.
-    stations : (k,), from the base, where there is none, to the tip.
+    spacing : of the contacts of a line, in m.
     """
 
     def __init__(self, rod: Rod) -> None:
-        length, ends = rod.arm.length, np.array([each.end for each in rod.ranges])
-        radius = min(rod.radius(index) for index in range(len(rod.ranges)))
-        count = max(1, round(length / (_SPACING * radius)))
-        self.spacing = length / count
-        stations = length * np.arange(1, count + 1) / count
-        nearest = ends[np.abs(stations[:, None] - ends).argmin(axis=1)]
-        close = np.abs(nearest - stations) < _SNAPPED * self.spacing
-        self.stations = np.where(close, nearest, stations)
-        self._rod, self._ends = rod, set(ends.tolist())
+        self.spacing = _SPACING * min(rod.radius(index) for index in range(len(rod.ranges)))
+        self._rod, self._length = rod, rod.ranges[-1].end
 
-    def touch(self, surface: int, station: float, force: Vector | float = 0.0) -> Touch:
-        """Return a contact of a line, with a force (3,) along its normal."""
-        ranges = self._rod.ranges
-        inside = [i for i, each in enumerate(ranges) if each.start <= station <= each.end]
-        index = max(inside, key=lambda i: (self._rod.radius(i), not ranges[i].rigid))
-        vector = np.zeros(3) + force
-        size = float(np.linalg.norm(vector))
-        return Touch(surface, index, station, True, vector, size, np.zeros(3), line=True)
+    def is_beside(self, station: float, lines: list[float]) -> bool:
+        """Return whether a station belongs to a contact of a line."""
+        return any(abs(station - each) < _BESIDE * self.spacing for each in lines)
 
-    def is_beside(self, station: float, others: list[float]) -> bool:
-        """Return whether a station is within a spacing of another one."""
-        return any(abs(station - other) < 1.2 * self.spacing for other in others)
-
-    def next_to(self, touches: tuple[Touch, ...], surface: int) -> Vector:
-        """Return the open stations next to those of a surface's lines."""
-        closed = {touch.station for touch in touches if touch.surface == surface}
-        lines = [touch.station for touch in touches if touch.surface == surface and touch.line]
-        return np.array(
-            [s for s in self.stations.tolist() if s not in closed and self.is_beside(s, lines)]
-        )
+    def is_held(self, touch: Touch) -> bool:
+        """Return whether a contact is pinned because it is inside a line or at its end at the tip."""
+        here = self._rod.ranges[touch.range]
+        inside = here.start < touch.station < here.end or touch.station >= self._length
+        return touch.line and touch.pinned and inside
 
     def changed(self, arm: LeaningArm) -> tuple[Touch, ...] | None:
-        """Return the contacts with one that became a line, or is a point again; None if none."""
+        """Return the contacts after one change that makes lines consistent; None if they are."""
         touches = arm.state.touches
         for j, touch in enumerate(touches):
             if touch.line:
-                beside = self._beside(touches, j)
-                if touch.crossings >= _MAX_CHANGES or len(beside) > 1:
-                    continue
-                if not beside and touch.station in self._ends and arm.is_let_go(j):
-                    continue
-                if not beside:
-                    return (*touches[:j], self._point([touch]), *touches[j + 1 :])
-                (i,) = beside
-                if i < j or len(self._beside(touches, i)) > 1:
-                    continue
-                pair = [touch, touches[i]]
-                bend = (arm.bend(j) + arm.bend(i)) / 2
-                if arm.shear(j) + arm.shear(i) < _SHORTER * self.spacing * bend:
-                    rest = [each for k, each in enumerate(touches) if k not in (i, j)]
-                    return (*rest, self._point(pair))
-            elif self._beside(touches, j):
-                return self._spread(touches, j)
-            elif arm.reach(j) > self.spacing and (not touch.pinned or arm.is_let_go(j)):
-                return self._spread(touches, j)
+                continue
+            own = [each for each in touches if each.line and each.surface == touch.surface]
+            if any(abs(each.station - touch.station) < self.spacing for each in own):
+                return _with(touches, {j: replace(touch, line=True)})
+            reach = arm.reach(j)
+            if reach > self.spacing and touch.crossings < _MAX_SPLITS:
+                if not touch.pinned and arm.bend(j) <= 0:
+                    return _with(touches, {j: replace(touch, line=True, pinned=True)})
+                if not touch.pinned:
+                    return (*_with(touches, {j: None}), *self._split(touch, reach))
+                if touch.station >= self._length and arm.is_let_go(j):
+                    return _with(touches, {j: replace(touch, line=True)})
+        for run in self._runs(touches):
+            changes = self._consistent(arm, run)
+            if changes:
+                return _with(touches, changes)
         return None
 
-    def _beside(self, touches: tuple[Touch, ...], j: int) -> list[int]:
-        """Return the contacts of a line on the same surface next to a contact."""
-        own = touches[j]
-        return [
-            i
-            for i, each in enumerate(touches)
-            if i != j
-            and each.line
-            and each.surface == own.surface
-            and abs(each.station - own.station) < 1.2 * self.spacing
-        ]
+    def _split(self, touch: Touch, reach: float) -> list[Touch]:
+        """Return the two ends of a line that replace a point."""
+        offset = min(reach, 2 * self.spacing) / 4
+        found = []
+        for station in (touch.station - offset, touch.station + offset):
+            new = replace(
+                touch,
+                station=min(station, self._length),
+                force=touch.force / 2,
+                normal_force=touch.normal_force / 2,
+                crossings=touch.crossings + 1,
+                line=True,
+            )
+            found.append(self._placed(new))
+        return found
 
-    def _point(self, line: list[Touch]) -> Touch:
-        """Return the contact at a point that replaces those of a line."""
-        total = sum(each.normal_force for each in line)
-        station = sum(each.normal_force * each.station for each in line) / total
-        inside = [i for i, each in enumerate(self._rod.ranges) if each.start < station < each.end]
-        one = replace(
-            line[0],
-            station=station,
-            force=np.sum([each.force for each in line], axis=0),
-            normal_force=total,
-            crossings=max(each.crossings for each in line) + 1,
-            line=False,
-        )
-        return replace(one, range=inside[0], pinned=False) if inside else one
+    def _placed(self, touch: Touch) -> Touch:
+        """Return a contact with the range that its station is in; at the tip it is pinned."""
+        for index, each in enumerate(self._rod.ranges):
+            if each.start < touch.station < each.end:
+                return replace(touch, range=index)
+        return replace(touch, pinned=True)
 
-    def _spread(self, touches: tuple[Touch, ...], j: int) -> tuple[Touch, ...]:
-        """Replace a contact by those of the stations on both of its sides."""
-        own, stations = touches[j], self.stations
-        after = int(np.searchsorted(stations, own.station - 1e-9))
-        chosen = {after: 1.0}
-        if after > 0 and own.station < stations[after] - 1e-9:
-            before = stations[after - 1]
-            share = (own.station - before) / (stations[after] - before)
-            chosen = {after - 1: 1 - share, after: share}
-        rest = [each for i, each in enumerate(touches) if i != j]
-        for index, share in chosen.items():
-            new = self.touch(own.surface, float(stations[index]), share * own.force)
-            new = replace(new, crossings=own.crossings)
-            same = [i for i, each in enumerate(rest) if each.surface == own.surface
-                    and each.station == new.station]  # fmt: skip
-            if same:
-                old = rest[same[0]]
-                force, normal_force = old.force + new.force, old.normal_force + new.normal_force
-                rest[same[0]] = replace(new, force=force, normal_force=normal_force)
+    def _runs(self, touches: tuple[Touch, ...]) -> list[list[int]]:
+        """Return the contacts of each line, from the base to the tip."""
+        lines = [j for j, touch in enumerate(touches) if touch.line]
+        lines.sort(key=lambda j: (touches[j].surface, touches[j].station))
+        runs: list[list[int]] = []
+        for j in lines:
+            last = touches[runs[-1][-1]] if runs else None
+            far = _FARTHEST * self.spacing
+            own = touches[j]
+            if last and last.surface == own.surface and own.station - last.station < far:
+                runs[-1].append(j)
             else:
-                rest.append(new)
-        return tuple(rest)
+                runs.append([j])
+        return runs
+
+    def _consistent(self, arm: LeaningArm, run: list[int]) -> dict[int, Touch | None]:
+        """Return the contacts of a line that change, or are dropped (None)."""
+        touches = arm.state.touches
+        first, last = run[0], run[-1]
+        if len(run) == 1:
+            own = touches[first]
+            if own.station >= self._length and arm.is_let_go(first):
+                return {}
+            if own.pinned and arm.bend(first) < _FLATTEST:
+                return {}
+            point = replace(own, line=False)
+            return {first: point if own.station >= self._length else replace(point, pinned=False)}
+        for i, j in pairwise(run):
+            if touches[j].station - touches[i].station < _CLOSEST * self.spacing:
+                keep, drop = (j, i) if j == last else (i, j)
+                return {keep: _joined(touches[keep], touches[drop]), drop: None}
+        if len(run) == 2 and not touches[last].station >= self._length:
+            bend = (arm.bend(first) + arm.bend(last)) / 2
+            if arm.shear(first) + arm.shear(last) < _SHORTER * self.spacing * bend:
+                pair = [touches[j] for j in run]
+                forces = [each.normal_force for each in pair]
+                station = float(np.average([each.station for each in pair], weights=forces))
+                point = replace(_joined(*pair), station=station, pinned=False, line=False)
+                return {first: self._placed(point), last: None}
+        changes: dict[int, Touch | None] = {}
+        for j in run:
+            touch = touches[j]
+            slides = j in (first, last) and touch.station < self._length
+            # an end cannot slide to where it is on a crest
+            slides = slides and arm.bend(j) > (_FLATTEST if touch.pinned else 0)
+            if slides and self.is_held(touch):
+                changes[j] = replace(touch, pinned=False)
+            elif not slides and not touch.pinned:
+                changes[j] = replace(touch, pinned=True)
+        return changes
+
+
+def _joined(touch: Touch, other: Touch) -> Touch:
+    """Return a contact that carries another one's force too."""
+    force, normal_force = touch.force + other.force, touch.normal_force + other.normal_force
+    crossings = max(touch.crossings, other.crossings)
+    return replace(touch, force=force, normal_force=normal_force, crossings=crossings)
+
+
+def _with(touches: tuple[Touch, ...], changes: dict[int, Touch | None]) -> tuple[Touch, ...]:
+    """Return contacts of which some are replaced, or dropped (None)."""
+    found = [changes.get(j, touch) for j, touch in enumerate(touches)]
+    return tuple(each for each in found if each is not None)

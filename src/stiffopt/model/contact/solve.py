@@ -41,6 +41,7 @@ _PENETRATION = 2e-6  # m, allowed penetration
 _SPACING = 4e-3  # m along the arm between stations at which gaps are evaluated
 _FINE_STATIONS = 17  # stations about a local minimum of a gap
 _SEEN_FROM = 2e-4  # m; a larger gap at a coarse minimum excludes a contact
+_SAG = 1e-4  # m; largest penetration on a line of contacts
 _SCANNED = 0.5  # motion of a free arm between two looks at the gaps, over the body's radius
 _MOST_LOOKS, _CLOSER_LOOKS = 24, 8  # along the motion, and where it first enters a surface
 _SWEPT = 1.0  # motion of a station in a step that is always allowed, over the body's radius
@@ -247,7 +248,7 @@ class ContactProblem:
         if changed is not None:
             return changed
         for j, touch in enumerate(touches):
-            if touch.line:
+            if self.lines.is_held(touch):
                 continue
             if touch.pinned and touch.crossings < _MAX_CROSSINGS and arm.is_let_go(j):
                 here = self.rod.ranges[touch.range]
@@ -257,7 +258,7 @@ class ContactProblem:
                 touches[j] = replace(touch, station=station, pinned=False, crossings=crossings)
                 return tuple(touches)
             for i, other in enumerate(touches[:j]):
-                near = abs(touch.station - other.station) < _SAME_CONTACT
+                near = abs(touch.station - other.station) < _SAME_CONTACT and not touch.line
                 if near and touch.surface == other.surface:
                     force = touch.force + other.force
                     normal_force = touch.normal_force + other.normal_force
@@ -274,12 +275,11 @@ class ContactProblem:
                 continue
             own = [j for j, touch in enumerate(arm.state.touches) if touch.surface == index]
             lines = [touch.station for touch in arm.state.touches if touch.surface == index and touch.line]
-            if lines:
-                found += self._missed_on_lines(arm, index)
             for i in dips(gaps):
                 if gaps[i] > _SEEN_FROM:
                     continue
-                if gaps[i] > -_SEEN_FROM and self.lines.is_beside(self.stations[i], lines):
+                inside = i < len(gaps) - 1  # at the tip, the line goes up to the tip
+                if inside and gaps[i] > -_SAG and self.lines.is_beside(self.stations[i], lines):
                     continue
                 ends = self.stations[[i - 1, min(i + 1, len(gaps) - 1)]]
                 around = np.linspace(ends[0], ends[1], _FINE_STATIONS)
@@ -293,14 +293,6 @@ class ContactProblem:
                     return None
                 found.append(self._touch(index, s))
         return found
-
-    def _missed_on_lines(self, arm: LeaningArm, index: int) -> list[Touch]:
-        """Return open contacts next to those of lines on a surface, where the body enters it."""
-        at = self.lines.next_to(arm.state.touches, index)
-        if not len(at):
-            return []
-        gaps = self._gaps_of(index, *arm.shape.body(at), at) + arm.state.condition.retreat[index]
-        return [self.lines.touch(index, float(s)) for s in at[gaps < -_PENETRATION]]
 
     def _is_of(self, arm: LeaningArm, j: int, s: float, gap: float) -> bool:
         """Return whether a penetration belongs to a contact that is closed."""
