@@ -44,7 +44,10 @@ class ContactLines:
 
     def is_beside(self, station: float, lines: list[float]) -> bool:
         """Return whether a station belongs to a contact of a line."""
-        return any(abs(station - each) < _BESIDE * self.spacing for each in lines)
+        near = _BESIDE * self.spacing
+        return bool(lines) and (
+            station < _CLOSEST * self.spacing or any(abs(station - each) < near for each in lines)
+        )
 
     def is_held(self, touch: Touch) -> bool:
         """Return whether a contact is pinned because it is inside a line or at its end at the tip."""
@@ -98,6 +101,18 @@ class ContactLines:
                 return replace(touch, range=index)
         return replace(touch, pinned=True)
 
+    def _joined(self, touch: Touch, other: Touch) -> Touch:
+        """Return a contact that carries another one's force too; if it slides, between them."""
+        forces = touch.normal_force, other.normal_force
+        mean = float(np.average([touch.station, other.station], weights=forces))
+        found = replace(
+            touch,
+            force=touch.force + other.force,
+            normal_force=sum(forces),
+            crossings=max(touch.crossings, other.crossings),
+        )
+        return found if touch.pinned else self._placed(replace(found, station=mean))
+
     def _runs(self, touches: tuple[Touch, ...]) -> list[list[int]]:
         """Return the contacts of each line, from the base to the tip."""
         lines = [j for j, touch in enumerate(touches) if touch.line]
@@ -117,6 +132,8 @@ class ContactLines:
         """Return the contacts of a line that change, or are dropped (None)."""
         touches = arm.state.touches
         first, last = run[0], run[-1]
+        if touches[first].station < _CLOSEST * self.spacing:
+            return {first: None}  # the base carries it
         if len(run) == 1:
             own = touches[first]
             if own.station >= self._length and arm.is_let_go(first):
@@ -128,15 +145,12 @@ class ContactLines:
         for i, j in pairwise(run):
             if touches[j].station - touches[i].station < _CLOSEST * self.spacing:
                 keep, drop = (j, i) if j == last else (i, j)
-                return {keep: _joined(touches[keep], touches[drop]), drop: None}
+                return {keep: self._joined(touches[keep], touches[drop]), drop: None}
         if len(run) == 2 and not touches[last].station >= self._length:
             bend = (arm.bend(first) + arm.bend(last)) / 2
             if arm.shear(first) + arm.shear(last) < _SHORTER * self.spacing * bend:
-                pair = [touches[j] for j in run]
-                forces = [each.normal_force for each in pair]
-                station = float(np.average([each.station for each in pair], weights=forces))
-                point = replace(_joined(*pair), station=station, pinned=False, line=False)
-                return {first: self._placed(point), last: None}
+                pair = [replace(touches[j], pinned=False, line=False) for j in run]
+                return {first: self._joined(*pair), last: None}
         changes: dict[int, Touch | None] = {}
         for j in run:
             touch = touches[j]
@@ -148,13 +162,6 @@ class ContactLines:
             elif not slides and not touch.pinned:
                 changes[j] = replace(touch, pinned=True)
         return changes
-
-
-def _joined(touch: Touch, other: Touch) -> Touch:
-    """Return a contact that carries another one's force too."""
-    force, normal_force = touch.force + other.force, touch.normal_force + other.normal_force
-    crossings = max(touch.crossings, other.crossings)
-    return replace(touch, force=force, normal_force=normal_force, crossings=crossings)
 
 
 def _with(touches: tuple[Touch, ...], changes: dict[int, Touch | None]) -> tuple[Touch, ...]:

@@ -189,7 +189,7 @@ class ContactProblem:
         edge = here.end if up else here.start
         other = touch.range + (1 if up else -1)
         if other < 0:
-            return replace(touch, station=here.start + _INSET)
+            return replace(touch, station=here.start + _INSET, pinned=True)
         if other == len(ranges):
             return replace(touch, station=edge, pinned=True)
         radii = [self.rod.radius(index) for index in (touch.range, other)]

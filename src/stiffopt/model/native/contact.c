@@ -13,7 +13,7 @@
 #include "functions.h"
 #include "work.h"
 
-#define MOST_CONTACTS 16
+#define MOST_CONTACTS 24
 #define MOST_STEPS 128
 #define MOST_EXTRAS 6
 #define MOST_COLUMNS (3 + 4 * MOST_CONTACTS + MOST_EXTRAS)
