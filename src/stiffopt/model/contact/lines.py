@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from stiffopt.model.contact.system import LeaningArm
 
 _SPACING = float(__import__("os").environ.get("SP","1"))  # of the contacts, over the least outer radius
-_CLOSEST, _FARTHEST = 0.4, 1.6  # distances of neighbours on a line, over the spacing
-_BESIDE = 0.8  # over the spacing; the body may enter the surface a little so near to a line
+_CLOSEST, _FARTHEST = 0.4, 1.3  # distances of neighbours on a line, over the spacing
+_BESIDE = 0.65  # over the spacing; the body may enter the surface a little so near to a line
 _SHORTER = 0.7  # reach over the spacing, below which two contacts become one
 _FLATTEST = 1e-3  # 1/m, second derivative of the gap with which an end begins to slide
 _MAX_SPLITS = 3  # of a point; then it stays one

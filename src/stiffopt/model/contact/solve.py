@@ -242,6 +242,8 @@ class ContactProblem:
         touches = list(arm.state.touches)
         pull = [touch.normal_force for touch in touches]
         if touches and min(pull) < 0:
+            if touches[pull.index(min(pull))].line:
+                return tuple(each for each in touches if not each.line or each.normal_force >= 0)
             del touches[pull.index(min(pull))]
             return tuple(touches)
         changed = self.lines.changed(arm)
