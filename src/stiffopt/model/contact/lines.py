@@ -3,9 +3,9 @@
 A point contact stands where the gap is least along the arm.  Where the body lies along a surface
 that is nearly as straight as the arm, that place is undetermined, as the gap's second derivative
 vanishes.  The force is then carried by several contacts about one outer radius apart.  Those at the
-ends of the line slide to where the slope of the gap is zero, as every contact does; those between
-them are pinned, as is one at the tip.  Between contacts, shear bends the centre line into the
-surface by some micrometres.
+ends of the line slide to where the slope of the gap is zero, as every contact does.  Those between
+them are pinned if the gap hardly curves, and so is one at the tip.  Between contacts, shear bends
+the centre line into the surface by some micrometres.
 """
 
 from __future__ import annotations
@@ -22,9 +22,10 @@ from stiffopt.model.contact.system import Touch
 if TYPE_CHECKING:
     from stiffopt.model.contact.system import LeaningArm
 
-_SPACING = float(__import__("os").environ.get("SP","1"))  # of the contacts, over the least outer radius
+_SPACING = 1.0  # of the contacts, over the least outer radius
 _CLOSEST, _FARTHEST = 0.4, 1.3  # distances of neighbours on a line, over the spacing
 _BESIDE = 0.65  # over the spacing; the body may enter the surface a little so near to a line
+_CURVED = 0.2  # 1/m, second derivative with which contacts inside a line slide too
 _SHORTER = 0.7  # reach over the spacing, below which two contacts become one
 _FLATTEST = 1e-3  # 1/m, second derivative of the gap with which an end begins to slide
 _MAX_SPLITS = 3  # of a point; then it stays one
@@ -154,9 +155,14 @@ class ContactLines:
         changes: dict[int, Touch | None] = {}
         for j in run:
             touch = touches[j]
-            slides = j in (first, last) and touch.station < self._length
-            # an end cannot slide to where it is on a crest
-            slides = slides and arm.bend(j) > (_FLATTEST if touch.pinned else 0)
+            is_end, bend = j in (first, last), arm.bend(j)
+            # less to go on sliding than to begin; on a crest a contact cannot slide
+            least = (
+                (_FLATTEST if touch.pinned else 0.0)
+                if is_end
+                else (_CURVED if touch.pinned else 0.6 * _CURVED)
+            )
+            slides = touch.station < self._length and bend > least
             if slides and self.is_held(touch):
                 changes[j] = replace(touch, pinned=False)
             elif not slides and not touch.pinned:

@@ -16,6 +16,7 @@ _TILT = 0.5  # rad, largest turn of a contact's normal in a step of a push that 
 _LARGEST_SWING = 0.2  # rad, largest turn of the tip in a step of a push
 _FORCE_LEFT = 1e-7  # N; a contact with less force has lifted off
 _SAME_LOSS = 0.01  # share by which two foretold losses may differ
+_NO_COMPLIANCE = 1e-11  # m/N; with less, a rigid surface holds the tip
 _NEW_CONTACT = 0.02  # longest step that adds a contact, over the loss that is foretold
 _MOST_STEPS = 150  # of a push, with those that are repeated
 _SHORTEST = 1e-6  # share of the largest push; with a shorter step the equilibrium is lost
@@ -136,7 +137,8 @@ class GrowingPush:
         along = moves[..., :3] @ self._direction
         turn = float(np.linalg.norm(changes[0, TURN, :3] @ self._direction))
         rates = solution[:, :3] @ self._direction
-        return _Tangent(system, solution, rates, along, turn, 1 / float(self._direction @ along[0]))
+        stiffness = rigid_if_huge(float(self._direction @ along[0]))
+        return _Tangent(system, solution, rates, along, turn, stiffness)
 
     def loss(self, arm: LeaningArm) -> ContactLoss:
         """Return the first contact that is lost as the push grows from an equilibrium."""
@@ -172,7 +174,7 @@ class GrowingPush:
     def _rates(self, arm: LeaningArm) -> tuple[Vector, float, float]:
         """Return changes (k,) of normal forces and of the tip's turn per push; a stiffness."""
         found = arm.tangent[:, :3] @ self._direction
-        stiffness = 1 / float(self._direction @ found[:3])
+        stiffness = rigid_if_huge(float(self._direction @ found[:3]))
         return found[6:], float(np.linalg.norm(found[3:6])), stiffness
 
     def _lifted(self, arm: LeaningArm, force: float, lost: int) -> ContactLoss:
@@ -184,6 +186,11 @@ class GrowingPush:
         touch = state.touches[lost]
         name = self._problem.surfaces[touch.surface].name
         return ContactLoss(force, name, touch.station, "lifts off", before, after)
+
+
+def rigid_if_huge(compliance: float) -> float:
+    """Return the stiffness in N/m; infinite where the compliance is zero but for rounding."""
+    return 1 / compliance if abs(compliance) > _NO_COMPLIANCE else np.inf
 
 
 def _forces(arm: LeaningArm) -> Vector:
