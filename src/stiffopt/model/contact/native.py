@@ -17,7 +17,7 @@ from stiffopt.model.contact.system import ContactRow, Contacts
 
 Vector = NDArray[np.float64]
 
-MOST_CONTACTS = 8
+MOST_CONTACTS = 24
 """Largest number of contacts, as in contact.c."""
 CONVERGED, LOST, REMESH = range(3)
 """Outcomes, as in contact.c."""

@@ -13,7 +13,7 @@
 #include "functions.h"
 #include "work.h"
 
-#define MOST_CONTACTS 8
+#define MOST_CONTACTS 24
 #define MOST_STEPS 128
 #define MOST_EXTRAS 6
 #define MOST_COLUMNS (3 + 4 * MOST_CONTACTS + MOST_EXTRAS)
@@ -585,14 +585,15 @@ static double slope_change(const Problem *p, const Touch *touch, const double *s
             to[6 + c] += share * own[i] * near[12 * (3 + i) + c] + crossed[i] * near[12 * i + c];
     for (int c = 0; c < 12 && node > 0; c++)
         for (int i = 0; i < 3; i++) to[c] += (1 - share) * own[i] * (near - 72)[12 * (3 + i) + c];
-    double local[6], xi[6], slope[6], a[3], b[3];
+    double local[6], xi[6], slope[6], a[3], b[3], w[3];
     transposed_times(R, force, local), transposed_times(R, moment, local + 3);
+    transposed_times(R, p->weight + 3 * touch->segment, w); /* reduces the force towards the tip */
     for (int i = 0; i < 6; i++) {
         xi[i] = p->strain[6 * touch->segment + i];
         for (int c = 0; c < 6; c++) xi[i] += C[6 * c + i] * local[c];
     }
     cross(local, xi + 3, slope), cross(local, xi, a), cross(local + 3, xi + 3, b);
-    for (int i = 0; i < 3; i++) slope[3 + i] = a[i] + b[i];
+    for (int i = 0; i < 3; i++) slope[i] -= w[i], slope[3 + i] = a[i] + b[i];
     cross(xi + 3, xi, a);
     for (int i = 0; i < 3; i++) {
         for (int c = 0; c < 6; c++) a[i] += C[6 * c + i] * slope[c];
@@ -640,7 +641,9 @@ int64_t stiffopt_contact_is_stable(const Problem *p, double *K, double *starts) 
                 K[(at + r) * wide + at + c] += held * touch->normal[r] * touch->normal[c] -
                                                f * touch->curvature[3 * r + c];
         if (touch->pinned) continue;
-        double bend = fmax(slope_change(p, touch, starts, slope), FLATTEST);
+        double bend = slope_change(p, touch, starts, slope);
+        if (bend < -FLATTEST && f > 0) return 0; /* the body enters on both sides */
+        bend = fmax(bend, FLATTEST);
         for (int r = touch->node ? 0 : 6; r < 18; r++)
             for (int c = touch->node ? 0 : 6; c < 18; c++)
                 K[(at - 9 + r) * wide + at - 9 + c] += f / bend * slope[r] * slope[c];
