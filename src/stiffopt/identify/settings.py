@@ -343,9 +343,9 @@ class DetectionSettings:
     clock_shifts : number of shifts that are tried.
     clock_overwhelming : as `overwhelming`, for the regression.
     begins : time in s at the beginning of a log that does not tell where its tip is at rest.
-    begins_share, begins_apart : a log begins at rest if the first tip's distance from there is at
-        most this share of that from where the first pressures hold it, and the latter at least this
-        multiple of the median error.
+    begins_near, begins_apart : a log begins at rest if the first tip's distance from where the arm
+        rests is at most `begins_near` median errors of the regression, and that from where the
+        first pressures hold it at least `begins_apart`.
     drift_rows, drift_parts : number of rows in the regression for a drift, and of parts of the log.
     drift_spread : smallest spread of the pressures in each part, over that of all.
     drift_near, drift_visits : a part visits the pressures of a row if it comes this near to them,
@@ -374,7 +374,7 @@ class DetectionSettings:
     clock_shifts: int = 61
     clock_overwhelming: float = 0.3
     begins: float = 2.0
-    begins_share: float = 0.3
+    begins_near: float = 2.0
     begins_apart: float = 3.0
     drift_rows: int = 1200
     drift_parts: int = 8
