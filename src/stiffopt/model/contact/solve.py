@@ -224,7 +224,16 @@ class ContactProblem:
 
     def is_far(self, start: Contacts, arm: LeaningArm) -> bool:
         """Return whether the normal of a contact has turned too much for a step."""
-        for old, new, row in zip(start.touches, arm.state.touches, arm.rows, strict=False):
+        pairs = list(zip(arm.state.touches, arm.rows, strict=True))
+        has_lines = any(touch.line for touch in (*start.touches, *arm.state.touches))
+        for old, (new, row) in zip(start.touches, pairs, strict=False):
+            if has_lines:  # contacts come and go; the nearest one has nearly the same normal
+                own = [each for each in pairs if each[0].surface == old.surface]
+                if not own:
+                    continue
+                new, row = min(own, key=lambda each: abs(each[0].station - old.station))
+                if abs(new.station - old.station) > self.lines.spacing:
+                    continue
             if old.surface != new.surface:
                 return False  # another set of contacts; those before were checked
             size = float(np.linalg.norm(old.force))
