@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 _SPACING = 1.0  # of the contacts, over the least outer radius
 _CLOSEST, _FARTHEST = 0.4, 1.3  # distances of neighbours on a line, over the spacing
 _BESIDE = 0.65  # over the spacing; the body may enter the surface a little so near to a line
-_CURVED = 0.2  # 1/m, second derivative with which contacts inside a line slide too
+_CURVED = 0.1  # 1/m beyond that of a flat line, with which contacts inside a line slide too
 _SHORTER = 0.7  # reach over the spacing, below which two contacts become one
 _LONG = 2.0  # reach over the spacing, with which an end is too undetermined to begin to slide
 _LIGHT, _HOLE = 0.05, 0.3  # force at the tip over its neighbour's, and free length over the spacing
@@ -166,7 +166,7 @@ class ContactLines:
             if is_end:  # neither on a crest nor where its place is nearly undetermined
                 slides = arm.reach(j) < _LONG * self.spacing / more
             else:
-                slides = bend > more * _CURVED
+                slides = bend > more * _CURVED + 1.25 * arm.sag(j)
             slides = slides and touch.station < self._length
             if slides and self.is_held(touch):
                 changes[j] = replace(touch, pinned=False)

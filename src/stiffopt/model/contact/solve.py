@@ -302,7 +302,10 @@ class ContactProblem:
                 if gap < -_DEEPEST * arm.shape.sections.radius.min():
                     self._deepest = (index, gap)
                     return None
-                found.append(self._touch(index, s))
+                new = self._touch(index, s)
+                if any(abs(s - each) < self.lines.spacing for each in lines):
+                    new = replace(new, line=True, pinned=True)
+                found.append(new)
         return found
 
     def _is_of(self, arm: LeaningArm, j: int, s: float, gap: float) -> bool:
