@@ -52,7 +52,7 @@ class ContactLines:
         )
 
     def is_held(self, touch: Touch) -> bool:
-        """Return whether a contact is pinned because it is inside a line or at its end at the tip."""
+        """Return whether a contact is pinned inside a line, or as its end at the tip."""
         here = self._rod.ranges[touch.range]
         inside = here.start < touch.station < here.end or touch.station >= self._length
         return touch.line and touch.pinned and inside

@@ -285,7 +285,11 @@ class ContactProblem:
             if gaps.min() > _SEEN_FROM:
                 continue
             own = [j for j, touch in enumerate(arm.state.touches) if touch.surface == index]
-            lines = [touch.station for touch in arm.state.touches if touch.surface == index and touch.line]
+            lines = [
+                touch.station
+                for touch in arm.state.touches
+                if touch.surface == index and touch.line
+            ]
             for i in dips(gaps):
                 if gaps[i] > _SEEN_FROM:
                     continue
