@@ -21,13 +21,14 @@ from stiffopt.control.controller import TipController
 from stiffopt.control.linearised_tip import LeaningTip
 from stiffopt.control.state import ControllerStatus
 from stiffopt.control.tuning import BracingTuning
-from stiffopt.errors import InputError
+from stiffopt.errors import FileError, InputError
 from stiffopt.optimise import braced
 from stiffopt.optimise.settings import BRACE, Effort
 from stiffopt.optimise.solution import PressureSolution
 from stiffopt.optimise.solver import PressureSolver
 from stiffopt.paths.configurations import Unsolved
 from stiffopt.paths.leaning import FORCE_RATE, GRADUAL, SPEED, BraceApproach, approach_to, gradual
+from stiffopt.paths.motion_file import read_motion
 from stiffopt.paths.trajectory import Trajectory, Waypoint
 from stiffopt.plant.settings import PlantLoad, PlantSettings, Silicone
 from stiffopt.plots import plot_motion
@@ -247,7 +248,7 @@ def test_a_slip_is_told_and_lets_go_where_contacts_are_to_stick(approach, contac
 
 def test_an_arm_without_contact_is_told_whatever_pushes_it(approach):
     course = held(approach)
-    apart = approach.free_tip - approach.tips[-1].pose[:3, 3]
+    apart = approach.free_tips[-1] - approach.tips[-1].pose[:3, 3]
     assert np.linalg.norm(apart) > 4e-3
     after = samples(course, approach, apart, 40)
     assert after is not None
@@ -273,7 +274,7 @@ def test_an_arm_that_is_let_down_is_not_told_to_slip(approach):
 
 def test_an_error_of_the_model_and_creep_are_no_push(approach):
     course = held(approach)
-    across = np.cross(approach.free_tip - approach.tips[-1].pose[:3, 3], [0.0, 0.0, 1.0])
+    across = np.cross(approach.free_tips[-1] - approach.tips[-1].pose[:3, 3], [0.0, 0.0, 1.0])
     across *= 3e-3 / np.linalg.norm(across)
     for step in range(400):  # 0.1 mm/s
         assert samples(course, approach, across * (1 + step * 0.025 / 30), 1) is None
@@ -300,8 +301,11 @@ def test_the_tip_goes_to_its_target_with_the_contact_force_as_it_is(approach):
 class Loop:
     """A controller and a simulated arm without inertia, beside the post or without it."""
 
-    def __init__(self, scene: stiffopt.Scene | None = TASK.scene, **plant: Any) -> None:
+    def __init__(
+        self, scene: stiffopt.Scene | None = TASK.scene, world: stiffopt.Scene | None = None
+    ) -> None:
         settings = PlantSettings(
+            scene=world,
             dynamics="quasi-static",
             silicone=Silicone(creep=(), hysteresis=()),
             discretisation={
@@ -310,7 +314,6 @@ class Loop:
                 "shear_degree": 1,
                 "sub_intervals": 3,
             },
-            **plant,
         )
         description = RigDescription(
             robot="stiff-flop-2",
@@ -410,6 +413,40 @@ def test_the_loop_leans_holds_tells_a_lift_off_and_lets_go(solution, approach, m
     loop.controller.close()
 
 
+def test_an_object_that_is_not_there_is_told_on_the_way(solution, monkeypatch):
+    """The object of the scene stands elsewhere on the rig, so that nothing is touched."""
+    known = SimpleNamespace(solve=lambda: solution)
+    monkeypatch.setattr(planning, "PressureSolver", lambda robot, task: known)
+    away = {"sphere": {"centre": (0.2, 0.2, 0.2), "radius": 0.01}, "contact": {"allowed": True}}
+    loop = Loop(world=stiffopt.Scene(objects=[{"name": "far", **away}]))
+    loop.wait(1.0)
+    loop.controller.set_task(TASK)
+    loop.until(lambda s: s.brace == "releasing", 20.0)
+    assert loop.told == ["brace-lost"]
+    assert loop.command.max() < 0.9 * solution.pressures.max(), "long before the end of the way"
+    loop.until(lambda s: s.brace == "released", 20.0)
+    loop.controller.close()
+
+
+def test_a_contact_that_friction_holds_is_brought_to_the_target(solution, monkeypatch):
+    """Friction withholds corrections at first; that is no push, so they go on."""
+    known = SimpleNamespace(solve=lambda: solution)
+    monkeypatch.setattr(planning, "PressureSolver", lambda robot, task: known)
+    rough = TASK.scene.objects[0].model_copy(
+        update={"contact": TASK.scene.objects[0].contact.model_copy(update={"friction": 0.4})}
+    )
+    loop = Loop(world=stiffopt.Scene(objects=[rough]))
+    loop.wait(1.0)
+    loop.controller.set_task(TASK)
+    loop.until(lambda s: s.brace == "held", 20.0)
+    missed = loop.status.position_error
+    loop.wait(40.0)
+    assert missed > 2e-3
+    assert loop.status.position_error < 0.3 * missed
+    assert set(loop.told) <= {"braced", "brace-off-target"}
+    loop.controller.close()
+
+
 def test_the_loop_tells_that_there_is_nothing_to_lean_on():
     away = {"sphere": {"centre": (0.2, 0.2, 0.2), "radius": 0.01}}
     nothing = stiffopt.Scene(objects=[{"name": "far", **away}])
@@ -464,6 +501,20 @@ def test_the_picture_of_a_motion_shows_the_arm_in_contact(solution):
     assert f"{np.linalg.norm(contact.force):.3g} N" in [
         text.get_text() for text in figure.findobj(Text)
     ]
+
+
+@pytest.mark.parametrize("name", ["motion.csv", "motion.yaml"])
+def test_a_written_motion_that_leans_is_not_played(tmp_path, name):
+    out, begin = tmp_path / name, "0,0,0,0,0,0 bar"
+    arguments = ["--to", "problems/braced/post.yaml", "--slew", "2 bar/s", "--quiet"]
+    assert main(["plan", "--from", begin, *arguments, "--out", str(out)]) == 0
+    with pytest.raises(FileError, match=r"leans on objects.*give the rig its task"):
+        read_motion(out, ROBOT.description)
+    found = stiffopt.plan_motion(ROBOT, np.zeros(6), [TASK], slew=2e5)
+    assert found.leans[-1]
+    assert not found.leans[0]
+    with pytest.raises(InputError, match="leans on objects"):
+        found.trajectory()
 
 
 def test_the_json_of_a_motion_names_its_contacts(capsys):

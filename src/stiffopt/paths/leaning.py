@@ -68,7 +68,7 @@ class BraceApproach:
     forces : largest force of a contact (k,), in N.
     contacts : at the end.
     hold : their forces and limits at the end.
-    free_tip : position (3,), in m, of the tip at the end pressures without contact.
+    free_tips : positions (k, 3), in m, of the tip at these pressures without contact.
     """
 
     times: Vector
@@ -77,7 +77,7 @@ class BraceApproach:
     forces: Vector
     contacts: tuple[Contact, ...]
     hold: Hold
-    free_tip: Vector
+    free_tips: Vector
 
 
 def approach_to(
@@ -99,14 +99,15 @@ def approach_to(
         As `way_into_contact` does.
     """
     states = way_into_contact(robot, solution)
+    pressures = np.array([eq.pressures for eq in states])
     return BraceApproach(
         times=least_times_along(robot, states, slew),
-        pressures=np.array([eq.pressures for eq in states]),
+        pressures=pressures,
         tips=tuple(TipAt(eq.tip_pose, eq.tip_jacobian, eq.tip_compliance) for eq in states),
         forces=np.array([_largest(eq) for eq in states]),
         contacts=states[-1].contacts,
         hold=_hold(states[-1]),
-        free_tip=robot.tip_pose(states[-1].pressures)[:3, 3],
+        free_tips=robot.pose(pressures, robot.length)[:, :3, 3],
     )
 
 
@@ -162,6 +163,8 @@ def least_times_along(
     pressures = np.array([eq.pressures for eq in states])
     rates = (np.abs(np.diff(pressures, axis=0)) / slew).max(axis=1)
     least = np.maximum.reduce([moved / SPEED, np.abs(np.diff(forces)) / FORCE_RATE, rates])
+    # in the step of the first touch, its mean speed is less than that before, or the force's after
+    least = np.maximum.reduce([least, np.append(least[1:], 0.0), np.append(0.0, least[:-1])])
     return np.concatenate([[0.0], np.cumsum(np.maximum(least, 1e-3))])
 
 

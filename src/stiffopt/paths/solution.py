@@ -15,6 +15,12 @@ from stiffopt.paths.trajectory import Trajectory, trajectory_through
 
 Vector = NDArray[np.float64]
 
+LEANS = (
+    "leans on objects, and is not followed as a trajectory: give the rig its task, and the daemon "
+    "goes the same way"
+)
+"""Why a motion into contact cannot be played."""
+
 Status = Literal["solved", "unreachable", "failed"]
 
 
@@ -97,6 +103,12 @@ class PathSolution(ShownInNotebook):
         return self.equilibria[own] if own >= 0 else None
 
     @property
+    def leans(self) -> NDArray[np.bool_]:
+        """Whether the arm is in contact at each point, (N,)."""
+        own = [bool(eq.contacts) for eq in self.equilibria]
+        return np.array([False] * (len(self.times) - len(own)) + own)
+
+    @property
     def worst_index(self) -> int | None:
         """Index of the least stiff point."""
         if self.stiffness is None or not len(self.stiffness):
@@ -122,10 +134,12 @@ class PathSolution(ShownInNotebook):
         Raises
         ------
         InputError
-            There are no pressures, or too many points remain.
+            There are no pressures, or too many points remain, or the arm leans on objects.
         """
         if not len(self.times):
             raise InputError(f"there is nothing to follow: {self.message}")
+        if self.leans.any():
+            raise InputError(f"the motion {LEANS}")
         ranges = self.robot.pressure_max - self.robot.pressure_min
         tips = self.tip_poses[:, :3, 3]
         return trajectory_through(self.times, self.pressures, tips, ranges, begin)
