@@ -390,7 +390,8 @@ def _arrived(arm: LeaningArm, share: float, what: str) -> ContactEquilibrium:
     if share < 1.0:
         touches = arm.state.touches
         names = sorted({arm.problem.surfaces[touch.surface].name for touch in touches})
-        on = f", leaning on {' and '.join(names)}" if names else ""
+        how = "lying along" if any(touch.line for touch in touches) else "leaning on"
+        on = f", {how} {' and '.join(names)}" if names else ""
         raise EquilibriumError(
             f"no equilibrium is reached continuously beyond {share:.0%} of {what}{on}: the arm "
             "slips off, snaps through or buckles there"

@@ -25,9 +25,10 @@ if TYPE_CHECKING:
 _SPACING = 1.0  # of the contacts, over the least outer radius
 _CLOSEST, _FARTHEST = 0.4, 1.3  # distances of neighbours on a line, over the spacing
 _BESIDE = 0.65  # over the spacing; the body may enter the surface a little so near to a line
-_CURVED = 0.2  # 1/m, second derivative with which contacts inside a line slide too
+_CURVED = 0.1  # 1/m beyond that of a flat line, with which contacts inside a line slide too
 _SHORTER = 0.7  # reach over the spacing, below which two contacts become one
-_FLATTEST = 1e-3  # 1/m, second derivative of the gap with which an end begins to slide
+_LONG = 2.0  # reach over the spacing, with which an end is too undetermined to begin to slide
+_LIGHT, _HOLE = 0.05, 0.3  # force at the tip over its neighbour's, and free length over the spacing
 _MAX_SPLITS = 3  # of a point; then it stays one
 
 
@@ -51,7 +52,7 @@ class ContactLines:
         )
 
     def is_held(self, touch: Touch) -> bool:
-        """Return whether a contact is pinned because it is inside a line or at its end at the tip."""
+        """Return whether a contact is pinned inside a line, or as its end at the tip."""
         here = self._rod.ranges[touch.range]
         inside = here.start < touch.station < here.end or touch.station >= self._length
         return touch.line and touch.pinned and inside
@@ -139,7 +140,7 @@ class ContactLines:
             own = touches[first]
             if own.station >= self._length and arm.is_let_go(first):
                 return {}
-            if own.pinned and arm.bend(first) < _FLATTEST:
+            if own.pinned and arm.reach(first) > _LONG * self.spacing:
                 return {}
             point = replace(own, line=False)
             return {first: point if own.station >= self._length else replace(point, pinned=False)}
@@ -147,6 +148,11 @@ class ContactLines:
             if touches[j].station - touches[i].station < _CLOSEST * self.spacing:
                 keep, drop = (j, i) if j == last else (i, j)
                 return {keep: self._joined(touches[keep], touches[drop]), drop: None}
+        if touches[last].station >= self._length:
+            before, end = run[-2], touches[run[-2]].station
+            is_light = touches[last].normal_force < _LIGHT * touches[before].normal_force
+            if is_light and end + arm.reach(before) / 2 < self._length - _HOLE * self.spacing:
+                return {last: None}  # the line ends before the tip
         if len(run) == 2 and not touches[last].station >= self._length:
             bend = (arm.bend(first) + arm.bend(last)) / 2
             if arm.shear(first) + arm.shear(last) < _SHORTER * self.spacing * bend:
@@ -156,13 +162,12 @@ class ContactLines:
         for j in run:
             touch = touches[j]
             is_end, bend = j in (first, last), arm.bend(j)
-            # less to go on sliding than to begin; on a crest a contact cannot slide
-            least = (
-                (_FLATTEST if touch.pinned else 0.0)
-                if is_end
-                else (_CURVED if touch.pinned else 0.6 * _CURVED)
-            )
-            slides = touch.station < self._length and bend > least
+            more = 1.0 if touch.pinned else 0.5  # to begin to slide than to go on
+            if is_end:  # neither on a crest nor where its place is nearly undetermined
+                slides = arm.reach(j) < _LONG * self.spacing / more
+            else:
+                slides = bend > more * _CURVED + 1.25 * arm.sag(j)
+            slides = slides and touch.station < self._length
             if slides and self.is_held(touch):
                 changes[j] = replace(touch, pinned=False)
             elif not slides and not touch.pinned:

@@ -225,7 +225,16 @@ class ContactProblem:
 
     def is_far(self, start: Contacts, arm: LeaningArm) -> bool:
         """Return whether the normal of a contact has turned too much for a step."""
-        for old, new, row in zip(start.touches, arm.state.touches, arm.rows, strict=False):
+        pairs = list(zip(arm.state.touches, arm.rows, strict=True))
+        has_lines = any(touch.line for touch in (*start.touches, *arm.state.touches))
+        for old, (new, row) in zip(start.touches, pairs, strict=False):
+            if has_lines:  # contacts come and go; the nearest one has nearly the same normal
+                own = [each for each in pairs if each[0].surface == old.surface]
+                if not own:
+                    continue
+                new, row = min(own, key=lambda each: abs(each[0].station - old.station))
+                if abs(new.station - old.station) > self.lines.spacing:
+                    continue
             if old.surface != new.surface:
                 return False  # another set of contacts; those before were checked
             size = float(np.linalg.norm(old.force))
@@ -277,7 +286,11 @@ class ContactProblem:
             if gaps.min() > _SEEN_FROM:
                 continue
             own = [j for j, touch in enumerate(arm.state.touches) if touch.surface == index]
-            lines = [touch.station for touch in arm.state.touches if touch.surface == index and touch.line]
+            lines = [
+                touch.station
+                for touch in arm.state.touches
+                if touch.surface == index and touch.line
+            ]
             for i in dips(gaps):
                 if gaps[i] > _SEEN_FROM:
                     continue
@@ -294,7 +307,10 @@ class ContactProblem:
                 if gap < -_DEEPEST * arm.shape.sections.radius.min():
                     self._deepest = (index, gap)
                     return None
-                found.append(self._touch(index, s))
+                new = self._touch(index, s)
+                if any(abs(s - each) < self.lines.spacing for each in lines):
+                    new = replace(new, line=True, pinned=True)
+                found.append(new)
         return found
 
     def _is_of(self, arm: LeaningArm, j: int, s: float, gap: float) -> bool:

@@ -166,6 +166,14 @@ class LeaningArm:
         )
         return own + float(n @ R @ (np.cross(u, v) + C[:3] @ slope))
 
+    def sag(self, j: int) -> float:
+        """Return the part in 1/m of `bend` that is the shear by the arm's own weight."""
+        segment = self.problem.rod.ranges[self.state.touches[j].range].segment
+        sections, R = self.shape.sections, self.shape.rotation[self.state.mesh.node[j]]
+        weight = R.T @ sections.weight[segment]
+        n = self.rows[j].point.normal
+        return max(0.0, -float(n @ R @ sections.compliance[segment, :3, :3] @ weight))
+
     def kink(self, j: int) -> tuple[float, float]:
         """Return depth and length, in m, of the centre line's kink at a point force.
 
