@@ -62,7 +62,8 @@ class ContactSurface:
         """Return distances (k,) of points (k, 3), in m."""
         if self._functions is None:
             return self._measured.distances(points).values
-        return self._of_pieces(points).max(axis=0)
+        largest: Vector = self._of_pieces(points).max(axis=0)
+        return largest
 
     def _of_pieces(self, points: Vector) -> Vector:
         """Return distances (pieces, k) of points (k, 3)."""
@@ -102,9 +103,9 @@ _FIT = np.linalg.pinv(
 
 
 def surface_functions(kind: type[Obstacle]) -> list[ca.Function]:
-    """Return functions of a point and a piece: to the distance, and with first and second derivatives.
+    """Return functions of a point (3,) and a piece's parameters.
 
-    The derivatives are those by the point, (3,) and (3, 3).
+    The first has the distance; the second has the gradient (3,) and second derivatives (3, 3) too.
     """
     point, q, distance = kind.contact_formula()
     hessian, gradient = ca.hessian(distance, point)

@@ -92,8 +92,7 @@ class InsideTube(Obstacle):
             for way, after in pairwise(ways)
         ]
         return [
-            [*piece, *bend]
-            for piece, bend in zip(self.pieces, [*bends, [0.0] * 7], strict=True)
+            [*piece, *bend] for piece, bend in zip(self.pieces, [*bends, [0.0] * 7], strict=True)
         ]
 
     def check_against(self, robot: RobotDescription, clearance: float) -> None:
