@@ -285,6 +285,8 @@ class TipController:
         self._now = now
         self._arm.touch.stiffness_error = self.replanner.deviation
         course = self.replanner.pursuit.course
+        if isinstance(course, Bracing):
+            course.is_steered = not self._is_held(now)
         counts = self._arm.observe(now, commanded, reading, samples, course)
         if counts.used and (sample := self._arm.tip.sample) is not None:
             self._first_motion.take(self._arm.tip.predicted, sample.position)
