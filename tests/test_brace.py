@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from io import StringIO
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -27,6 +28,7 @@ from stiffopt.optimise.leaning import MARGIN_ON, BracedProblem
 from stiffopt.optimise.local import LocalResult
 from stiffopt.optimise.search import Search
 from stiffopt.optimise.settings import BRACE, Effort
+from stiffopt.paths.leaning import way_into_contact
 
 PROBLEMS = Path(__file__).parents[1] / "problems"
 POST = """
@@ -158,7 +160,7 @@ def test_a_margin_that_no_contact_holds_leaves_the_free_answer(robot, task):
     assert found.found
     assert not found.contacts
     assert found.stiffness == found.stiffness_free
-    assert "leans on 'post'" in found.message
+    assert "leaning on 'post' at the target, the arm has no equilibrium" in found.message
 
 
 def test_a_calibrated_arm_holds_back_forces_that_are_in_doubt(robot, task):
@@ -340,6 +342,25 @@ def test_a_brace_needs_a_scene(tmp_path):
         stiffopt.load_task(written(tmp_path, TASK[: TASK.index("scene:")]))
 
 
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("margin: 20 mN", "margin: 1 N", "no equilibrium under a push of 1 N, the margin"),
+        (
+            "capsule: {from: [-35 mm, -60 mm, 100 mm], to: [-35 mm, 60 mm, 100 mm], radius: 5 mm}",
+            "sphere: {centre: [0 mm, 0 mm, 90 mm], radius: 30 mm}",
+            "inside 'post', which cannot push it out continuously",
+        ),
+    ],
+)
+def test_the_reason_for_no_brace(tmp_path, robot, old, new, message):
+    text = TASK.replace(old, new)
+    assert text != TASK
+    found = stiffopt.solve_pressure(robot, stiffopt.load_task(written(tmp_path, text)))
+    assert not found.contacts
+    assert message in found.message
+
+
 @pytest.mark.parametrize("file", sorted(PROBLEMS.glob("leaning_*.yaml")), ids=lambda p: p.stem)
 def test_the_gallery_holds_at_its_golden_pressures(file, monkeypatch):
     monkeypatch.setenv("STIFFOPT_COMPILER", "none")
@@ -352,6 +373,13 @@ def test_the_gallery_holds_at_its_golden_pressures(file, monkeypatch):
     assert judgement.holds, judgement.shortfalls
     assert judgement.stiffnesses[0] == pytest.approx(golden["stiffness"], rel=1e-5)
     assert {each.object for each in eq.contacts} == set(task.brace.objects)
+    assert robot.clearance(np.zeros(6), task.scene) >= task.scene.clearance
+    answer = SimpleNamespace(
+        task=task, pressures=eq.pressures, tip_pose=eq.tip_pose, contacts=eq.contacts
+    )
+    states = way_into_contact(robot, answer)
+    assert not states[0].contacts
+    assert states[-1].normal_forces == pytest.approx(eq.normal_forces, rel=1e-3)
 
 
 def test_json_files_and_picture(tmp_path, capsys):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -10,23 +11,27 @@ from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.text import Text
 
 import stiffopt
+from stiffopt.cli.main import main
 from stiffopt.control import planning
 from stiffopt.control.bracing import BracePhase, Bracing
 from stiffopt.control.controller import TipController
 from stiffopt.control.linearised_tip import LeaningTip
 from stiffopt.control.state import ControllerStatus
 from stiffopt.control.tuning import BracingTuning
-from stiffopt.errors import InputError
+from stiffopt.errors import FileError, InputError
 from stiffopt.optimise import braced
 from stiffopt.optimise.settings import BRACE, Effort
 from stiffopt.optimise.solution import PressureSolution
 from stiffopt.optimise.solver import PressureSolver
 from stiffopt.paths.configurations import Unsolved
-from stiffopt.paths.leaning import FORCE_RATE, SPEED, BraceApproach, approach_to
+from stiffopt.paths.leaning import FORCE_RATE, GRADUAL, SPEED, BraceApproach, approach_to, gradual
+from stiffopt.paths.motion_file import read_motion
 from stiffopt.paths.trajectory import Trajectory, Waypoint
 from stiffopt.plant.settings import PlantLoad, PlantSettings, Silicone
+from stiffopt.plots import plot_motion
 from stiffopt.rig.assembly import make_rig
 from stiffopt.rig.config import RigDescription, limits_of, slew_of
 
@@ -243,7 +248,7 @@ def test_a_slip_is_told_and_lets_go_where_contacts_are_to_stick(approach, contac
 
 def test_an_arm_without_contact_is_told_whatever_pushes_it(approach):
     course = held(approach)
-    apart = approach.free_tip - approach.tips[-1].pose[:3, 3]
+    apart = approach.free_tips[-1] - approach.tips[-1].pose[:3, 3]
     assert np.linalg.norm(apart) > 4e-3
     after = samples(course, approach, apart, 40)
     assert after is not None
@@ -251,9 +256,25 @@ def test_an_arm_without_contact_is_told_whatever_pushes_it(approach):
     assert "where an arm without contact has it" in course.notices()[-1].text
 
 
+def test_an_arm_that_is_let_down_is_not_told_to_slip(approach):
+    """The silicone follows its pressures late, so its tip is off the model's at each of them."""
+    course, tip, p = held(approach), approach.tips[-1], approach.pressures[-1]
+    samples(course, approach, np.zeros(3), 40)
+    course.is_steered = False
+    lifting = pushed(approach, (1.0, 0, 0))
+    for share in (0.95, 0.9, 0.8):
+        for _ in range(8):
+            course.look(0.025, tip.pose[:3, 3] + lifting, tip, share * p)
+    assert course.phase is BracePhase.HELD
+    assert [notice.kind for notice in course.notices()] == ["braced"]
+    for _ in range(20):  # held, at the same pressures, a contact that is lost is told
+        course.look(0.025, tip.pose[:3, 3] + lifting, tip, p)
+    assert course.phase is BracePhase.RELEASING
+
+
 def test_an_error_of_the_model_and_creep_are_no_push(approach):
     course = held(approach)
-    across = np.cross(approach.free_tip - approach.tips[-1].pose[:3, 3], [0.0, 0.0, 1.0])
+    across = np.cross(approach.free_tips[-1] - approach.tips[-1].pose[:3, 3], [0.0, 0.0, 1.0])
     across *= 3e-3 / np.linalg.norm(across)
     for step in range(400):  # 0.1 mm/s
         assert samples(course, approach, across * (1 + step * 0.025 / 30), 1) is None
@@ -280,8 +301,11 @@ def test_the_tip_goes_to_its_target_with_the_contact_force_as_it_is(approach):
 class Loop:
     """A controller and a simulated arm without inertia, beside the post or without it."""
 
-    def __init__(self, scene: stiffopt.Scene | None = TASK.scene, **plant: Any) -> None:
+    def __init__(
+        self, scene: stiffopt.Scene | None = TASK.scene, world: stiffopt.Scene | None = None
+    ) -> None:
         settings = PlantSettings(
+            scene=world,
             dynamics="quasi-static",
             silicone=Silicone(creep=(), hysteresis=()),
             discretisation={
@@ -290,7 +314,6 @@ class Loop:
                 "shear_degree": 1,
                 "sub_intervals": 3,
             },
-            **plant,
         )
         description = RigDescription(
             robot="stiff-flop-2",
@@ -390,6 +413,40 @@ def test_the_loop_leans_holds_tells_a_lift_off_and_lets_go(solution, approach, m
     loop.controller.close()
 
 
+def test_an_object_that_is_not_there_is_told_on_the_way(solution, monkeypatch):
+    """The object of the scene stands elsewhere on the rig, so that nothing is touched."""
+    known = SimpleNamespace(solve=lambda: solution)
+    monkeypatch.setattr(planning, "PressureSolver", lambda robot, task: known)
+    away = {"sphere": {"centre": (0.2, 0.2, 0.2), "radius": 0.01}, "contact": {"allowed": True}}
+    loop = Loop(world=stiffopt.Scene(objects=[{"name": "far", **away}]))
+    loop.wait(1.0)
+    loop.controller.set_task(TASK)
+    loop.until(lambda s: s.brace == "releasing", 20.0)
+    assert loop.told == ["brace-lost"]
+    assert loop.command.max() < 0.9 * solution.pressures.max(), "long before the end of the way"
+    loop.until(lambda s: s.brace == "released", 20.0)
+    loop.controller.close()
+
+
+def test_a_contact_that_friction_holds_is_brought_to_the_target(solution, monkeypatch):
+    """Friction withholds corrections at first; that is no push, so they go on."""
+    known = SimpleNamespace(solve=lambda: solution)
+    monkeypatch.setattr(planning, "PressureSolver", lambda robot, task: known)
+    rough = TASK.scene.objects[0].model_copy(
+        update={"contact": TASK.scene.objects[0].contact.model_copy(update={"friction": 0.4})}
+    )
+    loop = Loop(world=stiffopt.Scene(objects=[rough]))
+    loop.wait(1.0)
+    loop.controller.set_task(TASK)
+    loop.until(lambda s: s.brace == "held", 20.0)
+    missed = loop.status.position_error
+    loop.wait(40.0)
+    assert missed > 2e-3
+    assert loop.status.position_error < 0.3 * missed
+    assert set(loop.told) <= {"braced", "brace-off-target"}
+    loop.controller.close()
+
+
 def test_the_loop_tells_that_there_is_nothing_to_lean_on():
     away = {"sphere": {"centre": (0.2, 0.2, 0.2), "radius": 0.01}}
     nothing = stiffopt.Scene(objects=[{"name": "far", **away}])
@@ -409,15 +466,80 @@ def test_a_motion_goes_to_rest_and_then_into_contact(solution, approach):
     start = np.array([0.0, 0, 2e4, 0, 1e4, 0])
     found = stiffopt.plan_motion(ROBOT, start, [TASK], slew=2e5)
     assert found.found
-    assert "into contact with 'post'" in found.message
+    assert "into contact: at the end it leans on 'post' with 0." in found.message
     assert found.pressures[0] == pytest.approx(start)
     assert (np.abs(found.pressures).max(axis=1) < 1e-6).any()
     assert found.pressures[-1] == pytest.approx(solution.pressures)
     assert found.tip_poses[-1][:3, 3] == pytest.approx(approach.tips[-1].pose[:3, 3], abs=1e-5)
     assert (np.abs(np.diff(found.pressures, axis=0)).max(axis=1)
             <= 2e5 * np.diff(found.times) * (1 + 1e-6)).all()  # fmt: skip
+    assert found.equilibrium(0) is None
+    assert found.equilibrium(len(found.times) - 1) is found.equilibria[-1]
+    (contact,) = found.equilibria[-1].contacts
+    assert np.linalg.norm(contact.force) == pytest.approx(approach.forces[-1], rel=1e-4)
+    assert found.stiffness[0] == pytest.approx(ROBOT.stiffness(start, [1, 0, 0]))
+    assert found.stiffness[-1] == pytest.approx(solution.stiffness, rel=1e-3)
+    assert found.stiffness[-1] > 4 * found.stiffness[0]
     with pytest.raises(InputError, match="the only goal of a motion"):
         stiffopt.plan_motion(ROBOT, TASK, start, slew=2e5)
     given_up = stiffopt.plan_motion(ROBOT, start, TASK, slew=2e5, cancel=lambda: True)
     assert given_up.status == "failed"
     assert "cancelled" in given_up.message
+
+
+def test_the_picture_of_a_motion_shows_the_arm_in_contact(solution):
+    """The drawn centre line at the end is the braced one, and its force is labelled."""
+    found = stiffopt.plan_motion(ROBOT, np.zeros(6), [TASK], slew=2e5)
+    figure = plot_motion(found, TASK.scene)
+    space = figure.axes[0]
+    ends = [np.array(line.get_data_3d()).T[-1] for line in space.lines if len(line.get_xdata())]
+    near = 1e-3 * np.array(ends) - found.equilibria[-1].tip_pose[:3, 3]
+    assert (np.linalg.norm(near, axis=1) < 1e-6).sum() >= 2  # the tip's way, and the arm
+    free = 1e-3 * np.array(ends) - ROBOT.tip_pose(found.pressures[-1])[:3, 3]
+    assert np.linalg.norm(free, axis=1).min() > 2e-3
+    (contact,) = found.equilibria[-1].contacts
+    assert f"{np.linalg.norm(contact.force):.3g} N" in [
+        text.get_text() for text in figure.findobj(Text)
+    ]
+
+
+@pytest.mark.parametrize("name", ["motion.csv", "motion.yaml"])
+def test_a_written_motion_that_leans_is_not_played(tmp_path, name):
+    out, begin = tmp_path / name, "0,0,0,0,0,0 bar"
+    arguments = ["--to", "problems/braced/post.yaml", "--slew", "2 bar/s", "--quiet"]
+    assert main(["plan", "--from", begin, *arguments, "--out", str(out)]) == 0
+    with pytest.raises(FileError, match=r"leans on objects.*give the rig its task"):
+        read_motion(out, ROBOT.description)
+    found = stiffopt.plan_motion(ROBOT, np.zeros(6), [TASK], slew=2e5)
+    assert found.leans[-1]
+    assert not found.leans[0]
+    with pytest.raises(InputError, match="leans on objects"):
+        found.trajectory()
+
+
+def test_the_json_of_a_motion_names_its_contacts(capsys):
+    file = "problems/braced/post.yaml"
+    assert (
+        main(["plan", "--from", "0,0,0,0,0,0 bar", "--to", file, "--slew", "2 bar/s", "--json"])
+        == 0
+    )
+    said = json.loads(capsys.readouterr().out)
+    (contact,) = said["contacts"]
+    assert contact["object"] == "post"
+    assert said["stiffness"][-1] > 4 * said["stiffness"][0]
+
+
+def test_the_way_of_a_motion_begins_and_ends_gradually(approach):
+    """The points are passed in order, at the given speed but for a second at each end."""
+    for way in (approach.times, 0.1 * approach.times):  # the second one is too short to reach it
+        times, duration = gradual(way), way[-1]
+        pace = np.diff(way) / np.diff(times)
+        assert (pace > 0).all()
+        assert pace.max() <= 1 + 1e-9
+        assert np.abs(pace - pace[::-1]).max() < 0.35  # points are not spaced alike at both ends
+        middle = (times[1:] + times[:-1]) / 2
+        left = np.minimum(middle, times[-1] - middle)
+        assert (pace <= left / GRADUAL + 0.05).all() or duration > GRADUAL
+        assert (pace[left < GRADUAL] <= left[left < GRADUAL] / GRADUAL + 0.2).all()
+        extra = GRADUAL if duration > GRADUAL else 2 * np.sqrt(GRADUAL * duration) - duration
+        assert times[-1] == pytest.approx(duration + extra)

@@ -1,6 +1,7 @@
 """The local method in Python: its results hold, are optimal, and are those of compiled code."""
 
 import sys
+from dataclasses import replace
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
@@ -134,6 +135,22 @@ def test_search_is_over_when_nothing_new_is_found(without_compiler):
     short = search(problem, x, Effort(len(x), 3, 1))
     assert not short.confidence.complete
     assert short.confidence.reached == 1
+
+
+def test_a_search_may_have_to_find_the_best_several_times(without_compiler):
+    problem, x = program("position")
+    found = search(problem, x, Effort(len(x), 1, len(x)))
+    assert found.confidence.complete
+    longer = search(problem, x, Effort(len(x), 1, len(x)), best_found=found.confidence.agreeing + 1)
+    assert longer.confidence.reached > found.confidence.reached
+    assert longer.confidence.complete == (longer.confidence.agreeing > found.confidence.agreeing)
+    other = found.results[-1]
+    own = sum(abs(end.value - other.value) < found.same for end in found.ends)
+    needed = replace(found, best_found=own + 1)
+    assert found.confidence_in(other).complete
+    assert not needed.confidence_in(other).complete
+    never = search(problem, x, Effort(len(x), 1, len(x)), best_found=len(x) + 1)
+    assert not never.confidence.complete
 
 
 def test_search_for_what_cannot_be_reached_says_where_it_ended(without_compiler):

@@ -317,7 +317,7 @@ def test_what_is_in_the_way_is_told(two: Manipulator) -> None:
     assert motion.status == "unreachable"
     assert motion.pressures.shape == (0, 6)
     assert motion.message.startswith("start: the body is")
-    assert "mm too near 'post', where 2 mm of clearance are asked" in motion.message
+    assert "mm too near 'post', where 2 mm of clearance are required" in motion.message
     motion = plan_motion(two, LEFT, blocked, scene=scene)
     assert motion.message.startswith("goal: the body is")
     near = scene_of({"name": "wall", "half_space": {"point": (0, 0, 0.2), "normal": (0, 0, -1)}})

@@ -19,6 +19,7 @@ from stiffopt.daemon.service import create_app
 from stiffopt.errors import DeviceError, InputError
 from stiffopt.model.manipulator import load_robot
 from stiffopt.model.robot_files import load_description
+from stiffopt.optimise.task import load_task
 from stiffopt.studio import rig_watch, texts
 from stiffopt.studio.rig_watch import RigWatch
 from stiffopt.studio.workbench import Workbench
@@ -87,6 +88,30 @@ def test_without_the_token_it_only_reads(
     watch.go(Workbench(watch.design))
     assert not watch.in_control
     assert loop.names == []
+
+
+def test_a_braced_arm_is_drawn_as_it_leans(
+    rig: Path, watching: Callable[..., RigWatch], loop: FakeLoop
+) -> None:
+    task = load_task(ROOT / "problems" / "braced" / "post.yaml")
+    content = yaml.safe_load(rig.read_text(encoding="utf-8"))
+    content["scene"] = yaml.safe_load((ROOT / "rig" / "brace.yaml").read_text())["scene"]
+    rig.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
+    watch, robot = watching(), load_robot("stiff-flop-2")
+    pressures = np.array([1.1, 0, 0.1, 0, 0.2, 0]) * 1e5
+    loop.now = replace(loop.now, measured=pressures, brace="held", brace_force=0.2)
+    watch.poll()
+    leaning = watch.leaning(robot)
+    assert leaning is not None
+    expected = robot.contact_equilibrium(pressures, task.scene)
+    assert [each.object for each in leaning.contacts] == ["post"]
+    assert leaning.tip_pose == pytest.approx(expected.tip_pose)
+    html = texts.rig_html(watch)
+    assert "held" in html
+    assert "0.2 N" in html
+    loop.now = replace(loop.now, brace="released", brace_force=float("nan"))
+    watch.poll()
+    assert watch.leaning(robot) is None
 
 
 def test_a_preview_begins_where_the_arm_is(

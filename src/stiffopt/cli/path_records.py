@@ -10,6 +10,7 @@ import numpy as np
 
 from stiffopt.cli.console import plain_data
 from stiffopt.logs.table import read_bytes
+from stiffopt.paths.motion_file import LEANING
 from stiffopt.paths.path import Path
 from stiffopt.paths.rates import step_limits
 from stiffopt.paths.solution import PathSolution, Vector
@@ -83,6 +84,7 @@ def csv_text(solution: PathSolution) -> str:
         "angle_error_rad": solution.angle_errors,
         stiffness: solution.stiffness,
         "clearance_m": solution.clearance,
+        LEANING: solution.leans.astype(float) if solution.equilibria else None,
     }
     columns = {name: values for name, values in columns.items() if values is not None}
     rows = np.column_stack(list(columns.values())).tolist()
@@ -127,6 +129,7 @@ def solution_quantities(solution: PathSolution) -> dict[str, Any]:
         "stiffness": _quantities(solution.stiffness, unit),
         "stiffness_alone": _quantities(solution.alone, unit),
         "clearance": _quantities(solution.clearance, "mm", 1e3),
+        LEANING: solution.leans.tolist() if solution.equilibria else None,
         "solve_time": f"{solution.timings.get('total', 0.0):.4g} s",
     }
     return {key: value for key, value in record.items() if value not in (None, [], {})}

@@ -19,6 +19,7 @@ from stiffopt.cli.path_run import check_csv, is_csv
 from stiffopt.cli.quantities import listed, quantity
 from stiffopt.cli.quantities import view as view_angles
 from stiffopt.cli.solve_files import check_result_file
+from stiffopt.cli.solve_records import contact_record
 from stiffopt.documents import write_file, write_whole
 from stiffopt.errors import InputError, StiffoptError, printable, shown
 from stiffopt.model.manipulator import Manipulator, load_robot
@@ -68,7 +69,9 @@ class PlanCommand:
             progress(0, 0, "planning")
             scene, solution = self._plan()
         if as_json:
-            write_json({"from": self.start, "to": self.goals, **solution_values(solution)})
+            contacts = [each for eq in solution.equilibria[-1:] for each in eq.contacts]
+            values = {**solution_values(solution), "contacts": list(map(contact_record, contacts))}
+            write_json({"from": self.start, "to": self.goals, **values})
         elif not quiet:
             show(self._report(scene, solution))
         return self._write(scene, solution, out, plot, angles) or exits.OF_STATUS[solution.status]

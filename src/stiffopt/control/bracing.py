@@ -57,6 +57,7 @@ class Bracing:
     Attributes
     ----------
     phase : the present phase.
+    is_steered : whether the pressures follow this course; if not, they are held or let down.
     next : task to pursue after the release; None: the arm stays at rest.
     force : smallest normal force of the contacts, as estimated, in N; NaN without contact.
     margin : further push at the tip that would break a contact, in N; NaN while nothing pushes.
@@ -67,12 +68,13 @@ class Bracing:
 
     def __init__(self, task: Task, tuning: BracingTuning) -> None:
         self.task, self._tuning = task, tuning
-        self.phase = BracePhase.PLANNING
+        self.phase, self.is_steered = BracePhase.PLANNING, True
         self.next: Task | None = None
         self.force = self.margin = math.nan
         self.push, self.displacement = np.zeros(3), np.zeros(3)
         self.covariance: Array = tuning.usual_push**2 * np.eye(3)
         self._error: Array | None = None  # b (3,)
+        self._corrected: Array = np.zeros(3)  # of late, by the model; friction may withhold it
         self._residual: Array = np.zeros(3)  # y - s, smoothed over vibrations
         self._held = self._pushed = 0.0  # durations, in s
         self.approach: BraceApproach | None = None
@@ -83,6 +85,7 @@ class Bracing:
         self._waited = 0.0  # at its end, in s
         self._change: Array = np.zeros(0)  # of the planned pressures (n,), to correct the tip
         self._free = 0  # successive samples at which the tip is nearer to a free arm's
+        self._is_off = False  # the tip is known to stay off its target
         self._warned: set[str] = set()  # kinds of warnings about the present push
         self._lost = 0  # successive checks at which the model's contacts do not hold
         self._unchecked = 0.0  # time since the last such check, in s
@@ -189,31 +192,41 @@ class Bracing:
         pressures :
             Effective pressures (n,), in Pa.
         """
-        t = self._tuning
-        if self.phase is not BracePhase.HELD or self.approach is None:
+        t, held = self._tuning, self.phase is BracePhase.HELD
+        if self.approach is None or not (held or self.phase is BracePhase.APPROACHING):
             return
-        if float(np.abs(pressures - self.pressures).max()) > t.off_plan:  # being let down
+        off_plan = t.off_plan if self.is_steered else t.let_down
+        if float(np.abs(pressures - self.pressures).max()) > off_plan:
             return
         residual = seen - tip.pose[:3, 3]
         if self._error is None:
-            self._error = self._residual = residual
+            self._residual = residual
         self._residual = self._residual + min(elapsed / t.swing_time, 1.0) * (
             residual - self._residual
         )
         residual = self._residual
-        to_free = self.approach.free_tip - self.approach.tips[-1].pose[:3, 3]
+        to_free = self._free_tip() - tip.pose[:3, 3]
         distance = float(np.linalg.norm(to_free))
         share = float(residual @ to_free) / max(distance, 1e-9) ** 2
-        is_free = distance > t.min_distance and share > t.free_share
+        enough = t.min_distance if held else t.min_on_way
+        is_free = distance > enough and share > t.free_share
         self._free = self._free + 1 if is_free else 0
         if self._free >= t.samples:
-            self.release(why="the tip is where an arm without contact has it: the brace is lost")
+            where = "the tip is where an arm without contact has it"
+            lost = "the brace is lost" if held else "there is nothing where the scene has an object"
+            self.release(why=f"{where}: {lost}")
             return
-        off, settles = residual - self._error, self._held < t.settling
+        if not held:
+            return
+        if self._error is None:
+            self._error = residual
+        raw, settles = residual - self._error, self._held < t.settling
+        off = raw + self._withheld(raw)
+        self._corrected *= 1 - min(elapsed / t.withheld_time, 1.0)
         self._held += elapsed
         if settles or float(np.linalg.norm(off)) < t.felt or self._pushed > t.longest_push:
             time = t.settling_time if settles else t.error_time
-            self._error = self._error + min(elapsed / time, 1.0) * off
+            self._error = self._error + min(elapsed / time, 1.0) * raw
             self._pushed = self._pushed * float(np.linalg.norm(off) > t.felt)
             self.push = self.displacement = np.zeros(3)
             self.force, self.margin = float(self._forces(pressures).min()), math.nan
@@ -230,6 +243,23 @@ class Bracing:
         if self._unchecked >= t.every:
             self._unchecked = 0.0
             self._judge(self._forces(pressures))
+
+    def _free_tip(self) -> Array:
+        """Return the position (3,) of the tip of a free arm at the present place of the way."""
+        assert self.approach is not None
+        times, rows = self.approach.times, self.approach.free_tips
+        return np.array([np.interp(self._time, times, row) for row in rows.T])
+
+    def _withheld(self, off: Array) -> Array:
+        """Return the part of the recent correction (3,), in m, that explains a residual (3,) best.
+
+        A contact with friction sticks at first and slips later, so the tip may lag behind the
+        correction, or catch up, by up to all of it.
+        """
+        square = float(self._corrected @ self._corrected)
+        share = -float(off @ self._corrected) / max(square, 1e-12)
+        found: Array = float(np.clip(share, -1.0, 1.0)) * self._corrected
+        return found
 
     def _forces(self, pressures: Array) -> Array:
         """Return normal forces (k,) of the contacts at pressures (n,), without a push."""
@@ -289,11 +319,18 @@ class Bracing:
         if self.displacement.any() or self.approach is None:  # a push is not compensated
             return
         t = self._tuning
+        off = float(np.linalg.norm(error))
+        if not self._is_off and self._held > t.arrival and off > t.off_target:
+            self._is_off = True
+            text = f"the tip stays {1e3 * off:.1f} mm from its target while the arm leans"
+            self._notify("brace-off-target", text, Severity.WARNING)
         rows = np.vstack([jacobian, t.force_weight * self.approach.hold.per_pressure])
         wanted = np.concatenate([error, np.zeros(len(rows) - 3)])
         H = rows.T @ rows + t.pressure_weight**2 * np.eye(rows.shape[1])
         step = np.linalg.solve(H, rows.T @ wanted) * elapsed / t.time
-        self._change = np.clip(self._change + step, -t.most_change, t.most_change)
+        before = self._change
+        self._change = np.clip(before + step, -t.most_change, t.most_change)
+        self._corrected = self._corrected + jacobian @ (self._change - before)
 
     def notices(self) -> tuple[Notice, ...]:
         """Return events since the last call, and alarms."""

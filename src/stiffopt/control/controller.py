@@ -279,6 +279,8 @@ class TipController:
         self._now = now
         self._arm.touch.stiffness_error = self.replanner.deviation
         course = self.replanner.pursuit.course
+        if isinstance(course, Bracing):
+            course.is_steered = not self._is_held(now)
         counts = self._arm.observe(now, commanded, reading, samples, course)
         if self.forecast is not None:
             self.forecast.present = self._present(now)

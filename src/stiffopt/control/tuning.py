@@ -441,9 +441,12 @@ class BracingTuning:
     # distance between the tips of the braced and the free arm that the tracker can distinguish, in
     # m; share of it beyond which the arm is free; and successive samples
     min_distance: float = 4e-3
+    # the same on the way, where an object that is a little further away is touched a little later
+    min_on_way: float = 15e-3
     free_share: float = 0.6
     samples: int = 3
     off_plan: float = 1.5e4  # pressure error above which contacts are not judged, in Pa
+    let_down: float = 2e3  # the same while the pressures are held: then they are being let down
     swing_time: float = 0.08  # time constant of averaging the measured tip, in s
     # displacement of the tip above which a push is felt, in m; time constant with which a smaller
     # one becomes the model's error, in s
@@ -453,6 +456,8 @@ class BracingTuning:
     # constant, in s
     settling: float = 8.0
     settling_time: float = 0.3
+    # time for which friction at the contacts may withhold a correction of the tip, in s
+    withheld_time: float = 20.0
     longest_push: float = 60.0  # after which a push becomes the model's error too, in s
     # deviation of that displacement, in m, and of pushes, in N
     deviation: float = 5e-4
@@ -463,7 +468,10 @@ class BracingTuning:
     time: float = 3.0  # time constant with which the tip goes to its target, in s
     force_weight: float = 0.1  # error of the tip equivalent to a change of contact force, in m/N
     pressure_weight: float = 2e-8  # the same for a pressure, in m/Pa
-    most_change: float = 1e4  # largest change of a planned pressure, in Pa
+    most_change: float = 2e4  # largest change of a planned pressure, in Pa
+    # error of the tip that is reported if it is left after a time of holding, in m and s
+    off_target: float = 1e-3
+    arrival: float = 30.0
 
 
 @dataclass(frozen=True)

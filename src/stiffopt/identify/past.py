@@ -322,9 +322,9 @@ def _delayed(time: Array, pressures: Array, before: Array, dead_time: float) -> 
     first = time[0] - (np.median(np.diff(time)) if len(time) > 1 else 1.0)
     knots = np.concatenate([[first], time])
     values = np.vstack([before, pressures])
-    asked = time - dead_time
-    interval = np.clip(np.searchsorted(knots, asked, side="left") - 1, 0, len(knots) - 2)
+    at = time - dead_time
+    interval = np.clip(np.searchsorted(knots, at, side="left") - 1, 0, len(knots) - 2)
     slope = np.diff(values, axis=0) / np.diff(knots)[:, np.newaxis]
-    slope = np.where((asked < first)[:, np.newaxis], 0.0, slope[interval])
-    base = np.where((asked < first)[:, np.newaxis], before, values[interval])
-    return base + slope * (asked - knots[interval])[:, np.newaxis], slope
+    slope = np.where((at < first)[:, np.newaxis], 0.0, slope[interval])
+    base = np.where((at < first)[:, np.newaxis], before, values[interval])
+    return base + slope * (at - knots[interval])[:, np.newaxis], slope

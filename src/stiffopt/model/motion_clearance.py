@@ -101,14 +101,14 @@ class ClearMotions:
         self._found = np.empty(2 + arm.n_pressures)
         self._function: Callable[..., int] | None = None
 
-    def along(self, p: Array, asked: float) -> MotionClearance:
+    def along(self, p: Array, required: float) -> MotionClearance:
         """Check the motion along rows of pressures (N, n) in Pa, for a clearance in m."""
         p = np.ascontiguousarray(p, dtype=float)
         function = self._function or self._prepare(len(p))
         if function is None:
             checkpoint()
-            return self._interpreted(p, asked - _ALLOWED)
-        outcome = function(self._given, p.ctypes.data, len(p), asked - _ALLOWED, self._results)
+            return self._interpreted(p, required - _ALLOWED)
+        outcome = function(self._given, p.ctypes.data, len(p), required - _ALLOWED, self._results)
         least, poses = self._found[:2].tolist()
         if outcome == _NO_SHAPE:
             least = -np.inf
@@ -147,16 +147,16 @@ class ClearMotions:
 
     # -- without machine code ---------------------------------------------------------------
 
-    def _interpreted(self, p: Array, asked: float) -> MotionClearance:
+    def _interpreted(self, p: Array, required: float) -> MotionClearance:
         least, poses = np.inf, 0
         for a, b in pairwise(p):
-            found = self._stretch(a, b, asked)
+            found = self._stretch(a, b, required)
             least, poses = min(least, found.least), poses + found.poses
             if not found.clear:
                 return MotionClearance(False, least, poses, found.blocked_at)
         return MotionClearance(True, least, poses)
 
-    def _stretch(self, a: Array, b: Array, asked: float) -> MotionClearance:
+    def _stretch(self, a: Array, b: Array, required: float) -> MotionClearance:
         """Check the motion between two rows by repeated halving."""
         steep = (
             _STEEPEST if any(item.is_interpolated for item in self._clearance.scene.items) else 1
@@ -168,12 +168,12 @@ class ClearMotions:
         while len(new):
             values, tip_clear = self._look(a + new[:, None] * (b - a))
             least = min(least, float(values.min()))
-            if (values < asked).any():
+            if (values < required).any():
                 at = a + new[int(values.argmin())] * (b - a)
                 return MotionClearance(False, least, len(shares) + len(new), at)
             order = np.argsort(np.concatenate([shares, new]))
             shares = np.concatenate([shares, new])[order]
-            spare = np.concatenate([spare, np.minimum(values - asked, tip_clear)])[order]
+            spare = np.concatenate([spare, np.minimum(values - required, tip_clear)])[order]
             open_ = spare[1:] + spare[:-1] - path * np.diff(shares) < -2 * _SAG
             new = ((shares[1:] + shares[:-1]) / 2)[open_]
             if len(shares) + len(new) > _MAX_POSES:

@@ -151,9 +151,9 @@ def _checked_timeout(timeout: float) -> float:
 
 
 def _question(cancel: Cancel) -> Callable[[], object]:
-    asked = getattr(cancel, "is_set", cancel)
-    if not callable(asked):
+    is_set = getattr(cancel, "is_set", cancel)
+    if not callable(is_set):
         raise InputError(
             f"cancel must be an event or a function without arguments; got {shown(cancel)}"
         )
-    return asked
+    return is_set

@@ -40,6 +40,8 @@ from stiffopt.optimise.task import Task
 
 Vector = NDArray[np.float64]
 
+_LEAST_YIELDING = 1e-9  # m/N, of a contact, so that one at the base, which cannot yield, ranks last
+
 
 def candidates(problem: BracedProblem, table: SampleTable) -> Iterator[Vector]:
     """Yield variables (n,) at which the arm would lean on an object, the most promising first.
@@ -83,7 +85,8 @@ def _moved_by_contact(
     C = robot.compliance_between(p, np.concatenate([at, ends]), np.concatenate([at, at]))
     rows = np.arange(len(p))
     at_contact, to_tip = C[rows, station, :3, :3], C[rows, len(at) + station, :, :3]
-    force = depth / np.einsum("ni,nij,nj->n", n, at_contact, n)
+    yielding = np.einsum("ni,nij,nj->n", n, at_contact, n)
+    force = depth / np.maximum(yielding, _LEAST_YIELDING)
     moved: Vector = np.einsum("nij,nj,n->ni", to_tip, n, force)
     return moved
 
@@ -140,7 +143,7 @@ def _brought(
     point = reach(target_only, x, BRACE.iterations)
     if point is None or not point.reached:
         return []
-    problem.here = target_only.here
+    problem.here, problem.leant = target_only.here, True
     point = reach(problem, point.x, BRACE.iterations)
     if point is None:
         return []
@@ -160,7 +163,7 @@ def braced_answers(problem: BracedProblem, table: SampleTable, guess: Vector | N
         if nearby.results:
             return nearby
     starts = islice(candidates(problem, table), BRACE.rounds * BRACE.effort.screened)
-    return search(problem, starts, BRACE.effort, places=_places)
+    return search(problem, starts, BRACE.effort, places=_places, best_found=BRACE.best_found)
 
 
 def from_rest(problem: BracedProblem, result: LocalResult) -> Braced | None:
@@ -293,10 +296,22 @@ def _no_brace(problem: BracedProblem, judged: list[Braced | None]) -> str:
             f"postures that lean on {names} at the target were found, but the arm comes to other "
             "ones from rest"
         )
-    if not problem.missed:
-        return f"no posture was found that leans on {names} and reaches the target"
-    point = min(problem.missed, key=_most_missed)
     unit = display_units().force
+    if not problem.missed and problem.leant:
+        margin = unit.text(problem.brace.margin)
+        return (
+            f"leaning on {names} at the target, the arm has no equilibrium under a push of "
+            f"{margin}, the margin"
+        )
+    if not problem.missed:
+        why = f"no posture was found that leans on {names} and reaches the target"
+        if problem.brace.approach == "pressures":
+            try:
+                problem.robot.contact_equilibrium(np.zeros(len(problem.unit)), problem.scene)
+            except EquilibriumError as error:
+                return f"{why}: {error}"
+        return why
+    point = min(problem.missed, key=_most_missed)
     lacking = [
         f"{name} by {unit.text(error - c.radius, '.2g')}" if _is_force(name) else name
         for name, error, c in _missed(point)

@@ -121,6 +121,7 @@ class BracedProblem(PressureProblem):
     scene : the objects that the arm may lean on.
     here : equilibrium from which the next one is sought, or None: from rest.
     only_target : whether the demands on contacts are ignored.
+    leant : whether a posture that leans was found at the target, its contacts not yet judged.
     missed : points at the target at which contacts do not meet their demands.
     """
 
@@ -130,7 +131,7 @@ class BracedProblem(PressureProblem):
         self.brace: Brace = task.brace
         self.scene: Scene = leant_on(task.scene, task.brace)
         self.here: ContactEquilibrium | None = None
-        self.only_target = False
+        self.only_target = self.leant = False
         self.missed: list[ProgramPoint] = []
         super().__init__(robot, task)
 
@@ -290,8 +291,8 @@ class BracedProblem(PressureProblem):
         """Return rows for the objects that the body keeps clear of; see `Obstacles`."""
         if self.program.obstacles is None:
             return []
-        asked = self.program.obstacles.scene.clearance
-        return [OBSTACLES.margin - (each.distance - asked) for each in near]
+        required = self.program.obstacles.scene.clearance
+        return [OBSTACLES.margin - (each.distance - required) for each in near]
 
     def _slopes(self, eq: ContactEquilibrium, base: Quantities, slopes: Quantities) -> Vector:
         """Return derivatives (rows, n) of `_rows`; of several contacts on an object, the worst."""

@@ -96,6 +96,8 @@ class Search:
         optimum.
     same : float
         Difference of values below which ends count as one optimum.
+    best_found : int
+        How many descents must have found an answer for a complete search.
     """
 
     results: tuple[LocalResult, ...]
@@ -103,11 +105,13 @@ class Search:
     confidence: Confidence
     ends: tuple[LocalResult, ...] = ()
     same: float = SEARCH.same_optimum
+    best_found: int = 1
 
     def confidence_in(self, result: LocalResult) -> Confidence:
         """Return how sure the search is of another result than the best, with its own descent."""
-        agreeing = sum(_agree(end, result, self.same) for end in self.ends)
-        return replace(self.confidence, agreeing=max(1, agreeing))
+        agreeing = max(1, sum(_agree(end, result, self.same) for end in self.ends))
+        complete = self.confidence.complete and agreeing >= self.best_found
+        return replace(self.confidence, agreeing=agreeing, complete=complete)
 
 
 def search(
@@ -116,13 +120,14 @@ def search(
     tries: Effort = SEARCH.placed,
     same: float = SEARCH.same_optimum,
     places: Places | None = None,
+    best_found: int = 1,
 ) -> Search:
     """Run local optimisations from candidates until enough of them in a row find nothing new.
 
     `same` is the difference of values below which optima count as one; `places` brings candidates
-    to the target.
+    to the target; `best_found` is how many descents must have found the best optimum.
     """
-    trail = _Trail(same, tries.agreeing)
+    trail = _Trail(same, tries.agreeing, best_found)
     try:
         _descend_from(problem, (places or _places)(problem, candidates), tries, trail)
     except StoppedError:
@@ -156,8 +161,8 @@ def _descend_from(
 class _Trail:
     """Results of the descents of a search so far."""
 
-    def __init__(self, same: float, agreeing: int) -> None:
-        self.same, self._agreeing = same, agreeing
+    def __init__(self, same: float, agreeing: int, best_found: int) -> None:
+        self.same, self._agreeing, self._best_found = same, agreeing, best_found
         self.starts = self.descents = self._nothing_new = 0
         self.nearest: list[ProgramPoint] = []
         self.optima: list[LocalResult] = []
@@ -182,19 +187,23 @@ class _Trail:
 
     @property
     def is_complete(self) -> bool:
-        """Whether enough descents in a row have found nothing new."""
-        return self._nothing_new >= self._agreeing
+        """Whether enough descents in a row have found nothing new, and enough the best optimum."""
+        return self._nothing_new >= self._agreeing and self._agreeing_on_best >= self._best_found
+
+    @property
+    def _agreeing_on_best(self) -> int:
+        best = min(self._converged, key=_rank, default=None)
+        return sum(best is not None and _agree(end, best, self.same) for end in self._converged)
 
     def outcome(self) -> Search:
         """Return the outcome, the best results first."""
         results = sorted(self._results, key=_rank)
-        best = min(self._converged, key=_rank, default=None)
         ends = tuple(self._converged)
-        agreeing = sum(best is not None and _agree(end, best, self.same) for end in ends)
         confidence = Confidence(
-            self.starts, len(self._converged), agreeing, len(self.optima), self.is_complete
+            self.starts, len(ends), self._agreeing_on_best, len(self.optima), self.is_complete
         )
-        return Search(tuple(results), tuple(self.nearest), confidence, ends, self.same)
+        nearest = tuple(self.nearest)
+        return Search(tuple(results), nearest, confidence, ends, self.same, self._best_found)
 
 
 def _agree(a: LocalResult, b: LocalResult, same: float) -> bool:

@@ -178,6 +178,7 @@ class BraceSettings:
     screened : samples whose contact is estimated.
     effort : starts of a round that are brought to the target in contact, descents in a row that
         must find nothing new, and most descents.
+    best_found : descents that must find the best optimum before a search is complete.
     rounds : most rounds; the next one begins if a search is not complete.
     iterations : iterations of a start, to the target and to the contacts' demands.
     tried : local optima that are judged in turn, from rest.
@@ -194,7 +195,8 @@ class BraceSettings:
     spare: float = 5e-3
     stations: int = 14
     screened: int = 1024
-    effort: Effort = field(default=Effort(32, 4, 12))
+    effort: Effort = field(default=Effort(32, 4, 16))
+    best_found: int = 2
     rounds: int = 2
     iterations: int = 15
     tried: int = 8

@@ -59,7 +59,7 @@ class Confidence:
         Distinct local optima among them.
     complete : bool
         Whether the search ended because enough descents in a row found nothing new (see
-        `stiffopt.optimise.search.effort`).  False: it ran out of starts.
+        `stiffopt.optimise.search.effort`).  False: it ended before.
     """
 
     starts: int
@@ -73,7 +73,7 @@ class Confidence:
             return f"none of {self.starts} starts came to the pose"
         if self.starts == 1:
             return "local answer from the given guess"
-        sure = "search complete" if self.complete else "search ran out of starts"
+        sure = "search complete" if self.complete else "search not complete"
         optima = "optimum" if self.optima == 1 else "optima"
         return (
             f"{self.agreeing} of {self.reached} descents agree on the best of {self.optima} local "

@@ -29,6 +29,7 @@ Vector = NDArray[np.float64]
 
 SPEED = 0.02  # m/s, largest, of any part of the body
 FORCE_RATE = 0.1  # N/s, largest change of a contact's force
+GRADUAL = 1.0  # s, in which the way gets its speed or loses it
 _STATES = 61  # equilibria along the way
 _STATIONS = 41  # of the body
 _SAME = 2e-4  # m; tips that are nearer belong to the same equilibrium
@@ -67,7 +68,7 @@ class BraceApproach:
     forces : largest force of a contact (k,), in N.
     contacts : at the end.
     hold : their forces and limits at the end.
-    free_tip : position (3,), in m, of the tip at the end pressures without contact.
+    free_tips : positions (k, 3), in m, of the tip at these pressures without contact.
     """
 
     times: Vector
@@ -76,7 +77,7 @@ class BraceApproach:
     forces: Vector
     contacts: tuple[Contact, ...]
     hold: Hold
-    free_tip: Vector
+    free_tips: Vector
 
 
 def approach_to(
@@ -95,6 +96,27 @@ def approach_to(
     Raises
     ------
     Unsolved
+        As `way_into_contact` does.
+    """
+    states = way_into_contact(robot, solution)
+    pressures = np.array([eq.pressures for eq in states])
+    return BraceApproach(
+        times=least_times_along(robot, states, slew),
+        pressures=pressures,
+        tips=tuple(TipAt(eq.tip_pose, eq.tip_jacobian, eq.tip_compliance) for eq in states),
+        forces=np.array([_largest(eq) for eq in states]),
+        contacts=states[-1].contacts,
+        hold=_hold(states[-1]),
+        free_tips=robot.pose(pressures, robot.length)[:, :3, 3],
+    )
+
+
+def way_into_contact(robot: Manipulator, solution: PressureSolution) -> list[ContactEquilibrium]:
+    """Return the equilibria from rest to a braced solution.
+
+    Raises
+    ------
+    Unsolved
         The way is lost or ends in another equilibrium, presses an object with more than its
         largest force, or brings the body too near to another object.
     """
@@ -104,11 +126,9 @@ def approach_to(
     assert p is not None
     assert solution.tip_pose is not None
     scene, others = leant_on(task.scene, task.brace), kept_clear_of(task.scene, task.brace)
-    at = np.linspace(0.0, robot.length, _STATIONS)
-    shares = np.linspace(0.0, 1.0, _STATES)
     states: list[ContactEquilibrium] = []
     try:
-        for share in shares:
+        for share in np.linspace(0.0, 1.0, _STATES):
             nearby = states[-1] if states else None
             states.append(robot.contact_equilibrium(share * p, scene, nearby=nearby))
     except EquilibriumError as error:
@@ -127,22 +147,45 @@ def approach_to(
             if force > each.max_force * (1 + 1e-6):
                 text = display_units().force.text(force, ".3g")
                 raise Unsolved(f"on the way, '{each.object}' would be pressed with {text}")
-    lines = np.array([eq.poses(at)[:, :3, 3] for eq in states])  # (k, stations, 3)
     if others is not None:
-        _check_clear(robot, others, lines, at)
-    forces = np.array([_largest(eq) for eq in states])
+        at = _stations(robot)
+        _check_clear(robot, others, np.array([eq.poses(at)[:, :3, 3] for eq in states]), at)
+    return states
+
+
+def least_times_along(
+    robot: Manipulator, states: list[ContactEquilibrium], slew: Vector | float
+) -> Vector:
+    """Return the times (k,), in s, of equilibria that keep speed, rates of force and pressure."""
+    lines = np.array([eq.poses(_stations(robot))[:, :3, 3] for eq in states])  # (k, stations, 3)
     moved = np.linalg.norm(np.diff(lines, axis=0), axis=-1).max(axis=1)
-    rates = (np.diff(shares)[:, None] * p / slew).max(axis=1)
+    forces = np.array([_largest(eq) for eq in states])
+    pressures = np.array([eq.pressures for eq in states])
+    rates = (np.abs(np.diff(pressures, axis=0)) / slew).max(axis=1)
     least = np.maximum.reduce([moved / SPEED, np.abs(np.diff(forces)) / FORCE_RATE, rates])
-    return BraceApproach(
-        times=np.concatenate([[0.0], np.cumsum(np.maximum(least, 1e-3))]),
-        pressures=shares[:, None] * p,
-        tips=tuple(TipAt(eq.tip_pose, eq.tip_jacobian, eq.tip_compliance) for eq in states),
-        forces=forces,
-        contacts=end.contacts,
-        hold=_hold(end),
-        free_tip=robot.tip_pose(p)[:3, 3],
-    )
+    # in the step of the first touch, its mean speed is less than that before, or the force's after
+    least = np.maximum.reduce([least, np.append(least[1:], 0.0), np.append(0.0, least[:-1])])
+    return np.concatenate([[0.0], np.cumsum(np.maximum(least, 1e-3))])
+
+
+def gradual(times: Vector) -> Vector:
+    """Return times (k,), in s, of the same way with a speed that grows and falls uniformly."""
+    to_end = times[-1] - times
+    after = _begun_gradually(np.minimum(times, to_end))
+    whole = 2 * _begun_gradually(times[-1] / 2)
+    return np.where(times <= to_end, after, whole - after)
+
+
+def _begun_gradually(times: Vector) -> Vector:
+    """Return when a way is as far as it would be at times (k,) if it began at full speed.
+
+    Its share of the speed grows as t / T with T = `GRADUAL`, so that it is at t^2 / (2 T).
+    """
+    return np.where(times < GRADUAL / 2, np.sqrt(2 * GRADUAL * times), times + GRADUAL / 2)
+
+
+def _stations(robot: Manipulator) -> Vector:
+    return np.linspace(0.0, robot.length, _STATIONS)
 
 
 def _hold(eq: ContactEquilibrium) -> Hold:

@@ -29,7 +29,7 @@ from stiffopt.paths.configurations import (
     maximised,
     several,
 )
-from stiffopt.paths.leaning import approach_to
+from stiffopt.paths.leaning import gradual, least_times_along, way_into_contact
 from stiffopt.paths.motion_request import MotionRequest
 from stiffopt.paths.rates import least_times
 from stiffopt.paths.shortening import rounded, shortened
@@ -173,7 +173,7 @@ def _leaning(
     if not down.found:
         return down
     try:
-        way = approach_to(robot, found, np.inf if down.slew is None else down.slew)
+        states = way_into_contact(robot, found)
     except (Unsolved, StoppedError) as reason:
         own = {name: value for name, value in options.items() if name != "timeout"}
         request = MotionRequest.of(robot, start, rest, goal.scene, slew=slew, **own)
@@ -181,18 +181,29 @@ def _leaning(
         if isinstance(reason, Unsolved):
             return request.without_answer(why, "unreachable")
         return request.without_answer(why, "failed")
-    unit = display_units().force
-    leant = " and ".join(f"'{each.object}'" for each in found.contacts)
+    times = gradual(least_times_along(robot, states, np.inf if down.slew is None else down.slew))
+    end, way, unit = states[-1], states[1:], display_units().force
+    leant = " and ".join(
+        f"'{each.object}' with {unit.text(float(np.linalg.norm(each.force)), '.3g')}"
+        for each in end.contacts
+    )
+    assert goal.brace is not None
+    measures, grip = maximised(goal), goal.brace.contacts
+    leaning = [
+        min(eq.stiffness(m.direction, m.kind, m.boundary, m.frame, grip) for m in measures)
+        for eq in way
+    ]
     return replace(
         down,
-        message=f"from rest on into contact with {leant}, with {unit.text(way.forces[-1], '.3g')} "
-        "at the end; played backwards the motion lets go",
-        times=np.concatenate([down.times, down.times[-1] + way.times[1:]]),
-        pressures=np.concatenate([down.pressures, way.pressures[1:]]),
-        tip_poses=np.concatenate([down.tip_poses, np.array([tip.pose for tip in way.tips[1:]])]),
-        stiffness=None,
-        stiffness_unit=None,
+        message=f"from rest on into contact: at the end it leans on {leant}; played backwards the "
+        "motion lets go",
+        times=np.concatenate([down.times, down.times[-1] + times[1:]]),
+        pressures=np.concatenate([down.pressures, [eq.pressures for eq in way]]),
+        tip_poses=np.concatenate([down.tip_poses, [eq.tip_pose for eq in way]]),
+        stiffness=np.concatenate([_least_stiffness(robot, down.pressures, measures), leaning]),
+        stiffness_unit=measures[0].unit,
         clearance=None,
+        equilibria=tuple(way),
         confidence=f"{down.confidence}; the equilibria in contact were followed from rest",
     )
 
@@ -216,7 +227,7 @@ class _Planner:
         """Whether the way along pressures (N, n) is clear."""
         if self.motions is None:
             return True
-        found = self.motions.along(rows, self.request.asked)
+        found = self.motions.along(rows, self.request.required)
         self.poses += found.poses
         return found.clear
 
@@ -305,10 +316,10 @@ class _Planner:
         distance, name = float(near.distances[index]), near.names[index]
         shape = next(item.shape for item in request.scene.objects if item.name == name)
         unit = display_units().length
-        missing = unit.text(request.asked - distance, ".3g")
+        missing = unit.text(request.required - distance, ".3g")
         text = f"the body is {missing} {shape.amiss} '{name}'"
-        if request.asked:
-            text += f", where {unit.text(request.asked, '.3g')} of clearance are asked"
+        if request.required:
+            text += f", where {unit.text(request.required, '.3g')} of clearance are required"
         if request.margin:
             kept = unit.text(request.margin, ".3g")
             text += f", {kept} of them for what the calibration leaves open"

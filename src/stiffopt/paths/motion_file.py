@@ -13,11 +13,15 @@ from stiffopt.documents import read_document
 from stiffopt.errors import FileError, InputError
 from stiffopt.logs.table import read_table
 from stiffopt.model.description import RobotDescription
+from stiffopt.paths.solution import LEANS
 from stiffopt.paths.trajectory import Trajectory, trajectory_through
 from stiffopt.units import parse_quantity
 
 RESULT_FORMAT = "stiffopt-path-result/1"
 """Format of a result file of paths and motions."""
+
+LEANING = "leaning"
+"""Column or key that says at which points the arm is in contact."""
 
 Vector = NDArray[np.float64]
 
@@ -66,7 +70,8 @@ def read_motion(file: str | os.PathLike[str], description: RobotDescription) -> 
     Raises
     ------
     FileError
-        The file cannot be read, holds no complete motion, or one of another robot.
+        The file cannot be read, holds no complete motion, one of another robot, or one that leans
+        on objects.
     """
     name = os.fspath(file)
     if name.lower().endswith(".csv"):
@@ -94,6 +99,8 @@ def _of_csv(name: str, description: RobotDescription) -> MotionTable:
         )
     if f"p{n + 1}_pa" in table.columns:
         raise FileError(name, f"has more channels than '{description.name}'")
+    if LEANING in table.columns and table[LEANING].any():
+        raise FileError(name, LEANS)
     values = np.column_stack([table[each] for each in wanted])
     return MotionTable(name, values[:, 0] - values[0, 0], values[:, 1 : n + 1], values[:, n + 1 :])
 
@@ -112,6 +119,8 @@ def _of_result(name: str, description: RobotDescription) -> MotionTable:
         raise FileError(name, f"is not solved: {result.get('message', result.get('status'))}")
     if result.get("robot") != description.name:
         raise FileError(name, f"is for the robot '{result.get('robot')}'; this is another one")
+    if any(result.get(LEANING) or ()):
+        raise FileError(name, LEANS)
     try:
         times = _si(result["times"], "s", "time")
         pressures = [_si(each, "Pa", "pressure") for each in result["pressures"].values()]

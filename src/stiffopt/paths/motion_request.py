@@ -92,7 +92,7 @@ class MotionRequest:
         )
 
     @property
-    def asked(self) -> float:
+    def required(self) -> float:
         """Clearance required of the model's body, in m, margin included."""
         return self.clearance + (self.margin or 0.0)
 
@@ -107,7 +107,7 @@ class MotionRequest:
         """Return a task with the load, the scene and the clearance of the motion."""
         scene = self.scene
         if scene is not None:
-            scene = scene.model_copy(update={"clearance": self.asked})
+            scene = scene.model_copy(update={"clearance": self.required})
         return task.model_copy(update={"load": self.load, "press": None, "scene": scene})
 
     def without_answer(self, message: str, status: Status) -> PathSolution:

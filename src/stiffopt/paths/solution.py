@@ -8,11 +8,18 @@ from numpy.typing import NDArray
 
 from stiffopt.display import display_units
 from stiffopt.errors import InputError
+from stiffopt.model.contact.equilibrium import ContactEquilibrium
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.notebook import ShownInNotebook
 from stiffopt.paths.trajectory import Trajectory, trajectory_through
 
 Vector = NDArray[np.float64]
+
+LEANS = (
+    "leans on objects, and is not followed as a trajectory: give the rig its task, and the daemon "
+    "goes the same way"
+)
+"""Why a motion into contact cannot be played."""
 
 Status = Literal["solved", "unreachable", "failed"]
 
@@ -48,6 +55,8 @@ class PathSolution(ShownInNotebook):
         In m and rad; None where not asked for.
     clearance : ndarray (N,) or None
         Smallest distance between body and scene, in m; None without a scene.
+    equilibria : tuple of ContactEquilibrium
+        Of a motion into contact: those of its last points, from rest on; else empty.
     first_failure : int or None
         Index of the first point that cannot be solved, or of the last from which no way on was
         found.
@@ -70,6 +79,7 @@ class PathSolution(ShownInNotebook):
     position_errors: Vector | None = None
     angle_errors: Vector | None = None
     clearance: Vector | None = None
+    equilibria: tuple[ContactEquilibrium, ...] = ()
     first_failure: int | None = None
     confidence: str = ""
     timings: dict[str, float] = field(default_factory=dict)
@@ -86,6 +96,17 @@ class PathSolution(ShownInNotebook):
     def found(self) -> bool:
         """Whether every point meets its requirements, and every step the rates."""
         return self.status == "solved"
+
+    def equilibrium(self, index: int) -> ContactEquilibrium | None:
+        """Return the equilibrium in contact at a point, if the motion knows it."""
+        own = index - len(self.times) + len(self.equilibria)
+        return self.equilibria[own] if own >= 0 else None
+
+    @property
+    def leans(self) -> NDArray[np.bool_]:
+        """Whether the arm is in contact at each point, (N,)."""
+        own = [bool(eq.contacts) for eq in self.equilibria]
+        return np.array([False] * (len(self.times) - len(own)) + own)
 
     @property
     def worst_index(self) -> int | None:
@@ -113,10 +134,12 @@ class PathSolution(ShownInNotebook):
         Raises
         ------
         InputError
-            There are no pressures, or too many points remain.
+            There are no pressures, or too many points remain, or the arm leans on objects.
         """
         if not len(self.times):
             raise InputError(f"there is nothing to follow: {self.message}")
+        if self.leans.any():
+            raise InputError(f"the motion {LEANS}")
         ranges = self.robot.pressure_max - self.robot.pressure_min
         tips = self.tip_poses[:, :3, 3]
         return trajectory_through(self.times, self.pressures, tips, ranges, begin)

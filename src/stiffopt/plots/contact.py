@@ -63,11 +63,13 @@ def draw_contact(
     return drawing.finish(view)
 
 
-def draw_leaning_tube(drawing: ArmDrawing, equilibrium: ContactEquilibrium) -> None:
+def draw_leaning_tube(
+    drawing: ArmDrawing, equilibrium: ContactEquilibrium, shade: float = 0.38
+) -> None:
     """Draw the arm at an equilibrium in contact."""
     stations = segment_stations(drawing.robot, TUBE_STATIONS)
     poses = equilibrium.poses(stations.ravel()).reshape(*stations.shape, 4, 4)
-    drawing.draw_tube(equilibrium.pressures, poses=poses)
+    drawing.draw_tube(equilibrium.pressures, shade, poses)
 
 
 def draw_forces(drawing: ArmDrawing, equilibrium: ContactEquilibrium) -> None:

@@ -20,6 +20,7 @@ from stiffopt.paths.rates import step_limits
 from stiffopt.paths.solution import PathSolution
 from stiffopt.plots import style
 from stiffopt.plots.arm import ArmDrawing
+from stiffopt.plots.contact import draw_forces, draw_leaning_tube
 from stiffopt.plots.view import View
 from stiffopt.plots.wording import stiffness_text
 
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
 Vector = NDArray[np.float64]
 
 _POSES = 5  # of the arm
+_LOGARITHMIC = 30  # largest by smallest stiffness from which the scale is logarithmic
 _FULL = 0.99  # share of a rate from which a pressure counts as changing at it
 
 
@@ -202,7 +204,12 @@ def draw_path(
     drawing.draw_base()
     last = len(solution.times) - 1
     for index in np.unique(np.linspace(0, last, _POSES).astype(int)):
-        drawing.draw_tube(solution.pressures[index], 0.3 if index in (0, last) else 0.1)
+        shade = 0.3 if index in (0, last) else 0.1
+        leaning = solution.equilibrium(int(index))
+        if leaning is None:
+            drawing.draw_tube(solution.pressures[index], shade)
+        else:
+            draw_leaning_tube(drawing, leaning, shade)
     drawing.explain_segments()
     tips = drawing.unit.of(solution.tip_poses[:, :3, 3].T)
     if path is not None:
@@ -224,6 +231,8 @@ def draw_path(
         _label_stiffness(drawing, solution, tips)
     if scene is not None:
         drawing.draw_objects(scene)
+    if solution.equilibria:
+        draw_forces(drawing, solution.equilibria[-1])
     return drawing.finish(view)
 
 
@@ -307,6 +316,9 @@ def draw_stiffness_along(axes: Any, solution: PathSolution) -> None:
         markeredgecolor="white", label="least stiff",
     )  # fmt: skip
     axes.set_ylim(bottom=0.85 * values[index])
+    if values.max() > _LOGARITHMIC * values[index]:
+        axes.set_yscale("log")
+        axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
     axes.set_ylabel(f"stiffness\n({unit})")
     axes.set_xlabel("time (s)")
     _legend(axes)

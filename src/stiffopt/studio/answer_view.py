@@ -12,7 +12,16 @@ from stiffopt.optimise.measures.directional import StiffnessMeasure
 from stiffopt.plots import style
 from stiffopt.plots.shapes import StiffnessEllipsoid
 from stiffopt.plots.wording import stiffness_text
-from stiffopt.studio.drawing import NOWHERE, ArmTube, Vector, draw, place, rgb, turn
+from stiffopt.studio.drawing import (
+    NOWHERE,
+    ArmTube,
+    Vector,
+    add_force_arrows,
+    draw,
+    place,
+    rgb,
+    turn,
+)
 from stiffopt.studio.leaning import force_arrows
 from stiffopt.studio.workbench import StudioAnswer
 
@@ -46,14 +55,8 @@ class AnswerView:
             "/directions", NOWHERE, rgb(style.DIRECTIONS[0]), shaft_radius=0.006 * length,
             head_radius=0.016 * length, head_length=0.05 * length,
         )  # fmt: skip
-        self._forces = scene.add_arrows(
-            "/loads", NOWHERE, rgb(style.LOAD), shaft_radius=0.005 * length,
-            head_radius=0.013 * length, head_length=0.04 * length,
-        )  # fmt: skip
-        self._contacts = scene.add_arrows(
-            "/contacts", NOWHERE, rgb(style.LOAD), shaft_radius=0.005 * length,
-            head_radius=0.013 * length, head_length=0.04 * length,
-        )  # fmt: skip
+        self._forces = add_force_arrows(server, "/loads", length)
+        self._contacts = add_force_arrows(server, "/contacts", length)
         self._miss = scene.add_line_segments(
             "/miss", NOWHERE, rgb(style.TARGET), thickness=3.0, thickness_units="screen"
         )

@@ -53,6 +53,14 @@ def tube_faces(rings: int) -> NDArray[np.uint32]:
     return np.concatenate([sides, lid]).astype(np.uint32)
 
 
+def add_force_arrows(server: Any, name: str, length: float) -> Any:
+    """Add arrows of forces on an arm of a length, in m; none is visible yet."""
+    return server.scene.add_arrows(
+        name, NOWHERE, rgb(style.LOAD), shaft_radius=0.005 * length, head_radius=0.013 * length,
+        head_length=0.04 * length,
+    )  # fmt: skip
+
+
 class ArmTube:
     """An arm as a tube, each segment with its outer radius and in its colour.
 

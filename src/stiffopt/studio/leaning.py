@@ -17,7 +17,7 @@ import numpy as np
 from stiffopt import lie
 from stiffopt.display import FIGURES, display_units
 from stiffopt.errors import InputError
-from stiffopt.model.contact.equilibrium import Contact, ContactEquilibrium
+from stiffopt.model.contact.equilibrium import Approach, Contact, ContactEquilibrium
 from stiffopt.model.contact.push import ContactLoss
 from stiffopt.model.description import RobotDescription
 from stiffopt.model.manipulator import Manipulator
@@ -25,7 +25,16 @@ from stiffopt.optimise.measures.directional import StiffnessMeasure
 from stiffopt.plots import style
 from stiffopt.plots.shapes import StiffnessEllipsoid
 from stiffopt.studio.design import Design
-from stiffopt.studio.drawing import NOWHERE, ArmTube, Vector, draw, place, rgb, turn
+from stiffopt.studio.drawing import (
+    NOWHERE,
+    ArmTube,
+    Vector,
+    add_force_arrows,
+    draw,
+    place,
+    rgb,
+    turn,
+)
 
 _LARGEST_PUSH = 1.0  # N, up to which the loss of a contact is sought
 _ARROW_SHARE, _ELLIPSOID_SHARE = 0.25, 0.22  # of the arm's length
@@ -49,7 +58,9 @@ class Leaning:
 
     @classmethod
     def of(cls, design: Design, robot: Manipulator, pressures: Vector) -> Leaning:
-        """Find the equilibrium of an arm against objects that allow contact, pushed against it.
+        """Find the equilibrium of an arm against objects that allow contact.
+
+        With a brace it is reached as that says, else the objects come to the arm.
 
         Raises
         ------
@@ -65,7 +76,9 @@ class Leaning:
             raise InputError(
                 "there is nothing to lean on; choose an object and tick 'may be leant on'"
             )
-        found = robot.contact_equilibrium(pressures, scene, approach="objects")
+        brace = design.task.brace
+        approach: Approach = "objects" if brace is None else brace.approach
+        found = robot.contact_equilibrium(pressures, scene, approach=approach)
         return cls(design, robot, found)
 
     @property
@@ -167,10 +180,7 @@ class LeaningView:
             "/leaning/ellipsoid", radius=1.0, subdivisions=3, color=rgb(style.MEASURED),
             opacity=0.25, visible=False,
         )  # fmt: skip
-        self._forces = scene.add_arrows(
-            "/leaning/forces", NOWHERE, rgb(style.LOAD), shaft_radius=0.005 * length,
-            head_radius=0.013 * length, head_length=0.04 * length,
-        )  # fmt: skip
+        self._forces = add_force_arrows(server, "/leaning/forces", length)
 
     @property
     def visible(self) -> bool:

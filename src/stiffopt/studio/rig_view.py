@@ -10,8 +10,10 @@ import numpy as np
 
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.studio import texts
-from stiffopt.studio.drawing import ArmTube, add_surroundings, place, rgb
+from stiffopt.studio.drawing import ArmTube, add_force_arrows, add_surroundings, draw, place, rgb
+from stiffopt.studio.leaning import force_arrows
 from stiffopt.studio.rig_watch import RigWatch
+from stiffopt.studio.scene_view import draw_object
 from stiffopt.studio.task_view import TaskView
 from stiffopt.studio.workbench import Workbench
 
@@ -36,8 +38,12 @@ class RigView:
         self._preview = TaskView(server, self.bench, is_preview=True) if watch.may_command else None
         if self._preview is None:
             add_surroundings(server, description)
+            scene = watch.design.task.scene
+            for number, item in enumerate(() if scene is None else scene.objects):
+                draw_object(server, item, number, description.length)
         size = 0.02 * description.length
         self._arm = ArmTube(server, "/rig/arm", description)
+        self._contacts = add_force_arrows(server, "/rig/contacts", description.length)
         self._balls = {
             name: server.scene.add_icosphere(
                 f"/rig/{name}", radius=size, color=rgb(colour), visible=False
@@ -102,7 +108,9 @@ class RigView:
             if state is not None:
                 pressures = state.pressures
                 if pressures is not None:
-                    self._arm.show(self._robot, pressures)
+                    leaning = self.watch.leaning(self._robot)
+                    self._arm.show(self._robot, pressures, leaning)
+                    draw(self._contacts, force_arrows(leaning, self._robot.length))
                 self._show_ball("estimated", state.tip_position)
                 self._show_ball("seen", state.seen_position)
                 self._show_ball("target", state.target_position)

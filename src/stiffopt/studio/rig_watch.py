@@ -19,9 +19,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.control.bracing import BracePhase
 from stiffopt.control.state import Event, Snapshot
 from stiffopt.daemon.client import Client, daemon_url
 from stiffopt.errors import CommandError, InputError, StiffoptError
+from stiffopt.model.contact.equilibrium import ContactEquilibrium
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.robot_files import load_description, robot_path
 from stiffopt.optimise.task import PressureRange
@@ -34,6 +36,7 @@ Vector = NDArray[np.float64]
 
 NAME = "studio"
 """Name of this client that others see."""
+_LEANS = (BracePhase.APPROACHING, BracePhase.HELD, BracePhase.RELEASING)
 _EVENTS = 6  # number shown
 _QUICK = 2.0  # s, time limit of the daemon's answers; then the guard is asked to vent
 
@@ -112,6 +115,19 @@ class RigWatch:
             return self.design
         axes = (round(float(x), 5) if np.isfinite(x) else None for x in position)
         return self.design.with_target(position=tuple(axes))
+
+    def leaning(self, robot: Manipulator) -> ContactEquilibrium | None:
+        """Return the model's equilibrium in contact at the measured pressures of a braced arm.
+
+        None if the arm does not lean, or the model has no such equilibrium.
+        """
+        state, scene = self.state, self.design.task.scene
+        if state is None or state.pressures is None or scene is None or state.brace not in _LEANS:
+            return None
+        within = np.clip(state.pressures, robot.pressure_min, robot.pressure_max)
+        with suppress(StiffoptError):
+            return robot.contact_equilibrium(within, scene)
+        return None
 
     def poll(self) -> None:
         """Read state and events; renew control while a browser is connected."""

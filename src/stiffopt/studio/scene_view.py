@@ -22,6 +22,23 @@ _SHADES = {"inside_tube": 0.15, "half_space": 0.25}
 _SHADE = 0.55
 
 
+def draw_object(server: Any, item: SceneObject, number: int, length: float) -> tuple[Any, Any]:
+    """Draw an object with its name; unbounded ones are cut off at about a length, in m."""
+    vertices, faces = surface_mesh(item.shape, length)
+    name = f"/scene/{number}-{item.shape.key}-{abs(hash(item.name))}"
+    mesh = server.scene.add_mesh_simple(
+        name, vertices, faces, color=rgb(style.OBSTACLE), side="double",
+        opacity=_SHADES.get(item.shape.key, _SHADE), cast_shadow=False,
+    )  # fmt: skip
+    label = server.scene.add_label(f"{name}-name", item.name)
+    place(label, _label_place(vertices))
+    return mesh, label
+
+
+def _label_place(vertices: Any) -> Any:
+    return vertices.max(axis=0) * [0, 0, 1] + vertices.mean(axis=0) * [1, 1, 0]
+
+
 class SceneView:
     """Draws the objects around an arm, and forwards changes of them.
 
@@ -181,18 +198,13 @@ class SceneView:
         before = self._drawn.get(item.name)
         if before is not None and before[0] == item:
             return
-        vertices, faces = surface_mesh(item.shape, self._length)
         if before is not None and before[0].shape.key == item.shape.key:
             _, mesh, label = before
+            vertices, faces = surface_mesh(item.shape, self._length)
             mesh.vertices = vertices
             if mesh.faces.shape != faces.shape:
                 mesh.faces = faces
+            place(label, _label_place(vertices))
         else:
-            name = f"/scene/{len(self._drawn)}-{item.shape.key}-{abs(hash(item.name))}"
-            mesh = self._server.scene.add_mesh_simple(
-                name, vertices, faces, color=rgb(style.OBSTACLE), side="double",
-                opacity=_SHADES.get(item.shape.key, _SHADE), cast_shadow=False,
-            )  # fmt: skip
-            label = self._server.scene.add_label(f"{name}-name", item.name)
-        place(label, vertices.max(axis=0) * [0, 0, 1] + vertices.mean(axis=0) * [1, 1, 0])
+            mesh, label = draw_object(self._server, item, len(self._drawn), self._length)
         self._drawn[item.name] = item, mesh, label

@@ -102,7 +102,7 @@ def _rows(answer: StudioAnswer) -> Iterable[tuple[str, str]]:
     if solution.contacts and solution.stiffness_free is not None:
         unit = units.of_si(solution.stiffness_unit)
         yield "clear of all", unit.text(solution.stiffness_free, FIGURES)
-    if solution.task.scene is not None:  # the exact clearance is too slow during a drag
+    elif solution.task.scene is not None:  # the exact clearance is too slow during a drag
         clear = solution.clearance if answer.is_best else None
         yield (
             "clearance",
@@ -387,6 +387,10 @@ def _rig_rows(state: Snapshot) -> Iterable[tuple[str, str]]:
     if np.isfinite(state.stiffness):
         now = unit.number(state.stiffness, FIGURES)
         yield "stiffness", f"{now} of {unit.text(state.best_stiffness, FIGURES)}"
+    if state.brace:
+        yield "brace", state.brace
+    if np.isfinite(state.brace_force):
+        yield "contact force", display_units().force.text(state.brace_force, ".3g")
     for alarm in state.alarms:
         yield "alarm", f"<span style='color:#b35c00'>{escape(alarm.text)}</span>"
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stiffopt import lie
+from stiffopt.display import display_units
 from stiffopt.errors import EquilibriumError, InputError
 from stiffopt.model.arguments import check_choice, checked_measure
 from stiffopt.model.arm_clearance import SceneKey, measured_scene
@@ -359,12 +360,27 @@ def contact_equilibrium(
         found = problem.follow(nearby._arm, end)
         return _arrived(*found, "the way from the nearby equilibrium")
     if approach == "pressures":
-        rest = _arrived(*problem.hanging, "its own weight and payload")
+        rest = _at_rest(problem)
         return _arrived(*problem.follow(rest._arm, end), "its pressures and load")
     alone, what = problem.alone, "its weight, pressures and load, free of objects"
     rest = _arrived(*alone.hanging, what)
     free = _arrived(*alone.follow(rest._arm, end._replace(retreat=np.zeros(0))), what)
     return _arrived(*problem.follow(problem.clear(free._arm), end), "the objects' way to it")
+
+
+def _at_rest(problem: ContactProblem) -> ContactEquilibrium:
+    """Return the equilibrium without pressures; say which objects the straight arm is inside."""
+    arm, share = problem.hanging
+    inside = problem.straight.state.condition.retreat
+    if share < 1.0 and inside.any():
+        worst = int(inside.argmax())
+        depth = display_units().length.text(float(inside[worst]), ".2g")
+        raise EquilibriumError(
+            f"the arm at rest is {depth} inside '{problem.surfaces[worst].name}', which cannot "
+            "push it out continuously; move the object, or let it come to the arm under pressure "
+            "(approach: objects)"
+        )
+    return _arrived(arm, share, "its own weight and payload")
 
 
 def _arrived(arm: LeaningArm, share: float, what: str) -> ContactEquilibrium:
