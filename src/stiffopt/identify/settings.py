@@ -168,9 +168,10 @@ class FitSettings:
     least_position, least_angle : smallest spread of residuals, in m and rad; logs have few digits.
     most_memory, memory_slack : sum of the shares of a channel's history beyond which a penalty
         grows, and the excess that counts as one deviation.
-    least_modulus, most_stiffening, modulus_slack : share of a segment's modulus that pressure must
-        leave; largest exponent by which an exponential law may raise it (at 1, more pressure bends
-        the arm less); and the excess of either that counts as one deviation.
+    least_modulus, most_stiffening, most_softening, modulus_slack : share of a segment's modulus
+        that pressure must leave under a linear law; largest exponents by which an exponential law
+        may raise it (at 1, more pressure bends the arm less) and lower it; and the excess of any of
+        these that counts as one deviation.
     side : prior deviation of a channel's initial state of hysteresis, from -1 to 1.
     between_logs : assumed time at the last pressures between two logs of a sequence, in s.
     systematic : deviation of the errors that rows at nearby pressures share, in lengths of the arm.
@@ -192,6 +193,7 @@ class FitSettings:
     memory_slack: float = 0.01
     least_modulus: float = 0.1
     most_stiffening: float = 0.7
+    most_softening: float = 4.0
     modulus_slack: float = 0.005
     side: float = 0.6
     between_logs: float = 60.0
