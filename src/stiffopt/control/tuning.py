@@ -484,7 +484,7 @@ class BracingTuning:
     settling: float = 8.0
     settling_time: float = 0.3
     # time for which friction at the contacts may withhold a correction of the tip, in s
-    withheld_time: float = 20.0
+    withheld_time: float = 5.0
     longest_push: float = 60.0  # after which a push becomes the model's error too, in s
     # deviation of that displacement, in m, and of pushes, in N
     deviation: float = 5e-4
