@@ -268,9 +268,9 @@ def _look(n: int, tuning: RegulatorTuning) -> Formula:
     """Return the formula of the checks that every tick makes.
 
     Inputs: share by which smoothed readings (n,) follow; these; readings and shortfalls (n,); least
-    and greatest healthy pressures (2, n). Outputs: smoothed readings; readings, these without
-    the regulators' offset, and readings again (3, n); 1 for channels (n,) that follow; 1 for those (n,) that are beyond
-    the healthy pressures; and 1 if all follow and none is beyond them.
+    and greatest healthy pressures (2, n). Outputs: smoothed readings; readings, these without the
+    regulators' offset, and readings again (3, n); 1 for channels (n,) that follow; 1 for those (n,)
+    that are beyond the healthy pressures; and 1 if all follow and none is beyond them.
     """
     share, smoothed = ca.SX.sym("share"), ca.SX.sym("smoothed", n)
     reading, short = ca.SX.sym("reading", n), ca.SX.sym("short", n)

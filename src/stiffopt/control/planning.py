@@ -194,9 +194,7 @@ class Planning:
                 adapted=request.adapted,
             )  # fmt: skip
         else:
-            self._last = self._nearest(
-                request, task, target, distant=self._refused > refused
-            )
+            self._last = self._nearest(request, task, target, distant=self._refused > refused)
         return self._last
 
     def _braced(self, request: PlanRequest, task: Task, asked: Target) -> Plan | None:
