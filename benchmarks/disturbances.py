@@ -38,7 +38,7 @@ from stiffopt.commissioning.commission import commission
 from stiffopt.commissioning.expected import expected_steps
 from stiffopt.commissioning.procedure import DangerError
 from stiffopt.control.controller import TipController
-from stiffopt.control.state import Severity, State
+from stiffopt.control.state import State
 from stiffopt.errors import CommandError, InputError
 from stiffopt.plant.settings import PlantLoad
 from stiffopt.safety.rigs import gated_rig
@@ -56,6 +56,7 @@ DOUBTS = (
     "implausible",
     "leak",
     "lost-channel",
+    "channel-opposed",
     "shortfall",
     "regulator-stuck",
     "pressure-reading",
@@ -63,6 +64,7 @@ DOUBTS = (
     "tracker-lost",
     "unreachable",
 )
+FAULTS = ("leak", "regulator-stuck", "pressure-reading", "tracker-jumps", "guard", "device")
 
 
 @dataclass(frozen=True)
@@ -398,6 +400,7 @@ def run_row(case: Case, row: Row, dynamics: str) -> Outcome:
     controller = TipController(
         load_robot(case.believed), rig.supply.limits, rig.slew, period=PERIOD,
         control=rig.settings.control, safety=rig.settings.safety, vibrates=dynamics == "full",
+        commissioned=False,
     )  # fmt: skip
     run = LoopRun(rig, controller, case.point)
     try:
@@ -420,6 +423,7 @@ def run_row(case: Case, row: Row, dynamics: str) -> Outcome:
                 begin = rig.clock.now()
             _try_task(run, case, 1)
             tips.append(run.go(AFTER).tips)
+        ended = rig.clock.now()
         for _ in range(round(END)):
             if run.loop.snapshot().state is State.HOLDING:
                 run.go(1.0)
@@ -428,8 +432,8 @@ def run_row(case: Case, row: Row, dynamics: str) -> Outcome:
         told = [event for event in events if event.kind in kinds and event.time >= began]
         ways = np.concatenate(tips)
         if run.loop.snapshot().state is State.FAULT:  # venting takes the arm to rest
-            after = rig.clock.now() - next(e.time for e in events if e.severity is Severity.ERROR)
-            ways = ways[: len(ways) - round(after / PERIOD)]
+            after = ended - next(e.time for e in events if e.kind in FAULTS)
+            ways = ways[: len(ways) - max(0, round(after / PERIOD))]
         return Outcome(
             told=told[0].time - begin if told else np.inf,
             kind=told[0].kind if told else "",

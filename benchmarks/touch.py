@@ -47,7 +47,6 @@ ROBOTS = ("stiff-flop-1", "stiff-flop-2-hanging")
 TARGETS, REST, PUSHED, AFTER = 4, 4.0, 3.0, 2.0  # s
 ALLOWED, ALLOWED_FORCE = 0.2, 3e-3  # share, and N
 REACH = 0.7  # of the pressures that targets are drawn from
-HOLD = 25.0  # s of a press
 
 
 @dataclass
@@ -81,6 +80,7 @@ class Arm:
     """An arm under control, in simulated time."""
 
     draws_creep = False
+    hold = 25.0  # s of a press
 
     def __init__(
         self, name: str, seed: int, dynamics: str, surface: SoftSurface | None = None
@@ -230,7 +230,7 @@ def press(name: str, seed: int, dynamics: str, found: Found) -> None:
     with Arm(name, seed, dynamics, surface) as arm:
         arm.controller.set_task(task)
         forces, course = [], arm.controller.replanner.pursuit.course
-        for _ in range(round(HOLD / 0.05)):
+        for _ in range(round(arm.hold / 0.05)):
             arm.go(0.05)
             going = course.phase is Phase.GOING  # the surface may be in its way to the target
             forces.append(0.0 if going else arm.rig.world.plant.contact_force())
@@ -252,8 +252,9 @@ def main() -> None:
     parser.add_argument("--dynamics", choices=DYNAMICS, nargs="+", default=list(DYNAMICS))
     parser.add_argument("--what", nargs="+", default=["pushes", "free", "press"])
     parser.add_argument("--draw-creep", action="store_true", help="another creep for each arm")
+    parser.add_argument("--hold", type=float, default=Arm.hold, help="duration of a press, s")
     given = parser.parse_args()
-    Arm.draws_creep = given.draw_creep
+    Arm.draws_creep, Arm.hold = given.draw_creep, given.hold
     rows = []
     for name in given.robots:
         for dynamics in given.dynamics:

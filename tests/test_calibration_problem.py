@@ -315,6 +315,27 @@ def test_what_an_arm_cannot_be_is_penalised_with_the_right_slope(kind: str) -> N
         assert slope[:, i] == pytest.approx((up - down) / (2 * step), abs=1e-4)
 
 
+def test_an_exponential_law_may_not_take_nearly_all_of_the_modulus_either() -> None:
+    given = problem_of(CASES["one segment"])
+    (segment,) = given.description.segments
+    assert segment.compensation is not None
+    law = segment.compensation.model_copy(update={"modulus_law": "exponential"})
+    robot = given.description.model_copy(
+        update={"segments": (segment.model_copy(update={"compensation": law}),)}
+    )
+    problem = CalibrationProblem(
+        robot, given.unknowns, given.samples, given.points, given.base_in_tracker, given.noise
+    )
+    names = [unknown.name for unknown in problem.unknowns.all]
+    x = np.zeros(problem.size)
+    x[names.index("change of modulus with pressure, segment 1")] = -2.0
+    penalties = []
+    for softer in (0.0, 6.0):
+        x[names.index("Young's modulus, segment 1")] = -softer
+        penalties.append(problem.residuals(x)[0][3 * problem.starts[-1] + 3])
+    assert penalties[0] == 0 < penalties[1]
+
+
 def test_a_table_without_any_value_says_nothing() -> None:
     problem = problem_of(CASES["one segment with a table"])
     empty = replace(problem.tables[0], stiffness=np.full(4, np.nan))

@@ -182,12 +182,30 @@ def test_a_channel_that_keeps_its_pressure_is_found_before_the_monitor_faults(
     assert 3e3 < abs(line.p[0] - line.command[0]) < TOLERANCE / 2
 
 
+@pytest.mark.parametrize("to", [0.1, 0.9])
+def test_a_channel_that_moves_against_its_command_is_told_at_once(to: float) -> None:
+    line = Line()
+    line.to(0.5 * BAR, 0.5 * BAR, 0.0, seconds=2.0)
+    line.held[0] = line.p[0]
+    for k in range(round(0.15 / PERIOD)):
+        aim = BAR - line.command[0]  # with a lag of 60 ms
+        line.held[0] += PERIOD / 0.06 * (aim - line.held[0]) if k else 0.0
+        line.to(to * BAR, 0.5 * BAR, 0.0, seconds=PERIOD)
+        if line.channels.opposed.any():
+            break
+    assert line.channels.opposed.tolist() == [True, False, False]
+    notice = next(each for each in line.channels.notices() if each.kind == "channel-opposed")
+    assert notice.hold
+    assert "channel 1 moves against its command" in notice.text
+
+
 def test_a_regulator_that_is_slower_than_believed_is_not_lost() -> None:
     line = Line()
     line.rising = line.falling = 0.15  # of believed 0.06 s
     line.to(0.9 * BAR, 0.5 * BAR, 0.0, seconds=1.0)
     line.to(0.2 * BAR, 0.5 * BAR, 0.0, seconds=1.0)
     assert not line.channels.lost.any()
+    assert not line.channels.opposed.any()
 
 
 def test_a_channel_with_hardly_any_pressure_is_done_without() -> None:

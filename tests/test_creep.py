@@ -87,3 +87,15 @@ def test_another_model_and_another_jacobian_move_nothing() -> None:
     change = estimator.take_over(1.3 * JACOBIAN)
     np.testing.assert_allclose(change, 0.3 * before, rtol=1e-12)
     np.testing.assert_allclose(estimator.displacement, before + change, rtol=1e-12)
+
+
+@pytest.mark.parametrize("until", [5.0, 5.025, 5.05, 5.075])
+def test_a_jacobian_that_changes_between_two_corrections_teaches_nothing(until: float) -> None:
+    shares, times = (0.05, 0.05), (2.0, 20.0)
+    estimator = learned(shares, times, until)
+    before = estimator.shares.copy()
+    estimator.take_over(1.5 * JACOBIAN)
+    for time in until + FRAME * np.arange(4):
+        estimator.advance(FRAME, STEP, 1.5 * JACOBIAN)
+        estimator.learn(FRAME, 0.08 * WAY + creep(time, shares, times), 0.0, 0.0)
+    np.testing.assert_allclose(estimator.shares, before, atol=4e-3)

@@ -227,9 +227,10 @@ def test_an_arm_that_lags_has_one_clock() -> None:
 # -- the beginning ---------------------------------------------------------------------------------
 
 
-def test_a_log_that_begins_with_a_step_begins_at_rest() -> None:
+@pytest.mark.parametrize("step", [(9e4, 3e4, 0.0), (1.2e4, 0.0, 0.0)])
+def test_a_log_that_begins_with_a_step_begins_at_rest(step: tuple[float, float, float]) -> None:
     robot, log = load_description("stiff-flop-1"), log_of()
-    stepped = replace(log, commanded=np.vstack([[[9e4, 3e4, 0.0]], log.commanded[1:]]))
+    stepped = replace(log, commanded=np.vstack([[step], log.commanded[1:]]))
     (read,) = recordings_of(robot, [stepped], AS_RECORDED)
     np.testing.assert_array_equal(read.before, 0.0)
     (read,) = recordings_of(robot, [replace(stepped, measured=stepped.commanded)], AS_RECORDED)

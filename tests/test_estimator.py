@@ -486,3 +486,13 @@ def test_begin_forgets():
     estimator.advance(now, p, tip_at(p))
     assert not state(estimator).any()
     assert estimator.take([sample(now - 0.02, truth.position)]).used == 0
+
+
+@pytest.mark.parametrize(("ratio", "share"), [(1e-9, 1.0), (0.01, 0.8), (0.05, 0.0), (0.11, 0.0)])
+def test_only_a_direction_that_hardly_gives_is_a_stiff_axis(ratio: float, share: float) -> None:
+    """By the ratio of its compliance to the largest one; feedback corrects it without averaging."""
+    estimator = TipEstimator(PERIOD, 2, SWINGING, PLAIN)
+    tip = tip_at(np.zeros(2))
+    tip.compliance[2, 2] = ratio * tip.compliance[0, 0]
+    estimator.advance(0.0, np.zeros(2), tip)
+    assert estimator.stiff_axis == pytest.approx(np.diag([0.0, 0.0, share]), abs=1e-6)

@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 import stiffopt as so
@@ -164,6 +165,32 @@ def test_plans_leave_room_for_the_pressure_offset_within_the_limits(off):
     again = planning.plan(PlanRequest(1, task, task.target, np.zeros(6), 1.1 * offset))
     assert np.all(again.pressures - 1.1 * offset <= arm.pressure_max + 1)
     assert np.all(again.pressures - 1.1 * offset >= arm.pressure_min - 1)
+
+
+def test_a_plan_that_stays_changes_the_pressures_least(robot):
+    """Against a solver that knows nothing of it; the stiffest pressures are elsewhere."""
+    planning, first = Planning(robot), request(robot)
+    before = replace(planning.plan(first), pressures=PRESSURES)
+    offset = np.array([-4e-3, 3e-3, 0, 0, 0, 0])
+    moved = replace(first, offset=offset, stay=True, last=before)
+    plan = planning.plan(moved)
+    _, start = tip(robot, before.pressures)
+    wanted = start[:2] - offset[:2]
+    scale = 1e5
+    least = minimize(
+        lambda x: ((x - before.pressures / scale) ** 2).sum(), before.pressures / scale,
+        constraints={"type": "eq", "fun": lambda x: 1e3 * (tip(robot, x * scale)[1][:2] - wanted)},
+        bounds=[(0, 1.5)] * 3, method="SLSQP", options={"ftol": 1e-12},
+    )  # fmt: skip
+    assert plan.reached
+    here = robot.stiffness(plan.pressures, direction=[1, 0, 0])
+    assert plan.stiffness == pytest.approx(here, rel=1e-3)
+    np.testing.assert_allclose(tip(robot, plan.pressures)[1][:2], wanted, atol=2e-5)
+    np.testing.assert_allclose(plan.pressures, least.x * scale, atol=2e3)
+    stiffest = planning.plan(replace(moved, stay=False, last=None))
+    assert np.abs(stiffest.pressures - plan.pressures).max() > 1e4
+    far = first.target.model_copy(update={"position": (0.2, 0.0, None)})
+    assert not planning.plan(replace(moved, target=far)).reached
 
 
 def test_target_that_cannot_be_reached_has_a_plan_that_says_why(robot):

@@ -56,8 +56,8 @@ def ends() -> Iterator[Ends]:
 
 
 def assert_same(one: PlanRequest, other: PlanRequest) -> None:
-    assert (one.serial, one.task, one.target, one.search) == (
-        other.serial, other.task, other.target, other.search,
+    assert (one.serial, one.task, one.target, one.search, one.stay) == (
+        other.serial, other.task, other.target, other.search, other.stay,
     )  # fmt: skip
     assert one.offset.dtype == other.offset.dtype == np.float64
     assert one.offset.tobytes() == other.offset.tobytes()
@@ -77,6 +77,7 @@ def test_requests_arrive_as_they_were_whatever_changes(ends: Ends) -> None:
         {"pressure_offset": 2 * BESIDE},
         {"low": BESIDE, "high": 3 * BESIDE},
         {"search": False},
+        {"stay": True},
         elsewhere,
         {"serial": 2, "task": second},
         {"task": first},  # under the same number
@@ -108,7 +109,8 @@ def test_a_task_is_sent_once_and_again_on_a_new_line(ends: Ends) -> None:
         return set(pickle.loads(sent.pop()))
 
     arrays = {"offset", "pressure_offset", "low", "high", "way"}
-    everything = {"serial", "task", "target", "search", "last", "windows", "adapted", *arrays}
+    objects = {"serial", "task", "target", "search", "stay", "last", "windows", "adapted"}
+    everything = objects | arrays
     assert news(ends.ours, first) == everything
     assert news(ends.ours, replace(first, offset=0 * OFFSET)) == arrays
     other = Ends()

@@ -168,6 +168,23 @@ def test_a_model_that_changes_is_no_force() -> None:
         assert not estimator.felt.touches
 
 
+def test_creep_that_is_learned_is_no_force(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its shares change at once, and with them the creep that is predicted; the tip is at rest."""
+    estimator = TouchEstimator([3], vibrates=False, damping=0.04, tuning=TouchTuning())
+    creep, rng, moved = estimator.creep, np.random.default_rng(6), 0.0
+    monkeypatch.setattr(creep, "learn", lambda *_: None)
+    for time in np.arange(0.0, 6.0, FRAME).tolist():
+        if abs(time - 3.0) < FRAME / 2:
+            before = creep.displacement
+            taught = creep._mean + np.repeat([0.0, 0.08], 3)
+            monkeypatch.setattr(creep, "learn", lambda *_, to=taught: setattr(creep, "_mean", to))
+            moved = float(np.linalg.norm(creep._phi @ taught[3:] - before))
+        pressures = P * (1.0 + (time >= 1.0))
+        estimator.take(time, NOISE * rng.standard_normal(3), pressures, TIP, OMEGA)
+        assert time < 2.0 or not estimator.felt.touches
+    assert moved > 2e-3
+
+
 def test_after_a_long_gap_it_begins_anew() -> None:
     times, forces = felt(lambda t: C @ PUSH * (t > 2.0), 4.0)
     assert forces[-1].touches
@@ -260,6 +277,11 @@ def test_it_goes_back_when_the_contact_is_lost() -> None:
     arm.run(4.0)
     assert arm.pressing.phase is Phase.ENDED
     assert "lost" in arm.pressing.notices()[0].text
+    near_its_end = Spring(0.003, 200.0, PRESS.model_copy(update={"travel": 4e-3}))
+    near_its_end.run(8.0)
+    near_its_end.at = 1.0
+    near_its_end.run(4.0)
+    assert "gave way, by more than the travel of 4 mm" in near_its_end.pressing.notices()[0].text
 
 
 def test_it_goes_back_when_too_much_is_felt_or_nothing_although_it_is_held_back() -> None:
@@ -411,7 +433,7 @@ def test_a_press_is_planned_as_its_reaction() -> None:
     ("press", "why"),
     [
         (Press(force=0.03, direction=(0, 0, 1)), "cannot feel"),
-        (Press(force=0.5, direction=(1, 0, 0)), "closest configuration"),
+        (Press(force=0.5, direction=(1, 0, 0)), "cannot hold 0.5 N there"),
     ],
 )
 def test_what_cannot_be_held_or_felt_is_refused(press: Press, why: str) -> None:
@@ -424,6 +446,14 @@ def test_what_cannot_be_held_or_felt_is_refused(press: Press, why: str) -> None:
     with pytest.raises(InputError, match="press: the arm cannot press like that"):
         controller.check_ahead(asked(press=press))
     controller.close()
+
+
+@pytest.mark.usefixtures("compiled")
+def test_a_pose_out_of_reach_is_no_fault_of_the_press() -> None:
+    solution = PressureSolver(HANGING, asked(target=Target(position=(0.2, 0.0, 0.195)))).solve()
+    assert not solution.found
+    assert "closest configuration" in solution.message
+    assert "hold" not in solution.message.partition(";")[0]
 
 
 def _rig() -> tuple[Any, Any]:

@@ -240,6 +240,17 @@ def commissioned_control(rig: Any, robot: RobotDescription) -> ControlSettings:
     return control.model_copy(update={k: v for k, v in found.items() if k not in own})
 
 
+def is_commissioned(rig: Any, robot: RobotDescription) -> bool:
+    """Whether there is a record of exactly this rig that fits.
+
+    Parameters
+    ----------
+    rig : RigDescription
+    robot : RobotDescription
+    """
+    return _usable_record(rig, robot) is not None
+
+
 def commissioned_robot(rig: Any, robot: RobotDescription) -> RobotDescription:
     """Return a robot with the moduli and gains that the steps of its commissioning imply.
 

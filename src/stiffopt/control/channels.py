@@ -6,9 +6,10 @@ monitor's tolerance. If the channel is still short by more, it is *limited*: its
 becomes the plan's upper bound, and the command stays just above it, where more pressure shows as
 soon as there is some. If a limited channel does not follow its command down either, it is *stuck*:
 the plan takes its pressure as fixed, and the command stays just below it. A reading that does not
-move at all, although even a slow regulator would have moved it, shows both at once. Faults of
-the pressure monitor remain faults: none of these commands exceeds the limits, nor differs from the
-reading by more than the monitor tolerates.
+move at all, although even a slow regulator would have moved it, shows both at once. A channel that
+moves against its command is *opposed*: the pressures are held, as feedback would drive it on.
+Faults of the pressure monitor remain faults: none of these commands exceeds the limits, nor differs
+from the reading by more than the monitor tolerates.
 
 A shortfall or an excess that grows while the command rests is reported long before it matters: the
 gain and the offset of a healthy regulator or gauge do not change within seconds.
@@ -21,9 +22,11 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator
 
+import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.control.formula import Formula
 from stiffopt.control.interface import Notice
 from stiffopt.control.state import Severity
 from stiffopt.control.tuning import RegulatorTuning
@@ -50,8 +53,8 @@ class Channels:
 
     Attributes
     ----------
-    limited, stuck, out : flags (n,) of channels that have no more pressure, that keep their
-        pressure, and that were taken out by request.
+    limited, stuck, opposed, out : flags (n,) of channels that have no more pressure, that keep
+        their pressure, that move against their command, and that were taken out by request.
     shortfall : commands minus settled pressures (n,), in Pa.
     """
 
@@ -66,6 +69,8 @@ class Channels:
         self._empty = np.clip(0.0, limits.low, limits.high)
         self.out: Flags = np.zeros(limits.n, dtype=bool)
         self._any_out = False
+        self._none: Flags = np.zeros(limits.n, dtype=bool)
+        self._look = _look(limits.n, tuning)
         self.begin()
 
     def begin(self) -> None:
@@ -73,13 +78,15 @@ class Channels:
         n = self._limits.n
         self.limited: Flags = np.zeros(n, dtype=bool)
         self.stuck: Flags = np.zeros(n, dtype=bool)
+        self.opposed: Flags = np.zeros(n, dtype=bool)
         self.shortfall: Array = np.zeros(n)
         self._allowed: Array = self._min_allowed.copy()  # shortfall to compensate, in Pa
         self._held: Array = np.zeros(n)  # pressure of a limited or stuck channel, in Pa
         self._found: Array = np.zeros(n)  # the same when it was found, in Pa
         self._durations: Array = np.zeros((2, n))  # durations of being short, and too high, in s
-        # last readings that followed, and these without the regulators' offset (2, n), in Pa
-        self._followed: Array = np.zeros((2, n))
+        # last readings that followed, NaN once they have moved; these without the regulators'
+        # offset; and these, in Pa (3, n)
+        self._followed: Array = np.zeros((3, n))
         self._smoothed: Array = np.zeros(n)  # smoothed readings, in Pa
         self._ceiling: Array = np.where(self.out, self._empty, self._limits.high)
         self._rest = _Rest(n, self._tuning)
@@ -101,6 +108,8 @@ class Channels:
     @property
     def lost(self) -> Flags:
         """Channels (n,) that the plan does without, or uses below their usual limit."""
+        if self._quiet and not self._any_out:
+            return self._none
         return self.limited | self.stuck | self.out
 
     def update(
@@ -122,29 +131,28 @@ class Channels:
         self.shortfall = -offset
         self._rest.advance(elapsed, command, self.shortfall)
         share = -math.expm1(-elapsed / self._tuning.reading_time)
-        change = share * (reading - self._smoothed)
-        change[~np.isfinite(change)] = 0.0
-        self._smoothed = self._smoothed + change
+        self._smoothed, now, follows, strays, sound = self._look(
+            share, self._smoothed, reading, self.shortfall, healthy
+        )
         if self._any_out:
             self._ceiling = np.where(
                 self.out, np.maximum(self._ceiling - self._let_down * elapsed, self._empty),
                 self._limits.high,
             )  # fmt: skip
-        short, unmoved = self.shortfall, self._tuning.unmoved
-        follows = np.abs(short) <= self._min_allowed
-        settled = reading + short
-        strays = (healthy[0] - settled > unmoved) | (settled - healthy[1] > unmoved)
-        now = np.stack([reading, settled])
-        if self._quiet and follows.all() and not strays.any():
+        if self._quiet and sound[0]:
             self._followed = now
             return
-        self._followed = np.where(follows & ~strays, now, self._followed)
+        short, unmoved = self.shortfall, self._tuning.unmoved
+        self._followed = np.where((follows > 0) & (strays == 0), now, self._followed)
         # a reading that has moved must not count as still when it comes by again
         still = np.abs(reading - self._followed[0]) < unmoved
         self._followed[0, ~still] = np.nan
         above, below = self._followed[1] - healthy[1], healthy[0] - self._followed[1]
-        falls = above > self._probe
-        ignores = still & np.stack([falls | (below > self._probe), falls])
+        falls, rises = above > self._probe, below > self._probe
+        ignores = still & np.stack([falls | rises, falls])
+        moved = reading - self._followed[2]  # NaN: not measured
+        opposed = (falls & (moved > self._probe)) | (rises & (moved < -self._probe))
+        self.opposed = (self.opposed | opposed) & (follows == 0)
         self._smoothed = np.where(ignores[0], reading, self._smoothed)
         share = -math.expm1(-elapsed / self._tuning.make_up_time)
         wanted = np.minimum(np.maximum(short, self._min_allowed), self._max_allowed)
@@ -152,6 +160,7 @@ class Channels:
         self._judge(elapsed, short, command, ignores)
         self._quiet = not (
             self._durations.any()
+            or self.opposed.any()
             or self.limited.any()
             or (self._allowed > self._min_allowed + 1.0).any()
         )
@@ -222,7 +231,14 @@ class Channels:
         return low, high
 
     def notices(self) -> Iterator[Notice]:
-        """Yield alarms about lost and leaking channels."""
+        """Yield alarms about lost, opposed and leaking channels."""
+        if self.opposed.any():
+            each = ", ".join(str(c + 1) for c in np.flatnonzero(self.opposed))
+            text = (
+                f"the pressure of channel {each} moves against its command: its regulator acts the "
+                "wrong way, another channel's command reaches it, or the chamber has burst"
+            )
+            yield Notice("channel-opposed", text, Severity.ERROR, True, hold=True, undo=0.0)
         if not (self._quiet and not self._any_out) and self.lost.any():
             each = ", ".join(self._words(int(c)) for c in np.flatnonzero(self.lost))
             yield Notice("lost-channel", f"{each}; the plan goes on with the others", standing=True)
@@ -246,6 +262,31 @@ class Channels:
         if self.out[channel]:
             return f"{name} was taken out"
         return f"{name} is stuck at {has}" if self.stuck[channel] else f"{name} has {has} at most"
+
+
+def _look(n: int, tuning: RegulatorTuning) -> Formula:
+    """Return the formula of the checks that every tick makes.
+
+    Inputs: share by which smoothed readings (n,) follow; these; readings and shortfalls (n,); least
+    and greatest healthy pressures (2, n). Outputs: smoothed readings; readings, these without the
+    regulators' offset, and readings again (3, n); 1 for channels (n,) that follow; 1 for those (n,)
+    that are beyond the healthy pressures; and 1 if all follow and none is beyond them.
+    """
+    share, smoothed = ca.SX.sym("share"), ca.SX.sym("smoothed", n)
+    reading, short = ca.SX.sym("reading", n), ca.SX.sym("short", n)
+    healthy = ca.SX.sym("healthy", 2, n)
+    change = share * (reading - smoothed)
+    after = smoothed + ca.if_else(ca.fabs(change) < np.inf, change, 0)  # 0 for NaN
+    settled = reading + short
+    follows = ca.fabs(short) <= tuning.max_compensation
+    below, above = healthy[0, :].T - settled, settled - healthy[1, :].T
+    strays = ca.logic_or(below > tuning.unmoved, above > tuning.unmoved)
+    sound = ca.logic_and(ca.mmin(follows) > 0, ca.mmax(strays) < 1)
+    now = ca.vertcat(reading.T, settled.T, reading.T)
+    return Formula(
+        [share, smoothed, reading, short, healthy], [after, now, follows, strays, sound],
+        [healthy, now],
+    )  # fmt: skip
 
 
 class _Rest:

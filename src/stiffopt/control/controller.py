@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,6 +18,7 @@ from stiffopt.control.adaptation import Adapted
 from stiffopt.control.bracing import BracePhase, Bracing
 from stiffopt.control.checks import refusing
 from stiffopt.control.course import Course
+from stiffopt.control.first_motion import FirstMotion
 from stiffopt.control.forecast import Forecast, Present
 from stiffopt.control.interface import ControlOutput, Notice, SampleCounts
 from stiffopt.control.linearised_tip import LeaningTip
@@ -71,6 +71,8 @@ class TipController:
         Objects that the arm has to keep clear of; None: nothing is checked.
     plan_in_process :
         Whether to plan in a separate process; otherwise inline, for simulated time.
+    commissioned :
+        Whether the arm is known to respond as modelled; otherwise its first motion is slow.
     tuning :
         Tuning of the parts.
 
@@ -91,6 +93,7 @@ class TipController:
         vibrates: bool = True,
         scene: Scene | None = None,
         plan_in_process: bool = False,
+        commissioned: bool = True,
         tuning: ControlTuning | None = None,
     ) -> None:
         self.robot, self.limits = robot, limits
@@ -112,8 +115,17 @@ class TipController:
         )
         self._vibrates = mode is not None
         self._feedback = TipFeedback(
-            self._arm, limits, slew, period, mode, control, safety, tuning.feedback
+            self._arm,
+            limits,
+            slew,
+            period,
+            mode,
+            control,
+            safety,
+            tuning.feedback,
+            tuning.motion_error,
         )
+        self._first_motion = FirstMotion(commissioned, tuning.first_motion)
         self._requests = Requests(robot, limits, slew, scene, tuning)
         Planner = ProcessPlanner if plan_in_process else InlinePlanner
         self.replanner = Replanner(Planner(robot, scene), tuning.replanning, period, dead_time)
@@ -121,6 +133,7 @@ class TipController:
         if scene is not None:
             self.forecast = Forecast(Planner(robot, scene), tuning.forecast)
         self._lead = dead_time + 0.5 * period
+        self._largest_offset = tuning.feedback.max_offset * robot.length
         self._errors = TipErrors()
         self._windows = WindowWatch(tuning.windows)
         self._adapts = control.adaptation != "none"
@@ -137,8 +150,9 @@ class TipController:
         self._now = now
         self.replanner.begin()
         self._arm.begin(now)
+        self._first_motion.begin()
         self._reference.begin(np.concatenate([self._arm.pressures.command, np.zeros(6)]))
-        self._feedback.begin(np.zeros(6))
+        self._feedback.begin()
         self._permitted = self.limits.low, self.limits.high  # commands (n,) that the task permits
         self._at_rest = True  # the reference begins at the present pressures
         self._computed_at = now
@@ -265,7 +279,7 @@ class TipController:
         offset, pressures = self._offset, self._arm.pressures
         here = pressures.chamber if self._arm.channels.lost.any() else pressures.command
         self._reference.begin(np.concatenate([here + pressures.history_offset, offset]))
-        self._feedback.resume(offset)
+        self._feedback.resume()
         self._at_rest = False
 
     def observe(
@@ -282,6 +296,8 @@ class TipController:
         if isinstance(course, Bracing):
             course.is_steered = not self._is_held(now)
         counts = self._arm.observe(now, commanded, reading, samples, course)
+        if counts.used and (sample := self._arm.tip.sample) is not None:
+            self._first_motion.take(self._arm.tip.predicted, sample.position)
         if self.forecast is not None:
             self.forecast.present = self._present(now)
         return counts
@@ -305,7 +321,9 @@ class TipController:
         output = self._compute(now)
         self._computed_at = now
         posture = output.pressures + self._arm.pressures.command_offset
-        return replace(output, posture=posture, leans=self._arm.leaning is not None)
+        return ControlOutput(
+            output.pressures, output.valid, output.saturated, posture, self._arm.leaning is not None
+        )
 
     def _compute(self, now: float) -> ControlOutput:
         reference, pressures = self._reference, self._arm.pressures
@@ -319,7 +337,8 @@ class TipController:
             _, high = self._arm.channels.commands(last, *self._permitted)
             return ControlOutput(np.minimum(last, high), True, np.zeros(n, dtype=bool))
         lost = self._arm.channels.lost
-        if self._at_rest or (lost & ~self._lost).any():  # they are not where the reference is
+        newly_lost = lost is not self._lost and (lost & ~self._lost).any()
+        if self._at_rest or newly_lost:  # they are not where the reference is
             self.resume(now)
         self._lost = lost
         if self._model_is_wrong():
@@ -343,6 +362,7 @@ class TipController:
             self._offset,
             reference.command - pressures.command_offset,
             self._arm.channels.commands(reference.path[:n], *self._permitted),
+            isinstance(course, Course),
         )
         if command is None:
             return ControlOutput(last.copy(), False, self._feedback.saturated.copy())
@@ -367,7 +387,7 @@ class TipController:
             return self._brace(course, now)
         calm = now - self._adapted_at < tuning.adaptation.calm_time
         share = tuning.adaptation.slew_share if calm else tuning.reference.slew_share
-        reference.slew_share = share
+        reference.slew_share = min(share, self._first_motion.slew_share)
         way = None if self.forecast is None else self._way(now)
         found = replanner.update(
             now, self._offset, self._arm.pressures.command_offset, estimator.omega,
@@ -634,5 +654,4 @@ class TipController:
     def _model_is_wrong(self) -> bool:
         """Whether the offset is too large to be an error of this arm's model."""
         offset = self._arm.tip.offset[:3]
-        limit = self._tuning.feedback.max_offset * self.robot.length
-        return float(offset @ offset) > limit**2
+        return float(offset @ offset) > self._largest_offset**2

@@ -99,8 +99,9 @@ class CreepEstimator:
 
         The tip stays where it is: the model's error takes up the change.
         """
-        before = self.displacement
+        before, phi = self.displacement, self._phi
         self._phi = jacobian @ self._behind.T
+        self._sum[:, 1:] += self._count * (self._phi - phi)
         change: Array = self.displacement - before
         self._mean[:3] -= change
         return change

@@ -103,6 +103,7 @@ class TipEstimator:
         self._free = np.zeros((2, 3))
         self.offset = np.zeros(6)  # tip pose relative to the model's: d in m, and a rotation vector
         self.soft_plane = np.diag([1.0, 1.0, 0.0])  # projection on the directions of low stiffness
+        self.stiff_axis = np.diag([0.0, 0.0, 1.0])  # on those of a stiffness that is far higher
         self._lean: Array = np.zeros((3, 3))  # rotation of the tip per vibration
         self._pressures: Array | None = None
         deviations = (0.1, 0.05, 0.1) if self._mode is not None else (0.0, 0.0, 0.1)
@@ -233,6 +234,8 @@ class TipEstimator:
         # in a strongly bent arm no direction is entirely stiff
         share = np.minimum(1.0, compliances / (self._tuning.soft_share * compliances[2]))
         self.soft_plane = axes * share @ axes.T
+        share = np.maximum(0.0, 1 - compliances / (self._tuning.stiff_share * compliances[2]))
+        self.stiff_axis = axes * share @ axes.T
         omega = self._mode.frequency(lateral_stiffness(compliances))
         self.omega = max(self._tuning.least_frequency, omega)
         self._times[0] = self.omega

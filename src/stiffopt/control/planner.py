@@ -38,7 +38,7 @@ _IDLE = 1.0  # s without a request until the process compiles code
 # fields of a request: arrays are sent every time
 _ARRAYS = ("offset", "pressure_offset", "low", "high", "way")
 # immutable fields are sent if they are other objects than in the last request
-_OBJECTS = ("serial", "task", "target", "search", "last", "windows", "adapted")
+_OBJECTS = ("serial", "task", "target", "search", "stay", "last", "windows", "adapted")
 
 
 class InlinePlanner:

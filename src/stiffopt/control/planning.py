@@ -6,12 +6,17 @@ A plan is the local optimum next to the last plan. When the offset has changed m
 at rest, all configurations are searched again; the arm changes to another one only if that is
 clearly better. For a target that is out of reach, the plan is the nearest configuration.
 
+While the tip presses on something, plans follow the target by the least change of pressures
+instead: the error of the model, from which a force must be told, is another one elsewhere, and an
+optimum may jump when a channel reaches a limit.
+
 On a rig with a scene, a plan also reports whether the body keeps clear of it on the way.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import daqp
@@ -19,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt.control.adaptation import Adapted, Estimate, Learning, Window
-from stiffopt.control.tip_errors import TipErrors
+from stiffopt.control.tip_errors import TipErrors, stiffness_function
 from stiffopt.control.tuning import AdaptationTuning, FeedbackTuning, NearestTuning, PlanningTuning
 from stiffopt.control.ways import Ways
 from stiffopt.errors import InputError, StiffoptError
@@ -61,6 +66,7 @@ class PlanRequest:
     last: Plan | None = None  # replaces the planner's own last plan
     windows: tuple[Window, ...] = ()  # of the tip at rest, for adaptation
     adapted: Adapted | None = None  # the model that the offset refers to; None: the robot file's
+    stay: bool = False  # whether to follow the target by the least change of the last pressures
 
 
 @dataclass(frozen=True)
@@ -71,7 +77,7 @@ class Plan:
     pressures: Array  # effective (n,), in Pa
     offset: Array  # of the tip (6,), for which the plan was made
     target: Target | None
-    reached: bool  # whether the model reaches the target
+    reached: bool  # whether the model reaches the target, here or in a distant configuration
     stiffness: float  # along the task's first direction; NaN if it has none
     message: str  # how far the model stays from a target that is not reached
     blocked: str = ""  # why the way to the plan is not clear of the scene
@@ -104,6 +110,7 @@ class Planning:
         self._ways = None if self._scene is None else Ways(robot, self._scene)
         self._search = NearestSearch(self._tip, FeedbackTuning().lever, NearestTuning())
         self._solver: PressureSolver | None = None
+        self._stiffness: Callable[[Array, Array], float] | None = None  # in the task's direction
 
     def _go_on_with(self, request: PlanRequest) -> None:
         """Use the model of a request, and carry the last plan over to it."""
@@ -164,13 +171,18 @@ class Planning:
             exact = asked.model_copy(update={"tolerance": _EXACT})
             self._solver = PressureSolver(self._robot, task.model_copy(update={"target": exact}))
             self._is_compiled = self._solver.compile()
+            self._stiffness = stiffness_function(task)
         target = model_target(asked, request.offset)
         self._limits = self._effective_limits(request)
-        last = self._last = request.last or self._last
+        last, refused = request.last or self._last, self._refused
+        self._last = last
         if last is None or request.search:
             self._searched_at = request.offset
             self._advantage, self._refused = self._tuning.advantage, 0
             solution = self._solve(target, None)
+        elif request.stay:
+            self._last = self._nearest(request, task, target, distant=False)
+            return self._last
         else:
             solution = self._next_to(last, target)
             solution = self._better(request, target, solution, last) if solution else None
@@ -182,7 +194,7 @@ class Planning:
                 adapted=request.adapted,
             )  # fmt: skip
         else:
-            self._last = self._nearest(request, task, target)
+            self._last = self._nearest(request, task, target, distant=self._refused > refused)
         return self._last
 
     def _braced(self, request: PlanRequest, task: Task, asked: Target) -> Plan | None:
@@ -274,18 +286,26 @@ class Planning:
             solution = PressureSolver(self._robot, task).solve(guess=np.clip(p, low, high))
         return solution if solution.found else None
 
-    def _nearest(self, request: PlanRequest, task: Task, target: Target) -> Plan:
-        """Plan for a target that is out of reach, or unreachable at the required stiffness."""
+    def _nearest(self, request: PlanRequest, task: Task, target: Target, *, distant: bool) -> Plan:
+        """Plan for a target that is out of reach, or unreachable at the required stiffness.
+
+        It counts as reached if `request.stay` asks for no optimum, or if it can be reached in a
+        `distant` configuration, which a later plan may take.
+        """
         start = 0.5 * (self._limits[0] + self._limits[1])
         if self._last is not None:
             start = np.clip(self._last.pressures, *self._limits)
         pressures, distance, angle = self._search.find(target, self._limits, start)
         tolerance = task.target.tolerance
         far = distance > tolerance.position or angle > tolerance.angle
-        message = nearest_words(distance, angle, tolerance)
+        stays, stiffness = request.stay and not far, math.nan
+        if stays and self._stiffness is not None:
+            tip = self._tip.at(pressures)
+            stiffness = self._stiffness(tip.compliance, tip.pose[:3, :3])
         return Plan(
-            request.serial, pressures, request.offset, request.target, False, math.nan, message,
-            far=far, adapted=request.adapted,
+            request.serial, pressures, request.offset, request.target, stays or distant, stiffness,
+            "" if stays else nearest_words(distance, angle, tolerance), far=far,
+            adapted=request.adapted,
         )  # fmt: skip
 
     def _displacement(self, last: Plan, target: Target) -> Array:

@@ -210,9 +210,11 @@ class Pressing:
         elif self._felt_nothing > t.lost:  # it was no contact
             self.phase, self._felt_nothing = Phase.APPROACHING, 0.0
         elif gone > press.travel:
-            self._retreat(
-                f"{1e3 * press.force:g} mN were not reached within {1e3 * press.travel:g} mm"
-            )
+            way = f"{1e3 * press.travel:g} mm"
+            if self._why:
+                self._retreat(f"the contact gave way, by more than the travel of {way}")
+            else:
+                self._retreat(f"{1e3 * press.force:g} mN were not reached within {way}")
         elif self.force > t.most_force * press.force + press.tolerance:
             self._retreat(f"it presses with {1e3 * self.force:.0f} mN")
         elif self._held_back(gone) > t.most_force * press.force * compliance + t.held_back:

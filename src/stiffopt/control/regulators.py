@@ -146,6 +146,9 @@ class PressureEstimator:
         self.command = zero  # last commanded pressures, in Pa
         self.chamber = zero  # pressures in the chambers
         self.effective = zero  # pressures that would give a settled arm its present shape
+        # settled effective pressures relative to commands (n,), in Pa; they contain the part of the
+        # regulators' offset that commands may compensate
+        self.command_offset = zero
 
     def advance(self, steps: int, commanded: Array, reading: Array) -> None:
         """Take steps with commands (n,) and readings (n,) in Pa; NaN: not measured."""
@@ -160,6 +163,7 @@ class PressureEstimator:
         self.effective = self.chamber
         if self._memory is not None:
             self.effective = self._memory.advance(steps * self._period, self.chamber)
+        self.command_offset = self.history_offset + self.channels.compensated(offset)
 
     def adapt(self) -> bool:
         """Use the adapted lags from now on, at rest; return whether that changes anything."""
@@ -176,14 +180,6 @@ class PressureEstimator:
     def history_offset(self) -> Array:
         """Effective pressures relative to those in the chambers (n,), in Pa."""
         return self.effective - self.chamber
-
-    @property
-    def command_offset(self) -> Array:
-        """Settled effective pressures relative to commands (n,), in Pa.
-
-        It contains the part of the regulators' offset that commands may compensate.
-        """
-        return self.history_offset + self.channels.compensated(self._regulators.offset)
 
     @property
     def effective_ahead(self) -> Array:

@@ -17,7 +17,7 @@ from stiffopt.control.interface import Notice
 from stiffopt.control.planner import InlinePlanner, ProcessPlanner
 from stiffopt.control.planning import Plan, PlanRequest, nearest_words
 from stiffopt.control.posture import PostureCourse
-from stiffopt.control.pressing import Pressing
+from stiffopt.control.pressing import Phase, Pressing
 from stiffopt.control.tip_errors import stiffness_function, target_arrays
 from stiffopt.control.tuning import ReplanningTuning
 from stiffopt.optimise.target import Target
@@ -181,9 +181,10 @@ class Replanner:
             time = max(self._tuning.offset_time, self._tuning.offset_periods / omega)
             share = 1.0 if search else -math.expm1(-interval / time)
             self._offset = self._offset + share * (offset - self._offset)
+            stay = isinstance(course, Pressing) and course.phase is not Phase.GOING
             request = PlanRequest(
                 self._serial, task, target, self._offset.copy(), pressure_offset, search,
-                *available, windows=windows, adapted=self.adapted,
+                *available, windows=windows, adapted=self.adapted, stay=stay,
             )  # fmt: skip
             self._planner.request(request if way is None else replace(request, way=way))
         return self.latest()

@@ -7,9 +7,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from stiffopt.control.allocation import Allocation
 from stiffopt.control.feedback import GainSchedule, tracking_rows
+from stiffopt.control.motion_error import MotionErrorEstimator
 from stiffopt.control.observer import ArmObserver
 from stiffopt.control.reference import Reference, VibrationFilter
-from stiffopt.control.tuning import FeedbackTuning
+from stiffopt.control.tuning import FeedbackTuning, MotionErrorTuning
 from stiffopt.control.vibration import BendingMode
 from stiffopt.optimise.tip import TipAt
 from stiffopt.rig.interface import PressureLimits
@@ -29,7 +30,7 @@ class TipFeedback:
         See `TipController`; slew (n,), in Pa/s.
     mode :
         The arm's first bending mode; None for an arm that does not vibrate.
-    tuning :
+    tuning, motion_error :
         Tuning of the feedback.
 
     Attributes
@@ -47,10 +48,13 @@ class TipFeedback:
         control: ControlSettings,
         safety: Safety,
         tuning: FeedbackTuning,
+        motion_error: MotionErrorTuning,
     ) -> None:
         self._arm, self._tuning = arm, tuning
         lag, dead_time = arm.pressures.lag, arm.pressures.dead_time
-        self._averaged = VibrationFilter(period, control.damping, 6)  # the offset
+        # the offset and the position of the model's tip on the reference's path
+        self._averaged = VibrationFilter(period, control.damping, 9)
+        self._period, self._motion_error = period, MotionErrorEstimator(motion_error)
         self._gains: GainSchedule | None = None
         if mode is not None:
             self._gains = GainSchedule(period, lag, control.damping, tuning.effort)
@@ -64,18 +68,20 @@ class TipFeedback:
             tuning,
         )
 
-    def begin(self, offset: Array) -> None:
-        """Restart with an offset (6,) of the tip."""
-        self._averaged.begin(offset)
+    def begin(self) -> None:
+        """Restart."""
+        self.resume()
         self.saturated = np.zeros(len(self._arm.pressures.command), dtype=bool)
 
-    def resume(self, offset: Array) -> None:
-        """Continue after a pause with an offset (6,) of the tip."""
-        self._averaged.begin(offset)
+    def resume(self) -> None:
+        """Continue after a pause: the past does not count."""
+        self._is_new = True
+        self._motion_error.stop()
 
     def shift(self, change: Array) -> None:
         """Shift the offset by a change (6,) of the model."""
-        self._averaged.shift(change)
+        self._motion_error.stop()
+        self._averaged.shift(np.concatenate([change, -change[:3]]))
 
     def command(
         self,
@@ -85,6 +91,7 @@ class TipFeedback:
         offset: Array,
         goal: Array,
         limits: tuple[Array, Array],
+        follows: bool = False,
     ) -> Array | None:
         """Return the next command (n,), in Pa; None if the solver failed.
 
@@ -102,9 +109,15 @@ class TipFeedback:
             Command (n,) of the reference, in Pa.
         limits :
             Lowest and highest command (n,), in Pa.
+        follows :
+            Whether the tip follows a trajectory.
         """
         n = len(goal)
-        correction = reference.path[n:] - self._correctable(offset)
+        if not follows:
+            self._motion_error.stop()
+        elif (modelled := self._arm.modelled) is not None:
+            self._motion_error.learn(self._period, modelled.pose[:3, 3], self._arm.tip.offset[:3])
+        correction = reference.path[n:] - self._correctable(offset, tip, reference)
         self._allocation.limit(*limits)
         command, held, residual = self._allocation.solve(
             (tip.pose, tip.jacobian, prescribed, correction, *self._vibration_inputs(reference)),
@@ -116,16 +129,26 @@ class TipFeedback:
             self.saturated = held if reported else np.zeros(n, dtype=bool)
         return command
 
-    def _correctable(self, offset: Array) -> Array:
+    def _correctable(self, offset: Array, tip: TipAt, reference: Reference) -> Array:
         """Return the offset (6,) that feedback corrects now.
 
-        For an arm that vibrates it is averaged over a vibration, except along the stiff axis.
+        For an arm that vibrates it is averaged over a vibration, except along a stiff axis, and
+        except for the part that is known to grow with the motion; the regulators delay that part.
         """
-        estimator = self._arm.tip
-        self._averaged.advance(offset, estimator.omega)
-        corrected = self._averaged.value.copy()
-        behind = offset[:3] - corrected[:3]
-        corrected[:3] += behind - estimator.soft_plane @ behind
+        arm, slope, position = self._arm, self._motion_error.slope, tip.pose[:3, 3]
+        now = np.concatenate([offset, position])
+        if self._is_new:
+            self._averaged.begin(now)
+            self._is_new = False
+        self._averaged.advance(now, arm.tip.omega)
+        corrected = self._averaged.value[:6].copy()
+        behind, ahead = now[:3] - corrected[:3], np.zeros(3)
+        if slope.any():
+            n = len(arm.pressures.command)
+            velocity = tip.pose[:3, :3] @ (tip.jacobian[:3] @ reference.motion[1, :n])
+            behind -= slope @ (position - self._averaged.value[6:])
+            ahead = slope @ velocity * (arm.pressures.lag + arm.pressures.dead_time)
+        corrected[:3] = now[:3] - behind + arm.tip.stiff_axis @ behind + ahead
         return corrected
 
     def _vibration_inputs(self, reference: Reference) -> tuple[ArrayLike, ...]:

@@ -154,6 +154,7 @@ class TouchEstimator:
         self._better = self._quiet = 0  # successive samples
         self._begun = -math.inf  # time of the last hypothesis, in s
         self._softest = 1.0  # largest compliance, in m/N
+        self._looked_at: Array | None = None  # compliance for which the following numbers are
         # stiffness (3, 3) of the tip in the directions of feeling, and projection on these
         self._stiffness, self._felt_axes = np.eye(3), np.eye(3)
         self.stiffness_error = math.nan
@@ -256,7 +257,10 @@ class TouchEstimator:
             self.creep.skip()
         elif self._approach is None:
             grown = self._way**2 - (before * math.exp(-elapsed / t.motion_time)) ** 2
+            known = self.creep.displacement
             self.creep.learn(elapsed, away - self._filters.means[0, _XI], grown, speed)
+            # what is now taken for creep was taken for an error of the model: nothing has moved
+            self._filters.means[:, _E] -= self.creep.displacement - known
         self.felt = self._force()
 
     def _force(self) -> TipForce:
@@ -278,6 +282,9 @@ class TouchEstimator:
 
     def _look_at(self, tip: TipAt) -> None:
         """Find the directions in which the tip is soft, and the stiffness there."""
+        if tip.compliance is self._looked_at:
+            return
+        self._looked_at = tip.compliance
         R = tip.pose[:3, :3]
         compliances, axes = np.linalg.eigh(R @ tip.compliance[:3, :3] @ R.T)
         soft = compliances > SOFT_SHARE * compliances[2]
@@ -312,10 +319,11 @@ class TouchEstimator:
         pressed = np.zeros(3)
         if self._approach is not None:
             Q[_B, _B] = 0.0  # otherwise a beginning contact would be taken for creep
-            along = float(self._approach[0] @ moved.sum(axis=1))
+            n = self._approach[0]
+            along = float(n @ moved.sum(axis=1))
             self._approached += along
             if self._presses:
-                pressed = -t.held_share * along * self._approach[0]
+                pressed = -t.held_share * along * n
                 Q[_U, _U] = (t.held_error * along) ** 2
             else:
                 F[_E, _G] = along

@@ -30,6 +30,8 @@ class EstimatorTuning:
     memory: float = 0.4  # age beyond which a sample is dropped, in s
     # compliance, as a share of the largest, below which a direction vibrates less
     soft_share: float = 0.15
+    # the same, above which a direction vibrates slowly enough for fast corrections to excite it
+    stiff_share: float = 0.05
     # lower bound of the vibration's angular frequency, in rad/s; it is 0 for an arm about to buckle
     least_frequency: float = 0.5
     # displacement of the model, in m, after which an exactly unchanged pose is a frozen reading
@@ -111,6 +113,17 @@ class ReferenceTuning:
 
 
 @dataclass(frozen=True)
+class FirstMotionTuning:
+    """The first motion of an arm that is not known to respond as modelled (`FirstMotion`)."""
+
+    slew_share: float = 0.15  # share of the slew that the reference may take
+    # way of the model's tip after which it ends, in m, if the tip has followed with an error of at
+    # most a share of that way
+    way: float = 8e-3
+    error: float = 0.5
+
+
+@dataclass(frozen=True)
 class FeedbackTuning:
     """Feedback at the tip."""
 
@@ -125,6 +138,17 @@ class FeedbackTuning:
     unreported_error: float = 2e-4
     # share of the arm's length beyond which the tip's offset cannot be an error of its model
     max_offset: float = 0.5
+
+
+@dataclass(frozen=True)
+class MotionErrorTuning:
+    """How the tip's offset changes with motion on a trajectory (`MotionErrorEstimator`)."""
+
+    deviation: float = 0.1  # of the share by which the tip moves farther than modelled
+    drift: float = 3e-4  # growth of the deviation of the rest of the offset, in m / sqrt(s)
+    noise: float = 3e-4  # of an offset, in m
+    late: float = 0.1  # error of an offset in motion, as the way of the tip in this time, in s
+    every: float = 0.1  # between two offsets that are taken in, in s
 
 
 @dataclass(frozen=True)
@@ -312,8 +336,11 @@ class MotionTuning:
     # share of the turn that a push would cause by which the measured turn must miss it
     slip: float = 0.7
     least_turn: float = 0.02  # by which it must miss it at least, in rad
-    # displacement up to which a drift that turns the tip as a push does is a push that grows, in m
+    bends: float = 0.5  # share below which a change that begins so is a push
+    further: float = 2.0  # multiple of that turn up to which a larger one in its direction fits
+    # displacement of a growing push, in m, above which it must miss it by less than another share
     largest_push: float = 8e-3
+    slip_of_large: float = 0.25
     slips: int = 4  # successive samples that show a slip
     # an arm that responds otherwise than modelled explains a displacement: share of it that may be
     # across the model's motion, and its largest share of that motion
@@ -493,7 +520,9 @@ class ControlTuning:
     lags: LagTuning = field(default_factory=LagTuning)
     estimator: EstimatorTuning = field(default_factory=EstimatorTuning)
     reference: ReferenceTuning = field(default_factory=ReferenceTuning)
+    first_motion: FirstMotionTuning = field(default_factory=FirstMotionTuning)
     feedback: FeedbackTuning = field(default_factory=FeedbackTuning)
+    motion_error: MotionErrorTuning = field(default_factory=MotionErrorTuning)
     replanning: ReplanningTuning = field(default_factory=ReplanningTuning)
     posture: PostureTuning = field(default_factory=PostureTuning)
     forecast: ForecastTuning = field(default_factory=ForecastTuning)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from stiffopt.commissioning.record import commissioned_control, commissioned_robot
+from stiffopt.commissioning.record import commissioned_control, commissioned_robot, is_commissioned
 from stiffopt.control.controller import TipController
 from stiffopt.control.lifecycle import ARMED
 from stiffopt.control.loop import ControlLoop
@@ -141,6 +141,7 @@ class Daemon:
             vibrates=_vibrates(description),
             scene=scene,
             plan_in_process=True,
+            commissioned=is_commissioned(description, self.robot.description),
         )
         self.loop = ControlLoop(
             guarded,

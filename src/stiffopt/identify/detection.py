@@ -20,7 +20,7 @@ from stiffopt import lie
 from stiffopt.errors import PressureError
 from stiffopt.identify.discrepancy import smooth_functions
 from stiffopt.identify.recording import Recording, Track
-from stiffopt.identify.settings import DETECTION, PLAUSIBLE, Finding
+from stiffopt.identify.settings import DETECTION, SAMPLING, Finding
 from stiffopt.identify.tracker_faults import CUBE_ROTATIONS, whole
 from stiffopt.model.calibration import distances_from
 from stiffopt.model.description import RobotDescription, Tolerances
@@ -132,7 +132,7 @@ def begun(recording: Recording, span: Array) -> Recording:
     tip, late = recording.tracks[0].position, recording.time > recording.time[0] + DETECTION.begins
     rows = np.flatnonzero(whole(tip) & late)
     at = _quadratics(np.vstack([np.zeros_like(span), recording.before]) / span)
-    steps = (np.abs(recording.before) > PLAUSIBLE.late * span).any()
+    steps = (np.abs(recording.before) > SAMPLING.rest * span).any()
     if not steps or np.isnan(tip[0]).any() or len(rows) < 2 * at.shape[1]:
         return recording
     known = _quadratics(
@@ -140,10 +140,8 @@ def begun(recording: Recording, span: Array) -> Recording:
     )
     distances, coefficients = _regressed(known[rows], tip[rows])
     rest, first = np.linalg.norm(at @ coefficients - tip[0], axis=1)
-    if (
-        first < DETECTION.begins_apart * np.median(distances)
-        or rest > DETECTION.begins_share * first
-    ):
+    usual = np.median(distances)
+    if first < DETECTION.begins_apart * usual or rest > DETECTION.begins_near * usual:
         return recording
     return replace(recording, before=np.zeros_like(recording.before))
 

@@ -494,7 +494,7 @@ def _excess(robot: RobotDescription) -> ca.SX:
         if compensation.modulus_law == "linear":
             excess = FIT.least_modulus - (1 + change)
         else:
-            excess = change - FIT.most_stiffening
+            excess = ca.fmax(change - FIT.most_stiffening, -change - FIT.most_softening)
         modulus.append(excess / FIT.modulus_slack)
     return ca.fmax(ca.vertcat(*memory, *modulus), 0)
 

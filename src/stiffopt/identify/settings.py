@@ -168,9 +168,10 @@ class FitSettings:
     least_position, least_angle : smallest spread of residuals, in m and rad; logs have few digits.
     most_memory, memory_slack : sum of the shares of a channel's history beyond which a penalty
         grows, and the excess that counts as one deviation.
-    least_modulus, most_stiffening, modulus_slack : share of a segment's modulus that pressure must
-        leave; largest exponent by which an exponential law may raise it (at 1, more pressure bends
-        the arm less); and the excess of either that counts as one deviation.
+    least_modulus, most_stiffening, most_softening, modulus_slack : share of a segment's modulus
+        that pressure must leave under a linear law; largest exponents by which an exponential law
+        may raise it (at 1, more pressure bends the arm less) and lower it; and the excess of any of
+        these that counts as one deviation.
     side : prior deviation of a channel's initial state of hysteresis, from -1 to 1.
     between_logs : assumed time at the last pressures between two logs of a sequence, in s.
     systematic : deviation of the errors that rows at nearby pressures share, in lengths of the arm.
@@ -192,6 +193,7 @@ class FitSettings:
     memory_slack: float = 0.01
     least_modulus: float = 0.1
     most_stiffening: float = 0.7
+    most_softening: float = 4.0
     modulus_slack: float = 0.005
     side: float = 0.6
     between_logs: float = 60.0
@@ -343,9 +345,9 @@ class DetectionSettings:
     clock_shifts : number of shifts that are tried.
     clock_overwhelming : as `overwhelming`, for the regression.
     begins : time in s at the beginning of a log that does not tell where its tip is at rest.
-    begins_share, begins_apart : a log begins at rest if the first tip's distance from there is at
-        most this share of that from where the first pressures hold it, and the latter at least this
-        multiple of the median error.
+    begins_near, begins_apart : a log begins at rest if the first tip's distance from where the arm
+        rests is at most `begins_near` median errors of the regression, and that from where the
+        first pressures hold it at least `begins_apart`.
     drift_rows, drift_parts : number of rows in the regression for a drift, and of parts of the log.
     drift_spread : smallest spread of the pressures in each part, over that of all.
     drift_near, drift_visits : a part visits the pressures of a row if it comes this near to them,
@@ -374,7 +376,7 @@ class DetectionSettings:
     clock_shifts: int = 61
     clock_overwhelming: float = 0.3
     begins: float = 2.0
-    begins_share: float = 0.3
+    begins_near: float = 2.0
     begins_apart: float = 3.0
     drift_rows: int = 1200
     drift_parts: int = 8

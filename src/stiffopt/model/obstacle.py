@@ -86,6 +86,20 @@ class Obstacle(Schema, ABC):
     def pieces(self) -> list[list[float]]:
         """Parameters of each piece; the distance is the largest of the pieces' distances."""
 
+    @classmethod
+    def contact_formula(cls) -> tuple[ca.SX, ca.SX, ca.SX]:
+        """Return symbols of a point (3,) and of a contact's piece, and the distance for contacts.
+
+        It is `formula` except for kinds of which that has kinks that an arm can touch.
+        """
+        point, q = ca.SX.sym("point", 3), ca.SX.sym("parameters", cls.n_parameters)
+        return point, q, cls.formula(point, q)
+
+    @property
+    def contact_pieces(self) -> list[list[float]]:
+        """Parameters of each piece for contacts; their distance is the largest too."""
+        return self.pieces
+
     @property
     def grids(self) -> tuple[DistanceGrid, ...]:
         """Grids of distances, one for each piece, or none."""

@@ -107,7 +107,7 @@ class PressureSolver:
         with giving_up(timeout, cancel):
             solution = self._found(task, start)
         solution.timings.update(watch.timings())
-        return _felt(solution)
+        return _pressed(self, solution)
 
     def warm(
         self,
@@ -214,7 +214,7 @@ class PressureSolver:
                 found = found or self._search.nearest(self.task, start)
             except StoppedError as error:
                 return PressureSolution("failed", str(error), self.task)
-            return _felt(found or self._found(self.task, start))
+            return _pressed(self, found or self._found(self.task, start))
 
     def solve_at_once(
         self,
@@ -454,7 +454,7 @@ def _solved(
         solution.timings.update(shares)
         for name, time in watch.timings().items():
             solution.timings[name] = shares.get(name, 0.0) + time
-        solutions.append(_felt(solution))
+        solutions.append(_pressed(solver, solution))
     return solutions
 
 
@@ -462,11 +462,20 @@ def _at_once(robot: Manipulator, seed: int, task: Task) -> PressureSolution | No
     return PressureSolver(robot, task, seed=seed).solve_at_once()
 
 
-def _felt(solution: PressureSolution) -> PressureSolution:
-    """Mark a solution unreachable if the arm could not feel there how hard it presses."""
+def _pressed(solver: PressureSolver, solution: PressureSolution) -> PressureSolution:
+    """Return a solution that says if its press is too hard, or cannot be felt there."""
     press, pose, compliance = solution.task.press, solution.tip_pose, solution.compliance
-    if press is None or not solution.found or pose is None or compliance is None:
+    if press is None or solution.status == "failed" or pose is None or compliance is None:
         return solution
+    if not solution.found:
+        if not (solution.position_error or 0.0) > solution.task.target.tolerance.position:
+            return solution
+        plain = solution.task.model_copy(update={"stiffness": None, "press": None})
+        if not PressureSolver(solver._given, plain, seed=solver.seed).solve().found:
+            return solution
+        reached = solution.message.removeprefix("unreachable: ")
+        why = f"the arm reaches this pose, but cannot hold {press.force:g} N there"
+        return replace(solution, message=f"{why}; while it presses, {reached}")
     R = pose[:3, :3]
     reason = press.refusal(R, R @ compliance[:3, :3] @ R.T)
     return replace(solution, status="unreachable", message=reason) if reason else solution

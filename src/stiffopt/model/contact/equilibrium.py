@@ -15,7 +15,7 @@ from stiffopt.errors import EquilibriumError, InputError
 from stiffopt.model.arguments import check_choice, checked_measure
 from stiffopt.model.arm_clearance import SceneKey, measured_scene
 from stiffopt.model.compliance import Boundary, Frame, Kind, stiffness_of
-from stiffopt.model.contact.push import ContactLoss, GrowingPush
+from stiffopt.model.contact.push import ContactLoss, GrowingPush, rigid_if_huge
 from stiffopt.model.contact.rod import Condition, Rod, hat, rotations
 from stiffopt.model.contact.solve import ContactProblem
 from stiffopt.model.contact.surface import ContactSurface
@@ -201,12 +201,15 @@ class ContactEquilibrium:
     ) -> float:
         """Return the stiffness of the braced tip along a direction (N/m), or about it (N m/rad).
 
-        See `Manipulator.stiffness` for the arguments and `compliance` for `contacts`.
+        See `Manipulator.stiffness` for the arguments and `compliance` for `contacts`.  It is
+        infinite where a rigid surface holds the tip.
         """
         d = np.asarray(checked_measure(direction, kind, boundary, frame).direction)
         if frame == "base":
             d = self._arm.shape.rotation[0].T @ d
-        return float(stiffness_of(self.compliance(contacts), d, kind, boundary))
+        with np.errstate(divide="ignore"):
+            found = float(stiffness_of(self.compliance(contacts), d, kind, boundary))
+        return rigid_if_huge(1 / found) if found and kind == "translation" else found
 
     @property
     def friction(self) -> FrictionBounds:
@@ -387,7 +390,8 @@ def _arrived(arm: LeaningArm, share: float, what: str) -> ContactEquilibrium:
     if share < 1.0:
         touches = arm.state.touches
         names = sorted({arm.problem.surfaces[touch.surface].name for touch in touches})
-        on = f", leaning on {' and '.join(names)}" if names else ""
+        how = "lying along" if any(touch.line for touch in touches) else "leaning on"
+        on = f", {how} {' and '.join(names)}" if names else ""
         raise EquilibriumError(
             f"no equilibrium is reached continuously beyond {share:.0%} of {what}{on}: the arm "
             "slips off, snaps through or buckles there"

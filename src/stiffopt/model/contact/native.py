@@ -17,7 +17,7 @@ from stiffopt.model.contact.system import ContactRow, Contacts
 
 Vector = NDArray[np.float64]
 
-MOST_CONTACTS = 8
+MOST_CONTACTS = 24
 """Largest number of contacts, as in contact.c."""
 CONVERGED, LOST, REMESH = range(3)
 """Outcomes, as in contact.c."""
@@ -29,7 +29,7 @@ class _Surface(ctypes.Structure):
     """Structure `Surface` of contact.c."""
 
     _fields_ = [
-        ("formula", _pointer),
+        *((name, _pointer) for name in ("distance", "formula")),
         ("pieces", _integer),
         ("size", _integer),
         ("parameters", _pointer),
@@ -113,8 +113,9 @@ class NativeContacts:
         self._keep = [*(each.pieces for each in surfaces)]
         self._surfaces = (_Surface * max(1, len(surfaces)))()
         for own, each in zip(self._surfaces, surfaces, strict=False):
-            function = getattr(code.cdll, f"surface_{each.key}")
-            own.formula = ctypes.cast(function, _pointer).value
+            for name, function in (("distance", "surface_distance"), ("formula", "surface")):
+                address = ctypes.cast(getattr(code.cdll, f"{function}_{each.key}"), _pointer)
+                setattr(own, name, address.value)
             own.pieces, own.size = each.pieces.shape
             own.parameters, own.softness = each.pieces.ctypes.data, each.softness
 

@@ -16,7 +16,9 @@ _TILT = 0.5  # rad, largest turn of a contact's normal in a step of a push that 
 _LARGEST_SWING = 0.2  # rad, largest turn of the tip in a step of a push
 _FORCE_LEFT = 1e-7  # N; a contact with less force has lifted off
 _SAME_LOSS = 0.01  # share by which two foretold losses may differ
+_NO_COMPLIANCE = 1e-11  # m/N; with less, a rigid surface holds the tip
 _NEW_CONTACT = 0.02  # longest step that adds a contact, over the loss that is foretold
+_MOST_STEPS = 150  # of a push, with those that are repeated
 _SHORTEST = 1e-6  # share of the largest push; with a shorter step the equilibrium is lost
 
 
@@ -28,7 +30,8 @@ class ContactLoss(NamedTuple):
     force : of the push at the tip, in N; infinite if no contact is lost.
     object : on which a contact is lost, or None.
     at : arc length of that contact at rest, in m, or None.
-    how : "lifts off" or "slips", "snaps" where the equilibrium is lost instead, or "holds".
+    how : "lifts off" or "slips"; "snaps" where the equilibrium is lost instead; "stalls" where the
+        push could not be followed further, though nothing is lost yet; or "holds".
     stiffness : along the push just before, in N/m.
     stiffness_after : the same without the contact, or with it slipping.
     """
@@ -78,7 +81,7 @@ class GrowingPush:
         friction = self._friction(arm.state)
         sticking = [j for j, each in enumerate(friction) if each > 0]
         force, step, foretold, begin = 0.0, np.inf, -1.0, None
-        while True:
+        for _ in range(_MOST_STEPS):
             tangent = self._tangent(arm, sticking)
             begin = begin if begin is not None else tangent.stiffness
             left, lost, how = _first_loss(arm, tangent, friction, self._limit - force)
@@ -108,6 +111,8 @@ class GrowingPush:
                 sticking = [j for j, each in enumerate(friction) if each > 0]
                 found = self._problem.correct(state, sticking) or found
             arm, force, step, foretold = found, force + step, np.inf, total
+        else:
+            return ContactLoss(force, None, None, "stalls", tangent.stiffness, 0.0)
         if lost is None:
             return ContactLoss(np.inf, None, None, how, begin, begin)
         touches = arm.state.touches
@@ -132,12 +137,13 @@ class GrowingPush:
         along = moves[..., :3] @ self._direction
         turn = float(np.linalg.norm(changes[0, TURN, :3] @ self._direction))
         rates = solution[:, :3] @ self._direction
-        return _Tangent(system, solution, rates, along, turn, 1 / float(self._direction @ along[0]))
+        stiffness = rigid_if_huge(float(self._direction @ along[0]))
+        return _Tangent(system, solution, rates, along, turn, stiffness)
 
     def loss(self, arm: LeaningArm) -> ContactLoss:
         """Return the first contact that is lost as the push grows from an equilibrium."""
         without, force, step = arm.state.condition.dead, 0.0, np.inf
-        while True:
+        for _ in range(_MOST_STEPS):
             own = _forces(arm)
             slopes, turn, stiffness = self._rates(arm)
             # a contact is lost where its force is zero, by Newton's method from one side
@@ -163,11 +169,12 @@ class GrowingPush:
                 return ContactLoss(np.inf, None, None, "holds", stiffness, stiffness)
             if self._problem.missed(arm):
                 arm = self._problem.settle(arm.state) or arm
+        return ContactLoss(force, None, None, "stalls", stiffness, 0.0)
 
     def _rates(self, arm: LeaningArm) -> tuple[Vector, float, float]:
         """Return changes (k,) of normal forces and of the tip's turn per push; a stiffness."""
         found = arm.tangent[:, :3] @ self._direction
-        stiffness = 1 / float(self._direction @ found[:3])
+        stiffness = rigid_if_huge(float(self._direction @ found[:3]))
         return found[6:], float(np.linalg.norm(found[3:6])), stiffness
 
     def _lifted(self, arm: LeaningArm, force: float, lost: int) -> ContactLoss:
@@ -179,6 +186,11 @@ class GrowingPush:
         touch = state.touches[lost]
         name = self._problem.surfaces[touch.surface].name
         return ContactLoss(force, name, touch.station, "lifts off", before, after)
+
+
+def rigid_if_huge(compliance: float) -> float:
+    """Return the stiffness in N/m; infinite where the compliance is zero but for rounding."""
+    return 1 / compliance if abs(compliance) > _NO_COMPLIANCE else np.inf
 
 
 def _forces(arm: LeaningArm) -> Vector:

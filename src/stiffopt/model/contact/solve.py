@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.model.contact.lines import ContactLines
 from stiffopt.model.contact.native import CONVERGED, LOST, MOST_CONTACTS, NativeContacts
 from stiffopt.model.contact.rod import (
     MOMENT,
@@ -30,9 +31,9 @@ _LARGEST_TURN = 0.5  # rad, largest turn of a part of the arm in one correction;
 _FARTHEST_TURN = 1.5  # rad; if more were wanted, the equilibrium is not near
 _LARGEST_SLIDE = 0.02  # m, largest motion of a contact along the arm in one correction
 _TURN_LEFT, _SLIDE_LEFT = 1e-6, 1e-7  # rad and m; quadratic convergence: the error is 1e-12
-_MAX_ITERATIONS = 14
+_MAX_ITERATIONS = 40
 _MAX_MESHES = 8  # rebuilt as contacts move from range to range
-_MAX_SETS = 10  # sets of contacts that are tried in a step
+_MAX_SETS = 40  # sets of contacts that are tried in a step
 _DEEPEST = 0.3  # largest penetration of a surface in a step, over the body's radius
 _ENTERED = 2e-3  # m, wanted penetration after a step that went too deep
 _TILT = 0.5  # rad, largest turn of a contact's normal in a step
@@ -40,6 +41,7 @@ _PENETRATION = 2e-6  # m, allowed penetration
 _SPACING = 4e-3  # m along the arm between stations at which gaps are evaluated
 _FINE_STATIONS = 17  # stations about a local minimum of a gap
 _SEEN_FROM = 2e-4  # m; a larger gap at a coarse minimum excludes a contact
+_SAG = 1e-4  # m; largest penetration on a line of contacts
 _SCANNED = 0.5  # motion of a free arm between two looks at the gaps, over the body's radius
 _MOST_LOOKS, _CLOSER_LOOKS = 24, 8  # along the motion, and where it first enters a surface
 _SWEPT = 1.0  # motion of a station in a step that is always allowed, over the body's radius
@@ -49,6 +51,7 @@ _SAME_CONTACT = 2e-4  # m; closer contacts on a surface are merged
 _INSET = 1e-5  # m, least distance of a contact from the end of a range
 _MAX_CROSSINGS = 3  # of an end of a range, after which a contact is pinned there
 _APART = 1e-4  # m between an arm and surfaces that are moved back from it
+_MOST_STEPS = 500  # of a path, with those that are repeated
 _SHORTEST_STEP = 1e-4  # share of the path from rest; below it the path has ended
 
 
@@ -61,6 +64,7 @@ class ContactProblem:
         self._deepest: tuple[int, float] | None = None  # surface and gap of a step that failed
         count = int(np.ceil(rod.arm.length / _SPACING))
         self.stations = np.linspace(0.0, rod.arm.length, count + 1)
+        self.lines = ContactLines(rod)
 
     # -- Newton's method --------------------------------------------------------------------
 
@@ -185,7 +189,7 @@ class ContactProblem:
         edge = here.end if up else here.start
         other = touch.range + (1 if up else -1)
         if other < 0:
-            return replace(touch, station=here.start + _INSET)
+            return replace(touch, station=here.start + _INSET, pinned=True)
         if other == len(ranges):
             return replace(touch, station=edge, pinned=True)
         radii = [self.rod.radius(index) for index in (touch.range, other)]
@@ -208,19 +212,29 @@ class ContactProblem:
             if found is None or self.is_far(start, found):
                 return None
             changed = self._changed(found)
-            if changed is None:
-                missed = self.missed(found)
-                if missed is None:
-                    return None
-                if not missed:
-                    return found
-                changed = (*found.state.touches, *missed)
-            state = self.with_touches(found.state, changed)
+            if changed is not None:
+                start = state = self.with_touches(found.state, changed)
+                continue
+            missed = self.missed(found)
+            if missed is None:
+                return None
+            if not missed:
+                return found
+            state = self.with_touches(found.state, (*found.state.touches, *missed))
         return None
 
     def is_far(self, start: Contacts, arm: LeaningArm) -> bool:
         """Return whether the normal of a contact has turned too much for a step."""
-        for old, new, row in zip(start.touches, arm.state.touches, arm.rows, strict=False):
+        pairs = list(zip(arm.state.touches, arm.rows, strict=True))
+        has_lines = any(touch.line for touch in (*start.touches, *arm.state.touches))
+        for old, (new, row) in zip(start.touches, pairs, strict=False):
+            if has_lines:  # contacts come and go; the nearest one has nearly the same normal
+                own = [each for each in pairs if each[0].surface == old.surface]
+                if not own:
+                    continue
+                new, row = min(own, key=lambda each: abs(each[0].station - old.station))
+                if abs(new.station - old.station) > self.lines.spacing:
+                    continue
             if old.surface != new.surface:
                 return False  # another set of contacts; those before were checked
             size = float(np.linalg.norm(old.force))
@@ -238,19 +252,25 @@ class ContactProblem:
         touches = list(arm.state.touches)
         pull = [touch.normal_force for touch in touches]
         if touches and min(pull) < 0:
+            if touches[pull.index(min(pull))].line:
+                return tuple(each for each in touches if not each.line or each.normal_force >= 0)
             del touches[pull.index(min(pull))]
             return tuple(touches)
-        for j, (touch, row) in enumerate(zip(touches, arm.rows, strict=True)):
-            here = self.rod.ranges[touch.range]
-            up = touch.station > (here.start + here.end) / 2
-            inwards = row.slope if up else -row.slope
-            if touch.pinned and touch.crossings < _MAX_CROSSINGS and inwards > 1e-9:
+        changed = self.lines.changed(arm)
+        if changed is not None:
+            return changed
+        for j, touch in enumerate(touches):
+            if self.lines.is_held(touch):
+                continue
+            if touch.pinned and touch.crossings < _MAX_CROSSINGS and arm.is_let_go(j):
+                here = self.rod.ranges[touch.range]
+                up = touch.station > (here.start + here.end) / 2
                 station = here.end - 1e-4 if up else here.start + 1e-4
                 crossings = touch.crossings + 1
                 touches[j] = replace(touch, station=station, pinned=False, crossings=crossings)
                 return tuple(touches)
             for i, other in enumerate(touches[:j]):
-                near = abs(touch.station - other.station) < _SAME_CONTACT
+                near = abs(touch.station - other.station) < _SAME_CONTACT and not touch.line
                 if near and touch.surface == other.surface:
                     force = touch.force + other.force
                     normal_force = touch.normal_force + other.normal_force
@@ -266,8 +286,16 @@ class ContactProblem:
             if gaps.min() > _SEEN_FROM:
                 continue
             own = [j for j, touch in enumerate(arm.state.touches) if touch.surface == index]
+            lines = [
+                touch.station
+                for touch in arm.state.touches
+                if touch.surface == index and touch.line
+            ]
             for i in dips(gaps):
                 if gaps[i] > _SEEN_FROM:
+                    continue
+                inside = i < len(gaps) - 1  # at the tip, the line goes up to the tip
+                if inside and gaps[i] > -_SAG and self.lines.is_beside(self.stations[i], lines):
                     continue
                 ends = self.stations[[i - 1, min(i + 1, len(gaps) - 1)]]
                 around = np.linspace(ends[0], ends[1], _FINE_STATIONS)
@@ -279,7 +307,10 @@ class ContactProblem:
                 if gap < -_DEEPEST * arm.shape.sections.radius.min():
                     self._deepest = (index, gap)
                     return None
-                found.append(self._touch(index, s))
+                new = self._touch(index, s)
+                if any(abs(s - each) < self.lines.spacing for each in lines):
+                    new = replace(new, line=True, pinned=True)
+                found.append(new)
         return found
 
     def _is_of(self, arm: LeaningArm, j: int, s: float, gap: float) -> bool:
@@ -319,7 +350,9 @@ class ContactProblem:
     def follow(self, start: LeaningArm, end: Condition) -> tuple[LeaningArm, float]:
         """Follow the equilibrium straight to a condition; return the last and its share."""
         arm, share, step, halved = start, 0.0, 1.0, False
-        while share < 1.0:
+        for _ in range(_MOST_STEPS):
+            if share >= 1.0:
+                break
             target = min(1.0, share + step)
             guess = self._guess(arm.state, start.state.condition.towards(end, target))
             self._deepest = None

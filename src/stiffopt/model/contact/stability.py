@@ -31,6 +31,10 @@ _FLATTEST = 1e-3  # 1/m, least second derivative of a gap along the arm
 
 def is_stable(arm: LeaningArm) -> bool:
     """Return whether the energy is at a minimum; without a potential, whether nothing diverges."""
+    touches = enumerate(arm.state.touches)
+    sliding = [j for j, touch in touches if touch.normal_force > 0 and not touch.pinned]
+    if any(arm.bend(j) < -_FLATTEST for j in sliding):
+        return False  # the body enters the surface on both sides of the contact
     K = stiffness_left(arm)
     if arm.state.condition.is_conservative:
         try:

@@ -16,7 +16,7 @@ from stiffopt.model.batch import BatchFunction, InterpretedFunction
 from stiffopt.model.codegen import dense
 from stiffopt.model.compiled import Library, library
 from stiffopt.model.compiler import NATIVE
-from stiffopt.model.contact.surface import surface_function
+from stiffopt.model.contact.surface import surface_functions
 from stiffopt.model.obstacles import OBSTACLES
 from stiffopt.model.shooting import slopes
 
@@ -72,7 +72,7 @@ def contact_functions(
     """Return the step of some sections, and the surfaces of all kinds of objects with a formula."""
     step = step_function(ca.Sparsity(6, 6, starts, rows), weighted, eccentric)
     kinds = [kind for kind in OBSTACLES.values() if not kind.is_interpolated]
-    return [step, *(dense(surface_function(kind)) for kind in kinds)]
+    return [step, *(each for kind in kinds for each in surface_functions(kind))]
 
 
 def step_function(sparsity: ca.Sparsity, weighted: bool, eccentric: bool) -> ca.Function:

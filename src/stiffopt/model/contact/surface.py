@@ -38,7 +38,7 @@ class ContactSurface:
     friction : coefficient.
     softness : depth per normal force, in m/N.
     begin : arc length at rest from which the arm's body counts, in m.
-    key, pieces : kind of the object, and the numbers (k, size) of its formula.
+    key, pieces : kind of the object, and the numbers (k, size) of its formula for contacts.
     is_interpolated : whether its distances come from a grid instead.
     """
 
@@ -50,9 +50,9 @@ class ContactSurface:
         self.softness = 0.0 if item.contact.stiffness is None else 1 / item.contact.stiffness
         self.begin = begin
         self._shape = item.shape
-        self.key, self.pieces = item.shape.key, np.array(item.shape.pieces, dtype=float)
+        self.key, self.pieces = item.shape.key, np.array(item.shape.contact_pieces, dtype=float)
         self.is_interpolated = item.shape.is_interpolated
-        self._function = None if self.is_interpolated else _second_order(type(item.shape))
+        self._functions = None if self.is_interpolated else _interpreted(type(item.shape))
 
     @cached_property
     def _measured(self) -> MeasuredObject:
@@ -60,19 +60,24 @@ class ContactSurface:
 
     def distances(self, points: Vector) -> Vector:
         """Return distances (k,) of points (k, 3), in m."""
-        return self._measured.distances(points).values
+        if self._functions is None:
+            return self._measured.distances(points).values
+        largest: Vector = self._of_pieces(points).max(axis=0)
+        return largest
+
+    def _of_pieces(self, points: Vector) -> Vector:
+        """Return distances (pieces, k) of points (k, 3)."""
+        assert self._functions is not None
+        found = [self._functions[0].many(points, piece)[0][:, 0, 0] for piece in self.pieces]
+        return np.array(found)
 
     def at(self, point: Vector) -> SurfacePoint:
         """Return the distance of one point (3,) with its derivatives."""
-        if self._function is None:
+        if self._functions is None:
             return self._smoothed(point)
-        best = None
-        for piece in self.pieces:
-            value, normal, curvature = self._function(point, piece)
-            if best is None or value[0, 0] > best.distance:
-                best = SurfacePoint(float(value[0, 0]), normal[:, 0], curvature)
-        assert best is not None
-        return best
+        nearest = int(self._of_pieces(point[None]).argmax())
+        value, normal, curvature = self._functions[1](point, self.pieces[nearest])
+        return SurfacePoint(float(value[0, 0]), normal[:, 0], curvature)
 
     def _smoothed(self, point: Vector) -> SurfacePoint:
         """Fit a quadratic to a grid's distances about the point, as the grid is not smooth."""
@@ -97,14 +102,20 @@ _FIT = np.linalg.pinv(
 )
 
 
-def surface_function(kind: type[Obstacle]) -> ca.Function:
-    """Return the function of a point and a piece to distance, gradient and second derivatives."""
-    point, q = ca.SX.sym("point", 3), ca.SX.sym("parameters", kind.n_parameters)
-    hessian, gradient = ca.hessian(kind.formula(point, q), point)
-    outputs = ca.cse([kind.formula(point, q), ca.densify(gradient), ca.densify(hessian)])
-    return dense(ca.Function(f"surface_{kind.key}", [point, q], outputs))
+def surface_functions(kind: type[Obstacle]) -> list[ca.Function]:
+    """Return functions of a point (3,) and a piece's parameters.
+
+    The first has the distance; the second has the gradient (3,) and second derivatives (3, 3) too.
+    """
+    point, q, distance = kind.contact_formula()
+    hessian, gradient = ca.hessian(distance, point)
+    outputs = ca.cse([distance, ca.densify(gradient), ca.densify(hessian)])
+    return [
+        dense(ca.Function(f"surface_distance_{kind.key}", [point, q], [ca.cse(distance)])),
+        dense(ca.Function(f"surface_{kind.key}", [point, q], outputs)),
+    ]
 
 
 @cache
-def _second_order(kind: type[Obstacle]) -> InterpretedFunction:
-    return InterpretedFunction(surface_function(kind))
+def _interpreted(kind: type[Obstacle]) -> list[InterpretedFunction]:
+    return [InterpretedFunction(each) for each in surface_functions(kind)]

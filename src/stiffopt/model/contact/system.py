@@ -29,6 +29,10 @@ if TYPE_CHECKING:
 
 Vector = NDArray[np.float64]
 
+_LEAST_COMPLIANCE = 1e-6  # allowed below zero, as a share of the largest: the integrator's error
+_FLATTEST = 1e-3  # 1/m; with less, a contact's place is undetermined
+_LEAST_SLOPE = 1e-9  # of the gap; with less, a pinned contact stays where it is
+_LIGHT = 1e-5  # N; a contact with less force is a point
 _FLAT = 0.5  # 1/m, least second derivative of a gap in the estimate of a contact's length
 
 
@@ -47,6 +51,7 @@ class Touch:
     drag : friction's force (3,) per normal force, for a sliding contact.
     moment : on the centre line (3,), in N m, of a force that a sticking contact has at the surface.
     crossings : how often it moved from one range to the next during the search.
+    line : whether it is one of the pinned contacts of a line along which the body lies.
     """
 
     surface: int
@@ -58,6 +63,7 @@ class Touch:
     drag: Vector
     moment: Vector = field(default_factory=lambda: np.zeros(3))
     crossings: int = 0
+    line: bool = False
 
 
 class Contacts(NamedTuple):
@@ -100,8 +106,24 @@ class LeaningArm:
     @cached_property
     def is_stable(self) -> bool:
         """Whether the energy is at a minimum, see `stiffopt.model.contact.stability`."""
-        quickly = self.shape.is_stable() if self.state.condition.is_conservative else None
-        return is_stable(self) if quickly is None else quickly
+        conservative = self.state.condition.is_conservative
+        quickly = self.shape.is_stable() if conservative else None
+        if not (is_stable(self) if quickly is None else quickly):
+            return False
+        if not conservative or not self._is_flat:
+            return True
+        C = self.tangent[:3, :3]
+        values = np.linalg.eigvalsh((C + C.T) / 2)
+        return bool(values[0] > -_LEAST_COMPLIANCE * values[-1])
+
+    @property
+    def _is_flat(self) -> bool:
+        """Whether a contact's place along the arm is nearly undetermined.
+
+        The matrix of `stiffopt.model.contact.stability` is then too coarse to tell alone.
+        """
+        touches = enumerate(self.state.touches)
+        return any(self.bend(j) < 2 * _FLAT for j, touch in touches if not touch.pinned)
 
     @cached_property
     def tangent(self) -> Vector:
@@ -138,8 +160,19 @@ class LeaningArm:
         moment = R.T @ shape.moment_far[node]
         xi = shape.sections.strain[here.segment] + C @ np.concatenate([force, moment])
         v, u = xi[:3], xi[3:]
-        slope = np.concatenate([-np.cross(u, force), -np.cross(v, force) - np.cross(u, moment)])
+        weight = R.T @ shape.sections.weight[here.segment]  # reduces the force towards the tip
+        slope = np.concatenate(
+            [-np.cross(u, force) - weight, -np.cross(v, force) - np.cross(u, moment)]
+        )
         return own + float(n @ R @ (np.cross(u, v) + C[:3] @ slope))
+
+    def sag(self, j: int) -> float:
+        """Return the part in 1/m of `bend` that is the shear by the arm's own weight."""
+        segment = self.problem.rod.ranges[self.state.touches[j].range].segment
+        sections, R = self.shape.sections, self.shape.rotation[self.state.mesh.node[j]]
+        weight = R.T @ sections.weight[segment]
+        n = self.rows[j].point.normal
+        return max(0.0, -float(n @ R @ sections.compliance[segment, :3, :3] @ weight))
 
     def kink(self, j: int) -> tuple[float, float]:
         """Return depth and length, in m, of the centre line's kink at a point force.
@@ -147,14 +180,34 @@ class LeaningArm:
         Shear bends the line into the surface on both sides of the force.  In reality the
         force is distributed over this length, along which the line follows the surface.
         """
-        shape, touch, row = self.shape, self.state.touches[j], self.rows[j]
-        here = self.problem.rod.ranges[touch.range]
-        if here.rigid:
+        if self.problem.rod.ranges[self.state.touches[j].range].rigid:
             return 0.0, 0.0
-        d = shape.rotation[self.state.mesh.node[j]].T @ row.point.normal
-        shear = touch.normal_force * float(d @ shape.sections.compliance[here.segment, :3, :3] @ d)
+        shear = self.shear(j)
         bend = max(self.bend(j), _FLAT)
         return shear**2 / (8 * bend), shear / bend
+
+    def reach(self, j: int) -> float:
+        """Return the length in m along which the body really lies on a surface at a contact."""
+        bend, touch = self.bend(j), self.state.touches[j]
+        if touch.normal_force < _LIGHT:
+            return 0.0
+        if bend < _FLATTEST:
+            return np.inf
+        return 0.0 if self.problem.rod.ranges[touch.range].rigid else self.shear(j) / bend
+
+    def is_let_go(self, j: int) -> bool:
+        """Return whether a contact at an end of its range would slide into the range."""
+        touch = self.state.touches[j]
+        here = self.problem.rod.ranges[touch.range]
+        up = touch.station > (here.start + here.end) / 2
+        return (self.rows[j].slope if up else -self.rows[j].slope) > _LEAST_SLOPE
+
+    def shear(self, j: int) -> float:
+        """Return the angle of the centre line's kink at a contact on a soft range."""
+        touch, shape = self.state.touches[j], self.shape
+        d = shape.rotation[self.state.mesh.node[j]].T @ self.rows[j].point.normal
+        C = shape.sections.compliance[self.problem.rod.ranges[touch.range].segment]
+        return touch.normal_force * float(d @ C[:3, :3] @ d)
 
 
 class ContactSystem(LeaningArm):

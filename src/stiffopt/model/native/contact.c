@@ -13,7 +13,7 @@
 #include "functions.h"
 #include "work.h"
 
-#define MOST_CONTACTS 8
+#define MOST_CONTACTS 24
 #define MOST_STEPS 128
 #define MOST_EXTRAS 6
 #define MOST_COLUMNS (3 + 4 * MOST_CONTACTS + MOST_EXTRAS)
@@ -35,7 +35,7 @@ typedef int (*SurfaceFormula)(const double **arg, double **res, casadi_int *iw, 
 
 /* Mirrored by `_Surface` in contact/native.py. */
 typedef struct {
-    SurfaceFormula formula;
+    SurfaceFormula distance, formula; /* the latter with normal and curvature */
     int64_t pieces, size;
     const double *parameters; /* (pieces, size) */
     double softness;
@@ -211,19 +211,26 @@ static int linearise(const Work *work, const Problem *p, Changes *c, int64_t ext
     return 1;
 }
 
+/* Return the distance of a point from a surface and its nearest piece; -INFINITY where it fails. */
+static double distance_from(const Work *work, const Surface *surface, const double *point,
+                            const double **piece) {
+    double largest = -INFINITY, value;
+    work->res[0] = &value;
+    for (int64_t i = 0; i < surface->pieces; i++) {
+        work->arg[0] = point, work->arg[1] = surface->parameters + i * surface->size;
+        if (surface->distance(work->arg, work->res, work->iw, work->w, 0)) return -INFINITY;
+        if (value > largest) largest = value, *piece = work->arg[1];
+    }
+    return largest;
+}
+
 /* Compute distance, normal and curvature of a surface at a point. */
 static int look_at(const Work *work, const Surface *surface, const double *point, Touch *to) {
-    to->distance = -INFINITY;
-    for (int64_t i = 0; i < surface->pieces; i++) {
-        double value, normal[3], curvature[9];
-        work->arg[0] = point, work->arg[1] = surface->parameters + i * surface->size;
-        work->res[0] = &value, work->res[1] = normal, work->res[2] = curvature;
-        if (surface->formula(work->arg, work->res, work->iw, work->w, 0)) return 0;
-        if (!(value > to->distance)) continue;
-        to->distance = value;
-        memcpy(to->normal, normal, sizeof normal), memcpy(to->curvature, curvature, sizeof curvature);
-    }
-    return isfinite(to->distance);
+    const double *piece;
+    if (!isfinite(distance_from(work, surface, point, &piece))) return 0;
+    work->arg[0] = point, work->arg[1] = piece;
+    work->res[0] = &to->distance, work->res[1] = to->normal, work->res[2] = to->curvature;
+    return !surface->formula(work->arg, work->res, work->iw, work->w, 0);
 }
 
 /* Compute the mean tangent at a contact, and its change. */
@@ -506,11 +513,9 @@ void stiffopt_contact_between(const Problem *first, const Problem *last, int64_t
 void stiffopt_contact_distances(const Surface *surface, int64_t count, const double *points,
                                 double *distances) {
     NEW_WORK(work);
-    Touch found;
-    for (int64_t k = 0; k < count; k++) {
-        look_at(&work, surface, points + 3 * k, &found);
-        distances[k] = found.distance;
-    }
+    const double *piece;
+    for (int64_t k = 0; k < count; k++)
+        distances[k] = distance_from(&work, surface, points + 3 * k, &piece);
 }
 
 /* -- stability ------------------------------------------------------------------------------- */
@@ -580,14 +585,15 @@ static double slope_change(const Problem *p, const Touch *touch, const double *s
             to[6 + c] += share * own[i] * near[12 * (3 + i) + c] + crossed[i] * near[12 * i + c];
     for (int c = 0; c < 12 && node > 0; c++)
         for (int i = 0; i < 3; i++) to[c] += (1 - share) * own[i] * (near - 72)[12 * (3 + i) + c];
-    double local[6], xi[6], slope[6], a[3], b[3];
+    double local[6], xi[6], slope[6], a[3], b[3], w[3];
     transposed_times(R, force, local), transposed_times(R, moment, local + 3);
+    transposed_times(R, p->weight + 3 * touch->segment, w); /* reduces the force towards the tip */
     for (int i = 0; i < 6; i++) {
         xi[i] = p->strain[6 * touch->segment + i];
         for (int c = 0; c < 6; c++) xi[i] += C[6 * c + i] * local[c];
     }
     cross(local, xi + 3, slope), cross(local, xi, a), cross(local + 3, xi + 3, b);
-    for (int i = 0; i < 3; i++) slope[3 + i] = a[i] + b[i];
+    for (int i = 0; i < 3; i++) slope[i] -= w[i], slope[3 + i] = a[i] + b[i];
     cross(xi + 3, xi, a);
     for (int i = 0; i < 3; i++) {
         for (int c = 0; c < 6; c++) a[i] += C[6 * c + i] * slope[c];
@@ -635,7 +641,9 @@ int64_t stiffopt_contact_is_stable(const Problem *p, double *K, double *starts) 
                 K[(at + r) * wide + at + c] += held * touch->normal[r] * touch->normal[c] -
                                                f * touch->curvature[3 * r + c];
         if (touch->pinned) continue;
-        double bend = fmax(slope_change(p, touch, starts, slope), FLATTEST);
+        double bend = slope_change(p, touch, starts, slope);
+        if (bend < -FLATTEST && f > 0) return 0; /* the body enters on both sides */
+        bend = fmax(bend, FLATTEST);
         for (int r = touch->node ? 0 : 6; r < 18; r++)
             for (int c = touch->node ? 0 : 6; c < 18; c++)
                 K[(at - 9 + r) * wide + at - 9 + c] += f / bend * slope[r] * slope[c];

@@ -1,0 +1,60 @@
+"""Learn on a trajectory by how much farther than modelled the tip moves, and where to.
+
+Errors of stiffness and gain let the tip's offset d grow with the motion s of the model::
+
+    d = b + A (s - s_0)
+
+Feedback is late by a time T: it averages the offset over a vibration, and the regulators lag. On a
+trajectory with the velocity v the tip is then behind by T A v. With A, the part of the offset that
+grows with the motion is known in advance. A Kalman filter estimates A and b; all axes have the same
+noise, so it has one covariance (4, 4).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stiffopt.control.tuning import MotionErrorTuning
+
+Array = NDArray[np.float64]
+
+
+class MotionErrorEstimator:
+    """Estimates the change of the tip's offset with the motion of the model.
+
+    Attributes
+    ----------
+    slope : A (3, 3), displacement of the tip per displacement of the model's; zero before `learn`.
+    """
+
+    def __init__(self, tuning: MotionErrorTuning) -> None:
+        self._tuning = tuning
+        self.stop()
+
+    def stop(self) -> None:
+        """Forget everything; the next call of `learn` is the first."""
+        self._elapsed = 0.0
+        self._start: Array | None = None
+        self.slope: Array = np.zeros((3, 3))
+
+    def learn(self, elapsed: float, position: Array, offset: Array) -> None:
+        """Take in the position (3,) of the model's tip and its offset (3,), in m.
+
+        `elapsed` is the time since the last call, in s.
+        """
+        t = self._tuning
+        self._elapsed += elapsed
+        if self._start is None:
+            self._start = self._last = position.copy()
+            self._mean = np.vstack([np.zeros((3, 3)), offset])
+            self._covariance = np.diag([t.deviation**2] * 3 + [t.noise**2])
+        elif self._elapsed >= t.every:
+            P, h = self._covariance, np.append(position - self._start, 1.0)
+            speed = float(np.linalg.norm(position - self._last)) / self._elapsed
+            P[3, 3] += t.drift**2 * self._elapsed
+            gain = P @ h / (h @ P @ h + t.noise**2 + (t.late * speed) ** 2)
+            self._mean = self._mean + np.outer(gain, offset - h @ self._mean)
+            self._covariance = P - np.outer(gain, h @ P)
+            self.slope = self._mean[:3].T
+            self._last, self._elapsed = position.copy(), 0.0

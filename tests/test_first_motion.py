@@ -1,0 +1,74 @@
+"""The first motion of an arm that nobody has commissioned is slow until the tip has responded."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from stiffopt.control.controller import TipController
+from stiffopt.control.first_motion import FirstMotion
+from stiffopt.control.tuning import FirstMotionTuning
+from stiffopt.optimise.target import Target
+from stiffopt.optimise.task import Task
+from test_controller import LATERAL, PERIOD, Bench
+
+TUNING = FirstMotionTuning()
+X, Y = np.eye(3)[:2]
+BASE = np.array([0.01, 0.0, 0.2])
+
+
+@pytest.mark.parametrize(
+    ("seen", "responds"),
+    [(X, True), (0.6 * X, True), (1.4 * X, True), (0 * X, False), (-X, False), (Y, False)],
+)
+def test_it_ends_when_the_tip_has_followed_the_model(seen: np.ndarray, responds: bool) -> None:
+    first = FirstMotion(False, TUNING)
+    for way in np.linspace(0.0, 2 * TUNING.way, 20):
+        first.take(BASE + way * X, BASE + [0.0, 2e-3, 0.0] + way * seen)
+        if way < TUNING.way:
+            assert first.slew_share == TUNING.slew_share
+    assert (first.slew_share == math.inf) is responds
+    first.begin()
+    assert first.slew_share == TUNING.slew_share
+
+
+def test_an_arm_that_was_commissioned_is_fast_at_once() -> None:
+    assert FirstMotion(True, TUNING).slew_share == math.inf
+
+
+@pytest.mark.usefixtures("compiled")
+def test_an_arm_with_swapped_channels_is_stopped_before_it_has_moved_far() -> None:
+    """Slowly it goes less far before the doubt; without a fault it arrives all the same."""
+    ways = {}
+    for commissioned, swapped in ((True, True), (False, True), (False, False)):
+        bench = Bench(period=PERIOD)
+        bench.controller = TipController(
+            bench.controller.robot, bench.limits, bench.slew, period=PERIOD,
+            safety=bench.description.safety, vibrates=False, commissioned=commissioned,
+        )  # fmt: skip
+        bench.controller.check()
+        bench.controller.begin(bench.rig.clock.now())
+        start = bench.tip[:3, 3]
+        goal = bench.pose_at([0.2e5, 0.9e5, 0.1e5, 0.3e5, 0.8e5, 0.2e5])[:3, 3]
+        plant = bench.rig.world.plant
+        if swapped:
+            follow = plant.follow
+            plant.follow = lambda p, f=follow: f(np.ascontiguousarray(p[:, [1, 0, 2, 3, 4, 5]]))
+        target = Target(position=tuple(goal.tolist()))
+        task = Task(robot="stiff-flop-2-hanging", target=target, stiffness=LATERAL)
+        bench.controller.set_task(task)
+        tips = []
+        for _ in range(round(4.0 / PERIOD)):
+            bench.run(PERIOD)
+            tips.append(bench.tip[:3, 3])
+            if any(notice.hold for notice in bench.controller.notices()):
+                break
+        if not swapped:
+            assert np.linalg.norm(tips[-1] - goal) < 1e-3
+        else:
+            assert len(tips) < round(4.0 / PERIOD)
+            ways[commissioned] = float(np.linalg.norm(tips[-1] - start))
+    assert ways[False] < 0.012
+    assert ways[False] < ways[True]
