@@ -328,6 +328,9 @@ class Bracing:
         wanted = np.concatenate([error, np.zeros(len(rows) - 3)])
         H = rows.T @ rows + t.pressure_weight**2 * np.eye(rows.shape[1])
         step = np.linalg.solve(H, rows.T @ wanted) * elapsed / t.time
+        moved = float(np.linalg.norm(jacobian @ step))
+        if self._held >= t.settling and moved > t.correction_speed * elapsed:
+            step *= t.correction_speed * elapsed / moved  # a push that is not felt yet is quicker
         before = self._change
         self._change = np.clip(before + step, -t.most_change, t.most_change)
         self._corrected = self._corrected + jacobian @ (self._change - before)
