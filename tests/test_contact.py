@@ -265,6 +265,19 @@ def test_an_arm_along_a_wall_is_that_of_an_energy_minimisation(case):
     assert found.stiffness(np.cross(normal, side)) == pytest.approx(along, rel=0.02)
 
 
+@pytest.mark.parametrize(("share", "within"), [(0.9, False), (1.1, True)])
+def test_the_forces_along_a_line_are_limited_together(share, within):
+    model = robot(TWO.under((3.0, 0.0, 0.0)))
+    total = model.contact_equilibrium(REST, scene(table(0.0005))).normal_forces.sum()
+    limited = scene(table(0.0005), max_force=share * total)
+    found = model.contact_equilibrium(REST, limited)
+    assert found.normal_forces.max() < 0.5 * share * total
+    ((own, force),) = found.pressed()
+    assert own == list(range(len(found.contacts)))
+    assert force == pytest.approx(total, rel=1e-6)
+    assert found.within_limits is within
+
+
 def test_pushes_on_an_arm_that_lies_on_a_table_end():
     model = robot(TWO.under((3.0, 0.0, 0.0)))
     found = model.contact_equilibrium(REST, scene(table(0.0005)))

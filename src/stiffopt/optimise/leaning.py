@@ -338,8 +338,8 @@ class BracedProblem(PressureProblem):
     def refusals(self, eq: ContactEquilibrium) -> Iterator[str]:
         """Yield the reasons why an equilibrium is not acceptable."""
         unit, known = display_units().force, BraceUncertainty(self.robot, eq)
-        for each, doubt in zip(eq.contacts, known.forces, strict=True):
-            force = float(np.linalg.norm(each.force))
+        for own, force in eq.pressed():
+            each, doubt = eq.contacts[own[0]], float(np.sum(known.forces[own]))
             if force + doubt > each.max_force * (1 + 1e-9):
                 more = f", and {unit.text(doubt)} that the calibration leaves in doubt"
                 yield (

@@ -142,8 +142,8 @@ def way_into_contact(robot: Manipulator, solution: PressureSolution) -> list[Con
             f"{1e3 * apart:.2g} mm away, leaning on {quoted(names) or 'nothing'}"
         )
     for eq in states:
-        for each in eq.contacts:
-            force = float(np.linalg.norm(each.force))
+        for own, force in eq.pressed():
+            each = eq.contacts[own[0]]
             if force > each.max_force * (1 + 1e-6):
                 text = display_units().force.text(force, ".3g")
                 raise Unsolved(f"on the way, '{each.object}' would be pressed with {text}")
@@ -201,8 +201,7 @@ def _hold(eq: ContactEquilibrium) -> Hold:
 
 
 def _largest(eq: ContactEquilibrium) -> float:
-    found = [float(np.linalg.norm(each.force)) for each in eq.contacts]
-    return max(found, default=0.0)
+    return max((force for _, force in eq.pressed()), default=0.0)
 
 
 def _check_clear(robot: Manipulator, others: Scene, lines: Vector, at: Vector) -> None:

@@ -132,8 +132,21 @@ class ContactEquilibrium:
 
     @property
     def within_limits(self) -> bool:
-        """Whether no contact force exceeds what the scene allows."""
-        return all(np.linalg.norm(each.force) <= each.max_force for each in self.contacts)
+        """Whether no contact force exceeds what the scene allows; a line of contact is one."""
+        return all(force <= self.contacts[own[0]].max_force for own, force in self.pressed())
+
+    def pressed(self) -> list[tuple[list[int], float]]:
+        """Return contacts that share a limit, and the sum of their forces in N.
+
+        The contacts along a line on an object count as one; the others alone.
+        """
+        groups: dict[tuple[str, int], list[int]] = {}
+        for j, (each, touch) in enumerate(zip(self.contacts, self._arm.state.touches, strict=True)):
+            groups.setdefault((each.object, -1 if touch.line else j), []).append(j)
+        return [
+            (own, float(sum(np.linalg.norm(self.contacts[j].force) for j in own)))
+            for own in groups.values()
+        ]
 
     @property
     def normal_forces(self) -> Vector:
