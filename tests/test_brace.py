@@ -361,6 +361,18 @@ def test_the_reason_for_no_brace(tmp_path, robot, old, new, message):
     assert message in found.message
 
 
+def test_a_rigid_object_at_the_tip_is_no_brace(tmp_path, robot):
+    """Its stiffness along the normal has no limit, and is not the arm's."""
+    capsule = "capsule: {from: [-35 mm, -60 mm, 100 mm], to: [-35 mm, 60 mm, 100 mm], radius: 5 mm}"
+    wall = "half_space: {point: [-40 mm, 0 mm, 0 mm], normal: [1, 0, 0]}"
+    problem = BracedProblem(
+        robot, stiffopt.load_task(written(tmp_path, TASK.replace(capsule, wall)))
+    )
+    eq = robot.contact_equilibrium(np.array([5e4, 0, 0, 5e4, 0, 0]), problem.scene)
+    assert [each.at for each in eq.contacts] == [pytest.approx(robot.length)]
+    assert any("holds the tip itself" in why for why in problem.refusals(eq))
+
+
 @pytest.mark.parametrize("file", sorted(PROBLEMS.glob("leaning_*.yaml")), ids=lambda p: p.stem)
 def test_the_gallery_holds_at_its_golden_pressures(file, monkeypatch):
     monkeypatch.setenv("STIFFOPT_COMPILER", "none")

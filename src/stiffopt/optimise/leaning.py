@@ -78,6 +78,9 @@ class PlacedTip:
         return self.stations[at]
 
 
+_RIGID = 1e5  # N/m, beyond which no arm is stiff by itself
+
+
 class PlacedProgram:
     """Residuals and measures of a program, for an arm with given poses and compliance."""
 
@@ -216,7 +219,8 @@ class BracedProblem(PressureProblem):
             step = (-1.0 if inwards else 1.0) * BRACE.step
             change = step * self.unit[k] * np.eye(len(x))[k]
             seen = self._seen(eq.shifted(change), pushes, known, near, full)
-            differences.append([(b - a) / step for a, b in zip(base, seen, strict=True)])
+            with np.errstate(invalid="ignore"):  # an infinite stiffness has no derivative
+                differences.append([(b - a) / step for a, b in zip(base, seen, strict=True)])
         slopes = Quantities(
             *(np.stack(columns, axis=-1) for columns in zip(*differences, strict=True))
         )
@@ -348,6 +352,9 @@ class BracedProblem(PressureProblem):
                 )
         if not eq.stable:
             yield "the equilibrium is not stable"
+        if self._held_at_tip(eq):
+            yield "an object holds the tip itself, so that its stiffness there is without limit"
+            return
         grips = _GRIPS[: 1 + (self.brace.contacts == "sticking")]
         sure = {"sliding": 1.0, "sticking": known.grip}
         kept = (
@@ -368,6 +375,14 @@ class BracedProblem(PressureProblem):
                 f"a push of the margin leaves a contact force of {unit.text(left + doubt)}, less "
                 f"than the {unit.text(doubt)} that the calibration leaves in doubt"
             )
+
+    def _held_at_tip(self, eq: ContactEquilibrium) -> bool:
+        """Whether a stiffness that is maximised is that of a rigid object, not of the arm."""
+        grip = self.brace.contacts
+        return any(
+            eq.stiffness(m.direction, m.kind, m.boundary, m.frame, grip) > _RIGID
+            for m in self.directions
+        )
 
     def _left_in_doubt(self, eq: ContactEquilibrium, doubt: Vector) -> tuple[float, float]:
         """Return the force that a push of the margin leaves beyond the doubt, and that, in N."""
