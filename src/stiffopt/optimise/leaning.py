@@ -377,7 +377,7 @@ class BracedProblem(PressureProblem):
             )
 
     def _held_at_tip(self, eq: ContactEquilibrium) -> bool:
-        """Whether a stiffness that is maximised is that of a rigid object, not of the arm."""
+        """Return True if a rigid object holds the tip along a direction that is maximised."""
         grip = self.brace.contacts
         return any(
             eq.stiffness(m.direction, m.kind, m.boundary, m.frame, grip) > _RIGID

@@ -187,7 +187,7 @@ class _Trail:
 
     @property
     def is_complete(self) -> bool:
-        """Whether enough descents in a row have found nothing new, and enough the best optimum."""
+        """True if enough descents in a row found nothing new, and enough found the best."""
         return self._nothing_new >= self._agreeing and self._agreeing_on_best >= self._best_found
 
     @property

@@ -104,7 +104,7 @@ class PathSolution(ShownInNotebook):
 
     @property
     def leans(self) -> NDArray[np.bool_]:
-        """Whether the arm is in contact at each point, (N,)."""
+        """Flags (N,) of the points at which the arm is in contact."""
         own = [bool(eq.contacts) for eq in self.equilibria]
         return np.array([False] * (len(self.times) - len(own)) + own)
 

@@ -132,7 +132,7 @@ class ContactEquilibrium:
 
     @property
     def within_limits(self) -> bool:
-        """Whether no contact force exceeds what the scene allows; a line of contact is one."""
+        """True if no force exceeds what the scene allows; forces along a line are added."""
         return all(force <= self.contacts[own[0]].max_force for own, force in self.pressed())
 
     def pressed(self) -> list[tuple[list[int], float]]:
