@@ -57,6 +57,13 @@ def flexibilities(at: float) -> tuple[float, float, float]:
     return bend * length**3 / 3 + shear * length, between, bend * at**3 / 3 + shear * at
 
 
+def euler_load() -> float:
+    """Of a straight arm that is free at the tip, in N: ``P (1 + P/GA - P/EA) = (pi / 2L)^2 EI``."""
+    law, length = rod_section(FLOP, np.zeros(3), TWO.gravity), TWO.length
+    bend, shear, stretch = law.compliance[3, 3], law.compliance[1, 1], law.compliance[2, 2]
+    return float(np.roots([shear - stretch, 1.0, -((np.pi / (2 * length)) ** 2) / bend]).max())
+
+
 # -- closed forms ---------------------------------------------------------------------------------
 
 
@@ -283,7 +290,10 @@ def test_pushes_on_an_arm_that_lies_on_a_table_end():
     found = model.contact_equilibrium(REST, scene(table(0.0005)))
     for way in np.concatenate([np.eye(3), -np.eye(3)]):
         loss = found.lift_off(way)
-        assert loss.how in ("lifts off", "holds")
+        along = way[2] < 0
+        assert loss.how in (("buckles",) if along else ("lifts off", "holds"))
+        if along:
+            assert loss.force == pytest.approx(euler_load(), rel=0.015)
         assert loss.stiffness > 0
     lifted = found.lift_off((-1, 0, 0))
     assert (lifted.object, lifted.at) == ("0", pytest.approx(TWO.length))
@@ -291,6 +301,16 @@ def test_pushes_on_an_arm_that_lies_on_a_table_end():
     assert 1e-4 / (near.tip_pose[1, 3] - found.tip_pose[1, 3]) == pytest.approx(
         found.stiffness((0, 1, 0)), rel=1e-3
     )
+
+
+@pytest.mark.parametrize("contacts", ["sliding", "sticking"])
+@pytest.mark.parametrize("sideways", [0.0, 2e-4])
+def test_a_push_along_the_arm_buckles_it_next_to_the_post(contacts, sideways):
+    """Across the post's normal it is a free column."""
+    found = robot().contact_equilibrium(REST, scene(post(0.12, 1e-5)), load=push(5e-4))
+    lost = found.lift_off((sideways, 0.0, -1.0), contacts=contacts)
+    assert (lost.how, lost.object, lost.stiffness_after) == ("buckles", None, 0.0)
+    assert lost.force == pytest.approx(euler_load(), rel=0.015)
 
 
 def test_pushes_and_paths_have_a_greatest_number_of_steps(monkeypatch):

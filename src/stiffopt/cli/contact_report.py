@@ -84,7 +84,8 @@ def summary(robot: Manipulator, found: ContactEquilibrium) -> RenderableType:
     headings = ("along", "free", "sliding", "sticking", "lost at +", "lost at -")
     remark = (
         f"{units.stiffness}, contacts sliding and sticking; lost: the push at the tip, along and "
-        f"against the axis, by which the first contact lifts off if all slide, in {units.force}"
+        "against the axis, by which the first contact lifts off or the arm buckles if all slide, "
+        f"in {units.force}"
     )
     parts.append(TextTable("", headings, lines, remark).renderable())
     return Group(*parts)

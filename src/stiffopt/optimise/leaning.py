@@ -358,14 +358,15 @@ class BracedProblem(PressureProblem):
         grips = _GRIPS[: 1 + (self.brace.contacts == "sticking")]
         sure = {"sliding": 1.0, "sticking": known.grip}
         kept = (
-            sure[each.contacts] * each.loss.force
+            (sure[each.contacts] * each.loss.force, each.loss.object is not None)
             for each in self.preloads(eq)
             if each.contacts in grips
         )
-        least = min(kept, default=np.inf)
+        least, is_contact = min(kept, default=(np.inf, True))
         if least < self.brace.margin * (1 - 1e-6):
+            what = "takes a contact away" if is_contact else "makes the arm buckle"
             yield (
-                f"a push of {unit.text(least)} takes a contact away; the margin is "
+                f"a push of {unit.text(least)} {what}; the margin is "
                 f"{unit.text(self.brace.margin)}"
             )
             return
