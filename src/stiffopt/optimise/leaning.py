@@ -78,7 +78,7 @@ class PlacedTip:
         return self.stations[at]
 
 
-_RIGID = 1e5  # N/m, beyond which no arm is stiff by itself
+RIGID = 1e5  # N/m, beyond which no arm is stiff by itself
 
 
 class PlacedProgram:
@@ -366,8 +366,7 @@ class BracedProblem(PressureProblem):
         if least < self.brace.margin * (1 - 1e-6):
             what = "takes a contact away" if is_contact else "makes the arm buckle"
             yield (
-                f"a push of {unit.text(least)} {what}; the margin is "
-                f"{unit.text(self.brace.margin)}"
+                f"a push of {unit.text(least)} {what}; the margin is {unit.text(self.brace.margin)}"
             )
             return
         left, doubt = self._left_in_doubt(eq, known.forces)
@@ -381,7 +380,7 @@ class BracedProblem(PressureProblem):
         """Return True if a rigid object holds the tip along a direction that is maximised."""
         grip = self.brace.contacts
         return any(
-            eq.stiffness(m.direction, m.kind, m.boundary, m.frame, grip) > _RIGID
+            eq.stiffness(m.direction, m.kind, m.boundary, m.frame, grip) > RIGID
             for m in self.directions
         )
 
