@@ -649,6 +649,22 @@ def test_an_arm_in_a_bent_tube_is_where_an_independent_rod_is():
     assert found.stiffness(X) == pytest.approx(17.313, rel=0.02)
 
 
+def test_a_line_in_a_tube_is_found_with_other_contacts_along_it(monkeypatch):
+    """The way is lost with contacts one radius apart; the rod is the one above."""
+    points = [(0, 0, -0.03), (0, 0, 0.16573), (0.03655, 0.00223, 0.36235)]
+    tube = {"inside_tube": {"points": points, "radius": 0.02407}}
+    p, model = [59170, 2470, 25290, 79940, 73380, 0], robot(TWO.under((6.0, 0, 5.0), 0.0))
+    found = model.contact_equilibrium(p, scene(tube))
+    assert found.tip_pose[:3, 3] == pytest.approx([3.4491e-3, -8.6904e-3, 191.3427e-3], abs=3e-5)
+    assert found.normal_forces.sum() == pytest.approx(393.3e-3, rel=0.01)
+    assert found.stiffness(X) == pytest.approx(19.23, rel=0.02)
+    near = model.contact_equilibrium(np.add(p, 100.0), scene(tube), nearby=found)
+    assert np.linalg.norm(near.tip_pose[:3, 3] - found.tip_pose[:3, 3]) < 2e-4
+    monkeypatch.setattr("stiffopt.model.contact.equilibrium.SPACINGS", (1.0,))
+    with pytest.raises(EquilibriumError, match="lying along"):
+        model.contact_equilibrium(p, scene(tube))
+
+
 def test_a_contact_in_a_tube_opens_while_another_one_holds():
     """Its force is then against that of the other contact, which must not seem to have turned."""
     points = [(0, 0, -0.03), (0, 0, 0.106), (0.0012, -0.0005, 0.166), (0.0382, 0.0176, 0.3615)]
