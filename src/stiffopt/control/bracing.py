@@ -331,11 +331,11 @@ class Bracing:
         wanted = np.concatenate([error, np.zeros(len(rows) - 3)])
         H = rows.T @ rows + t.pressure_weight**2 * np.eye(rows.shape[1])
         step = np.linalg.solve(H, rows.T @ wanted) * elapsed
-        has_settled = self._held >= t.settling
-        step /= t.time if has_settled else t.first_time
-        moved = float(np.linalg.norm(jacobian @ step))
-        if has_settled and moved > t.correction_speed * elapsed:
-            step *= t.correction_speed * elapsed / moved  # a push that is not felt yet is quicker
+        time, speed = t.first_time, t.first_speed
+        if self._held >= t.settling:  # a push that is not felt yet is quicker
+            time, speed = t.time, t.correction_speed
+        step /= time
+        step *= min(1.0, speed * elapsed / max(float(np.linalg.norm(jacobian @ step)), 1e-12))
         before = self._change
         self._change = np.clip(before + step, -t.most_change, t.most_change)
         self._corrected = self._corrected + jacobian @ (self._change - before)
