@@ -223,6 +223,8 @@ class ContactEquilibrium:
             d = self._arm.shape.rotation[0].T @ d
         with np.errstate(divide="ignore"):
             found = float(stiffness_of(self.compliance(contacts), d, kind, boundary))
+        if found < 0 and self.stable:
+            return np.inf  # a contact that slides holds the tip, but for the error of lines
         return rigid_if_huge(1 / found) if found and kind == "translation" else found
 
     @property

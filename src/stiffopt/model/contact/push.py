@@ -55,7 +55,6 @@ class _Tangent(NamedTuple):
     moves : of the nodes (N + 1, 3) per push.
     turn : of the tip per push, in rad/N.
     stiffness : along the push, in N/m.
-    is_stable : whether no force or moment at the tip moves it against itself.
     """
 
     system: ContactSystem
@@ -64,7 +63,6 @@ class _Tangent(NamedTuple):
     moves: Vector
     turn: float
     stiffness: float
-    is_stable: bool
 
 
 class GrowingPush:
@@ -105,7 +103,7 @@ class GrowingPush:
             if missed and step > _NEW_CONTACT * total:
                 step /= 2
                 continue
-            if not self._tangent(found, sticking).is_stable:
+            if not self._is_stable(found, sticking):
                 if step < _SAME_LOSS * (force + step):
                     return ContactLoss(force, None, None, "buckles", tangent.stiffness, 0.0)
                 step /= 2
@@ -147,15 +145,21 @@ class GrowingPush:
         turn = float(np.linalg.norm(changes[0, TURN, :3] @ self._direction))
         rates = solution[:, :3] @ self._direction
         stiffness = rigid_if_huge(float(self._direction @ along[0]))
-        is_stable = self._is_stable(system.of_tip(solution)[:6])
-        return _Tangent(system, solution, rates, along, turn, stiffness, is_stable)
+        return _Tangent(system, solution, rates, along, turn, stiffness)
 
-    def _is_stable(self, compliance: Vector) -> bool:
-        """Return False where the stability was lost under the growing push.
+    def _is_stable(self, arm: LeaningArm, sticking: Collection[int]) -> bool:
+        """Return whether an arm is stable, with contacts that slide, or else with those that stick.
 
-        A stiffness passes zero there, so a compliance (6, 6) of the tip passes infinity and becomes
-        negative.
+        With the latter, a stiffness passes zero where stability is lost, so a compliance of the tip
+        passes infinity and becomes negative.
         """
+        settled = self._problem.settle(arm.state)  # points may have become lines
+        if settled is not None and settled.is_stable:
+            return True
+        if not sticking:
+            return False
+        tangent = self._tangent(arm, sticking)
+        compliance = tangent.system.of_tip(tangent.solution)[:6]
         scale = np.repeat([1.0, 1 / self._problem.rod.arm.length], 3)
         values = np.linalg.eigvals(scale[:, None] * compliance * scale)
         return not (values.real < -LEAST_COMPLIANCE * np.abs(values).max() - abs(values.imag)).any()
@@ -180,21 +184,21 @@ class GrowingPush:
                 step = ahead / 2
                 continue
             forces = _forces(found)
-            if not found.is_stable:
+            if (forces < -_FORCE_LEFT).any():
+                step = ahead * min(0.9, max(0.1, float((own / (own - forces))[forces < 0].min())))
+                continue
+            settled = self._problem.settle(found.state) or found  # points may become lines
+            if not settled.is_stable:
                 if ahead < _SAME_LOSS * (force + ahead):
                     return ContactLoss(force, None, None, "buckles", stiffness, 0.0)
                 step = ahead / 2
                 continue
-            if (forces < -_FORCE_LEFT).any():
-                step = ahead * min(0.9, max(0.1, float((own / (own - forces))[forces < 0].min())))
-                continue
-            arm, force, step = found, force + ahead, np.inf
+            force, step = force + ahead, np.inf
             if (forces < _FORCE_LEFT).any():
-                return self._lifted(arm, force, int(np.argmin(forces)))
+                return self._lifted(found, force, int(np.argmin(forces)))
+            arm = settled
             if force >= self._limit * (1 - 1e-12):
                 return ContactLoss(np.inf, None, None, "holds", begin, begin)
-            if self._problem.missed(arm):
-                arm = self._problem.settle(arm.state) or arm
         return ContactLoss(force, None, None, "stalls", stiffness, 0.0)
 
     def _rates(self, arm: LeaningArm) -> tuple[Vector, float, float]:
