@@ -345,7 +345,7 @@ class TipController:
             return ControlOutput(last.copy(), False, self._feedback.saturated.copy())
         self._set_reference_rate()
         reference.omega = self._arm.tip.omega
-        reference.advance(plan)
+        reference.advance(self._awaited(plan, now))
         if self._arm.leaning is not None:
             return self._feedforward(reference.command - pressures.command_offset, last)
         tip = self._arm.on_path(reference.path[:n])
@@ -367,6 +367,21 @@ class TipController:
         if command is None:
             return ControlOutput(last.copy(), False, self._feedback.saturated.copy())
         return ControlOutput(command, True, self._feedback.saturated.copy())
+
+    def _awaited(self, plan: Array, now: float) -> Array:
+        """Return the reference's goal (n + 6,): the plan, unless channels do not follow.
+
+        The reference waits for them where it is, and a trajectory of pressures too.
+        """
+        pace, course = self._arm.channels.pace, self.replanner.pursuit.course
+        if pace == 1 or isinstance(course, Bracing):
+            return plan
+        if isinstance(course, PostureCourse):
+            course.wait((1 - pace) * min(now - self._computed_at, _HELD * self._period))
+            return plan
+        path = self._reference.path
+        goal: Array = path + pace * (plan - path)
+        return goal
 
     def _feedforward(self, pressures: Array, last: Array) -> ControlOutput:
         """Command pressures (n,) without feedback: contacts change how the arm vibrates."""
