@@ -340,6 +340,12 @@ class TipController:
         newly_lost = lost is not self._lost and (lost & ~self._lost).any()
         if self._at_rest or newly_lost:  # they are not where the reference is
             self.resume(now)
+        if newly_lost:
+            estimate = self._arm.tip.estimate
+            self.replanner.go_straight(
+                now, estimate.position, estimate.rotation, self._reference.path[:n], self._offset
+            )
+            plan = self._reference.path
         self._lost = lost
         if self._model_is_wrong():
             return ControlOutput(last.copy(), False, self._feedback.saturated.copy())

@@ -167,6 +167,11 @@ class ReplanningTuning:
     # change of a target, in m, after which all configurations are searched
     far_position: float = 5e-3
     far_angle: float = math.radians(5)  # the same of its orientation or pointing, in rad
+    # speed of the tip on its straight way after a loss of channels, in m/s; largest change of a
+    # pressure from plan to plan meanwhile, and one with which it has arrived, in Pa
+    detour_speed: float = 0.03
+    detour_step: float = 5e3
+    detour_rest: float = 1e3
     # change of an available pressure, in Pa, after which all configurations are searched
     other_pressure: float = 1e4
 
