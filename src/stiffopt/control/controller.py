@@ -375,11 +375,11 @@ class TipController:
         return ControlOutput(command, True, self._feedback.saturated.copy())
 
     def _awaited(self, plan: Array, now: float) -> Array:
-        """Return the reference's goal (n + 6,): the plan, unless channels do not follow.
+        """Return the reference's goal (n + 6,): the plan, unless channels or tip do not follow.
 
         The reference waits for them where it is, and a trajectory of pressures too.
         """
-        pace, course = self._arm.channels.pace, self.replanner.pursuit.course
+        pace, course = min(self._arm.channels.pace, self._arm.watch.pace), self.replanner.pursuit.course
         if pace == 1 or isinstance(course, Bracing):
             return plan
         if isinstance(course, PostureCourse):
