@@ -211,7 +211,7 @@ class Replanner:
             search = self._search and course is None and detour is None
             self._requested_at, self._search = now, False
             later = now + delay + self._lead
-            if detour is not None:
+            if detour is not None and later < detour.end:
                 target = detour.at(later)
             if isinstance(course, Course):  # the target when the reference will be there
                 target = course.at(later, delay / 2)  # the spread of four equal lags

@@ -120,7 +120,7 @@ class ReferenceTuning:
 class FirstMotionTuning:
     """The first motion of an arm that is not known to respond as modelled (`FirstMotion`)."""
 
-    slew_share: float = 0.15  # share of the slew that the reference may take
+    slew_share: float = 0.1  # share of the slew that the reference may take
     # way of the model's tip after which it ends, in m, if the tip has followed with an error of at
     # most a share of that way
     way: float = 8e-3
