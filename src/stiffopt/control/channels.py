@@ -159,7 +159,8 @@ class Channels:
         ignores = still & np.stack([falls | rises, falls])
         moved = reading - self._followed[2]  # NaN: not measured
         opposed = (falls & (moved > self._probe)) | (rises & (moved < -self._probe))
-        self.opposed = (self.opposed | opposed) & (follows == 0)
+        # a supply that fails while the command rises is short, not opposed
+        self.opposed = (self.opposed | opposed) & (follows == 0) & ~self.limited
         self._smoothed = np.where(ignores[0], reading, self._smoothed)
         share = -math.expm1(-elapsed / self._tuning.make_up_time)
         wanted = np.minimum(np.maximum(short, self._min_allowed), self._max_allowed)
