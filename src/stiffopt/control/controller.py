@@ -369,6 +369,7 @@ class TipController:
             reference.command - pressures.command_offset,
             self._arm.channels.commands(reference.path[:n], *self._permitted),
             isinstance(course, Course),
+            self._first_motion.largest_correction(tip.pose[:3, 3]),
         )
         if command is None:
             return ControlOutput(last.copy(), False, self._feedback.saturated.copy())

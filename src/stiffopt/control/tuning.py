@@ -125,6 +125,8 @@ class FirstMotionTuning:
     # most a share of that way
     way: float = 8e-3
     error: float = 0.5
+    # largest correction by feedback at first, in m; it grows with the reference's way by `error`
+    correction: float = 2e-3
 
 
 @dataclass(frozen=True)
