@@ -12,10 +12,11 @@ distances of the tip over all runs, in mm, until it is vented; and the state in 
 distance is from the way that the tip takes without a fault (but with a push that the row has too).
 The second is what the loop causes of it: the distance from that way and from the one on which the
 fault alone takes the tip, with the commands frozen from its beginning. They differ where a chamber
-bursts or a gauge or tracker shows a motion that is none; all that follows from commands after the
-fault counts, those before it is visible included. A push or a payload must not be detected as a
-fault. Below each row on the way, both distances of each run, and what was told. With `--commission`, `stiffopt commission --quick` looks for the faults of the
-set-up instead: its first finding, whether it permits arming, and how far the tip moved from rest.
+bursts or leaks, or something pushes the arm; all that follows from commands after the beginning of
+the fault counts, also before the fault is visible. A push or a payload must not be detected as a
+fault. Below each row on the way, both distances of each run, and what was told. With
+`--commission`, `stiffopt commission --quick` looks for the faults of the set-up instead: its first
+finding, whether it permits arming, and how far the tip moved from rest.
 """
 
 from __future__ import annotations
@@ -514,7 +515,10 @@ def _looped(cases: list[Case], rows: list[Row], dynamics: str) -> list[list[str]
         kinds = Counter(outcome.kind for outcome in noticed)
         ends = Counter(outcome.end for outcome in found)
         off = [
-            (_farthest(outcome.tips, way), _farthest(outcome.tips, _with_fault(case, row, dynamics, way)))
+            (
+                _farthest(outcome.tips, way),
+                _farthest(outcome.tips, _with_fault(case, row, dynamics, way)),
+            )
             for case, way, outcome in zip(cases, ways, found, strict=True)
             if len(outcome.tips)
         ]

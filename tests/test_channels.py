@@ -220,7 +220,7 @@ def test_the_reference_waits_for_a_channel_that_is_behind_but_not_for_ever() -> 
     assert line.channels.pace < 0.3
     paces = []
     for _ in range(round(4.0 / PERIOD)):  # a gauge that reads too much from now on
-        line.estimator.advance(1, line.command, line.command + [2e4, 0.0, 0.0])
+        line.estimator.advance(1, line.command, line.command + np.array([2e4, 0, 0]))
         paces.append(line.channels.pace)
     assert min(paces) < 0.7
     assert paces[-1] == 1.0

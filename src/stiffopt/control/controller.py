@@ -380,7 +380,10 @@ class TipController:
 
         The reference waits for them where it is, and a trajectory of pressures too.
         """
-        pace, course = min(self._arm.channels.pace, self._arm.watch.pace), self.replanner.pursuit.course
+        pace, course = (
+            min(self._arm.channels.pace, self._arm.watch.pace),
+            self.replanner.pursuit.course,
+        )
         if pace == 1 or isinstance(course, Bracing):
             return plan
         if isinstance(course, PostureCourse):

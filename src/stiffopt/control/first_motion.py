@@ -50,7 +50,7 @@ class FirstMotion:
         self._responds = size > self._tuning.way and off < self._tuning.error * size
 
     def largest_correction(self, on_path: Array) -> float:
-        """Return the largest correction of the tip with the model on the reference at (3,), in m."""
+        """Return the largest correction, in m, with the model's tip on the reference at (3,)."""
         if self._responds:
             return math.inf
         if self._on_path is None:

@@ -240,7 +240,7 @@ class MotionWatch:
         )
 
     def _missed(self, rows: Array, jacobian: Array, P: Array) -> _Miss:
-        """Return where the model's way and the seen one fit least. They are projected by P (3, 3)."""
+        """Return where the model's way and the seen one, projected by P (3, 3), fit least."""
         tuning = self._tuning
         ways = rows[-1] - rows[:-1]
         way, seen = ways[:, _PREDICTED] @ P, ways[:, _SEEN] @ P

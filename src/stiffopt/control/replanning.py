@@ -225,7 +225,8 @@ class Replanner:
             request = PlanRequest(
                 self._serial, task, target, self._offset.copy(), pressure_offset, search,
                 *available, windows=windows, adapted=self.adapted, stay=stay,
-                last=self._detour_from, step=math.inf if detour is None else self._tuning.detour_step,
+                last=self._detour_from,
+                step=math.inf if detour is None else self._tuning.detour_step,
             )  # fmt: skip
             self._detour_from = None
             self._planner.request(request if way is None else replace(request, way=way))

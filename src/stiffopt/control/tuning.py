@@ -77,8 +77,8 @@ class RegulatorTuning:
     rest_range: float = 1e4
     gain_error: float = 0.05
     usual_time: float = 30.0
-    # pressure by which a channel is behind, beyond `follows`, at which the reference stands still, in
-    # Pa, and time constant with which it no longer waits, in s
+    # pressure by which a channel is behind, beyond `follows`, at which the reference stands still,
+    # in Pa, and time constant with which it no longer waits, in s
     longest_wait: float = 1e4
     wait_time: float = 1.0
     let_down_share: float = 0.1  # share of the slew with which a removed channel is let down
