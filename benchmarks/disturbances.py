@@ -522,7 +522,7 @@ def _looped(cases: list[Case], rows: list[Row], dynamics: str) -> list[list[str]
             for case, way, outcome in zip(cases, ways, found, strict=True)
             if len(outcome.tips)
         ]
-        whole, caused = np.max(off, axis=0, initial=0.0)
+        whole, caused = np.max([(0.0, 0.0), *off], axis=0)
         lines.append([
             row.name,
             f"{len(noticed)} of {len(found)}{'' if row.is_fault else ' (none should)'}",
