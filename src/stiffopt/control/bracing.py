@@ -283,7 +283,8 @@ class Bracing:
         sticks = self.task.brace.contacts == "sticking"
         self.force = float(forces[weakest])
         self.margin = max(min(left, slip) if sticks else left, 0.0)
-        how = "lifts off" if self.force <= 0 else "slips" if sticks and slip <= 0 else ""
+        none = self._tuning.lost_share * before[weakest]
+        how = "lifts off" if self.force <= none else "slips" if sticks and slip <= 0 else ""
         self._lost = self._lost + 1 if how else 0
         where = f"on '{self.approach.contacts[weakest].object}'"
         words = f"under a push of {1e3 * size:.0f} mN"

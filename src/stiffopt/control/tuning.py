@@ -504,6 +504,8 @@ class BracingTuning:
     usual_push: float = 0.1
     every: float = 0.03  # interval of checks of the contacts, in s
     looks: int = 2  # successive checks
+    # of its force, below which the estimate cannot tell it from none
+    lost_share: float = 0.08
     weak_share: float = 0.4  # of its force, below which a contact that a push relieves may lift off
     # time constants with which the tip goes to its target, at first and once it has settled, in s
     first_time: float = 2.0
