@@ -57,6 +57,8 @@ class Press(Schema):
     def refusal(self, rotation: Array, compliance: Array) -> str:
         """Return why a force along the direction could not be felt, or "".
 
+        The direction must be soft enough, and the force more than the allowed error of a felt one.
+
         Parameters
         ----------
         rotation : (3, 3)
@@ -67,6 +69,13 @@ class Press(Schema):
         felt = Feeling.of(self.direction_in_base(rotation), compliance)
         allowed = FELT_SHARE * self.force + FELT_FORCE
         deviation = felt.deviation(POSITION_ERROR)
+        if self.force <= allowed:
+            return (
+                f"the arm cannot feel so small a force: with an error of up to "
+                f"{100 * FELT_SHARE:g} % + {1e3 * FELT_FORCE:g} mN, {1e3 * self.force:.3g} mN "
+                "may be none at all; press with more than "
+                f"{1e3 * FELT_FORCE / (1 - FELT_SHARE):.3g} mN"
+            )
         if felt.share >= LEAST_SHARE and deviation <= allowed:
             return ""
         return (
