@@ -486,6 +486,8 @@ def test_a_press_is_planned_as_its_reaction() -> None:
         (Press(force=0.03, direction=(0, 0, 1)), "cannot feel"),
         (Press(force=0.5, direction=(1, 0, 0)), "cannot hold 0.5 N there"),
         (Press(force=0.0037, direction=(1, 0, 0)), "press with more than 3.75 mN"),
+        (Press(force=0.03, direction=(1, 0, 0), tolerance=0.03), "may be none at all"),
+        (Press(force=0.03, direction=(1, 0, 0), speed=0.1), "press.speed must be at most"),
     ],
 )
 def test_what_cannot_be_held_or_felt_is_refused(press: Press, why: str) -> None:
