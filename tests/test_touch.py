@@ -322,7 +322,11 @@ def test_it_goes_back_from_an_object_on_the_way_that_lets_the_target_unreached(
     pressing, creep = Pressing(PRESS, TARGET, PressingTuning()), Spring(1.0, 1.0).creep
     c, wall, free, forces = COMPLIANCE[0, 0], 0.019, 0.0, []
     none = TipForce(False, np.zeros(3), 1e-6 * np.eye(3), np.zeros(3))
-    for _ in range(800):
+    for tick in range(1600):
+        if tick == 800:
+            assert pressing.phase is Phase.ENDED
+            assert forces[-1] == 0.0
+            wall -= 4e-3  # the object follows, and the tip goes back once more
         forces.append(max(0.0, stiffness * (free - wall) / (1 + stiffness * c)))
         tip = np.array([free - c * forces[-1], 0.0, 0.1])
         offset = np.array([tip[0] - free, 0.0, 0.0, 0.0, 0.0, 0.0])
@@ -334,7 +338,7 @@ def test_it_goes_back_from_an_object_on_the_way_that_lets_the_target_unreached(
     assert pressing.phase is Phase.ENDED
     assert max(forces) < 0.1
     assert forces[-1] == 0.0
-    assert tip[0] == pytest.approx(wall - PressingTuning().clear, abs=5e-4)
+    assert tip[0] == pytest.approx(wall - PressingTuning().clear, abs=1e-3)
 
 
 def test_an_error_of_the_model_that_feedback_removes_holds_nothing_back() -> None:

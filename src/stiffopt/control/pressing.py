@@ -177,10 +177,13 @@ class Pressing:
             in base axes.
         """
         t = self._tuning
+        is_free = self.phase in (Phase.GOING, Phase.ENDED)
+        aim = np.array(self._target.position, dtype=float)
+        if is_free and self._watch.take(tip, offset, aim):
+            self._leave(tip, offset, creep)
+        if self.phase is Phase.ENDED:
+            return
         if self.phase is Phase.GOING:
-            if self._watch.take(tip, offset, np.array(self._target.position, dtype=float)):
-                self._leave(tip, offset, creep)
-                return
             self._waited = self._waited + elapsed if arrived else 0.0
             self._pushed = self._pushed + elapsed if felt.touches else 0.0
             n = self.press.direction_in_base(rotation)
@@ -212,14 +215,18 @@ class Pressing:
             if self._blocked:
                 self._go_clear(gone, tip)
             elif self._shift <= 0.0:
-                self._shift, self.phase, self.force = 0.0, Phase.ENDED, math.nan
+                self._end()
+
+    def _end(self) -> None:
+        self._shift, self.phase, self.force = 0.0, Phase.ENDED, math.nan
+        self._watch.begin()
 
     def _go_clear(self, gone: float, tip: Array) -> None:
         """End the retreat from an object before the target once the tip has left it; stay there."""
         t = self._tuning
         if gone < -t.clear or self._shift < -t.most_back:
             self._target = self._target.model_copy(update={"position": tuple(tip.tolist())})
-            self._shift, self.phase, self.force = 0.0, Phase.ENDED, math.nan
+            self._end()
 
     def _approach(self, elapsed: float, gone: float, compliance: float) -> None:
         press, t = self.press, self._tuning
@@ -269,7 +276,7 @@ class Pressing:
         return self._shift - gone
 
     def _leave(self, tip: Array, offset: Array, creep: CreepEstimator) -> None:
-        """Begin to go back from an object before the target; nothing jumps."""
+        """Begin to go back from an object at the target, or that has come there; nothing jumps."""
         withheld = self._watch.withheld
         self._shift = float(np.linalg.norm(withheld))
         self._direction, self._start = withheld / self._shift, tip.copy()
@@ -278,8 +285,9 @@ class Pressing:
         self._block()
 
     def _block(self) -> None:
+        why = "something holds the tip at the target, where it must be free"
+        self._retreat(self._why if self.phase is Phase.ENDED else why)
         self._blocked = True
-        self._retreat("something holds the tip at the target, where it must be free")
 
     def _retreat(self, why: str) -> None:
         self.phase, self._why = Phase.RETREATING, why
