@@ -311,7 +311,9 @@ def test_it_goes_back_when_the_tip_touched_something_before_the_approach(inside:
     assert arm.forces[-1] == 0.0
     assert arm.pressing.phase is Phase.ENDED
     assert "holds the tip at the target" in arm.pressing.notices()[0].text
-    assert arm.pressing.at(0.0).position == pytest.approx((0.017 - inside, 0.0, 0.1), abs=1e-4)
+    position = arm.pressing.at(0.0).position
+    assert position is not None
+    assert 2e-3 < 0.02 - inside - cast("float", position[0]) < 5e-3
 
 
 @pytest.mark.parametrize("stiffness", [100.0, 2e3])
@@ -338,7 +340,7 @@ def test_it_goes_back_from_an_object_on_the_way_that_lets_the_target_unreached(
     assert pressing.phase is Phase.ENDED
     assert max(forces) < 0.1
     assert forces[-1] == 0.0
-    assert tip[0] == pytest.approx(wall - PressingTuning().clear, abs=1e-3)
+    assert 2e-3 < wall - tip[0] < 5e-3
 
 
 def test_an_error_of_the_model_that_feedback_removes_holds_nothing_back() -> None:

@@ -76,6 +76,8 @@ class Pressing:
         self._watch = ObstructionWatch(tuning.obstruction)
         self._free = False  # whether it is known whether the tip was free when the approach began
         self._blocked = False  # whether it was not, or an object keeps it from the target
+        # ways of the tip and of the arm on the way back from it, and the way on which both were one
+        self._before, self._clear = (0.0, 0.0), 0.0
         self._notices: list[Notice] = []
 
     def at(self, now: float) -> Target:
@@ -205,7 +207,7 @@ class Pressing:
         if self.touches_on_purpose and not self._blocked and not self._free:
             self._free = way > self._tuning.free_way
             if self._free and gone < self._tuning.free_share * way:
-                self._block()
+                self._block(gone, way)
         if self.phase is Phase.APPROACHING:
             self._approach(elapsed, gone, feeling.compliance)
         elif self.phase is Phase.PRESSING:
@@ -213,7 +215,7 @@ class Pressing:
         elif self.phase is Phase.RETREATING:
             self._shift -= self.press.speed * elapsed
             if self._blocked:
-                self._go_clear(gone, tip)
+                self._go_clear(gone, way, tip)
             elif self._shift <= 0.0:
                 self._end()
 
@@ -221,10 +223,18 @@ class Pressing:
         self._shift, self.phase, self.force = 0.0, Phase.ENDED, math.nan
         self._watch.begin()
 
-    def _go_clear(self, gone: float, tip: Array) -> None:
-        """End the retreat from an object before the target once the tip has left it; stay there."""
-        t = self._tuning
-        if gone < -t.clear or self._shift < -t.most_back:
+    def _go_clear(self, gone: float, way: float, tip: Array) -> None:
+        """End the retreat from an object once the tip follows the arm back; stay there.
+
+        `gone` and `way` are the ways of the tip and of the arm without contact, in m.
+        """
+        t, (gone_before, way_before) = self._tuning, self._before
+        back = way_before - way
+        if back > t.free_way:
+            follows = gone_before - gone > t.free_share * back
+            self._clear = self._clear + back if follows else 0.0
+            self._before = gone, way
+        if self._clear >= t.clear or self._shift < -t.most_back:
             self._target = self._target.model_copy(update={"position": tuple(tip.tolist())})
             self._end()
 
@@ -282,12 +292,12 @@ class Pressing:
         self._direction, self._start = withheld / self._shift, tip.copy()
         self._offset, self._crept = offset.copy(), creep.displacement.copy()
         self._offset[:3] += withheld
-        self._block()
+        self._block(0.0, self._shift)
 
-    def _block(self) -> None:
+    def _block(self, gone: float, way: float) -> None:
         why = "something holds the tip at the target, where it must be free"
         self._retreat(self._why if self.phase is Phase.ENDED else why)
-        self._blocked = True
+        self._blocked, self._before, self._clear = True, (gone, way), 0.0
 
     def _retreat(self, why: str) -> None:
         self.phase, self._why = Phase.RETREATING, why

@@ -469,8 +469,8 @@ class PressingTuning:
     # it touched something when the approach began
     free_way: float = 1.5e-3
     free_share: float = 0.45
-    # distance by which the tip goes back from an object before its target, and the largest motion
-    # of the arm without contact for it, in m
+    # way on which the tip follows again before it has left an object at its target, and the largest
+    # motion of the arm without contact for it, in m
     clear: float = 3e-3
     most_back: float = 0.03
     obstruction: ObstructionTuning = field(default_factory=ObstructionTuning)
