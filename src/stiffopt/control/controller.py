@@ -584,7 +584,7 @@ class TipController:
         if isinstance(pursuit.course, Pressing):
             target = pursuit.course.shown(estimate.position)
             press_force, press_goal = pursuit.course.force, pursuit.course.press.force
-            touches = touches or pursuit.course.phase is Phase.PRESSING
+            touches = touches or pursuit.course.touches
         position, pointing, quaternion = target_arrays(target)
         position_error, angle_error = self._errors.at(target, estimate.position, estimate.rotation)
         sample, plan = self._arm.tip.sample, self.replanner.plan

@@ -150,13 +150,14 @@ class TipFeedback:
             self._is_new = False
         self._averaged.advance(now, arm.tip.omega)
         corrected = self._averaged.value[:6].copy()
-        behind, ahead = now[:3] - corrected[:3], np.zeros(3)
-        if slope.any():
+        behind = offset[:3] - corrected[:3]
+        if self._motion_error.knows:
             n = len(arm.pressures.command)
             velocity = tip.pose[:3, :3] @ (tip.jacobian[:3] @ reference.motion[1, :n])
-            behind -= slope @ (position - self._averaged.value[6:])
             ahead = slope @ velocity * (arm.pressures.lag + arm.pressures.dead_time)
-        corrected[:3] = now[:3] - behind + arm.tip.stiff_axis @ behind + ahead
+            behind -= slope @ (position - self._averaged.value[6:])
+            corrected[:3] = offset[:3] - behind + ahead
+        corrected[:3] += arm.tip.stiff_axis @ behind
         return corrected
 
     def _vibration_inputs(self, reference: Reference) -> tuple[ArrayLike, ...]:

@@ -447,6 +447,18 @@ class TouchTuning:
 
 
 @dataclass(frozen=True)
+class ObstructionTuning:
+    """When something holds the tip back from its target (`ObstructionWatch`)."""
+
+    still: float = 1e-3  # displacement within which the tip has stopped, in m
+    error: float = 4e-4  # of the tip, below which more is allowed in inverse proportion, in m
+    # change of the offset without anything in the way, in m; and the part of it that creep may
+    # cause, as a share of the way to the target
+    least: float = 1.5e-3
+    creep: float = 0.1
+
+
+@dataclass(frozen=True)
 class PressingTuning:
     """How the tip presses on something (`Pressing`)."""
 
@@ -466,6 +478,15 @@ class PressingTuning:
     held_back: float = 2e-3
     settled: float = 0.5  # time within the tolerance after which an event reports it, in s
     patience: float = 5.0  # time beyond the tolerance after which there is an alarm, in s
+    # way of the arm without contact, in m, on which the tip follows by at least this share, unless
+    # it touched something when the approach began
+    free_way: float = 1.5e-3
+    free_share: float = 0.45
+    # way on which the tip follows again before it has left an object at its target, and the largest
+    # motion of the arm without contact for it, in m
+    clear: float = 3e-3
+    most_back: float = 0.03
+    obstruction: ObstructionTuning = field(default_factory=ObstructionTuning)
 
 
 @dataclass(frozen=True)
