@@ -262,15 +262,15 @@ class ErrorSettings:
         from commanded pressures is estimated.
     """
 
-    discrepancy: float = 0.02
-    residual: float = 1.2
+    discrepancy: float = 0.01
+    residual: float = 1.5
     tail: float = 10.0
     timing: float = 0.5
     deviations: tuple[float, float, float, float] = (0.8, 0.4, 0.4, 1.0)
     per_cell: float = 1.0
     reaches: tuple[float, ...] = (0.2, 0.4, 0.8)
     reach: float = 0.4
-    untested: float = 5.5
+    untested: float = 6.0
     rows: int = 800
     representatives: int = 60
     spacing: float = 0.04
