@@ -302,17 +302,15 @@ def coverage_table(found: Sequence[Comparison]) -> TextTable:
         rows,
         "with history: about the prediction that knows what was commanded before; moving, settled: "
         "about the tip's pose at the commanded pressures alone, which change or are held; inside, "
-        "outside: of what the calibration has seen; in brackets the 95 % interval, by a bootstrap "
-        "of blocks of two minutes",
+        "outside: of what the calibration has seen; in percent, with half the 95 % interval from a "
+        "bootstrap of blocks of two minutes",
     )
 
 
 def _with_interval(share: float, interval: tuple[float, float]) -> str:
-    """Return a share with its interval, in percent: ``67 (60-74)``."""
-    low, high = interval
-    return (
-        f"{share:.0%}" if np.isnan(low) else f"{100 * share:.0f} ({100 * low:.0f}-{100 * high:.0f})"
-    )
+    """Return a share with half its interval, in percent: ``67 ±7``."""
+    half = (interval[1] - interval[0]) / 2
+    return f"{100 * share:.0f}" if np.isnan(half) else f"{100 * share:.0f} ±{100 * half:.0f}"
 
 
 def range_remarks(robot: RobotDescription, found: Sequence[Comparison]) -> list[str]:
