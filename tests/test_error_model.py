@@ -24,8 +24,9 @@ from stiffopt.identify.results import LEVELS, Comparison, coverage
 from stiffopt.identify.settings import ERRORS, CalibrationSettings
 from stiffopt.identify.setup import Setup, recordings_of
 from stiffopt.identify.structures import STRUCTURES
+from stiffopt.identify.validation import validate
 from stiffopt.logs import Log
-from stiffopt.model.calibration import Calibration, ErrorModel, RelativeErrors
+from stiffopt.model.calibration import Calibration, ErrorModel, FittedParameter, RelativeErrors
 from stiffopt.model.history import History, Play
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.robot_files import load_description, save_robot
@@ -301,6 +302,29 @@ def test_frames_move_what_the_tracker_reads() -> None:
     np.testing.assert_allclose(
         problem.base_in_tracker[:3, :3] @ acting, problem.predict(x).per_pressure[0], atol=1e-15
     )
+
+
+@pytest.mark.parametrize(("deviation", "believed"), [(1e-4, True), (0.5, False)])
+def test_a_first_reading_tells_the_history_only_if_the_model_is_certain(
+    deviation: float, believed: bool
+) -> None:
+    """A log that begins in the middle, 3 mm off: by the side of its play, or by a wrong modulus."""
+    history = History(play=(Play(width=4e4, share=0.4),))
+    segment = ONE.segments[0].model_copy(update={"history": history})
+    key = "segments[0].material.youngs_modulus"
+    fitted = FittedParameter(key=key, deviation=deviation, prior=0.5)
+    calibration = Calibration(
+        parameters=(fitted,), correlation=((1.0,),), position_residual=2e-4, errors=ROUGH
+    )
+    robot = ONE.model_copy(update={"segments": (segment,), "calibration": calibration})
+    pressures = np.tile([8e4, 0.0, 0.0], (60, 1))
+    pressures[30:, 1] = 1e4
+    acting = pressures - np.array([1.2e4, 0.0, 0.0])  # as after a rise
+    tips = Manipulator(ONE).tip_pose(acting)[:, :3, 3]
+    log = Log(np.arange(60.0) * 0.2, pressures, tips)
+    found = validate(robot, [("log", log)])[0]
+    rise = float(found.pressures[0, 0] - found.effective[0, 0])
+    assert (rise > 9e3) if believed else (abs(rise) < 5e3)
 
 
 # -- the fit ----------------------------------------------------------------------------------
