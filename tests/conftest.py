@@ -13,6 +13,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+import hypothesis
 import pytest
 
 LONGEST = (
@@ -50,6 +51,10 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def pytest_configure(config: pytest.Config) -> None:
     if config.getoption("--long"):
         os.environ["STIFFOPT_LONG"] = "1"
+    # the short form tries the same examples in every run, the long form new ones
+    hypothesis.settings.register_profile("short", derandomize=True, deadline=None)
+    hypothesis.settings.register_profile("long", deadline=None)
+    hypothesis.settings.load_profile("long" if is_long() else "short")
 
 
 def is_long() -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.optimize import lsq_linear, minimize
 
@@ -155,7 +155,8 @@ def test_channels_at_limits_are_said(solver):
     assert p == pytest.approx(np.array([0.0, 1.5, 0.75, 0.0, 1.5, 0.65]) * BAR, abs=1.0)
 
 
-@settings(max_examples=150 if is_long() else 60, deadline=None)
+@settings(max_examples=150 if is_long() else 60)
+@example(seed=458946, kind="rank 1", solver="osqp", size=0.0, tip_step=1e-4)
 @given(
     seed=st.integers(0, 10**6),
     kind=st.sampled_from(["full", "tall", "none", "zero", "rank 1", "huge", "tiny"]),

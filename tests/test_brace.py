@@ -387,11 +387,52 @@ def test_the_gallery_holds_at_its_golden_pressures(file, monkeypatch):
     assert {each.object for each in eq.contacts} == set(task.brace.objects)
     assert robot.clearance(np.zeros(6), task.scene) >= task.scene.clearance
     answer = SimpleNamespace(
-        task=task, pressures=eq.pressures, tip_pose=eq.tip_pose, contacts=eq.contacts
-    )
+        task=task, pressures=eq.pressures, tip_pose=eq.tip_pose, contacts=eq.contacts,
+        stiffness=judgement.stiffnesses[0], stiffness_unit="N/m",
+    )  # fmt: skip
     states = way_into_contact(robot, answer)
     assert not states[0].contacts
     assert states[-1].normal_forces == pytest.approx(eq.normal_forces, rel=1e-3)
+
+
+LYING = """format: stiffopt-task/1
+robot: lying.yaml
+target: {position: [11 mm, -4 mm, 190 mm], tolerance: {position: 2 mm}}
+stiffness: {maximise: {direction: [0, 1, 0]}}
+brace: {objects: [bench], margin: 5 mN}
+scene:
+  objects:
+    - name: bench
+      half_space: {point: [26 mm, 0 mm, 0 mm], normal: [-1, 0, 0]}
+      contact: {allowed: true, max_force: 0.5 N, friction: 0.2}
+"""
+
+
+def test_an_arm_that_lies_on_an_object_at_rest_moves_along_it(tmp_path, capsys):
+    robot_file = (PROBLEMS.parent / "src/stiffopt/robots/stiff-flop-2.yaml").read_text()
+    lying = robot_file.replace("name: stiff-flop-2", "name: lying")
+    assert "gravity" not in lying.partition("segments:")[2]
+    (tmp_path / "lying.yaml").write_text(f"{lying}\ngravity: [6 m/s^2, 0 m/s^2, 0 m/s^2]\n")
+    file = tmp_path / "task.yaml"
+    file.write_text(LYING)
+    out = str(tmp_path / "motion.png")
+    arguments = ["--from", "0, 0.1, 0, 0, 0, 0.1 bar", "--to", str(file), "--json", "--plot", out]
+    code = main(["plan", *arguments])
+    said = json.loads(capsys.readouterr().out)
+    assert code == 0, said["message"]
+    assert "leans on 'bench'" in said["message"]
+    pressures = np.array(said["pressures_pa"])
+    at_rest = np.flatnonzero(~pressures.any(axis=1))
+    assert len(at_rest) == 1
+    assert 0 < at_rest[0] < len(pressures) - 1
+    model = stiffopt.load_robot(tmp_path / "lying.yaml")
+    task = stiffopt.load_task(file)
+    # each state is the equilibrium that is reached from rest, by itself
+    for index in (0, 10, at_rest[0], len(pressures) - 1):
+        found = model.contact_equilibrium(pressures[index], task.scene)
+        assert found.contacts
+        assert said["tip_position_m"][index] == pytest.approx(found.tip_pose[:3, 3], abs=2e-5)
+    assert np.diff(said["times_s"]).min() > 0
 
 
 def test_json_files_and_picture(tmp_path, capsys):

@@ -57,6 +57,13 @@ def flexibilities(at: float) -> tuple[float, float, float]:
     return bend * length**3 / 3 + shear * length, between, bend * at**3 / 3 + shear * at
 
 
+def euler_load() -> float:
+    """Of a straight arm that is free at the tip, in N: ``P (1 + P/GA - P/EA) = (pi / 2L)^2 EI``."""
+    law, length = rod_section(FLOP, np.zeros(3), TWO.gravity), TWO.length
+    bend, shear, stretch = law.compliance[3, 3], law.compliance[1, 1], law.compliance[2, 2]
+    return float(np.roots([shear - stretch, 1.0, -((np.pi / (2 * length)) ** 2) / bend]).max())
+
+
 # -- closed forms ---------------------------------------------------------------------------------
 
 
@@ -283,7 +290,10 @@ def test_pushes_on_an_arm_that_lies_on_a_table_end():
     found = model.contact_equilibrium(REST, scene(table(0.0005)))
     for way in np.concatenate([np.eye(3), -np.eye(3)]):
         loss = found.lift_off(way)
-        assert loss.how in ("lifts off", "holds")
+        along = way[2] < 0
+        assert loss.how in (("buckles",) if along else ("lifts off", "holds"))
+        if along:
+            assert loss.force == pytest.approx(euler_load(), rel=0.015)
         assert loss.stiffness > 0
     lifted = found.lift_off((-1, 0, 0))
     assert (lifted.object, lifted.at) == ("0", pytest.approx(TWO.length))
@@ -291,6 +301,16 @@ def test_pushes_on_an_arm_that_lies_on_a_table_end():
     assert 1e-4 / (near.tip_pose[1, 3] - found.tip_pose[1, 3]) == pytest.approx(
         found.stiffness((0, 1, 0)), rel=1e-3
     )
+
+
+@pytest.mark.parametrize("contacts", ["sliding", "sticking"])
+@pytest.mark.parametrize("sideways", [0.0, 2e-4])
+def test_a_push_along_the_arm_buckles_it_next_to_the_post(contacts, sideways):
+    """Across the post's normal it is a free column."""
+    found = robot().contact_equilibrium(REST, scene(post(0.12, 1e-5)), load=push(5e-4))
+    lost = found.lift_off((sideways, 0.0, -1.0), contacts=contacts)
+    assert (lost.how, lost.object, lost.stiffness_after) == ("buckles", None, 0.0)
+    assert lost.force == pytest.approx(euler_load(), rel=0.015)
 
 
 def test_pushes_and_paths_have_a_greatest_number_of_steps(monkeypatch):
@@ -627,6 +647,22 @@ def test_an_arm_in_a_bent_tube_is_where_an_independent_rod_is():
     assert np.linalg.norm(contact.force) == pytest.approx(71.453e-3, rel=2e-3)
     assert contact.at == pytest.approx(119.44e-3, abs=2e-4)
     assert found.stiffness(X) == pytest.approx(17.313, rel=0.02)
+
+
+def test_a_line_in_a_tube_is_found_with_other_contacts_along_it(monkeypatch):
+    """The way is lost with contacts one radius apart; the rod is the one above."""
+    points = [(0, 0, -0.03), (0, 0, 0.16573), (0.03655, 0.00223, 0.36235)]
+    tube = {"inside_tube": {"points": points, "radius": 0.02407}}
+    p, model = [59170, 2470, 25290, 79940, 73380, 0], robot(TWO.under((6.0, 0, 5.0), 0.0))
+    found = model.contact_equilibrium(p, scene(tube))
+    assert found.tip_pose[:3, 3] == pytest.approx([3.4491e-3, -8.6904e-3, 191.3427e-3], abs=3e-5)
+    assert found.normal_forces.sum() == pytest.approx(393.3e-3, rel=0.01)
+    assert found.stiffness(X) == pytest.approx(19.23, rel=0.02)
+    near = model.contact_equilibrium(np.add(p, 100.0), scene(tube), nearby=found)
+    assert np.linalg.norm(near.tip_pose[:3, 3] - found.tip_pose[:3, 3]) < 2e-4
+    monkeypatch.setattr("stiffopt.model.contact.equilibrium.SPACINGS", (1.0,))
+    with pytest.raises(EquilibriumError, match="lying along"):
+        model.contact_equilibrium(p, scene(tube))
 
 
 def test_a_contact_in_a_tube_opens_while_another_one_holds():

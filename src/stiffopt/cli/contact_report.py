@@ -1,6 +1,6 @@
 """Report the equilibrium of an arm that leans on objects: on the terminal and as JSON."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from rich.console import Group, RenderableType
@@ -40,6 +40,28 @@ def _stiffness(robot: Manipulator, found: ContactEquilibrium, d: Any) -> dict[st
     }
 
 
+class PressedContact(NamedTuple):
+    """A contact, or those along a line as one: `force` in N, `where` in words."""
+
+    object: str
+    where: str
+    force: float
+    max_force: float
+
+
+def pressed_contacts(found: ContactEquilibrium) -> list[PressedContact]:
+    """Return the contacts that have a limit of their own, from the base to the tip."""
+    unit, rows = display_units().length, []
+    for own, force in found.pressed():
+        at = sorted(found.contacts[j].at for j in own)
+        where = f"at {unit.text(at[0], '.1f')}"
+        if len(at) > 1:
+            where = f"from {unit.number(at[0], '.1f')} to {unit.text(at[-1], '.1f')}"
+        each = found.contacts[own[0]]
+        rows.append((at[0], PressedContact(each.object, where, force, each.max_force)))
+    return [row for _, row in sorted(rows)]
+
+
 def summary(robot: Manipulator, found: ContactEquilibrium) -> RenderableType:
     """Return the report of an equilibrium."""
     units = display_units()
@@ -59,18 +81,13 @@ def summary(robot: Manipulator, found: ContactEquilibrium) -> RenderableType:
         rows = tuple(
             (
                 printable(each.object),
-                units.length.number(each.at, ".1f"),
-                units.force.number(float(np.linalg.norm(each.force))),
+                each.where,
+                units.force.number(each.force),
                 units.force.number(each.max_force) if np.isfinite(each.max_force) else "-",
             )
-            for each in found.contacts
+            for each in pressed_contacts(found)
         )
-        heading = (
-            "contact",
-            f"at ({units.length})",
-            f"force ({units.force})",
-            f"at most ({units.force})",
-        )
+        heading = ("contact", "along the arm", f"force ({units.force})", f"at most ({units.force})")
         parts.append(TextTable("", heading, rows).renderable())
     lines = tuple(
         (
@@ -84,7 +101,8 @@ def summary(robot: Manipulator, found: ContactEquilibrium) -> RenderableType:
     headings = ("along", "free", "sliding", "sticking", "lost at +", "lost at -")
     remark = (
         f"{units.stiffness}, contacts sliding and sticking; lost: the push at the tip, along and "
-        f"against the axis, by which the first contact lifts off if all slide, in {units.force}"
+        "against the axis, by which the first contact lifts off or the arm buckles if all slide, "
+        f"in {units.force}"
     )
     parts.append(TextTable("", headings, lines, remark).renderable())
     return Group(*parts)

@@ -9,7 +9,7 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from stiffopt.cli.contact_report import friction_text
+from stiffopt.cli.contact_report import friction_text, pressed_contacts
 from stiffopt.cli.solve_records import priced
 from stiffopt.cli.solved_task import SolvedTask
 from stiffopt.cli.tables import STATUS_COLOURS, block_title, labelled
@@ -130,22 +130,21 @@ def _press(solution: PressureSolution, pose: Vector) -> Iterable[Line]:
 
 def _brace(solution: PressureSolution) -> Iterable[Line]:
     """Yield the contacts, the stiffness without them, what they hold, and the active limits."""
-    if not solution.contacts:
+    if solution.equilibrium is None or not solution.contacts:
         return
     units = display_units()
-    for number, each in enumerate(solution.contacts):
-        size = units.force.text(float(np.linalg.norm(each.force)), ".3g")
+    for number, each in enumerate(pressed_contacts(solution.equilibrium)):
         most = f" of at most {units.force.text(each.max_force, 'g')}"
         yield (
             "" if number else "leans on",
             Text.assemble(
                 (f"'{printable(each.object)}'", "bold"),
-                f" at {units.length.text(each.at, '.1f')} along the arm with ",
-                (size, "bold"),
+                f" {each.where} along the arm with ",
+                (units.force.text(each.force, ".3g"), "bold"),
                 most if np.isfinite(each.max_force) else "",
             ),
         )
-    if solution.equilibrium and solution.equilibrium.friction.tip:
+    if solution.equilibrium.friction.tip:
         yield "friction", friction_text(solution.equilibrium)
     free, unit = solution.stiffness_free, units.of_si(solution.stiffness_unit)
     value = solution.stiffness

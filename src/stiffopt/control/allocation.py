@@ -10,7 +10,8 @@ possible::
 there is always a solution, though OSQP gives up on one in a thousand of the hardest problems. All
 inputs and outputs are checked to be finite and within bounds, because solvers' flags are not
 reliable: OSQP answers 2e9 to a contradiction, and NaN for ever after one NaN; DAQP may return NaN
-with a flag of success.
+with a flag of success. An answer that moves the tip too fast (OSQP, where it ran out of iterations)
+is shortened until it does not.
 
 The reference and the gate limit the slew too: the reference as a whole, so that its path stays
 straight, the gate each channel, by the time since the last command. Here it is a bound of the
@@ -154,7 +155,7 @@ class Allocation:
         if change is None or change.shape != last.shape:
             return None, self._none_held, math.nan
         p, held, residual, violation = self._solution(
-            change, lower, upper, J, v, reference, last, self._low, self._high
+            change, lower, upper, G, J, v, reference, last, self._low, self._high
         )
         if not violation[0] <= _BOUND_ERROR**2:  # NaN is rejected too
             return None, self._none_held, math.nan
@@ -195,13 +196,19 @@ def _solution(law: TrackingRows) -> Formula:
     t, n = law.rows.shape
     change = ca.SX.sym("change", n)
     lower, upper = ca.SX.sym("lower", n + 3), ca.SX.sym("upper", n + 3)
+    G = ca.SX.sym("G", 3, n)
     J, v = ca.SX.sym("J", t, n), ca.SX.sym("v", t)
     reference, last = ca.SX.sym("reference", n), ca.SX.sym("last", n)
     low, high = ca.SX.sym("low", n), ca.SX.sym("high", n)
     bounded = ca.fmin(ca.fmax(change, lower[:n]), upper[:n])
-    p = last / _BAR + bounded
+    # The change nearest to none is within all bounds, and so is the way from it up to a share s.
+    least = ca.fmin(ca.fmax(0, lower[:n]), upper[:n])
+    start, way = G @ least, G @ (bounded - least)
+    room = upper[n:] - ca.sign(way) * start
+    share = ca.mmin(ca.fmin(1, room / ca.fmax(ca.fabs(way), 1e-12)))
+    p = last / _BAR + least + share * (bounded - least)
     held = ca.logic_or(p <= low + _SLACK, p >= high - _SLACK)
     residual = (J @ (p * _BAR - reference) - v)[: law.task_rows]
     violation = ca.sumsqr(change - bounded)
-    inputs = [change, lower, upper, J, v, reference, last, low, high]
-    return Formula(inputs, [p * _BAR, held, ca.norm_2(residual), violation], [J])
+    inputs = [change, lower, upper, G, J, v, reference, last, low, high]
+    return Formula(inputs, [p * _BAR, held, ca.norm_2(residual), violation], [G, J])

@@ -86,6 +86,7 @@ class Bracing:
         self._change: Array = np.zeros(0)  # of the planned pressures (n,), to correct the tip
         self._free = 0  # successive samples at which the tip is nearer to a free arm's
         self._is_off = False  # the tip is known to stay off its target
+        self._nearest = (math.inf, 0.0)  # distance of the tip from it, in m, and when it fell to it
         self._warned: set[str] = set()  # kinds of warnings about the present push
         self._lost = 0  # successive checks at which the model's contacts do not hold
         self._unchecked = 0.0  # time since the last such check, in s
@@ -282,7 +283,8 @@ class Bracing:
         sticks = self.task.brace.contacts == "sticking"
         self.force = float(forces[weakest])
         self.margin = max(min(left, slip) if sticks else left, 0.0)
-        how = "lifts off" if self.force <= 0 else "slips" if sticks and slip <= 0 else ""
+        none = self._tuning.lost_share * before[weakest]
+        how = "lifts off" if self.force <= none else "slips" if sticks and slip <= 0 else ""
         self._lost = self._lost + 1 if how else 0
         where = f"on '{self.approach.contacts[weakest].object}'"
         words = f"under a push of {1e3 * size:.0f} mN"
@@ -319,18 +321,22 @@ class Bracing:
         if self.displacement.any() or self.approach is None:  # a push is not compensated
             return
         t = self._tuning
-        off = float(np.linalg.norm(error))
-        if not self._is_off and self._held > t.arrival and off > t.off_target:
+        off, (least, since) = float(np.linalg.norm(error)), self._nearest
+        if off < (1 - t.progress) * least:
+            self._nearest = off, self._held
+        elif not self._is_off and least > t.off_target and self._held > since + t.patience:
             self._is_off = True
             text = f"the tip stays {1e3 * off:.1f} mm from its target while the arm leans"
             self._notify("brace-off-target", text, Severity.WARNING)
         rows = np.vstack([jacobian, t.force_weight * self.approach.hold.per_pressure])
         wanted = np.concatenate([error, np.zeros(len(rows) - 3)])
         H = rows.T @ rows + t.pressure_weight**2 * np.eye(rows.shape[1])
-        step = np.linalg.solve(H, rows.T @ wanted) * elapsed / t.time
-        moved = float(np.linalg.norm(jacobian @ step))
-        if self._held >= t.settling and moved > t.correction_speed * elapsed:
-            step *= t.correction_speed * elapsed / moved  # a push that is not felt yet is quicker
+        step = np.linalg.solve(H, rows.T @ wanted) * elapsed
+        time, speed = t.first_time, t.first_speed
+        if self._held >= t.settling:  # a push that is not felt yet is quicker
+            time, speed = t.time, t.correction_speed
+        step /= time
+        step *= min(1.0, speed * elapsed / max(float(np.linalg.norm(jacobian @ step)), 1e-12))
         before = self._change
         self._change = np.clip(before + step, -t.most_change, t.most_change)
         self._corrected = self._corrected + jacobian @ (self._change - before)

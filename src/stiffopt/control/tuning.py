@@ -491,15 +491,22 @@ class BracingTuning:
     usual_push: float = 0.1
     every: float = 0.03  # interval of checks of the contacts, in s
     looks: int = 2  # successive checks
+    # of its force, below which the estimate cannot tell it from none
+    lost_share: float = 0.08
     weak_share: float = 0.4  # of its force, below which a contact that a push relieves may lift off
-    time: float = 3.0  # time constant with which the tip goes to its target, in s
-    correction_speed: float = 5e-4  # largest one of the tip by that, once it has settled, in m/s
+    # time constants with which the tip goes to its target, at first and once it has settled, in s
+    first_time: float = 2.0
+    time: float = 3.0
+    # largest speeds of the tip by that, at first and once it has settled, in m/s
+    first_speed: float = 4e-3
+    correction_speed: float = 5e-4
     force_weight: float = 0.1  # error of the tip equivalent to a change of contact force, in m/N
     pressure_weight: float = 2e-8  # the same for a pressure, in m/Pa
     most_change: float = 1e4  # largest change of a planned pressure, in Pa
-    # error of the tip that is reported if it is left after a time of holding, in m and s
+    # error of the tip that is reported if it does not fall by a share for a time, in m and s
     off_target: float = 1e-3
-    arrival: float = 30.0
+    progress: float = 0.1
+    patience: float = 10.0
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ from stiffopt.model.contact.equilibrium import ContactEquilibrium
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.optimise.brace import quoted
 from stiffopt.optimise.brace_uncertainty import BraceUncertainty
-from stiffopt.optimise.leaning import FORCE_ON, MARGIN_ON, BracedProblem
+from stiffopt.optimise.leaning import FORCE_ON, MARGIN_ON, RIGID, BracedProblem
 from stiffopt.optimise.local import LocalResult, descend
 from stiffopt.optimise.prices import prices_at
 from stiffopt.optimise.problem import ProgramPoint
@@ -261,7 +261,8 @@ def lean(
 def _left_out(judged: list[Braced | None], best: Braced) -> str:
     """Tell of an optimum stiffer than the answer that does not hold from rest, or return ""."""
     others = [each for each in judged if each is not None and not each.judgement.holds]
-    others = [each for each in others if each.least > (1 + BRACE.stiffer) * best.least]
+    least = (1 + BRACE.stiffer) * best.least
+    others = [each for each in others if least < each.least <= RIGID]
     if not others:
         return ""
     stiffest = max(others, key=lambda each: each.least)

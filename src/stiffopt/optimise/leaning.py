@@ -78,7 +78,7 @@ class PlacedTip:
         return self.stations[at]
 
 
-_RIGID = 1e5  # N/m, beyond which no arm is stiff by itself
+RIGID = 1e5  # N/m, beyond which no arm is stiff by itself
 
 
 class PlacedProgram:
@@ -358,15 +358,15 @@ class BracedProblem(PressureProblem):
         grips = _GRIPS[: 1 + (self.brace.contacts == "sticking")]
         sure = {"sliding": 1.0, "sticking": known.grip}
         kept = (
-            sure[each.contacts] * each.loss.force
+            (sure[each.contacts] * each.loss.force, each.loss.object is not None)
             for each in self.preloads(eq)
             if each.contacts in grips
         )
-        least = min(kept, default=np.inf)
+        least, is_contact = min(kept, default=(np.inf, True))
         if least < self.brace.margin * (1 - 1e-6):
+            what = "takes a contact away" if is_contact else "makes the arm buckle"
             yield (
-                f"a push of {unit.text(least)} takes a contact away; the margin is "
-                f"{unit.text(self.brace.margin)}"
+                f"a push of {unit.text(least)} {what}; the margin is {unit.text(self.brace.margin)}"
             )
             return
         left, doubt = self._left_in_doubt(eq, known.forces)
@@ -380,7 +380,7 @@ class BracedProblem(PressureProblem):
         """Return True if a rigid object holds the tip along a direction that is maximised."""
         grip = self.brace.contacts
         return any(
-            eq.stiffness(m.direction, m.kind, m.boundary, m.frame, grip) > _RIGID
+            eq.stiffness(m.direction, m.kind, m.boundary, m.frame, grip) > RIGID
             for m in self.directions
         )
 

@@ -22,8 +22,9 @@ from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.scene import Scene
 from stiffopt.optimise.brace import kept_clear_of, leant_on, quoted
 from stiffopt.optimise.solution import PressureSolution
+from stiffopt.optimise.task import Task
 from stiffopt.optimise.tip import TipAt
-from stiffopt.paths.configurations import Unsolved
+from stiffopt.paths.configurations import Unsolved, maximised
 
 Vector = NDArray[np.float64]
 
@@ -33,6 +34,7 @@ GRADUAL = 1.0  # s, in which the way gets its speed or loses it
 _STATES = 61  # equilibria along the way
 _STATIONS = 41  # of the body
 _SAME = 2e-4  # m; tips that are nearer belong to the same equilibrium
+_AS_STIFF = 0.05  # largest difference of stiffnesses in the same equilibrium
 _PUSH = 2e-3  # N, step of finite differences by a push at the tip
 _FORGIVEN = 1e-4  # m, tolerated lack of clearance from other objects
 
@@ -117,36 +119,75 @@ def way_into_contact(robot: Manipulator, solution: PressureSolution) -> list[Con
     Raises
     ------
     Unsolved
-        The way is lost or ends in another equilibrium, presses an object with more than its
-        largest force, or brings the body too near to another object.
+        As `way_from_rest` does, or the way ends in another equilibrium.
     """
-    task, p = solution.task, solution.pressures
+    assert solution.tip_pose is not None
+    assert solution.pressures is not None
+    states = way_from_rest(robot, solution.task, solution.pressures)
+    end = states[-1]
+    names, wanted = ({each.object for each in found.contacts} for found in (end, solution))
+    apart = float(np.linalg.norm(end.tip_pose[:3, 3] - solution.tip_pose[:3, 3]))
+    if apart > _SAME or (wanted and names != wanted):
+        raise Unsolved(
+            "all pressures growing together lead to another equilibrium: the tip is "
+            f"{1e3 * apart:.2g} mm away, leaning on {quoted(sorted(names)) or 'nothing'}"
+        )
+    stiffness, promised = stiffness_leaning(end, solution.task), solution.stiffness
+    if wanted and promised and abs(promised / stiffness - 1) > _AS_STIFF:
+        unit = display_units().of_si(solution.stiffness_unit)
+        raise Unsolved(
+            "all pressures growing together lead to another equilibrium, of "
+            f"{unit.text(stiffness)} instead of {unit.text(promised)}"
+        )
+    return states
+
+
+def stiffness_leaning(eq: ContactEquilibrium, task: Task) -> float:
+    """Return the smallest of the stiffnesses that a task with a brace maximises."""
+    assert task.brace is not None
+    grip = task.brace.contacts
+    return min(
+        eq.stiffness(m.direction, m.kind, m.boundary, m.frame, grip) for m in maximised(task)
+    )
+
+
+def lies_at_rest(robot: Manipulator, task: Task) -> bool:
+    """Return whether the arm without pressures touches an object of a task's brace."""
     assert task.brace is not None
     assert task.scene is not None
-    assert p is not None
-    assert solution.tip_pose is not None
+    try:
+        rest = np.zeros(robot.n_pressures)
+        return bool(robot.contact_equilibrium(rest, leant_on(task.scene, task.brace)).contacts)
+    except EquilibriumError:  # an object is inside the arm
+        return False
+
+
+def way_from_rest(robot: Manipulator, task: Task, p: Vector) -> list[ContactEquilibrium]:
+    """Return the equilibria from rest to pressures (n,) among the objects of a task with a brace.
+
+    Raises
+    ------
+    Unsolved
+        The way is lost, presses an object with more than its largest force, or brings the body too
+        near to an object that must not be touched.
+    """
+    assert task.brace is not None
+    assert task.scene is not None
     scene, others = leant_on(task.scene, task.brace), kept_clear_of(task.scene, task.brace)
     states: list[ContactEquilibrium] = []
     try:
-        for share in np.linspace(0.0, 1.0, _STATES):
+        for share in np.linspace(0.0, 1.0, _STATES if p.any() else 1):
             nearby = states[-1] if states else None
             states.append(robot.contact_equilibrium(share * p, scene, nearby=nearby))
     except EquilibriumError as error:
-        raise Unsolved(f"the way into contact is lost at {share:.0%} of it: {error}") from None
-    end = states[-1]
-    names = sorted(each.object for each in end.contacts)
-    apart = float(np.linalg.norm(end.tip_pose[:3, 3] - solution.tip_pose[:3, 3]))
-    if apart > _SAME or names != sorted(each.object for each in solution.contacts):
-        raise Unsolved(
-            "all pressures growing together lead to another equilibrium: the tip is "
-            f"{1e3 * apart:.2g} mm away, leaning on {quoted(names) or 'nothing'}"
-        )
-    for eq in states:
+        raise Unsolved(f"the way from rest is lost at {share:.0%} of it: {error}") from None
+    for number, eq in enumerate(states):
         for own, force in eq.pressed():
             each = eq.contacts[own[0]]
             if force > each.max_force * (1 + 1e-6):
                 text = display_units().force.text(force, ".3g")
-                raise Unsolved(f"on the way, '{each.object}' would be pressed with {text}")
+                where = "on the way" if number else "at rest"
+                raise Unsolved(f"{where}, '{each.object}' would be pressed with {text}")
     if others is not None:
         at = _stations(robot)
         _check_clear(robot, others, np.array([eq.poses(at)[:, :3, 3] for eq in states]), at)
@@ -161,6 +202,8 @@ def least_times_along(
     moved = np.linalg.norm(np.diff(lines, axis=0), axis=-1).max(axis=1)
     forces = np.array([_largest(eq) for eq in states])
     pressures = np.array([eq.pressures for eq in states])
+    if len(states) < 2:
+        return np.zeros(len(states))
     rates = (np.abs(np.diff(pressures, axis=0)) / slew).max(axis=1)
     least = np.maximum.reduce([moved / SPEED, np.abs(np.diff(forces)) / FORCE_RATE, rates])
     # in the step of the first touch, its mean speed is less than that before, or the force's after
@@ -212,4 +255,4 @@ def _check_clear(robot: Manipulator, others: Scene, lines: Vector, at: Vector) -
         gaps = gaps[:, at >= item.begin]
         if gaps.size and gaps.min() < others.clearance - _FORGIVEN:
             missing = display_units().length.text(others.clearance - float(gaps.min()), ".2g")
-            raise Unsolved(f"on the way into contact the body is {missing} too near an object")
+            raise Unsolved(f"on the way the body is {missing} too near an object")

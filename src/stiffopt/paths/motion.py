@@ -29,7 +29,14 @@ from stiffopt.paths.configurations import (
     maximised,
     several,
 )
-from stiffopt.paths.leaning import gradual, least_times_along, way_into_contact
+from stiffopt.paths.leaning import (
+    gradual,
+    least_times_along,
+    lies_at_rest,
+    stiffness_leaning,
+    way_from_rest,
+    way_into_contact,
+)
 from stiffopt.paths.motion_request import MotionRequest
 from stiffopt.paths.rates import least_times
 from stiffopt.paths.shortening import rounded, shortened
@@ -78,7 +85,7 @@ def plan_motion(
         reach.  If that one has less than 0.95 of the best known stiffness, the search goes on, for
         about as long again, towards one that has more.  For a single task with a brace whose answer
         leans, the motion goes to rest first, and from there into contact
-        (`stiffopt.paths.leaning`).
+        (`stiffopt.paths.leaning`); an arm that lies on such an object at rest stays in contact.
     scene : Scene, optional
         Replaces that of the tasks.  Without any, the way is straight.
     clearance : float, optional
@@ -164,47 +171,72 @@ def _with_margin(request: MotionRequest, timings: dict[str, float]) -> tuple[_Pl
 def _leaning(
     robot: Manipulator, start: End, goal: Task, slew: Any, options: dict[str, Any]
 ) -> PathSolution:
-    """Plan a motion to a task with a brace: to rest, clear of the scene, then into contact."""
+    """Plan a motion to a task with a brace: to rest, and from there into contact.
+
+    Down to rest the body keeps clear of the scene, unless it lies on an object there.
+    """
+    watch = Stopwatch()
     found = solve_pressure(robot, goal)
-    if found.pressures is None or not found.contacts:  # it keeps clear, or there is no answer
+    rest, lies = np.zeros(robot.n_pressures), lies_at_rest(robot, goal)
+    if found.pressures is None or not (found.contacts or lies):
         return plan_motion(robot, start, goal.unbraced, slew=slew, **options)
-    rest = np.zeros(robot.n_pressures)
-    down = plan_motion(robot, start, rest, scene=goal.scene, slew=slew, **options)
-    if not down.found:
-        return down
+    own = {name: value for name, value in options.items() if name != "timeout"}
+    request = MotionRequest.of(robot, start, rest, goal.scene, slew=slew, **own)
+    measures = maximised(goal)
     try:
         states = way_into_contact(robot, found)
-    except (Unsolved, StoppedError) as reason:
-        own = {name: value for name, value in options.items() if name != "timeout"}
-        request = MotionRequest.of(robot, start, rest, goal.scene, slew=slew, **own)
-        why = str(reason)
-        if isinstance(reason, Unsolved):
-            return request.without_answer(why, "unreachable")
-        return request.without_answer(why, "failed")
-    times = gradual(least_times_along(robot, states, np.inf if down.slew is None else down.slew))
+        if lies:
+            down = _down_in_contact(robot, goal, request)
+        else:
+            down = plan_motion(robot, start, rest, scene=goal.scene, slew=slew, **options)
+            if not down.found:
+                return down
+            down = replace(down, stiffness=_least_stiffness(robot, down.pressures, measures))
+    except Unsolved as reason:
+        return request.without_answer(str(reason), "unreachable")
+    except StoppedError as reason:
+        return request.without_answer(str(reason), "failed")
+    times = gradual(least_times_along(robot, states, request.slew))
     end, way, unit = states[-1], states[1:], display_units().force
     leant = " and ".join(
-        f"'{each.object}' with {unit.text(float(np.linalg.norm(each.force)), '.3g')}"
-        for each in end.contacts
+        f"'{end.contacts[on[0]].object}' with {unit.text(force, '.3g')}"
+        for on, force in end.pressed()
     )
-    assert goal.brace is not None
-    measures, grip = maximised(goal), goal.brace.contacts
-    leaning = [
-        min(eq.stiffness(m.direction, m.kind, m.boundary, m.frame, grip) for m in measures)
-        for eq in way
-    ]
+    message = f"from rest on into contact: at the end it leans on {leant}; played backwards the "
+    message += "motion lets go"
+    if not leant:
+        message = "from rest, where the arm lies on an object, to a posture that is clear of it"
     return replace(
         down,
-        message=f"from rest on into contact: at the end it leans on {leant}; played backwards the "
-        "motion lets go",
+        message=message,
         times=np.concatenate([down.times, down.times[-1] + times[1:]]),
         pressures=np.concatenate([down.pressures, [eq.pressures for eq in way]]),
         tip_poses=np.concatenate([down.tip_poses, [eq.tip_pose for eq in way]]),
-        stiffness=np.concatenate([_least_stiffness(robot, down.pressures, measures), leaning]),
+        stiffness=np.concatenate([down.stiffness, [stiffness_leaning(eq, goal) for eq in way]]),
         stiffness_unit=measures[0].unit,
         clearance=None,
-        equilibria=tuple(way),
+        equilibria=(*down.equilibria, *way),
+        timings=down.timings | watch.timings(),
         confidence=f"{down.confidence}; the equilibria in contact were followed from rest",
+    )
+
+
+def _down_in_contact(robot: Manipulator, goal: Task, request: MotionRequest) -> PathSolution:
+    """Return the motion from the start to rest of an arm that lies on an object there."""
+    start = request.start
+    if isinstance(start, Task):
+        start = TaskConfigurations(
+            "start", robot, request.posed(start), request.seed
+        ).best.pressures
+    states = way_from_rest(robot, goal, start)[::-1]
+    return replace(
+        request.without_answer("", "solved"),
+        times=gradual(least_times_along(robot, states, request.slew)),
+        pressures=np.array([eq.pressures for eq in states]),
+        tip_poses=np.array([eq.tip_pose for eq in states]),
+        stiffness=np.array([stiffness_leaning(eq, goal) for eq in states]),
+        equilibria=tuple(states),
+        confidence="a straight way in pressures",
     )
 
 

@@ -279,7 +279,7 @@ def _draw_requested(drawing: ArmDrawing, path: Path) -> None:
 
 def _label_stiffness(drawing: ArmDrawing, solution: PathSolution, tips: Vector) -> None:
     """Label the point of least stiffness."""
-    if solution.worst is not None:
+    if solution.worst is not None and np.isfinite(solution.worst):
         text = f"least stiff:\n{stiffness_text(solution.worst, solution.stiffness_unit)}"
         drawing.add_label(tips[:, solution.worst_index], text, style.LEAST_STIFF_TEXT)
 
@@ -302,7 +302,11 @@ def draw_stiffness_along(axes: Any, solution: PathSolution) -> None:
     if solution.stiffness is None or index is None:
         raise InputError("there is nothing to draw: the solution has no stiffness")
     unit = display_units().of_si(solution.stiffness_unit)
-    values = unit.of(solution.stiffness)
+    known = np.isfinite(solution.stiffness)
+    values = np.where(known, unit.of(solution.stiffness), np.nan)
+    if not known.all():  # where a rigid object holds the tip
+        share = {"ha": "right", "va": "top", "transform": axes.transAxes, "color": style.GREY}
+        axes.text(0.98, 0.95, "gaps: without limit, an object holds the tip", **share)
     if solution.alone is not None:
         axes.plot(
             solution.times, unit.of(solution.alone), color=style.GREY, linewidth=5, alpha=0.35,
@@ -311,12 +315,15 @@ def draw_stiffness_along(axes: Any, solution: PathSolution) -> None:
     axes.plot(
         solution.times, values, color=style.WITHIN_LIMITS, linewidth=2, label="on the path"
     )  # fmt: skip
-    axes.plot(
-        solution.times[index], values[index], "D", color=style.AT_LIMIT, markersize=7,
-        markeredgecolor="white", label="least stiff",
-    )  # fmt: skip
-    axes.set_ylim(bottom=0.85 * values[index])
-    if values.max() > _LOGARITHMIC * values[index]:
+    if not known.any():
+        axes.set_yticks([])
+    else:
+        axes.plot(
+            solution.times[index], values[index], "D", color=style.AT_LIMIT, markersize=7,
+            markeredgecolor="white", label="least stiff",
+        )  # fmt: skip
+        axes.set_ylim(bottom=0.85 * values[index])
+    if values[known].max(initial=0.0) > _LOGARITHMIC * values[index]:
         axes.set_yscale("log")
         axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
     axes.set_ylabel(f"stiffness\n({unit})")

@@ -15,6 +15,7 @@ from stiffopt.errors import EquilibriumError, InputError
 from stiffopt.model.arguments import check_choice, checked_measure
 from stiffopt.model.arm_clearance import SceneKey, measured_scene
 from stiffopt.model.compliance import Boundary, Frame, Kind, stiffness_of
+from stiffopt.model.contact.lines import SPACINGS
 from stiffopt.model.contact.push import ContactLoss, GrowingPush, rigid_if_huge
 from stiffopt.model.contact.rod import Condition, Rod, hat, rotations
 from stiffopt.model.contact.solve import ContactProblem
@@ -222,6 +223,8 @@ class ContactEquilibrium:
             d = self._arm.shape.rotation[0].T @ d
         with np.errstate(divide="ignore"):
             found = float(stiffness_of(self.compliance(contacts), d, kind, boundary))
+        if found < 0 and self.stable:
+            return np.inf  # a contact that slides holds the tip, but for the error of lines
         return rigid_if_huge(1 / found) if found and kind == "translation" else found
 
     @property
@@ -365,16 +368,28 @@ def contact_equilibrium(
     pressures = arm.checked_pressures(p)
     arm._check_margin(pressures[np.newaxis], "")
     check_choice("approach", approach, get_args(Approach))
-    problem = contact_problem(arm, scene)
     wrench = np.zeros(6) if load is None else checked_wrench(load)
     tip = np.array(arm.tip_load)
     end = Condition(
         pressures, tip[:6] + wrench, tip[6:], np.array(arm.description.gravity),
-        np.zeros(len(problem.surfaces)),
+        np.zeros(len(contact_problem(arm, scene).surfaces)),
     )  # fmt: skip
     if nearby is not None:
+        problem = contact_problem(arm, scene, nearby._arm.problem.lines.share)
         found = problem.follow(nearby._arm, end)
         return _arrived(*found, "the way from the nearby equilibrium")
+    error = None
+    for spacing in SPACINGS:
+        try:
+            return _from_rest(contact_problem(arm, scene, spacing), end, approach)
+        except _LostAlongLineError as lost:  # perhaps for the contacts that stand for the line
+            error = error or lost
+    assert error is not None
+    raise error
+
+
+def _from_rest(problem: ContactProblem, end: Condition, approach: Approach) -> ContactEquilibrium:
+    """Return the equilibrium that is reached from rest."""
     if approach == "pressures":
         rest = _at_rest(problem)
         return _arrived(*problem.follow(rest._arm, end), "its pressures and load")
@@ -382,6 +397,10 @@ def contact_equilibrium(
     rest = _arrived(*alone.hanging, what)
     free = _arrived(*alone.follow(rest._arm, end._replace(retreat=np.zeros(0))), what)
     return _arrived(*problem.follow(problem.clear(free._arm), end), "the objects' way to it")
+
+
+class _LostAlongLineError(EquilibriumError):
+    """The way from rest is lost while the arm lies along a surface."""
 
 
 def _at_rest(problem: ContactProblem) -> ContactEquilibrium:
@@ -403,23 +422,24 @@ def _arrived(arm: LeaningArm, share: float, what: str) -> ContactEquilibrium:
     if share < 1.0:
         touches = arm.state.touches
         names = sorted({arm.problem.surfaces[touch.surface].name for touch in touches})
-        how = "lying along" if any(touch.line for touch in touches) else "leaning on"
+        lies = any(touch.line for touch in touches)
+        how = "lying along" if lies else "leaning on"
         on = f", {how} {' and '.join(names)}" if names else ""
-        raise EquilibriumError(
+        raise (_LostAlongLineError if lies else EquilibriumError)(
             f"no equilibrium is reached continuously beyond {share:.0%} of {what}{on}: the arm "
             "slips off, snaps through or buckles there"
         )
     return ContactEquilibrium(arm)
 
 
-def contact_problem(arm: Manipulator, scene: Scene) -> ContactProblem:
+def contact_problem(arm: Manipulator, scene: Scene, spacing: float = SPACINGS[0]) -> ContactProblem:
     """Return the arm among the objects of a scene that allow contact; cached."""
     rod = arm.kept("contact rod", lambda: Rod(arm))
-    return _problem(rod, SceneKey(scene))
+    return _problem(rod, SceneKey(scene), spacing)
 
 
 @lru_cache(maxsize=64)
-def _problem(rod: Rod, key: SceneKey) -> ContactProblem:
+def _problem(rod: Rod, key: SceneKey, spacing: float) -> ContactProblem:
     measured = measured_scene(key.scene, rod.arm.description)
     pairs = zip(key.scene.objects, measured.items, strict=True)
     return ContactProblem(
@@ -429,4 +449,5 @@ def _problem(rod: Rod, key: SceneKey) -> ContactProblem:
             for item, known in pairs
             if item.contact is not None and item.contact.allowed
         ),
+        spacing,
     )

@@ -22,7 +22,7 @@ from stiffopt.model.contact.system import Touch
 if TYPE_CHECKING:
     from stiffopt.model.contact.system import LeaningArm
 
-_SPACING = 1.0  # of the contacts, over the least outer radius
+SPACINGS = (1.0, 1.5, 0.5)  # of the contacts, over the least outer radius; tried in this order
 _CLOSEST, _FARTHEST = 0.4, 1.3  # distances of neighbours on a line, over the spacing
 _BESIDE = 0.65  # over the spacing; the body may enter the surface a little so near to a line
 _CURVED = 0.1  # 1/m beyond that of a flat line, with which contacts inside a line slide too
@@ -37,11 +37,13 @@ class ContactLines:
 
     Attributes
     ----------
-    spacing : of the contacts of a line, in m.
+    share : spacing of the contacts of a line, over the least outer radius.
+    spacing : the same in m.
     """
 
-    def __init__(self, rod: Rod) -> None:
-        self.spacing = _SPACING * min(rod.radius(index) for index in range(len(rod.ranges)))
+    def __init__(self, rod: Rod, share: float = SPACINGS[0]) -> None:
+        self.share = share
+        self.spacing = share * min(rod.radius(index) for index in range(len(rod.ranges)))
         self._rod, self._length = rod, rod.ranges[-1].end
 
     def is_beside(self, station: float, lines: list[float]) -> bool:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from stiffopt.model.contact.rod import TURN
 from stiffopt.model.contact.solve import ContactProblem
-from stiffopt.model.contact.system import Contacts, ContactSystem, LeaningArm
+from stiffopt.model.contact.system import LEAST_COMPLIANCE, Contacts, ContactSystem, LeaningArm
 
 Vector = NDArray[np.float64]
 
@@ -30,9 +30,10 @@ class ContactLoss(NamedTuple):
     force : of the push at the tip, in N; infinite if no contact is lost.
     object : on which a contact is lost, or None.
     at : arc length of that contact at rest, in m, or None.
-    how : "lifts off" or "slips"; "snaps" where the equilibrium is lost instead; "stalls" where the
-        push could not be followed further, though nothing is lost yet; or "holds".
-    stiffness : along the push just before, in N/m.
+    how : "lifts off" or "slips"; "buckles" where the equilibrium loses its stability instead, and
+        "snaps" where it ends; "stalls" where the push could not be followed further, though nothing
+        is lost yet; or "holds".
+    stiffness : along the push, in N/m: just before the loss, and at first if nothing is lost.
     stiffness_after : the same without the contact, or with it slipping.
     """
 
@@ -97,9 +98,14 @@ class GrowingPush:
             if found is None or missed is None or _has_tilted(arm, found):
                 step /= 2
                 if step < _SHORTEST * self._limit:
-                    return ContactLoss(force, None, None, "snaps", begin, 0.0)
+                    return ContactLoss(force, None, None, "snaps", tangent.stiffness, 0.0)
                 continue
             if missed and step > _NEW_CONTACT * total:
+                step /= 2
+                continue
+            if not self._is_stable(found, sticking):
+                if step < _SAME_LOSS * (force + step):
+                    return ContactLoss(force, None, None, "buckles", tangent.stiffness, 0.0)
                 step /= 2
                 continue
             if is_known and not missed and step == left:
@@ -124,7 +130,8 @@ class GrowingPush:
             found = self._problem.correct(self._problem.with_touches(arm.state, rest), kept)
             after = 0.0 if found is None else self._tangent(found, kept).stiffness
         name = self._problem.surfaces[touches[lost].surface].name
-        return ContactLoss(total, name, touches[lost].station, how, begin, after)
+        at = touches[lost].station
+        return ContactLoss(total, name, at, how, tangent.stiffness, after)
 
     def _friction(self, state: Contacts) -> list[float]:
         return [self._problem.surfaces[touch.surface].friction for touch in state.touches]
@@ -140,9 +147,27 @@ class GrowingPush:
         stiffness = rigid_if_huge(float(self._direction @ along[0]))
         return _Tangent(system, solution, rates, along, turn, stiffness)
 
+    def _is_stable(self, arm: LeaningArm, sticking: Collection[int]) -> bool:
+        """Return whether an arm is stable, with contacts that slide, or else with those that stick.
+
+        With the latter, a stiffness passes zero where stability is lost, so a compliance of the tip
+        passes infinity and becomes negative.
+        """
+        settled = self._problem.settle(arm.state)  # points may have become lines
+        if settled is not None and settled.is_stable:
+            return True
+        if not sticking:
+            return False
+        tangent = self._tangent(arm, sticking)
+        compliance = tangent.system.of_tip(tangent.solution)[:6]
+        scale = np.repeat([1.0, 1 / self._problem.rod.arm.length], 3)
+        values = np.linalg.eigvals(scale[:, None] * compliance * scale)
+        return not (values.real < -LEAST_COMPLIANCE * np.abs(values).max() - abs(values.imag)).any()
+
     def loss(self, arm: LeaningArm) -> ContactLoss:
         """Return the first contact that is lost as the push grows from an equilibrium."""
         without, force, step = arm.state.condition.dead, 0.0, np.inf
+        *_, begin = self._rates(arm)
         for _ in range(_MOST_STEPS):
             own = _forces(arm)
             slopes, turn, stiffness = self._rates(arm)
@@ -162,13 +187,18 @@ class GrowingPush:
             if (forces < -_FORCE_LEFT).any():
                 step = ahead * min(0.9, max(0.1, float((own / (own - forces))[forces < 0].min())))
                 continue
-            arm, force, step = found, force + ahead, np.inf
+            settled = self._problem.settle(found.state) or found  # points may become lines
+            if not settled.is_stable:
+                if ahead < _SAME_LOSS * (force + ahead):
+                    return ContactLoss(force, None, None, "buckles", stiffness, 0.0)
+                step = ahead / 2
+                continue
+            force, step = force + ahead, np.inf
             if (forces < _FORCE_LEFT).any():
-                return self._lifted(arm, force, int(np.argmin(forces)))
+                return self._lifted(found, force, int(np.argmin(forces)))
+            arm = settled
             if force >= self._limit * (1 - 1e-12):
-                return ContactLoss(np.inf, None, None, "holds", stiffness, stiffness)
-            if self._problem.missed(arm):
-                arm = self._problem.settle(arm.state) or arm
+                return ContactLoss(np.inf, None, None, "holds", begin, begin)
         return ContactLoss(force, None, None, "stalls", stiffness, 0.0)
 
     def _rates(self, arm: LeaningArm) -> tuple[Vector, float, float]:

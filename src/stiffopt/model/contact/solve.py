@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from stiffopt.model.contact.lines import ContactLines
+from stiffopt.model.contact.lines import SPACINGS, ContactLines
 from stiffopt.model.contact.native import CONVERGED, LOST, MOST_CONTACTS, NativeContacts
 from stiffopt.model.contact.rod import (
     MOMENT,
@@ -56,15 +56,17 @@ _SHORTEST_STEP = 1e-4  # share of the path from rest; below it the path has ende
 
 
 class ContactProblem:
-    """An arm among surfaces."""
+    """An arm among surfaces; `spacing` of contacts on lines, over the least outer radius."""
 
-    def __init__(self, rod: Rod, surfaces: tuple[ContactSurface, ...]) -> None:
+    def __init__(
+        self, rod: Rod, surfaces: tuple[ContactSurface, ...], spacing: float = SPACINGS[0]
+    ) -> None:
         self.rod, self.surfaces = rod, surfaces
         self._in_c: NativeContacts | None = None
         self._deepest: tuple[int, float] | None = None  # surface and gap of a step that failed
         count = int(np.ceil(rod.arm.length / _SPACING))
         self.stations = np.linspace(0.0, rod.arm.length, count + 1)
-        self.lines = ContactLines(rod)
+        self.lines = ContactLines(rod, spacing)
 
     # -- Newton's method --------------------------------------------------------------------
 

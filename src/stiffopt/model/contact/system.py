@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 Vector = NDArray[np.float64]
 
-_LEAST_COMPLIANCE = 1e-6  # allowed below zero, as a share of the largest: the integrator's error
+LEAST_COMPLIANCE = 1e-3  # allowed below zero, as a share of the largest: that of contacts on lines
 _FLATTEST = 1e-3  # 1/m; with less, a contact's place is undetermined
 _LEAST_SLOPE = 1e-9  # of the gap; with less, a pinned contact stays where it is
 _LIGHT = 1e-5  # N; a contact with less force is a point
@@ -114,7 +114,7 @@ class LeaningArm:
             return True
         C = self.tangent[:3, :3]
         values = np.linalg.eigvalsh((C + C.T) / 2)
-        return bool(values[0] > -_LEAST_COMPLIANCE * values[-1])
+        return bool(values[0] > -LEAST_COMPLIANCE * values[-1])
 
     @property
     def _is_flat(self) -> bool:
