@@ -8,6 +8,8 @@ three seconds. An estimate is right if, one second after the push began, its err
 observable part of the push is at most 20 % + 3 mN. False alarms are counted while nothing touches
 the arm as it goes to targets, rests and follows circles. Presses of 15 to 40 mN, onto flat surfaces
 of 100 to 1,000 N/m at 2 to 8 mm distance, are judged by the true force of the last three seconds.
+With ``--what inside`` the targets of such presses are 0.5 to 4 mm inside surfaces of 100 to 2,000
+N/m instead. Then the loop must not press on: it has to go back, or to hold with a reason.
 """
 
 from __future__ import annotations
@@ -63,6 +65,8 @@ class Found:
     most: list[float] = field(default_factory=list)  # largest true force over the wanted one
     aside: list[float] = field(default_factory=list)  # m, error across the direction at the end
     failed: list[str] = field(default_factory=list)
+    # of targets inside an object: how it ended, largest and last true force over the wanted one
+    inside: list[tuple[str, float, float]] = field(default_factory=list)
 
 
 def drawn_creep(seed: int) -> tuple[SiliconeCreep, ...]:
@@ -204,29 +208,65 @@ def _onsets(states: list[ControllerStatus]) -> int:
     return int((np.diff(touches, prepend=0) == 1).sum())
 
 
-def press(name: str, seed: int, dynamics: str, found: Found) -> None:
-    """Press on a surface beside the tip."""
-    rng = np.random.default_rng([seed, 22])
+def drawn_press(
+    name: str, seed: int, dynamics: str, rng: np.random.Generator
+) -> tuple[Task, Array, Array] | None:
+    """Return a press that an arm can do, with its target's pose (4, 4) and direction (3,)."""
     with Arm(name, seed, dynamics) as arm:
         for _ in range(20):
             pose = arm.place()
             turn = rng.uniform(0, 2 * np.pi)
             way = pose[:3, 0] * np.cos(turn) + pose[:3, 1] * np.sin(turn)
-            wanted = rng.uniform(0.015, 0.04)
-            asked = Press(force=wanted, direction=tuple(way.tolist()))
+            asked = Press(force=rng.uniform(0.015, 0.04), direction=tuple(way.tolist()))
             task = Task(target=Target(position=tuple(pose[:3, 3].tolist())), press=asked)
             try:
                 arm.controller.check_ahead(task)
             except InputError:
                 continue  # it cannot press like that there
-            break
-        else:
-            return
-    stiffness, away = float(np.exp(rng.uniform(np.log(100), np.log(1000)))), rng.uniform(2e-3, 8e-3)
-    surface = SoftSurface(
+            return task, pose, way
+    return None
+
+
+def surface_at(pose: Array, way: Array, away: float, stiffness: float) -> SoftSurface:
+    """Return a surface across `way` (3,), at a distance from the tip's pose (4, 4), in m."""
+    return SoftSurface(
         point=tuple((pose[:3, 3] + away * way).tolist()), normal=tuple((-way).tolist()),
         stiffness=stiffness,
     )  # fmt: skip
+
+
+def inside(name: str, seed: int, dynamics: str, found: Found) -> None:
+    """Press from a target that lies inside an object."""
+    rng = np.random.default_rng([seed, 24])
+    drawn = drawn_press(name, seed, dynamics, rng)
+    if drawn is None:
+        return
+    task, pose, way = drawn
+    stiffness, deep = float(np.exp(rng.uniform(np.log(100), np.log(2000)))), rng.uniform(5e-4, 4e-3)
+    with Arm(name, seed, dynamics, surface_at(pose, way, -deep, stiffness)) as arm:
+        arm.controller.set_task(task)
+        course, forces, why = arm.controller.replanner.pursuit.course, [], ""
+        for _ in range(round(arm.hold / 0.05)):
+            arm.go(0.05)
+            forces.append(arm.rig.world.plant.contact_force())
+            held = [n.kind for n in arm.controller.notices() if n.hold or n.kind == "implausible"]
+            if held or course.phase is Phase.ENDED:
+                why = f"held: {held[0]}" if held else "gone back"
+                break
+    wanted = task.press.force
+    found.inside.append((why or course.phase.value, max(forces) / wanted, forces[-1] / wanted))
+
+
+def press(name: str, seed: int, dynamics: str, found: Found) -> None:
+    """Press on a surface beside the tip."""
+    rng = np.random.default_rng([seed, 22])
+    drawn = drawn_press(name, seed, dynamics, rng)
+    if drawn is None:
+        return
+    task, pose, way = drawn
+    wanted = task.press.force
+    stiffness, away = float(np.exp(rng.uniform(np.log(100), np.log(1000)))), rng.uniform(2e-3, 8e-3)
+    surface = surface_at(pose, way, away, stiffness)
     with Arm(name, seed, dynamics, surface) as arm:
         arm.controller.set_task(task)
         forces, course = [], arm.controller.replanner.pursuit.course
@@ -261,11 +301,13 @@ def main() -> None:
             found = Found()
             for seed in range(given.seed, given.seed + given.arms):
                 for what in given.what:
-                    {"pushes": pushes, "free": free, "press": press}[what](
+                    {"pushes": pushes, "free": free, "press": press, "inside": inside}[what](
                         name, seed, dynamics, found
                     )
             rows.append(row(f"{name}, {dynamics}", found))
             print(rows[-1], found.failed, flush=True)
+            for why, most, last in found.inside:
+                print(f"  {why}: at most {most:.1f}, at last {last:.1f} of the force", flush=True)
     head = [
         "arm", "pushes right", "error, mN, median / most", "in the 95 % region",
         "false alarms", "presses right", "worst, of what is allowed", "largest, of what is wanted",

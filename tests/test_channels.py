@@ -208,6 +208,24 @@ def test_a_regulator_that_is_slower_than_believed_is_not_lost() -> None:
     assert not line.channels.opposed.any()
 
 
+def test_the_reference_waits_for_a_channel_that_is_behind_but_not_for_ever() -> None:
+    line = Line()
+    line.to(0.9 * BAR, 0.5 * BAR, 0.0)
+    line.rising = line.falling = 0.1  # of believed 0.06 s
+    line.to(0.4 * BAR, 0.5 * BAR, 0.0, seconds=0.15)
+    assert line.channels.pace == 1.0
+    line.to(0.9 * BAR, 0.5 * BAR, 0.0)
+    line.rising = line.falling = 0.6
+    line.to(0.4 * BAR, 0.5 * BAR, 0.0, seconds=0.2)
+    assert line.channels.pace < 0.3
+    paces = []
+    for _ in range(round(4.0 / PERIOD)):  # a gauge that reads too much from now on
+        line.estimator.advance(1, line.command, line.command + np.array([2e4, 0, 0]))
+        paces.append(line.channels.pace)
+    assert min(paces) < 0.7
+    assert paces[-1] == 1.0
+
+
 def test_a_channel_with_hardly_any_pressure_is_done_without() -> None:
     line = Line()
     line.saturation[2] = 0.02 * BAR  # its tube is off
@@ -290,6 +308,24 @@ def test_the_tip_arrives_without_a_lost_channel() -> None:
     bench.controller.set_channels([4])
     assert bench.run(2.0, position)[-30:].mean() < 3e-4
     assert bench.rig.world.pressures[4] < 500
+
+
+@pytest.mark.usefixtures("compiled")
+def test_the_tip_goes_straight_to_its_target_when_a_channel_is_lost_on_the_way() -> None:
+    bench = Bench(HANGING)
+    start = np.array(bench.settled(duration=1.5))
+    way = np.array([-0.02, 0.012, 0.004])
+    channel = int(np.argmax(bench.command))
+    bench.rig.world._regulators.held[channel] = bench.rig.world.pressures[channel]
+    bench.controller.set_target(Target(position=tuple(start + way)))
+    aside = []
+    for _ in range(round(3.0 / bench.period)):
+        bench.run(bench.period)
+        moved = bench.tip[:3, 3] - start
+        aside.append(np.linalg.norm(moved - way * np.clip(moved @ way / (way @ way), 0, 1)))
+    assert max(aside) < 5e-3
+    assert np.linalg.norm(moved - way) < 5e-4
+    assert [notice.kind for notice in bench.controller.notices()] == ["lost-channel"]
 
 
 @pytest.mark.usefixtures("compiled")

@@ -35,7 +35,21 @@ def test_it_ends_when_the_tip_has_followed_the_model(seen: np.ndarray, responds:
 
 
 def test_an_arm_that_was_commissioned_is_fast_at_once() -> None:
-    assert FirstMotion(True, TUNING).slew_share == math.inf
+    first = FirstMotion(True, TUNING)
+    assert first.slew_share == math.inf
+    assert first.largest_correction(BASE) == math.inf
+
+
+def test_until_then_feedback_corrects_no_more_than_an_error_of_the_model() -> None:
+    first = FirstMotion(False, TUNING)
+    assert first.largest_correction(BASE) == TUNING.correction
+    later = first.largest_correction(BASE + 0.004 * X)
+    assert later == pytest.approx(TUNING.correction + 0.004 * TUNING.error)
+    first.take(BASE, BASE)
+    first.take(BASE + 0.02 * X, BASE + 0.02 * X)
+    assert first.largest_correction(BASE) == math.inf
+    first.begin()
+    assert first.largest_correction(BASE + 0.1 * X) == TUNING.correction
 
 
 @pytest.mark.usefixtures("compiled")

@@ -121,11 +121,25 @@ def test_a_hold_never_commands_more_than_was_commanded_whatever_a_gauge_reads() 
     arm.ticks(15)  # falling: the chambers have more than is commanded
     before = arm.loop.snapshot().commanded
     assert before.max() > 1e4
+    most = np.max(arm.loop._supervisor._recent, axis=0)  # of the last 0.3 s
     arm.world.inject("supply", "wrong", channel=2)  # reads 0.2 bar of an empty chamber
     arm.controller.said = DOUBT
-    arm.tick()
-    arm.ticks(5)
-    assert (arm.loop.snapshot().commanded <= before + 1e-6).all()
+    for _ in range(30):
+        arm.tick()
+        assert (arm.loop.snapshot().commanded <= most + 1e-6).all()
+
+
+def test_a_doubt_leads_back_the_way_where_pressures_rise_and_fall() -> None:
+    arm = Lab(safety={"hold_timeout": TIMEOUT}, supply={"driver": "simulated", "lag": 0.1})
+    arm.controller.wanted = before = np.array([1e5, 0.0, 0.5e5])
+    arm.ticks(200)
+    arm.controller.wanted = np.array([0.0, 1e5, 0.5e5])
+    arm.ticks(8)
+    arm.controller.said = DOUBT
+    arm.until(State.HOLDING)
+    assert arm.world.pressures[0] < 0.97e5
+    arm.ticks(45)
+    assert arm.world.pressures == pytest.approx(before, abs=2e3)
 
 
 def test_no_timeout_has_to_be_accepted() -> None:

@@ -113,6 +113,25 @@ def test_a_tip_that_does_not_move_when_it_should_is_doubted_after_a_few_millimet
     assert moved(time) < 0.018
 
 
+@pytest.mark.parametrize("wrong", [0.0, 1.0])
+def test_the_reference_is_slowed_down_before_the_doubt_but_not_for_an_error(wrong: float) -> None:
+    """A tip that moves across its way, or a third too little."""
+    watch = MotionWatch(ROBOT.description, MotionTuning())
+    moved, paces = step(0.04), []
+    for time in np.arange(0.0, 3.0, FRAME):
+        way = moved(time) * X
+        watch.intend(time, way)
+        take(watch, time, way * 0.7 * (1 - wrong) + moved(time) * wrong * Y, way, NONE)
+        if watch.doubt is not None:
+            break
+        paces.append(watch.pace)
+    assert (watch.doubt is not None) is bool(wrong)
+    assert (min(paces) < 0.5) is bool(wrong)
+    assert max(paces) == 1.0
+    watch.go_on()
+    assert watch.pace == 1.0
+
+
 def test_a_tip_that_moves_along_its_axis_does_not_lie_still() -> None:
     axis, aside, moved = TIP.pose[:3, 2], TIP.pose[:3, 0], step(1.0, lag=0.3)
 

@@ -193,6 +193,18 @@ def test_a_plan_that_stays_changes_the_pressures_least(robot):
     assert not planning.plan(replace(moved, target=far)).reached
 
 
+def test_a_plan_in_small_steps_stays_near_the_last_one(robot):
+    planning, first = Planning(robot), request(robot)
+    stiffest = planning.plan(first)
+    before = replace(stiffest, pressures=PRESSURES)
+    assert np.abs(stiffest.pressures - PRESSURES).max() > 1e4
+    for _ in range(40):
+        plan = planning.plan(replace(first, search=False, step=5e3, last=before))
+        assert np.abs(plan.pressures - before.pressures).max() <= 5e3 + 1.0
+        before = plan
+    np.testing.assert_allclose(plan.pressures, stiffest.pressures, atol=100.0)
+
+
 def test_target_that_cannot_be_reached_has_a_plan_that_says_why(robot):
     asked = request(robot)
     far = asked.target.model_copy(update={"position": (0.2, 0.0, None)})

@@ -10,7 +10,7 @@ import pytest
 from stiffopt.errors import InputError
 from stiffopt.experiments.poses import load_poses, save_poses
 from stiffopt.identify.suggestion import suggest_poses
-from stiffopt.model.calibration import Calibration, ErrorModel, FittedParameter
+from stiffopt.model.calibration import Calibration, ErrorModel, FittedParameter, RelativeErrors
 from stiffopt.model.description import RobotDescription
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.parameters import Parameter, with_values
@@ -76,7 +76,8 @@ def test_the_next_pose_tells_most() -> None:
             errors.distances([3], everywhere)[:, 0], np.linalg.norm(everywhere - pose, axis=1)
         )
         growth = 1 - np.exp(-2 * away / errors.reach)
-        variance = errors.discrepancy**2 * growth + (errors.gain * away) ** 2
+        told = RelativeErrors(np.vstack([errors.recorded, pose]), errors.range)
+        variance = errors.discrepancy**2 * growth + errors.gain**2 * told.variances(everywhere)
         total += sum(v * np.trace(j @ j.T) for v, j in zip(variance, acting, strict=True))
         return float(total)
 

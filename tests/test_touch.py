@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, cast
@@ -15,9 +16,10 @@ from conftest import is_long
 from stiffopt import Press, StiffnessGoal, StiffnessMeasure, Target, Task, load_robot, load_task
 from stiffopt.control.controller import TipController
 from stiffopt.control.creep import CreepEstimator
+from stiffopt.control.obstruction import ObstructionWatch
 from stiffopt.control.pressing import Phase, Pressing
 from stiffopt.control.touch import TipForce, TouchEstimator, _vibration
-from stiffopt.control.tuning import CreepTuning, PressingTuning, TouchTuning
+from stiffopt.control.tuning import CreepTuning, ObstructionTuning, PressingTuning, TouchTuning
 from stiffopt.control.vibration import transition
 from stiffopt.errors import InputError
 from stiffopt.model.robot_files import load_description
@@ -296,6 +298,61 @@ def test_it_goes_back_when_too_much_is_felt_or_nothing_although_it_is_held_back(
     assert max(numb.forces) < 0.06
 
 
+@pytest.mark.parametrize("inside", [0.0, 3e-4])
+def test_it_goes_back_when_the_tip_touched_something_before_the_approach(inside: float) -> None:
+    arm = Spring(-inside, 200.0, late=10_000)
+    arm.run(0.75)
+    assert arm.pressing.phase is Phase.APPROACHING
+    arm.run(0.2)
+    assert arm.pressing.is_blocked
+    assert arm.pressing.touches
+    assert math.isnan(arm.pressing.force)  # not known: it began before it was watched
+    arm.run(3.0)
+    assert arm.forces[-1] == 0.0
+    assert arm.pressing.phase is Phase.ENDED
+    assert "holds the tip at the target" in arm.pressing.notices()[0].text
+    position = arm.pressing.at(0.0).position
+    assert position is not None
+    assert 2e-3 < 0.02 - inside - cast("float", position[0]) < 5e-3
+
+
+@pytest.mark.parametrize("stiffness", [100.0, 2e3])
+def test_it_goes_back_from_an_object_on_the_way_that_lets_the_target_unreached(
+    stiffness: float,
+) -> None:
+    """The tip is held a millimetre short of its target, and feedback presses ever harder."""
+    pressing, creep = Pressing(PRESS, TARGET, PressingTuning()), Spring(1.0, 1.0).creep
+    c, wall, free, forces = COMPLIANCE[0, 0], 0.019, 0.0, []
+    none = TipForce(False, np.zeros(3), 1e-6 * np.eye(3), np.zeros(3))
+    for tick in range(1600):
+        if tick == 800:
+            assert pressing.phase is Phase.ENDED
+            assert forces[-1] == 0.0
+            wall -= 4e-3  # the object follows, and the tip goes back once more
+        forces.append(max(0.0, stiffness * (free - wall) / (1 + stiffness * c)))
+        tip = np.array([free - c * forces[-1], 0.0, 0.1])
+        offset = np.array([tip[0] - free, 0.0, 0.0, 0.0, 0.0, 0.0])
+        pressing.advance(0.01, False, True, tip, offset, none, creep, np.eye(3), COMPLIANCE)
+        position = pressing.at(0.0).position
+        assert position is not None
+        goal = cast("float", position[0]) - pressing.corrected(offset)[0]
+        free += float(np.clip(0.1 * (goal - free), -1e-3, 1e-3))  # 0.1 s late
+    assert pressing.phase is Phase.ENDED
+    assert max(forces) < 0.1
+    assert forces[-1] == 0.0
+    assert 2e-3 < wall - tip[0] < 5e-3
+
+
+def test_an_error_of_the_model_that_feedback_removes_holds_nothing_back() -> None:
+    watch, target = ObstructionWatch(ObstructionTuning()), np.array([0.02, 0.01, 0.1])
+    goal = target.copy()
+    for _ in range(2000):  # everything moves the tip by a third less than modelled
+        tip = 0.7 * goal
+        assert not watch.take(tip, np.concatenate([tip - goal, np.zeros(3)]), target)
+        goal = goal + 0.05 * (target - tip)
+    assert np.linalg.norm(tip - target) < 1e-6
+
+
 def test_the_offset_is_kept_along_the_direction_only() -> None:
     arm = Spring(0.003, 200.0)
     arm.run(6.0)
@@ -434,6 +491,9 @@ def test_a_press_is_planned_as_its_reaction() -> None:
     [
         (Press(force=0.03, direction=(0, 0, 1)), "cannot feel"),
         (Press(force=0.5, direction=(1, 0, 0)), "cannot hold 0.5 N there"),
+        (Press(force=0.0037, direction=(1, 0, 0)), "press with more than 3.75 mN"),
+        (Press(force=0.03, direction=(1, 0, 0), tolerance=0.03), "may be none at all"),
+        (Press(force=0.03, direction=(1, 0, 0), speed=0.1), "press.speed must be at most"),
     ],
 )
 def test_what_cannot_be_held_or_felt_is_refused(press: Press, why: str) -> None:

@@ -293,7 +293,7 @@ def errors_of_logs(robot: RobotDescription, found: Sequence[Comparison]) -> Text
 def coverage_table(found: Sequence[Comparison]) -> TextTable:
     """Return the share of measured tips within the regions about the predictions."""
     rows = tuple(
-        (kind, f"{each.n}", *(_percent(share) for share in each.shares))
+        (kind, f"{each.n}", *map(_with_interval, each.shares, each.intervals))
         for kind, each in coverage(found).items()
     )
     return TextTable(
@@ -302,8 +302,15 @@ def coverage_table(found: Sequence[Comparison]) -> TextTable:
         rows,
         "with history: about the prediction that knows what was commanded before; moving, settled: "
         "about the tip's pose at the commanded pressures alone, which change or are held; inside, "
-        "outside: of what the calibration has seen",
+        "outside: of what the calibration has seen; in percent, with half the 95 % interval from a "
+        "bootstrap of blocks of two minutes",
     )
+
+
+def _with_interval(share: float, interval: tuple[float, float]) -> str:
+    """Return a share with half its interval, in percent: ``67 ±7``."""
+    half = (interval[1] - interval[0]) / 2
+    return f"{100 * share:.0f}" if np.isnan(half) else f"{100 * share:.0f} ±{100 * half:.0f}"
 
 
 def range_remarks(robot: RobotDescription, found: Sequence[Comparison]) -> list[str]:
@@ -511,7 +518,13 @@ def validation_record(robot: RobotDescription, found: Sequence[Comparison]) -> d
         **_outside_record(robot, found),
         "robot": robot.name,
         "coverage": {
-            kind: {"n": each.n, **{f"{level:g}": share for level, share in each.by_level.items()}}
+            kind: {
+                "n": each.n,
+                **{f"{level:g}": share for level, share in each.by_level.items()},
+                "intervals": [
+                    None if np.isnan(low) else [low, high] for low, high in each.intervals
+                ],
+            }
             for kind, each in coverage(found).items()
         },
         "remarks": [f"{each.name}: {remark}" for each in found for remark in each.remarks],

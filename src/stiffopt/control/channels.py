@@ -8,6 +8,9 @@ soon as there is some. If a limited channel does not follow its command down eit
 the plan takes its pressure as fixed, and the command stays just below it. A reading that does not
 move at all, although even a slow regulator would have moved it, shows both at once. A channel that
 moves against its command is *opposed*: the pressures are held, as feedback would drive it on.
+Until that is decided, the reference waits: it is slowed down by as much as a channel stays behind
+what even a slow regulator would have reached. The others then do not run ahead of it, and the tip
+stays near its way. Differences that last become usual, so the reference never waits for ever.
 Faults of the pressure monitor remain faults: none of these commands exceeds the limits, nor differs
 from the reading by more than the monitor tolerates.
 
@@ -56,6 +59,7 @@ class Channels:
     limited, stuck, opposed, out : flags (n,) of channels that have no more pressure, that keep
         their pressure, that move against their command, and that were taken out by request.
     shortfall : commands minus settled pressures (n,), in Pa.
+    pace : share of its speed that the reference may keep, for channels that stay behind.
     """
 
     def __init__(
@@ -90,6 +94,8 @@ class Channels:
         self._smoothed: Array = np.zeros(n)  # smoothed readings, in Pa
         self._ceiling: Array = np.where(self.out, self._empty, self._limits.high)
         self._rest = _Rest(n, self._tuning)
+        self.pace = 1.0
+        self._usual: Array = np.zeros(n)  # lasting differences from the healthy pressures, in Pa
         self._quiet = True  # whether no channel is short, or was until now
 
     def take_out(self, channels: Iterable[int]) -> None:
@@ -140,8 +146,9 @@ class Channels:
                 self._limits.high,
             )  # fmt: skip
         if self._quiet and sound[0]:
-            self._followed = now
+            self._followed, self.pace = now, 1.0
             return
+        self._set_pace(elapsed, reading, healthy)
         short, unmoved = self.shortfall, self._tuning.unmoved
         self._followed = np.where((follows > 0) & (strays == 0), now, self._followed)
         # a reading that has moved must not count as still when it comes by again
@@ -152,7 +159,8 @@ class Channels:
         ignores = still & np.stack([falls | rises, falls])
         moved = reading - self._followed[2]  # NaN: not measured
         opposed = (falls & (moved > self._probe)) | (rises & (moved < -self._probe))
-        self.opposed = (self.opposed | opposed) & (follows == 0)
+        # a supply that fails while the command rises is short, not opposed
+        self.opposed = (self.opposed | opposed) & (follows == 0) & ~self.limited
         self._smoothed = np.where(ignores[0], reading, self._smoothed)
         share = -math.expm1(-elapsed / self._tuning.make_up_time)
         wanted = np.minimum(np.maximum(short, self._min_allowed), self._max_allowed)
@@ -164,6 +172,14 @@ class Channels:
             or self.limited.any()
             or (self._allowed > self._min_allowed + 1.0).any()
         )
+
+    def _set_pace(self, elapsed: float, reading: Array, healthy: Array) -> None:
+        """Let the reference wait for channels that are behind their healthy pressures (2, n)."""
+        tuning = self._tuning
+        behind = np.fmax(np.fmax(healthy[0] - reading, reading - healthy[1]), 0.0)  # 0 for NaN
+        self._usual += -math.expm1(-elapsed / tuning.wait_time) * (behind - self._usual)
+        late = np.where(self.lost, 0.0, behind - self._usual).max() - tuning.follows
+        self.pace = min(max(1 - late / tuning.longest_wait, 0.0), 1.0)
 
     def _judge(self, elapsed: float, short: Array, command: Array, ignores: Flags) -> None:
         """Find channels that are limited or stuck, and those that follow again.

@@ -340,12 +340,18 @@ class TipController:
         newly_lost = lost is not self._lost and (lost & ~self._lost).any()
         if self._at_rest or newly_lost:  # they are not where the reference is
             self.resume(now)
+        if newly_lost:
+            estimate = self._arm.tip.estimate
+            self.replanner.go_straight(
+                now, estimate.position, estimate.rotation, self._reference.path[:n], self._offset
+            )
+            plan = self._reference.path
         self._lost = lost
         if self._model_is_wrong():
             return ControlOutput(last.copy(), False, self._feedback.saturated.copy())
         self._set_reference_rate()
         reference.omega = self._arm.tip.omega
-        reference.advance(plan)
+        reference.advance(self._awaited(plan, now))
         if self._arm.leaning is not None:
             return self._feedforward(reference.command - pressures.command_offset, last)
         tip = self._arm.on_path(reference.path[:n])
@@ -363,10 +369,29 @@ class TipController:
             reference.command - pressures.command_offset,
             self._arm.channels.commands(reference.path[:n], *self._permitted),
             isinstance(course, Course),
+            self._first_motion.largest_correction(tip.pose[:3, 3]),
         )
         if command is None:
             return ControlOutput(last.copy(), False, self._feedback.saturated.copy())
         return ControlOutput(command, True, self._feedback.saturated.copy())
+
+    def _awaited(self, plan: Array, now: float) -> Array:
+        """Return the reference's goal (n + 6,): the plan, unless channels or tip do not follow.
+
+        The reference waits for them where it is, and a trajectory of pressures too.
+        """
+        pace, course = (
+            min(self._arm.channels.pace, self._arm.watch.pace),
+            self.replanner.pursuit.course,
+        )
+        if pace == 1 or isinstance(course, Bracing):
+            return plan
+        if isinstance(course, PostureCourse):
+            course.wait((1 - pace) * min(now - self._computed_at, _HELD * self._period))
+            return plan
+        path = self._reference.path
+        goal: Array = path + pace * (plan - path)
+        return goal
 
     def _feedforward(self, pressures: Array, last: Array) -> ControlOutput:
         """Command pressures (n,) without feedback: contacts change how the arm vibrates."""
@@ -559,7 +584,7 @@ class TipController:
         if isinstance(pursuit.course, Pressing):
             target = pursuit.course.shown(estimate.position)
             press_force, press_goal = pursuit.course.force, pursuit.course.press.force
-            touches = touches or pursuit.course.phase is Phase.PRESSING
+            touches = touches or pursuit.course.touches
         position, pointing, quaternion = target_arrays(target)
         position_error, angle_error = self._errors.at(target, estimate.position, estimate.rotation)
         sample, plan = self._arm.tip.sample, self.replanner.plan

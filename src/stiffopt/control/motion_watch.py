@@ -56,6 +56,14 @@ class Doubt:
     undo: float = 1.0
 
 
+class _Miss(NamedTuple):
+    """Motion that the model does not explain: beyond a share of 1."""
+
+    share: float  # of the difference between the ways in what is explained; 0 if they fit
+    way: float  # length of the model's way, in m
+    seen: float  # of the seen one, in m
+
+
 class MotionWatch:
     """Compares the tip's motion with that of the model and of the reference.
 
@@ -69,6 +77,8 @@ class MotionWatch:
     Attributes
     ----------
     doubt : the present doubt; it stays until `forgive` or `go_on`.
+    pace : share of its speed that the reference may keep; less than 1 before a missing response is
+        certain.
     """
 
     def __init__(self, robot: RobotDescription, tuning: MotionTuning) -> None:
@@ -90,11 +100,13 @@ class MotionWatch:
         self._intended: deque[tuple[float, Array]] = deque(maxlen=self._kept)
         self._swings = [_Swings(self._tuning) for _ in range(3)]
         self.doubt: Doubt | None = None
+        self.pace = 1.0
 
     def go_on(self) -> None:
         """Continue after a pause in which the arm was not controlled, or not seen."""
         self._intended.clear()
         self._misses = self._slips = 0
+        self.pace = 1.0
         self._swings = [_Swings(self._tuning) for _ in range(3)]
         self.forgive()
 
@@ -204,11 +216,15 @@ class MotionWatch:
         ways = rows[-1, _PREDICTED] - rows[:-1, _PREDICTED]
         if ((ways**2).sum(axis=1) > self._min_motion**2).any():  # projections are no longer
             across = np.eye(3) - np.outer(axis, axis)
-            missed = self._missed(rows, jacobian, np.eye(3)) or self._missed(rows, jacobian, across)
-        self._misses = self._misses + 1 if missed else 0
+            found = (self._missed(rows, jacobian, P) for P in (np.eye(3), across))
+            missed = max(found, key=lambda miss: miss.share)
+        share = 0.0 if missed is None else missed.share
+        usual = self._tuning.usual_share
+        self.pace = min(max((1 - share) / (1 - usual), 0.0), 1.0)
+        self._misses = self._misses + 1 if share > 1 else 0
         if missed is None or self._misses < self._tuning.misses:
             return None
-        most, moved = 1e3 * missed[0], 1e3 * missed[1]
+        most, moved = 1e3 * missed.way, 1e3 * missed.seen
         text = f"the tip should have moved by {most:.1f} mm and was seen to move by {moved:.1f} mm"
         if moved < most / 2:
             return Doubt(
@@ -223,11 +239,8 @@ class MotionWatch:
             "has slipped, or something pushes the arm; run 'stiffopt commission'",
         )
 
-    def _missed(self, rows: Array, jacobian: Array, P: Array) -> tuple[float, float] | None:
-        """Return lengths of the model's way and of the seen one where they do not fit, in m.
-
-        Ways are projected by P (3, 3). They must be longer than explained.
-        """
+    def _missed(self, rows: Array, jacobian: Array, P: Array) -> _Miss:
+        """Return where the model's way and the seen one, projected by P (3, 3), fit least."""
         tuning = self._tuning
         ways = rows[-1] - rows[:-1]
         way, seen = ways[:, _PREDICTED] @ P, ways[:, _SEEN] @ P
@@ -238,7 +251,7 @@ class MotionWatch:
         meant = (ways[:, _INTENDED] @ P * way).sum(axis=1) > distance**2 / 2
         suspects = np.flatnonzero(meant & wrong & (distance > self._min_motion))
         if not len(suspects):
-            return None
+            return _Miss(0.0, 0.0, 0.0)
         off = np.sqrt(((seen - way)[suspects] ** 2).sum(axis=1))
         steps = np.diff(rows, axis=0)
         speeds = np.sqrt(((steps[:, _PREDICTED] @ P) ** 2).sum(axis=1)) / steps[:, _TIME]
@@ -250,10 +263,10 @@ class MotionWatch:
         moved, model = ((ways[suspects, part] ** 2).sum(axis=1) for part in (_SEEN, _PREDICTED))
         own[moved < tuning.still**2 * model] = 0.0  # a wrong model would move it somewhere
         explained = own + late + swing + tuning.noise + 6 * tuning.scatter
-        missed = suspects[off > explained]
-        if not len(missed):
-            return None
-        return float(distance[missed[0]]), float(np.linalg.norm(seen[missed[0]]))
+        worst = int(np.argmax(off / explained))
+        first = suspects[worst]
+        lengths = float(distance[first]), float(np.linalg.norm(seen[first]))
+        return _Miss(float(off[worst] / explained[worst]), *lengths)
 
     def _slip(self, jacobian: Array, tip: TipAt) -> Doubt | None:
         """Test whether the offset has changed as no force, wherever it acts, changes it."""

@@ -200,6 +200,8 @@ class ArmObserver:
             if isinstance(course, Pressing) and course.begins_free and self.touch.felt.touches:
                 self.touch.forget()
         self.touch.take(sample.time, sample.position - predicted, effective, tip, self.tip.omega)
+        if isinstance(course, Pressing) and course.is_blocked:
+            return  # an object of unknown force holds the tip: its motion is not the model's
         if presses:
             pushed = self.touch.felt.displacement
         self.watch.take(

@@ -67,6 +67,7 @@ class PlanRequest:
     windows: tuple[Window, ...] = ()  # of the tip at rest, for adaptation
     adapted: Adapted | None = None  # the model that the offset refers to; None: the robot file's
     stay: bool = False  # whether to follow the target by the least change of the last pressures
+    step: float = math.inf  # largest change of a pressure from the last plan, in Pa
 
 
 @dataclass(frozen=True)
@@ -176,6 +177,9 @@ class Planning:
         self._limits = self._effective_limits(request)
         last, refused = request.last or self._last, self._refused
         self._last = last
+        if last is not None and request.step < math.inf:
+            bounds = last.pressures - request.step, last.pressures + request.step
+            self._limits = np.clip(bounds[0], *self._limits), np.clip(bounds[1], *self._limits)
         if last is None or request.search:
             self._searched_at = request.offset
             self._advantage, self._refused = self._tuning.advantage, 0

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from stiffopt.control.creep import CreepEstimator
 from stiffopt.control.interface import Notice
+from stiffopt.control.obstruction import ObstructionWatch
 from stiffopt.control.state import Severity
 from stiffopt.control.touch import TipForce
 from stiffopt.control.tuning import PressingTuning
@@ -72,6 +73,11 @@ class Pressing:
         self._waited = self._felt_nothing = self._within = self._off = 0.0
         self._pushed = 0.0  # how long something has pushed the tip before the approach, in s
         self._touched, self._why = False, ""
+        self._watch = ObstructionWatch(tuning.obstruction)
+        self._free = False  # whether it is known whether the tip was free when the approach began
+        self._blocked = False  # whether it was not, or an object keeps it from the target
+        # ways of the tip and of the arm on the way back from it, and the way on which both were one
+        self._before, self._clear = (0.0, 0.0), 0.0
         self._notices: list[Notice] = []
 
     def at(self, now: float) -> Target:
@@ -103,6 +109,16 @@ class Pressing:
         return self.phase is Phase.PRESSING and self._touched
 
     @property
+    def touches(self) -> bool:
+        """Whether the tip is known to touch something."""
+        return self.phase is Phase.PRESSING or self.is_blocked
+
+    @property
+    def is_blocked(self) -> bool:
+        """Whether the tip goes back from an object before its target."""
+        return self._blocked and self.phase is Phase.RETREATING
+
+    @property
     def begins_free(self) -> bool:
         """True while the arm rests before the approach; nothing may touch the tip then."""
         return self.phase is Phase.GOING and self._waited >= self._tuning.rest
@@ -128,6 +144,7 @@ class Pressing:
     def change_model(self, change: Array) -> None:
         """Adjust to another model, for which the tip's offset changes by (6,)."""
         self._offset = self._offset + change
+        self._watch.change_model(change)
 
     def advance(
         self,
@@ -162,6 +179,12 @@ class Pressing:
             in base axes.
         """
         t = self._tuning
+        is_free = self.phase in (Phase.GOING, Phase.ENDED)
+        aim = np.array(self._target.position, dtype=float)
+        if is_free and self._watch.take(tip, offset, aim):
+            self._leave(tip, offset, creep)
+        if self.phase is Phase.ENDED:
+            return
         if self.phase is Phase.GOING:
             self._waited = self._waited + elapsed if arrived else 0.0
             self._pushed = self._pushed + elapsed if felt.touches else 0.0
@@ -177,15 +200,43 @@ class Pressing:
         n, self._creep = self._direction, creep.displacement - self._crept
         feeling = Feeling.of(n, compliance)
         self.force = -float(n @ felt.force) / max(feeling.share, 0.1)
+        if self._blocked:
+            self.force = math.nan  # what holds the tip may have begun long ago
         gone = float(n @ (tip - self._start))
+        way = gone - float(n @ (offset - self._offset)[:3])  # of the arm without contact
+        if self.touches_on_purpose and not self._blocked and not self._free:
+            self._free = way > self._tuning.free_way
+            if self._free and gone < self._tuning.free_share * way:
+                self._block(gone, way)
         if self.phase is Phase.APPROACHING:
             self._approach(elapsed, gone, feeling.compliance)
         elif self.phase is Phase.PRESSING:
             self._keep_the_force(elapsed, gone, feeling.compliance)
         elif self.phase is Phase.RETREATING:
-            self._shift = max(0.0, self._shift - self.press.speed * elapsed)
-            if not self._shift:
-                self.phase, self.force = Phase.ENDED, math.nan
+            self._shift -= self.press.speed * elapsed
+            if self._blocked:
+                self._go_clear(gone, way, tip)
+            elif self._shift <= 0.0:
+                self._end()
+
+    def _end(self) -> None:
+        self._shift, self.phase, self.force = 0.0, Phase.ENDED, math.nan
+        self._watch.begin()
+
+    def _go_clear(self, gone: float, way: float, tip: Array) -> None:
+        """End the retreat from an object once the tip follows the arm back; stay there.
+
+        `gone` and `way` are the ways of the tip and of the arm without contact, in m.
+        """
+        t, (gone_before, way_before) = self._tuning, self._before
+        back = way_before - way
+        if back > t.free_way:
+            follows = gone_before - gone > t.free_share * back
+            self._clear = self._clear + back if follows else 0.0
+            self._before = gone, way
+        if self._clear >= t.clear or self._shift < -t.most_back:
+            self._target = self._target.model_copy(update={"position": tuple(tip.tolist())})
+            self._end()
 
     def _approach(self, elapsed: float, gone: float, compliance: float) -> None:
         press, t = self.press, self._tuning
@@ -234,6 +285,20 @@ class Pressing:
         """Return by how much the tip is held back, in m: needs no estimate of the force."""
         return self._shift - gone
 
+    def _leave(self, tip: Array, offset: Array, creep: CreepEstimator) -> None:
+        """Begin to go back from an object at the target, or that has come there; nothing jumps."""
+        withheld = self._watch.withheld
+        self._shift = float(np.linalg.norm(withheld))
+        self._direction, self._start = withheld / self._shift, tip.copy()
+        self._offset, self._crept = offset.copy(), creep.displacement.copy()
+        self._offset[:3] += withheld
+        self._block(0.0, self._shift)
+
+    def _block(self, gone: float, way: float) -> None:
+        why = "something holds the tip at the target, where it must be free"
+        self._retreat(self._why if self.phase is Phase.ENDED else why)
+        self._blocked, self._before, self._clear = True, (gone, way), 0.0
+
     def _retreat(self, why: str) -> None:
         self.phase, self._why = Phase.RETREATING, why
 
@@ -244,7 +309,8 @@ class Pressing:
         """Return events since the last call, and alarms."""
         found, self._notices = tuple(self._notices), []
         if self.phase in (Phase.RETREATING, Phase.ENDED):
-            text = f"{self._why}; the tip goes back to where it began, until there is a new task"
+            where = "until it is free" if self._blocked else "to where it began"
+            text = f"{self._why}; the tip goes back {where}, and stays there until a new task"
             return (*found, Notice("press-failed", text, standing=True))
         if self.phase is Phase.GOING and self._pushed > self._tuning.patience:
             text = "something touches the tip already; it presses once nothing does"

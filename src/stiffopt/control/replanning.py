@@ -20,8 +20,10 @@ from stiffopt.control.posture import PostureCourse
 from stiffopt.control.pressing import Phase, Pressing
 from stiffopt.control.tip_errors import stiffness_function, target_arrays
 from stiffopt.control.tuning import ReplanningTuning
+from stiffopt.errors import InputError
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import Task
+from stiffopt.paths.trajectory import Trajectory, Waypoint
 
 Array = NDArray[np.float64]
 AnyCourse = Course | PostureCourse | Pressing | Bracing
@@ -107,6 +109,8 @@ class Replanner:
         """Start anew, with nothing to pursue."""
         self.pursuit = Pursuit()
         self.plan: Plan | None = None  # the newest, possibly of the task before
+        self._detour: Course | None = None  # the tip's way to its target after a loss of channels
+        self._detour_from: Plan | None = None  # where it begins, until that is planned from
         self._offset = np.zeros(6)
         self.deviation = math.nan  # of the plan's stiffness, relative
         self._available: Array | None = None  # (2, n), see `update`
@@ -118,13 +122,46 @@ class Replanner:
         far_position, far_angle = self._tuning.far_position, self._tuning.far_angle
         new = pursuit.is_new_after(before)
         far = is_far(before.target, pursuit.target, far_position, far_angle)
-        self.pursuit = pursuit
+        self.pursuit, self._detour = pursuit, None
         if new:
             self._renew()
         if isinstance(pursuit.course, PostureCourse):
             self.plan = None  # it belongs to another posture than the trajectory's
         self._search = self._search or far
         self._requested_at = -math.inf
+
+    def go_straight(
+        self, now: float, position: Array, rotation: Array, pressures: Array, offset: Array
+    ) -> None:
+        """Lead the tip straight to its target, in small steps from where it is.
+
+        Without the channels that are lost, pressures for the target may be far from the present
+        ones; the straight line to them could bend widely at the tip. Trajectories and presses have
+        a way of their own.
+
+        Parameters
+        ----------
+        now :
+            Time, in s.
+        position, rotation :
+            Of the tip now, (3,) and (3, 3).
+        pressures, offset :
+            Effective pressures (n,), in Pa, and the tip's offset (6,) now.
+        """
+        target, here = self.pursuit.target, target_arrays(self.pursuit.target)[0]
+        if self.pursuit.course is not None or target is None:
+            return
+        way = 0.0 if here is None else float(np.linalg.norm(np.nan_to_num(here - position)))
+        end = Waypoint(time=max(way / self._tuning.detour_speed, 0.5), target=target)
+        try:
+            self._detour = Course(Trajectory(waypoints=(end,)), now, position, rotation)
+        except InputError:  # it has to turn by half a turn
+            return
+        self._detour_from = Plan(
+            self._serial, pressures, offset, self._detour.at(now), True, math.nan, "",
+            adapted=self.adapted,
+        )  # fmt: skip
+        self._offset, self._requested_at = offset.copy(), -math.inf
 
     def _renew(self) -> None:
         self._serial += 1
@@ -170,9 +207,12 @@ class Replanner:
         interval = self._tuning.interval
         if task is not None and target is not None and now - self._requested_at >= interval - 1e-6:
             self._note_available(available)
-            search = self._search and self.pursuit.course is None
+            detour, course = self._detour, self.pursuit.course
+            search = self._search and course is None and detour is None
             self._requested_at, self._search = now, False
-            course, later = self.pursuit.course, now + delay + self._lead
+            later = now + delay + self._lead
+            if detour is not None and later < detour.end:
+                target = detour.at(later)
             if isinstance(course, Course):  # the target when the reference will be there
                 target = course.at(later, delay / 2)  # the spread of four equal lags
             elif course is not None:
@@ -185,7 +225,10 @@ class Replanner:
             request = PlanRequest(
                 self._serial, task, target, self._offset.copy(), pressure_offset, search,
                 *available, windows=windows, adapted=self.adapted, stay=stay,
+                last=self._detour_from,
+                step=math.inf if detour is None else self._tuning.detour_step,
             )  # fmt: skip
+            self._detour_from = None
             self._planner.request(request if way is None else replace(request, way=way))
         return self.latest()
 
@@ -217,6 +260,8 @@ class Replanner:
         """Take the newest plan, unless its way is blocked; return as `update` does."""
         plan = self._planner.latest()
         if plan is not None and plan.serial == self._serial and plan is not self._newest:
+            if self._detour is not None and self._newest is not None:
+                self._end_detour(plan, self._newest)
             self._newest, self.deviation = plan, plan.deviation
             self.known = plan.estimate or self.known
             self._blocked = plan.blocked
@@ -226,6 +271,14 @@ class Replanner:
             return None
         return np.concatenate([self.plan.pressures, self.plan.offset])
 
+    def _end_detour(self, plan: Plan, before: Plan) -> None:
+        """End a detour whose last plans rest at its end; search further if that is short of it."""
+        assert self._detour is not None
+        is_last = plan.target == before.target == self.pursuit.target
+        moved = float(np.abs(plan.pressures - before.pressures).max())
+        if is_last and moved < self._tuning.detour_rest:
+            self._detour, self._search = None, not plan.reached
+
     def notices(self, away: tuple[float, float] | None = None) -> tuple[Notice, ...]:
         """Return what is wrong with the planner and its plan.
 
@@ -233,7 +286,8 @@ class Replanner:
         a tip at rest on its plan, or off it under held pressures; None: use the plan's own.
         """
         notices, plan = self._planner.notices(), self.plan
-        if plan is not None and plan.serial == self._serial and not plan.reached:
+        is_final = plan is not None and plan.serial == self._serial and self._detour is None
+        if plan is not None and is_final and not plan.reached:
             message, task = f"{plan.message} by the model", self.pursuit.task
             if away is not None and task is not None:
                 message = nearest_words(*away, task.target.tolerance, "the tip")

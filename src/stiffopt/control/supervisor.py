@@ -330,14 +330,14 @@ class Supervisor:
 
         Chambers lag behind commands, so these are the measured pressures. Whatever the gauges read,
         none is above or below all recent commands. A motion that is doubted is undone, wholly or by
-        a share: the pressures are nearer to the lowest recent ones.
+        a share: the arm goes back towards the first of the recent commands.
         """
         last, lowest = np.minimum(self._requested, self.commanded), np.min(self._recent, axis=0)
         measured = np.clip(self.reading.pressures, lowest, np.max(self._recent, axis=0))
         falls = measured - last > self._tuning.falls  # False for NaN: not measured
         held: Array = np.where(falls, measured, np.fmin(measured, last))
         if (doubt := self._holds.get("doubt")) is not None:
-            held = held + doubt.undo * (np.minimum(last, lowest) - held)
+            held = held + doubt.undo * (self._recent[0] - held)
         return held
 
     def _end_a_long_hold(self, now: float) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -92,6 +94,7 @@ class TipFeedback:
         goal: Array,
         limits: tuple[Array, Array],
         follows: bool = False,
+        most: float = math.inf,
     ) -> Array | None:
         """Return the next command (n,), in Pa; None if the solver failed.
 
@@ -111,6 +114,8 @@ class TipFeedback:
             Lowest and highest command (n,), in Pa.
         follows :
             Whether the tip follows a trajectory.
+        most :
+            Largest correction of the position, in m.
         """
         n = len(goal)
         if not follows:
@@ -118,6 +123,9 @@ class TipFeedback:
         elif (modelled := self._arm.modelled) is not None:
             self._motion_error.learn(self._period, modelled.pose[:3, 3], self._arm.tip.offset[:3])
         correction = reference.path[n:] - self._correctable(offset, tip, reference)
+        size = float(np.linalg.norm(correction[:3]))
+        if size > most:
+            correction = correction * (most / size)
         self._allocation.limit(*limits)
         command, held, residual = self._allocation.solve(
             (tip.pose, tip.jacobian, prescribed, correction, *self._vibration_inputs(reference)),
@@ -142,13 +150,14 @@ class TipFeedback:
             self._is_new = False
         self._averaged.advance(now, arm.tip.omega)
         corrected = self._averaged.value[:6].copy()
-        behind, ahead = now[:3] - corrected[:3], np.zeros(3)
-        if slope.any():
+        behind = offset[:3] - corrected[:3]
+        if self._motion_error.knows:
             n = len(arm.pressures.command)
             velocity = tip.pose[:3, :3] @ (tip.jacobian[:3] @ reference.motion[1, :n])
-            behind -= slope @ (position - self._averaged.value[6:])
             ahead = slope @ velocity * (arm.pressures.lag + arm.pressures.dead_time)
-        corrected[:3] = now[:3] - behind + arm.tip.stiff_axis @ behind + ahead
+            behind -= slope @ (position - self._averaged.value[6:])
+            corrected[:3] = offset[:3] - behind + ahead
+        corrected[:3] += arm.tip.stiff_axis @ behind
         return corrected
 
     def _vibration_inputs(self, reference: Reference) -> tuple[ArrayLike, ...]:

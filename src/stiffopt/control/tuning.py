@@ -77,6 +77,10 @@ class RegulatorTuning:
     rest_range: float = 1e4
     gain_error: float = 0.05
     usual_time: float = 30.0
+    # pressure by which a channel is behind, beyond `follows`, at which the reference stands still,
+    # in Pa, and time constant with which it no longer waits, in s
+    longest_wait: float = 1e4
+    wait_time: float = 1.0
     let_down_share: float = 0.1  # share of the slew with which a removed channel is let down
 
 
@@ -116,11 +120,13 @@ class ReferenceTuning:
 class FirstMotionTuning:
     """The first motion of an arm that is not known to respond as modelled (`FirstMotion`)."""
 
-    slew_share: float = 0.15  # share of the slew that the reference may take
+    slew_share: float = 0.1  # share of the slew that the reference may take
     # way of the model's tip after which it ends, in m, if the tip has followed with an error of at
     # most a share of that way
     way: float = 8e-3
     error: float = 0.5
+    # largest correction by feedback at first, in m; it grows with the reference's way by `error`
+    correction: float = 2e-3
 
 
 @dataclass(frozen=True)
@@ -163,6 +169,11 @@ class ReplanningTuning:
     # change of a target, in m, after which all configurations are searched
     far_position: float = 5e-3
     far_angle: float = math.radians(5)  # the same of its orientation or pointing, in rad
+    # speed of the tip on its straight way after a loss of channels, in m/s; largest change of a
+    # pressure from plan to plan meanwhile, and one with which it has arrived, in Pa
+    detour_speed: float = 0.03
+    detour_step: float = 5e3
+    detour_rest: float = 1e3
     # change of an available pressure, in Pa, after which all configurations are searched
     other_pressure: float = 1e4
 
@@ -328,6 +339,8 @@ class MotionTuning:
     late: float = 0.01  # by which the tip may move later than the model's, in s
     # share of the amplitude of the vibration that the pressures excite, whose phase may be wrong
     swing_error: float = 0.35
+    # share of the explained difference from the model above which the reference is slowed down
+    usual_share: float = 0.4
     misses: int = 2  # successive samples that show no response
     # share of the latest motion that a hold undoes where the tip was not seen to move: the arm has
     # followed its pressures about so far, and then swings least; 0 for an arm that does not vibrate
@@ -434,6 +447,18 @@ class TouchTuning:
 
 
 @dataclass(frozen=True)
+class ObstructionTuning:
+    """When something holds the tip back from its target (`ObstructionWatch`)."""
+
+    still: float = 1e-3  # displacement within which the tip has stopped, in m
+    error: float = 4e-4  # of the tip, below which more is allowed in inverse proportion, in m
+    # change of the offset without anything in the way, in m; and the part of it that creep may
+    # cause, as a share of the way to the target
+    least: float = 1.5e-3
+    creep: float = 0.1
+
+
+@dataclass(frozen=True)
 class PressingTuning:
     """How the tip presses on something (`Pressing`)."""
 
@@ -453,6 +478,15 @@ class PressingTuning:
     held_back: float = 2e-3
     settled: float = 0.5  # time within the tolerance after which an event reports it, in s
     patience: float = 5.0  # time beyond the tolerance after which there is an alarm, in s
+    # way of the arm without contact, in m, on which the tip follows by at least this share, unless
+    # it touched something when the approach began
+    free_way: float = 1.5e-3
+    free_share: float = 0.45
+    # way on which the tip follows again before it has left an object at its target, and the largest
+    # motion of the arm without contact for it, in m
+    clear: float = 3e-3
+    most_back: float = 0.03
+    obstruction: ObstructionTuning = field(default_factory=ObstructionTuning)
 
 
 @dataclass(frozen=True)

@@ -10,13 +10,16 @@ of positions by effective pressures and the correlation K of the rows, ::
     cov(x) = C + s^2 N^-1 (A' J_p) K (A' J_p)' N^-1.
 
 Second, it acts on predictions: at a distance d from the nearest recorded pressure its variance is
-``s^2 (1 - exp(-2 d / l))``, that of the process given its value there.  It moves the tip as far as
-such pressures would, but equally in all directions: a model of bending and elongation may be wrong
-in either, whatever a single pressure does.
+``s^2 (1 - exp(-2 d / l))``, that of the process given its value there.  To this comes a relative
+error ``g |p|`` in directions of pressure space that were not recorded, with ``g = 7 s / R`` over
+the recorded range R (`ErrorModel`): where held-back data show that a model is more wrong, so it is
+where none can show it.  Both move the tip as far as such pressures would, but equally in all
+directions: a model of bending and elongation may be wrong in either, whatever a single pressure
+does.  Besides, the tip moves at another time than predicted, by a standard deviation t.
 
-s, l, the residual and the tail of the errors maximise the probability of the held-back errors, with
-weak priors.  Rows are weighted so that many rows in one region of pressures count little more than
-one.
+s, l, t, the residual and the tail of the errors maximise the probability of the held-back
+errors, with weak priors.  Rows are weighted so that many rows in one region of pressures count
+little more than one.
 """
 
 from __future__ import annotations
@@ -36,10 +39,12 @@ from stiffopt.identify.results import Errors
 from stiffopt.identify.settings import ERRORS, FIT
 from stiffopt.model.calibration import (
     ErrorModel,
+    RelativeErrors,
     distances_from,
     even_variance,
     fading_mean,
     growth,
+    recorded_range,
     squared_moves,
 )
 from stiffopt.model.history import NO_HISTORY
@@ -74,14 +79,17 @@ def error_model(
     reaches = np.array(ERRORS.reaches) * np.ptp(pressures, axis=0).max()
     folds = [_Fold.of(each, pressures, reaches, found.independent) for each in held_back.values()]
     best = min((_most_probable(folds, i, found) for i in range(len(reaches))), key=lambda b: b[0])
-    _, index, (discrepancy, residual, tail) = best
+    _, index, (discrepancy, *_) = best
+    gain = ERRORS.untested * discrepancy / recorded_range(pressures)
+    _, _, (discrepancy, residual, tail, timing) = _most_probable(folds, index, found, gain)
     kept, spacing = representatives(_channels(found), pressures if recorded is None else recorded)
     settled, moving = _unsettled(found)
     return ErrorModel(
         residual=float(f"{residual:.4g}"),
         discrepancy=float(f"{discrepancy:.4g}"),
         reach=float(f"{reaches[index]:.4g}"),
-        gain=float(f"{_untested_gain(found, held_back):.3g}"),
+        gain=float(f"{gain:.3g}"),
+        timing=float(f"{timing:.3g}"),
         degrees_of_freedom=float(f"{_MIN_FREEDOM + tail:.3g}"),
         settled=settled,
         moving=moving,
@@ -145,6 +153,8 @@ class _Fold:
     through_fit : covariances (R, N, 3, 3) due to a discrepancy of variance 1 Pa^2, for each reach,
         through its effect on the fit.
     direct : variances (R, N) of each axis due to that discrepancy itself.
+    relative : those (N,) due to relative errors with a gain of 1, in m^2.
+    moving : covariance (N, 3, 3) due to an error of 1 s in time.
     weight : (R, N), of the rows, see `_weights`.
     """
 
@@ -152,6 +162,8 @@ class _Fold:
     parameters: Array
     through_fit: Array
     direct: Array
+    relative: Array
+    moving: Array
     weight: Array
 
     @classmethod
@@ -164,10 +176,18 @@ class _Fold:
         kept, spacing = representatives(channels, pressures[counted])  # as in a robot file
         distances = distances_from(channels, predicted.effective, kept) - spacing
         shares = growth(np.maximum(distances, 0.0), reaches[:, np.newaxis, np.newaxis])
-        moves = [
-            squared_moves(predicted.per_pressure[0], share)
-            for share in np.repeat(shares, channels, axis=2)
+        relative = [
+            RelativeErrors(kept[:, a:b], recorded_range(kept)).variances(
+                predicted.effective[:, a:b]
+            )
+            for a, b in pairwise(np.cumsum([0, *channels]))
         ]
+        acting = predicted.per_pressure[0]
+        *direct, untested = [
+            _even_variance(squared_moves(acting, np.repeat(share, channels, axis=1)), fit)[rows]
+            for share in (*shares, np.stack(relative, axis=1))
+        ]
+        velocity = (acting @ predicted.rates[..., np.newaxis])[rows]
         numbers = kept_unknowns(problem)
         slope = slopes[rows][:, :, numbers]
         added = _influence(problem, fit.x, fit.gain, reaches)[:, numbers[:, np.newaxis], numbers]
@@ -175,19 +195,30 @@ class _Fold:
             errors=predicted.errors[0][rows],
             parameters=_spread(slope, fit.covariance[np.ix_(numbers, numbers)]),
             through_fit=np.stack([_spread(slope, each) for each in added]),
-            direct=np.stack([_even_variance(each, fit)[rows] for each in moves]),
+            direct=np.stack(direct),
+            relative=untested,
+            moving=velocity @ np.swapaxes(velocity, 1, 2),
             weight=np.stack([_weights(pressures[rows], reach, independent) for reach in reaches]),
         )
 
-    def misfit(self, index: int, discrepancy: float, residual: float, tail: float) -> float:
+    def misfit(
+        self,
+        index: int,
+        gain: float,
+        discrepancy: float,
+        residual: float,
+        tail: float,
+        timing: float,
+    ) -> float:
         """Return the negative log density of the errors, up to a constant."""
         from scipy.special import gammaln
 
+        even = discrepancy**2 * self.direct[index] + gain**2 * self.relative + residual**2
         covariance = (
             self.parameters
             + discrepancy**2 * self.through_fit[index]
-            + (discrepancy**2 * self.direct[index] + residual**2)[:, np.newaxis, np.newaxis]
-            * np.eye(3)
+            + timing**2 * self.moving
+            + even[:, np.newaxis, np.newaxis] * np.eye(3)
         )
         v = _MIN_FREEDOM + tail
         squares = np.einsum(
@@ -242,49 +273,37 @@ def _weights(pressures: Array, reach: float, independent: float) -> Array:
 
 
 def _most_probable(
-    folds: Sequence[_Fold], index: int, found: Fit
-) -> tuple[float, int, tuple[float, float, float]]:
-    """Find discrepancy, residual and tail at one reach; return misfit, index and these values."""
+    folds: Sequence[_Fold], index: int, found: Fit, gain: float = 0.0
+) -> tuple[float, int, tuple[float, float, float, float]]:
+    """Find discrepancy, residual, tail and timing at one reach and gain.
+
+    Returns misfit, index and these values.
+    """
     from scipy.optimize import minimize  # a large library; only fits need it
 
     acting = found.predicted.per_pressure[0]
     length = found.problem.description.length
     slope = np.sqrt(np.mean((acting**2).sum(axis=(1, 2))))
+    steps = [np.median(np.diff(each.recording.time)) for each in found.problem.samples]
     expected = np.log([
         ERRORS.discrepancy * length / slope, ERRORS.residual * found.problem.noise.position,
-        ERRORS.tail,
+        ERRORS.tail, ERRORS.timing * np.median(steps),
     ])  # fmt: skip
 
     def misfit(logarithms: Array) -> float:
         values = np.exp(np.clip(logarithms, expected - 5, expected + 5)).tolist()
-        data = sum(fold.misfit(index, *values) for fold in folds)
+        data = sum(fold.misfit(index, gain, *values) for fold in folds)
         return data + 0.5 * float((((logarithms - expected) / ERRORS.deviations) ** 2).sum())
 
     result: Any = minimize(
         misfit,
         expected,
         method="Nelder-Mead",
-        options={"xatol": 0.01, "fatol": 0.01, "maxiter": 300},
+        options={"xatol": 0.01, "fatol": 0.01, "maxiter": 600},
     )
-    discrepancy, residual, tail = np.exp(result.x).tolist()
+    discrepancy, residual, tail, timing = np.exp(result.x).tolist()
     reach_prior = 0.5 * float(np.log(ERRORS.reaches[index] / ERRORS.reach) ** 2)
-    return float(result.fun) + reach_prior, index, (discrepancy, residual, tail)
-
-
-def _untested_gain(found: Fit, held_back: Mapping[str, HeldBack]) -> float:
-    """Return the relative error of the effect of pressures in directions that were not recorded.
-
-    No recording shows it. It is taken as a multiple of the relative error that shows: mean error on
-    held-back rows (or else in the fit) over the mean distance of the tip from its mean.
-    """
-    tips = found.predicted.read[0].position
-    way = float(np.linalg.norm(tips - tips.mean(axis=0), axis=1).mean())
-    if held_back:
-        error = float(np.mean([each.errors.median for each in held_back.values()]))
-    else:
-        distances = np.linalg.norm(found.predicted.errors[0], axis=1)
-        error = ERRORS.residual * Errors.of(distances, None).median
-    return ERRORS.untested * error / way if way > 0 else ERRORS.untested
+    return float(result.fun) + reach_prior, index, (discrepancy, residual, tail, timing)
 
 
 def _influence(problem: CalibrationProblem, x: Array, gain: Array, reaches: Array) -> Array:

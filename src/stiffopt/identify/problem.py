@@ -106,6 +106,7 @@ class Predicted:
     Attributes
     ----------
     effective : effective pressures (M, n), in Pa; not by point.
+    rates : their time derivatives (M, n), in Pa/s, without those of their memory.
     poses : (M, 4, 4), in the base frame.
     read : predicted readings, in the frame of the recordings.
     errors : (M, 3), measured minus predicted position, in m; NaN where nothing was measured.
@@ -113,6 +114,7 @@ class Predicted:
     """
 
     effective: Array
+    rates: Array
     poses: tuple[Array, ...]
     read: tuple[Readings, ...]
     errors: tuple[Array, ...]
@@ -356,7 +358,7 @@ class CalibrationProblem:
         """Return predictions, and derivatives (M, 3, d) of each point's position and turn."""
         coordinates = x * self.scale
         base, sensors, zeros, sides = self.unknowns.slices()
-        effective, by_history = self._effective(coordinates, sides)
+        effective, rates, by_history = self._effective(coordinates, sides)
         k = len(self._parameters)
         starts = self.starts
         poses, read, errors, acting, slopes = [], [], [], [], []
@@ -394,13 +396,15 @@ class CalibrationProblem:
             errors.append(position - place)
             acting.append(seen.per_twist[:, :, :6] @ found.per_pressure)
             slopes.append((moved, turned))
-        predicted = Predicted(effective, tuple(poses), tuple(read), tuple(errors), tuple(acting))
+        predicted = Predicted(
+            effective, rates, tuple(poses), tuple(read), tuple(errors), tuple(acting)
+        )
         return predicted, slopes
 
-    def _effective(self, coordinates: Array, sides: Sequence[slice]) -> tuple[Array, Array]:
-        """Return effective pressures (M, n) of all samples, and derivatives (M, n, d)."""
+    def _effective(self, coordinates: Array, sides: Sequence[slice]) -> tuple[Array, Array, Array]:
+        """Return effective pressures (M, n), their rates (M, n), and derivatives (M, n, d)."""
         starts, n = self.starts, self.description.n_pressures
-        effective = np.zeros((starts[-1], n))
+        effective, rates = np.zeros((starts[-1], n)), np.zeros((starts[-1], n))
         slopes = np.zeros((starts[-1], n, self.size))
         robot = varied(self.description, self._parameters, coordinates)
         first = 0
@@ -433,12 +437,13 @@ class CalibrationProblem:
                 end = found.end
                 rows = slice(starts[i], starts[i + 1])
                 effective[rows, channels] = found.pressures
+                rates[rows, channels] = -found.per_number["dead_time"]  # later means as before
                 for place, name, per_coordinate in varying:
                     slopes[rows, channels, place] = found.per_number[name] * per_coordinate
                 if owner.stop > owner.start:
                     places = slice(owner.start + channels.start, owner.start + channels.stop)
                     slopes[rows, channels, places] = found.per_side
-        return effective, slopes
+        return effective, rates, slopes
 
     def _measurements(self, point: TrackedPoint) -> tuple[Array, Array | None]:
         """Return measured positions (M, 3) and rotations (M, 3, 3) of a point in all rows."""

@@ -75,7 +75,8 @@ class Comparison:
     name : of the log.
     time : (N,), in s.
     pressures : (N, n), commanded, in Pa.
-    effective : (N, n), effective pressures, at which the model predicts the tip, in Pa.
+    effective, rates : (N, n), effective pressures, at which the model predicts the tip, in Pa, and
+        their time derivatives, in Pa/s.
     measured, predicted : (N, 3), positions of the tip's sensor, in m; NaN where not measured.
     angle : (N,), between the measured and the predicted axis of the tip, in rad; None if no
         orientation was recorded.
@@ -92,6 +93,7 @@ class Comparison:
     time: Array
     pressures: Array
     effective: Array
+    rates: Array
     measured: Array
     predicted: Array
     angle: Array | None
@@ -143,10 +145,13 @@ class RegionCoverage:
     ----------
     n : number of rows.
     shares : for each level, from 0 to 1.
+    intervals : 95 % intervals of the shares, by a bootstrap of blocks of two minutes: neighbouring
+        rows have similar errors. NaN with fewer than two blocks.
     """
 
     n: int
     shares: tuple[float, ...]
+    intervals: tuple[tuple[float, float], ...]
 
     @property
     def by_level(self) -> dict[float, float]:
@@ -163,7 +168,7 @@ def coverage(comparisons: Sequence[Comparison]) -> dict[str, RegionCoverage]:
     ``settled``. Each also appears for the rows inside and outside the recorded pressures, as in
     ``settled, outside``. Kinds without a row are left out.
     """
-    found: dict[str, list[Array]] = {}
+    found: dict[str, list[Array]] = {}  # of each block
     for each in comparisons:
         if each.levels is None or each.unsettled_levels is None:
             continue
@@ -176,15 +181,25 @@ def coverage(comparisons: Sequence[Comparison]) -> dict[str, RegionCoverage]:
         places = {"": every, ", inside": each.inside, ", outside": ~each.inside}
         for kind, (levels, wanted) in kinds.items():
             for place, where in places.items():
-                known = levels[wanted & where]
-                found.setdefault(kind + place, []).append(known[np.isfinite(known)])
-    answer = {}
-    for kind, parts in found.items():
-        levels = np.concatenate(parts)
-        if len(levels):
-            shares = tuple(float(np.mean(levels <= level)) for level in LEVELS)
-            answer[kind] = RegionCoverage(len(levels), shares)
-    return answer
+                rows = np.flatnonzero(wanted & where & np.isfinite(levels))
+                block = (each.time[rows] - each.time[0]) // REPORT.block
+                parts = np.split(levels[rows], np.flatnonzero(np.diff(block)) + 1)
+                found.setdefault(kind + place, []).extend(part for part in parts if len(part))
+    return {kind: _region_coverage(blocks) for kind, blocks in found.items() if blocks}
+
+
+def _region_coverage(blocks: Sequence[Array]) -> RegionCoverage:
+    """Return the coverage from the levels of the rows of each block."""
+    sizes = np.array([len(block) for block in blocks])
+    hits = np.array([[(block <= level).sum() for level in LEVELS] for block in blocks])
+    shares = hits.sum(axis=0) / sizes.sum()
+    limits = np.full((2, len(LEVELS)), np.nan)
+    if len(blocks) > 1:
+        drawn = np.random.default_rng(0).integers(len(blocks), size=(REPORT.draws, len(blocks)))
+        among = hits[drawn].sum(axis=1) / sizes[drawn].sum(axis=1)[:, np.newaxis]
+        limits = np.quantile(among, (0.025, 0.975), axis=0)
+    pairs = ((float(low), float(high)) for low, high in limits.T)
+    return RegionCoverage(int(sizes.sum()), tuple(map(float, shares)), tuple(pairs))
 
 
 @dataclass(frozen=True)

@@ -242,15 +242,16 @@ class ErrorSettings:
 
     Attributes
     ----------
-    discrepancy, residual, tail : prior means: tip error far from recorded pressures, in lengths of
-        the arm; standard deviation per axis on held-back rows, relative to that of the fit; degrees
-        of freedom beyond four.
+    discrepancy, residual, tail, timing : prior medians: tip error far from recorded pressures, in
+        lengths of the arm; standard deviation per axis on held-back rows, relative to that of the
+        fit; degrees of freedom beyond four; error in time, in median time steps of the logs, as
+        commands are not known between their rows.
     deviations : prior standard deviations of their logarithms.
     per_cell : number of rows that count in a cell of pressures as wide as the reach.
     reaches, reach : candidates for the distance over which the discrepancy grows, and its prior
         median, as shares of the range of recorded pressures.
-    untested : relative error of the effect of pressures in directions that were not recorded, over
-        the relative error on held-back data; no recording can show it.
+    untested : relative error of the effect of pressures in directions that were not recorded, in
+        discrepancies over the recorded range; no recording can show it.
     rows : largest number of rows in the estimate of the discrepancy's effect on a fit.
     representatives, spacing : largest number of a segment's pressures kept to represent all
         recorded ones, and the spacing, as a share of the pressure range, at which fewer suffice.
@@ -261,14 +262,15 @@ class ErrorSettings:
         from commanded pressures is estimated.
     """
 
-    discrepancy: float = 0.1
-    residual: float = 1.2
+    discrepancy: float = 0.01
+    residual: float = 1.5
     tail: float = 10.0
-    deviations: tuple[float, float, float] = (0.8, 0.4, 0.4)
+    timing: float = 0.5
+    deviations: tuple[float, float, float, float] = (0.8, 0.4, 0.4, 1.0)
     per_cell: float = 1.0
     reaches: tuple[float, ...] = (0.2, 0.4, 0.8)
     reach: float = 0.4
-    untested: float = 1.6
+    untested: float = 7.0
     rows: int = 800
     representatives: int = 60
     spacing: float = 0.04
@@ -308,6 +310,8 @@ class ReportSettings:
     outlier : distance of an outlying row from the model, in deviations.
     unfit, alone : mean error in the fitted logs, in lengths of the arm, beyond which a robot is
         unfit; and multiple of the median log's error beyond which one log is singled out.
+    block, draws : length in s of the blocks of rows in the bootstrap of a coverage, and number of
+        draws.
     correlation_digits : decimals of correlations in the robot file.
     """
 
@@ -318,6 +322,8 @@ class ReportSettings:
     outlier: float = 4.0
     unfit: float = 0.1
     alone: float = 3.0
+    block: float = 120.0
+    draws: int = 1000
     correlation_digits: int = 4
 
 

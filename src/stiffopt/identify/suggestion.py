@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from stiffopt.errors import InputError
 from stiffopt.identify.settings import SUGGESTION
-from stiffopt.model.calibration import Calibration, ErrorModel, growth
+from stiffopt.model.calibration import Calibration, ErrorModel, RelativeErrors, growth
 from stiffopt.model.description import RobotDescription
 from stiffopt.model.parameters import Parameter
 from stiffopt.model.uncertainty import ReadingSlopes
@@ -123,6 +123,12 @@ class _Design:
             ],
             axis=2,
         )
+        recorded = np.array(errors.recorded)
+        self._relative = [RelativeErrors(recorded[:, a:b], errors.range) for a, b in pairwise(ends)]
+        self._smooth = [
+            relative.covariance(candidates[:, a:b])
+            for relative, (a, b) in zip(self._relative, pairwise(ends), strict=True)
+        ]
 
     def chosen(self, count: int) -> Suggestion:
         """Choose poses greedily."""
@@ -134,11 +140,21 @@ class _Design:
             self._record(chosen[-1])
         return Suggestion(self._candidates[chosen], before, self._deviation())
 
-    def _variance(self, distances: Array) -> Array:
-        """Return a channel's discrepancy variance in Pa^2 by distance from recorded pressures."""
+    def _variance(self, distances: Array, smooth: Array) -> Array:
+        """Return a channel's discrepancy variance (N, segments), in Pa^2.
+
+        Given are distances from recorded pressures, and variances of relative errors.
+        """
         known = self._errors
         share = growth(distances, known.reach)
-        return np.asarray(known.discrepancy**2 * share + (known.gain * distances) ** 2)
+        return np.asarray(known.discrepancy**2 * share + known.gain**2 * smooth)
+
+    def _after(self, index: int) -> list[Array]:
+        """Return the covariances (N, N) of relative errors as if a candidate had been recorded."""
+        return [
+            relative.recorded(covariance, index)
+            for relative, covariance in zip(self._relative, self._smooth, strict=True)
+        ]
 
     def _reading(self, index: int) -> Array:
         """Return the covariance (3, 3), in m^2, of a candidate's reading given the parameters."""
@@ -154,11 +170,13 @@ class _Design:
 
     def _gains(self) -> Array:
         """Return by how much each candidate (N,) would lower the mean variance, in m^2."""
-        now = self._variance(self._distances)
+        now = self._variance(self._distances, _diagonals(self._smooth))
         found = np.zeros(len(self._candidates))
         for index in range(len(self._candidates)):
             seen, inverse = self._seen(index)
-            then = self._variance(np.minimum(self._distances, self._between[index]))
+            then = self._variance(
+                np.minimum(self._distances, self._between[index]), _diagonals(self._after(index))
+            )
             found[index] = np.trace(inverse @ seen @ self._mean @ seen.T)
             found[index] += np.mean((self._weights * (now - then)).sum(axis=1))
         return found
@@ -168,8 +186,15 @@ class _Design:
         seen, inverse = self._seen(index)
         self._covariance = self._covariance - seen.T @ inverse @ seen
         self._distances = np.minimum(self._distances, self._between[index])
+        self._smooth = self._after(index)
 
     def _deviation(self) -> float:
         """Return the tip's standard deviation in m, root mean square over all pressures."""
-        discrepancy = np.mean((self._weights * self._variance(self._distances)).sum(axis=1))
+        variance = self._variance(self._distances, _diagonals(self._smooth))
+        discrepancy = np.mean((self._weights * variance).sum(axis=1))
         return float(np.sqrt(np.trace(self._mean @ self._covariance) + discrepancy))
+
+
+def _diagonals(covariances: list[Array]) -> Array:
+    """Return the diagonals (N, k) of k matrices (N, N)."""
+    return np.stack([np.diagonal(each) for each in covariances], axis=1)

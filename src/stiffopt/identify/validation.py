@@ -161,7 +161,7 @@ def _beginnings(
                 [begun],
                 setup.points,
                 setup.base,
-                _noise(setup.description),
+                _noise(setup.description, sample.recording.pressures[first]),
             )
             x = fit(problem, [x], on_evaluation, rounds=0).x
         found_zeros.append(x[: len(zeros)])
@@ -170,12 +170,20 @@ def _beginnings(
     return unknowns, np.concatenate([*found_zeros, *found_sides])
 
 
-def _noise(description: RobotDescription) -> Noise:
-    """Return the spread of readings about the prediction that the calibration found."""
+def _noise(description: RobotDescription, pressures: Array) -> Noise:
+    """Return the spread of readings about predictions at pressures (N, n) after a known history.
+
+    A first reading that is off by no more than the model may be wrong says nothing of the history.
+    """
     known = description.calibration
     if known is None or not known.position_residual:
         return NOISE
-    return Noise(known.position_residual, known.angle_residual or NOISE.angle)
+    angle = known.angle_residual or NOISE.angle
+    if known.errors is None:
+        return Noise(known.position_residual, angle)
+    found = Uncertainty(description).errors(pressures[:1], effective=pressures[:1]).covariance[0]
+    position = float(np.sqrt(np.trace(found) / 3))
+    return Noise(position, angle * max(position / known.position_residual, 1.0))
 
 
 def _comparison(
@@ -207,6 +215,7 @@ def _comparison(
         time=recording.time[rows],
         pressures=pressures,
         effective=predicted.effective[own],
+        rates=predicted.rates[own],
         measured=position + predicted.errors[0][own],
         predicted=position,
         angle=angle,
@@ -228,12 +237,13 @@ def _with_levels(setup: Setup, logs: Sequence[Comparison]) -> list[Comparison]:
         np.linspace(begin, end - 1, min(end - begin, ERRORS.compared)).astype(np.intp)
         for begin, end in pairwise(ends)
     ])  # fmt: skip
-    p, u = (np.concatenate([getattr(each, name) for each in logs])[rows]
-            for name in ("pressures", "effective"))  # fmt: skip
+    p, u, rates = (np.concatenate([getattr(each, name) for each in logs])[rows]
+                   for name in ("pressures", "effective", "rates"))  # fmt: skip
     moving = np.concatenate([each.moving for each in logs])[rows]
     time = in_turn([each.time for each in logs])[rows]
     source = Uncertainty(setup.description)
-    known, unknown = source.errors(p, effective=u, time=time), source.errors(p, moving=moving)
+    known = source.errors(p, effective=u, rates=rates, time=time)
+    unknown = source.errors(p, moving=moving)
     off = np.concatenate([each.measured - each.predicted for each in logs])[rows]
     off = off @ setup.base[:3, :3]
     found = []

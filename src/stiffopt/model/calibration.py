@@ -15,7 +15,7 @@ from pydantic import Field, model_validator
 from stiffopt.errors import shown
 from stiffopt.model.history import lagged
 from stiffopt.schema import BadKeyError, Items, Schema
-from stiffopt.units import Angle, Length, Number, Pressure, Ratio
+from stiffopt.units import Angle, Duration, Length, Number, Pressure, Ratio
 
 Array = NDArray[np.float64]
 _POSITIVE = Field(ge=0)
@@ -23,6 +23,7 @@ _ROUNDING = 1e-3  # of correlations, which are written with few digits
 _MORE_MEMORY = 0.12  # of the pressure acts through hysteresis that no model has
 _FADING = 30.0  # s in which an arm forgets former pressures, by creep
 _NEAR = 0.1  # distance within which a pressure counts as recorded, over the recorded range
+_KNOWN = 0.07  # error of what a recorded pressure tells of relative errors, in recorded ranges
 _SLACK = 0.02  # allowed excess over recorded pressures, as a share of the highest
 
 
@@ -77,11 +78,14 @@ class ErrorModel(Schema):
 
     The arm behaves as if its effective pressures were off by a discrepancy, a Gaussian process in
     the pressures of each segment, which moves the tip equally in all directions (`even_variance`).
-    At a distance d from the nearest recorded pressure, the variance
-    of each channel is ``discrepancy^2 (1 - exp(-2 d / reach)) + (gain d_u)^2``.  Here d_u is the
-    part of the displacement x from there in directions that were not recorded: ``d_u^2 = x' (I - S
-    (S + e I)^-1) x``, with S the mean square of the displacements from the nearest to the other
-    recorded pressures about it, and ``e = (reach / 4)^2``.
+    It has two independent parts.
+
+    A rough part has the standard deviation `discrepancy` far from recorded pressures, and at a
+    distance d from the nearest the variance ``discrepancy^2 (1 - exp(-2 d / reach))``.  A smooth
+    part is a relative error that depends on the direction of the pressures: p and q have errors of
+    covariance ``gain^2 |p| |q| cos(p, q)^4``.  It is conditioned on the recorded pressures, each of
+    which tells it up to 0.07 `gain` R with the recorded range R; so it remains in directions that
+    were not recorded.
 
     Attributes
     ----------
@@ -89,6 +93,8 @@ class ErrorModel(Schema):
     discrepancy : standard deviation of an effective pressure far from recorded ones, in Pa.
     reach : distance over which the discrepancy grows, in Pa.
     gain : relative error of the effect of pressures in directions that were not recorded.
+    timing : standard deviation of the time at which the tip moves, in s; where it moves fast, the
+        prediction with history is wrong along its way.
     degrees_of_freedom : of the multivariate t-distribution of the errors.
     settled, moving : root mean square of effective minus commanded pressure of each channel, in Pa,
         while pressures were held and while they changed; empty if that was not recorded.
@@ -100,6 +106,7 @@ class ErrorModel(Schema):
     discrepancy: Annotated[Pressure, _POSITIVE]
     reach: Annotated[Pressure, Field(gt=0)]
     gain: Annotated[Ratio, _POSITIVE]
+    timing: Annotated[Duration, _POSITIVE] = 0.0
     degrees_of_freedom: Annotated[Number, Field(gt=2)]
     settled: Items[Pressure] = ()
     moving: Items[Pressure] = ()
@@ -121,33 +128,68 @@ class ErrorModel(Schema):
     def variances(self, channels: Sequence[int], pressures: Array) -> Array:
         """Return the discrepancy's variance (N, n) by channel at pressures (N, n), in Pa^2."""
         recorded = np.array(self.recorded)
-        nearest, ways = nearest_recorded(channels, pressures, recorded)
-        ends = np.cumsum([0, *channels])
-        found = np.zeros_like(pressures)
-        for way, index, begin, end in zip(ways, nearest.T, ends, ends[1:], strict=False):
-            distance = np.linalg.norm(way, axis=1)
-            beyond = np.maximum(distance - self.spacing, 0.0)
-            way = way * (beyond / np.maximum(distance, 1.0))[:, np.newaxis]
-            share = self._untested(recorded[:, begin:end])[index]
-            untested = np.maximum(np.einsum("ni,nij,nj->n", way, share, way), 0.0)
-            variance = self.discrepancy**2 * growth(beyond, self.reach)
-            found[:, begin:end] = (variance + self.gain**2 * untested)[:, np.newaxis]
-        return found
+        distances = self.distances(channels, pressures)
+        rough = self.discrepancy**2 * growth(distances, self.reach)
+        parts = []
+        for segment, (begin, end) in enumerate(pairwise(np.cumsum([0, *channels]))):
+            smooth = RelativeErrors(recorded[:, begin:end], self.range)
+            variance = self.gain**2 * smooth.variances(pressures[:, begin:end])
+            parts.append(rough[:, segment] + variance)
+        return np.repeat(np.stack(parts, axis=1), channels, axis=1)
 
-    def _untested(self, recorded: Array) -> Array:
-        """Return the matrices (K, c, c) of untested directions about recorded pressures (K, c)."""
-        between = recorded - recorded[:, np.newaxis]
-        weight = np.exp(-((between**2).sum(axis=2)) / (2 * self.reach**2))
-        spread = np.einsum("kl,kli,klj->kij", weight, between, between)
-        spread /= weight.sum(axis=1)[:, np.newaxis, np.newaxis]
-        identity = np.eye(recorded.shape[1])
-        ridge = (self.reach / 4) ** 2 * identity
-        return np.asarray(identity - np.linalg.solve(spread + ridge, spread))
+    @property
+    def range(self) -> float:
+        """Largest recorded range of a channel's pressure, in Pa."""
+        return recorded_range(np.array(self.recorded))
 
     @property
     def near(self) -> float:
         """Distance in Pa up to which a pressure counts as recorded."""
-        return float(_NEAR * np.ptp(np.array(self.recorded), axis=0).max())
+        return _NEAR * self.range
+
+
+class RelativeErrors:
+    """Relative errors of pressures that depend on their direction, and are known at recorded ones.
+
+    Before the recording their covariance is ``|p| |q| cos(p, q)^4``.
+
+    Parameters
+    ----------
+    recorded : pressures (K, c), in Pa.
+    scale : R, in Pa, see `ErrorModel`.
+    """
+
+    def __init__(self, recorded: Array, scale: float) -> None:
+        self._recorded = recorded
+        self._noise = (_KNOWN * scale) ** 2
+        noise = self._noise * np.eye(len(recorded))
+        self._root = np.linalg.cholesky(_prior(recorded, recorded) + noise)
+
+    def covariance(self, pressures: Array) -> Array:
+        """Return the covariance (N, N) at pressures (N, c), in Pa^2."""
+        known = np.linalg.solve(self._root, _prior(self._recorded, pressures))
+        return np.asarray(_prior(pressures, pressures) - known.T @ known)
+
+    def recorded(self, covariance: Array, index: int) -> Array:
+        """Return a `covariance` (N, N) after one of its pressures was recorded too."""
+        own = covariance[index]
+        return np.asarray(covariance - np.outer(own, own) / (own[index] + self._noise))
+
+    def variances(self, pressures: Array) -> Array:
+        """Return the variances (N,) at pressures (N, c), in Pa^2."""
+        known = np.linalg.solve(self._root, _prior(self._recorded, pressures))
+        return np.asarray(np.maximum((pressures**2).sum(axis=1) - (known**2).sum(axis=0), 0.0))
+
+
+def _prior(one: Array, other: Array) -> Array:
+    """Return the prior covariance (N, M) of `RelativeErrors` at pressures (N, c) and (M, c)."""
+    norms = np.linalg.norm(one, axis=1)[:, np.newaxis] * np.linalg.norm(other, axis=1)
+    return np.asarray((one @ other.T) ** 4 / np.maximum(norms, 1.0) ** 3)
+
+
+def recorded_range(pressures: Array) -> float:
+    """Return the largest range of a channel's pressures (N, n), in Pa; at least 1 Pa."""
+    return max(float(np.ptp(pressures, axis=0).max()), 1.0)
 
 
 def growth(distances: Array, reach: float | Array) -> Array:

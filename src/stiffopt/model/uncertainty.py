@@ -122,7 +122,7 @@ class PositionErrors:
     ----------
     position : predicted (N, 3), in base axes and m.
     parameters, hysteresis, discrepancy, residual : mean squares (N, 3, 3) of its error by source,
-        as in `TipUncertainty`.
+        as in `TipUncertainty`; hysteresis includes that of the time at which the tip moves.
     """
 
     position: Vector
@@ -197,6 +197,7 @@ class Uncertainty:
         pressures: Vector,
         *,
         effective: Vector | None = None,
+        rates: Vector | None = None,
         time: Vector | None = None,
         moving: NDArray[np.bool_] | None = None,
     ) -> PositionErrors:
@@ -207,6 +208,7 @@ class Uncertainty:
         pressures : commanded (N, n), in Pa.
         effective, time : effective pressures (N, n) in Pa after a known history, and their times
             (N,) in s, increasing; without these the prediction is `tip_pose` at the commanded ones.
+        rates : time derivatives (N, n) of the effective pressures, in Pa/s; zero by default.
         moving : which rows (N,) are not held; none by default.
         """
         u = pressures if effective is None else effective
@@ -220,10 +222,14 @@ class Uncertainty:
         before = self._typical_moves if time is None else fading_mean(time, moves)
         errors = self._calibration.errors
         residual = self._calibration.position_residual if errors is None else errors.residual
+        hysteresis = (per_pressure * acting[:, np.newaxis]) @ transposed
+        if rates is not None and errors is not None:
+            way = errors.timing * per_pressure @ rates[..., np.newaxis]
+            hysteresis = hysteresis + way @ np.swapaxes(way, 1, 2)
         return PositionErrors(
             position=position,
             parameters=per_number @ self._covariance @ np.swapaxes(per_number, 1, 2),
-            hysteresis=(per_pressure * acting[:, np.newaxis]) @ transposed,
+            hysteresis=hysteresis,
             discrepancy=even_variance(moves, before, self._memory)[:, np.newaxis, np.newaxis]
             * np.eye(3),
             residual=np.broadcast_to(np.eye(3) * residual**2, (len(u), 3, 3)),

@@ -23,6 +23,8 @@ POSITION_ERROR = 5e-4
 """Change of the model's tip error along the short path of an approach, in m."""
 FELT_SHARE, FELT_FORCE = 0.2, 3e-3
 """Allowed error of a felt force: a share of it, plus a part in N."""
+LATE = 0.2
+"""Time after a contact in which the approach goes on, in s."""
 
 
 class Press(Schema):
@@ -57,6 +59,9 @@ class Press(Schema):
     def refusal(self, rotation: Array, compliance: Array) -> str:
         """Return why a force along the direction could not be felt, or "".
 
+        The direction must be soft enough, and the force more than the allowed error of a felt one
+        and than what a rigid surface gets before the contact is felt.
+
         Parameters
         ----------
         rotation : (3, 3)
@@ -67,14 +72,33 @@ class Press(Schema):
         felt = Feeling.of(self.direction_in_base(rotation), compliance)
         allowed = FELT_SHARE * self.force + FELT_FORCE
         deviation = felt.deviation(POSITION_ERROR)
-        if felt.share >= LEAST_SHARE and deviation <= allowed:
-            return ""
-        return (
-            f"the arm cannot feel how hard it presses along ({_numbers(self.direction)})"
-            f"{' of the tip' if self.frame == 'tip' else ''}: it is too stiff there, "
-            f"{1 / felt.compliance:.3g} N/m, so that {1e3 * POSITION_ERROR:g} mm of error look "
-            f"like {1e3 * deviation:.3g} mN; press along a softer direction, or harder"
-        )
+        at_once = self.speed * LATE / max(felt.compliance, 1e-12)  # against a rigid surface
+        force = f"{1e3 * self.force:.3g} mN"
+        if felt.share < LEAST_SHARE or deviation > allowed:
+            return (
+                f"the arm cannot feel how hard it presses along ({_numbers(self.direction)})"
+                f"{' of the tip' if self.frame == 'tip' else ''}: it is too stiff there, "
+                f"{1 / felt.compliance:.3g} N/m, so that {1e3 * POSITION_ERROR:g} mm of error look "
+                f"like {1e3 * deviation:.3g} mN; press along a softer direction, or harder"
+            )
+        if self.force <= allowed:
+            return (
+                f"the arm cannot feel so small a force: with an error of up to "
+                f"{100 * FELT_SHARE:g} % + {1e3 * FELT_FORCE:g} mN, {force} may be none at all; "
+                f"press with more than {1e3 * FELT_FORCE / (1 - FELT_SHARE):.3g} mN"
+            )
+        if self.tolerance >= self.force:
+            return (
+                f"{force} with a tolerance of {1e3 * self.tolerance:.3g} mN may be none at all; "
+                "press.tolerance must be less than press.force"
+            )
+        if at_once > self.force:
+            return (
+                f"an approach at {1e3 * self.speed:.3g} mm/s may press with {1e3 * at_once:.3g} mN "
+                f"before a contact is felt, more than {force}; press.speed must be at most "
+                f"{1e3 * self.speed * self.force / at_once:.2g} mm/s there"
+            )
+        return ""
 
 
 @dataclass(frozen=True)
