@@ -245,6 +245,9 @@ def lean(
         if again is not None:
             holding.append(again)
     if not holding:
+        if free.confidence is not None and any(each is not None for each in judged):
+            # a posture was found and refused; another one nearby may hold
+            free = replace(free, confidence=replace(free.confidence, complete=False))
         return _free_answer(task, free, _no_brace(problem, judged))
     best = max(holding, key=lambda each: each.least)
     if free.found and least_maximised(task, free.stiffnesses) >= best.least:

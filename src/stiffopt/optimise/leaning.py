@@ -267,12 +267,14 @@ class BracedProblem(PressureProblem):
         return Quantities(residuals, values, distances, forces, np.array(pushed), slips)
 
     def _slip(self, eq: ContactEquilibrium, push: Vector, grip: float) -> float:
-        """Return the push at which a sticking contact is lost, at most twice the margin.
+        """Return the push at which a contact is lost or the arm snaps, at most twice the margin.
 
-        `grip` is the share of it that is sure.
+        The least of contacts that stick and, as friction is not certain, that slide; `grip` is the
+        share of the former that is sure.
         """
-        largest = 2 * self.brace.margin / grip
-        return grip * min(largest, eq.lift_off(push, largest, "sticking").force)
+        most = 2 * self.brace.margin
+        sticking = grip * eq.lift_off(push, most / grip, "sticking").force
+        return min(most, sticking, eq.lift_off(push, most).force)
 
     def _rows(self, eq: ContactEquilibrium, seen: Quantities, near: list[Nearest]) -> Vector:
         rows = self.obstacle_rows(near)
@@ -364,7 +366,7 @@ class BracedProblem(PressureProblem):
         )
         least, is_contact = min(kept, default=(np.inf, True))
         if least < self.brace.margin * (1 - 1e-6):
-            what = "takes a contact away" if is_contact else "makes the arm buckle"
+            what = "takes a contact away" if is_contact else "makes the arm buckle or snap"
             yield (
                 f"a push of {unit.text(least)} {what}; the margin is {unit.text(self.brace.margin)}"
             )
