@@ -23,6 +23,7 @@ from stiffopt.model.shooting import mass_per_length
 TWO = Arm((FLOP, FLOP))
 REST = np.zeros(6)
 X = (1.0, 0.0, 0.0)
+PROBLEMS = Path(__file__).parents[1] / "problems"
 REFERENCES = json.loads((Path(__file__).parent / "contact_reference.json").read_text())
 SLIPS = json.loads((Path(__file__).parent / "slip_reference.json").read_text())
 
@@ -311,6 +312,19 @@ def test_a_push_along_the_arm_buckles_it_next_to_the_post(contacts, sideways):
     lost = found.lift_off((sideways, 0.0, -1.0), contacts=contacts)
     assert (lost.how, lost.object, lost.stiffness_after) == ("buckles", None, 0.0)
     assert lost.force == pytest.approx(euler_load(), rel=0.015)
+
+
+def test_contacts_that_become_a_line_or_come_to_the_tip_are_no_buckling():
+    """An independent rod follows both pushes to 1.3 times of where these seemed to end."""
+    lying = robot(TWO.under((6.0, 0.0, 3.0))).contact_equilibrium(REST, scene(table(0.0007)))
+    for way in ([0.3, 1, 0], [0, 1, 0.5], [1, 0, 0]):
+        assert lying.lift_off(way).how == "holds"
+        assert lying.stiffness(way) > 0
+    task = stiffopt.load_task(PROBLEMS / "leaning_in_a_tube.yaml")
+    golden = json.loads((PROBLEMS / "golden/leaning_in_a_tube.json").read_text())
+    found = robot().contact_equilibrium(golden["pressures_pa"], task.scene)
+    for contacts in ("sliding", "sticking"):
+        assert found.lift_off(X, 1.25, contacts).how == "holds"
 
 
 def test_pushes_and_paths_have_a_greatest_number_of_steps(monkeypatch):

@@ -151,14 +151,13 @@ def stiffness_leaning(eq: ContactEquilibrium, task: Task) -> float:
     )
 
 
-def lies_at_rest(robot: Manipulator, task: Task) -> bool:
-    """Return whether the arm without pressures touches an object of a task's brace."""
+def touches_at(robot: Manipulator, task: Task, p: Vector) -> bool:
+    """Return whether the arm at pressures (n,) touches an object of a task's brace."""
     assert task.brace is not None
     assert task.scene is not None
     try:
-        rest = np.zeros(robot.n_pressures)
-        return bool(robot.contact_equilibrium(rest, leant_on(task.scene, task.brace)).contacts)
-    except EquilibriumError:  # an object is inside the arm
+        return bool(robot.contact_equilibrium(p, leant_on(task.scene, task.brace)).contacts)
+    except EquilibriumError:  # the way into contact tells why
         return False
 
 

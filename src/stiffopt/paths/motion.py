@@ -32,8 +32,8 @@ from stiffopt.paths.configurations import (
 from stiffopt.paths.leaning import (
     gradual,
     least_times_along,
-    lies_at_rest,
     stiffness_leaning,
+    touches_at,
     way_from_rest,
     way_into_contact,
 )
@@ -85,7 +85,8 @@ def plan_motion(
         reach.  If that one has less than 0.95 of the best known stiffness, the search goes on, for
         about as long again, towards one that has more.  For a single task with a brace whose answer
         leans, the motion goes to rest first, and from there into contact
-        (`stiffopt.paths.leaning`); an arm that lies on such an object at rest stays in contact.
+        (`stiffopt.paths.leaning`); an arm that touches such an object at the
+        start or at rest stays in contact on the way there.
     scene : Scene, optional
         Replaces that of the tasks.  Without any, the way is straight.
     clearance : float, optional
@@ -173,19 +174,26 @@ def _leaning(
 ) -> PathSolution:
     """Plan a motion to a task with a brace: to rest, and from there into contact.
 
-    Down to rest the body keeps clear of the scene, unless it lies on an object there.
+    Down to rest the body keeps clear of the scene, unless it leans on an object at the start or
+    lies on one at rest.
     """
     watch = Stopwatch()
     found = solve_pressure(robot, goal)
-    rest, lies = np.zeros(robot.n_pressures), lies_at_rest(robot, goal)
+    rest = np.zeros(robot.n_pressures)
+    lies = touches_at(robot, goal, rest)
     if found.pressures is None or not (found.contacts or lies):
         return plan_motion(robot, start, goal.unbraced, slew=slew, **options)
     own = {name: value for name, value in options.items() if name != "timeout"}
     request = MotionRequest.of(robot, start, rest, goal.scene, slew=slew, **own)
     measures = maximised(goal)
+    if not found.found:
+        return request.without_answer(found.message, "unreachable")
     try:
         states = way_into_contact(robot, found)
-        if lies:
+        begins_in_contact = not isinstance(request.start, Task) and touches_at(
+            robot, goal, request.start
+        )
+        if lies or begins_in_contact:
             down = _down_in_contact(robot, goal, request)
         else:
             down = plan_motion(robot, start, rest, scene=goal.scene, slew=slew, **options)
@@ -222,7 +230,7 @@ def _leaning(
 
 
 def _down_in_contact(robot: Manipulator, goal: Task, request: MotionRequest) -> PathSolution:
-    """Return the motion from the start to rest of an arm that lies on an object there."""
+    """Return the motion to rest of an arm that touches an object at the start or at rest."""
     start = request.start
     if isinstance(start, Task):
         start = TaskConfigurations(
