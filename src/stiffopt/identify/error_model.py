@@ -285,8 +285,9 @@ def _most_probable(
     length = found.problem.description.length
     slope = np.sqrt(np.mean((acting**2).sum(axis=(1, 2))))
     steps = [np.median(np.diff(each.recording.time)) for each in found.problem.samples]
+    typical = ERRORS.discrepancy * (1.0 if folds else ERRORS.unchecked)
     expected = np.log([
-        ERRORS.discrepancy * length / slope, ERRORS.residual * found.problem.noise.position,
+        typical * length / slope, ERRORS.residual * found.problem.noise.position,
         ERRORS.tail, ERRORS.timing * np.median(steps),
     ])  # fmt: skip
 
