@@ -235,7 +235,7 @@ def test_what_was_not_tested_is_as_wrong_as_a_multiple_of_what_was() -> None:
     assert wrong_one.gain > 3 * right.gain
     acting = found[0].predicted.per_pressure[0]
     slope = np.sqrt(np.mean((acting**2).sum(axis=(1, 2))))
-    prior = ERRORS.discrepancy * ONE.segments[0].length / slope
+    prior = ERRORS.unchecked * ERRORS.discrepancy * ONE.segments[0].length / slope
     expected = ERRORS.untested * prior / np.ptp(CIRCLE, axis=0).max()
     assert error_model(found[0], {}).gain == pytest.approx(expected, rel=0.03)
 
