@@ -327,6 +327,18 @@ def test_contacts_that_become_a_line_or_come_to_the_tip_are_no_buckling():
         assert found.lift_off(X, 1.25, contacts).how == "holds"
 
 
+def test_another_contact_takes_the_force_of_the_first_under_a_push():
+    """The independent rod touches the second sphere at 27 mN, and leaves the first at 35 mN."""
+    spheres = [
+        {"sphere": {"centre": (0.03722, -0.01678, 0.11206), "radius": 0.00899}},
+        {"sphere": {"centre": (0.0535, -0.01646, 0.13807), "radius": 0.0119}},
+    ]
+    p = [25290, 67850, 60490, 114050, 104500, 0]
+    lost = robot().contact_equilibrium(p, scene(*spheres)).lift_off((0.427, 0.793, -0.435))
+    assert (lost.how, lost.object) == ("lifts off", "0")
+    assert lost.force == pytest.approx(0.035, rel=0.03)
+
+
 def test_pushes_and_paths_have_a_greatest_number_of_steps(monkeypatch):
     found = robot().contact_equilibrium(REST, scene(post(0.12)), load=push(0.02))
     monkeypatch.setattr("stiffopt.model.contact.push._MOST_STEPS", 1)

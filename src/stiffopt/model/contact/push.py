@@ -187,6 +187,10 @@ class GrowingPush:
             if (forces < -_FORCE_LEFT).any():
                 step = ahead * min(0.9, max(0.1, float((own / (own - forces))[forces < 0].min())))
                 continue
+            missed = self._problem.missed(found)
+            if missed != [] and ahead > _NEW_CONTACT * (force + ahead):
+                step = ahead / 2
+                continue
             settled = self._problem.settle(found.state) or found  # points may become lines
             if not settled.is_stable:
                 if ahead < _SAME_LOSS * (force + ahead):
