@@ -241,7 +241,7 @@ def commissioned_control(rig: Any, robot: RobotDescription) -> ControlSettings:
 
 
 def is_commissioned(rig: Any, robot: RobotDescription) -> bool:
-    """Whether there is a record of exactly this rig that fits.
+    """Return True if there is a record of exactly this rig that fits.
 
     Parameters
     ----------

@@ -333,7 +333,7 @@ class Bracing:
         H = rows.T @ rows + t.pressure_weight**2 * np.eye(rows.shape[1])
         step = np.linalg.solve(H, rows.T @ wanted) * elapsed
         time, speed = t.first_time, t.first_speed
-        if self._held >= t.settling:  # a push that is not felt yet is quicker
+        if self._held >= t.settling:  # so slow that a push which is not felt yet is quicker
             time, speed = t.time, t.correction_speed
         step /= time
         step *= min(1.0, speed * elapsed / max(float(np.linalg.norm(jacobian @ step)), 1e-12))

@@ -74,8 +74,8 @@ class Pressing:
         self._pushed = 0.0  # how long something has pushed the tip before the approach, in s
         self._touched, self._why = False, ""
         self._watch = ObstructionWatch(tuning.obstruction)
-        self._free = False  # whether it is known whether the tip was free when the approach began
-        self._blocked = False  # whether it was not, or an object keeps it from the target
+        self._free = False  # the approach has shown if the tip was free when it began
+        self._blocked = False  # it was not free, or an object keeps it from the target
         # ways of the tip and of the arm on the way back from it, and the way on which both were one
         self._before, self._clear = (0.0, 0.0), 0.0
         self._notices: list[Notice] = []
@@ -110,12 +110,12 @@ class Pressing:
 
     @property
     def touches(self) -> bool:
-        """Whether the tip is known to touch something."""
+        """True while the tip is known to touch something."""
         return self.phase is Phase.PRESSING or self.is_blocked
 
     @property
     def is_blocked(self) -> bool:
-        """Whether the tip goes back from an object before its target."""
+        """True while the tip goes back from an object that is in front of its target."""
         return self._blocked and self.phase is Phase.RETREATING
 
     @property

@@ -305,8 +305,10 @@ def draw_stiffness_along(axes: Any, solution: PathSolution) -> None:
     known = np.isfinite(solution.stiffness)
     values = np.where(known, unit.of(solution.stiffness), np.nan)
     if not known.all():  # where a rigid object holds the tip
-        share = {"ha": "right", "va": "top", "transform": axes.transAxes, "color": style.GREY}
-        axes.text(0.98, 0.95, "gaps: without limit, an object holds the tip", **share)
+        axes.text(
+            0.98, 0.95, "gaps: without limit, an object holds the tip", ha="right", va="top",
+            transform=axes.transAxes, color=style.GREY,
+        )  # fmt: skip
     if solution.alone is not None:
         axes.plot(
             solution.times, unit.of(solution.alone), color=style.GREY, linewidth=5, alpha=0.35,

@@ -118,7 +118,7 @@ class LeaningArm:
 
     @property
     def _is_flat(self) -> bool:
-        """Whether a contact's place along the arm is nearly undetermined.
+        """True if a contact's place along the arm is nearly undetermined.
 
         The matrix of `stiffopt.model.contact.stability` is then too coarse to tell alone.
         """
