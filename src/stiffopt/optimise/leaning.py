@@ -155,8 +155,11 @@ class BracedProblem(PressureProblem):
 
     @property
     def _row_names(self) -> Iterator[str]:
-        """Names of the rows: for each object, one for its force and one for each push."""
-        per_object = len(self.directions) * (2 if self.brace.contacts == "sliding" else 4)
+        """Names of the rows: for each object, one for its force and one for each push.
+
+        With sticking contacts, two more for each push: see `_slips`.
+        """
+        per_object = len(self.directions) * (2 if self.brace.contacts == "sliding" else 6)
         for item in self.scene.objects:
             yield f"{FORCE_ON}{item.name}"
             yield from [f"{MARGIN_ON}{item.name}"] * per_object
@@ -218,7 +221,7 @@ class BracedProblem(PressureProblem):
         for k, inwards in enumerate(x > (self.lower + self.upper) / 2):
             step = (-1.0 if inwards else 1.0) * BRACE.step
             change = step * self.unit[k] * np.eye(len(x))[k]
-            seen = self._seen(eq.shifted(change), pushes, known, near, full)
+            seen = self._seen(eq.shifted(change), pushes, known, near, full, base)
             with np.errstate(invalid="ignore"):  # an infinite stiffness has no derivative
                 differences.append([(b - a) / step for a, b in zip(base, seen, strict=True)])
         slopes = Quantities(
@@ -248,6 +251,7 @@ class BracedProblem(PressureProblem):
         known: BraceUncertainty,
         near: list[Nearest],
         full: bool,
+        base: Quantities | None = None,
     ) -> Quantities:
         C = eq.compliance(self.brace.contacts) if full else np.eye(6)
         residuals, values = self.judged_by(eq, C)
@@ -257,7 +261,7 @@ class BracedProblem(PressureProblem):
         if pushes:
             forces = forces + known.forces
             if self.brace.contacts == "sticking":
-                slips = np.array([self._slip(eq, push, known.grip) for push in pushes])
+                slips = self._slips(eq, pushes, known.grip, None if base is None else base.slips)
         at = np.array([each.s for each in near])
         points, _, radii = eq.line(at) if near else (np.zeros((0, 3)), None, np.zeros(0))
         distances = np.array(
@@ -266,15 +270,22 @@ class BracedProblem(PressureProblem):
         )  # fmt: skip
         return Quantities(residuals, values, distances, forces, np.array(pushed), slips)
 
-    def _slip(self, eq: ContactEquilibrium, push: Vector, grip: float) -> float:
-        """Return the push at which a contact is lost or the arm snaps, at most twice the margin.
+    def _slips(
+        self, eq: ContactEquilibrium, pushes: list[Vector], grip: float, before: Vector | None
+    ) -> Vector:
+        """Return the pushes at which a contact is lost or the arm snaps, at most twice the margin.
 
-        The least of contacts that stick and, as friction is not certain, that slide; `grip` is the
-        share of the former that is sure.
+        Those of contacts that stick and, as friction is not certain, of contacts that slide; `grip`
+        is the share of the former that is sure.  Next to an equilibrium whose pushes were `before`,
+        those at the limit are taken to stay there.
         """
         most = 2 * self.brace.margin
-        sticking = grip * eq.lift_off(push, most / grip, "sticking").force
-        return min(most, sticking, eq.lift_off(push, most).force)
+        found = np.full(2 * len(pushes), most)
+        for k, (push, contacts) in enumerate(product(pushes, _GRIPS)):
+            if before is None or before[k] < most:
+                sure = grip if contacts == "sticking" else 1.0
+                found[k] = min(most, sure * eq.lift_off(push, most / sure, contacts).force)
+        return found
 
     def _rows(self, eq: ContactEquilibrium, seen: Quantities, near: list[Nearest]) -> Vector:
         rows = self.obstacle_rows(near)
