@@ -305,9 +305,9 @@ def draw_stiffness_along(axes: Any, solution: PathSolution) -> None:
     known = np.isfinite(solution.stiffness)
     values = np.where(known, unit.of(solution.stiffness), np.nan)
     if not known.all():  # where a rigid object holds the tip
-        axes.text(
-            0.98, 0.95, "gaps: without limit, an object holds the tip", ha="right", va="top",
-            transform=axes.transAxes, color=style.GREY,
+        axes.fill_between(
+            solution.times, 0, 1, where=~known, transform=axes.get_xaxis_transform(), linewidth=0,
+            color=style.GREY, alpha=0.2, label="without limit: an object holds the tip",
         )  # fmt: skip
     if solution.alone is not None:
         axes.plot(
