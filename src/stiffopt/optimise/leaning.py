@@ -113,6 +113,7 @@ class Quantities(NamedTuple):
     forces: Vector  # along the normals, as large as they may be
     pushed: Vector
     slips: Vector
+    foretold: Vector  # slips, by the tangent
 
 
 class BracedProblem(PressureProblem):
@@ -257,35 +258,43 @@ class BracedProblem(PressureProblem):
         residuals, values = self.judged_by(eq, C)
         margin, forces = (1 + BRACE.spare) * self.brace.margin, eq.normal_forces
         pushed = [eq.shifted(push=margin * push).normal_forces - known.forces for push in pushes]
-        slips = np.zeros(0)
+        slips = foretold = np.zeros(0)
         if pushes:
             forces = forces + known.forces
             if self.brace.contacts == "sticking":
-                slips = self._slips(eq, pushes, known.grip, None if base is None else base.slips)
+                slips, foretold = self._slips(eq, pushes, known.grip, base)
         at = np.array([each.s for each in near])
         points, _, radii = eq.line(at) if near else (np.zeros((0, 3)), None, np.zeros(0))
         distances = np.array(
             [each.normal @ x - each.radius_share * r
              for each, x, r in zip(near, points, radii, strict=True)]
         )  # fmt: skip
-        return Quantities(residuals, values, distances, forces, np.array(pushed), slips)
+        return Quantities(residuals, values, distances, forces, np.array(pushed), slips, foretold)
 
     def _slips(
-        self, eq: ContactEquilibrium, pushes: list[Vector], grip: float, before: Vector | None
-    ) -> Vector:
+        self, eq: ContactEquilibrium, pushes: list[Vector], grip: float, base: Quantities | None
+    ) -> tuple[Vector, Vector]:
         """Return the pushes at which a contact is lost or the arm snaps, at most twice the margin.
 
         Those of contacts that stick and, as friction is not certain, of contacts that slide; `grip`
-        is the share of the former that is sure.  Next to an equilibrium whose pushes were `before`,
-        those at the limit are taken to stay there.
+        is the share of the former that is sure.  Next to an equilibrium with the quantities `base`,
+        pushes at the limit stay there, and those of contacts that stick change as the tangent
+        foretells, the second result.
         """
         most = 2 * self.brace.margin
-        found = np.full(2 * len(pushes), most)
+        found, foretold = np.full(2 * len(pushes), most), np.full(2 * len(pushes), np.inf)
         for k, (push, contacts) in enumerate(product(pushes, _GRIPS)):
-            if before is None or before[k] < most:
-                sure = grip if contacts == "sticking" else 1.0
-                found[k] = min(most, sure * eq.lift_off(push, most / sure, contacts).force)
-        return found
+            if base is not None and base.slips[k] == most:
+                continue
+            if contacts == "sliding":
+                found[k] = min(most, eq.lift_off(push, most).force)
+                continue
+            foretold[k] = eq.foretold_slip(push)
+            if base is None:
+                found[k] = min(most, grip * eq.lift_off(push, most / grip, "sticking").force)
+            elif np.isfinite(base.foretold[k]):
+                found[k] = base.slips[k] * foretold[k] / base.foretold[k]
+        return found, foretold
 
     def _rows(self, eq: ContactEquilibrium, seen: Quantities, near: list[Nearest]) -> Vector:
         rows = self.obstacle_rows(near)

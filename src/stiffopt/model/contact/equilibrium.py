@@ -355,6 +355,15 @@ class ContactEquilibrium:
         push = GrowingPush(self._arm.problem, d, limit)
         return push.loss(self._arm) if contacts == "sliding" else push.slip(self._arm)
 
+    def foretold_slip(self, direction: ArrayLike) -> float:
+        """Return the push in N at which sticking contacts are lost, to first order in the push.
+
+        A thirtieth of the time of `lift_off`, exact for small pushes.  The direction is (3,), of any
+        length, in base axes.
+        """
+        d = np.asarray(checked_measure(direction, "translation", "free", "base").direction)
+        return GrowingPush(self._arm.problem, d, np.inf).foretold(self._arm)
+
 
 def contact_equilibrium(
     arm: Manipulator,
