@@ -507,6 +507,39 @@ def test_large_pushes_slip_where_an_independent_rod_does(case):
     assert lost.force == pytest.approx(case["push"], rel=0.02)
 
 
+@SLIPPING
+def test_the_foretold_slip_changes_as_the_exact_one(case):
+    """To first order in the push: nearly so for pushes of some 30 mN, roughly for 0.1 N."""
+    found, push = slipping(case), case["direction"]
+    share = 0.1 if case["push"] < 0.05 else 0.5
+    changes = 20.0 * np.eye(len(found.pressures))
+    exact, foretold = (
+        np.array([value(found.shifted(each)) / value(found) - 1 for each in changes])
+        for value in (
+            lambda eq: eq.lift_off(push, contacts="sticking").force,
+            lambda eq: eq.foretold_slip(push),
+        )
+    )
+    assert foretold == pytest.approx(exact, abs=share * np.abs(exact).max())
+
+
+def test_a_contact_that_a_push_adds_may_slide():
+    """A hanging arm leans on a ball; the push bends it on to a post, along which it slides."""
+    hanging = TWO.under((0, 0, 9.81), 0.02)
+    post = {"from": (-0.04887, -0.02223, 0.08921), "to": (0.04998, -0.0331, 0.07873)}
+    around = scene(
+        {"capsule": {**post, "radius": 0.0119}},
+        {"sphere": {"centre": (0.00827, 0.02515, 0.09987), "radius": 0.0095}},
+        friction=0.3,
+    )
+    pressures = 1e3 * np.array([12.441, 23.445, 145.64, 31.826, 22.003, 0.0])
+    found = robot(hanging).contact_equilibrium(pressures, around)
+    assert [each.object for each in found.contacts] == ["1"]
+    direction = np.array([-0.19, 0.921, -0.339])
+    lost = found.lift_off(direction, contacts="sticking")
+    assert (lost.object, lost.how) == ("1", "slips")
+
+
 # -- approach, and what cannot be -----------------------------------------------------------------
 
 
