@@ -25,7 +25,9 @@ Objects = Sequence[tuple[int, Sequence[float]]]  # see `pressed_rod.pressed`
 _LENGTH, _FORCE = 0.1, 0.1  # m and N, units of the variables
 _COARSE, _FINE, _ABOUT = 1.5e-3, 2.5e-4, 3e-3  # m, elements in the end; the shortest about contacts
 _LEAST = 1e-5  # N, of a contact
-_ROUND = 2.5e-7  # square of a distance from a tube's axis, so that it is smooth where the arm begins
+_ROUND = (
+    2.5e-7  # square of a distance from a tube's axis, so that it is smooth where the arm begins
+)
 _OPTIONS = {
     "print_time": False, "ipopt.print_level": 0, "ipopt.tol": 1e-10, "ipopt.max_iter": 150,
     "ipopt.bound_relax_factor": 0, "ipopt.nlp_scaling_method": "none", "ipopt.mu_init": 1e-5,
@@ -74,9 +76,7 @@ class _Rod:
                 x[:, i + 1] - x[:, i] - step * _turned(half, xi[:3, i]),
             ]
         radii = np.array([tube.outer_radius for tube in arm.tubes])[self.segment] / _LENGTH
-        clear = [
-            distance(each, x[:, i + 1]) - radii[i] for each in objects for i in range(k)
-        ]
+        clear = [distance(each, x[:, i + 1]) - radii[i] for each in objects for i in range(k)]
         rows = ca.vertcat(*equal)
         self._equal = rows.shape[0]
         program = {
@@ -118,10 +118,7 @@ class _Rod:
         ]
         scale = np.array([1.0, 1, 1, _LENGTH, _LENGTH, _LENGTH])  # of strains
         free = [law.strain * scale for law in laws]
-        K = [
-            np.linalg.inv(law.compliance) / np.outer(scale, scale) / _FORCE
-            for law in laws
-        ]
+        K = [np.linalg.inv(law.compliance) / np.outer(scale, scale) / _FORCE for law in laws]
         parameters = np.concatenate([*free, *(each.ravel() for each in K), force / _FORCE, [load]])
         upper = np.full(self._equal + len(self.objects) * (len(self.edges) - 1), np.inf)
         upper[: self._equal] = 0.0
@@ -134,9 +131,7 @@ class _Rod:
         pushes = -_FORCE * multipliers[self._equal :].reshape(count, k)
         pushes[pushes < _LEAST / 10] = 0.0
         total = pushes.sum(axis=1)
-        at = np.divide(
-            pushes @ self.edges[1:], total, out=np.full(count, np.nan), where=total > 0
-        )
+        at = np.divide(pushes @ self.edges[1:], total, out=np.full(count, np.nan), where=total > 0)
         tip = _LENGTH * values[9 * k : 9 * k + 3]
         return Pressed(tip, total, at, values, multipliers, self, force)
 
@@ -159,9 +154,6 @@ class _Rod:
             if is_end or each - edges[-1] > 0.6 * _FINE:
                 edges.append(each)
         return np.array(edges)
-
-
-
 
 
 def _product(a: ca.SX, b: ca.SX) -> ca.SX:
@@ -230,9 +222,7 @@ def _from_tube(a: Array, b: Array, c: Array, radius: float, x: ca.SX) -> ca.SX:
     return ca.if_else(at_ridge, ca.fmax(off, inside), inside)
 
 
-def pressed(
-    arm: Arm, p: Array, objects: Objects, force: Array, n: int, steps: int = 8
-) -> Pressed:
+def pressed(arm: Arm, p: Array, objects: Objects, force: Array, n: int, steps: int = 8) -> Pressed:
     """The arm after its weight and then pressures and a force at the tip have grown from rest."""
     edges = np.linspace(0, arm.length, n * len(arm.tubes) + 1)
     rod, force = _Rod(arm, p, objects, edges), np.asarray(force, float)

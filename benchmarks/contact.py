@@ -5,16 +5,16 @@
 Random arms, with and without weight, at random pressures, half of them with a load, among one to
 three spheres, capsules and walls that the free arm would enter by up to 20 mm. With `--strong`
 objects are early on the arm's way from rest, and bend it far; with `--enclosed` the arms are in
-tubes, or pass through rings. The rod is that of `pressed_rod.py`, which needs JAX and compiles for a
-minute; a case takes some ten seconds. With `--lying` the weight presses arms on a wall, and with
+tubes, or pass through rings. The rod is that of `pressed_rod.py`, which needs JAX and compiles for
+a minute; a case takes some ten seconds. With `--lying` the weight presses arms on a wall, and with
 `--bent` they are in tubes with a bend; the rod is that of `constrained_rod.py`. Cases are stored in
 the folder and computed once. Where the two disagree, the rod is computed again with four times as
 many steps from rest.
 
 Metrics, each the largest over a case's objects or directions: the error of the tip, over the arm's
 length; the error of the contact forces, over the largest force; the error of the tip's stiffness
-along a random direction, or for every second arm on a wall along its normal, where the rod's stiffness is extrapolated to no push from pairs of pushes
-of 1 and of 0.5 mN; contacts above 1 mN that only one of the two has. If a push below 0.3 N loses a
+along a random direction, or for every second arm on a wall along its normal, where the rod's
+stiffness is extrapolated to no push from pairs of pushes of 1 and of 0.5 mN; contacts above 1 mN that only one of the two has. If a push below 0.3 N loses a
 contact of more than 2 mN: whether the independent rod still has the contact at 0.9 of that push and
 has lost it at 1.1.
 """
@@ -308,7 +308,7 @@ def measured(case: dict[str, Any]) -> dict[str, float]:
     length = arm_of(case).length
     stiffness = 100 * abs(own["stiffness"] / other["stiffness"] - 1)
     if own["stiffness"] > _RIGID:  # a surface holds the tip
-        stiffness = 0.0 if other["stiffness"] > _RIGID else 100.0
+        stiffness = 0.0 if abs(other["stiffness"]) > _RIGID else 100.0
     return {
         "tip": 100 * float(np.linalg.norm(np.subtract(own["tip"], other["tip"]))) / length,
         "force": 100 * float(np.abs(forces - expected).max() / max(expected.max(), 1e-3)),

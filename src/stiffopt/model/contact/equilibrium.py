@@ -358,8 +358,8 @@ class ContactEquilibrium:
     def foretold_slip(self, direction: ArrayLike) -> float:
         """Return the push in N at which sticking contacts are lost, to first order in the push.
 
-        A thirtieth of the time of `lift_off`, exact for small pushes.  The direction is (3,), of any
-        length, in base axes.
+        It takes a thirtieth of the time of `lift_off`.  The direction is (3,), of any length, in
+        base axes.  Infinite if nothing is lost.
         """
         d = np.asarray(checked_measure(direction, "translation", "free", "base").direction)
         return GrowingPush(self._arm.problem, d, np.inf).foretold(self._arm)

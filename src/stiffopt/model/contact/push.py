@@ -74,10 +74,10 @@ class GrowingPush:
     def slip(self, arm: LeaningArm) -> ContactLoss:
         """Return the first contact that slips or lifts off as the push grows from an equilibrium.
 
-        Contacts with friction stick, and carry no tangential force at first.  One
-        slips when the tangential force reaches the coefficient of friction times the normal
-        force; one that the push adds may slide without being lost.  The push goes half of the way to the loss that the tangent foretells, until that no
-        longer changes.
+        Contacts with friction stick, and carry no tangential force at first.  One slips when the
+        tangential force reaches the coefficient of friction times the normal force; one that the
+        push adds may slide without being lost.  The push goes half of the way to the loss that the
+        tangent foretells, until that no longer changes.
         """
         friction, count = self._friction(arm.state), len(arm.state.touches)
         sticking = [j for j, each in enumerate(friction) if each > 0]
