@@ -14,9 +14,9 @@ many steps from rest.
 Metrics, each the largest over a case's objects or directions: the error of the tip, over the arm's
 length; the error of the contact forces, over the largest force; the error of the tip's stiffness
 along a random direction, or for every second arm on a wall along its normal, where the rod's
-stiffness is extrapolated to no push from pairs of pushes of 1 and of 0.5 mN; contacts above 1 mN that only one of the two has. If a push below 0.3 N loses a
-contact of more than 2 mN: whether the independent rod still has the contact at 0.9 of that push and
-has lost it at 1.1.
+stiffness is extrapolated to no push from pairs of pushes of 1 and of 0.5 mN; contacts above 1 mN
+that only one of the two has. If a push below 0.3 N loses a contact of more than 2 mN: whether the
+independent rod still has the contact at 0.9 of that push and has lost it at 1.1.
 """
 
 from __future__ import annotations
