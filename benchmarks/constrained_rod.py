@@ -57,7 +57,9 @@ class _Rod:
         self.arm, self.p, self.objects, self.edges = arm, np.asarray(p), objects, edges
         h, k = np.diff(edges), len(edges) - 1
         ends = np.cumsum([tube.length for tube in arm.tubes])
-        self.segment = np.minimum(np.searchsorted(ends, (edges[1:] + edges[:-1]) / 2), len(ends))
+        self.segment = np.minimum(
+            np.searchsorted(ends, (edges[1:] + edges[:-1]) / 2), len(ends) - 1
+        )
         xi, x, q = ca.SX.sym("xi", 6, k), ca.SX.sym("x", 3, k + 1), ca.SX.sym("q", 4, k + 1)
         free, share = ca.SX.sym("free", 6, len(ends)), ca.SX.sym("share")
         K = ca.SX.sym("K", 36, len(ends))

@@ -334,7 +334,7 @@ def report(cases: list[dict[str, Any]]) -> str:
     gains = np.array(
         [case["stiffopt"]["stiffness"] / case["stiffopt"]["free_stiffness"] for case in good]
     )
-    gains = gains[np.isfinite(gains)]
+    gains = gains[np.isfinite(gains)] if np.isfinite(gains).any() else np.ones(1)
     around = [
         case for case in good if case["rod"]["around"] and case["stiffopt"]["lost"] is not None
     ]

@@ -159,7 +159,7 @@ def test_the_foretold_slip_changes_as_the_exact_one(case):
         np.array([value(found.shifted(each)) / value(found) - 1 for each in changes])
         for value in (
             lambda eq: eq.lift_off(push, contacts="sticking").force,
-            lambda eq: eq.foretold_slip(push),
+            lambda eq: eq.foretold_loss(push, "sticking"),
         )
     )
     assert foretold == pytest.approx(exact, abs=share * np.abs(exact).max())

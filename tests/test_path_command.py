@@ -283,6 +283,10 @@ def test_where_an_object_holds_the_tip_the_stiffness_is_shaded(
     plots.draw_stiffness_along(axes, held)
     labels = [text.get_text() for text in axes.get_legend().get_texts()]
     assert ("without limit: an object holds the tip" in labels) == (end - begin < 11)
+    shaded = [patch.get_extents() for patch in axes.patches]
+    across = axes.transData.transform([(t, 1.0) for t in solution.times])[:, 0]
+    for x, value in zip(across, values, strict=True):
+        assert any(each.x0 <= x <= each.x1 for each in shaded) == np.isinf(value)
 
 
 @pytest.mark.parametrize("file", sorted(PROBLEMS.glob("*.yaml")), ids=lambda file: file.stem)

@@ -277,23 +277,22 @@ class BracedProblem(PressureProblem):
         """Return the pushes at which a contact is lost or the arm snaps, at most twice the margin.
 
         Those of contacts that stick and, as friction is not certain, of contacts that slide; `grip`
-        is the share of the former that is sure.  Next to an equilibrium with the quantities `base`,
-        pushes at the limit stay there, and those of contacts that stick change as the tangent
-        foretells, the second result.
+        is the share of the former that is sure.  The second result is what the tangent foretells.
+        Next to an equilibrium with the quantities `base`, pushes at the limit stay there, and the
+        others change by the same share as those that are foretold.
         """
         most = 2 * self.brace.margin
         found, foretold = np.full(2 * len(pushes), most), np.full(2 * len(pushes), np.inf)
         for k, (push, contacts) in enumerate(product(pushes, _GRIPS)):
             if base is not None and base.slips[k] == most:
                 continue
-            if contacts == "sliding":
-                found[k] = min(most, eq.lift_off(push, most).force)
-                continue
-            foretold[k] = eq.foretold_slip(push)
+            foretold[k] = eq.foretold_loss(push, contacts)
             if base is None:
-                found[k] = min(most, grip * eq.lift_off(push, most / grip, "sticking").force)
-            elif np.isfinite(base.foretold[k]):
-                found[k] = base.slips[k] * foretold[k] / base.foretold[k]
+                sure = grip if contacts == "sticking" else 1.0
+                found[k] = min(most, sure * eq.lift_off(push, most / sure, contacts).force)
+            else:
+                share = foretold[k] / base.foretold[k] if np.isfinite(base.foretold[k]) else 1.0
+                found[k] = base.slips[k] * (share if np.isfinite(share) else 1.0)
         return found, foretold
 
     def _rows(self, eq: ContactEquilibrium, seen: Quantities, near: list[Nearest]) -> Vector:

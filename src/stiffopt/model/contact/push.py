@@ -137,11 +137,11 @@ class GrowingPush:
         at = touches[lost].station
         return ContactLoss(total, name, at, how, tangent.stiffness, after)
 
-    def foretold(self, arm: LeaningArm) -> float:
-        """Return the push at which the tangent at no push foretells that a contact slips, in N.
-
-        Infinite if no contact does.
-        """
+    def foretold(self, arm: LeaningArm, *, sticks: bool) -> float:
+        """Return the push at which the tangent at no push foretells a loss; see `foretold_loss`."""
+        if not sticks:
+            own, slopes = _forces(arm), self._rates(arm)[0]
+            return float(_until_zero(own, slopes).min(initial=np.inf))
         friction = self._friction(arm.state)
         tangent = self._tangent(arm, [j for j, each in enumerate(friction) if each > 0])
         return _first_loss(arm, tangent, friction, np.inf)[0]
@@ -185,7 +185,7 @@ class GrowingPush:
             own = _forces(arm)
             slopes, turn, stiffness = self._rates(arm)
             # a contact is lost where its force is zero, by Newton's method from one side
-            until = np.divide(own, -slopes, out=np.full(len(own), np.inf), where=slopes < 0)
+            until = _until_zero(own, slopes)
             step = min(step, _LARGEST_SWING / max(turn, 1e-9), self._limit - force)
             ahead = min(step, float(until.min(initial=np.inf)))
             dead = without + np.concatenate([(force + ahead) * self._direction, np.zeros(3)])
@@ -238,6 +238,11 @@ class GrowingPush:
 def rigid_if_huge(compliance: float) -> float:
     """Return the stiffness in N/m; infinite where the compliance is zero but for rounding."""
     return 1 / compliance if abs(compliance) > _NO_COMPLIANCE else np.inf
+
+
+def _until_zero(own: Vector, slopes: Vector) -> Vector:
+    """Return the pushes (k,) at which forces (k,) vanish; infinite for those that grow."""
+    return np.divide(own, -slopes, out=np.full(len(own), np.inf), where=slopes < 0)
 
 
 def _forces(arm: LeaningArm) -> Vector:
