@@ -364,7 +364,8 @@ def test_an_arm_that_is_as_the_model_has_no_discrepancy_and_the_residual_of_its_
     found = fit(problem, [np.zeros(problem.size)], rounds=1)
     parts = held_back(found, 2.0, lambda: None)
     known = error_model(found, parts)
-    assert known.residual == pytest.approx(3e-4, rel=0.2)
+    session = 0.005 * problem.description.length  # differs between sessions
+    assert known.residual == pytest.approx(np.hypot(3e-4, session), rel=0.1)
     slope = np.sqrt(np.mean(found.predicted.per_pressure[0] ** 2))
     assert known.discrepancy * slope < 2e-4
     assert known.moving == ()  # every row was held for 10 s

@@ -40,7 +40,8 @@ Vector = NDArray[np.float64]
 Part = Literal["parameters", "hysteresis", "discrepancy", "residual"]
 
 _LEVEL = 0.95  # probability of the reported regions
-_WAYS = 128  # ways to given pressures
+_WAYS = 256  # ways to given pressures
+_SINGULAR = 1e-9  # smallest variance of a direction, over that of all
 NORMAL_QUANTILE = 1.959963984540054  # of 97.5 %, for two-sided intervals of 95 %
 
 
@@ -324,7 +325,7 @@ class Uncertainty:
                 held = np.zeros(1)
                 for x in (*part_of(self._visited[..., own], play.of), end):
                     held = np.clip(held, x - play.width, x + play.width)
-                found[..., own] += memory * play.share * (held - end)
+                found[..., own] += memory * play.share * part_of(held - end, play.of)
         errors = self._calibration.errors
         if errors is not None and errors.settled:
             size = np.sqrt(np.mean(found**2, axis=1, keepdims=True))
@@ -335,8 +336,13 @@ class Uncertainty:
     def _visited(self) -> Vector:
         """Pressures (2, W, n) in Pa that the ways visit in turn."""
         known, robot = self._calibration, self._description
-        low, high = known.pressure_min or robot.pressure_min, known.pressure_max or robot.pressure_max
-        return np.random.default_rng(0).uniform(low, high, (2, _WAYS, robot.n_pressures))
+        low, high = (
+            known.pressure_min or robot.pressure_min,
+            known.pressure_max or robot.pressure_max,
+        )
+        strata = np.tile((np.arange(_WAYS) + 0.5) / _WAYS, (2, robot.n_pressures, 1))
+        shares = np.random.default_rng(0).permuted(strata, axis=2)  # a Latin hypercube
+        return np.asarray(low + np.swapaxes(shares, 1, 2) * np.subtract(high, low))
 
 
 class ReadingSlopes:
@@ -400,8 +406,9 @@ def _shape(moves: Vector, covariance: Vector) -> Vector:
     An error is one of the moves (N, W, 3), equally likely, and an independent normal error; both
     together have the mean squares `covariance` (N, 3, 3).
     """
-    root = np.linalg.inv(np.linalg.cholesky(covariance))
-    moves = moves @ np.swapaxes(root, 1, 2)  # in deviations
+    least = _SINGULAR * np.trace(covariance, axis1=1, axis2=2) + np.finfo(float).tiny
+    root = np.linalg.cholesky(covariance + least[:, np.newaxis, np.newaxis] * np.eye(3))
+    moves = np.swapaxes(np.linalg.solve(root, np.swapaxes(moves, 1, 2)), 1, 2)  # in deviations
     squares = (moves**2).sum(axis=2)
     bounded = np.swapaxes(moves, 1, 2) @ moves / moves.shape[1]
     rest = np.eye(3) - bounded
