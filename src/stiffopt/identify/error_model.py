@@ -11,7 +11,7 @@ of positions by effective pressures and the correlation K of the rows, ::
 
 Second, it acts on predictions: at a distance d from the nearest recorded pressure its variance is
 ``s^2 (1 - exp(-2 d / l))``, that of the process given its value there.  To this comes a relative
-error ``g |p|`` in directions of pressure space that were not recorded, with ``g = 7 s / R`` over
+error ``g |p|`` in directions of pressure space that were not recorded, with ``g = 6.5 s / R`` over
 the recorded range R (`ErrorModel`): where held-back data show that a model is more wrong, so it is
 where none can show it.  Both move the tip as far as such pressures would, but equally in all
 directions: a model of bending and elongation may be wrong in either, whatever a single pressure

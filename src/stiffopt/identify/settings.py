@@ -274,7 +274,7 @@ class ErrorSettings:
     per_cell: float = 1.0
     reaches: tuple[float, ...] = (0.2, 0.4, 0.8)
     reach: float = 0.4
-    untested: float = 7.0
+    untested: float = 6.5
     rows: int = 800
     representatives: int = 60
     spacing: float = 0.04
