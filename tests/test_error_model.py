@@ -319,6 +319,7 @@ def test_a_first_reading_tells_the_history_only_if_the_model_is_certain(
     robot = ONE.model_copy(update={"segments": (segment,), "calibration": calibration})
     pressures = np.tile([8e4, 0.0, 0.0], (60, 1))
     pressures[30:, 1] = 1e4
+    pressures[50:, 0] = 1.6e5  # a fall from there may have led to the beginning as well
     acting = pressures - np.array([1.2e4, 0.0, 0.0])  # as after a rise
     tips = Manipulator(ONE).tip_pose(acting)[:, :3, 3]
     log = Log(np.arange(60.0) * 0.2, pressures, tips)
