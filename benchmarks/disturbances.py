@@ -63,6 +63,7 @@ DOUBTS = (
     "lost-channel",
     "channel-opposed",
     "shortfall",
+    "slow-channel",
     "regulator-stuck",
     "pressure-reading",
     "tracker-jumps",

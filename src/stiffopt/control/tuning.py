@@ -79,8 +79,9 @@ class RegulatorTuning:
     usual_time: float = 30.0
     # pressure by which a channel is behind, beyond `follows`, at which the reference stands still,
     # in Pa, and time constant with which it no longer waits, in s
-    longest_wait: float = 1e4
+    longest_wait: float = 5e3
     wait_time: float = 1.0
+    slow_memory: float = 10.0  # time after that for which feedback leaves the channel alone, in s
     let_down_share: float = 0.1  # share of the slew with which a removed channel is let down
 
 
@@ -332,10 +333,10 @@ class MotionTuning:
     least_motion: float = 3e-3
     least_motion_share: float = 0.025
     response_window: float = 0.6  # within which the tip must have moved like the model's, in s
-    least_response: float = 0.25  # share of the model's way by which it must have moved along it
+    # share of the model's way by which the tip may miss it, if not by moving farther along it
+    most_error: float = 0.5
     # share of the model's way below which the tip lies still, which no error of the model explains
     still: float = 0.1
-    most_across: float = 0.75  # share of that way by which it may have moved across it
     late: float = 0.01  # by which the tip may move later than the model's, in s
     # share of the amplitude of the vibration that the pressures excite, whose phase may be wrong
     swing_error: float = 0.35
@@ -349,12 +350,18 @@ class MotionTuning:
     # share of the turn that a push would cause by which the measured turn must miss it
     slip: float = 0.7
     least_turn: float = 0.02  # by which it must miss it at least, in rad
+    # force on the tip that would turn it as much as a push of about twice that elsewhere on the arm
+    # may turn it otherwise, in N
+    elsewhere: float = 0.02
     bends: float = 0.5  # share below which a change that begins so is a push
     further: float = 2.0  # multiple of that turn up to which a larger one in its direction fits
     # displacement of a growing push, in m, above which it must miss it by less than another share
     largest_push: float = 8e-3
     slip_of_large: float = 0.25
     slips: int = 4  # successive samples that show a slip
+    # decrease of the missing share of the turn in these samples with which it is a push, whose
+    # higher modes turned the tip otherwise at first
+    catches_up: float = 0.1
     # an arm that responds otherwise than modelled explains a displacement: share of it that may be
     # across the model's motion, and its largest share of that motion
     aside: float = 0.5
