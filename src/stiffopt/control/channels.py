@@ -167,6 +167,7 @@ class Channels:
         wanted = np.minimum(np.maximum(short, self._min_allowed), self._max_allowed)
         self._allowed = self._allowed + share * (wanted - self._allowed)
         self._judge(elapsed, short, command, ignores)
+        self._slow_for[self.lost] = 0.0
         self._quiet = not (
             self._durations.any()
             or self.opposed.any()
@@ -271,8 +272,8 @@ class Channels:
         if self._slow_for.any():
             each = ", ".join(str(c + 1) for c in np.flatnonzero(self._slow_for))
             text = (
-                f"channel {each} follows its commands late: check regulator, supply and tubes, and "
-                "control.regulator_lag in the rig file"
+                f"the pressure of channel {each} is not where even a slow regulator would have it: "
+                "check regulator, gauge, supply and tubes, and control.regulator_lag in the rig file"
             )
             yield Notice("slow-channel", text, Severity.WARNING, standing=True)
         fed = self._allowed > self._tuning.alarm_share * self._max_allowed

@@ -283,13 +283,12 @@ class MotionWatch:
             own = float(self._explained(np.diff(rows, axis=0), jacobian).sum())
             rests = float(np.linalg.norm(way[_INTENDED])) < least  # then the offset moves the arm
             explained = math.hypot(least, own) if rests else least + own
+            explained += float(rows[-1, _FREE])  # a push displaces the arm farther at first
             wrong = distance > explained + 6 * tuning.scatter
         if wrong:
             bent = turn_of_a_push(tip) @ moved
             missing, size = self._missed_turn(bent, turned), float(np.linalg.norm(bent))
-            push = tuning.elsewhere * float(np.linalg.norm(tip.compliance[:3, :3], 2))
-            least = max(tuning.least_turn, size / distance * push)
-            least_turn = math.hypot(least, size * own / distance)
+            least_turn = math.hypot(tuning.least_turn, size * own / distance)
             now = float(rows[-1, _TIME])
             if not self._slips and missing < tuning.bends * size and size > least_turn:
                 self._bends_until = now + tuning.slip_window

@@ -350,9 +350,6 @@ class MotionTuning:
     # share of the turn that a push would cause by which the measured turn must miss it
     slip: float = 0.7
     least_turn: float = 0.02  # by which it must miss it at least, in rad
-    # force on the tip that would turn it as much as a push of about twice that elsewhere on the arm
-    # may turn it otherwise, in N
-    elsewhere: float = 0.02
     bends: float = 0.5  # share below which a change that begins so is a push
     further: float = 2.0  # multiple of that turn up to which a larger one in its direction fits
     # displacement of a growing push, in m, above which it must miss it by less than another share
