@@ -272,8 +272,9 @@ class Channels:
         if self._slow_for.any():
             each = ", ".join(str(c + 1) for c in np.flatnonzero(self._slow_for))
             text = (
-                f"the pressure of channel {each} is not where even a slow regulator would have it: "
-                "check regulator, gauge, supply and tubes, and control.regulator_lag in the rig file"
+                f"the pressure of channel {each} is not where even a slow regulator would have "
+                "it: check regulator, gauge, supply and tubes, and control.regulator_lag in the "
+                "rig file"
             )
             yield Notice("slow-channel", text, Severity.WARNING, standing=True)
         fed = self._allowed > self._tuning.alarm_share * self._max_allowed
