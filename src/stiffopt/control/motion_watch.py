@@ -283,7 +283,8 @@ class MotionWatch:
             own = float(self._explained(np.diff(rows, axis=0), jacobian).sum())
             rests = float(np.linalg.norm(way[_INTENDED])) < least  # then the offset moves the arm
             explained = math.hypot(least, own) if rests else least + own
-            explained += float(rows[-1, _FREE])  # a push displaces the arm farther at first
+            # a push displaces the arm farther at first
+            explained += min(float(rows[-1, _FREE]), least / 2)
             wrong = distance > explained + 6 * tuning.scatter
         if wrong:
             bent = turn_of_a_push(tip) @ moved
