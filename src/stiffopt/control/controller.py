@@ -361,13 +361,14 @@ class TipController:
         self._led_to = None
         if isinstance(course, PostureCourse):
             self._led_to = course.target(tip.pose, reference.path[n:])
+        goal = reference.command - pressures.command_offset
         command = self._feedback.command(
             tip,
             reference,
             self.replanner.pursuit.prescribed,
             self._offset,
-            reference.command - pressures.command_offset,
-            self._arm.channels.commands(reference.path[:n], *self._permitted),
+            goal,
+            self._arm.channels.commands(reference.path[:n], *self._permitted, goal),
             isinstance(course, Course),
             self._first_motion.largest_correction(tip.pose[:3, 3]),
         )

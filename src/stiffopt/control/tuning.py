@@ -79,8 +79,9 @@ class RegulatorTuning:
     usual_time: float = 30.0
     # pressure by which a channel is behind, beyond `follows`, at which the reference stands still,
     # in Pa, and time constant with which it no longer waits, in s
-    longest_wait: float = 1e4
+    longest_wait: float = 5e3
     wait_time: float = 1.0
+    slow_memory: float = 10.0  # time after that for which feedback leaves the channel alone, in s
     let_down_share: float = 0.1  # share of the slew with which a removed channel is let down
 
 
@@ -332,15 +333,17 @@ class MotionTuning:
     least_motion: float = 3e-3
     least_motion_share: float = 0.025
     response_window: float = 0.6  # within which the tip must have moved like the model's, in s
-    least_response: float = 0.25  # share of the model's way by which it must have moved along it
+    # share of the model's way by which the tip may miss it, if not by moving farther along it
+    most_error: float = 0.5
     # share of the model's way below which the tip lies still, which no error of the model explains
     still: float = 0.1
-    most_across: float = 0.75  # share of that way by which it may have moved across it
     late: float = 0.01  # by which the tip may move later than the model's, in s
     # share of the amplitude of the vibration that the pressures excite, whose phase may be wrong
     swing_error: float = 0.35
-    # share of the explained difference from the model above which the reference is slowed down
-    usual_share: float = 0.4
+    # shares of the explained difference from the model, above which the reference is slowed down,
+    # and from which it stands still
+    usual_share: float = 0.25
+    stops_share: float = 0.6
     misses: int = 2  # successive samples that show no response
     # share of the latest motion that a hold undoes where the tip was not seen to move: the arm has
     # followed its pressures about so far, and then swings least; 0 for an arm that does not vibrate
@@ -355,6 +358,9 @@ class MotionTuning:
     largest_push: float = 8e-3
     slip_of_large: float = 0.25
     slips: int = 4  # successive samples that show a slip
+    # decrease of the missing share of the turn in these samples with which it is a push, whose
+    # higher modes turned the tip otherwise at first
+    catches_up: float = 0.1
     # an arm that responds otherwise than modelled explains a displacement: share of it that may be
     # across the model's motion, and its largest share of that motion
     aside: float = 0.5
