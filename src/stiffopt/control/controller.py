@@ -124,6 +124,7 @@ class TipController:
             safety,
             tuning.feedback,
             tuning.motion_error,
+            tuning.step_error,
         )
         self._first_motion = FirstMotion(commissioned, tuning.first_motion)
         self._requests = Requests(robot, limits, slew, scene, tuning)
@@ -368,7 +369,7 @@ class TipController:
             self._offset,
             reference.command - pressures.command_offset,
             self._arm.channels.commands(reference.path[:n], *self._permitted),
-            isinstance(course, Course),
+            None if isinstance(course, PostureCourse | Pressing) else course is not None,
             self._first_motion.largest_correction(tip.pose[:3, 3]),
         )
         if command is None:
