@@ -274,7 +274,7 @@ class Planning:
         On the straight line to it the tip would leave its target by millimetres, and by more in a
         quick change, as feedback needs time for an offset that differs between them.
         """
-        assert self._change is not None and self._last is not None
+        assert self._change is not None
         begin, share, _ = self._change
         share += self._tuning.change_step / max(float(np.abs(end - begin).max()), _SLACK)
         if share >= 1:

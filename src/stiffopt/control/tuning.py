@@ -570,7 +570,7 @@ class ControlTuning:
     first_motion: FirstMotionTuning = field(default_factory=FirstMotionTuning)
     feedback: FeedbackTuning = field(default_factory=FeedbackTuning)
     motion_error: MotionErrorTuning = field(default_factory=MotionErrorTuning)
-    # of a step: it goes one way and soon ends, so that its offsets count more, and what they say less
+    # of a step, which goes one way and soon ends: its offsets count more, for smaller changes
     step_error: MotionErrorTuning = field(
         default_factory=lambda: MotionErrorTuning(deviation=0.05, late=0.01, every=0.05)
     )
