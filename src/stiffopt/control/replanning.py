@@ -102,8 +102,6 @@ class Replanner:
         self.adapted: Adapted | None = None  # the model that plans use; None: the robot file's
         self._newest: Plan | None = None  # the last that `latest` took
         self._lead = dead_time + 0.5 * period
-        # mean age of a plan, less the tick at whose end the reference has taken it in
-        self._held = max(0.0, 0.5 * (tuning.interval - period) - period)
         self._serial, self._search = 0, True
         self.begin()
 
@@ -216,7 +214,7 @@ class Replanner:
             if detour is not None and later < detour.end:
                 target = detour.at(later)
             if isinstance(course, Course):  # the target when the reference will be there
-                target = course.at(later + self._held, delay)
+                target = course.at(later, delay)
             elif course is not None:
                 target = course.at(later)
             # The offset depends on the posture. Plans follow it slowly, feedback at once.
