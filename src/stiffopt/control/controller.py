@@ -124,6 +124,7 @@ class TipController:
             safety,
             tuning.feedback,
             tuning.motion_error,
+            tuning.step_error,
         )
         self._first_motion = FirstMotion(commissioned, tuning.first_motion)
         self._requests = Requests(robot, limits, slew, scene, tuning)
@@ -369,7 +370,7 @@ class TipController:
             self._offset,
             goal,
             self._arm.channels.commands(reference.path[:n], *self._permitted, goal),
-            isinstance(course, Course),
+            None if isinstance(course, PostureCourse | Pressing) else course is not None,
             self._first_motion.largest_correction(tip.pose[:3, 3]),
         )
         if command is None:

@@ -149,13 +149,16 @@ class FeedbackTuning:
 
 @dataclass(frozen=True)
 class MotionErrorTuning:
-    """How the tip's offset changes with motion on a trajectory (`MotionErrorEstimator`)."""
+    """How the tip's offset changes with motion (`MotionErrorEstimator`)."""
 
     deviation: float = 0.1  # of the share by which the tip moves farther than modelled
     drift: float = 3e-4  # growth of the deviation of the rest of the offset, in m / sqrt(s)
     noise: float = 3e-4  # of an offset, in m
     late: float = 0.1  # error of an offset in motion, as the way of the tip in this time, in s
     every: float = 0.1  # between two offsets that are taken in, in s
+    # distance, in m, between the model's tip and its average over a vibration, below which a step
+    # has ended
+    ended: float = 1e-4
 
 
 @dataclass(frozen=True)
@@ -275,6 +278,8 @@ class PlanningTuning:
     neighbourhood_per_metre: float = 2e7
     # successive plans that refuse an optimum in another configuration before one takes it
     patience: int = 20
+    # change of a pressure from plan to plan on the way to another configuration, in Pa
+    change_step: float = 7e2
     position_tolerance: float = 1e-5  # of plans, in m
     angle_tolerance: float = 1e-3  # of plans, in rad
 
@@ -571,6 +576,10 @@ class ControlTuning:
     first_motion: FirstMotionTuning = field(default_factory=FirstMotionTuning)
     feedback: FeedbackTuning = field(default_factory=FeedbackTuning)
     motion_error: MotionErrorTuning = field(default_factory=MotionErrorTuning)
+    # of a step, which goes one way and soon ends: its offsets count more, for smaller changes
+    step_error: MotionErrorTuning = field(
+        default_factory=lambda: MotionErrorTuning(deviation=0.05, late=0.01, every=0.05)
+    )
     replanning: ReplanningTuning = field(default_factory=ReplanningTuning)
     posture: PostureTuning = field(default_factory=PostureTuning)
     forecast: ForecastTuning = field(default_factory=ForecastTuning)
