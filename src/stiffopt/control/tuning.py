@@ -347,8 +347,8 @@ class MotionTuning:
     swing_error: float = 0.35
     # shares of the explained difference from the model, above which the reference is slowed down,
     # and from which it stands still
-    usual_share: float = 0.25
-    stops_share: float = 0.6
+    usual_share: float = 0.4
+    stops_share: float = 1.0
     misses: int = 2  # successive samples that show no response
     # share of the latest motion that a hold undoes where the tip was not seen to move: the arm has
     # followed its pressures about so far, and then swings least; 0 for an arm that does not vibrate

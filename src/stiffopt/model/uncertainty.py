@@ -407,8 +407,9 @@ def _shape(moves: Vector, covariance: Vector) -> Vector:
     together have the mean squares `covariance` (N, 3, 3).
     """
     least = _SINGULAR * np.trace(covariance, axis1=1, axis2=2) + np.finfo(float).tiny
-    root = np.linalg.cholesky(covariance + least[:, np.newaxis, np.newaxis] * np.eye(3))
-    moves = np.swapaxes(np.linalg.solve(root, np.swapaxes(moves, 1, 2)), 1, 2)  # in deviations
+    squared, axes = np.linalg.eigh(covariance)
+    deviations = np.sqrt(np.maximum(squared, least[:, np.newaxis]))
+    moves = moves @ axes / deviations[:, np.newaxis]
     squares = (moves**2).sum(axis=2)
     bounded = np.swapaxes(moves, 1, 2) @ moves / moves.shape[1]
     rest = np.eye(3) - bounded

@@ -242,7 +242,8 @@ def rigid_if_huge(compliance: float) -> float:
 
 def _until_zero(own: Vector, slopes: Vector) -> Vector:
     """Return the pushes (k,) at which forces (k,) vanish; infinite for those that grow."""
-    return np.divide(own, -slopes, out=np.full(len(own), np.inf), where=slopes < 0)
+    until: Vector = np.divide(own, -slopes, out=np.full(len(own), np.inf), where=slopes < 0)
+    return until
 
 
 def _forces(arm: LeaningArm) -> Vector:
