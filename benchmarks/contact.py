@@ -1,20 +1,22 @@
-"""Compare equilibria of arms that lean on objects with an independent rod (`pressed_rod.py`).
+"""Compare equilibria of arms that lean on objects with independent rods.
 
     python benchmarks/contact.py --cases 100 --out out/contact
 
 Random arms, with and without weight, at random pressures, half of them with a load, among one to
 three spheres, capsules and walls that the free arm would enter by up to 20 mm. With `--strong`
 objects are early on the arm's way from rest, and bend it far; with `--enclosed` the arms are in
-tubes, or pass through rings. Cases are stored in the folder and computed once. JAX is needed and
-compiles for a minute; a case takes some ten seconds. Where the two disagree, the rod is computed
-again with four times as many steps from rest.
+tubes, or pass through rings. The rod is that of `pressed_rod.py`, which needs JAX and compiles for
+a minute; a case takes some ten seconds. With `--lying` the weight presses arms on a wall, and with
+`--bent` they are in tubes with a bend; the rod is that of `constrained_rod.py`. Cases are stored in
+the folder and computed once. Where the two disagree, the rod is computed again with four times as
+many steps from rest.
 
 Metrics, each the largest over a case's objects or directions: the error of the tip, over the arm's
 length; the error of the contact forces, over the largest force; the error of the tip's stiffness
-along a random direction, where the rod's stiffness is extrapolated to no push from pairs of pushes
-of 1 and of 0.5 mN; contacts above 1 mN that only one of the two has. If a push below 0.3 N loses a
-contact of more than 2 mN: whether the independent rod still has the contact at 0.9 of that push and
-has lost it at 1.1.
+along a random direction, or for every second arm on a wall along its normal, where the rod's
+stiffness is extrapolated to no push from pairs of pushes of 1 and of 0.5 mN; contacts above 1 mN
+that only one of the two has. If a push below 0.3 N loses a contact of more than 2 mN: whether the
+independent rod still has the contact at 0.9 of that push and has lost it at 1.1.
 """
 
 from __future__ import annotations
@@ -40,14 +42,25 @@ _ELEMENTS = {"1 segment": 32, "2 segments": 16}
 _BARS = {"tip": 0.5, "force": 5.0, "stiffness": 5.0, "contacts": 0.5}
 _PUSH = 1e-3  # N; the rod's discrete springs blur smaller ones
 _STEPS, _MORE_STEPS = 12, 48  # of the rod from rest, and where the two disagree
+_KINDS = {
+    "strong": "contacts that bend the arm far",
+    "enclosed": "in tubes and through rings",
+    "lying": "along a wall, under their weight",
+    "bent": "in tubes with a bend",
+}
+_BY_CONSTRAINTS = ("lying", "bent")
+_RIGID = 1e5  # N/m
 
 
-def draw(seed: int, *, enclosed: bool = False, strong: bool = False) -> dict[str, Any]:
+def draw(seed: int, kind: str = "") -> dict[str, Any]:
     """A random case: arm, pressures, load and objects, clear of the arm at rest.
 
-    If it is enclosed, the arm is in a tube or passes through a ring instead. If it is strong,
-    objects are early on the arm's way, and pressures higher.
+    If it is "enclosed", the arm is in a tube or passes through a ring instead. If it is "strong",
+    objects are early on the arm's way, and pressures higher. See `_lying` and `_bent`.
     """
+    if kind in _BY_CONSTRAINTS:
+        return (_lying if kind == "lying" else _bent)(np.random.default_rng([21, seed]), seed)
+    enclosed, strong = kind == "enclosed", kind == "strong"
     rng = np.random.default_rng([20, seed])
     name = ("2 segments", "1 segment", "2 segments")[seed % 3]
     hangs, count = bool(seed // 3 % 2), 1 + seed // 6 % 3
@@ -130,6 +143,47 @@ def _around(
     return 2, [0, 0, -0.03, 0, 0, bend, own, *(beyond * 1.2), 1.6 * length]
 
 
+def _lying(rng: np.random.Generator, seed: int) -> dict[str, Any]:
+    """An arm that its weight presses on a wall; half of the arms are under pressure."""
+    angle, gap = rng.uniform(0, 2 * np.pi), rng.uniform(0, 0.01) * (rng.random() < 0.8)
+    down = np.array([np.cos(angle), np.sin(angle), 0.0])
+    gravity = rng.uniform(3, 9) * down + [0, 0, rng.uniform(-2, 4)]
+    p = 10 ** rng.uniform(2, 4.9) * rng.random(6) * (rng.random(6) < 0.6) * (seed % 2)
+    wall = [*((ARMS["2 segments"].tubes[0].outer_radius + gap) * down), *-down, 0.0]
+    direction = -down if seed // 2 % 2 else rng.normal(size=3)
+    return _case(seed, gravity, p, (1, wall), direction)
+
+
+def _bent(rng: np.random.Generator, seed: int) -> dict[str, Any]:
+    """An arm in a tube with a bend, clear of it at rest; every second one hangs."""
+    arm, gravity = ARMS["2 segments"], np.array([0, 0, 9.81 * (seed % 2)])
+    while True:
+        p = rng.uniform(0, 1e5, 6) * (rng.random(6) < 0.7)
+        wider = rng.uniform(0.002, 0.015)
+        bend, side = np.radians(rng.uniform(3, 30)), rng.uniform(0, 2 * np.pi)
+        first = max(0.05, arm.length - 0.95 * (wider - 5e-4) / np.tan(bend))
+        if first > 0.95 * arm.length:
+            continue
+        height = rng.uniform(first, 0.95 * arm.length)
+        way = [np.sin(bend) * np.cos(side), np.sin(bend) * np.sin(side), np.cos(bend)]
+        end = np.array([0, 0, height]) + 0.2 * np.array(way)
+        tube = [0, 0, -0.03, 0, 0, height, arm.tubes[0].outer_radius + wider, *end]
+        case = _case(seed, gravity, p, (2, tube), rng.normal(size=3))
+        robot = stiffopt.Manipulator(stiffopt.RobotDescription(**arm_of(case).mapping()))
+        if robot.clearance(p, scene_of(case)) < -0.001:
+            return case
+
+
+def _case(
+    seed: int, gravity: Any, p: Any, item: tuple[int, list[float]], direction: Any
+) -> dict[str, Any]:
+    return {
+        "seed": seed, "arm": "2 segments", "gravity": list(gravity), "tip_mass": 0.0,
+        "pressures": p.tolist(), "force": [0.0, 0.0, 0.0], "objects": [item],
+        "direction": (direction / np.linalg.norm(direction)).tolist(),
+    }  # fmt: skip
+
+
 def _nearest(item: tuple[int, list[float]], points: Any) -> float:
     kind, numbers = item
     a, b, r = np.array(numbers[:3]), np.array(numbers[3:6]), numbers[6]
@@ -195,9 +249,14 @@ def found_by_stiffopt(case: dict[str, Any]) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def found_by_rod(case: dict[str, Any], lost_at: float | None, steps: int) -> dict[str, Any]:
+def found_by_rod(
+    case: dict[str, Any], lost_at: float | None, steps: int, kind: str
+) -> dict[str, Any]:
     """What the independent rod says of it, after so many steps from rest."""
-    from pressed_rod import pressed, pushed
+    if kind in _BY_CONSTRAINTS:
+        from constrained_rod import pressed, pushed
+    else:
+        from pressed_rod import pressed, pushed  # type: ignore[assignment]
 
     n, objects, d = _ELEMENTS[case["arm"]], case["objects"], np.array(case["direction"])
     try:
@@ -219,18 +278,18 @@ def found_by_rod(case: dict[str, Any], lost_at: float | None, steps: int) -> dic
     }  # fmt: skip
 
 
-def run(seeds: range, folder: Path, **kind: Any) -> Iterator[dict[str, Any]]:
+def run(seeds: range, folder: Path, kind: str = "") -> Iterator[dict[str, Any]]:
     """All cases, from the folder where they are there; the model's part always anew."""
     folder.mkdir(parents=True, exist_ok=True)
     for seed in seeds:
         file = folder / f"{seed}.json"
-        case = json.loads(file.read_text()) if file.exists() else draw(seed, **kind)
+        case = json.loads(file.read_text()) if file.exists() else draw(seed, kind)
         case["stiffopt"] = found_by_stiffopt(case)
         if "rod" not in case:
-            case["rod"] = found_by_rod(case, case["stiffopt"].get("lost_at"), _STEPS)
+            case["rod"] = found_by_rod(case, case["stiffopt"].get("lost_at"), _STEPS, kind)
         if not is_within(case) and "first rod" not in case:
             case["first rod"] = case["rod"]
-            case["rod"] = found_by_rod(case, case["stiffopt"].get("lost_at"), _MORE_STEPS)
+            case["rod"] = found_by_rod(case, case["stiffopt"].get("lost_at"), _MORE_STEPS, kind)
         file.write_text(json.dumps(case))
         yield case
 
@@ -247,10 +306,13 @@ def measured(case: dict[str, Any]) -> dict[str, float]:
     own, other = case["stiffopt"], case["rod"]
     forces, expected = np.array(own["forces"]), np.array(other["forces"])
     length = arm_of(case).length
+    stiffness = 100 * abs(own["stiffness"] / other["stiffness"] - 1)
+    if own["stiffness"] > _RIGID:  # a surface holds the tip
+        stiffness = 0.0 if abs(other["stiffness"]) > _RIGID else 100.0
     return {
         "tip": 100 * float(np.linalg.norm(np.subtract(own["tip"], other["tip"]))) / length,
         "force": 100 * float(np.abs(forces - expected).max() / max(expected.max(), 1e-3)),
-        "stiffness": 100 * abs(own["stiffness"] / other["stiffness"] - 1),
+        "stiffness": stiffness,
         "contacts": float(((forces > 1e-3) & (expected < 1e-5)).sum()
                           + ((expected > 1e-3) & (forces < 1e-5)).sum()),
     }  # fmt: skip
@@ -269,7 +331,10 @@ def report(cases: list[dict[str, Any]]) -> str:
         cells = (f"{np.median(values):.3g}", f"{np.quantile(values, 0.95):.3g}")
         rows.append([key, units[key], *cells, f"{values.max():.3g}", within])
     turned = np.array([case["stiffopt"]["turned_deg"] for case in good])
-    gains = [case["stiffopt"]["stiffness"] / case["stiffopt"]["free_stiffness"] for case in good]
+    gains = np.array(
+        [case["stiffopt"]["stiffness"] / case["stiffopt"]["free_stiffness"] for case in good]
+    )
+    gains = gains[np.isfinite(gains)] if np.isfinite(gains).any() else np.ones(1)
     around = [
         case for case in good if case["rod"]["around"] and case["stiffopt"]["lost"] is not None
     ]
@@ -279,7 +344,7 @@ def report(cases: list[dict[str, Any]]) -> str:
     lines = [
         f"{len(good)} cases, {again} of them with more steps; the tip turned by the contacts by "
         f"{np.median(turned):.0f} degrees in the median, by {turned.max():.0f} at most; stiffness "
-        f"{np.median(gains):.2f} times that of the free arm in the median, {max(gains):.1f} at "
+        f"{np.median(gains):.2f} times that of the free arm in the median, {gains.max():.1f} at "
         "most.",
         "",
         *table(["what", "unit", "median", "95 %", "largest", "within the bar"], rows),
@@ -306,16 +371,18 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--cases", type=int, default=100)
     parser.add_argument("--first", type=int, default=0, metavar="SEED")
-    parser.add_argument("--strong", action="store_true", help="contacts that bend the arm far")
+    kinds = parser.add_mutually_exclusive_group()
+    for name, text in _KINDS.items():
+        kinds.add_argument(
+            f"--{name}", action="store_const", const=name, dest="kind", default="", help=text
+        )
     parser.add_argument("--out", type=Path, default=Path("out/contact"))
     parser.add_argument("--keep", type=Path, help="write the report here too")
-    parser.add_argument("--enclosed", action="store_true", help="in tubes and through rings")
     arguments = parser.parse_args()
     warnings.simplefilter("ignore")
     cases = []
     seeds = range(arguments.first, arguments.first + arguments.cases)
-    kind = {"enclosed": arguments.enclosed, "strong": arguments.strong}
-    for case in run(seeds, arguments.out, **kind):
+    for case in run(seeds, arguments.out, arguments.kind):
         cases.append(case)
         error = case["stiffopt"].get("error") or case["rod"].get("error")
         print(case["seed"], error or measured(case), flush=True)

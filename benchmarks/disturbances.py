@@ -7,8 +7,10 @@ Arms and targets are those of `control_cases.py`; the controller has the nominal
 run the arm goes to a first target and rests there; then a fault begins, and four seconds later a
 second target follows. Faults of the set-up are there from the beginning. Columns: number of runs
 that detected the fault, and as what; longest time from its beginning to detection (for faults that
-only show in motion, from the second target; negative if it was detected before); two largest
-distances of the tip over all runs, in mm, until it is vented; and the state in the end. The first
+only show in motion, from the second target; negative if it was detected before; for leaks, from
+the moment when the channel has pressure to lose, a command above 0.2 bar, or 0.03 bar for a burst);
+two largest distances of the tip over all runs, in mm, until it is vented; and the state in the end.
+The first
 distance is from the way that the tip takes without a fault (but with a push that the row has too).
 The second is what the loop causes of it: the distance from that way and from the one on which the
 fault alone takes the tip, with the commands frozen from its beginning. They differ where a chamber
@@ -63,6 +65,7 @@ DOUBTS = (
     "lost-channel",
     "channel-opposed",
     "shortfall",
+    "slow-channel",
     "regulator-stuck",
     "pressure-reading",
     "tracker-jumps",
@@ -85,6 +88,8 @@ class Row:
     is_fault : whether it is to be noticed.
     noise : of the tracker, in m, if not as usual.
     usual : the part of it that is no fault, with which the tip takes the way to compare with.
+    shows_above : command of channel 2 above which it can be noticed, in Pa: an empty channel does
+        not leak.
     """
 
     name: str
@@ -94,6 +99,7 @@ class Row:
     is_fault: bool = True
     noise: float = 5e-5
     usual: Callable[[Any], object] | None = None
+    shows_above: float = 0.0
 
 
 def _tracker(fault: str) -> Callable[[Any], object]:
@@ -345,7 +351,7 @@ ROWS = (
     Row("tracker is 0.1 s later every second", _tracker("lagging"), shows_in_motion=True),
     Row("tip shakes by 10 mm at 3 Hz", _tracker("shaking")),
     Row("a regulator keeps its pressure", _stuck, shows_in_motion=True),
-    Row("a leak that the regulator feeds", _leaking),
+    Row("a leak that the regulator feeds", _leaking, shows_above=2e4),
     Row("tracker freezes for 1 s, then jumps by 8 mm", _freezes_then_jumps),
     Row("a gauge reads 0.12 bar too much", _gauge(1, lambda p, _: p + 1.2e4)),
     Row("a gauge keeps its reading", _gauge(1, lambda _, p: p), shows_in_motion=True),
@@ -354,7 +360,7 @@ ROWS = (
     Row("a kinked line behind a gauge", _behind_gauge(_kinked), shows_in_motion=True),
     Row("a regulator of ten times the lag", _slow, shows_in_motion=True),
     Row("a regulator without more pressure", _saturates, shows_in_motion=True),
-    Row("a chamber bursts", _burst),
+    Row("a chamber bursts", _burst, shows_above=3e3),
     Row("tip is shaken by 6 mm at 5 Hz", _seen_as(_shaken)),
     Row("tracker drifts, and a leak", _both(_tracker("drifting"), _leaking)),
     Row(
@@ -421,18 +427,21 @@ def run_row(case: Case, row: Row, dynamics: str, *, frozen: bool = False) -> Out
         run.go(0.3)
         began = begin = rig.clock.now()
         _try_task(run, case, 0)
-        tips = [run.go(REST).tips]
+        traces = [run.go(REST)]
         if not row.at_once:
             began = begin = rig.clock.now()
             row.begin(rig)
             if frozen:
                 return Outcome(np.inf, "", _tips_alone(rig, BEFORE + AFTER), "frozen")
-            tips = [*tips[: row.name == "nothing"], run.go(BEFORE).tips]
+            traces = [*traces[: row.name == "nothing"], run.go(BEFORE)]
         if run.loop.snapshot().state is State.ACTIVE:
             if row.shows_in_motion:
                 begin = rig.clock.now()
             _try_task(run, case, 1)
-            tips.append(run.go(AFTER).tips)
+            traces.append(run.go(AFTER))
+        if row.shows_above:
+            high = np.concatenate([t.commands for t in traces])[:, 1] > row.shows_above
+            begin = began + PERIOD * float(np.argmax(high))
         ended = rig.clock.now()
         for _ in range(round(END)):
             if run.loop.snapshot().state is State.HOLDING:
@@ -440,7 +449,7 @@ def run_row(case: Case, row: Row, dynamics: str, *, frozen: bool = False) -> Out
         events, _ = run.loop.events.since(0)
         kinds = DOUBTS if row.is_fault else DOUBTS[:-1]  # what is pushed may reach less
         told = [event for event in events if event.kind in kinds and event.time >= began]
-        ways = np.concatenate(tips)
+        ways = np.concatenate([trace.tips for trace in traces])
         if run.loop.snapshot().state is State.FAULT:  # venting takes the arm to rest
             after = ended - next(e.time for e in events if e.kind in FAULTS)
             ways = ways[: len(ways) - max(0, round(after / PERIOD))]

@@ -32,7 +32,7 @@ _BAR = 10.0  # %
 def draw_rough(seed: int, *, strong: bool) -> dict[str, Any]:
     """A case of `contact.py` with a coefficient of friction."""
     friction = float(np.random.default_rng([21, seed]).uniform(0.1, 0.5))
-    return draw(seed, strong=strong) | {"friction": friction}
+    return draw(seed, "strong" if strong else "") | {"friction": friction}
 
 
 def found_by_stiffopt(case: dict[str, Any]) -> dict[str, Any] | None:

@@ -18,6 +18,7 @@ HERE = Path(__file__).parent
 BENCHMARKS = HERE.parent / "benchmarks"
 sys.path.insert(0, str(BENCHMARKS))
 
+import contact  # noqa: E402
 import counts  # noqa: E402
 import environment  # noqa: E402
 import plots  # noqa: E402
@@ -244,6 +245,13 @@ def test_a_plot_is_drawn(tmp_path):
     path = tmp_path / "full_task.png"
     plots.draw({"1": {"stiffopt": record}, "2": {"stiffopt": record}}, path)
     assert path.stat().st_size > 5000
+
+
+@pytest.mark.parametrize(("kind", "seed"), [("lying", 3010), ("bent", 1041)])
+def test_a_rod_with_constraints_agrees(kind, seed, tmp_path):
+    (case,) = contact.run(range(seed, seed + 1), tmp_path, kind)
+    assert contact.is_within(case)
+    assert max(case["rod"]["forces"]) > 0.02
 
 
 @pytest.mark.long

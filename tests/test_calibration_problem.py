@@ -217,7 +217,8 @@ def test_effective_pressures_are_those_of_the_robots_history() -> None:
         before = sample.recording.before
         start = Start.from_rest(history, before)
         if sample.begin == "unknown":
-            start = Start.settled(history, before, coordinates[sides[i]])
+            visited = sample.recording.pressures
+            start = Start.settled(history, before, coordinates[sides[i]], visited)
         expected = Past(history, 3).effective(
             sample.recording.time, sample.recording.pressures, sample.rows, start, history
         )

@@ -208,6 +208,20 @@ def test_a_regulator_that_is_slower_than_believed_is_not_lost() -> None:
     assert not line.channels.opposed.any()
 
 
+def test_feedback_leaves_a_slow_channel_alone_for_a_while() -> None:
+    line = Line()
+    line.to(0.3 * BAR, 0.3 * BAR, 0.3 * BAR)
+    line.rising = line.falling = np.array([0.06, 0.6, 0.06])
+    line.to(0.6 * BAR, 0.6 * BAR, 0.6 * BAR, seconds=0.3)
+    assert line.kinds[0] == "slow-channel"
+    goal, low, high = np.full(N, 0.6 * BAR), np.zeros(N), np.full(N, 1.5 * BAR)
+    low, high = line.channels.commands(goal, low, high, goal)
+    assert low.tolist() == [0.0, 0.6 * BAR, 0.0]
+    assert high.tolist() == [1.5 * BAR, 0.6 * BAR, 1.5 * BAR]
+    line.to(0.6 * BAR, 0.6 * BAR, 0.6 * BAR, seconds=14)
+    assert line.kinds == []
+
+
 def test_the_reference_waits_for_a_channel_that_is_behind_but_not_for_ever() -> None:
     line = Line()
     line.to(0.9 * BAR, 0.5 * BAR, 0.0)

@@ -319,6 +319,7 @@ def test_a_first_reading_tells_the_history_only_if_the_model_is_certain(
     robot = ONE.model_copy(update={"segments": (segment,), "calibration": calibration})
     pressures = np.tile([8e4, 0.0, 0.0], (60, 1))
     pressures[30:, 1] = 1e4
+    pressures[50:, 0] = 1.6e5  # a fall from there may have led to the beginning as well
     acting = pressures - np.array([1.2e4, 0.0, 0.0])  # as after a rise
     tips = Manipulator(ONE).tip_pose(acting)[:, :3, 3]
     log = Log(np.arange(60.0) * 0.2, pressures, tips)
@@ -364,7 +365,8 @@ def test_an_arm_that_is_as_the_model_has_no_discrepancy_and_the_residual_of_its_
     found = fit(problem, [np.zeros(problem.size)], rounds=1)
     parts = held_back(found, 2.0, lambda: None)
     known = error_model(found, parts)
-    assert known.residual == pytest.approx(3e-4, rel=0.2)
+    session = 0.005 * problem.description.length  # differs between sessions
+    assert known.residual == pytest.approx(np.hypot(3e-4, session), rel=0.1)
     slope = np.sqrt(np.mean(found.predicted.per_pressure[0] ** 2))
     assert known.discrepancy * slope < 2e-4
     assert known.moving == ()  # every row was held for 10 s

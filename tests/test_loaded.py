@@ -199,3 +199,14 @@ def test_a_load_that_buckles_the_arm_is_said(monkeypatch):
     solution = so.solve_pressure(model, so.Task(robot="any", target=target, load=load))
     assert solution.status == "failed"
     assert "buckles" in solution.message
+
+
+def test_a_target_that_few_samples_reach_is_searched_well(hanging):
+    goal = maximise(along(-0.217, 0.571, -0.792))
+    target = so.Target(position=(-0.01727, -0.02155, 0.18724))
+    task = so.Task(robot="any", target=target, stiffness=goal)
+    found = so.solve_pressure(hanging, task)
+    elsewhere = 1e5 * np.array([0.897, 0, 0, 0.287, 1.449, 0.089])
+    other = so.solve_pressure(hanging, task, guess=elsewhere)
+    assert found.confidence.complete
+    assert found.stiffness >= 0.995 * other.stiffness

@@ -113,6 +113,24 @@ def test_a_tip_that_does_not_move_when_it_should_is_doubted_after_a_few_millimet
     assert moved(time) < 0.018
 
 
+@pytest.mark.parametrize(("along", "aside", "is_doubted"), [(0.6, 0.5, True), (1.6, 0.0, False)])
+def test_a_tip_that_misses_half_of_its_way_is_doubted_but_not_if_it_moves_farther(
+    along: float, aside: float, is_doubted: bool
+) -> None:
+    moved = step(0.04)
+    _, doubt = watched(
+        4, lambda t: moved(t) * (along * X + aside * Y), lambda t: moved(t) * X,
+        lambda t: moved(t) * X,
+    )  # fmt: skip
+    assert (doubt is not None and doubt.kind == "no-response") is is_doubted
+
+
+def test_a_push_whose_second_mode_turns_the_tip_the_other_way_at_first_is_no_slip() -> None:
+    """The turn catches up with the displacement within a few tenths of a second."""
+    assert displaced(1.0, turns=step(1.6, lag=0.3)) is None
+    assert displaced(0.0, turns=step(1.6, lag=0.3)) is not None
+
+
 @pytest.mark.parametrize("wrong", [0.0, 1.0])
 def test_the_reference_is_slowed_down_before_the_doubt_but_not_for_an_error(wrong: float) -> None:
     """A tip that moves across its way, or a third too little."""
@@ -233,16 +251,25 @@ def test_nothing_is_doubted_after_steering_has_ended() -> None:
 
 
 def displaced(
-    turned: float, force: float = 1.0, grown: Callable[[float], float] | None = None
+    turned: float,
+    force: float = 1.0,
+    grown: Callable[[float], float] | None = None,
+    turns: Callable[[float], float] | None = None,
 ) -> Doubt | None:
-    """Doubt of a tip that is displaced by 10 mm and turned by a share of what a push turns it."""
+    """Doubt of a tip that is displaced by 10 mm and turned by a share of what a push turns it.
+
+    It begins with 0.6 of that turn the other way if the turn follows a time course of its own.
+    """
     push = TIP.pose[:3, :3] @ np.array([0.01, 0.004, 0.0]) * force
     pushed = ROBOT.loaded_tip_pose(P, [*push, 0.0, 0.0, 0.0])
     moved = pushed[:3, 3] - TIP.pose[:3, 3]
     turn = turned * lie.log(pushed @ np.linalg.inv(TIP.pose))[3:]
     watch = MotionWatch(ROBOT.description, MotionTuning())
     for time in np.arange(0.0, 3.0, FRAME):
-        offset = (grown or step(1.0, lag=0.05))(time) * np.concatenate([moved, turn])
+        course = (grown or step(1.0, lag=0.05))(time)
+        offset = np.concatenate([course * moved, course * turn])
+        if turns and time > 1.0:
+            offset[3:] = turned and (turns(time) - 0.6) * turn
         watch.intend(time, np.zeros(3))
         if grown:  # the loop has not made up for it
             take(watch, time, offset[:3], np.zeros(3), offset)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from stiffopt.identify import past
 from stiffopt.identify.past import Effective, Past, Start
-from stiffopt.model.history import Creep, History, Memory, Play
+from stiffopt.model.history import Creep, History, Memory, Part, Play
 
 Array = NDArray[np.float64]
 
@@ -46,6 +46,7 @@ KINDS = {
 }
 SHARES = ("play[0].share", "play[1].share", "creep[0].share", "creep[1].share")
 SIDES = np.array([0.5, -0.2, 0.1])
+EVERYWHERE = 1e6 * np.array([[-1.0] * 3, [1.0] * 3])  # visited pressures, in Pa
 FINE = 2e-3  # s
 
 
@@ -136,7 +137,7 @@ def almost_everywhere(found: Array, expected: Array, share: float = 0.99) -> Non
 def log(request: pytest.FixtureRequest) -> tuple[History, Array, Array, Start, Effective]:
     history = KINDS[request.param]
     time, pressures = course(1500, seed=3)
-    start = Start.settled(history, pressures[0] - 7 * KPA, SIDES)
+    start = Start.settled(history, pressures[0] - 7 * KPA, SIDES, EVERYWHERE)
     return history, time, pressures, start, run(history, time, pressures, start)
 
 
@@ -189,7 +190,7 @@ def test_derivatives_by_sides(c: int, history: History) -> None:
     pressures = pressures[0] + 0.2 * (pressures - pressures[0])  # the wide play is not dragged yet
 
     def at(change: float) -> Effective:
-        start = Start.settled(history, pressures[0], SIDES + change * np.eye(3)[c])
+        start = Start.settled(history, pressures[0], SIDES + change * np.eye(3)[c], EVERYWHERE)
         return run(history, time, pressures, start)
 
     found = at(0.0).per_side[:, :, c]
@@ -239,7 +240,7 @@ def test_derivatives_go_on_in_the_next_log(name: str) -> None:
             history = FULL.model_copy(update={name: getattr(FULL, name) + change})
         sides = SIDES + (change if name == "side" else 0.0)
         one = pressures if name != "side" else small[::-1]
-        start = Start.settled(history, one[0], sides)
+        start = Start.settled(history, one[0], sides, EVERYWHERE)
         first = run(history, time, one, start)
         return run(history, time, small, first.end)
 
@@ -306,7 +307,32 @@ def test_starts() -> None:
     assert rest.states[:, 0] == pytest.approx([2 * KPA, 0.0, 0.0, 2 * KPA, 2 * KPA])
     assert rest.states[:, 1] == pytest.approx(np.array([30, 26, 15, 30, 30]) * KPA)
     assert not rest.per_side.any()
-    settled = Start.settled(FULL, pressures, np.array([1.0, -1.0, 0.0]))
+    settled = Start.settled(FULL, pressures, np.array([1.0, -1.0, 0.0]), EVERYWHERE)
     assert settled.states[:, 0] == pytest.approx(np.array([2, 6, 17, 2, 2]) * KPA)
     assert settled.states[:, 1] == pytest.approx(np.array([30, 26, 15, 30, 30]) * KPA)
     assert settled.per_side[0, :, 2] == pytest.approx([0, 4 * KPA, 15 * KPA, 0, 0])
+
+
+@pytest.mark.parametrize("limits", [(0.0, 100.0), (20.0, 100.0), (-30.0, 100.0), (0.0, 15.0)])
+@pytest.mark.parametrize("of", ["pressure", "elongation"])
+def test_no_way_to_a_pressure_begins_a_log_beyond_its_sides(
+    of: Part, limits: tuple[float, float]
+) -> None:
+    plays = [Play(width=w * KPA, share=0.2, of=of) for w in (3.0, 12.0, 40.0)]
+    history, rng = History(memory=(0.5, 1.0, 1.5), play=plays), np.random.default_rng(3)
+    low, high = np.array(limits) * KPA
+    memory = Memory([history] * 3, [0, 1, 2])
+
+    def after(*way: Array) -> Array:
+        memory.start(np.zeros(3))
+        return memory.run(1.0, np.array(way))[-1]
+
+    ends = np.array([low, high])[:, np.newaxis] * np.ones(3)
+    for p in rng.uniform(low, high, (5, 3)):
+        starts = [Start.settled(history, p, np.full(3, side), ends) for side in (-1.0, 1.0)]
+        least, most = (np.array(history.effective(each.states)).ravel() for each in starts)
+        reached = np.array([after(*way, p) for way in rng.uniform(low, high, (60, 3, 3))])
+        assert (least <= reached.min(axis=0) + 1e-6).all()
+        assert (reached.max(axis=0) <= most + 1e-6).all()
+        assert after(np.minimum(ends[0], 0), p) == pytest.approx(least, abs=1e-6)
+        assert after(ends[1], p) == pytest.approx(most, abs=1e-6)

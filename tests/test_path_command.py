@@ -7,6 +7,7 @@ import json
 import re
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from types import ModuleType
@@ -14,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from matplotlib.image import imread
 from typer.testing import CliRunner
 
@@ -265,6 +267,26 @@ def test_the_figure_shows_arm_stiffness_clearance_and_pressures(
         assert part in text
     with pytest.raises(InputError, match="there is nothing to draw"):
         plots.plot_path(path, PathSolution("failed", "", solution.robot, *[np.empty(0)] * 3))
+
+
+@pytest.mark.parametrize(("begin", "end"), [(1, 8), (4, 5), (0, 11)])
+def test_where_an_object_holds_the_tip_the_stiffness_is_shaded(
+    begin: int, end: int, write: Write
+) -> None:
+    path = stiffopt.load_path(write("line.yaml", LINE))
+    solution = followed(path)
+    assert solution.stiffness is not None
+    values = np.full(len(solution.times), np.inf)
+    values[begin:end] = solution.stiffness[begin:end]
+    held = replace(solution, stiffness=values)
+    axes = Figure().add_subplot()
+    plots.draw_stiffness_along(axes, held)
+    labels = [text.get_text() for text in axes.get_legend().get_texts()]
+    assert ("without limit: an object holds the tip" in labels) == (end - begin < 11)
+    shaded = [patch.get_extents() for patch in axes.patches]
+    across = axes.transData.transform([(t, 1.0) for t in solution.times])[:, 0]
+    for x, value in zip(across, values, strict=True):
+        assert any(each.x0 <= x <= each.x1 for each in shaded) == np.isinf(value)
 
 
 @pytest.mark.parametrize("file", sorted(PROBLEMS.glob("*.yaml")), ids=lambda file: file.stem)

@@ -205,6 +205,25 @@ def test_a_plan_in_small_steps_stays_near_the_last_one(robot):
     np.testing.assert_allclose(plan.pressures, stiffest.pressures, atol=100.0)
 
 
+def test_plans_lead_to_another_configuration_slowly_and_on_the_target(robot):
+    planning, first = Planning(robot), request(robot)
+    plan, wanted = planning.plan(first), np.array(first.target.position[:2])
+    stiffest, moved = plan.pressures, []
+    away = 2 * PRESSURES - stiffest  # on the other side, and on the target by the search
+    begin, _, _ = planning._search.find(
+        model_target(first.target, np.zeros(6)), planning._limits, away
+    )
+    assert np.abs(stiffest - begin).max() > 2.5e4
+    plan = planning.plan(replace(first, search=False, last=replace(plan, pressures=begin)))
+    before = begin
+    for _ in range(400):
+        moved.append(np.abs(plan.pressures - before).max())
+        assert np.linalg.norm(tip(robot, plan.pressures)[1][:2] - wanted) < 1e-5
+        before, plan = plan.pressures, planning.plan(replace(first, search=False))
+    assert max(moved) < 3e3
+    np.testing.assert_allclose(plan.pressures, stiffest, atol=100.0)
+
+
 def test_target_that_cannot_be_reached_has_a_plan_that_says_why(robot):
     asked = request(robot)
     far = asked.target.model_copy(update={"position": (0.2, 0.0, None)})

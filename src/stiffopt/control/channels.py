@@ -95,6 +95,7 @@ class Channels:
         self._ceiling: Array = np.where(self.out, self._empty, self._limits.high)
         self._rest = _Rest(n, self._tuning)
         self.pace = 1.0
+        self._slow_for: Array = np.zeros(n)  # remaining time for which channels count as slow, in s
         self._usual: Array = np.zeros(n)  # lasting differences from the healthy pressures, in Pa
         self._quiet = True  # whether no channel is short, or was until now
 
@@ -166,10 +167,12 @@ class Channels:
         wanted = np.minimum(np.maximum(short, self._min_allowed), self._max_allowed)
         self._allowed = self._allowed + share * (wanted - self._allowed)
         self._judge(elapsed, short, command, ignores)
+        self._slow_for[self.lost] = 0.0
         self._quiet = not (
             self._durations.any()
             or self.opposed.any()
             or self.limited.any()
+            or self._slow_for.any()
             or (self._allowed > self._min_allowed + 1.0).any()
         )
 
@@ -178,8 +181,10 @@ class Channels:
         tuning = self._tuning
         behind = np.fmax(np.fmax(healthy[0] - reading, reading - healthy[1]), 0.0)  # 0 for NaN
         self._usual += -math.expm1(-elapsed / tuning.wait_time) * (behind - self._usual)
-        late = np.where(self.lost, 0.0, behind - self._usual).max() - tuning.follows
-        self.pace = min(max(1 - late / tuning.longest_wait, 0.0), 1.0)
+        late = np.where(self.lost, 0.0, behind - self._usual) - tuning.follows
+        self.pace = min(max(1 - float(late.max()) / tuning.longest_wait, 0.0), 1.0)
+        left = np.maximum(self._slow_for - elapsed, 0.0)
+        self._slow_for = np.where(late > tuning.longest_wait, tuning.slow_memory, left)
 
     def _judge(self, elapsed: float, short: Array, command: Array, ignores: Flags) -> None:
         """Find channels that are limited or stuck, and those that follow again.
@@ -228,11 +233,17 @@ class Channels:
         low = np.where(self.out, self._empty, np.where(self.stuck, has, low))
         return low, high
 
-    def commands(self, path: Array, low: Array, high: Array) -> tuple[Array, Array]:
+    def commands(
+        self, path: Array, low: Array, high: Array, goal: Array | None = None
+    ) -> tuple[Array, Array]:
         """Return the lowest and highest commands (n,) at a path's pressures (n,), in Pa.
 
-        They stay within `low` and `high` (n,).
+        They stay within `low` and `high` (n,). Those of slow channels are those of the reference,
+        `goal` (n,): feedback through them would come late, and excite what it is to damp.
         """
+        if not self._quiet and goal is not None:
+            slow = self._slow_for > 0
+            low, high = (np.where(slow, np.clip(goal, low, high), bound) for bound in (low, high))
         if not self._quiet and self.limited.any():
             above, below = self._held + self._probe, self._smoothed - self._probe
             pressed = path > self._held - self._tuning.follows
@@ -258,6 +269,14 @@ class Channels:
         if not (self._quiet and not self._any_out) and self.lost.any():
             each = ", ".join(self._words(int(c)) for c in np.flatnonzero(self.lost))
             yield Notice("lost-channel", f"{each}; the plan goes on with the others", standing=True)
+        if self._slow_for.any():
+            each = ", ".join(str(c + 1) for c in np.flatnonzero(self._slow_for))
+            text = (
+                f"the pressure of channel {each} is not where even a slow regulator would have "
+                "it: check regulator, gauge, supply and tubes, and control.regulator_lag in the "
+                "rig file"
+            )
+            yield Notice("slow-channel", text, Severity.WARNING, standing=True)
         fed = self._allowed > self._tuning.alarm_share * self._max_allowed
         off = ~self.lost & (fed | self._rest.changed)
         if off.any():

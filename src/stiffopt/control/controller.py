@@ -124,6 +124,7 @@ class TipController:
             safety,
             tuning.feedback,
             tuning.motion_error,
+            tuning.step_error,
         )
         self._first_motion = FirstMotion(commissioned, tuning.first_motion)
         self._requests = Requests(robot, limits, slew, scene, tuning)
@@ -361,14 +362,15 @@ class TipController:
         self._led_to = None
         if isinstance(course, PostureCourse):
             self._led_to = course.target(tip.pose, reference.path[n:])
+        goal = reference.command - pressures.command_offset
         command = self._feedback.command(
             tip,
             reference,
             self.replanner.pursuit.prescribed,
             self._offset,
-            reference.command - pressures.command_offset,
-            self._arm.channels.commands(reference.path[:n], *self._permitted),
-            isinstance(course, Course),
+            goal,
+            self._arm.channels.commands(reference.path[:n], *self._permitted, goal),
+            None if isinstance(course, PostureCourse | Pressing) else course is not None,
             self._first_motion.largest_correction(tip.pose[:3, 3]),
         )
         if command is None:

@@ -19,6 +19,10 @@ Array = NDArray[np.float64]
 
 _OPPOSITE = -0.99  # cosine below which directions count as opposite: no unique way between them
 _SHORT = 0.05  # length below which an interpolated direction is undefined
+# The inverse of four lags without their delay, e^-4u (1 + u)^4 = 1 - 2 u^2 + 4/3 u^3 + u^4 + ...
+# with u = s / a, by differences at these times, in delays 4 / a; weights of the positions there.
+_AROUND = (-1.0, -0.5, 0.0, 0.5, 1.0)
+_INVERSE = np.array([1.0, -36.0, 126.0, -52.0, 9.0]) / 48
 _BETWEEN = np.arange(1, 8) / 8  # shares of the way between waypoints at which that is checked
 
 
@@ -71,20 +75,21 @@ class Course:
         self._knots = knots
         self.begin, self.end = begin, begin + times[-1]
 
-    def at(self, now: float, spread: float = 0.0) -> Target:
+    def at(self, now: float, delay: float = 0.0) -> Target:
         """Return the target at a time, in s, for a reference that smooths it.
 
-        `spread` is the standard deviation of the reference's impulse response, in s. The smoothed
-        positions are then those of the course, except for its fourth and higher derivatives.
+        `delay` is that of the reference's four equal lags, in s. The smoothed positions are then,
+        that much later, those of the course, except for its fifth and higher derivatives.
         """
         t, *around = (
-            float(np.clip(time - self.begin, self._knots[0], self._knots[-1]))
-            for time in (now, now - math.sqrt(3) * spread, now + math.sqrt(3) * spread)
+            float(np.clip(now + share * delay - self.begin, self._knots[0], self._knots[-1]))
+            for share in (0.0, *_AROUND)
         )
         update: dict[str, object] = {}
         if self._position is not None and self._first.position is not None:
             values = self._position(t)
-            values = values - (self._position(np.array(around)).sum(axis=0) - 2 * values) / 6
+            if delay:
+                values = _INVERSE @ self._position(np.array(around))
             update["position"] = tuple(
                 None if axis is None else float(value)
                 for axis, value in zip(self._first.position, values, strict=True)

@@ -1,4 +1,4 @@
-"""Learn on a trajectory by how much farther than modelled the tip moves, and where to.
+"""Learn in motion by how much farther than modelled the tip moves, and where to.
 
 Errors of stiffness and gain let the tip's offset d grow with the motion s of the model::
 
@@ -6,7 +6,8 @@ Errors of stiffness and gain let the tip's offset d grow with the motion s of th
 
 Feedback is late by a time T: it averages the offset over a vibration, and the regulators lag. On a
 trajectory with the velocity v the tip is then behind by T A v. With A, the part of the offset that
-grows with the motion is known in advance. A Kalman filter estimates A and b; all axes have the same
+grows with the motion is known in advance. In a step, which ends before feedback has acted, the tip
+would otherwise go too far by it. A Kalman filter estimates A and b; all axes have the same
 noise, so it has one covariance (4, 4).
 """
 

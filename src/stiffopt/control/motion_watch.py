@@ -94,7 +94,9 @@ class MotionWatch:
 
     def begin(self) -> None:
         """Restart."""
-        self._count = self._misses = self._slips = 0
+        self._count = self._misses = 0
+        # shares of the turn of a push that are missing in the latest samples
+        self._slips: deque[float] = deque(maxlen=self._tuning.slips)
         self._bends_until = -math.inf  # end of the pause after a push, in s
         self._path = 0.0  # length of the way of r, in m
         self._intended: deque[tuple[float, Array]] = deque(maxlen=self._kept)
@@ -105,7 +107,8 @@ class MotionWatch:
     def go_on(self) -> None:
         """Continue after a pause in which the arm was not controlled, or not seen."""
         self._intended.clear()
-        self._misses = self._slips = 0
+        self._misses = 0
+        self._slips.clear()
         self.pace = 1.0
         self._swings = [_Swings(self._tuning) for _ in range(3)]
         self.forgive()
@@ -219,8 +222,8 @@ class MotionWatch:
             found = (self._missed(rows, jacobian, P) for P in (np.eye(3), across))
             missed = max(found, key=lambda miss: miss.share)
         share = 0.0 if missed is None else missed.share
-        usual = self._tuning.usual_share
-        self.pace = min(max((1 - share) / (1 - usual), 0.0), 1.0)
+        usual, stops = self._tuning.usual_share, self._tuning.stops_share
+        self.pace = min(max((stops - share) / (stops - usual), 0.0), 1.0)
         self._misses = self._misses + 1 if share > 1 else 0
         if missed is None or self._misses < self._tuning.misses:
             return None
@@ -247,7 +250,8 @@ class MotionWatch:
         distance = np.sqrt((way**2).sum(axis=1))
         along = (seen * way).sum(axis=1) / np.maximum(distance, 1e-9)
         aside = np.sqrt(np.maximum((seen**2).sum(axis=1) - along**2, 0.0))
-        wrong = (along < tuning.least_response * distance) | (aside > tuning.most_across * distance)
+        short = np.maximum(distance - along, 0.0)  # a softer arm moves farther
+        wrong = aside**2 + short**2 > (tuning.most_error * distance) ** 2
         meant = (ways[:, _INTENDED] @ P * way).sum(axis=1) > distance**2 / 2
         suspects = np.flatnonzero(meant & wrong & (distance > self._min_motion))
         if not len(suspects):
@@ -279,6 +283,8 @@ class MotionWatch:
             own = float(self._explained(np.diff(rows, axis=0), jacobian).sum())
             rests = float(np.linalg.norm(way[_INTENDED])) < least  # then the offset moves the arm
             explained = math.hypot(least, own) if rests else least + own
+            # a push displaces the arm farther at first
+            explained += min(float(rows[-1, _FREE]), least / 2)
             wrong = distance > explained + 6 * tuning.scatter
         if wrong:
             bent = turn_of_a_push(tip) @ moved
@@ -288,8 +294,11 @@ class MotionWatch:
             if not self._slips and missing < tuning.bends * size and size > least_turn:
                 self._bends_until = now + tuning.slip_window
             wrong = missing > max(tuning.slip * size, least_turn) and now > self._bends_until
-        self._slips = self._slips + 1 if wrong else 0
-        if self._slips < tuning.slips:
+        if not wrong:
+            self._slips.clear()
+            return None
+        self._slips.append(missing / size)
+        if len(self._slips) < tuning.slips or self._slips[0] - self._slips[-1] > tuning.catches_up:
             return None
         if share := self._share(moved, way[_PREDICTED]):
             return Doubt(

@@ -103,6 +103,8 @@ class Planning:
         self._last: Plan | None = None
         self._searched_at: Array = np.zeros(6)
         self._advantage, self._refused = self._tuning.advantage, 0
+        # way to another configuration: its begin (n,), the share that is done, and its end (n,)
+        self._change: tuple[Array, float, Array] | None = None
         self._leaning: tuple[int, Plan | None] = (-1, None)
 
     def _put(self, robot: Manipulator) -> None:
@@ -168,6 +170,7 @@ class Planning:
             task = task.unbraced
         if request.serial != self._serial:
             self._serial, self._last, self._solver = request.serial, None, None
+            self._change = None
         if self._solver is None or self._last is None:
             exact = asked.model_copy(update={"tolerance": _EXACT})
             self._solver = PressureSolver(self._robot, task.model_copy(update={"target": exact}))
@@ -177,6 +180,8 @@ class Planning:
         self._limits = self._effective_limits(request)
         last, refused = request.last or self._last, self._refused
         self._last = last
+        if request.search or request.stay:
+            self._change = None
         if last is not None and request.step < math.inf:
             bounds = last.pressures - request.step, last.pressures + request.step
             self._limits = np.clip(bounds[0], *self._limits), np.clip(bounds[1], *self._limits)
@@ -187,12 +192,19 @@ class Planning:
         elif request.stay:
             self._last = self._nearest(request, task, target, distant=False)
             return self._last
+        elif self._change is not None:
+            solution = self._solve(target, self._change[2])
         else:
             solution = self._next_to(last, target)
             solution = self._better(request, target, solution, last) if solution else None
         if solution is not None and solution.pressures is not None:
             pressures = np.array(solution.pressures, dtype=float)
             stiffness = math.nan if solution.stiffness is None else float(solution.stiffness)
+            if last is not None and not request.search:
+                if self._change is None and self._is_distant(last, pressures, target):
+                    self._change = last.pressures, 0.0, pressures
+                if self._change is not None:
+                    pressures = self._toward(pressures, target)
             self._last = Plan(
                 request.serial, pressures, request.offset, asked, True, stiffness, "",
                 adapted=request.adapted,
@@ -240,17 +252,37 @@ class Planning:
         solution = self._solve(target, last.pressures)
         if solution is None or solution.pressures is None:
             return None
-        t = self._tuning
-        distance = float(np.max(np.abs(solution.pressures - last.pressures)))
-        displacement = float(np.linalg.norm(self._displacement(last, target)))
-        if distance <= t.neighbourhood + t.neighbourhood_per_metre * displacement:
+        if not self._is_distant(last, np.asarray(solution.pressures), target):
             self._refused = 0
             return solution
         self._refused += 1
-        if self._refused <= t.patience:
+        if self._refused <= self._tuning.patience:
             return None
         self._refused = 0
         return solution
+
+    def _is_distant(self, last: Plan, pressures: Array, target: Target) -> bool:
+        """Whether pressures (n,) are another configuration than those of the last plan."""
+        t = self._tuning
+        displacement = float(np.linalg.norm(self._displacement(last, target)))
+        reach = t.neighbourhood + t.neighbourhood_per_metre * displacement
+        return float(np.max(np.abs(pressures - last.pressures))) > reach
+
+    def _toward(self, end: Array, target: Target) -> Array:
+        """Return pressures (n,) on the way to another configuration (n,): next to the target.
+
+        On the straight line to it the tip would leave its target by millimetres, and by more in a
+        quick change, as feedback needs time for an offset that differs between them.
+        """
+        assert self._change is not None
+        begin, share, _ = self._change
+        share += self._tuning.change_step / max(float(np.abs(end - begin).max()), _SLACK)
+        if share >= 1:
+            self._change = None
+            return end
+        self._change = begin, share, end
+        found, _, _ = self._search.find(target, self._limits, begin + share * (end - begin))
+        return found
 
     def _better(
         self, request: PlanRequest, target: Target, solution: PressureSolution, last: Plan

@@ -214,7 +214,7 @@ class Replanner:
             if detour is not None and later < detour.end:
                 target = detour.at(later)
             if isinstance(course, Course):  # the target when the reference will be there
-                target = course.at(later, delay / 2)  # the spread of four equal lags
+                target = course.at(later, delay)
             elif course is not None:
                 target = course.at(later)
             # The offset depends on the posture. Plans follow it slowly, feedback at once.

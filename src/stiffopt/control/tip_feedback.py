@@ -32,8 +32,8 @@ class TipFeedback:
         See `TipController`; slew (n,), in Pa/s.
     mode :
         The arm's first bending mode; None for an arm that does not vibrate.
-    tuning, motion_error :
-        Tuning of the feedback.
+    tuning, motion_error, step_error :
+        Tuning of the feedback, and of what it learns on trajectories and in steps.
 
     Attributes
     ----------
@@ -51,12 +51,15 @@ class TipFeedback:
         safety: Safety,
         tuning: FeedbackTuning,
         motion_error: MotionErrorTuning,
+        step_error: MotionErrorTuning,
     ) -> None:
         self._arm, self._tuning = arm, tuning
         lag, dead_time = arm.pressures.lag, arm.pressures.dead_time
         # the offset and the position of the model's tip on the reference's path
         self._averaged = VibrationFilter(period, control.damping, 9)
-        self._period, self._motion_error = period, MotionErrorEstimator(motion_error)
+        self._period, self._ended = period, step_error.ended
+        self._on_trajectories = MotionErrorEstimator(motion_error)
+        self._motion_error = self._in_steps = MotionErrorEstimator(step_error)
         self._gains: GainSchedule | None = None
         if mode is not None:
             self._gains = GainSchedule(period, lag, control.damping, tuning.effort)
@@ -93,7 +96,7 @@ class TipFeedback:
         offset: Array,
         goal: Array,
         limits: tuple[Array, Array],
-        follows: bool = False,
+        follows: bool | None = False,
         most: float = math.inf,
     ) -> Array | None:
         """Return the next command (n,), in Pa; None if the solver failed.
@@ -113,15 +116,13 @@ class TipFeedback:
         limits :
             Lowest and highest command (n,), in Pa.
         follows :
-            Whether the tip follows a trajectory.
+            Whether the tip follows a trajectory, or steps to a target; None: neither, and what its
+            motion does to the offset is not learned.
         most :
             Largest correction of the position, in m.
         """
         n = len(goal)
-        if not follows:
-            self._motion_error.stop()
-        elif (modelled := self._arm.modelled) is not None:
-            self._motion_error.learn(self._period, modelled.pose[:3, 3], self._arm.tip.offset[:3])
+        self._learn(tip.pose[:3, 3], follows)
         correction = reference.path[n:] - self._correctable(offset, tip, reference)
         size = float(np.linalg.norm(correction[:3]))
         if size > most:
@@ -136,6 +137,18 @@ class TipFeedback:
             reported = residual > self._tuning.unreported_error
             self.saturated = held if reported else np.zeros(n, dtype=bool)
         return command
+
+    def _learn(self, position: Array, follows: bool | None) -> None:
+        """Learn how the offset changes while the tip on the reference (3,) moves."""
+        other = self._on_trajectories if follows else self._in_steps
+        if follows is None or other is not self._motion_error:
+            self._motion_error.stop()
+        self._motion_error, modelled = other, self._arm.modelled
+        behind = 0.0 if self._is_new else math.dist(position, self._averaged.value[6:])
+        if follows is None or (not follows and behind < self._ended):
+            self._motion_error.stop()
+        elif modelled is not None:
+            self._motion_error.learn(self._period, modelled.pose[:3, 3], self._arm.tip.offset[:3])
 
     def _correctable(self, offset: Array, tip: TipAt, reference: Reference) -> Array:
         """Return the offset (6,) that feedback corrects now.

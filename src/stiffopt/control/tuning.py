@@ -79,8 +79,9 @@ class RegulatorTuning:
     usual_time: float = 30.0
     # pressure by which a channel is behind, beyond `follows`, at which the reference stands still,
     # in Pa, and time constant with which it no longer waits, in s
-    longest_wait: float = 1e4
+    longest_wait: float = 5e3
     wait_time: float = 1.0
+    slow_memory: float = 10.0  # time after that for which feedback leaves the channel alone, in s
     let_down_share: float = 0.1  # share of the slew with which a removed channel is let down
 
 
@@ -148,13 +149,16 @@ class FeedbackTuning:
 
 @dataclass(frozen=True)
 class MotionErrorTuning:
-    """How the tip's offset changes with motion on a trajectory (`MotionErrorEstimator`)."""
+    """How the tip's offset changes with motion (`MotionErrorEstimator`)."""
 
     deviation: float = 0.1  # of the share by which the tip moves farther than modelled
     drift: float = 3e-4  # growth of the deviation of the rest of the offset, in m / sqrt(s)
     noise: float = 3e-4  # of an offset, in m
     late: float = 0.1  # error of an offset in motion, as the way of the tip in this time, in s
     every: float = 0.1  # between two offsets that are taken in, in s
+    # distance, in m, between the model's tip and its average over a vibration, below which a step
+    # has ended
+    ended: float = 1e-4
 
 
 @dataclass(frozen=True)
@@ -274,6 +278,8 @@ class PlanningTuning:
     neighbourhood_per_metre: float = 2e7
     # successive plans that refuse an optimum in another configuration before one takes it
     patience: int = 20
+    # change of a pressure from plan to plan on the way to another configuration, in Pa
+    change_step: float = 7e2
     position_tolerance: float = 1e-5  # of plans, in m
     angle_tolerance: float = 1e-3  # of plans, in rad
 
@@ -332,15 +338,17 @@ class MotionTuning:
     least_motion: float = 3e-3
     least_motion_share: float = 0.025
     response_window: float = 0.6  # within which the tip must have moved like the model's, in s
-    least_response: float = 0.25  # share of the model's way by which it must have moved along it
+    # share of the model's way by which the tip may miss it, if not by moving farther along it
+    most_error: float = 0.5
     # share of the model's way below which the tip lies still, which no error of the model explains
     still: float = 0.1
-    most_across: float = 0.75  # share of that way by which it may have moved across it
     late: float = 0.01  # by which the tip may move later than the model's, in s
     # share of the amplitude of the vibration that the pressures excite, whose phase may be wrong
     swing_error: float = 0.35
-    # share of the explained difference from the model above which the reference is slowed down
+    # shares of the explained difference from the model, above which the reference is slowed down,
+    # and from which it stands still
     usual_share: float = 0.4
+    stops_share: float = 1.0
     misses: int = 2  # successive samples that show no response
     # share of the latest motion that a hold undoes where the tip was not seen to move: the arm has
     # followed its pressures about so far, and then swings least; 0 for an arm that does not vibrate
@@ -355,6 +363,9 @@ class MotionTuning:
     largest_push: float = 8e-3
     slip_of_large: float = 0.25
     slips: int = 4  # successive samples that show a slip
+    # decrease of the missing share of the turn in these samples with which it is a push, whose
+    # higher modes turned the tip otherwise at first
+    catches_up: float = 0.1
     # an arm that responds otherwise than modelled explains a displacement: share of it that may be
     # across the model's motion, and its largest share of that motion
     aside: float = 0.5
@@ -565,6 +576,10 @@ class ControlTuning:
     first_motion: FirstMotionTuning = field(default_factory=FirstMotionTuning)
     feedback: FeedbackTuning = field(default_factory=FeedbackTuning)
     motion_error: MotionErrorTuning = field(default_factory=MotionErrorTuning)
+    # of a step, which goes one way and soon ends: its offsets count more, for smaller changes
+    step_error: MotionErrorTuning = field(
+        default_factory=lambda: MotionErrorTuning(deviation=0.05, late=0.01, every=0.05)
+    )
     replanning: ReplanningTuning = field(default_factory=ReplanningTuning)
     posture: PostureTuning = field(default_factory=PostureTuning)
     forecast: ForecastTuning = field(default_factory=ForecastTuning)

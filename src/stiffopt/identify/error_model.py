@@ -11,11 +11,13 @@ of positions by effective pressures and the correlation K of the rows, ::
 
 Second, it acts on predictions: at a distance d from the nearest recorded pressure its variance is
 ``s^2 (1 - exp(-2 d / l))``, that of the process given its value there.  To this comes a relative
-error ``g |p|`` in directions of pressure space that were not recorded, with ``g = 7 s / R`` over
+error ``g |p|`` in directions of pressure space that were not recorded, with ``g = 6.5 s / R`` over
 the recorded range R (`ErrorModel`): where held-back data show that a model is more wrong, so it is
 where none can show it.  Both move the tip as far as such pressures would, but equally in all
 directions: a model of bending and elongation may be wrong in either, whatever a single pressure
-does.  Besides, the tip moves at another time than predicted, by a standard deviation t.
+does.  Besides, the tip moves at another time than predicted, by a standard deviation t.  What
+differs from one recording session to another, as the zero of the tracker or the state of the
+silicone, is not seen within one; the residual includes 0.5 % of the arm's length for it.
 
 s, l, t, the residual and the tail of the errors maximise the probability of the held-back
 errors, with weak priors.  Rows are weighted so that many rows in one region of pressures count
@@ -82,6 +84,7 @@ def error_model(
     _, index, (discrepancy, *_) = best
     gain = ERRORS.untested * discrepancy / recorded_range(pressures)
     _, _, (discrepancy, residual, tail, timing) = _most_probable(folds, index, found, gain)
+    residual = float(np.hypot(residual, ERRORS.session * found.problem.description.length))
     kept, spacing = representatives(_channels(found), pressures if recorded is None else recorded)
     settled, moving = _unsettled(found)
     return ErrorModel(

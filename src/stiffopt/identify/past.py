@@ -54,12 +54,27 @@ class Start:
         return cls(states, np.zeros((_sides(history, len(pressures)), *states.shape)), pressures)
 
     @classmethod
-    def settled(cls, history: History, pressures: Array, sides: Array) -> Start:
-        """Return the settled state at these pressures (c,), on given sides (c,) of the plays."""
-        none, count = np.zeros_like(sides), len(sides)
+    def settled(cls, history: History, pressures: Array, sides: Array, visited: Array) -> Start:
+        """Return the settled state at these pressures (c,), on given sides (c,) of the plays.
+
+        Each play lies between the ends to which ways from rest may drag it: at -1 on its side that
+        of a rise, at 1 that of a fall. None of these ways leaves the range of zero and the
+        pressures `visited` (N, c): wide plays then rest far from the middle of their width.
+        """
+        count = len(sides)
         changes = np.eye(count) if _sides(history, count) > 1 else np.ones((1, count))
-        per_side = np.stack([history.settled(none, change) for change in changes])
-        return cls(history.settled(pressures, sides), per_side, pressures)
+        states = history.settled(pressures, np.zeros(count))
+        per_side = np.zeros((len(changes), *states.shape))
+        low, high = np.minimum(visited.min(axis=0), 0), np.maximum(visited.max(axis=0), 0)
+        for j, play in enumerate(history.play, start=1):
+            projection, x, w = part_of(np.eye(count), play.of), states[j], play.width
+            up, down = np.maximum(projection, 0), np.minimum(projection, 0)
+            lowest = np.maximum(x - w, np.minimum(up @ low + down @ high + w, 0))
+            highest = np.minimum(x + w, np.maximum(up @ high + down @ low - w, 0))
+            half = (highest - lowest) / 2
+            states[j] = lowest + half * (1 + part_of(sides, play.of))
+            per_side[:, j] = half * part_of(changes, play.of)
+        return cls(states, per_side, pressures)
 
 
 @dataclass(frozen=True, eq=False)

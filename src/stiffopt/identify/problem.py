@@ -427,7 +427,7 @@ class CalibrationProblem:
                 elif sample.begin == "unknown" and sides[i].stop > sides[i].start:
                     owner = sides[i]
                     own = coordinates[owner][channels]
-                    start = Start.settled(history, before, own)
+                    start = Start.settled(history, before, own, pressures)
                 else:
                     owner = slice(0, 0)
                     start = Start.from_rest(history, before)

@@ -246,6 +246,7 @@ class ErrorSettings:
         lengths of the arm; standard deviation per axis on held-back rows, relative to that of the
         fit; degrees of freedom beyond four; error in time, in median time steps of the logs, as
         commands are not known between their rows.
+    session : what differs between recording sessions, per axis, in lengths of the arm.
     unchecked : factor on that of the discrepancy where nothing was held back, as after `--quick`.
     deviations : prior standard deviations of their logarithms.
     per_cell : number of rows that count in a cell of pressures as wide as the reach.
@@ -267,12 +268,13 @@ class ErrorSettings:
     residual: float = 1.5
     tail: float = 10.0
     timing: float = 0.5
+    session: float = 0.005
     unchecked: float = 4.0
     deviations: tuple[float, float, float, float] = (0.8, 0.4, 0.4, 1.0)
     per_cell: float = 1.0
     reaches: tuple[float, ...] = (0.2, 0.4, 0.8)
     reach: float = 0.4
-    untested: float = 7.0
+    untested: float = 6.5
     rows: int = 800
     representatives: int = 60
     spacing: float = 0.04

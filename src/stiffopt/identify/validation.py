@@ -248,9 +248,8 @@ def _with_levels(setup: Setup, logs: Sequence[Comparison]) -> list[Comparison]:
     off = off @ setup.base[:3, :3]
     found = []
     for each, error in ((known, off), (unknown, off + known.position - unknown.position)):
-        seen = np.isfinite(error).all(axis=1)
         levels = np.full(ends[-1], np.nan)
-        levels[rows[seen]] = source.levels(error[seen], each.covariance[seen])
+        levels[rows] = source.levels(error, each)
         found.append(np.split(levels, ends[1:-1]))
     return [
         replace(each, levels=known, unsettled_levels=unknown)

@@ -7,16 +7,19 @@ pressures; and the residual that no parameter explained in the recordings.  All 
 propagated to the tip by their Jacobians, to first order; the discrepancy in its size alone, for it
 may move the tip in any direction.  Together they follow a multivariate t-distribution.
 
-Hysteresis is bounded: no play operator was ever dragged beyond the robot's pressure
-limits, so less hysteresis is possible near the limits than between them.  Its mean square is
-that of effective minus commanded pressures as recorded, and at most that of a uniform distribution
-between the bounds, about the equilibrium, which is what `tip_pose` returns.
+Hysteresis depends on how the arm came to its pressures.  Its mean square, about the equilibrium,
+which is what `tip_pose` returns, is that over ways from rest to two pressures drawn from the
+recorded range, and from there; but at most that of effective minus commanded pressures as recorded.
+Most of these ways leave most play operators at an end of their width, so that the tip is rarely
+near the equilibrium.  Therefore its squared distance, in deviations of the region, is distributed
+as 3 F(k, v) with k > 3 degrees of freedom, such that its variance is right (F. E. Satterthwaite, An
+approximate distribution of estimates of variance components, 1946); without hysteresis, k = 3.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
 from typing import Literal
@@ -29,7 +32,7 @@ from stiffopt.model.arguments import checked_measure
 from stiffopt.model.calibration import Calibration, even_variance, fading_mean, squared_moves
 from stiffopt.model.compliance import Boundary, Frame, Kind
 from stiffopt.model.description import RobotDescription
-from stiffopt.model.history import NO_HISTORY, History, part_of
+from stiffopt.model.history import NO_HISTORY, part_of
 from stiffopt.model.parameters import Parameter
 from stiffopt.model.parametric import ParametricArm
 
@@ -37,6 +40,8 @@ Vector = NDArray[np.float64]
 Part = Literal["parameters", "hysteresis", "discrepancy", "residual"]
 
 _LEVEL = 0.95  # probability of the reported regions
+_WAYS = 256  # ways to given pressures
+_SINGULAR = 1e-9  # smallest variance of a direction, over that of all
 NORMAL_QUANTILE = 1.959963984540054  # of 97.5 %, for two-sided intervals of 95 %
 
 
@@ -64,6 +69,7 @@ class TipUncertainty:
     extrapolation: str
     _source: Uncertainty
     _pressures: Vector
+    _shape: float
 
     @property
     def covariance(self) -> Vector:
@@ -80,7 +86,7 @@ class TipUncertainty:
         if not 0 < level < 1:
             raise InputError(f"a probability lies between 0 and 1, both excluded; got {level!r}")
         values = np.linalg.eigvalsh(self.covariance)[::-1]
-        factor = squared_radius(level, self._source.degrees_of_freedom)
+        factor = squared_radius(level, self._source.degrees_of_freedom, self._shape)
         return np.asarray(np.sqrt(factor * np.maximum(values, 0.0)))
 
     @cached_property
@@ -123,6 +129,8 @@ class PositionErrors:
     position : predicted (N, 3), in base axes and m.
     parameters, hysteresis, discrepancy, residual : mean squares (N, 3, 3) of its error by source,
         as in `TipUncertainty`; hysteresis includes that of the time at which the tip moves.
+    shape : degrees of freedom k (N,) of the error's squared distance; 3 unless the history is
+        unknown.
     """
 
     position: Vector
@@ -130,6 +138,7 @@ class PositionErrors:
     hysteresis: Vector
     discrepancy: Vector
     residual: Vector
+    shape: Vector
 
     @property
     def covariance(self) -> Vector:
@@ -190,6 +199,7 @@ class Uncertainty:
             extrapolation=extrapolation,
             _source=self,
             _pressures=pressures,
+            _shape=float(found.shape[0]),
         )
 
     def errors(
@@ -214,30 +224,35 @@ class Uncertainty:
         u = pressures if effective is None else effective
         position, per_number, per_pressure = self._slopes.at(u)
         transposed = np.swapaxes(per_pressure, 1, 2)
-        acting = np.zeros_like(pressures)
-        if effective is None:
-            still = moving if moving is not None else np.zeros(len(pressures), dtype=bool)
-            acting = self._hysteresis(pressures, still)
         moves = squared_moves(per_pressure, self._discrepancy(u))
         before = self._typical_moves if time is None else fading_mean(time, moves)
         errors = self._calibration.errors
         residual = self._calibration.position_residual if errors is None else errors.residual
-        hysteresis = (per_pressure * acting[:, np.newaxis]) @ transposed
+        if effective is None:
+            still = moving if moving is not None else np.zeros(len(pressures), dtype=bool)
+            ways = self._remembered(pressures)
+            hysteresis = per_pressure @ self._hysteresis(ways, still) @ transposed
+        else:
+            ways, hysteresis = np.zeros((len(u), 1, u.shape[1])), np.zeros((len(u), 3, 3))
         if rates is not None and errors is not None:
             way = errors.timing * per_pressure @ rates[..., np.newaxis]
             hysteresis = hysteresis + way @ np.swapaxes(way, 1, 2)
-        return PositionErrors(
+        found = PositionErrors(
             position=position,
             parameters=per_number @ self._covariance @ np.swapaxes(per_number, 1, 2),
             hysteresis=hysteresis,
             discrepancy=even_variance(moves, before, self._memory)[:, np.newaxis, np.newaxis]
             * np.eye(3),
             residual=np.broadcast_to(np.eye(3) * residual**2, (len(u), 3, 3)),
+            shape=np.full(len(u), 3.0),
         )
+        if effective is not None:
+            return found
+        return replace(found, shape=_shape(ways @ transposed, found.covariance))
 
-    def levels(self, errors: Vector, covariance: Vector) -> Vector:
+    def levels(self, errors: Vector, known: PositionErrors) -> Vector:
         """Return the probability (N,) of the smallest regions that hold errors (N, 3)."""
-        return levels(errors, covariance, self.degrees_of_freedom)
+        return levels(errors, known.covariance, self.degrees_of_freedom, known.shape)
 
     def stiffness_interval(
         self, pressures: Vector, direction: ArrayLike, kind: Kind, boundary: Boundary, frame: Frame
@@ -250,8 +265,9 @@ class Uncertainty:
         )
         g, h = per_coordinate[0] / k[0], per_pressure[0] / k[0]
         size = len(g)
-        acting = self._hysteresis(p, np.zeros(1, dtype=bool)) + self._discrepancy(p)
-        variance = g @ self._covariance[:size, :size] @ g + h**2 @ acting[0]
+        acting = self._hysteresis(self._remembered(p), np.zeros(1, dtype=bool))[0]
+        variance = g @ self._covariance[:size, :size] @ g
+        variance += h @ acting @ h + h**2 @ self._discrepancy(p)[0]
         deviation = float(np.sqrt(max(variance, 0.0)))
         return float(k[0] * np.exp(-NORMAL_QUANTILE * deviation)), float(
             k[0] * np.exp(NORMAL_QUANTILE * deviation)
@@ -284,29 +300,49 @@ class Uncertainty:
         moves = squared_moves(per_pressure, self._discrepancy(pressures))
         return np.asarray(moves.mean(axis=0))
 
-    def _hysteresis(self, pressures: Vector, moving: NDArray[np.bool_]) -> Vector:
-        """Return mean squares (N, n) of effective minus commanded pressures (N, n), in Pa^2."""
-        bounds = np.array([self._even(row) for row in pressures])
-        errors = self._calibration.errors
-        if errors is None:
-            return bounds
-        if errors.settled:
-            bounds = np.minimum(bounds, np.square(errors.settled))
-        if errors.moving:
-            bounds[moving] = np.maximum(bounds, np.square(errors.moving))[moving]
-        return bounds
+    def _hysteresis(self, ways: Vector, moving: NDArray[np.bool_]) -> Vector:
+        """Return mean squares (N, n, n), in Pa^2, of effective minus commanded pressures.
 
-    def _even(self, pressures: Vector) -> Vector:
-        """Return mean squares (n,) if all effective pressures are equally likely, in Pa^2."""
-        robot, first, found = self._description, 0, []
-        limits = np.array([robot.pressure_min, robot.pressure_max])
+        `ways` are these after each way (N, W, n), if pressures are held.
+        """
+        found = np.swapaxes(ways, 1, 2) @ ways / ways.shape[1]
+        errors = self._calibration.errors
+        if errors is not None and errors.moving:
+            more = np.square(errors.moving) - np.einsum("nii->ni", found[moving])
+            found[moving] += np.maximum(more, 0.0)[..., np.newaxis] * np.eye(ways.shape[2])
+        return np.asarray(found)
+
+    def _remembered(self, pressures: Vector) -> Vector:
+        """Return effective minus commanded pressures (N, W, n) in Pa after W ways to (N, n)."""
+        robot, first = self._description, 0
+        found = np.zeros((len(pressures), _WAYS, robot.n_pressures))
         for segment in robot.segments:
             own = slice(first, first := first + segment.n_channels)
-            p = pressures[own]
-            ends = settled_range(segment.history or NO_HISTORY, p, *limits[:, own])
-            low, high = np.subtract(ends, p)
-            found.append((low**2 + low * high + high**2) / 3)
-        return np.concatenate(found)
+            history = segment.history or NO_HISTORY
+            memory = np.array([history.memory_of(c) for c in range(segment.n_channels)])
+            for play in history.play:
+                end = part_of(pressures[:, own], play.of)[:, np.newaxis]
+                held = np.zeros(1)
+                for x in (*part_of(self._visited[..., own], play.of), end):
+                    held = np.clip(held, x - play.width, x + play.width)
+                found[..., own] += memory * play.share * part_of(held - end, play.of)
+        errors = self._calibration.errors
+        if errors is not None and errors.settled:
+            size = np.sqrt(np.mean(found**2, axis=1, keepdims=True))
+            found *= np.minimum(1.0, errors.settled / np.maximum(size, 1e-9))
+        return found
+
+    @cached_property
+    def _visited(self) -> Vector:
+        """Pressures (2, W, n) in Pa that the ways visit in turn."""
+        known, robot = self._calibration, self._description
+        low, high = (
+            known.pressure_min or robot.pressure_min,
+            known.pressure_max or robot.pressure_max,
+        )
+        strata = np.tile((np.arange(_WAYS) + 0.5) / _WAYS, (2, robot.n_pressures, 1))
+        shares = np.random.default_rng(0).permuted(strata, axis=2)  # a Latin hypercube
+        return np.asarray(low + np.swapaxes(shares, 1, 2) * np.subtract(high, low))
 
 
 class ReadingSlopes:
@@ -364,24 +400,44 @@ def _skew(vectors: Vector) -> Vector:
     return np.stack(rows, axis=-2)
 
 
-def squared_radius(level: float, degrees_of_freedom: float) -> float:
+def _shape(moves: Vector, covariance: Vector) -> Vector:
+    """Return k (N,) for which 3 chi^2(k) / k has the variance of the squared distances of errors.
+
+    An error is one of the moves (N, W, 3), equally likely, and an independent normal error; both
+    together have the mean squares `covariance` (N, 3, 3).
+    """
+    least = _SINGULAR * np.trace(covariance, axis1=1, axis2=2) + np.finfo(float).tiny
+    squared, axes = np.linalg.eigh(covariance)
+    deviations = np.sqrt(np.maximum(squared, least[:, np.newaxis]))
+    moves = moves @ axes / deviations[:, np.newaxis]
+    squares = (moves**2).sum(axis=2)
+    bounded = np.swapaxes(moves, 1, 2) @ moves / moves.shape[1]
+    rest = np.eye(3) - bounded
+    variance = squares.var(axis=1) + np.einsum("nij,nji->n", 4 * bounded + 2 * rest, rest)
+    return np.asarray(18 / variance)
+
+
+def squared_radius(level: float, degrees_of_freedom: float, shape: float = 3.0) -> float:
     """Return the squared Mahalanobis radius of a region of this probability, in 3D.
 
     The covariance of a t-distribution with v degrees of freedom is v / (v - 2) times its scale
-    matrix, so the squared distance by the covariance is (v - 2) / v times 3 F(3, v).
+    matrix, so the squared distance by the covariance is (v - 2) / v times 3 F(3, v), or 3 F(k, v)
+    with the `shape` k of the errors.
     """
     from scipy.special import chdtri, fdtri
 
     v = degrees_of_freedom
     if np.isinf(v):
-        return float(chdtri(3, 1 - level))
-    return float(3 * (v - 2) / v * fdtri(3, v, level))
+        return float(3 / shape * chdtri(shape, 1 - level))
+    return float(3 * (v - 2) / v * fdtri(shape, v, level))
 
 
-def levels(errors: Vector, covariance: Vector, degrees_of_freedom: float) -> Vector:
+def levels(
+    errors: Vector, covariance: Vector, degrees_of_freedom: float, shape: float | Vector = 3.0
+) -> Vector:
     """Return the probability (N,) of the smallest regions that hold errors (N, 3).
 
-    Regions are ellipsoids of the covariances (N, 3, 3).
+    Regions are ellipsoids of the covariances (N, 3, 3); for the others see `squared_radius`.
     """
     from scipy.special import chdtr, fdtr
 
@@ -390,37 +446,5 @@ def levels(errors: Vector, covariance: Vector, degrees_of_freedom: float) -> Vec
         "ni,ni->n", errors, np.linalg.solve(covariance, errors[..., np.newaxis])[..., 0]
     )
     if np.isinf(v):
-        return np.asarray(chdtr(3, squares))
-    return np.asarray(fdtr(3, v, squares * v / (3 * (v - 2))))
-
-
-def settled_range(
-    history: History, pressures: Vector, low: Vector, high: Vector, first: int = 0
-) -> tuple[Vector, Vector]:
-    """Return the least and largest possible effective pressures (c,) at rest, in Pa.
-
-    The arm began at rest without pressure; commands since then are known only to lie within the
-    limits.
-
-    Parameters
-    ----------
-    history : of the channels' segment.
-    pressures : of all of its channels (c,), in Pa.
-    low, high : limits (c,), in Pa.
-    first : index of the first of these channels in the segment.
-    """
-    low, high = np.minimum(low, np.minimum(pressures, 0)), np.maximum(high, pressures)
-    high = np.maximum(high, 0)
-    memory = np.array([history.memory_of(first + c) for c in range(len(pressures))])
-    lowest, highest = pressures.astype(float), pressures.astype(float)
-    for play in history.play:
-        projection = part_of(np.eye(len(pressures)), play.of)
-        forward, backward = np.maximum(projection, 0), np.minimum(projection, 0)
-        x, farthest = projection @ pressures, forward @ high + backward @ low
-        nearest = forward @ low + backward @ high
-        # the operator is dragged down to low + width and up to high - width; it began at zero
-        under = np.maximum(x - play.width, np.minimum(nearest + play.width, 0)) - x
-        over = np.minimum(x + play.width, np.maximum(farthest - play.width, 0)) - x
-        lowest = lowest + memory * play.share * (forward @ under + backward @ over)
-        highest = highest + memory * play.share * (forward @ over + backward @ under)
-    return lowest, highest
+        return np.asarray(chdtr(shape, squares * shape / 3))
+    return np.asarray(fdtr(shape, v, squares * v / (3 * (v - 2))))

@@ -113,6 +113,7 @@ class Quantities(NamedTuple):
     forces: Vector  # along the normals, as large as they may be
     pushed: Vector
     slips: Vector
+    foretold: Vector  # slips, by the tangent
 
 
 class BracedProblem(PressureProblem):
@@ -155,8 +156,11 @@ class BracedProblem(PressureProblem):
 
     @property
     def _row_names(self) -> Iterator[str]:
-        """Names of the rows: for each object, one for its force and one for each push."""
-        per_object = len(self.directions) * (2 if self.brace.contacts == "sliding" else 4)
+        """Names of the rows: for each object, one for its force and one for each push.
+
+        With sticking contacts, two more for each push: see `_slips`.
+        """
+        per_object = len(self.directions) * (2 if self.brace.contacts == "sliding" else 6)
         for item in self.scene.objects:
             yield f"{FORCE_ON}{item.name}"
             yield from [f"{MARGIN_ON}{item.name}"] * per_object
@@ -218,7 +222,7 @@ class BracedProblem(PressureProblem):
         for k, inwards in enumerate(x > (self.lower + self.upper) / 2):
             step = (-1.0 if inwards else 1.0) * BRACE.step
             change = step * self.unit[k] * np.eye(len(x))[k]
-            seen = self._seen(eq.shifted(change), pushes, known, near, full)
+            seen = self._seen(eq.shifted(change), pushes, known, near, full, base)
             with np.errstate(invalid="ignore"):  # an infinite stiffness has no derivative
                 differences.append([(b - a) / step for a, b in zip(base, seen, strict=True)])
         slopes = Quantities(
@@ -248,33 +252,48 @@ class BracedProblem(PressureProblem):
         known: BraceUncertainty,
         near: list[Nearest],
         full: bool,
+        base: Quantities | None = None,
     ) -> Quantities:
         C = eq.compliance(self.brace.contacts) if full else np.eye(6)
         residuals, values = self.judged_by(eq, C)
         margin, forces = (1 + BRACE.spare) * self.brace.margin, eq.normal_forces
         pushed = [eq.shifted(push=margin * push).normal_forces - known.forces for push in pushes]
-        slips = np.zeros(0)
+        slips = foretold = np.zeros(0)
         if pushes:
             forces = forces + known.forces
             if self.brace.contacts == "sticking":
-                slips = np.array([self._slip(eq, push, known.grip) for push in pushes])
+                slips, foretold = self._slips(eq, pushes, known.grip, base)
         at = np.array([each.s for each in near])
         points, _, radii = eq.line(at) if near else (np.zeros((0, 3)), None, np.zeros(0))
         distances = np.array(
             [each.normal @ x - each.radius_share * r
              for each, x, r in zip(near, points, radii, strict=True)]
         )  # fmt: skip
-        return Quantities(residuals, values, distances, forces, np.array(pushed), slips)
+        return Quantities(residuals, values, distances, forces, np.array(pushed), slips, foretold)
 
-    def _slip(self, eq: ContactEquilibrium, push: Vector, grip: float) -> float:
-        """Return the push at which a contact is lost or the arm snaps, at most twice the margin.
+    def _slips(
+        self, eq: ContactEquilibrium, pushes: list[Vector], grip: float, base: Quantities | None
+    ) -> tuple[Vector, Vector]:
+        """Return the pushes at which a contact is lost or the arm snaps, at most twice the margin.
 
-        The least of contacts that stick and, as friction is not certain, that slide; `grip` is the
-        share of the former that is sure.
+        Those of contacts that stick and, as friction is not certain, of contacts that slide; `grip`
+        is the share of the former that is sure.  The second result is what the tangent foretells.
+        Next to an equilibrium with the quantities `base`, pushes at the limit stay there, and the
+        others change by the same share as those that are foretold.
         """
         most = 2 * self.brace.margin
-        sticking = grip * eq.lift_off(push, most / grip, "sticking").force
-        return min(most, sticking, eq.lift_off(push, most).force)
+        found, foretold = np.full(2 * len(pushes), most), np.full(2 * len(pushes), np.inf)
+        for k, (push, contacts) in enumerate(product(pushes, _GRIPS)):
+            if base is not None and base.slips[k] == most:
+                continue
+            foretold[k] = eq.foretold_loss(push, contacts)
+            if base is None:
+                sure = grip if contacts == "sticking" else 1.0
+                found[k] = min(most, sure * eq.lift_off(push, most / sure, contacts).force)
+            else:
+                share = foretold[k] / base.foretold[k] if np.isfinite(base.foretold[k]) else 1.0
+                found[k] = base.slips[k] * (share if np.isfinite(share) else 1.0)
+        return found, foretold
 
     def _rows(self, eq: ContactEquilibrium, seen: Quantities, near: list[Nearest]) -> Vector:
         rows = self.obstacle_rows(near)

@@ -73,7 +73,9 @@ class Confidence:
             return f"none of {self.starts} starts came to the pose"
         if self.starts == 1:
             return "local answer from the given guess"
-        sure = "search complete" if self.complete else "search not complete"
+        sure = "search complete"
+        if not self.complete:
+            sure = f"search not complete after {self.starts} starts"
         optima = "optimum" if self.optima == 1 else "optima"
         return (
             f"{self.agreeing} of {self.reached} descents agree on the best of {self.optima} local "

@@ -5,7 +5,7 @@ Each panel is a function that draws into axes of the caller.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -304,10 +304,10 @@ def draw_stiffness_along(axes: Any, solution: PathSolution) -> None:
     unit = display_units().of_si(solution.stiffness_unit)
     known = np.isfinite(solution.stiffness)
     values = np.where(known, unit.of(solution.stiffness), np.nan)
-    if not known.all():  # where a rigid object holds the tip
-        axes.text(
-            0.98, 0.95, "gaps: without limit, an object holds the tip", ha="right", va="top",
-            transform=axes.transAxes, color=style.GREY,
+    for k, (begin, end) in enumerate(_stretches(solution.times, ~known)):
+        axes.axvspan(
+            begin, end, linewidth=0, color=style.GREY, alpha=0.2,
+            label="" if k else "without limit: an object holds the tip",
         )  # fmt: skip
     if solution.alone is not None:
         axes.plot(
@@ -315,7 +315,8 @@ def draw_stiffness_along(axes: Any, solution: PathSolution) -> None:
             label="each point alone",
         )  # fmt: skip
     axes.plot(
-        solution.times, values, color=style.WITHIN_LIMITS, linewidth=2, label="on the path"
+        solution.times, values, ".-", color=style.WITHIN_LIMITS, linewidth=2, markersize=2,
+        label="on the path",
     )  # fmt: skip
     if not known.any():
         axes.set_yticks([])
@@ -331,6 +332,14 @@ def draw_stiffness_along(axes: Any, solution: PathSolution) -> None:
     axes.set_ylabel(f"stiffness\n({unit})")
     axes.set_xlabel("time (s)")
     _legend(axes)
+
+
+def _stretches(times: Vector, where: NDArray[np.bool_]) -> Iterator[tuple[float, float]]:
+    """Yield the beginning and end of each stretch, halfway to the next samples."""
+    edges = np.concatenate([times[:1], (times[1:] + times[:-1]) / 2, times[-1:]])
+    changes = np.flatnonzero(np.diff(np.concatenate([[False], where, [False]]).astype(int)))
+    for first, after in changes.reshape(-1, 2):
+        yield float(edges[first]), float(edges[after])
 
 
 def draw_clearance_along(axes: Any, solution: PathSolution, required: float | None = None) -> None:

@@ -355,6 +355,17 @@ class ContactEquilibrium:
         push = GrowingPush(self._arm.problem, d, limit)
         return push.loss(self._arm) if contacts == "sliding" else push.slip(self._arm)
 
+    def foretold_loss(self, direction: ArrayLike, contacts: Grip = "sliding") -> float:
+        """Return the push in N of `lift_off` to first order in the push; infinite if there is none.
+
+        It takes a thirtieth of the time, and knows no contacts that the push adds.  Parameters are
+        those of `lift_off`.
+        """
+        d = np.asarray(checked_measure(direction, "translation", "free", "base").direction)
+        check_choice("contacts", contacts, get_args(Grip))
+        push = GrowingPush(self._arm.problem, d, np.inf)
+        return push.foretold(self._arm, sticks=contacts == "sticking")
+
 
 def contact_equilibrium(
     arm: Manipulator,

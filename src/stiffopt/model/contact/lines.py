@@ -28,7 +28,7 @@ _BESIDE = 0.65  # over the spacing; the body may enter the surface a little so n
 _CURVED = 0.1  # 1/m beyond that of a flat line, with which contacts inside a line slide too
 _SHORTER = 0.7  # reach over the spacing, below which two contacts become one
 _LONG = 2.0  # reach over the spacing, with which an end is too undetermined to begin to slide
-_LIGHT, _HOLE = 0.05, 0.3  # force at the tip over its neighbour's, and free length over the spacing
+_LIGHT, _HOLE = 0.25, 0.3  # force at the tip over its neighbour's, and free length over the spacing
 _MAX_SPLITS = 3  # of a point; then it stays one
 
 

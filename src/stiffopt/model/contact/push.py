@@ -74,12 +74,12 @@ class GrowingPush:
     def slip(self, arm: LeaningArm) -> ContactLoss:
         """Return the first contact that slips or lifts off as the push grows from an equilibrium.
 
-        Contacts with friction stick, and carry no tangential force at first.  One
-        slips when the tangential force reaches the coefficient of friction times the normal
-        force.  The push goes half of the way to the loss that the tangent foretells, until that no
-        longer changes.
+        Contacts with friction stick, and carry no tangential force at first.  One slips when the
+        tangential force reaches the coefficient of friction times the normal force; one that the
+        push adds may slide without being lost.  The push goes half of the way to the loss that the
+        tangent foretells, until that no longer changes.
         """
-        friction = self._friction(arm.state)
+        friction, count = self._friction(arm.state), len(arm.state.touches)
         sticking = [j for j, each in enumerate(friction) if each > 0]
         force, step, foretold, begin = 0.0, np.inf, -1.0, None
         for _ in range(_MOST_STEPS):
@@ -87,6 +87,10 @@ class GrowingPush:
             begin = begin if begin is not None else tangent.stiffness
             left, lost, how = _first_loss(arm, tangent, friction, self._limit - force)
             total = force + left
+            if lost is not None and lost >= count and how == "slips":
+                friction[lost] = 0.0
+                sticking.remove(lost)
+                continue
             if left == 0.0:
                 break
             is_known = abs(total - foretold) <= _SAME_LOSS * total
@@ -113,7 +117,7 @@ class GrowingPush:
             if missed:
                 touches = (*found.state.touches, *missed)
                 state = self._problem.with_touches(found.state, touches)
-                friction = self._friction(state)
+                friction += self._friction(state)[len(friction) :]
                 sticking = [j for j, each in enumerate(friction) if each > 0]
                 found = self._problem.correct(state, sticking) or found
             arm, force, step, foretold = found, force + step, np.inf, total
@@ -132,6 +136,15 @@ class GrowingPush:
         name = self._problem.surfaces[touches[lost].surface].name
         at = touches[lost].station
         return ContactLoss(total, name, at, how, tangent.stiffness, after)
+
+    def foretold(self, arm: LeaningArm, *, sticks: bool) -> float:
+        """Return the push at which the tangent at no push foretells a loss; see `foretold_loss`."""
+        if not sticks:
+            own, slopes = _forces(arm), self._rates(arm)[0]
+            return float(_until_zero(own, slopes).min(initial=np.inf))
+        friction = self._friction(arm.state)
+        tangent = self._tangent(arm, [j for j, each in enumerate(friction) if each > 0])
+        return _first_loss(arm, tangent, friction, np.inf)[0]
 
     def _friction(self, state: Contacts) -> list[float]:
         return [self._problem.surfaces[touch.surface].friction for touch in state.touches]
@@ -172,7 +185,7 @@ class GrowingPush:
             own = _forces(arm)
             slopes, turn, stiffness = self._rates(arm)
             # a contact is lost where its force is zero, by Newton's method from one side
-            until = np.divide(own, -slopes, out=np.full(len(own), np.inf), where=slopes < 0)
+            until = _until_zero(own, slopes)
             step = min(step, _LARGEST_SWING / max(turn, 1e-9), self._limit - force)
             ahead = min(step, float(until.min(initial=np.inf)))
             dead = without + np.concatenate([(force + ahead) * self._direction, np.zeros(3)])
@@ -225,6 +238,12 @@ class GrowingPush:
 def rigid_if_huge(compliance: float) -> float:
     """Return the stiffness in N/m; infinite where the compliance is zero but for rounding."""
     return 1 / compliance if abs(compliance) > _NO_COMPLIANCE else np.inf
+
+
+def _until_zero(own: Vector, slopes: Vector) -> Vector:
+    """Return the pushes (k,) at which forces (k,) vanish; infinite for those that grow."""
+    until: Vector = np.divide(own, -slopes, out=np.full(len(own), np.inf), where=slopes < 0)
+    return until
 
 
 def _forces(arm: LeaningArm) -> Vector:

@@ -83,7 +83,8 @@ static int64_t nearest_samples(Program *P, Ranked *nearest, Effort *effort) {
     effort->agreeing = least->agreeing + (int64_t)(share * (double)(most->agreeing - least->agreeing));
     effort->most_descents = least->most_descents +
         (int64_t)(share * (double)(most->most_descents - least->most_descents));
-    kept = 2 * effort->screened < s->samples ? 2 * effort->screened : s->samples;
+    kept = 2 * (s->state ? most : effort)->screened; /* under load few samples reach the target */
+    kept = kept < s->samples ? kept : s->samples;
     for (int64_t i = 0; i < s->samples; i++)
         if (count < kept || distances[i] < nearest[0].value)
             keep_smallest(nearest, &count, kept, (Ranked){distances[i], i});
