@@ -195,7 +195,7 @@ class BraceSettings:
     spare: float = 5e-3
     stations: int = 14
     screened: int = 1024
-    effort: Effort = field(default=Effort(32, 4, 16))
+    effort: Effort = field(default=Effort(32, 8, 24))
     best_found: int = 2
     rounds: int = 2
     iterations: int = 15
