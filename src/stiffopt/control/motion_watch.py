@@ -222,8 +222,8 @@ class MotionWatch:
             found = (self._missed(rows, jacobian, P) for P in (np.eye(3), across))
             missed = max(found, key=lambda miss: miss.share)
         share = 0.0 if missed is None else missed.share
-        usual, stops = self._tuning.usual_share, self._tuning.stops_share
-        self.pace = min(max((stops - share) / (stops - usual), 0.0), 1.0)
+        usual = self._tuning.usual_share
+        self.pace = min(max((1 - share) / (1 - usual), 0.0), 1.0)
         self._misses = self._misses + 1 if share > 1 else 0
         if missed is None or self._misses < self._tuning.misses:
             return None

@@ -262,7 +262,7 @@ class Planning:
         return solution
 
     def _is_distant(self, last: Plan, pressures: Array, target: Target) -> bool:
-        """Whether pressures (n,) are another configuration than those of the last plan."""
+        """Return True if pressures (n,) are too far from the last plan for one configuration."""
         t = self._tuning
         displacement = float(np.linalg.norm(self._displacement(last, target)))
         reach = t.neighbourhood + t.neighbourhood_per_metre * displacement

@@ -345,10 +345,8 @@ class MotionTuning:
     late: float = 0.01  # by which the tip may move later than the model's, in s
     # share of the amplitude of the vibration that the pressures excite, whose phase may be wrong
     swing_error: float = 0.35
-    # shares of the explained difference from the model, above which the reference is slowed down,
-    # and from which it stands still
+    # share of the explained difference from the model above which the reference is slowed down
     usual_share: float = 0.4
-    stops_share: float = 1.0
     misses: int = 2  # successive samples that show no response
     # share of the latest motion that a hold undoes where the tip was not seen to move: the arm has
     # followed its pressures about so far, and then swings least; 0 for an arm that does not vibrate

@@ -358,7 +358,7 @@ class ContactEquilibrium:
     def foretold_loss(self, direction: ArrayLike, contacts: Grip = "sliding") -> float:
         """Return the push in N of `lift_off` to first order in the push; infinite if there is none.
 
-        It takes a thirtieth of the time, and knows no contacts that the push adds.  Parameters are
+        It takes a small part of the time, and knows no contacts that the push adds.  Parameters are
         those of `lift_off`.
         """
         d = np.asarray(checked_measure(direction, "translation", "free", "base").direction)
