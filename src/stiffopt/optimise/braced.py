@@ -26,12 +26,13 @@ from stiffopt.model.contact.equilibrium import ContactEquilibrium
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.optimise.brace import quoted
 from stiffopt.optimise.brace_uncertainty import BraceUncertainty
-from stiffopt.optimise.leaning import FORCE_ON, MARGIN_ON, RIGID, BracedProblem
+from stiffopt.optimise.leaning import FORCE_ON, MARGIN_ON, RIGID, BracedPoint, BracedProblem
 from stiffopt.optimise.local import LocalResult, descend
 from stiffopt.optimise.prices import prices_at
 from stiffopt.optimise.problem import ProgramPoint
 from stiffopt.optimise.program import Constraint
-from stiffopt.optimise.reach import attempt, reach
+from stiffopt.optimise.reach import attempt
+from stiffopt.optimise.reach_in_contact import reach_in_contact
 from stiffopt.optimise.samples import SampleTable, distances
 from stiffopt.optimise.search import Search, search, unlike_first
 from stiffopt.optimise.settings import BRACE, Effort
@@ -110,7 +111,7 @@ def _places(
     """
     remaining, tried, arrived = iter(starts), 0, False
     while some := list(islice(remaining, BRACE.effort.screened)):
-        found: list[tuple[float, ProgramPoint, ContactEquilibrium]] = []
+        found: list[tuple[float, BracedPoint]] = []
         for x in some:
             tried += 1
             try:
@@ -125,35 +126,32 @@ def _places(
         if not found:
             yield tried, None
             continue
-        for i in unlike_first(problem, np.array([point.x for _, point, _ in found])):
-            problem.here = found[i][2]
-            yield tried, found[i][1]
+        for i in unlike_first(problem, np.array([point.x for _, point in found])):
+            point = found[i][1]
+            problem.here = point.equilibrium
+            yield tried, point
 
 
-def _brought(
-    problem: BracedProblem, x: Vector
-) -> list[tuple[float, ProgramPoint, ContactEquilibrium]]:
-    """Bring a start to the target in contact; return its objective, point and equilibrium.
+def _brought(problem: BracedProblem, x: Vector) -> list[tuple[float, BracedPoint]]:
+    """Bring a start to the target in contact; return its objective and point.
 
     The list is empty if it does not arrive.
     """
     target_only = copy(problem)
     target_only.only_target = True
     target_only.restart()
-    point = reach(target_only, x, BRACE.iterations)
+    point = reach_in_contact(target_only, x)
     if point is None or not point.reached:
         return []
-    problem.here, problem.leant = target_only.here, True
-    point = reach(problem, point.x, BRACE.iterations)
+    problem.here, problem.leant = point.equilibrium, True
+    point = reach_in_contact(problem, point.x)
     if point is None:
         return []
     if not point.reached:
         problem.missed.append(point)
         return []
-    full = attempt(problem.needed, point.x)
-    if full is None or problem.here is None:
-        return []
-    return [(problem.objective.value(full), full, problem.here)]
+    full = attempt(problem.point, point.x)
+    return [] if full is None else [(problem.objective.value(full), full)]
 
 
 def braced_answers(problem: BracedProblem, table: SampleTable, guess: Vector | None) -> Search:
@@ -186,7 +184,7 @@ def reached_again(problem: BracedProblem, judged: Braced) -> Braced | None:
     """
     problem.restart()
     problem.here = judged.equilibrium
-    point = reach(problem, judged.result.point.x, BRACE.iterations)
+    point = reach_in_contact(problem, judged.result.point.x)
     if point is None or not point.reached:
         return None
     result = descend(problem, point)

@@ -104,6 +104,25 @@ class PlacedProgram:
         return found[0][:, 0], found[1][:, 0]
 
 
+class BracedPoint(ProgramPoint):
+    """The program's values at an equilibrium in contact.
+
+    Attributes
+    ----------
+    equilibrium : ContactEquilibrium
+    force : float
+        Sum of the contacts' normal forces, in N.
+    force_gradient : ndarray (n,)
+        Its derivative, per variable.
+    """
+
+    __slots__ = ("equilibrium", "force", "force_gradient")
+
+    equilibrium: ContactEquilibrium
+    force: float
+    force_gradient: Vector
+
+
 class Quantities(NamedTuple):
     """Quantities at one equilibrium from which the program's rows and values are computed."""
 
@@ -199,19 +218,19 @@ class BracedProblem(PressureProblem):
         self.here, self._kept = eq, (x.tobytes(), eq)
         return eq
 
-    def pose(self, x: Vector) -> ProgramPoint:
+    def pose(self, x: Vector) -> BracedPoint:
         """See `PressureProblem.pose`."""
         return self._evaluated(x, full=False)
 
-    def point(self, x: Vector) -> ProgramPoint:
+    def point(self, x: Vector) -> BracedPoint:
         """See `PressureProblem.point`."""
         return self._evaluated(x, full=True)
 
-    def worth(self, x: Vector) -> ProgramPoint:
+    def worth(self, x: Vector) -> BracedPoint:
         """See `PressureProblem.worth`."""
         return self._evaluated(x, full=True)
 
-    def _evaluated(self, x: Vector, *, full: bool) -> ProgramPoint:
+    def _evaluated(self, x: Vector, *, full: bool) -> BracedPoint:
         checkpoint()
         eq = self.equilibrium(x)
         pushes = [] if self.only_target else list(self.pushes(eq))
@@ -231,12 +250,13 @@ class BracedProblem(PressureProblem):
         residual = np.concatenate([base.residuals, self._rows(eq, base, near)])
         jacobian = np.vstack([slopes.residuals, self._slopes(eq, base, slopes)])
         first = len(self.program.measures) - self.program.n_floors
-        if not full:
-            return ProgramPoint(x, residual, jacobian, self.constraints, *_nothing(len(x)))
-        return ProgramPoint(
-            x, residual, jacobian, self.constraints, -base.values[:first], -slopes.values[:first],
-            base.values[first:], slopes.values[first:],
-        )  # fmt: skip
+        rest = (
+            -base.values[:first], -slopes.values[:first], base.values[first:], slopes.values[first:]
+        ) if full else _nothing(len(x))  # fmt: skip
+        point = BracedPoint(x, residual, jacobian, self.constraints, *rest)
+        point.equilibrium, point.force = eq, float(eq.normal_forces.sum())
+        point.force_gradient = slopes.forces.sum(axis=0)
+        return point
 
     def pushes(self, eq: ContactEquilibrium) -> Iterator[Vector]:
         """Yield unit vectors (3,) of pushes at the tip, both ways per direction, in base axes."""

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,7 @@ from stiffopt.optimise.problem import PressureProblem, ProgramPoint
 from stiffopt.optimise.settings import REACH
 
 Vector = NDArray[np.float64]
+Point = TypeVar("Point", bound=ProgramPoint)
 
 
 def reach(
@@ -178,7 +180,7 @@ def within(low: Vector, x: Vector, high: Vector) -> Vector:
     return np.minimum(np.maximum(x, low), high)
 
 
-def attempt(evaluate: Callable[[Vector], ProgramPoint], x: Vector) -> ProgramPoint | None:
+def attempt(evaluate: Callable[[Vector], Point], x: Vector) -> Point | None:
     """Evaluate; return None without a stable equilibrium or with non-finite numbers."""
     try:
         point = evaluate(x)

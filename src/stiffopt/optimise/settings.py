@@ -32,6 +32,29 @@ class ReachSettings:
 
 
 @dataclass(frozen=True)
+class ReachInContactSettings:
+    """Method that brings pressures to a target in contact (`stiffopt.optimise.reach_in_contact`).
+
+    Attributes
+    ----------
+    iterations : to the target, and as many to the contacts' demands.
+    first_radius, least_radius : of the trust region, as shares of the pressures' ranges.
+    damping : of a step.
+    inside : share of tolerances and demands that is aimed at.
+    kept : share of the contact force that a step must leave.
+    least_progress : share of the misfit that a step must promise.
+    """
+
+    iterations: int = 15
+    first_radius: float = 2 / 3
+    least_radius: float = 1e-5
+    damping: float = 1e-4
+    inside: float = 0.9
+    kept: float = 0.1
+    least_progress: float = 1e-3
+
+
+@dataclass(frozen=True)
 class DescentSettings:
     """Feasible-path SQP method (`stiffopt.optimise.local`); steps are shares of a range.
 
@@ -180,7 +203,6 @@ class BraceSettings:
         must find nothing new, and most descents.
     best_found : descents that must find the best optimum before a search is complete.
     rounds : most rounds; the next one begins if a search is not complete.
-    iterations : iterations of a start, to the target and to the contacts' demands.
     tried : local optima that are judged in turn, from rest.
     stiffer : share by which an optimum that does not hold is stiffer than the answer, to be told.
     least_price : gain from a whole tolerance or limit, as a share of the stiffness, to be reported.
@@ -192,13 +214,12 @@ class BraceSettings:
     scale: float = 1.0
     step: float = 3e-4
     precision: float = 1e-4
-    spare: float = 5e-3
+    spare: float = 1e-3
     stations: int = 14
     screened: int = 1024
     effort: Effort = field(default=Effort(32, 8, 24))
     best_found: int = 2
     rounds: int = 2
-    iterations: int = 15
     tried: int = 8
     stiffer: float = 0.01
     least_price: float = 1e-3
@@ -329,6 +350,7 @@ class KeptSettings:
 
 
 REACH = ReachSettings()
+REACH_IN_CONTACT = ReachInContactSettings()
 DESCENT = DescentSettings()
 SEARCH = SearchSettings()
 CLOSEST = ClosestSettings()
