@@ -2,7 +2,7 @@
 
     python benchmarks/brace.py --cases 50 --starts 200 --out out/brace
 
-Random targets of the two-segment arm, bent by up to 60 degrees, with a post, a ball or a wall
+Random targets of a two-segment arm (`--robot`), bent by up to 60 degrees, with a post, ball or wall
 beside the body where it bends, a contact force of at most 0.3 N, a margin of 20 mN and a random
 direction of stiffness. Cases are stored in the folder, so that their reference is computed once.
 
@@ -32,17 +32,27 @@ import stiffopt
 from report import table
 from stiffopt.errors import EquilibriumError
 
+ROBOT = "stiff-flop-2"
 MAX_FORCE, MARGIN, TOLERANCE = 0.3, 0.02, 1e-4
+AWAY = stiffopt.Scene(
+    objects=[
+        stiffopt.SceneObject(
+            name="away", sphere={"centre": [0, 0, 9], "radius": 0.01}, contact={"allowed": True}
+        )
+    ]
+)
 _STEP = 30.0  # Pa, of differences
 
 
-def draw(seed: int) -> dict[str, Any]:
-    """A random task, whose object is clear of the arm at rest."""
+def draw(seed: int, name: str = ROBOT) -> dict[str, Any]:
+    """A random task of a robot, whose object is clear of the arm at rest."""
     rng = np.random.default_rng([22, seed])
-    robot = stiffopt.load_robot("stiff-flop-2")
+    robot = stiffopt.load_robot(name)
     while True:
         p = rng.uniform(0, 1.5e5, 6) * (rng.random(6) < 0.8)
         T = robot.backbone(p, 61)
+        if robot.is_loaded:
+            T = robot.contact_equilibrium(p, AWAY).poses(np.linspace(0, robot.length, 61))
         tilt = np.degrees(np.arccos(T[-1, 2, 2]))
         if not 10 < tilt < 60:
             continue
@@ -54,7 +64,7 @@ def draw(seed: int) -> dict[str, Any]:
     direction = rng.normal(size=3)
     direction /= np.linalg.norm(direction)
     return {
-        "seed": seed, "kind": str(kind), "tilt_deg": float(tilt), "object": item,
+        "seed": seed, "robot": name, "kind": str(kind), "tilt_deg": float(tilt), "object": item,
         "target": np.round(T[-1, :3, 3], 4).tolist(), "direction": direction.tolist(),
     }  # fmt: skip
 
@@ -81,7 +91,7 @@ def task_of(case: dict[str, Any]) -> stiffopt.Task:
     """The task of a case."""
     scene = stiffopt.Scene(objects=[stiffopt.SceneObject(**case["object"])])
     return stiffopt.Task(
-        robot="stiff-flop-2",
+        robot=case.get("robot", ROBOT),
         target=stiffopt.Target(position=case["target"], tolerance={"position": TOLERANCE}),
         stiffness={"maximise": {"direction": case["direction"]}},
         scene=scene,
@@ -92,7 +102,7 @@ def task_of(case: dict[str, Any]) -> stiffopt.Task:
 def answered(case: dict[str, Any]) -> dict[str, Any]:
     """What stiffopt answers."""
     task = task_of(case)
-    robot = stiffopt.load_robot("stiff-flop-2")
+    robot = stiffopt.load_robot(task.robot)
     began = time.process_time()
     found = stiffopt.solve_pressure(robot, task)
     return {
@@ -248,15 +258,15 @@ class Reference:
         return np.array([*eq.tip_pose[:3, 3], eq.stiffness(self.d), *rest])
 
 
-def run(seeds: range, starts: int, folder: Path) -> Iterator[dict[str, Any]]:
+def run(seeds: range, starts: int, folder: Path, name: str) -> Iterator[dict[str, Any]]:
     """All cases; the reference from the folder where it is there, the answer always anew."""
     folder.mkdir(parents=True, exist_ok=True)
     for seed in seeds:
         file = folder / f"{seed}.json"
-        case = json.loads(file.read_text()) if file.exists() else draw(seed)
+        case = json.loads(file.read_text()) if file.exists() else draw(seed, name)
         case["answer"] = answered(case)
         if starts and case.get("reference", {}).get("asked") != starts:
-            reference = Reference(stiffopt.load_robot("stiff-flop-2"), task_of(case))
+            reference = Reference(stiffopt.load_robot(name), task_of(case))
             case["reference"] = {"asked": starts, **reference.best(starts, seed)}
         file.write_text(json.dumps(case))
         yield case
@@ -318,6 +328,7 @@ def report(cases: list[dict[str, Any]]) -> str:
 def main() -> None:
     """Run, and print the report."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--robot", default=ROBOT, help="one of two segments")
     parser.add_argument("--cases", type=int, default=50)
     parser.add_argument("--first", type=int, default=0, metavar="SEED")
     parser.add_argument("--starts", type=int, default=200, help="of the reference; 0: none")
@@ -327,7 +338,7 @@ def main() -> None:
     warnings.simplefilter("ignore")
     cases = []
     seeds = range(arguments.first, arguments.first + arguments.cases)
-    for case in run(seeds, arguments.starts, arguments.out):
+    for case in run(seeds, arguments.starts, arguments.out, arguments.robot):
         cases.append(case)
         answer = case["answer"]
         print(

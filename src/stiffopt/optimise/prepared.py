@@ -17,7 +17,7 @@ from stiffopt.optimise.functions import functions
 from stiffopt.optimise.problem import floor_bounds
 from stiffopt.optimise.program import Program
 from stiffopt.optimise.samples import SampleTable
-from stiffopt.optimise.settings import KEPT
+from stiffopt.optimise.settings import KEPT, SAMPLES
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import Task
 
@@ -101,6 +101,13 @@ class Prepared:
         except EquilibriumError:
             return None
         return table if len(table.pressures) else None
+
+    def many_samples(self, arm: LoadedArm) -> SampleTable:
+        """Sample an arm under load, in machine code, as often as one without loads."""
+        return _recent(
+            self.robot, "many samples", self._key,
+            lambda: SampleTable(self.robot, self.lower, self.upper, self._seed, arm, SAMPLES.free),
+        )  # fmt: skip
 
     @cached_property
     def samples(self) -> SampleTable:

@@ -27,6 +27,8 @@ class SampleTable:
         Shifts the low-discrepancy sequence.
     arm : LoadedArm, optional
         The robot in machine code, to find equilibria under load.
+    count : int, optional
+        Number of configurations, before those without an equilibrium are left out.
 
     Attributes
     ----------
@@ -44,11 +46,12 @@ class SampleTable:
         upper: Vector,
         seed: int,
         arm: LoadedArm | None = None,
+        count: int | None = None,
     ) -> None:
         self.arm, self._ranges = arm, pressure_ranges(robot.description)
-        count = SAMPLES.free
-        if robot.is_loaded:
-            count = SAMPLES.loaded if arm is None else SAMPLES.compiled
+        if count is None:
+            loaded = SAMPLES.loaded if arm is None else SAMPLES.compiled
+            count = loaded if robot.is_loaded else SAMPLES.free
         x = lower + (upper - lower) * _spread_with_edges(count, len(lower), seed)
         if robot.is_loaded:
             # under load small pressures can have a large effect: scale down every other sample

@@ -327,6 +327,8 @@ class PressureSolver:
             return replace(free, task=task)
         fast = self._search.fast(plain, None)
         table = self._prepared.samples if fast is None else fast[0].table
+        if table.arm is not None:  # few suffice to find a free answer, but not where to lean
+            table = self._prepared.many_samples(table.arm)
         return lean(BracedProblem(self.robot, task), table, free, guess)
 
     def _otherwise(self, task: Task, guess: Vector | None) -> PressureSolution:
