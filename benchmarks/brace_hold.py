@@ -252,7 +252,7 @@ def push_off(loop: Loop, first: Any, normal: Any, *, grows: float, slips: bool) 
     warned = loop.told_since(begin, "brace-slips" if slips else "brace-weak")
     row = {
         "grows": grows, "reported": is_reported, "lost": bool(lost),
-        "error_force": float(np.mean(np.abs(errors))),
+        "error_force": float(np.nanmean(np.abs(errors))),
         "push": float(np.linalg.norm(rate)) * (lost[0] if lost else longest),
     }  # fmt: skip
     if lost and is_reported:

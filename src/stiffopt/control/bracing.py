@@ -88,6 +88,7 @@ class Bracing:
         self._is_off = False  # the tip is known to stay off its target
         self._nearest = (math.inf, 0.0)  # distance of the tip from it, in m, and when it fell to it
         self._warned: set[str] = set()  # kinds of warnings about the present push
+        self._share = 1.0  # of the weakest contact's force that a push leaves, averaged
         self._why = ""
         self._notices: list[Notice] = []
 
@@ -234,12 +235,13 @@ class Bracing:
             self._pushed = self._pushed * float(feels)
             self.push = self.displacement = np.zeros(3)
             self.force, self.margin = float(before.min()), math.nan
+            self._share = 1.0
             self._warned.clear()
             return
         self._pushed += elapsed
         self.push, self.displacement = push, off
         self.covariance[:] = np.linalg.inv(C @ C / t.deviation**2 + np.eye(3) / t.usual_push**2)
-        self._judge(before)
+        self._judge(before, elapsed)
 
     def _feels(self, off: Array, push: Array, before: Array) -> bool:
         """Return whether a displacement (3,) of the tip is more than the model's error.
@@ -287,8 +289,11 @@ class Bracing:
         found: Array = hold.forces + hold.per_pressure @ (pressures - planned)
         return found
 
-    def _judge(self, before: Array) -> None:
-        """Judge whether the contacts hold the estimated push; `before`: normal forces (k,)."""
+    def _judge(self, before: Array, elapsed: float) -> None:
+        """Judge whether the contacts hold the estimated push; `before`: normal forces (k,).
+
+        Silicone is stiffer to a quick push, so while one grows, less is left than estimated.
+        """
         assert self.approach is not None
         hold, size = self.approach.hold, float(np.linalg.norm(self.push))
         change = hold.per_push @ self.push
@@ -299,8 +304,10 @@ class Bracing:
         slip = self._slips_at(self.push) - size
         self.force = float(forces[weakest])
         self.margin = max(min(left, slip) if self._sticks else left, 0.0)
-        none = self._tuning.lost_share * before[weakest]
-        how = "lifts off" if self.force <= none else "slips" if self._sticks and slip <= 0 else ""
+        t, share = self._tuning, self.force / max(float(before[weakest]), 1e-6)
+        self._share += min(elapsed / t.grown_time, 1.0) * (share - self._share)
+        none = t.lost_share + min(max(self._share - share, 0.0), t.grown_share)
+        how = "lifts off" if share <= none else "slips" if self._sticks and slip <= 0 else ""
         where = f"on '{self.approach.contacts[weakest].object}'"
         words = f"under a push of {1e3 * size:.0f} mN"
         if how:
@@ -308,7 +315,7 @@ class Bracing:
             return
         if slip <= 0:
             self._warn("brace-slips", f"the contact {where} slips {words}")
-        if self.force < self._tuning.weak_share * before[weakest]:
+        if share < t.weak_share:
             left_over = f"{1e3 * max(self.force, 0.0):.0f} of {1e3 * before[weakest]:.0f} mN"
             self._warn("brace-weak", f"the contact {where} may lift off: {left_over} left {words}")
 

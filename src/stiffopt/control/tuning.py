@@ -535,8 +535,11 @@ class BracingTuning:
     # deviation of that displacement, in m, and of pushes, in N
     deviation: float = 2e-4
     usual_push: float = 0.1
-    # of its force, below which the estimate cannot tell it from none
-    lost_share: float = 0.2
+    # of its force, below which the estimate cannot tell it from none; what may be added to that for
+    # what a growing push has taken of late, and how long that is, in s
+    lost_share: float = 0.15
+    grown_share: float = 0.1
+    grown_time: float = 1.0
     weak_share: float = 0.4  # of its force, below which a contact that a push relieves may lift off
     # time constants with which the tip goes to its target, at first and once it has settled, in s
     first_time: float = 2.0
