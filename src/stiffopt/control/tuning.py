@@ -515,13 +515,16 @@ class BracingTuning:
     min_on_way: float = 15e-3
     free_share: float = 0.6
     samples: int = 3
-    off_plan: float = 1.5e4  # pressure error above which contacts are not judged, in Pa
+    off_plan: float = 3e4  # pressure error above which contacts are not judged, in Pa
     let_down: float = 2e3  # the same while the pressures are held: then they are being let down
     swing_time: float = 0.08  # time constant of averaging the measured tip, in s
     # displacement of the tip above which a push is felt, in m; time constant with which a smaller
     # one becomes the model's error, in s
     felt: float = 6e-4
     error_time: float = 5.0
+    # the same for a push that uses up a share of what a contact holds, and that share
+    least_felt: float = 2e-4
+    felt_share: float = 0.12
     # at first, while the tip goes to its target and the arm creeps most: duration and such a time
     # constant, in s
     settling: float = 8.0
@@ -530,12 +533,13 @@ class BracingTuning:
     withheld_time: float = 5.0
     longest_push: float = 60.0  # after which a push becomes the model's error too, in s
     # deviation of that displacement, in m, and of pushes, in N
-    deviation: float = 5e-4
+    deviation: float = 2e-4
     usual_push: float = 0.1
-    every: float = 0.03  # interval of checks of the contacts, in s
-    looks: int = 2  # successive checks
-    # of its force, below which the estimate cannot tell it from none
-    lost_share: float = 0.08
+    # of its force, below which the estimate cannot tell it from none; what may be added to that for
+    # what a growing push has taken of late, and how long that is, in s
+    lost_share: float = 0.15
+    grown_share: float = 0.1
+    grown_time: float = 1.0
     weak_share: float = 0.4  # of its force, below which a contact that a push relieves may lift off
     # time constants with which the tip goes to its target, at first and once it has settled, in s
     first_time: float = 2.0
