@@ -9,6 +9,7 @@ damps the arm's vibration. A small quadratic program (`Allocation`) combines bot
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Sequence
 
 import numpy as np
@@ -126,6 +127,10 @@ class TipController:
             tuning.motion_error,
             tuning.step_error,
         )
+        # the latest places of the reference, with what feedback added to its commands
+        self._ways: deque[tuple[Array, Array]] = deque(
+            maxlen=max(1, round(tuning.reference.taken_back / period))
+        )
         self._first_motion = FirstMotion(commissioned, tuning.first_motion)
         self._requests = Requests(robot, limits, slew, scene, tuning)
         Planner = ProcessPlanner if plan_in_process else InlinePlanner
@@ -163,6 +168,7 @@ class TipController:
         self._lost = self._arm.channels.lost
         self._windows.begin()
         self._led_to: Target | None = None  # present target of a trajectory of pressures
+        self._ways.clear()
 
     def set_task(self, task: Task) -> None:
         """Pursue a task; see `Controller.set_task`."""
@@ -281,6 +287,7 @@ class TipController:
         here = pressures.chamber if self._arm.channels.lost.any() else pressures.command
         self._reference.begin(np.concatenate([here + pressures.history_offset, offset]))
         self._feedback.resume()
+        self._ways.clear()
         self._at_rest = False
 
     def observe(
@@ -358,6 +365,8 @@ class TipController:
         tip = self._arm.on_path(reference.path[:n])
         if now - self._went_back_at > self._tuning.adaptation.blind_time:
             self._arm.watch.intend(now, tip.pose[:3, 3] + reference.path[n : n + 3])
+        if self._arm.channels.pace == 0 and self._ways:
+            return self._without_feedback(last)
         course = self.replanner.pursuit.course
         self._led_to = None
         if isinstance(course, PostureCourse):
@@ -375,7 +384,30 @@ class TipController:
         )
         if command is None:
             return ControlOutput(last.copy(), False, self._feedback.saturated.copy())
+        self._ways.append((reference.path.copy(), command - goal))
         return ControlOutput(command, True, self._feedback.saturated.copy())
+
+    def stop(self, now: float) -> Array | None:
+        """Stop a doubted motion; see `Controller.stop`.
+
+        The reference goes back to where it was a while before. On its smooth path the arm does not
+        begin to vibrate, as it would if its commands froze. Feedback, which may have followed a
+        sensor that is wrong, keeps its mean of that time.
+        """
+        reference, n = self._reference, self.robot.n_pressures
+        if not self._vibrates or not self._ways or self._arm.leaning is not None:
+            return None
+        goal = self._ways[0][0]
+        if self._is_near(goal[:n]):
+            return None
+        reference.advance(goal)
+        return self._without_feedback(self._arm.pressures.command).pressures
+
+    def _without_feedback(self, last: Array) -> ControlOutput:
+        """Command the reference's pressures, and what feedback added to them lately on average."""
+        added = np.mean([correction for _, correction in self._ways], axis=0)
+        command = self._reference.command - self._arm.pressures.command_offset + added
+        return self._feedforward(command, last)
 
     def _awaited(self, plan: Array, now: float) -> Array:
         """Return the reference's goal (n + 6,): the plan, unless channels or tip do not follow.
@@ -391,7 +423,8 @@ class TipController:
         if isinstance(course, PostureCourse):
             course.wait((1 - pace) * min(now - self._computed_at, _HELD * self._period))
             return plan
-        path = self._reference.path
+        # an arm that vibrates goes on for a while before its smooth path turns
+        path = self._ways[0][0] if self._vibrates and self._ways else self._reference.path
         goal: Array = path + pace * (plan - path)
         return goal
 
