@@ -391,23 +391,24 @@ class TipController:
         """Stop a doubted motion; see `Controller.stop`.
 
         The reference goes back to where it was a while before. On its smooth path the arm does not
-        begin to vibrate, as it would if its commands froze. Feedback, which may have followed a
-        sensor that is wrong, keeps its mean of that time.
+        begin to vibrate, as it would if its commands froze. What feedback adds becomes what it was
+        then, since it may have followed a sensor that is wrong. A channel that moves against its
+        command keeps it.
         """
-        reference, n = self._reference, self.robot.n_pressures
-        if not self._vibrates or not self._ways or self._arm.leaning is not None:
+        opposed, last = self._arm.channels.opposed, self._arm.pressures.command
+        is_doubted = self._arm.watch.doubt is not None or opposed.any()
+        if not self._vibrates or not is_doubted or not self._ways:
             return None
         goal = self._ways[0][0]
-        if self._is_near(goal[:n]):
+        if self._is_near(goal[: len(last)]):
             return None
-        reference.advance(goal)
-        return self._without_feedback(self._arm.pressures.command).pressures
+        self._reference.advance(goal)
+        return np.where(opposed, last, self._without_feedback(last).pressures)
 
     def _without_feedback(self, last: Array) -> ControlOutput:
-        """Command the reference's pressures, and what feedback added to them lately on average."""
-        added = np.mean([correction for _, correction in self._ways], axis=0)
-        command = self._reference.command - self._arm.pressures.command_offset + added
-        return self._feedforward(command, last)
+        """Command the reference's pressures, with what feedback added to them a while before."""
+        command = self._reference.command - self._arm.pressures.command_offset
+        return self._feedforward(command + self._ways[0][1], last)
 
     def _awaited(self, plan: Array, now: float) -> Array:
         """Return the reference's goal (n + 6,): the plan, unless channels or tip do not follow.
