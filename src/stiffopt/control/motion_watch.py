@@ -105,8 +105,8 @@ class MotionWatch:
         self._swings = [_Swings(self._tuning) for _ in range(3)]
         self.doubt: Doubt | None = None
         self.pace = 1.0
-        # motion of the tip by each segment up to which the model's error is known, in m; that
-        # error, as a share of it; and times, errors and motions that do not count yet
+        # motion of the tip by each segment so far, in m; largest error of the model in it, as a share
+        # of it; and times, errors and motions (segments,) that do not count yet
         self._verified = np.zeros(len(self._segments))
         self._error = 0.0
         self._unproven: deque[tuple[float, float, Array]] = deque()
@@ -211,7 +211,8 @@ class MotionWatch:
         `changes` (k, 18 + n) are differences of samples; the Jacobian (3, n) is of the tip's
         position, base axes.
         """
-        return self._tuning.model_error * self._by_segments(changes, jacobian).sum(axis=1)
+        own: Array = self._tuning.model_error * self._by_segments(changes, jacobian).sum(axis=1)
+        return own
 
     def _by_segments(self, changes: Array, jacobian: Array) -> Array:
         """Return the lengths (k, segments) by which each segment moves the tip, in m."""
@@ -219,7 +220,8 @@ class MotionWatch:
             changes[:, _PRESSURES][:, channels] @ jacobian[:, channels].T
             for channels in self._segments
         ]
-        return np.sqrt((np.stack(motions, axis=1) ** 2).sum(axis=2))
+        lengths: Array = np.sqrt((np.stack(motions, axis=1) ** 2).sum(axis=2))
+        return lengths
 
     @property
     def _shares(self) -> Array:
@@ -266,7 +268,7 @@ class MotionWatch:
                 "no-response",
                 f"{text}: its sensor has come off, the tracker is late, the arm is blocked, or it "
                 "does not get its pressures; look at the sensor and the tubes",
-                self._tuning.undo_unseen,
+                undo=0.0,  # it has probably moved as intended
             )
         return Doubt(
             "no-response",
@@ -300,7 +302,7 @@ class MotionWatch:
         late = tuning.late * (speeds + speeds[-1])  # error by a delay of y, in m
         driven = rows[:-1, _DRIVEN] + rows[-1, _DRIVEN]
         other = late + tuning.swing_error * driven + rows[:-1, _FREE] + 6 * tuning.scatter
-        error = float(((off - other)[far] / motion[far]).max())
+        error = float(((off - other)[far] / np.maximum(motion, distance)[far]).max())
         suspects = np.flatnonzero(far & (aside**2 + short**2 > (most * distance) ** 2))
         if not len(suspects):
             return _Miss(0.0, 0.0, 0.0, error)

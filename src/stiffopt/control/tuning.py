@@ -355,9 +355,6 @@ class MotionTuning:
     # share of the explained difference from the model above which the reference is slowed down
     usual_share: float = 0.4
     misses: int = 2  # successive samples that show no response
-    # share of the latest motion that a hold undoes where the tip was not seen to move: the arm has
-    # followed its pressures about so far, and then swings least; 0 for an arm that does not vibrate
-    undo_unseen: float = 0.5
     slip_window: float = 1.0  # in which a slip is looked for, in s
     # share of the turn that a push would cause by which the measured turn must miss it
     slip: float = 0.7
