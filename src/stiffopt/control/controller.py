@@ -365,7 +365,8 @@ class TipController:
         tip = self._arm.on_path(reference.path[:n])
         if now - self._went_back_at > self._tuning.adaptation.blind_time:
             self._arm.watch.intend(now, tip.pose[:3, 3] + reference.path[n : n + 3])
-        if self._arm.channels.pace == 0 and self._ways:
+        moves = np.abs(reference.motion[1, :n]).max() > self._tuning.reference.at_rest
+        if self._arm.channels.pace == 0 and moves and self._ways:
             return self._without_feedback(last)
         course = self.replanner.pursuit.course
         self._led_to = None

@@ -105,11 +105,10 @@ class MotionWatch:
         self._swings = [_Swings(self._tuning) for _ in range(3)]
         self.doubt: Doubt | None = None
         self.pace = 1.0
-        # motion of the tip by each segment so far, in m; largest error of the model in it, as a share
-        # of it; and times, errors and motions (segments,) that do not count yet
-        self._verified = np.zeros(len(self._segments))
-        self._error = 0.0
+        # motion of the tip by each segment so far, in m; largest error of the model in it, as a
+        # share of it; and times, errors and motions (segments,) that do not count yet
         self._unproven: deque[tuple[float, float, Array]] = deque()
+        self._forget()
 
     def go_on(self) -> None:
         """Continue after a pause in which the arm was not controlled, or not seen."""
@@ -179,6 +178,8 @@ class MotionWatch:
         row = (time, *seen, *predicted, *intended, *offset, *swings, *pressures)
         self._rows[self._count] = row
         self._count += 1
+        if self._is_pushed():
+            self._forget()
         if self._count > 1:
             self._path += float(np.linalg.norm(intended - self._rows[self._count - 2, _INTENDED]))
         for axis, error in zip(self._swings, (seen - intended).tolist(), strict=True):
@@ -189,6 +190,14 @@ class MotionWatch:
             self.doubt = self.doubt or self._slip(jacobian, tip)
         bending = turn_of_a_push(tip) if turns else None
         self.doubt = self.doubt or self._drift(jacobian, bending) or self._swing()
+
+    def _is_pushed(self) -> bool:
+        """Return whether something has just displaced the tip while the reference rested."""
+        tuning, rows = self._tuning, self._since(self._tuning.slip_window)
+        if np.ptp(rows[:, _INTENDED], axis=0).max() > tuning.noise:
+            return False
+        jump = self._since(tuning.push_time)[0, _OFFSET] - rows[-1, _OFFSET]
+        return float(np.linalg.norm(jump)) > tuning.push
 
     def _is_early(self, time: float) -> bool:
         last = self._rows[self._count - 1, _TIME] if self._count else -np.inf
@@ -229,6 +238,11 @@ class MotionWatch:
         tuning = self._tuning
         learned = min(max(2 * self._error, tuning.least_error), tuning.model_error)
         return np.where(self._verified > self._min_motion, learned, tuning.model_error)
+
+    def _forget(self) -> None:
+        """Forget the error of the model: under a load the arm may respond otherwise."""
+        self._verified, self._error = np.zeros(len(self._segments)), 0.0
+        self._unproven.clear()
 
     def _learn(self, time: float, error: float, moved: Array) -> None:
         """Take in an error as a share of the motion, and the motion (segments,) since the last one.

@@ -339,6 +339,10 @@ class MotionTuning:
     model_error: float = 0.35
     least_error: float = 0.15
     proven_after: float = 2.0
+    # displacement of the tip at rest, in m, within a time, in s, after which it has to prove itself
+    # again: a payload may change its response
+    push: float = 8e-4
+    push_time: float = 0.25
     noise: float = 1e-3  # of a measured motion, in m
     scatter: float = 5e-5  # standard deviation of a tracked position in each axis, in m
     # shortest way for a test of the response: in m, and as a share of the arm's length
