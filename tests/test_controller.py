@@ -340,6 +340,23 @@ def test_a_doubted_motion_stops_without_a_swing():
     assert swings[0] < 0.5 * swings[1]
 
 
+def test_a_channel_that_acts_the_wrong_way_stops_at_the_pressure_at_which_it_followed():
+    bench = Bench(HANGING, "full")
+    bench.settled(duration=1.5)
+    place = bench.pose_at(np.array([0.2, 0.9, 0.6, 0.5, 0.3, 0.2]) * BAR)[:3, 3]
+    bench.controller.set_task(bench.task(position=tuple(map(float, place))))
+    bench.run(0.3)
+    channels = bench.controller._arm.channels
+    followed = float(channels.last_followed[1])
+    channels.opposed = np.arange(bench.n) == 1
+    for _ in range(20):
+        bench.command = bench.controller.stop(bench.rig.clock.now())
+        bench.run(bench.period, steer=False)
+        channels.opposed = np.arange(bench.n) == 1
+        channels._followed[2, 1] = followed
+    assert bench.command[1] == pytest.approx(followed, abs=1.0)
+
+
 def test_readings_that_are_not_there():
     bench = Bench(HANGING)
     position = bench.settled(duration=2.0)

@@ -367,7 +367,7 @@ class TipController:
             self._arm.watch.intend(now, tip.pose[:3, 3] + reference.path[n : n + 3])
         moves = np.abs(reference.motion[1, :n]).max() > self._tuning.reference.at_rest
         if self._arm.channels.pace == 0 and moves and self._ways:
-            return self._without_feedback(last)
+            return self._feedforward(self._without_feedback, last)
         course = self.replanner.pursuit.course
         self._led_to = None
         if isinstance(course, PostureCourse):
@@ -394,22 +394,25 @@ class TipController:
         The reference goes back to where it was a while before. On its smooth path the arm does not
         begin to vibrate, as it would if its commands froze. What feedback adds becomes what it was
         then, since it may have followed a sensor that is wrong. A channel that moves against its
-        command keeps it.
+        command gets the pressure at which it last followed: even reversed it goes back to that.
         """
-        opposed, last = self._arm.channels.opposed, self._arm.pressures.command
-        is_doubted = self._arm.watch.doubt is not None or opposed.any()
+        channels, last = self._arm.channels, self._arm.pressures.command
+        is_doubted = self._arm.watch.doubt is not None or channels.opposed.any()
         if not self._vibrates or not is_doubted or not self._ways:
             return None
         goal = self._ways[0][0]
         if self._is_near(goal[: len(last)]):
             return None
         self._reference.advance(goal)
-        return np.where(opposed, last, self._without_feedback(last).pressures)
+        command = np.where(channels.opposed, channels.last_followed, self._without_feedback)
+        return self._feedforward(command, last).pressures
 
-    def _without_feedback(self, last: Array) -> ControlOutput:
-        """Command the reference's pressures, with what feedback added to them a while before."""
+    @property
+    def _without_feedback(self) -> Array:
+        """Commands (n,) of the reference, with what feedback added to them a while before."""
         command = self._reference.command - self._arm.pressures.command_offset
-        return self._feedforward(command + self._ways[0][1], last)
+        added: Array = self._ways[0][1]
+        return command + added
 
     def _awaited(self, plan: Array, now: float) -> Array:
         """Return the reference's goal (n + 6,): the plan, unless channels or tip do not follow.
