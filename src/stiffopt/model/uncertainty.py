@@ -10,6 +10,9 @@ may move the tip in any direction.  Together they follow a multivariate t-distri
 Hysteresis depends on how the arm came to its pressures.  Its mean square, about the equilibrium,
 which is what `tip_pose` returns, is that over ways from rest to two pressures drawn from the
 recorded range, and from there; but at most that of effective minus commanded pressures as recorded.
+Silicone remembers its stretch rather than pressures: the tip is about as far from the equilibrium
+where the arm is soft as where it is stiff.  And what a fit calls hysteresis is partly creep, which
+is over where a pose is held.
 Most of these ways leave most play operators at an end of their width, so that the tip is rarely
 near the equilibrium.  Therefore its squared distance, in deviations of the region, is distributed
 as 3 F(k, v) with k > 3 degrees of freedom, such that its variance is right (F. E. Satterthwaite, An
@@ -41,7 +44,8 @@ Part = Literal["parameters", "hysteresis", "discrepancy", "residual"]
 
 _LEVEL = 0.95  # probability of the reported regions
 _WAYS = 256  # ways to given pressures
-_HELD = 0.9  # share of a fit's hysteresis that held poses show; the rest was creep
+_HELD = 0.85  # share of a fit's hysteresis that held poses show; the rest was creep
+_STIFFEST = 0.25  # least softness, over that at recorded pressures: a dead band has none
 _SINGULAR = 1e-9  # smallest variance of a direction, over that of all
 NORMAL_QUANTILE = 1.959963984540054  # of 97.5 %, for two-sided intervals of 95 %
 
@@ -319,8 +323,7 @@ class Uncertainty:
 
         `per_pressure` are the tip's slopes (N, 3, n) there. Silicone remembers its stretch, so the
         ways leave the tip about as far away at all pressures, though a pressure moves it further
-        where the arm is soft. On the mean over recorded pressures the squares are those of the
-        plays.
+        where the arm is soft. At the median of the recorded pressures they are those of the plays.
         """
         robot, first = self._description, 0
         found = np.zeros((len(pressures), _WAYS, robot.n_pressures))
@@ -340,7 +343,7 @@ class Uncertainty:
             found *= np.minimum(1.0, errors.settled / np.maximum(size, 1e-9))
         if errors is not None:
             softness = self._softness(per_pressure) / self._recorded_softness
-            found *= _HELD / np.sqrt(softness)[:, np.newaxis]
+            found *= _HELD / np.sqrt(np.maximum(softness, _STIFFEST))[:, np.newaxis]
         return found
 
     def _softness(self, per_pressure: Vector) -> Vector:
@@ -348,15 +351,15 @@ class Uncertainty:
         ends = np.cumsum([0, *self._channels])
         squares = [(per_pressure[..., a:b] ** 2).sum(axis=(1, 2)) for a, b in pairwise(ends)]
         found = np.repeat(np.stack(squares, axis=1), self._channels, axis=1)
-        return np.asarray(np.maximum(found, np.finfo(float).tiny))
+        return found
 
     @cached_property
     def _recorded_softness(self) -> Vector:
-        """Harmonic mean (n,) of `_softness` over the recorded pressures."""
+        """Median (n,) of `_softness` over the recorded pressures."""
         errors = self._calibration.errors
         assert errors is not None  # a caller's condition
         _, _, per_pressure = self._slopes.at(np.array(errors.recorded))
-        return np.asarray(1 / np.mean(1 / self._softness(per_pressure), axis=0))
+        return np.asarray(np.median(self._softness(per_pressure), axis=0))
 
     @cached_property
     def _visited(self) -> Vector:
