@@ -44,7 +44,7 @@ Part = Literal["parameters", "hysteresis", "discrepancy", "residual"]
 
 _LEVEL = 0.95  # probability of the reported regions
 _WAYS = 256  # ways to given pressures
-_HELD = 0.85  # share of a fit's hysteresis that held poses show; the rest was creep
+_HELD = 0.9  # share of a fit's hysteresis that held poses show; the rest was creep
 _STIFFEST = 0.25  # least softness, over that at recorded pressures: a dead band has none
 _SINGULAR = 1e-9  # smallest variance of a direction, over that of all
 NORMAL_QUANTILE = 1.959963984540054  # of 97.5 %, for two-sided intervals of 95 %
@@ -350,8 +350,7 @@ class Uncertainty:
         """Return the squared slopes (N, n) of the tip by all pressures of a channel's segment."""
         ends = np.cumsum([0, *self._channels])
         squares = [(per_pressure[..., a:b] ** 2).sum(axis=(1, 2)) for a, b in pairwise(ends)]
-        found = np.repeat(np.stack(squares, axis=1), self._channels, axis=1)
-        return found
+        return np.repeat(np.stack(squares, axis=1), self._channels, axis=1)
 
     @cached_property
     def _recorded_softness(self) -> Vector:
