@@ -20,12 +20,13 @@ from conftest import use_compiler
 from stiffopt.cli.main import main
 from stiffopt.cli.solve_report import block
 from stiffopt.cli.solved_task import SolvedTask, with_uncertainty
-from stiffopt.errors import DerivativeError, InputError
+from stiffopt.errors import DerivativeError, InputError, OutOfTimeError
 from stiffopt.model.calibration import Calibration
 from stiffopt.optimise import braced
 from stiffopt.optimise.brace_uncertainty import BraceUncertainty
 from stiffopt.optimise.leaning import MARGIN_ON, BracedProblem
 from stiffopt.optimise.local import LocalResult
+from stiffopt.optimise.problem import PressureProblem
 from stiffopt.optimise.search import Search
 from stiffopt.optimise.settings import BRACE, Effort
 from stiffopt.paths.leaning import way_into_contact
@@ -514,3 +515,35 @@ def test_a_stiffer_posture_that_is_left_out_is_told(robot, task, solution, monke
 
 def _twice(found: Search) -> Search:
     return replace(found, results=(found.results[0], *found.results))
+
+
+def test_a_guess_outside_the_limits_is_taken_to_them(robot, task, solution):
+    found = stiffopt.solve_pressure(robot, task, guess=np.full(6, 4e5))
+    assert found.found
+    assert (found.pressures <= 1.5e5).all()
+
+
+def test_a_search_that_is_stopped_leaves_the_free_answer(robot, task, monkeypatch):
+    free = stiffopt.solve_pressure(robot, task.unbraced)
+
+    def late(*_: Any) -> Any:
+        raise OutOfTimeError("no answer within 1 s")
+
+    def search(*_: Any) -> Any:
+        monkeypatch.setattr(PressureProblem, "point", late)  # nothing can be explained any more
+        return late()
+
+    monkeypatch.setattr(braced, "braced_answers", search)
+    found = braced.lean(BracedProblem(robot, task), late, free, None)
+    assert found.found
+    assert found.stiffness == free.stiffness
+    assert "the search for where to lean was ended: no answer within 1 s" in found.message
+
+
+def test_an_optimum_that_misses_by_little_from_rest_gets_more_to_spare(robot, task):
+    problem = BracedProblem(robot, task)
+    tightened = problem.tightened()
+    (position, *_), (own, *_) = problem.constraints, tightened.constraints
+    assert own.radius == pytest.approx(0.995e-4)
+    assert own.radius < position.radius < 1e-4
+    assert tightened.spare > problem.spare == BRACE.spare

@@ -9,7 +9,7 @@ the stiffest of them, and their ends are judged at the equilibrium that is reach
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from copy import copy
 from dataclasses import replace
 from itertools import islice
@@ -31,7 +31,7 @@ from stiffopt.optimise.local import LocalResult, descend
 from stiffopt.optimise.prices import prices_at
 from stiffopt.optimise.problem import ProgramPoint
 from stiffopt.optimise.program import Constraint
-from stiffopt.optimise.reach import attempt
+from stiffopt.optimise.reach import attempt, within
 from stiffopt.optimise.reach_in_contact import reach_in_contact
 from stiffopt.optimise.samples import SampleTable, distances
 from stiffopt.optimise.search import Search, search, unlike_first
@@ -47,7 +47,8 @@ _LEAST_YIELDING = 1e-9  # m/N, of a contact, so that one at the base, which cann
 def candidates(problem: BracedProblem, table: SampleTable) -> Iterator[Vector]:
     """Yield variables (n,) at which the arm would lean on an object, the most promising first.
 
-    Objects take turns; starts unlike each other come before the rest.
+    Objects take turns, and promising starts alternate with arbitrary ones, since the estimate is
+    poor for a deep contact. Starts unlike each other come before the rest.
     """
     robot, terms = problem.robot, problem.program.terms
     at = np.linspace(0, robot.length, BRACE.stations + 1)[1:]
@@ -59,7 +60,7 @@ def candidates(problem: BracedProblem, table: SampleTable) -> Iterator[Vector]:
         gaps = seen.values.reshape(radii.shape) - radii
         gaps[:, at < item.begin] = np.inf
         station, deepest = gaps.argmin(axis=1), gaps.min(axis=1)
-        entering = np.flatnonzero(deepest < 0)
+        arbitrary = entering = np.flatnonzero(deepest < 0)
         rough = table.distances(terms, robot.length)[entering]
         entering = entering[np.argsort(rough, kind="stable")[: BRACE.screened]]
         normals = seen.normals.reshape(*radii.shape, 3)[entering, station[entering]]
@@ -70,8 +71,10 @@ def candidates(problem: BracedProblem, table: SampleTable) -> Iterator[Vector]:
         )
         poses = _displaced(table.poses[entering], moved)
         ranked = entering[np.argsort(distances(poses, terms, robot.length), kind="stable")]
-        x = table.pressures[ranked] / problem.unit
-        rows.append([int(ranked[i]) for i in unlike_first(problem, x[: 8 * BRACE.effort.screened])])
+        pairs = np.stack([ranked, arbitrary[: len(ranked)]], axis=1).ravel()
+        mixed = np.array(list(dict.fromkeys(pairs.tolist())))[: 8 * BRACE.effort.screened]
+        x = table.pressures[mixed] / problem.unit
+        rows.append([int(mixed[i]) for i in unlike_first(problem, x)])
     for turn in range(max(map(len, rows), default=0)):
         for own_rows in rows:
             if turn < len(own_rows):
@@ -154,13 +157,16 @@ def _brought(problem: BracedProblem, x: Vector) -> list[tuple[float, BracedPoint
     return [] if full is None else [(problem.objective.value(full), full)]
 
 
-def braced_answers(problem: BracedProblem, table: SampleTable, guess: Vector | None) -> Search:
+def braced_answers(
+    problem: BracedProblem, samples: Callable[[], SampleTable], guess: Vector | None
+) -> Search:
     """Return local optima in contact, best first; only those near a guess, (n,) in Pa, if any."""
     if guess is not None:
-        nearby = search(problem, [guess / problem.unit], Effort(1, 1, 1), places=_places)
+        x = within(problem.lower, guess / problem.unit, problem.upper)
+        nearby = search(problem, [x], Effort(1, 1, 1), places=_places)
         if nearby.results:
             return nearby
-    starts = islice(candidates(problem, table), BRACE.rounds * BRACE.effort.screened)
+    starts = islice(candidates(problem, samples()), BRACE.rounds * BRACE.effort.screened)
     return search(problem, starts, BRACE.effort, places=_places, best_found=BRACE.best_found)
 
 
@@ -180,9 +186,10 @@ def reached_again(problem: BracedProblem, judged: Braced) -> Braced | None:
     """Bring an optimum to the target from its equilibrium from rest, and descend again.
 
     A descent follows one equilibrium from step to step.  From rest the arm may come to another one
-    close by, which misses the target by little.  Returns None if that is not remedied.
+    close by, which misses the target by little.  Then there is more to spare.  Returns None if that
+    is not remedied.
     """
-    problem.restart()
+    problem = problem.tightened()
     problem.here = judged.equilibrium
     point = reach_in_contact(problem, judged.result.point.x)
     if point is None or not point.reached:
@@ -214,19 +221,24 @@ def least_maximised(task: Task, stiffnesses: tuple[float, ...]) -> float:
 
 
 def lean(
-    problem: BracedProblem, table: SampleTable, free: PressureSolution, guess: Vector | None
+    problem: BracedProblem,
+    samples: Callable[[], SampleTable],
+    free: PressureSolution,
+    guess: Vector | None,
 ) -> PressureSolution:
     """Return the stiffer of the best answer that leans on objects and the free one.
 
     Parameters
     ----------
-    problem, table : of the task, with its samples.
+    problem : of the task.
+    samples : returns its samples; called only if the guess does not suffice.
     free : answer that keeps clear of all objects.
     guess : (n,) in Pa, near the braced answer, or None.
     """
     task, why = problem.task, ""
+    _ = free.message  # computed when first read, which must not be when the time has run out
     try:
-        found = braced_answers(problem, table, guess)
+        found = braced_answers(problem, samples, guess)
     except StoppedError as error:
         if not free.found:
             return replace(free, task=task)

@@ -11,6 +11,7 @@ of a calibration. Derivatives are differences of equilibria with the same contac
 from __future__ import annotations
 
 from collections.abc import Iterator
+from copy import copy
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any, NamedTuple, cast
@@ -144,6 +145,7 @@ class BracedProblem(PressureProblem):
     scene : the objects that the arm may lean on.
     here : equilibrium from which the next one is sought, or None: from rest.
     only_target : whether the demands on contacts are ignored.
+    spare : share of tolerances, forces and margins that is not used.
     leant : whether a posture that leans was found at the target, its contacts not yet judged.
     missed : points at the target at which contacts do not meet their demands.
     """
@@ -155,6 +157,7 @@ class BracedProblem(PressureProblem):
         self.scene: Scene = leant_on(task.scene, task.brace)
         self.here: ContactEquilibrium | None = None
         self.only_target = self.leant = False
+        self.spare = BRACE.spare
         self.missed: list[ProgramPoint] = []
         super().__init__(robot, task)
 
@@ -167,7 +170,7 @@ class BracedProblem(PressureProblem):
         self._kept: tuple[bytes, ContactEquilibrium] | None = None
 
     def _all_constraints(self) -> tuple[Constraint, ...]:
-        inside = 1 - BRACE.spare  # from rest, the integration may take other steps
+        inside = 1 - self.spare  # from rest, the integration may take other steps
         own = [c._replace(radius=inside * c.radius) for c in super()._all_constraints()]
         for row, name in enumerate(self._row_names, start=own[-1].end if own else 0):
             own.append(Constraint(name, row, row + 1, BRACE.force, BRACE.scale, one_sided=True))
@@ -195,6 +198,14 @@ class BracedProblem(PressureProblem):
         return list(goal.maximise)
 
     # -- evaluation -------------------------------------------------------------------------
+
+    def tightened(self) -> BracedProblem:
+        """Return the same program with more to spare."""
+        other = copy(self)
+        other.spare = BRACE.more_spare
+        other._set_constraints()
+        other.restart()
+        return other
 
     def restart(self) -> None:
         """Find the next equilibrium from rest."""
@@ -276,7 +287,7 @@ class BracedProblem(PressureProblem):
     ) -> Quantities:
         C = eq.compliance(self.brace.contacts) if full else np.eye(6)
         residuals, values = self.judged_by(eq, C)
-        margin, forces = (1 + BRACE.spare) * self.brace.margin, eq.normal_forces
+        margin, forces = (1 + self.spare) * self.brace.margin, eq.normal_forces
         pushed = [eq.shifted(push=margin * push).normal_forces - known.forces for push in pushes]
         slips = foretold = np.zeros(0)
         if pushes:
@@ -325,10 +336,11 @@ class BracedProblem(PressureProblem):
                 rows += [0.0] * (1 + len(seen.pushed) + len(seen.slips))
                 continue
             limit = _max_force(item)
-            force = float(seen.forces[own].max()) - (1 - BRACE.spare) * (limit or np.inf)
+            force = max(float(seen.forces[each].sum()) for each in self._limited(eq, own))
+            force -= (1 - self.spare) * (limit or np.inf)
             rows.append(BRACE.force + force if limit else 0.0)
             rows += (BRACE.force - seen.pushed[:, own].min(axis=1)).tolist()
-            margin = (1 + BRACE.spare) * self.brace.margin
+            margin = (1 + self.spare) * self.brace.margin
             rows += (BRACE.force + margin - seen.slips).tolist()
         return np.array(rows)
 
@@ -350,8 +362,8 @@ class BracedProblem(PressureProblem):
             if not own:
                 rows += [none] * (1 + len(base.pushed) + len(base.slips))
                 continue
-            first = own[int(base.forces[own].argmax())]
-            rows.append(slopes.forces[first] if _max_force(item) else none)
+            most = max(self._limited(eq, own), key=lambda each: float(base.forces[each].sum()))
+            rows.append(slopes.forces[most].sum(axis=0) if _max_force(item) else none)
             for at_push, slope in zip(base.pushed, slopes.pushed, strict=True):
                 rows.append(-slope[own[int(at_push[own].argmin())]])
             rows += list(-slopes.slips)
@@ -361,6 +373,11 @@ class BracedProblem(PressureProblem):
     def _of(eq: ContactEquilibrium, name: str) -> list[int]:
         """Return the indices of the contacts on an object."""
         return [j for j, each in enumerate(eq.contacts) if each.object == name]
+
+    @staticmethod
+    def _limited(eq: ContactEquilibrium, own: list[int]) -> list[list[int]]:
+        """Return the groups of an object's contacts to which its greatest force applies."""
+        return [each for each, _ in eq.pressed() if each[0] in own]
 
     def _nearest(self, eq: ContactEquilibrium, *, quickly: bool) -> list[Nearest]:
         """Return the body's nearest point to each object that it keeps clear of, by rows."""

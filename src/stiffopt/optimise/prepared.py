@@ -102,12 +102,10 @@ class Prepared:
             return None
         return table if len(table.pressures) else None
 
-    def many_samples(self, arm: LoadedArm) -> SampleTable:
-        """Sample an arm under load, in machine code, as often as one without loads."""
-        return _recent(
-            self.robot, "many samples", self._key,
-            lambda: SampleTable(self.robot, self.lower, self.upper, self._seed, arm, SAMPLES.free),
-        )  # fmt: skip
+    def samples_to_lean(self, arm: LoadedArm) -> SampleTable:
+        """Sample an arm under load more densely, in machine code, to find where it could lean."""
+        count = SAMPLES.leaning
+        return SampleTable(self.robot, self.lower, self.upper, self._seed, arm, count)
 
     @cached_property
     def samples(self) -> SampleTable:

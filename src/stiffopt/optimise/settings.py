@@ -196,7 +196,8 @@ class BraceSettings:
     scale : typical violation of a force far from the target, in N.
     step : step of a pressure, as a share of its range, in differences of equilibria.
     precision : decrease of the objective that no longer matters, resolved by these differences.
-    spare : share of tolerances, forces and margins that is not used.
+    spare, more_spare : share of tolerances, forces and margins that is not used; the same for an
+        optimum that misses them by little when it is reached from rest.
     stations : stations along the body at which samples are tested for contact.
     screened : samples whose contact is estimated.
     effort : starts of a round that are brought to the target in contact, descents in a row that
@@ -215,6 +216,7 @@ class BraceSettings:
     step: float = 3e-4
     precision: float = 1e-4
     spare: float = 1e-3
+    more_spare: float = 5e-3
     stations: int = 14
     screened: int = 1024
     effort: Effort = field(default=Effort(32, 8, 24))
@@ -236,12 +238,14 @@ class SampleSettings:
     free : number for an arm without loads.
     loaded : number under gravity or a load, where equilibria take a thousand times longer.
     compiled : the same in machine code; each load has its own samples.
+    leaning : the same to find where to lean.
     hopeless : if none of the first samples up to this number has an equilibrium, the arm has none.
     """
 
     free: int = 4096
     loaded: int = 128
     compiled: int = 64
+    leaning: int = 1024
     hopeless: int = 16
 
 

@@ -34,6 +34,7 @@ from stiffopt.optimise.prepared import prepared
 from stiffopt.optimise.problem import PressureProblem
 from stiffopt.optimise.program import Program
 from stiffopt.optimise.reach import can_reach
+from stiffopt.optimise.samples import SampleTable
 from stiffopt.optimise.search import starts
 from stiffopt.optimise.solution import Judgement, PressureSolution, are_within
 from stiffopt.optimise.target import Target
@@ -327,9 +328,11 @@ class PressureSolver:
             return replace(free, task=task)
         fast = self._search.fast(plain, None)
         table = self._prepared.samples if fast is None else fast[0].table
-        if table.arm is not None:  # few suffice to find a free answer, but not where to lean
-            table = self._prepared.many_samples(table.arm)
-        return lean(BracedProblem(self.robot, task), table, free, guess)
+
+        def samples() -> SampleTable:
+            return table if table.arm is None else self._prepared.samples_to_lean(table.arm)
+
+        return lean(BracedProblem(self.robot, task), samples, free, guess)
 
     def _otherwise(self, task: Task, guess: Vector | None) -> PressureSolution:
         """Answer a task for which the compiled search found no solution."""
