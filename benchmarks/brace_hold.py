@@ -3,22 +3,34 @@
     python benchmarks/brace_hold.py --arms 1 2 --keep out/calibrated --out out/brace_hold.json
 
 Arms, calibrated files and tasks are those of `brace_rig.py`, with other seeds for the tasks. The
-controller gets the calibrated file; it goes into contact, holds for 20 s, and a push at the tip
-then grows until the plant loses contact. The push is along the direction in which it should lift
-off first, and grows to twice the foretold push in a second, or as `--grows` says. The arm then lets
-go by itself. Every second arm that leans lets go without a push, by a task at rest.
+controller gets the calibrated file; it goes into contact and holds for 20 s. From there, each in a
+copy of the process:
 
-Metrics: the estimated contact force (`brace_force`) over that of the plant after the hold; what
-the contacts were pressed with at most; how late a lost contact is reported, and how late or early
-the warning that it may be lost (`brace-weak`); whether anything was reported without a loss; and
-whether the arm ends at rest, clear of the object.
+- Pushes at the tip grow from zero until a loss is reported, by `--grows` of the foretold loss in a
+  second, along the direction in which the contact should lift off first. With `--slips`, along or
+  against the direction whose stiffness counts, in which it should slip first, and `contacts` are
+  `sticking`.
+- A push in the same direction stays at 0.7 of the push that loses the contact, for 20 s.
+
+Once a loss is reported the arm lets go by itself; otherwise a task at rest makes it.
+
+The contact is lost by a lift-off where the plant's force becomes zero; by a slip where the point of
+the body that touches has slid by 0.1 mm since the push began. If the loss is reported before, a
+copy of the plant that does not let go tells when it would have come: the delay is then negative.
+
+Metrics: this delay; that of the warning that the contact may be lost (`brace-weak`,
+`brace-slips`); losses reported without one, during the hold or the push at 0.7; the estimated
+contact force (`brace_force`) against that of the plant; what the contacts were pressed with at
+most; and whether the arm ends at rest, clear of the object.
 """
 
 from __future__ import annotations
 
 import argparse
+import copy
 import json
-import time
+import multiprocessing
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -41,6 +53,44 @@ HOLD, APPROACH, RELEASE = 20.0, 60.0, 60.0  # s
 CREEPS = 3.0  # s at rest, in which silicone that was bent goes back
 FADES = 1.0  # s, of the push, when the loss is reported
 LONGEST = 3.0  # times the foretold loss, at most
+SLID = 1e-4  # m, from which a contact has slipped
+KEPT, RAMP = 0.7, 3.0  # of the push that loses the contact, and time in which it is reached, in s
+TICK = 0.01  # s
+FORK = multiprocessing.get_context("fork")
+
+
+class Slide:
+    """How far the body has slid on an object, at one contact with a normal (3,)."""
+
+    def __init__(self, plant: Any, normal: Any) -> None:
+        self._normal = normal
+        self._radius = plant.robot.segments[-1].outer_radius
+        self._length = sum(each.length for each in plant.robot.segments)
+        self._touched: Any = None
+        self._slid = np.zeros(3)
+
+    def update(self, plant: Any) -> float:
+        """Return the distance so far, in m."""
+        nodes = plant.poses()
+        if self._touched is not None:
+            node, share, lever, before = self._touched
+            moved = self._skin(nodes, node, share, lever) - before
+            self._slid = self._slid + moved - self._normal * (self._normal @ moved)
+        forces = plant.object_forces()
+        self._touched = None
+        if forces:
+            chords = np.linalg.norm(np.diff(nodes[:, :3, 3], axis=0), axis=1)
+            along = np.concatenate([[0.0], np.cumsum(chords)]) / chords.sum()
+            at = forces[0].at / self._length
+            node = int(np.clip(np.searchsorted(along, at) - 1, 0, len(chords) - 1))
+            share = (at - along[node]) / (along[node + 1] - along[node])
+            lever = nodes[node, :3, :3].T @ (-self._radius * self._normal)
+            self._touched = node, share, lever, self._skin(nodes, node, share, lever)
+        return float(np.linalg.norm(self._slid))
+
+    def _skin(self, nodes: Any, node: int, share: float, lever: Any) -> Any:
+        centre = (1 - share) * nodes[node, :3, 3] + share * nodes[node + 1, :3, 3]
+        return centre + nodes[node, :3, :3] @ lever
 
 
 class Loop:
@@ -107,73 +157,145 @@ class Loop:
 
 
 def held(
-    case: Any, believed: Any, seed: list[int], *, pushed: bool, grows: float
-) -> dict[str, Any] | None:
-    """What one task gives; None if its answer does not lean, or for little."""
+    case: Any, believed: Any, seed: list[int], grows: Sequence[float], *, slips: bool
+) -> list[dict[str, Any]]:
+    """What the pushes of a task give; none if its answer does not lean, or for little."""
     robot = stiffopt.Manipulator(believed)
     task = draw_task(robot, seed)
     found = stiffopt.solve_pressure(robot, task)
     if not found.contacts or found.stiffness < WORTH * (found.stiffness_free or np.inf):
-        return None
+        return []
+    contacts = "sticking" if slips else "sliding"
+    losses = [each for each in found.preloads if each.contacts == contacts]
+    first = min(losses, key=lambda each: each.loss.force)
+    if first.loss.how != ("slips" if slips else "lifts off"):
+        return []
+    if slips:
+        assert task.brace is not None
+        sticks = task.brace.model_copy(update={"contacts": contacts})
+        task = task.model_copy(update={"brace": sticks})
     loop = Loop(case, believed, task, found)
     loop.go(1.0)
     row: dict[str, Any] = {"seed": seed, "promised": float(np.linalg.norm(found.contacts[0].force))}
     try:
         loop.controller.set_task(task)
     except stiffopt.StiffoptError as reason:
-        return row | {"refused": str(reason)}
+        return [row | {"refused": str(reason)}]
     row["approach"] = loop.go(APPROACH, lambda: loop.status.brace == "held")
     if loop.status.brace != "held":
-        return row | {"refused": loop.status.brace, "told": [each[1:] for each in loop.told]}
+        return [row | {"refused": loop.status.brace, "told": [each[1:] for each in loop.told]}]
     on_way, loop.most = loop.most, 0.0
-    loop.go(HOLD)
+    loop.go(HOLD, lambda: loop.status.brace != "held")
     row |= {
         "estimated": loop.status.brace_force, "force": loop.force,
-        "error": loop.status.position_error, "false": loop.told_since(0.0, "brace-lost"),
-        "most": loop.most, "most_on_way": on_way, "max": found.contacts[0].max_force,
+        "error": loop.status.position_error, "most": loop.most, "most_on_way": on_way,
+        "max": found.contacts[0].max_force, "foretold": first.loss.force,
     }  # fmt: skip
-    plant = loop.rig.world.plant
-    lifting = [each for each in found.preloads if each.contacts == "sliding"]
-    weakest = min(lifting, key=lambda each: each.loss.force)
-    if pushed and loop.status.brace == "held" and np.isfinite(weakest.loss.force):
-        rate = grows * weakest.loss.force
-        begin, longest = loop.rig.clock.now(), LONGEST * weakest.loss.force / rate
-        lost_after = loop.go(
-            longest, lambda: loop.force == 0.0 or loop.status.brace == "releasing",
-            lambda after: rate * after * weakest.direction,
-        )  # fmt: skip
-        lost = loop.rig.clock.now()
-        was_lost, push = loop.force == 0.0, rate * lost_after
-        if loop.status.brace != "releasing":
-            loop.go(
-                5.0, lambda: loop.status.brace == "releasing",
-                lambda after: (push + rate * after) * weakest.direction,
-            )  # fmt: skip
-        late = loop.rig.clock.now() - lost if was_lost else 0.0
-        row |= {
-            "foretold": weakest.loss.force, "push": push, "contact_lost": was_lost, "late": late,
-            "slips": loop.told_since(begin, "brace-slips"),
-            "warned": _after(loop.told_since(begin, "brace-weak"), lost - begin),
-            "reported": loop.status.brace == "releasing",
-            "told": [each[1:] for each in loop.told][-3:],
+    row["false"] = loop.status.brace != "held"
+    normal, rest = found.contacts[0].normal, robot.tip_pose(np.zeros(6))[:3, 3]
+
+    def pushed(work: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+        own = work() if loop.status.brace == "held" else {}
+        if loop.status.brace == "held":
+            target = stiffopt.Target(position=tuple(rest))
+            loop.controller.set_task(stiffopt.Task(robot=task.robot, target=target))
+        before = loop.most = loop.force
+        loop.go(RELEASE, lambda: loop.status.brace not in ("held", "releasing"))
+        loop.go(CREEPS)
+        return row | own | {
+            "ends": loop.status.brace, "left": loop.force, "most_in_release": loop.most - before,
+            "told": [each[1:] for each in loop.told][-4:],
         }  # fmt: skip
-        most = rate * (loop.rig.clock.now() - begin) * weakest.direction
-        loop.go(FADES, push=lambda after: max(0.0, 1 - after / FADES) * most)
-        plant.set_load(None)
-    if loop.status.brace == "held":
-        rest = stiffopt.Target(position=tuple(robot.tip_pose(np.zeros(6))[:3, 3]))
-        loop.controller.set_task(stiffopt.Task(robot=task.robot, target=rest))
-    before = loop.most = loop.force
-    row["release"] = loop.go(RELEASE, lambda: loop.status.brace not in ("held", "releasing"))
-    loop.go(CREEPS)
-    row |= {"ends": loop.status.brace, "left": loop.force, "most_in_release": loop.most - before}
+
+    works: list[Callable[[], dict[str, Any]]] = [
+        lambda each=each: push_off(loop, first, normal, grows=each, slips=slips)  # type: ignore[misc]
+        for each in grows
+    ]
+    works.append(lambda: keep_pushing(loop, first, normal, slips=slips))
+    rows = [in_copy(lambda each=each: pushed(each)) for each in works]  # type: ignore[misc]
     loop.controller.close()
+    return rows
+
+
+def in_copy(work: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    """What some work returns in a copy of this process."""
+    ours, theirs = FORK.Pipe()
+    process = FORK.Process(target=lambda: theirs.send(work()))
+    process.start()
+    theirs.close()
+    found: dict[str, Any] = ours.recv()
+    process.join()
+    return found
+
+
+def push_off(loop: Loop, first: Any, normal: Any, *, grows: float, slips: bool) -> dict[str, Any]:
+    """What a push gives that grows until a loss is reported."""
+    rate = grows * first.loss.force * np.array(first.direction)
+    longest, plant, begin = LONGEST / grows, loop.rig.world.plant, loop.rig.clock.now()
+    slide, lost, errors = Slide(plant, normal), [], []
+
+    def is_told() -> bool:
+        slid = slide.update(plant)
+        if not lost:
+            errors.append(loop.status.brace_force - loop.force)
+            if loop.force == 0.0 or (slips and slid > SLID):
+                lost.append(loop.rig.clock.now() - begin)
+        return bool(loop.status.brace != "held")
+
+    told = loop.go(longest, is_told, lambda after: rate * after)
+    is_reported = loop.status.brace != "held"
+    if not lost:
+        copied, left = copy.deepcopy((plant, slide)), loop.rig.supply.read().pressures
+        after = loss_of(*copied, left, lambda after: rate * (told + after), longest, slips=slips)
+        if after is not None:
+            lost.append(told + after)
+    warned = loop.told_since(begin, "brace-slips" if slips else "brace-weak")
+    row = {
+        "grows": grows, "reported": is_reported, "lost": bool(lost),
+        "error_force": float(np.nanmean(np.abs(errors))),
+        "push": float(np.linalg.norm(rate)) * (lost[0] if lost else longest),
+    }  # fmt: skip
+    if lost and is_reported:
+        row |= {
+            "late": told - lost[0],
+            "at_share": told / lost[0],
+            "warned": None if warned is None else warned - lost[0],
+        }
+    loop.go(FADES, push=lambda after: max(0.0, 1 - after / FADES) * told * rate)
+    plant.set_load(None)
     return row
 
 
-def _after(told: float | None, lost: float) -> float | None:
-    """How long after a loss something was reported, in s; negative if before."""
-    return None if told is None else told - lost
+def keep_pushing(loop: Loop, first: Any, normal: Any, *, slips: bool) -> dict[str, Any]:
+    """What a push gives that stays below the loss."""
+    plant, pressures = loop.rig.world.plant, loop.rig.supply.read().pressures
+    rate = first.loss.force * np.array(first.direction) / RAMP
+    copied = copy.deepcopy((plant, Slide(plant, normal)))
+    after = loss_of(*copied, pressures, lambda after: rate * after, LONGEST * RAMP, slips=slips)
+    if after is None:
+        return {}
+    most = KEPT * after * rate
+    loop.go(
+        RAMP + HOLD, lambda: loop.status.brace != "held",
+        lambda after: min(after / RAMP, 1.0) * most,
+    )  # fmt: skip
+    kept = loop.status.brace == "held"
+    row = {"kept": kept, "estimated_pushed": loop.status.brace_force, "force_pushed": loop.force}
+    loop.go(FADES, push=lambda after: max(0.0, 1 - after / FADES) * most)
+    plant.set_load(None)
+    return row
+
+
+def loss_of(
+    plant: Any, slide: Slide, pressures: Any, push: Any, longest: float, *, slips: bool
+) -> float | None:
+    """When a push loses the contact of a plant whose pressures stay, in s; None if it does not."""
+    for tick in range(1, round(longest / TICK)):
+        plant.set_load(PlantLoad(force=tuple(push(tick * TICK))))
+        plant.advance(TICK, pressures)
+        if not plant.object_forces() or (slide.update(plant) > SLID and slips):
+            return tick * TICK
+    return None
 
 
 def main() -> None:
@@ -183,7 +305,11 @@ def main() -> None:
     parser.add_argument("--tasks", type=int, default=4)
     parser.add_argument("--keep", type=Path, default=Path("out/calibrated"))
     parser.add_argument("--out", type=Path)
-    parser.add_argument("--grows", type=float, default=2.0, help="share of the loss per second")
+    parser.add_argument(
+        "--grows", type=float, nargs="+", default=[1.0, 0.2, 0.1],
+        help="shares of the foretold loss per second",
+    )  # fmt: skip
+    parser.add_argument("--slips", action="store_true", help="contacts that are to stick")
     given = parser.parse_args()
     rows: list[dict[str, Any]] = []
     for arm in given.arms:
@@ -191,34 +317,48 @@ def main() -> None:
         believed = calibrated_file(case, given.keep)
         count = number = 0
         while count < given.tasks and number < 8 * given.tasks:
-            began, number = time.process_time(), number + 1
-            row = held(case, believed, [arm, number, 25], pushed=count % 2 == 0, grows=given.grows)
-            if row is None:
-                continue
-            count += 1
-            rows.append(row | {"arm": arm})
-            print(json.dumps(rows[-1]), f"{time.process_time() - began:.0f} s", flush=True)
+            number += 1
+            new = held(case, believed, [arm, number, 25], given.grows, slips=given.slips)
+            count += bool(new)
+            rows += [row | {"arm": arm} for row in new]
+            for row in new:
+                print(json.dumps(row), flush=True)
             if given.out:
                 given.out.write_text(json.dumps(rows, indent=1))
+    report(rows)
+
+
+def report(rows: list[dict[str, Any]]) -> None:
+    """Print the tables."""
     good = [row for row in rows if "force" in row]
     head = ["arm", "force promised, estimated, met, mN", "push foretold, lost at, mN", "late, s"]
     lines = [
         [
             f"{row['arm']}",
             ", ".join(f"{1e3 * row[key]:.0f}" for key in ("promised", "estimated", "force")),
-            f"{1e3 * row['foretold']:.0f}, {1e3 * row['push']:.0f}" if "push" in row else "",
-            f"{row['late']:.2f}" if "push" in row else "",
+            f"{1e3 * row['foretold']:.0f}, {1e3 * row['push']:.0f}",
+            f"{row['late']:.2f}" if "late" in row else "not reported",
         ]
         for row in good
+        if row.get("lost")
     ]
     print("\n".join(table(head, lines)))
-    pushed = [row for row in good if row.get("contact_lost")]
-    print(
-        f"reported within 0.3 s: {sum(row['late'] < 0.3 + 1e-6 for row in pushed)} of {len(pushed)}"
-    )
-    warned = sum(row["warned"] is not None and row["warned"] <= 0.3 for row in pushed)
-    print(f"reported or warned of by 0.3 s after: {warned} of {len(pushed)}")
-    print(f"reported without a loss: {sum(row['false'] is not None for row in good)}")
+    head = ["grows, 1/s", "pushes", "median, s", "first", "last", "by 0.3 s after", "within 0.3 s",
+            "not reported"]  # fmt: skip
+    lines = []
+    for grows in sorted({row["grows"] for row in good if "grows" in row}, reverse=True):
+        lost = [row for row in good if row.get("grows") == grows and row["lost"]]
+        late = np.array([row["late"] for row in lost if "late" in row])
+        if not len(late):
+            continue
+        cells = [f"{each:.2f}" for each in (np.median(late), late.min(), late.max())]
+        by, within = (late <= 0.3 + 1e-6).sum(), (abs(late) <= 0.3 + 1e-6).sum()
+        missing = len(lost) - len(late)
+        lines.append([f"{grows}", f"{len(lost)}", *cells, f"{by}", f"{within}", f"{missing}"])
+    print("\n".join(table(head, lines)))
+    kept = [row["kept"] for row in good if "kept" in row]
+    print(f"lost while nothing pushed: {sum(row['false'] for row in good)} of {len(good)}")
+    print(f"pushed with {KEPT} of the loss for {HOLD:.0f} s, and held: {sum(kept)} of {len(kept)}")
     print(f"let go, clear: {sum(row['left'] == 0 for row in good)} of {len(good)}")
 
 

@@ -138,6 +138,9 @@ class IntegralFeedback:
         at_limit = (wanted <= self._limits.low) | (wanted >= self._limits.high)
         return ControlOutput(self._commanded.copy(), valid=True, saturated=at_limit)
 
+    def stop(self, now: float) -> None:
+        """Nothing is doubted."""
+
     def status(self, now: float) -> ControllerStatus:
         """It knows of the tip what the model says."""
         return ControllerStatus(

@@ -4,7 +4,8 @@ It does not import stiffopt. From an equilibrium without tangential forces, a pu
 in steps. During a step the point of the body at each contact is held along the surface by a stiff
 spring. After it, the spring's force is carried on, and the point that is then at the contact is
 held: so the body rolls without slipping, by any distance. A contact slips where its tangential
-force reaches the coefficient of friction times the normal force.
+force reaches the coefficient of friction times the normal force. A contact that the push adds may
+slide without being lost: from there on it is taken as frictionless, as the model does.
 """
 
 from __future__ import annotations
@@ -45,11 +46,12 @@ def slip(
     Each object must be touched at one station at most.
     """
     known, begun, start, push = numbers(objects), state.rod.force, state.tip, 0.0
+    friction = np.full(len(state.forces), friction)
     carried, step, left = np.zeros((3, 3)), _FIRST_STEP, friction * state.forces
-    longest = _FIRST_STEP
+    longest, is_new = _FIRST_STEP, state.forces <= _LEAST_FORCE
     while push < limit:
         step = min(step, limit - push)
-        rod = _anchored(state, known, carried)
+        rod = _anchored(state, known, carried, friction > 0)
         rod = rod._replace(force=begun + (push + step) * np.asarray(direction))
         y = minimum(state.strains, rod, known, MANY)
         after = read(y, rod, known, len(objects))
@@ -57,10 +59,14 @@ def slip(
         if begins and step > _NEW_CONTACT * (push + step):
             step /= 4
             continue
-        state, forces = after, _held_forces(rod, y)
-        count = len(objects)
+        forces, count = _held_forces(rod, y), len(objects)
         size = np.linalg.norm(forces[:count], axis=1)
-        now = friction * state.forces - size
+        now = friction * after.forces - size
+        slides = is_new & (after.forces > _LEAST_FORCE) & (now < 0)
+        if slides.any():
+            friction[slides], left[slides], carried[:count][slides] = 0.0, 0.0, 0.0
+            continue
+        state = after
         lost = int(np.argmin(np.where(left > 0, now, np.inf)))
         if now[lost] <= 0:
             share = left[lost] / (left[lost] - now[lost])
@@ -86,15 +92,15 @@ def _places(rod: Any, y: Array) -> tuple[Array, Array, Array]:
     return np.array(axes), np.array(places), strains
 
 
-def _anchored(state: Pressed, objects: Array, carried: Array) -> Any:
-    """The rod with an anchor at each contact, which carries forces (3, 3) already."""
+def _anchored(state: Pressed, objects: Array, carried: Array, sticks: Array) -> Any:
+    """The rod with an anchor at each contact that sticks, which carries forces (3, 3) already."""
     rod = state.rod
     axes, places, strains = _places(rod, state.strains)
     ends = np.cumsum(rod.h + rod.connector) - rod.connector
     hold = np.zeros((len(rod.h), 3))
     share, (lever, at, normal, force) = np.zeros(3), np.zeros((4, 3, 3))
     for j, s in enumerate(state.at):
-        if not state.forces[j] > _LEAST_FORCE:
+        if not (sticks[j] and state.forces[j] > _LEAST_FORCE):
             continue
         e = int(min(np.searchsorted(ends, s - 1e-12), len(ends) - 1))
         share[j] = np.clip((s - ends[e]) / rod.h[e] + 1, 0, 1)

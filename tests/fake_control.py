@@ -38,6 +38,8 @@ class FakeController:
         self.closed = False
         self.override: Callable[[Array], Array] | None = None
         """Makes of the next pressures (n,) what is handed out instead."""
+        self.stopping: Callable[[float], Array | None] = lambda now: None
+        """Returns the pressures (n,) with which a doubted motion stops."""
         self.accident: Callable[[str], None] = lambda call: None
         """Called with the name of each call before it does anything."""
 
@@ -108,6 +110,10 @@ class FakeController:
         self.p = self.p + np.clip(self.wanted - self.p, -step, step)
         p = self.p if self.override is None else self.override(self.p)
         return ControlOutput(p, self.valid, np.zeros(self.n, dtype=bool))
+
+    def stop(self, now: float) -> Array | None:
+        self.accident("stop")
+        return self.stopping(now)
 
     def status(self, now: float) -> ControllerStatus:
         self.accident("status")

@@ -230,6 +230,67 @@ def test_a_lift_off_is_told_within_300_ms_and_less_is_not(approach):
     assert standing.kind == "brace-lost"
 
 
+def stiff(approach: BraceApproach, moved: float) -> tuple[BraceApproach, Any]:
+    """The same approach with a tip that moves by so much until it lifts off, and that push."""
+    hold, way, tip = approach.hold, np.array([1.0, 0.0, 0.0]), approach.tips[-1]
+    lifts = float(-hold.forces[0] / (hold.per_push @ way)[0]) * way
+    compliance = tip.compliance * moved / np.linalg.norm(pushed(approach, lifts))
+    tips = (*approach.tips[:-1], tip._replace(compliance=compliance))
+    return replace(approach, tips=tips), lifts
+
+
+def test_a_slow_push_that_hardly_moves_a_stiff_arm_is_told_in_time(approach):
+    """It lifts off in five seconds, when the tip has moved by 0.8 mm."""
+    very_stiff, lifts = stiff(approach, 8e-4)
+    course = held(very_stiff)
+    samples(course, very_stiff, np.zeros(3), 40)
+    for number in range(1, 300):
+        off = pushed(very_stiff, number * 0.025 / 5.0 * lifts)
+        if samples(course, very_stiff, off, 1) is not None:
+            break
+    assert 0.7 * 5.0 < number * 0.025 < 5.0 + 0.3
+    assert "lifts off" in course.notices()[-1].text
+
+
+def test_a_push_below_the_loss_is_held_and_becomes_the_models_error_in_the_end(approach):
+    very_stiff, lifts = stiff(approach, 8e-4)
+    course = held(very_stiff)
+    samples(course, very_stiff, np.zeros(3), 40)
+    off = pushed(very_stiff, 0.6 * lifts)
+    assert samples(course, very_stiff, off, 800) is None
+    assert course.force == pytest.approx(0.4 * approach.hold.forces[0], rel=0.2)
+    assert samples(course, very_stiff, off, 2400) is None
+    for _ in range(20):
+        assert samples(course, very_stiff, off, 1) is None
+        assert not course.push.any()
+    assert course.force == pytest.approx(approach.hold.forces[0])
+
+
+@pytest.mark.parametrize("quick", [True, False])
+def test_less_is_left_while_a_push_grows_than_when_it_stays(approach, quick):
+    """A quick push to 0.8 of the loss counts as one, a slow one that then stays does not."""
+    way = np.array([1.0, 0.0, 0.0])
+    lifts = float(-approach.hold.forces[0] / (approach.hold.per_push @ way)[0]) * way
+    course = held(approach)
+    samples(course, approach, np.zeros(3), 40)
+    steps = 10 if quick else 400
+    shares = [*np.linspace(0, 0.65, 40), *[0.65] * 80, *np.linspace(0.65, 0.8, steps), *[0.8] * 400]
+    lost = [samples(course, approach, pushed(approach, each * lifts), 1) for each in shares]
+    assert any(lost) == quick
+
+
+def test_contacts_are_judged_at_pressures_that_the_silicone_keeps_off_the_plan(approach):
+    """Creep takes up to a tenth of a pressure, for which a supply at its limit has no more."""
+    steady = replace(
+        approach, hold=approach.hold._replace(per_pressure=0 * approach.hold.per_pressure)
+    )
+    course, tip = held(steady), steady.tips[-1]
+    p = steady.pressures[-1] - np.array([2e4, 0, 0, 0, 0, 0])
+    for off in (*[np.zeros(3)] * 40, *[pushed(steady, (1.0, 0, 0))] * 12):
+        course.look(0.025, tip.pose[:3, 3] + off, tip, p)
+    assert course.phase is BracePhase.RELEASING
+
+
 @pytest.mark.parametrize("contacts", ["sliding", "sticking"])
 def test_a_slip_is_told_and_lets_go_where_contacts_are_to_stick(approach, contacts):
     slips = float(approach.hold.slips[int(np.argmax(approach.hold.directions @ [1.0, 0, 0]))])

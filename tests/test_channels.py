@@ -194,6 +194,7 @@ def test_a_channel_that_moves_against_its_command_is_told_at_once(to: float) -> 
         if line.channels.opposed.any():
             break
     assert line.channels.opposed.tolist() == [True, False, False]
+    assert line.channels.last_followed[0] == pytest.approx(0.5 * BAR, abs=3e3)
     notice = next(each for each in line.channels.notices() if each.kind == "channel-opposed")
     assert notice.hold
     assert "channel 1 moves against its command" in notice.text

@@ -15,6 +15,7 @@ import pytest
 import stiffopt as so
 from conftest import is_long
 from stiffopt.control.controller import TipController
+from stiffopt.control.motion_watch import Doubt
 from stiffopt.errors import InputError
 from stiffopt.model.calibration import Calibration, ErrorModel
 from stiffopt.model.robot_files import load_description, save_robot
@@ -309,6 +310,51 @@ def test_going_on_after_a_hold_is_no_jump():
     bench.run(bench.period)
     assert np.abs(bench.command - before).max() < 0.03 * BAR
     assert bench.run(4.0, position)[-30:].max() < 1e-3
+
+
+def test_a_doubted_motion_stops_without_a_swing():
+    """Twice less at least than if the commands just stay."""
+    swings = []
+    for stops in (True, False):
+        bench = Bench(HANGING, "full")
+        bench.settled(duration=3.0)
+        place = bench.pose_at(np.array([0.2, 0.9, 0.6, 0.5, 0.3, 0.2]) * BAR)[:3, 3]
+        bench.controller.set_task(bench.task(position=tuple(map(float, place))))
+        bench.run(0.35)
+        steered = bench.controller._arm.watch
+        steered.doubt = Doubt("no-response", "made up")
+        for _ in range(80 if stops else 0):
+            before = bench.command
+            stopping = bench.controller.stop(bench.rig.clock.now())
+            if stopping is None:
+                break
+            bench.command = stopping
+            bench.run(bench.period, steer=False)
+            assert np.all(np.abs(bench.command - before) <= bench.slew * bench.period + 1e-3)
+        bench.run(0.2, steer=False)
+        tips = []
+        for _ in range(60):
+            bench.run(bench.period, steer=False)
+            tips.append(bench.tip[:3, 3].copy())
+        swings.append(np.linalg.norm(np.ptp(np.array(tips), axis=0)))
+    assert swings[0] < 0.5 * swings[1]
+
+
+def test_a_channel_that_acts_the_wrong_way_stops_at_the_pressure_at_which_it_followed():
+    bench = Bench(HANGING, "full")
+    bench.settled(duration=1.5)
+    place = bench.pose_at(np.array([0.2, 0.9, 0.6, 0.5, 0.3, 0.2]) * BAR)[:3, 3]
+    bench.controller.set_task(bench.task(position=tuple(map(float, place))))
+    bench.run(0.3)
+    channels = bench.controller._arm.channels
+    followed = float(channels.last_followed[1])
+    channels.opposed = np.arange(bench.n) == 1
+    for _ in range(20):
+        bench.command = bench.controller.stop(bench.rig.clock.now())
+        bench.run(bench.period, steer=False)
+        channels.opposed = np.arange(bench.n) == 1
+        channels._followed[2, 1] = followed
+    assert bench.command[1] == pytest.approx(followed, abs=1.0)
 
 
 def test_readings_that_are_not_there():

@@ -182,8 +182,8 @@ def test_a_discrepancy_moves_the_tip_as_far_in_all_directions() -> None:
     one = np.trace(by_pressures) / 3
     now = np.zeros(1)
     followed = source.errors(CIRCLE[:1], effective=away, time=now)
-    # of an arm that stays, 12 % of the pressure acts independently through hysteresis
-    stays = one * (0.88**2 + 0.12**2) * np.eye(3)
+    # of an arm that stays, 7 % of the pressure acts independently through hysteresis
+    stays = one * (0.93**2 + 0.07**2) * np.eye(3)
     np.testing.assert_allclose(followed.discrepancy[0], stays, rtol=1e-9)
     assert not source.errors(away, effective=CIRCLE[:1], time=now).discrepancy.any()
 
@@ -200,7 +200,7 @@ def test_an_arm_with_hysteresis_keeps_a_share_of_what_was_wrong_before() -> None
     far = ROUGH.variances([3], away[np.newaxis])[0, 0] * np.trace(slopes @ slopes.T) / 3
     time, forgotten = np.array([0.0, 30.0, 60.0, 90.0]), np.exp(-1)  # in 30 s
     found = source.errors(commands, effective=commands, time=time).discrepancy[:, 0, 0]
-    share = 0.25 + 0.75 * 0.12  # the silicone has more hysteresis than any model
+    share = 0.25 + 0.75 * 0.07  # the silicone has more hysteresis than any model
     before = far * (1 - forgotten) * np.array([0.0, 0.0, 1.0, forgotten])
     expected = share**2 * before + (1 - share) ** 2 * far * np.array([0.0, 1.0, 0.0, 0.0])
     assert found == pytest.approx(expected, rel=1e-9)

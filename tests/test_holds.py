@@ -7,6 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from simulated_loop import TASK, Lab
 from stiffopt.control.arming import late_ticks
@@ -22,6 +23,7 @@ from stiffopt.safety.realtime import load_of_processors
 
 DOUBT = (Notice("drift", "the tip seems to move on", standing=True, hold=True),)
 TIMEOUT = 0.5  # s
+Array = NDArray[np.float64]
 
 
 def lab(**safety: object) -> Lab:
@@ -113,6 +115,43 @@ def test_a_doubt_undoes_the_latest_motion_or_a_share_of_it() -> None:
         held.append(arm.loop.snapshot().commanded[0])
     assert held[1] == pytest.approx((held[0] + held[2]) / 2, rel=0.2)
     assert held[2] < 0.5 * held[0]
+
+
+def test_a_doubted_motion_stops_as_the_controller_says_and_then_stays() -> None:
+    arm = lab()
+    change = np.array([-2e3, -2e3, 2e3])
+    way = [arm.loop.snapshot().commanded + k * change for k in (1, 2)]
+    left = iter(way)
+    arm.controller.stopping = lambda now: next(left, None)
+    arm.controller.said = DOUBT
+    arm.until(State.HOLDING)
+    held = [arm.tick().commanded for _ in range(40)]
+    assert held[0] == pytest.approx(way[0], abs=1.0)
+    assert held[1] == pytest.approx(way[1], abs=1.0)
+    assert held[-1] == pytest.approx(way[1], abs=1.0)
+    arm.until(State.INACTIVE, within=2.0)
+
+
+@pytest.mark.parametrize("wrong", [np.full(3, np.nan), np.zeros(2)])
+def test_a_stop_that_makes_no_sense_is_an_ordinary_hold(wrong: Array) -> None:
+    held = []
+    for stopping in (None, wrong):
+        arm = lab()
+        arm.controller.stopping = lambda now, stopping=stopping: stopping
+        arm.controller.said = DOUBT
+        arm.until(State.HOLDING)
+        held.append(arm.ticks(20).commanded)
+    assert held[0] == pytest.approx(held[1], abs=1.0)
+
+
+def test_a_stop_ends_after_a_while() -> None:
+    arm = Lab(safety={"hold_timeout": 5.0}).under_pressure()
+    begin = arm.now
+    arm.controller.stopping = lambda now: np.array([2e4 + 1e4 * min(now - begin, 10), 1e4, 0.0])
+    arm.controller.said = DOUBT
+    arm.until(State.HOLDING)
+    at_last = arm.ticks(200).commanded
+    assert arm.ticks(100).commanded == pytest.approx(at_last)
 
 
 def test_a_hold_never_commands_more_than_was_commanded_whatever_a_gauge_reads() -> None:

@@ -295,6 +295,12 @@ class Whim:
                 p = p * chance.uniform(-1e3, 1e3)
         return ControlOutput(p, sound, self.unsaturated)
 
+    def stop(self, now: float) -> Array | None:
+        kind = self.chance.randrange(4) if self.wild else 0
+        if kind == 1:
+            self._fail()
+        return (None, None, self.base, np.full(2, math.nan))[kind]
+
     def status(self, now: float) -> ControllerStatus:
         self._fail()
         return self.nowhere

@@ -125,6 +125,43 @@ def test_a_tip_that_misses_half_of_its_way_is_doubted_but_not_if_it_moves_farthe
     assert (doubt is not None and doubt.kind == "no-response") is is_doubted
 
 
+@pytest.mark.parametrize(
+    ("first", "second", "pause", "is_doubted"),
+    [
+        (1.0, 0.7, 5.0, True),
+        (1.0, 0.7, 1.0, False),  # the first motion may turn out to be a fault yet
+        (1.0, 0.9, 5.0, False),
+        (0.8, 0.7, 5.0, False),
+        (None, 0.7, 5.0, False),
+    ],
+)
+def test_an_arm_that_has_followed_its_model_must_go_on_doing_so(
+    first: float | None, second: float, pause: float, is_doubted: bool
+) -> None:
+    one, other = step(0.0 if first is None else 0.04), step(0.04, at=1 + pause)
+
+    def seen(t: float) -> Array:
+        return (first or 0) * one(t) * X + second * other(t) * Y
+
+    def modelled(t: float) -> Array:
+        return one(t) * X + other(t) * Y
+
+    assert (watched(pause + 3, seen, modelled, modelled)[1] is not None) is is_doubted
+
+
+@pytest.mark.parametrize(("push", "is_doubted"), [(0.0, True), (0.001, False)])
+def test_a_payload_at_rest_may_change_how_the_arm_responds(push: float, is_doubted: bool) -> None:
+    one, other, pushed = step(0.04), step(0.04, at=6.0), step(push, at=4.0)
+    watch = MotionWatch(ROBOT.description, MotionTuning())
+    for time in np.arange(0.0, 8.0, FRAME):
+        modelled = one(time) * X + other(time) * Y
+        offset = np.concatenate([pushed(time) * X, np.zeros(3)])
+        watch.intend(time, modelled + offset[:3])
+        seen = one(time) * X + 0.7 * other(time) * Y + offset[:3]
+        take(watch, time, seen, modelled, offset)
+    assert (watch.doubt is not None) is is_doubted
+
+
 def test_a_push_whose_second_mode_turns_the_tip_the_other_way_at_first_is_no_slip() -> None:
     """The turn catches up with the displacement within a few tenths of a second."""
     assert displaced(1.0, turns=step(1.6, lag=0.3)) is None

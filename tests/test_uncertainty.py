@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from stiffopt.errors import InputError, PressureError
 from stiffopt.model.calibration import Calibration, ErrorModel, FittedParameter
-from stiffopt.model.description import RobotDescription
+from stiffopt.model.description import Corrections, RobotDescription
 from stiffopt.model.history import History, Memory, Part, Play
 from stiffopt.model.manipulator import Manipulator, load_robot
 from stiffopt.model.parameters import Parameter, with_values
@@ -255,7 +255,7 @@ def test_hysteresis_is_at_most_what_was_recorded() -> None:
     settled = (200.0, 1e6, 1e6)
     errors = ErrorModel(
         residual=1e-4, discrepancy=0.0, reach=1e4, gain=0.0, degrees_of_freedom=9.0,
-        recorded=((0.0, 0.0, 0.0),),
+        recorded=(tuple(P),),
     )  # fmt: skip
     free, held = (
         calibrated(
@@ -272,8 +272,34 @@ def test_hysteresis_is_at_most_what_was_recorded() -> None:
         inverse @ Manipulator(each).tip_uncertainty(P).hysteresis @ inverse.T
         for each in (free, held)
     ]
-    assert acting[1][0, 0] == pytest.approx(200.0**2)
+    assert acting[1][0, 0] == pytest.approx((0.9 * 200.0) ** 2)
     np.testing.assert_allclose(acting[1][1:, 1:], acting[0][1:, 1:])
+
+
+def test_hysteresis_moves_the_tip_less_where_the_arm_is_soft() -> None:
+    """As far as at recorded pressures, of which the first is the median, except in a dead band."""
+    recorded = np.array([[4e4, 3e4, 2e4], [1e4, 0.0, 0.0], [1.2e5, 1.2e5, 0.0]])
+    errors = ErrorModel(
+        residual=1e-4, discrepancy=0.0, reach=1e4, gain=0.0, degrees_of_freedom=9.0,
+        recorded=tuple(map(tuple, recorded.tolist())),
+    )  # fmt: skip
+    arms = []
+    for each in (None, errors):
+        robot = calibrated(history=HYSTERESIS, errors=each, parameters=(), correlation=())
+        segment = robot.segments[0].model_copy(update={"corrections": Corrections(dead_band=2e4)})
+        arms.append(Manipulator(robot.model_copy(update={"segments": (segment,)})))
+    free, held = arms
+
+    def softness(p: Array) -> float:
+        slope = free.tip_pose(p)[:3, :3] @ free.tip_jacobian(p)[:3]
+        return float((slope**2).sum())
+
+    usual = np.median([softness(p) for p in recorded])
+    for p, least in ((np.array([1.4e5, 0.2e5, 1e5]), 0.0), (np.array([2.1e4, 1e3, 2e3]), 0.25)):
+        share = 0.9**2 / max(softness(p) / usual, least)
+        assert (softness(p) < 0.25 * usual) == (least > 0)
+        expected = share * free.tip_uncertainty(p).hysteresis
+        np.testing.assert_allclose(held.tip_uncertainty(p).hysteresis, expected, rtol=1e-6)
 
 
 def test_hysteresis_widens_the_interval_of_the_stiffness() -> None:

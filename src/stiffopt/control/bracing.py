@@ -88,8 +88,7 @@ class Bracing:
         self._is_off = False  # the tip is known to stay off its target
         self._nearest = (math.inf, 0.0)  # distance of the tip from it, in m, and when it fell to it
         self._warned: set[str] = set()  # kinds of warnings about the present push
-        self._lost = 0  # successive checks at which the model's contacts do not hold
-        self._unchecked = 0.0  # time since the last such check, in s
+        self._share = 1.0  # of the weakest contact's force that a push leaves, averaged
         self._why = ""
         self._notices: list[Notice] = []
 
@@ -225,25 +224,46 @@ class Bracing:
         off = raw + self._withheld(raw)
         self._corrected *= 1 - min(elapsed / t.withheld_time, 1.0)
         self._held += elapsed
-        if settles or float(np.linalg.norm(off)) < t.felt or self._pushed > t.longest_push:
+        R, before = tip.pose[:3, :3], self._forces(pressures)
+        C = R @ tip.compliance[:3, :3] @ R.T
+        doubt = (t.deviation / t.usual_push) ** 2
+        push = C @ np.linalg.solve(C @ C + doubt * np.eye(3), off)
+        feels = self._feels(off, push, before)
+        if settles or not feels or self._pushed > t.longest_push:
             time = t.settling_time if settles else t.error_time
             self._error = self._error + min(elapsed / time, 1.0) * raw
-            self._pushed = self._pushed * float(np.linalg.norm(off) > t.felt)
+            self._pushed = self._pushed * float(feels)
             self.push = self.displacement = np.zeros(3)
-            self.force, self.margin = float(self._forces(pressures).min()), math.nan
+            self.force, self.margin = float(before.min()), math.nan
+            self._share = 1.0
             self._warned.clear()
             return
         self._pushed += elapsed
-        R = tip.pose[:3, :3]
-        C = R @ tip.compliance[:3, :3] @ R.T
-        doubt = (t.deviation / t.usual_push) ** 2
-        self.push = C @ np.linalg.solve(C @ C + doubt * np.eye(3), off)
+        self.push, self.displacement = push, off
         self.covariance[:] = np.linalg.inv(C @ C / t.deviation**2 + np.eye(3) / t.usual_push**2)
-        self.displacement = off
-        self._unchecked += elapsed
-        if self._unchecked >= t.every:
-            self._unchecked = 0.0
-            self._judge(self._forces(pressures))
+        self._judge(before, elapsed)
+
+    def _feels(self, off: Array, push: Array, before: Array) -> bool:
+        """Return whether a displacement (3,) of the tip is more than the model's error.
+
+        It is if it is large, or if its push uses up a share of what a contact holds: an arm that is
+        stiff loses its contact before the tip has moved far. `before`: normal forces (k,).
+        """
+        assert self.approach is not None
+        t, size = self._tuning, float(np.linalg.norm(off))
+        uses = float((-(self.approach.hold.per_push @ push) / np.maximum(before, 1e-6)).max())
+        return size > t.felt or (size > t.least_felt and uses > t.felt_share)
+
+    @property
+    def _sticks(self) -> bool:
+        """Whether a contact that slips is lost."""
+        return self.task.brace is not None and self.task.brace.contacts == "sticking"
+
+    def _slips_at(self, push: Array) -> float:
+        """Return the push in N at which a contact slips, in about the direction of a push (3,)."""
+        assert self.approach is not None
+        hold = self.approach.hold
+        return float(hold.slips[int(np.argmax(hold.directions @ push))])
 
     def _free_tip(self) -> Array:
         """Return the position (3,) of the tip of a free arm at the present place of the way."""
@@ -269,31 +289,33 @@ class Bracing:
         found: Array = hold.forces + hold.per_pressure @ (pressures - planned)
         return found
 
-    def _judge(self, before: Array) -> None:
-        """Judge whether the contacts hold the estimated push; `before`: normal forces (k,)."""
+    def _judge(self, before: Array, elapsed: float) -> None:
+        """Judge whether the contacts hold the estimated push; `before`: normal forces (k,).
+
+        Silicone is stiffer to a quick push, so while one grows, less is left than estimated.
+        """
         assert self.approach is not None
-        assert self.task.brace is not None
         hold, size = self.approach.hold, float(np.linalg.norm(self.push))
         change = hold.per_push @ self.push
         forces = before + change
         weakest = int(forces.argmin())
         falls = change < 0
         left = size * float(np.min(forces[falls] / -change[falls], initial=math.inf))
-        slip = float(hold.slips[int(np.argmax(hold.directions @ self.push))]) - size
-        sticks = self.task.brace.contacts == "sticking"
+        slip = self._slips_at(self.push) - size
         self.force = float(forces[weakest])
-        self.margin = max(min(left, slip) if sticks else left, 0.0)
-        none = self._tuning.lost_share * before[weakest]
-        how = "lifts off" if self.force <= none else "slips" if sticks and slip <= 0 else ""
-        self._lost = self._lost + 1 if how else 0
+        self.margin = max(min(left, slip) if self._sticks else left, 0.0)
+        t, share = self._tuning, self.force / max(float(before[weakest]), 1e-6)
+        self._share += min(elapsed / t.grown_time, 1.0) * (share - self._share)
+        none = t.lost_share + min(max(self._share - share, 0.0), t.grown_share)
+        how = "lifts off" if share <= none else "slips" if self._sticks and slip <= 0 else ""
         where = f"on '{self.approach.contacts[weakest].object}'"
         words = f"under a push of {1e3 * size:.0f} mN"
-        if self._lost >= self._tuning.looks:
+        if how:
             self.release(why=f"the contact {where} {how} {words}")
             return
         if slip <= 0:
             self._warn("brace-slips", f"the contact {where} slips {words}")
-        if self.force < self._tuning.weak_share * before[weakest]:
+        if share < t.weak_share:
             left_over = f"{1e3 * max(self.force, 0.0):.0f} of {1e3 * before[weakest]:.0f} mN"
             self._warn("brace-weak", f"the contact {where} may lift off: {left_over} left {words}")
 

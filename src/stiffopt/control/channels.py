@@ -119,6 +119,12 @@ class Channels:
             return self._none
         return self.limited | self.stuck | self.out
 
+    @property
+    def last_followed(self) -> Array:
+        """Readings (n,) with which channels last followed their commands, in Pa."""
+        value: Array = self._followed[2]
+        return value
+
     def update(
         self, elapsed: float, command: Array, reading: Array, offset: Array, healthy: Array
     ) -> None:

@@ -9,6 +9,7 @@ damps the arm's vibration. A small quadratic program (`Allocation`) combines bot
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Sequence
 
 import numpy as np
@@ -126,6 +127,10 @@ class TipController:
             tuning.motion_error,
             tuning.step_error,
         )
+        # the latest places of the reference, with what feedback added to its commands
+        self._ways: deque[tuple[Array, Array]] = deque(
+            maxlen=max(1, round(tuning.reference.taken_back / period))
+        )
         self._first_motion = FirstMotion(commissioned, tuning.first_motion)
         self._requests = Requests(robot, limits, slew, scene, tuning)
         Planner = ProcessPlanner if plan_in_process else InlinePlanner
@@ -163,6 +168,7 @@ class TipController:
         self._lost = self._arm.channels.lost
         self._windows.begin()
         self._led_to: Target | None = None  # present target of a trajectory of pressures
+        self._ways.clear()
 
     def set_task(self, task: Task) -> None:
         """Pursue a task; see `Controller.set_task`."""
@@ -281,6 +287,7 @@ class TipController:
         here = pressures.chamber if self._arm.channels.lost.any() else pressures.command
         self._reference.begin(np.concatenate([here + pressures.history_offset, offset]))
         self._feedback.resume()
+        self._ways.clear()
         self._at_rest = False
 
     def observe(
@@ -358,6 +365,9 @@ class TipController:
         tip = self._arm.on_path(reference.path[:n])
         if now - self._went_back_at > self._tuning.adaptation.blind_time:
             self._arm.watch.intend(now, tip.pose[:3, 3] + reference.path[n : n + 3])
+        moves = np.abs(reference.motion[1, :n]).max() > self._tuning.reference.at_rest
+        if self._arm.channels.pace == 0 and moves and self._ways:
+            return self._feedforward(self._without_feedback, last)
         course = self.replanner.pursuit.course
         self._led_to = None
         if isinstance(course, PostureCourse):
@@ -375,7 +385,34 @@ class TipController:
         )
         if command is None:
             return ControlOutput(last.copy(), False, self._feedback.saturated.copy())
+        self._ways.append((reference.path.copy(), command - goal))
         return ControlOutput(command, True, self._feedback.saturated.copy())
+
+    def stop(self, now: float) -> Array | None:
+        """Stop a doubted motion; see `Controller.stop`.
+
+        The reference goes back to where it was a while before. On its smooth path the arm does not
+        begin to vibrate, as it would if its commands froze. What feedback adds becomes what it was
+        then, since it may have followed a sensor that is wrong. A channel that moves against its
+        command gets the pressure at which it last followed: even reversed it goes back to that.
+        """
+        channels, last = self._arm.channels, self._arm.pressures.command
+        is_doubted = self._arm.watch.doubt is not None or channels.opposed.any()
+        if not self._vibrates or not is_doubted or not self._ways:
+            return None
+        goal = self._ways[0][0]
+        if self._is_near(goal[: len(last)]):
+            return None
+        self._reference.advance(goal)
+        command = np.where(channels.opposed, channels.last_followed, self._without_feedback)
+        return self._feedforward(command, last).pressures
+
+    @property
+    def _without_feedback(self) -> Array:
+        """Commands (n,) of the reference, with what feedback added to them a while before."""
+        command = self._reference.command - self._arm.pressures.command_offset
+        added: Array = self._ways[0][1]
+        return command + added
 
     def _awaited(self, plan: Array, now: float) -> Array:
         """Return the reference's goal (n + 6,): the plan, unless channels or tip do not follow.
@@ -391,7 +428,8 @@ class TipController:
         if isinstance(course, PostureCourse):
             course.wait((1 - pace) * min(now - self._computed_at, _HELD * self._period))
             return plan
-        path = self._reference.path
+        # an arm that vibrates goes on for a while before its smooth path turns
+        path = self._ways[0][0] if self._vibrates and self._ways else self._reference.path
         goal: Array = path + pace * (plan - path)
         return goal
 

@@ -98,6 +98,12 @@ class Controller(Protocol):
     def compute(self, now: float) -> ControlOutput:
         """Return the next command, within all limits; only in ticks in the state `active`."""
 
+    def stop(self, now: float) -> Array | None:
+        """Return the next command (n,) of a doubted motion on its way to rest; None once it rests.
+
+        In ticks of a hold for a doubt, in place of `compute`.
+        """
+
     def status(self, now: float) -> ControllerStatus:
         """Return the controller's part of the state."""
 

@@ -14,7 +14,8 @@ look for what no push, payload or model error explains:
 
 A push or a payload moves y - s too, but then it rests. Drift is tested at three time scales, to
 distinguish it from creep. The model may be wrong by a share of the motion that each segment causes,
-even if segments move the tip in opposite directions.
+even if segments move the tip in opposite directions. The response test learns this share: an arm
+that has followed its model well so far must go on doing so.
 """
 
 from __future__ import annotations
@@ -62,6 +63,7 @@ class _Miss(NamedTuple):
     share: float  # of the difference between the ways in what is explained; 0 if they fit
     way: float  # length of the model's way, in m
     seen: float  # of the seen one, in m
+    error: float  # of the model, as a share of the motion by the segments
 
 
 class MotionWatch:
@@ -103,10 +105,15 @@ class MotionWatch:
         self._swings = [_Swings(self._tuning) for _ in range(3)]
         self.doubt: Doubt | None = None
         self.pace = 1.0
+        # motion of the tip by each segment so far, in m; largest error of the model in it, as a
+        # share of it; and times, errors and motions (segments,) that do not count yet
+        self._unproven: deque[tuple[float, float, Array]] = deque()
+        self._forget()
 
     def go_on(self) -> None:
         """Continue after a pause in which the arm was not controlled, or not seen."""
         self._intended.clear()
+        self._unproven.clear()
         self._misses = 0
         self._slips.clear()
         self.pace = 1.0
@@ -171,6 +178,8 @@ class MotionWatch:
         row = (time, *seen, *predicted, *intended, *offset, *swings, *pressures)
         self._rows[self._count] = row
         self._count += 1
+        if self._is_pushed():
+            self._forget()
         if self._count > 1:
             self._path += float(np.linalg.norm(intended - self._rows[self._count - 2, _INTENDED]))
         for axis, error in zip(self._swings, (seen - intended).tolist(), strict=True):
@@ -181,6 +190,14 @@ class MotionWatch:
             self.doubt = self.doubt or self._slip(jacobian, tip)
         bending = turn_of_a_push(tip) if turns else None
         self.doubt = self.doubt or self._drift(jacobian, bending) or self._swing()
+
+    def _is_pushed(self) -> bool:
+        """Return whether something has just displaced the tip while the reference rested."""
+        tuning, rows = self._tuning, self._since(self._tuning.slip_window)
+        if np.ptp(rows[:, _INTENDED], axis=0).max() > tuning.noise:
+            return False
+        jump = self._since(tuning.push_time)[0, _OFFSET] - rows[-1, _OFFSET]
+        return float(np.linalg.norm(jump)) > tuning.push
 
     def _is_early(self, time: float) -> bool:
         last = self._rows[self._count - 1, _TIME] if self._count else -np.inf
@@ -203,11 +220,40 @@ class MotionWatch:
         `changes` (k, 18 + n) are differences of samples; the Jacobian (3, n) is of the tip's
         position, base axes.
         """
-        moved = np.zeros(len(changes))
-        for channels in self._segments:
-            motion = changes[:, _PRESSURES][:, channels] @ jacobian[:, channels].T
-            moved += np.sqrt((motion**2).sum(axis=1))
-        return self._tuning.model_error * moved
+        own: Array = self._tuning.model_error * self._by_segments(changes, jacobian).sum(axis=1)
+        return own
+
+    def _by_segments(self, changes: Array, jacobian: Array) -> Array:
+        """Return the lengths (k, segments) by which each segment moves the tip, in m."""
+        motions = [
+            changes[:, _PRESSURES][:, channels] @ jacobian[:, channels].T
+            for channels in self._segments
+        ]
+        lengths: Array = np.sqrt((np.stack(motions, axis=1) ** 2).sum(axis=2))
+        return lengths
+
+    @property
+    def _shares(self) -> Array:
+        """Permitted errors of the model (segments,), as shares of the motion by each segment."""
+        tuning = self._tuning
+        learned = min(max(2 * self._error, tuning.least_error), tuning.model_error)
+        return np.where(self._verified > self._min_motion, learned, tuning.model_error)
+
+    def _forget(self) -> None:
+        """Forget the error of the model: under a load the arm may respond otherwise."""
+        self._verified, self._error = np.zeros(len(self._segments)), 0.0
+        self._unproven.clear()
+
+    def _learn(self, time: float, error: float, moved: Array) -> None:
+        """Take in an error as a share of the motion, and the motion (segments,) since the last one.
+
+        It counts a while later: until then it may turn out to be a fault.
+        """
+        self._unproven.append((time, error, moved))
+        while self._unproven and self._unproven[0][0] < time - self._tuning.proven_after:
+            _, error, moved = self._unproven.popleft()
+            self._error = max(self._error, error)
+            self._verified += moved
 
     def _no_response(self, jacobian: Array, axis: Array) -> Doubt | None:
         """Test whether the tip has not moved although the model has, or has moved elsewhere.
@@ -219,8 +265,10 @@ class MotionWatch:
         ways = rows[-1, _PREDICTED] - rows[:-1, _PREDICTED]
         if ((ways**2).sum(axis=1) > self._min_motion**2).any():  # projections are no longer
             across = np.eye(3) - np.outer(axis, axis)
-            found = (self._missed(rows, jacobian, P) for P in (np.eye(3), across))
+            steps = self._by_segments(np.diff(rows, axis=0), jacobian)
+            found = [self._missed(rows, steps, P) for P in (np.eye(3), across)]
             missed = max(found, key=lambda miss: miss.share)
+            self._learn(float(rows[-1, _TIME]), found[0].error, steps[-1])
         share = 0.0 if missed is None else missed.share
         usual = self._tuning.usual_share
         self.pace = min(max((1 - share) / (1 - usual), 0.0), 1.0)
@@ -234,7 +282,7 @@ class MotionWatch:
                 "no-response",
                 f"{text}: its sensor has come off, the tracker is late, the arm is blocked, or it "
                 "does not get its pressures; look at the sensor and the tubes",
-                self._tuning.undo_unseen,
+                undo=0.0,  # it has probably moved as intended
             )
         return Doubt(
             "no-response",
@@ -242,8 +290,11 @@ class MotionWatch:
             "has slipped, or something pushes the arm; run 'stiffopt commission'",
         )
 
-    def _missed(self, rows: Array, jacobian: Array, P: Array) -> _Miss:
-        """Return where the model's way and the seen one, projected by P (3, 3), fit least."""
+    def _missed(self, rows: Array, by_segments: Array, P: Array) -> _Miss:
+        """Return where the model's way and the seen one, projected by P (3, 3), fit least.
+
+        `by_segments` (k - 1, segments) is how far each segment moves the tip between samples, in m.
+        """
         tuning = self._tuning
         ways = rows[-1] - rows[:-1]
         way, seen = ways[:, _PREDICTED] @ P, ways[:, _SEEN] @ P
@@ -251,26 +302,32 @@ class MotionWatch:
         along = (seen * way).sum(axis=1) / np.maximum(distance, 1e-9)
         aside = np.sqrt(np.maximum((seen**2).sum(axis=1) - along**2, 0.0))
         short = np.maximum(distance - along, 0.0)  # a softer arm moves farther
-        wrong = aside**2 + short**2 > (tuning.most_error * distance) ** 2
         meant = (ways[:, _INTENDED] @ P * way).sum(axis=1) > distance**2 / 2
-        suspects = np.flatnonzero(meant & wrong & (distance > self._min_motion))
-        if not len(suspects):
-            return _Miss(0.0, 0.0, 0.0)
-        off = np.sqrt(((seen - way)[suspects] ** 2).sum(axis=1))
+        # summed along the way, on which segments may have moved the tip in opposite directions
+        moved = np.cumsum(by_segments[::-1], axis=0)[::-1]
+        motion, own = moved.sum(axis=1), moved @ self._shares
+        most = tuning.most_error * own / np.maximum(tuning.model_error * motion, 1e-9)
+        far = meant & (distance > self._min_motion)
+        if not far.any():
+            return _Miss(0.0, 0.0, 0.0, 0.0)
+        off = np.sqrt(((seen - way) ** 2).sum(axis=1))
         steps = np.diff(rows, axis=0)
         speeds = np.sqrt(((steps[:, _PREDICTED] @ P) ** 2).sum(axis=1)) / steps[:, _TIME]
-        late = tuning.late * (speeds[suspects] + speeds[-1:])  # error by a delay of y, in m
-        driven = rows[suspects, _DRIVEN] + rows[-1, _DRIVEN]
-        swing = tuning.swing_error * driven + rows[suspects, _FREE]
-        # summed along the way, on which segments may have moved the tip in opposite directions
-        own = np.cumsum(self._explained(steps, jacobian)[::-1])[::-1][suspects]
-        moved, model = ((ways[suspects, part] ** 2).sum(axis=1) for part in (_SEEN, _PREDICTED))
-        own[moved < tuning.still**2 * model] = 0.0  # a wrong model would move it somewhere
-        explained = own + late + swing + tuning.noise + 6 * tuning.scatter
-        worst = int(np.argmax(off / explained))
+        late = tuning.late * (speeds + speeds[-1])  # error by a delay of y, in m
+        driven = rows[:-1, _DRIVEN] + rows[-1, _DRIVEN]
+        other = late + tuning.swing_error * driven + rows[:-1, _FREE] + 6 * tuning.scatter
+        error = float(((off - other)[far] / np.maximum(motion, distance)[far]).max())
+        suspects = np.flatnonzero(far & (aside**2 + short**2 > (most * distance) ** 2))
+        if not len(suspects):
+            return _Miss(0.0, 0.0, 0.0, error)
+        length, model = ((ways[suspects, part] ** 2).sum(axis=1) for part in (_SEEN, _PREDICTED))
+        own = own[suspects]
+        own[length < tuning.still**2 * model] = 0.0  # a wrong model would move it somewhere
+        explained = own + other[suspects] + tuning.noise
+        worst = int(np.argmax(off[suspects] / explained))
         first = suspects[worst]
-        lengths = float(distance[first]), float(np.linalg.norm(seen[first]))
-        return _Miss(float(off[worst] / explained[worst]), *lengths)
+        share = float(off[first] / explained[worst])
+        return _Miss(share, float(distance[first]), float(np.linalg.norm(seen[first])), error)
 
     def _slip(self, jacobian: Array, tip: TipAt) -> Doubt | None:
         """Test whether the offset has changed as no force, wherever it acts, changes it."""

@@ -99,8 +99,6 @@ class ArmObserver:
             ),
         )
         motion = replace(tuning.motion, scatter=control.tracker_noise)
-        if mode is None:  # it stops where its chambers stop
-            motion = replace(motion, undo_unseen=0.0)
         self.watch = MotionWatch(robot.description, motion)
         self.model: ArmModel | None = None
         self._now, self._modelled_at = 0.0, np.zeros(n)

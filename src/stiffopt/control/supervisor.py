@@ -118,6 +118,7 @@ class Supervisor:
         lag = int(np.ceil(tuning.chamber_lag / period))
         self._recent: deque[Array] = deque([self._zero], maxlen=max(2, lag))
         self._held: Array | None = None
+        self._stops = False  # whether the controller has begun to stop a doubted motion
         # the latest reading; NaN before the first one, and for implausible values
         self.reading = PressureReading(float("nan"), np.full(n, np.nan))
         self.samples: tuple[PoseSample, ...] = ()  # delivered since the last tick
@@ -284,8 +285,8 @@ class Supervisor:
     def _control(self, now: float) -> None:
         """Command what the controller decides."""
         output = self.controller.compute(now)
-        p, n = output.pressures, len(self._zero)
-        if not output.valid or p.shape != (n,) or not np.isfinite(p).all():
+        p = output.pressures
+        if not output.valid or not self._makes_sense(p):
             self._count_failure(now, "the solver has no answer")
             self._command(now, self.commanded)
         elif too_near := self._too_near(output):
@@ -295,6 +296,9 @@ class Supervisor:
             self._failures = 0
             self.alarms.clear(now, "solver")
             self.saturated = self.saturated | output.saturated
+
+    def _makes_sense(self, pressures: Array) -> bool:
+        return pressures.shape == self._zero.shape and bool(np.isfinite(pressures).all())
 
     def _too_near(self, output: ControlOutput) -> str:
         """Return why a command would bring the body too near to the scene; empty if it is clear."""
@@ -316,14 +320,27 @@ class Supervisor:
         self._end_a_long_hold(now)
         ramp = self._ramp
         if ramp is None:
+            if self._held is None and (stopping := self._stopping_pressures(now)) is not None:
+                self._command(now, stopping)
+                return
             if self._held is None:  # only once: a late reading must not change them
-                self._held = self._present_pressures()
+                self._held = self.commanded if self._stops else self._present_pressures()
             self._command(now, self._held)
             return
         if not ramp.progress(now) < 1 - 1e-9:
             self._stop(now, ramp.reason)
             return
         self._command(now, let_down(ramp.pressures, ramp.share(now), self.outlet.limits))
+
+    def _stopping_pressures(self, now: float) -> Array | None:
+        """Return pressures (n,) that bring a doubted motion to rest; None where it rests."""
+        if "doubt" not in self._holds or now - self._doubted_at > self._tuning.longest_stop:
+            return None
+        pressures = self.controller.stop(now)
+        if pressures is None or not self._makes_sense(pressures):
+            return None
+        self._stops = True
+        return pressures
 
     def _present_pressures(self) -> Array:
         """Return pressures (n,) that stop the arm, in Pa.
@@ -409,7 +426,7 @@ class Supervisor:
             self._held_since = now
         self._holds[kind] = _Hold(reason, lasting, undo)
         if self.lifecycle.state is State.ACTIVE:
-            self._held = None
+            self._held, self._stops = None, False
             self.lifecycle.change(State.HOLDING, reason)
 
     def _resume(self, now: float) -> None:

@@ -112,6 +112,8 @@ class ReferenceTuning:
     # change of pressure (norm over all channels) over which the model on the reference is not
     # linearised again, in Pa
     model_range: float = 3e3
+    # time by which a doubted motion of an arm that vibrates is taken back, in s
+    taken_back: float = 0.3
     # distance from the plan at which it has arrived, in Pa, and rate below which it rests, in Pa/s
     there: float = 5e3
     at_rest: float = 5e4
@@ -302,6 +304,7 @@ class SupervisionTuning:
     force_alarm: float = 0.5
     max_failures: int = 3  # successive failures of the controller after which pressures are held
     chamber_lag: float = 0.3  # by which the pressures in the chambers may lag behind commands, in s
+    longest_stop: float = 1.0  # in which the controller stops a doubted motion, in s
     falls: float = 3e3  # above its command, in Pa, at which a chamber is on its way down
     # time of control after which a hold is a new one, and its timeout starts again, in s
     hold_memory: float = 2.0
@@ -330,8 +333,16 @@ class MotionTuning:
 
     spacing: float = 0.02  # minimum time between two samples that are compared, in s
     longest_pause: float = 0.1  # without control, after which samples are not compared, in s
-    # error of the model, as a share of the motion that each segment causes
+    # error of the model, as a share of the motion that each segment causes: at first, and the least
+    # that is permitted of an arm that has followed its model; time after which a motion has proven
+    # to be no fault, in s
     model_error: float = 0.35
+    least_error: float = 0.15
+    proven_after: float = 2.0
+    # displacement of the tip at rest, in m, within a time, in s, after which it has to prove itself
+    # again: a payload may change its response
+    push: float = 8e-4
+    push_time: float = 0.25
     noise: float = 1e-3  # of a measured motion, in m
     scatter: float = 5e-5  # standard deviation of a tracked position in each axis, in m
     # shortest way for a test of the response: in m, and as a share of the arm's length
@@ -348,9 +359,6 @@ class MotionTuning:
     # share of the explained difference from the model above which the reference is slowed down
     usual_share: float = 0.4
     misses: int = 2  # successive samples that show no response
-    # share of the latest motion that a hold undoes where the tip was not seen to move: the arm has
-    # followed its pressures about so far, and then swings least; 0 for an arm that does not vibrate
-    undo_unseen: float = 0.5
     slip_window: float = 1.0  # in which a slip is looked for, in s
     # share of the turn that a push would cause by which the measured turn must miss it
     slip: float = 0.7
@@ -515,13 +523,16 @@ class BracingTuning:
     min_on_way: float = 15e-3
     free_share: float = 0.6
     samples: int = 3
-    off_plan: float = 1.5e4  # pressure error above which contacts are not judged, in Pa
+    off_plan: float = 3e4  # pressure error above which contacts are not judged, in Pa
     let_down: float = 2e3  # the same while the pressures are held: then they are being let down
     swing_time: float = 0.08  # time constant of averaging the measured tip, in s
     # displacement of the tip above which a push is felt, in m; time constant with which a smaller
     # one becomes the model's error, in s
     felt: float = 6e-4
     error_time: float = 5.0
+    # the same for a push that uses up a share of what a contact holds, and that share
+    least_felt: float = 2e-4
+    felt_share: float = 0.12
     # at first, while the tip goes to its target and the arm creeps most: duration and such a time
     # constant, in s
     settling: float = 8.0
@@ -530,12 +541,13 @@ class BracingTuning:
     withheld_time: float = 5.0
     longest_push: float = 60.0  # after which a push becomes the model's error too, in s
     # deviation of that displacement, in m, and of pushes, in N
-    deviation: float = 5e-4
+    deviation: float = 2e-4
     usual_push: float = 0.1
-    every: float = 0.03  # interval of checks of the contacts, in s
-    looks: int = 2  # successive checks
-    # of its force, below which the estimate cannot tell it from none
-    lost_share: float = 0.08
+    # of its force, below which the estimate cannot tell it from none; what may be added to that for
+    # what a growing push has taken of late, and how long that is, in s
+    lost_share: float = 0.15
+    grown_share: float = 0.1
+    grown_time: float = 1.0
     weak_share: float = 0.4  # of its force, below which a contact that a push relieves may lift off
     # time constants with which the tip goes to its target, at first and once it has settled, in s
     first_time: float = 2.0

@@ -20,7 +20,7 @@ from stiffopt.units import Angle, Duration, Length, Number, Pressure, Ratio
 Array = NDArray[np.float64]
 _POSITIVE = Field(ge=0)
 _ROUNDING = 1e-3  # of correlations, which are written with few digits
-_MORE_MEMORY = 0.12  # of the pressure acts through hysteresis that no model has
+_MORE_MEMORY = 0.07  # of the pressure acts through hysteresis that no model has
 _FADING = 30.0  # s in which an arm forgets former pressures, by creep
 _NEAR = 0.1  # distance within which a pressure counts as recorded, over the recorded range
 _KNOWN = 0.07  # error of what a recorded pressure tells of relative errors, in recorded ranges

@@ -10,6 +10,9 @@ may move the tip in any direction.  Together they follow a multivariate t-distri
 Hysteresis depends on how the arm came to its pressures.  Its mean square, about the equilibrium,
 which is what `tip_pose` returns, is that over ways from rest to two pressures drawn from the
 recorded range, and from there; but at most that of effective minus commanded pressures as recorded.
+Silicone remembers its stretch rather than pressures: the tip is about as far from the equilibrium
+where the arm is soft as where it is stiff.  And what a fit calls hysteresis is partly creep, which
+is over where a pose is held.
 Most of these ways leave most play operators at an end of their width, so that the tip is rarely
 near the equilibrium.  Therefore its squared distance, in deviations of the region, is distributed
 as 3 F(k, v) with k > 3 degrees of freedom, such that its variance is right (F. E. Satterthwaite, An
@@ -21,7 +24,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import product
+from itertools import pairwise, product
 from typing import Literal
 
 import numpy as np
@@ -41,6 +44,8 @@ Part = Literal["parameters", "hysteresis", "discrepancy", "residual"]
 
 _LEVEL = 0.95  # probability of the reported regions
 _WAYS = 256  # ways to given pressures
+_HELD = 0.9  # share of a fit's hysteresis that held poses show; the rest was creep
+_STIFFEST = 0.25  # least softness, over that at recorded pressures: a dead band has none
 _SINGULAR = 1e-9  # smallest variance of a direction, over that of all
 NORMAL_QUANTILE = 1.959963984540054  # of 97.5 %, for two-sided intervals of 95 %
 
@@ -230,7 +235,7 @@ class Uncertainty:
         residual = self._calibration.position_residual if errors is None else errors.residual
         if effective is None:
             still = moving if moving is not None else np.zeros(len(pressures), dtype=bool)
-            ways = self._remembered(pressures)
+            ways = self._remembered(pressures, per_pressure)
             hysteresis = per_pressure @ self._hysteresis(ways, still) @ transposed
         else:
             ways, hysteresis = np.zeros((len(u), 1, u.shape[1])), np.zeros((len(u), 3, 3))
@@ -265,7 +270,8 @@ class Uncertainty:
         )
         g, h = per_coordinate[0] / k[0], per_pressure[0] / k[0]
         size = len(g)
-        acting = self._hysteresis(self._remembered(p), np.zeros(1, dtype=bool))[0]
+        ways = self._remembered(p, self._slopes.at(p)[2])
+        acting = self._hysteresis(ways, np.zeros(1, dtype=bool))[0]
         variance = g @ self._covariance[:size, :size] @ g
         variance += h @ acting @ h + h**2 @ self._discrepancy(p)[0]
         deviation = float(np.sqrt(max(variance, 0.0)))
@@ -312,8 +318,13 @@ class Uncertainty:
             found[moving] += np.maximum(more, 0.0)[..., np.newaxis] * np.eye(ways.shape[2])
         return np.asarray(found)
 
-    def _remembered(self, pressures: Vector) -> Vector:
-        """Return effective minus commanded pressures (N, W, n) in Pa after W ways to (N, n)."""
+    def _remembered(self, pressures: Vector, per_pressure: Vector) -> Vector:
+        """Return effective minus commanded pressures (N, W, n) in Pa after W ways to (N, n).
+
+        `per_pressure` are the tip's slopes (N, 3, n) there. Silicone remembers its stretch, so the
+        ways leave the tip about as far away at all pressures, though a pressure moves it further
+        where the arm is soft. At the median of the recorded pressures they are those of the plays.
+        """
         robot, first = self._description, 0
         found = np.zeros((len(pressures), _WAYS, robot.n_pressures))
         for segment in robot.segments:
@@ -330,7 +341,24 @@ class Uncertainty:
         if errors is not None and errors.settled:
             size = np.sqrt(np.mean(found**2, axis=1, keepdims=True))
             found *= np.minimum(1.0, errors.settled / np.maximum(size, 1e-9))
+        if errors is not None:
+            softness = self._softness(per_pressure) / self._recorded_softness
+            found *= _HELD / np.sqrt(np.maximum(softness, _STIFFEST))[:, np.newaxis]
         return found
+
+    def _softness(self, per_pressure: Vector) -> Vector:
+        """Return the squared slopes (N, n) of the tip by all pressures of a channel's segment."""
+        ends = np.cumsum([0, *self._channels])
+        squares = [(per_pressure[..., a:b] ** 2).sum(axis=(1, 2)) for a, b in pairwise(ends)]
+        return np.repeat(np.stack(squares, axis=1), self._channels, axis=1)
+
+    @cached_property
+    def _recorded_softness(self) -> Vector:
+        """Median (n,) of `_softness` over the recorded pressures."""
+        errors = self._calibration.errors
+        assert errors is not None  # a caller's condition
+        _, _, per_pressure = self._slopes.at(np.array(errors.recorded))
+        return np.asarray(np.median(self._softness(per_pressure), axis=0))
 
     @cached_property
     def _visited(self) -> Vector:
