@@ -34,13 +34,6 @@ from stiffopt.errors import EquilibriumError
 
 ROBOT = "stiff-flop-2"
 MAX_FORCE, MARGIN, TOLERANCE = 0.3, 0.02, 1e-4
-AWAY = stiffopt.Scene(
-    objects=[
-        stiffopt.SceneObject(
-            name="away", sphere={"centre": [0, 0, 9], "radius": 0.01}, contact={"allowed": True}
-        )
-    ]
-)
 _STEP = 30.0  # Pa, of differences
 
 
@@ -50,14 +43,12 @@ def draw(seed: int, name: str = ROBOT) -> dict[str, Any]:
     robot = stiffopt.load_robot(name)
     while True:
         p = rng.uniform(0, 1.5e5, 6) * (rng.random(6) < 0.8)
-        T = robot.backbone(p, 61)
-        if robot.is_loaded:
-            T = robot.contact_equilibrium(p, AWAY).poses(np.linspace(0, robot.length, 61))
+        T = robot.pose(p, np.linspace(0, robot.length, 61)[1:])
         tilt = np.degrees(np.arccos(T[-1, 2, 2]))
         if not 10 < tilt < 60:
             continue
         kind = rng.choice(["post", "ball", "wall"], p=[0.5, 0.2, 0.3])
-        item = _object(rng, str(kind), T[round(rng.uniform(0.35, 0.9) * 60)])
+        item = _object(rng, str(kind), T[round(rng.uniform(0.35, 0.9) * 60) - 1])
         scene = stiffopt.Scene(objects=[stiffopt.SceneObject(**item)])
         if robot.clearance(np.zeros(6), scene) > 1e-3:
             break

@@ -21,6 +21,8 @@ from stiffopt.errors import EquilibriumError
 from stiffopt.model.contact.solve import ContactProblem
 from stiffopt.model.contact.surface import ContactSurface
 from stiffopt.model.shooting import mass_per_length
+from stiffopt.optimise.leaning import FORCE_ON, BracedProblem
+from stiffopt.optimise.settings import BRACE
 
 
 def _lying_beam(gap: float, g: float) -> float:
@@ -118,6 +120,26 @@ def test_the_forces_along_a_line_are_limited_together(share, within):
     assert own == list(range(len(found.contacts)))
     assert force == pytest.approx(total, rel=1e-6)
     assert found.within_limits is within
+
+
+def test_the_search_limits_the_forces_along_a_line_together():
+    model, objects = robot(TWO.under((3.0, 0.0, 0.0))), scene(table(0.0005))
+    found = model.contact_equilibrium(REST, objects)
+    (item,) = scene(table(0.0005), max_force=0.1).objects
+    task = stiffopt.Task(
+        robot="stiff-flop-2",
+        target={"position": tuple(found.tip_pose[:3, 3])},
+        stiffness={"maximise": {"direction": [0, 1, 0]}},
+        scene={"objects": [item]},
+        brace={"objects": [item.name]},
+    )
+    problem = BracedProblem(model, task)
+    point = problem.pose(REST / problem.unit)
+    row = next(c.first for c in point.constraints if c.name.startswith(FORCE_ON))
+    limit = (1 - problem.spare) * 0.1
+    expected = BRACE.force + found.normal_forces.sum() - limit
+    assert point.residual[row] == pytest.approx(expected, abs=1e-6)
+    np.testing.assert_allclose(point.jacobian[row], point.force_gradient)
 
 
 @pytest.mark.parametrize("gap", [0.002, 0.006])

@@ -312,15 +312,21 @@ def test_going_on_after_a_hold_is_no_jump():
     assert bench.run(4.0, position)[-30:].max() < 1e-3
 
 
+def moving(*, rested: float, moved: float) -> Bench:
+    """A hanging arm with inertia, on its way to another place."""
+    bench = Bench(HANGING, "full")
+    bench.settled(duration=rested)
+    place = bench.pose_at(np.array([0.2, 0.9, 0.6, 0.5, 0.3, 0.2]) * BAR)[:3, 3]
+    bench.controller.set_task(bench.task(position=tuple(map(float, place))))
+    bench.run(moved)
+    return bench
+
+
 def test_a_doubted_motion_stops_without_a_swing():
     """Twice less at least than if the commands just stay."""
     swings = []
     for stops in (True, False):
-        bench = Bench(HANGING, "full")
-        bench.settled(duration=3.0)
-        place = bench.pose_at(np.array([0.2, 0.9, 0.6, 0.5, 0.3, 0.2]) * BAR)[:3, 3]
-        bench.controller.set_task(bench.task(position=tuple(map(float, place))))
-        bench.run(0.35)
+        bench = moving(rested=3.0, moved=0.35)
         steered = bench.controller._arm.watch
         steered.doubt = Doubt("no-response", "made up")
         for _ in range(80 if stops else 0):
@@ -341,11 +347,7 @@ def test_a_doubted_motion_stops_without_a_swing():
 
 
 def test_a_channel_that_acts_the_wrong_way_stops_at_the_pressure_at_which_it_followed():
-    bench = Bench(HANGING, "full")
-    bench.settled(duration=1.5)
-    place = bench.pose_at(np.array([0.2, 0.9, 0.6, 0.5, 0.3, 0.2]) * BAR)[:3, 3]
-    bench.controller.set_task(bench.task(position=tuple(map(float, place))))
-    bench.run(0.3)
+    bench = moving(rested=1.5, moved=0.3)
     channels = bench.controller._arm.channels
     followed = float(channels.last_followed[1])
     channels.opposed = np.arange(bench.n) == 1

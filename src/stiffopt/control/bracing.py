@@ -256,7 +256,7 @@ class Bracing:
 
     @property
     def _sticks(self) -> bool:
-        """Whether a contact that slips is lost."""
+        """True if a contact that slips counts as lost."""
         return self.task.brace is not None and self.task.brace.contacts == "sticking"
 
     def _slips_at(self, push: Array) -> float:

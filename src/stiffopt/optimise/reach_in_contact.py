@@ -1,7 +1,7 @@
 """Bring pressures to a target in contact, with the contact kept on the way.
 
 A Gauss-Newton method within a trust region. Each step solves a quadratic program for the change d
-of the variables and for what the rows of the residual miss,
+of the variables and for s, how far each row of the residual is then outside its bounds,
 
     minimise |s|^2 + damping |d|^2  subject to  low <= (r + J d) / scale - s <= high,
 
@@ -62,7 +62,7 @@ def reach_in_contact(problem: BracedProblem, x: Vector) -> BracedPoint | None:
 
 
 class _Misses:
-    """What the rows of a residual miss, over their scales."""
+    """How far each row of a residual is outside its bounds, divided by the row's scale."""
 
     def __init__(self, bounding: Bounding) -> None:
         self._bounding, self._scale = bounding, bounding.scale
@@ -74,13 +74,13 @@ class _Misses:
         self._low = np.where(one_sided, -math.inf, -self._high)
 
     def of(self, residual: Vector) -> float:
-        """Return the sum of squares that a residual misses."""
+        """Return the sum of the squares of these distances."""
         rows = residual[self._bounding.rows] / self._scale
         missed = rows - np.clip(rows, self._low, self._high)
         return float(missed @ missed)
 
     def step(self, problem: BracedProblem, point: BracedPoint, radius: float) -> Vector | None:
-        """Return the change (n,) of the variables that misses least; None if there is none."""
+        """Return the step (n,) that brings the rows nearest to their bounds, or None."""
         n, m, settings = len(point.x), len(self._scale), REACH_IN_CONTACT
         rows = self._bounding.rows
         residual = point.residual[rows] / self._scale
