@@ -537,12 +537,23 @@ class BracingTuning:
     # constant, in s
     settling: float = 8.0
     settling_time: float = 0.3
+    # time after that in which contacts that are to stick are relieved of friction, in s
+    relief: float = 8.0
+    # time constant with which friction follows the pressures, whose noise would move it, in s; and
+    # the slide of a contact, as the estimated push foretells it, that is a slip, in m
+    even_time: float = 0.5
+    slid: float = 5e-5
+    sure: float = 0.9  # of the friction, on which a contact that is pushed can count
     # time for which friction at the contacts may withhold a correction of the tip, in s
     withheld_time: float = 5.0
     longest_push: float = 60.0  # after which a push becomes the model's error too, in s
     # deviation of that displacement, in m, and of pushes, in N
     deviation: float = 2e-4
     usual_push: float = 0.1
+    # where contacts are to stick, whose friction is known: that deviation of the displacement, and
+    # that of pushes aside from the directions of stiffness, as a share
+    sticking_deviation: float = 1e-4
+    aside: float = 0.3
     # of its force, below which the estimate cannot tell it from none; what may be added to that for
     # what a growing push has taken of late, and how long that is, in s
     lost_share: float = 0.15
