@@ -99,6 +99,8 @@ def test_the_way_into_contact_leaves_friction_against_the_slide():
     friction.follow(small, 1.0)  # back: it sticks, and the force falls
     change = held.per_pressure @ (small - PRESSURES)
     assert friction.forces == pytest.approx(before + change, abs=1e-6)
+    friction.follow(small, 1.0, creep=1e-4)  # as if the pressures had come back
+    assert friction.forces == pytest.approx(before, abs=1e-6)
 
 
 def test_without_friction_nothing_is_withheld():

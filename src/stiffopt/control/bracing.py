@@ -205,7 +205,8 @@ class Bracing:
         if float(np.abs(pressures - self.pressures).max()) > off_plan:
             return
         sticks = self._sticks
-        friction.follow(pressures, min(elapsed / t.even_time, 1.0))
+        creep = t.creep * elapsed / (t.creep_time + self._held) if held else 0.0
+        friction.follow(pressures, min(elapsed / t.even_time, 1.0), creep)
         residual = seen - tip.pose[:3, 3]
         if sticks:
             residual = residual - friction.tip @ friction.forces
@@ -235,12 +236,12 @@ class Bracing:
         self._corrected *= 1 - min(elapsed / t.withheld_time, 1.0)
         self._held += elapsed
         R, before = tip.pose[:3, :3], friction.sliding(pressures)
-        C, deviation = R @ tip.compliance[:3, :3] @ R.T, t.deviation
+        C = R @ tip.compliance[:3, :3] @ R.T
         if sticks:
-            before, deviation = friction.normals(pressures), t.sticking_deviation
+            before = friction.normals(pressures)
             C = C + friction.tip @ self.approach.hold.sticking.per_push
         usual = self._usual(R)
-        push = usual @ C.T @ np.linalg.solve(C @ usual @ C.T + deviation**2 * np.eye(3), off)
+        push = usual @ C.T @ np.linalg.solve(C @ usual @ C.T + t.deviation**2 * np.eye(3), off)
         feels = self._feels(off, push, before)
         if settles or not feels or self._pushed > t.longest_push:
             time = t.settling_time if settles else t.error_time
@@ -252,8 +253,10 @@ class Bracing:
             self._warned.clear()
             return
         self._pushed += elapsed
+        if sticks:  # what stays is creep in the end
+            self._error = self._error + min(elapsed / t.push_creeps, 1.0) * raw
         self.push, self.displacement = push, off
-        self.covariance[:] = np.linalg.inv(C.T @ C / deviation**2 + np.linalg.inv(usual))
+        self.covariance[:] = np.linalg.inv(C.T @ C / t.deviation**2 + np.linalg.inv(usual))
         self._judge(before, elapsed)
 
     def _feels(self, off: Array, push: Array, before: Array) -> bool:
@@ -333,7 +336,7 @@ class Bracing:
         left = size * float(np.min(before[falls] / -change[falls], initial=math.inf))
         if self._sticks:
             left = min(left, self._friction.left(self.push / size, before))
-        slips = float(self._friction.slid(self.push, before, t.sure).max(initial=0.0)) > t.slid
+        slips = float(self._friction.slid(self.push, before).max(initial=0.0)) > t.slid
         self.force = float(forces[weakest])
         self.margin = max(left - size, 0.0)
         share = self.force / max(float(before[weakest]), 1e-6)

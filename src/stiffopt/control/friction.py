@@ -56,8 +56,8 @@ class Friction:
         self.per_push = hold.per_push + self._normals @ held.per_push
         self.per_pressure = hold.per_pressure + self._normals @ held.per_pressure
 
-    def follow(self, pressures: Array, share: float) -> None:
-        """Go on to pressures (n,), in Pa.
+    def follow(self, pressures: Array, share: float, creep: float = 0.0) -> None:
+        """Go on to pressures (n,), in Pa, while creep makes them count more by a share.
 
         Their noise would move a contact that is about to slide, so only a share of their change
         counts at a time.
@@ -66,7 +66,7 @@ class Friction:
             self._pressures = pressures
         change = share * (pressures - self._pressures)
         self._pressures = self._pressures + change
-        trial = self.forces + self._sticking.per_pressure @ change
+        trial = self.forces + self._sticking.per_pressure @ (change + creep * pressures)
         slides = self._slides(trial, self.sliding(self._pressures) + self._normals @ trial)
         self.forces = trial + self._sticking.per_slide @ slides
 
@@ -80,13 +80,13 @@ class Friction:
         found: Array = self.sliding(pressures) + self._normals @ self.forces
         return found
 
-    def slid(self, push: Array, normals: Array, share: float = 1.0) -> Array:
+    def slid(self, push: Array, normals: Array) -> Array:
         """Return how far the contacts (k,) slide under a push (3,) at the tip, in m.
 
-        `normals`: normal forces (contacts,) before, in N; `share`: of friction that is there.
+        `normals`: normal forces (contacts,) before, in N.
         """
         trial = self.forces + self._sticking.per_push @ push
-        slides = self._slides(trial, share * (normals + self.per_push @ push))
+        slides = self._slides(trial, normals + self.per_push @ push)
         found: Array = np.linalg.norm(slides.reshape(-1, 2), axis=1)
         return found
 
