@@ -15,13 +15,16 @@ copy of the process:
 Once a loss is reported the arm lets go by itself; otherwise a task at rest makes it.
 
 The contact is lost by a lift-off where the plant's force becomes zero; by a slip where the point of
-the body that touches has slid by 0.1 mm since the push began. If the loss is reported before, a
-copy of the plant that does not let go tells when it would have come: the delay is then negative.
+the body that touches has slid by 0.1 mm since the push began. A measured tip cannot show so little
+(`docs/contact.md`), and under a push that stays creep alone can slide a contact by as much. If the
+loss is reported before, a copy of the plant that does not let go tells when it would have come: the
+delay is then negative.
 
 Metrics: this delay; that of the warning that the contact may be lost (`brace-weak`,
 `brace-slips`); losses reported without one, during the hold or the push at 0.7; the estimated
 contact force (`brace_force`) against that of the plant; what the contacts were pressed with at
-most; and whether the arm ends at rest, clear of the object.
+most; and whether the arm ends at rest, clear of the object. A slip that is reported during the push
+at 0.7 is a false one only if the contact has not slid by then.
 """
 
 from __future__ import annotations
@@ -270,17 +273,25 @@ def keep_pushing(loop: Loop, first: Any, normal: Any, *, slips: bool) -> dict[st
     """What a push gives that stays below the loss."""
     plant, pressures = loop.rig.world.plant, loop.rig.supply.read().pressures
     rate = first.loss.force * np.array(first.direction) / RAMP
-    copied = copy.deepcopy((plant, Slide(plant, normal)))
+    slide = Slide(plant, normal)
+    copied = copy.deepcopy((plant, slide))
     after = loss_of(*copied, pressures, lambda after: rate * after, LONGEST * RAMP, slips=slips)
     if after is None:
         return {}
-    most = KEPT * after * rate
-    loop.go(
-        RAMP + HOLD, lambda: loop.status.brace != "held",
-        lambda after: min(after / RAMP, 1.0) * most,
-    )  # fmt: skip
+    most, slid = KEPT * after * rate, [0.0]
+
+    def is_told() -> bool:
+        slid[0] = slide.update(plant)
+        return bool(loop.status.brace != "held")
+
+    loop.go(RAMP + HOLD, is_told, lambda after: min(after / RAMP, 1.0) * most)
     kept = loop.status.brace == "held"
-    row = {"kept": kept, "estimated_pushed": loop.status.brace_force, "force_pushed": loop.force}
+    row = {
+        "kept": kept,
+        "slid": slid[0],
+        "estimated_pushed": loop.status.brace_force,
+        "force_pushed": loop.force,
+    }
     loop.go(FADES, push=lambda after: max(0.0, 1 - after / FADES) * most)
     plant.set_load(None)
     return row
@@ -359,6 +370,8 @@ def report(rows: list[dict[str, Any]]) -> None:
     kept = [row["kept"] for row in good if "kept" in row]
     print(f"lost while nothing pushed: {sum(row['false'] for row in good)} of {len(good)}")
     print(f"pushed with {KEPT} of the loss for {HOLD:.0f} s, and held: {sum(kept)} of {len(kept)}")
+    slid = sum(row["slid"] > SLID and not row["kept"] for row in good if "kept" in row)
+    print(f"  not held, and had slid by {1e3 * SLID} mm when it was reported: {slid}")
     print(f"let go, clear: {sum(row['left'] == 0 for row in good)} of {len(good)}")
 
 

@@ -507,7 +507,9 @@ class TipController:
             return
         error = np.nan_to_num(wanted - self._arm.tip.position)
         elapsed = min(now - self._computed_at, _HELD * self._period)
-        course.correct(elapsed, error, tip.pose[:3, :3] @ tip.jacobian[:3])
+        offset = self._arm.pressures.command_offset
+        limits = self._permitted[0] + offset, self._permitted[1] + offset
+        course.correct(elapsed, error, tip.pose[:3, :3] @ tip.jacobian[:3], limits)
 
     def _shift(self, change: Array) -> None:
         """Shift reference and feedback by a change of the offset (6,), without a jump."""
