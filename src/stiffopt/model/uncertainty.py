@@ -338,6 +338,9 @@ class Uncertainty:
                 for x in (*part_of(self._visited[..., own], play.of), end):
                     held = np.clip(held, x - play.width, x + play.width)
                 found[..., own] += memory * play.share * part_of(held - end, play.of)
+            found[..., own] = history.at_fixed_modulus(
+                pressures[:, np.newaxis, own], found[..., own]
+            )
         errors = self._calibration.errors
         if errors is not None and errors.settled:
             size = np.sqrt(np.mean(found**2, axis=1, keepdims=True))
