@@ -517,10 +517,12 @@ def test_a_contact_that_friction_holds_is_brought_to_the_target(solution, monkey
     loop.controller.close()
 
 
-def test_contacts_that_are_to_stick_are_relieved_of_friction(solution, monkeypatch):
+@pytest.mark.parametrize("is_placed", [True, False])
+def test_contacts_that_are_to_stick_are_relieved_of_friction(is_placed, solution, monkeypatch):
     """The plant's own friction: all that it can after the way into contact, little after a while.
 
-    So it holds a push either way, along the direction of stiffness, and tells when it does not.
+    So it holds a push either way, along the direction of stiffness, and tells when it does not. The
+    same if the target has no position, and the tip just stays.
     """
     known = SimpleNamespace(solve=lambda: solution)
     monkeypatch.setattr(planning, "PressureSolver", lambda robot, task: known)
@@ -535,13 +537,17 @@ def test_contacts_that_are_to_stick_are_relieved_of_friction(solution, monkeypat
         return float(np.linalg.norm(contact.force - along * normal)) / along
 
     loop.wait(1.0)
-    loop.controller.set_task(TASK.model_copy(update={"brace": brace}))
+    target = TASK.target
+    if not is_placed:
+        pointing = tuple(map(float, solution.tip_pose[:3, 2]))
+        target = target.model_copy(update={"position": None, "pointing": pointing})
+    loop.controller.set_task(TASK.model_copy(update={"brace": brace, "target": target}))
     loop.until(lambda s: s.brace == "held", 20.0)
     loop.wait(8.0)
     assert share() > 0.15
     loop.wait(12.0)
-    assert share() < 0.08
-    assert loop.status.position_error < 1e-3
+    assert share() < (0.08 if is_placed else 0.12)
+    assert loop.status.position_error < 1e-3 or not is_placed
     assert loop.status.brace == "held"
     loop.controller.close()
 

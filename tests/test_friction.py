@@ -42,6 +42,45 @@ def friction_at(*names: str, friction: float = MU) -> Friction:
     return Friction(hold, PRESSURES)
 
 
+def test_contacts_at_almost_the_same_station_stay_within_their_cones():
+    """Between two crossing posts: what they hold is the same, and its stiffness is negative."""
+    pressures = np.array([26091.9, 0, 0, 32047.7, 13894.5, 46330.3])
+    ends = [
+        (
+            (0.04407147717262898, -0.028982446037186207, 0.07441589014812137),
+            (-0.01762749956664817, 0.04971467125008257, 0.07441589014812137),
+        ),
+        (
+            (0.005497362689674181, 0.05262337289443876, 0.0728120717405957),
+            (-0.03684971388127545, -0.03796760406184607, 0.0728120717405957),
+        ),
+    ]
+    objects = [
+        {
+            "name": f"post {i}",
+            "capsule": {"from": first, "to": second, "radius": 0.005},
+            "contact": {"allowed": True, "friction": 0.2},
+        }
+        for i, (first, second) in enumerate(ends)
+    ]
+    eq = ROBOT.contact_equilibrium(pressures, stiffopt.Scene(objects=objects))
+    first, second = eq.contacts
+    assert abs(first.at - second.at) < 1e-4
+    stiffness, sticking = np.linalg.eigvalsh(eq.sticking.per_slide), eq.sticking.softened(1e-4)
+    assert stiffness.min() < -1e5
+    assert np.linalg.eigvalsh(sticking.per_slide) == pytest.approx(
+        [*stiffness[1:] / (1 + 1e-4 * stiffness[1:]), 1e4], rel=0.05
+    )
+    hold = Hold(eq.normal_forces, eq.force_gradients, np.zeros((2, 3)), sticking)
+    friction = Friction(hold, pressures)
+    for share in np.linspace(0.0, 1.0, 60):
+        friction.follow(share * pressures, 0.2, 1e-4)
+        most = 0.2 * np.maximum(friction.normals(friction._pressures), 0.0)
+        sizes = np.linalg.norm(friction.forces.reshape(2, 2), axis=1)
+        assert (sizes <= 1.01 * most + 1e-4).all()
+    assert np.isfinite(friction.slid(np.array([0.05, 0.0, 0.0]), eq.normal_forces)).all()
+
+
 @pytest.mark.parametrize("names", [("post",), ("ball",), ("post", "ball")])
 def test_an_arm_that_sticks_is_one_that_slides_with_tangential_forces(names):
     """The forces by a push bend the arm that slides into the one that sticks."""

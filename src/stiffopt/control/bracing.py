@@ -413,7 +413,8 @@ class Bracing:
         """Return the change (n,) of pressures that fits rows (m, n) @ it best.
 
         To relieve friction takes all channels, so those at their limits are known to stay there.
-        `wanted` may lack zeros at its end.
+        `wanted` may lack zeros at its end. A channel that comes to its limit stays there for this
+        step, even if the others could then do better without that: the next steps make it up.
         """
         t, n = self._tuning, len(self._change)
         A = np.vstack([rows, t.pressure_weight * np.eye(n)])

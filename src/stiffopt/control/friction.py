@@ -24,7 +24,7 @@ from stiffopt.paths.leaning import Hold
 
 Array = NDArray[np.float64]
 
-_ROUNDS = 20  # over the contacts, and of Newton's method at one
+_ROUNDS = 10  # over the contacts, and of Newton's method at one
 _SAME = 1e-3  # share of the cone within which a force is on it
 _LEAST = 1e-6  # N, a force of a contact that is about to open
 

@@ -35,6 +35,7 @@ _STATIONS = 41  # of the body
 _SAME = 2e-4  # m; tips that are nearer belong to the same equilibrium
 _AS_STIFF = 0.05  # largest difference of stiffnesses in the same equilibrium
 _PUSH = 2e-3  # N, step of finite differences by a push at the tip
+_TANGENTIAL = 1e-4  # m/N, compliance of a contact that sticks: a hundredth of an arm's along itself
 _FORGIVEN = 1e-4  # m, tolerated lack of clearance from other objects
 
 
@@ -232,7 +233,8 @@ def _hold(eq: ContactEquilibrium) -> Hold:
         (eq.shifted(push=step).normal_forces - eq.shifted(push=-step).normal_forces) / (2 * _PUSH)
         for step in _PUSH * np.eye(3)
     ]
-    return Hold(eq.normal_forces, eq.force_gradients, np.array(pushed).T, eq.sticking)
+    sticking = eq.sticking.softened(_TANGENTIAL)
+    return Hold(eq.normal_forces, eq.force_gradients, np.array(pushed).T, sticking)
 
 
 def _largest(eq: ContactEquilibrium) -> float:

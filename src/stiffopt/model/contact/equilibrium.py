@@ -97,6 +97,25 @@ class Sticking(NamedTuple):
         """Return the slides (2k,), in m, that tangential forces (2k,) withhold."""
         return np.asarray(-np.linalg.solve(self.per_slide, forces))
 
+    def softened(self, compliance: float) -> Sticking:
+        """Return the same for contacts whose surfaces give way along themselves, by so many m/N.
+
+        Two contacts that stick at almost the same station hold almost the same thing, so that K,
+        the stiffness against slides, is huge in one direction, or negative by rounding. With the
+        compliance c, ``G = (1 + c K)^-1`` is the share of a slide that the body takes part in.
+        """
+        stiffness, axes = np.linalg.eigh((self.per_slide + self.per_slide.T) / 2)
+        rigid = stiffness <= 0
+        share = np.where(rigid, 0.0, 1 / (1 + compliance * np.maximum(stiffness, 0.0)))
+        given = axes * share @ axes.T
+        return self._replace(
+            per_pressure=given @ self.per_pressure,
+            per_push=given @ self.per_push,
+            per_slide=axes * np.where(rigid, 1 / compliance, stiffness * share) @ axes.T,
+            tip=self.tip @ given,
+            normals=self.normals @ given,
+        )
+
 
 class ContactEquilibrium:
     """An equilibrium with contacts; see `Manipulator.contact_equilibrium`.

@@ -285,7 +285,7 @@ def _first_loss(
 def until_equal(a: Vector, b: Vector, c: float, d: float) -> float:
     """Return the least x > 0 at which ``|a + b x| = c + d x``; infinite if there is none."""
     square, double, rest = b @ b - d * d, a @ b - c * d, a @ a - c * c
-    if rest >= 0:
+    if c <= 0 or rest >= 0:
         return 0.0
     root = double * double - square * rest
     if root < 0 or double + np.sqrt(root) <= 0:
