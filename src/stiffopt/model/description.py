@@ -544,7 +544,7 @@ class RobotDescription(Schema):
             if 1 + softening * most <= 0:
                 raise BadKeyError(
                     f"segments.{index}.history.softening",
-                    f"{softening:g} per Pa leaves no modulus at the highest pressures, which have a "
+                    f"{softening:g} per Pa leaves no modulus at the highest pressures, with a "
                     f"norm of {most * 1e-5:g} bar; expected between {-1 / most:.3g} and 0",
                 )
 
