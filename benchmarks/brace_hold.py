@@ -356,10 +356,10 @@ def main() -> None:
                 print(json.dumps(row), flush=True)
             if given.out:
                 given.out.write_text(json.dumps(rows, indent=1))
-    report(rows)
+    report(rows, slips=given.slips)
 
 
-def report(rows: list[dict[str, Any]]) -> None:
+def report(rows: list[dict[str, Any]], *, slips: bool) -> None:
     """Print the tables."""
     good = [row for row in rows if "force" in row]
     head = ["arm", "force promised, estimated, met, mN", "push foretold, lost at, mN", "late, s"]
@@ -393,8 +393,9 @@ def report(rows: list[dict[str, Any]]) -> None:
     kept = [row["kept"] for row in good if "kept" in row]
     print(f"lost while nothing pushed: {sum(row['false'] for row in good)} of {len(good)}")
     print(f"pushed with {KEPT} of the loss for {HOLD:.0f} s, and held: {sum(kept)} of {len(kept)}")
-    slid = sum(row["slid"] > SLIDES[0] and not row["kept"] for row in good if "kept" in row)
-    print(f"  not held, and had slid by {1e3 * SLIDES[0]} mm when it was reported: {slid}")
+    if slips:
+        slid = sum(row["slid"] > SLIDES[0] and not row["kept"] for row in good if "kept" in row)
+        print(f"  not held, and had slid by {1e3 * SLIDES[0]} mm when it was reported: {slid}")
     print(f"let go, clear: {sum(row['left'] == 0 for row in good)} of {len(good)}")
 
 
