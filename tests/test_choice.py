@@ -28,6 +28,23 @@ ONE = load_description("stiff-flop-1")
 BY_NAME = {structure.name: structure for structure in STRUCTURES}
 
 
+def test_memory_of_an_arm_that_softens_acts_at_its_modulus() -> None:
+    """Where creep is fitted; without it, play also stands for creep."""
+    softening = {
+        name: BY_NAME[name].applied(ONE, 1e5).segments[0].history
+        for name in ("hysteresis", "creep", "elongation-hysteresis")
+    }
+    values = [history.softening if history else None for history in softening.values()]
+    assert values == [0.0, pytest.approx(-0.2 / 1e5), pytest.approx(-0.2 / 1e5)]
+    known = ONE.segments[0].compensation
+    assert known is not None
+    update = {"compensation": known.model_copy(update={"modulus_law": "exponential"})}
+    segment = ONE.segments[0].model_copy(update=update)
+    other = BY_NAME["creep"].applied(ONE.model_copy(update={"segments": (segment,)}), 1e5)
+    assert other.segments[0].history is not None
+    assert other.segments[0].history.softening == 0
+
+
 @dataclass(frozen=True)
 class Nothing:
     """Stands for a fit that nobody asks."""

@@ -569,3 +569,16 @@ def test_arm_of_one_channel(tmp_path, dynamics):
     bench.controller.set_task(Task(robot=str(path), target=target))
     errors = bench.run(5.0, (np.nan, np.nan, height))
     assert errors[-round(1.0 / PERIOD) :].mean() < 3e-4
+
+
+@pytest.mark.parametrize("seed", [34, 35])
+def test_late_ticks_after_arming_are_no_slip(seed: int) -> None:
+    tilted = {"position": [2e-3, -1e-3, 0.0], "orientation": [0.99992, 0.0087, -0.0087, 0.0]}
+    bench = Bench(dynamics="full", seed=seed, plant={"mismatch": {"base": tilted}})
+    bench.controller.set_task(bench.task(position=(-0.025, 0.005, 0.195)))
+    rng = np.random.default_rng(seed)
+    for _ in range(20):
+        bench.run(bench.period)
+        lateness, is_late = rng.uniform(0, 0.045), rng.random() < 0.4
+        bench.rig.clock.sleep(lateness * is_late)
+        assert not bench.controller.notices()

@@ -185,6 +185,7 @@ MISTAKES = [
     ("inertia: 1.05", "inertia: 1 mm", 13, "inertia: '1 mm' is not a number"),
     ("connector: 5 mm", "connector: -1 mm", 14, "connector: must be at least 0"),
     ("connector: 5 mm", "strain_law: neo", 14, "'neo' is not one of 'paper', 'rest-length'"),
+    ("connector: 5 mm", "history: {softening: -0.2}", 14, "-0.2 per Pa leaves no modulus"),
     ("tip_mass: 20 g", "tip_mass: -20 g", 15, "tip_mass: must be at least 0, not '-20 g'"),
     ("9.81 m/s^2]", "9.81 m/s^2, 0 m/s^2]", 16, "gravity: expected 3 items, not 4"),
     ("9.81 m/s^2]", "9.81 N]", 16, "gravity[2]: '9.81 N': 'N' is not a unit of acceleration"),

@@ -171,6 +171,8 @@ def test_pressures_that_change_make_a_larger_region() -> None:
     slopes = arm.tip_pose(CIRCLE[0])[:3, :3] @ arm.tip_jacobian(CIRCLE[0])[:3]
     np.testing.assert_allclose(moving.hysteresis, 3e3**2 * slopes @ slopes.T, rtol=1e-9)
     assert not held.hysteresis.any()  # this arm has no play
+    assert held.discrepancy.any()
+    np.testing.assert_allclose(held.discrepancy, 0.9 * moving.discrepancy, rtol=1e-9)
 
 
 def test_a_discrepancy_moves_the_tip_as_far_in_all_directions() -> None:
@@ -371,6 +373,27 @@ def test_an_arm_that_is_as_the_model_has_no_discrepancy_and_the_residual_of_its_
     assert known.discrepancy * slope < 2e-4
     assert known.moving == ()  # every row was held for 10 s
     assert known.settled == (0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize("together", [True, False])
+def test_a_motion_counts_as_one_of_all_channels(together: bool) -> None:
+    """Where channels move one at a time, each row has less error than where all of them do."""
+    tooth = np.interp(np.arange(0, 8, 0.1), [0, 2, 4], [0, 8e4, 0])
+    one = tooth[:, np.newaxis]
+    moved = [np.ones(3)] * 3 if together else np.eye(3)
+    pressures = np.concatenate([one * channels for channels in moved])
+    time = 0.1 * np.arange(len(pressures))
+    tips = Manipulator(ONE).tip_pose(np.roll(pressures, 3, axis=0))[:, :3, 3]  # 0.3 s late
+    settings = CalibrationSettings()
+    recordings = recordings_of(ONE, [("log", Log(time, pressures, tips))], settings)
+    problem = Setup.of(ONE, recordings, [], settings).problem(STRUCTURES[1], 400)
+    found = fit(problem, [np.zeros(problem.size)], rounds=0)
+    known = error_model(found, {})
+    rows = is_moving(time, pressures)
+    late = found.predicted.effective[rows] - pressures[rows]
+    assert np.abs(late).max() > 1e3
+    share = 1.0 if together else 5 / 3  # of three channels, of one
+    assert known.moving == pytest.approx(np.sqrt(np.mean(late**2, axis=0) * share), rel=1e-3)
 
 
 def test_a_robot_file_keeps_its_error_model(tmp_path: object) -> None:

@@ -120,7 +120,8 @@ def test_it_predicts_another_day(kind: str) -> None:
 def test_play_of_elongation_is_found_and_chosen() -> None:
     """An arm that keeps more of its elongation than of its bending, and creeps."""
     plays = (Play(width=10 * KPA, share=0.15), Play(width=40 * KPA, share=0.4, of="elongation"))
-    history = History(lag=0.5, lag_falling=0.8, play=plays, creep=(Creep(time=20.0, share=0.1),))
+    creep = (Creep(time=20.0, share=0.1),)
+    history = History(lag=0.5, lag_falling=0.8, softening=-0.2 / 1e5, play=plays, creep=creep)
     robot = with_history(true_robot("static"), history)
     first, second = (
         ("log.csv", made_log(robot, *course(3, 60.0, seed, rate=5.0), base=BASE, noise=3e-4))

@@ -412,6 +412,27 @@ def test_shares_count_for_what_they_act_on() -> None:
 # -- mistakes -------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("x", [[90e3, 0.0, 0.0], [80e3, 70e3, 90e3], [0.0, 0.0, 0.0]])
+def test_what_is_remembered_is_a_stress_at_the_present_modulus(x: list[float]) -> None:
+    """Pressures x and s at the modulus of x have the strain of effective ones, to first order."""
+    c, small = -2e-6, 1e-3
+    now, remembered = np.array([x]), small * KPA * np.array([[-3.0, 5.0, -2.0]])
+    history = History(softening=c, play=PLAYS)
+
+    def strain(p: Vector, modulus_at: Vector) -> Vector:
+        return np.asarray(p / (1 + c * np.linalg.norm(modulus_at)))
+
+    acting = history.at_fixed_modulus(now, remembered)
+    expected = strain(now + remembered, now) - strain(now, now)
+    found = strain(now + acting, now + acting) - strain(now, now)
+    assert found == pytest.approx(expected, rel=1e-3)
+    assert (acting != pytest.approx(remembered, rel=0.01)) == bool(now.any())
+    none = history.model_copy(update={"softening": 0.0})
+    assert none.at_fixed_modulus(now, remembered) == pytest.approx(remembered)
+    symbolic = history.at_fixed_modulus(ca.SX(now), ca.SX(remembered))
+    assert ca.evalf(symbolic).full() == pytest.approx(acting)
+
+
 def test_what_a_memory_refuses() -> None:
     with pytest.raises(InputError, match="at least one channel"):
         Memory([])

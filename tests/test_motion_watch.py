@@ -24,17 +24,24 @@ ROBOT = load_robot("stiff-flop-2")
 P = np.array([4e4, 0.0, 2e4, 0.0, 5e4, 0.0])
 TIP = TipModel(ROBOT).at(P)
 J = TIP.pose[:3, :3] @ TIP.jacobian[:3]
-NONE = np.zeros(6)  # no offset
+NONE = np.zeros(6)  # no offset, of a tracker that measures no orientations
 
 
 def take(
-    watch: MotionWatch, time: float, seen: Array, predicted: Array, offset: Array, swing: float = 0
+    watch: MotionWatch,
+    time: float,
+    seen: Array,
+    predicted: Array,
+    offset: Array,
+    swing: float = 0,
+    deviation: float = 0,
 ) -> None:
     """Have a sample watched, at the least pressures that make the model move as predicted."""
-    pressures, turns = np.linalg.pinv(J) @ predicted, bool(offset.any())
+    pressures, turns = np.linalg.pinv(J) @ predicted, offset is not NONE
     watch.take(
-        time, seen, predicted, offset, pressures, TIP, turns=turns, swings=(swing, swing / 2)
-    )
+        time, seen, predicted, offset, pressures, TIP,
+        turns=turns, swings=(swing, swing / 2), deviation=deviation,
+    )  # fmt: skip
 
 
 def watched(
@@ -327,6 +334,19 @@ def test_a_displacement_that_turns_nothing_is_a_slip(turned: float) -> None:
     assert doubt is not None
     assert doubt.kind == "slip"
     assert "sensor has slipped" in doubt.text
+
+
+@pytest.mark.parametrize(("known_after", "is_doubted"), [(0.1, True), (0.4, False)])
+def test_an_offset_that_the_estimator_does_not_know_yet_is_no_slip(
+    known_after: float, is_doubted: bool
+) -> None:
+    watch = MotionWatch(ROBOT.description, MotionTuning())
+    for time in np.arange(0.0, 1.0, FRAME):
+        found = (time > 0.25) * 0.008 * X  # at first it counts as a vibration
+        deviation = 1e-4 if time > known_after else 2e-3
+        watch.intend(time, np.zeros(3))
+        take(watch, time, found, np.zeros(3), np.concatenate([found, np.zeros(3)]), 0, deviation)
+    assert (watch.doubt is not None) is is_doubted
 
 
 @pytest.mark.parametrize(("response", "words"), [(0.5, "too low"), (1.6, "too high")])

@@ -272,7 +272,7 @@ def test_hysteresis_is_at_most_what_was_recorded() -> None:
         inverse @ Manipulator(each).tip_uncertainty(P).hysteresis @ inverse.T
         for each in (free, held)
     ]
-    assert acting[1][0, 0] == pytest.approx((0.9 * 200.0) ** 2)
+    assert acting[1][0, 0] == pytest.approx(0.9 * 200.0**2)
     np.testing.assert_allclose(acting[1][1:, 1:], acting[0][1:, 1:])
 
 
@@ -296,7 +296,7 @@ def test_hysteresis_moves_the_tip_less_where_the_arm_is_soft() -> None:
 
     usual = np.median([softness(p) for p in recorded])
     for p, least in ((np.array([1.4e5, 0.2e5, 1e5]), 0.0), (np.array([2.1e4, 1e3, 2e3]), 0.25)):
-        share = 0.9**2 / max(softness(p) / usual, least)
+        share = 0.9 / max(softness(p) / usual, least)
         assert (softness(p) < 0.25 * usual) == (least > 0)
         expected = share * free.tip_uncertainty(p).hysteresis
         np.testing.assert_allclose(held.tip_uncertainty(p).hysteresis, expected, rtol=1e-6)

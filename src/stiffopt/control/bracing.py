@@ -22,12 +22,14 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.control.friction import Friction
 from stiffopt.control.interface import Notice
 from stiffopt.control.state import Severity
 from stiffopt.control.tuning import BracingTuning
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import Task
 from stiffopt.optimise.tip import TipAt
+from stiffopt.paths.configurations import maximised
 from stiffopt.paths.leaning import BraceApproach
 
 Array = NDArray[np.float64]
@@ -78,6 +80,7 @@ class Bracing:
         self._residual: Array = np.zeros(3)  # y - s, smoothed over vibrations
         self._held = self._pushed = 0.0  # durations, in s
         self.approach: BraceApproach | None = None
+        self._friction: Friction | None = None
         self._start: Array = np.zeros(0)  # pressures (n,) from which the arm goes to rest
         self._left = 1.0  # share of `_start` that is left
         self._time = 0.0  # along the approach, in s
@@ -116,6 +119,7 @@ class Bracing:
     def begin(self, approach: BraceApproach, pressures: Array) -> None:
         """Go from pressures (n,) to rest, then along the approach."""
         self.approach, self._start = approach, pressures
+        self._friction = Friction(approach.hold, approach.pressures[-1])
         self._left = float(bool(np.abs(pressures).max() > self._tuning.at_rest))
         self._change = np.zeros_like(pressures)
         self.phase = BracePhase.TO_REST
@@ -192,13 +196,20 @@ class Bracing:
         pressures :
             Effective pressures (n,), in Pa.
         """
-        t, held = self._tuning, self.phase is BracePhase.HELD
-        if self.approach is None or not (held or self.phase is BracePhase.APPROACHING):
+        t, held, friction = self._tuning, self.phase is BracePhase.HELD, self._friction
+        if self.approach is None or friction is None:
+            return
+        if not (held or self.phase is BracePhase.APPROACHING):
             return
         off_plan = t.off_plan if self.is_steered else t.let_down
         if float(np.abs(pressures - self.pressures).max()) > off_plan:
             return
+        sticks = self._sticks
+        creep = t.creep * elapsed / (t.creep_time + self._held) if held else 0.0
+        friction.follow(pressures, min(elapsed / t.even_time, 1.0), creep)
         residual = seen - tip.pose[:3, 3]
+        if sticks:
+            residual = residual - friction.tip @ friction.forces
         if self._error is None:
             self._residual = residual
         self._residual = self._residual + min(elapsed / t.swing_time, 1.0) * (
@@ -220,14 +231,17 @@ class Bracing:
             return
         if self._error is None:
             self._error = residual
-        raw, settles = residual - self._error, self._held < t.settling
+        raw, settles = residual - self._error, self._held < self._settling
         off = raw + self._withheld(raw)
         self._corrected *= 1 - min(elapsed / t.withheld_time, 1.0)
         self._held += elapsed
-        R, before = tip.pose[:3, :3], self._forces(pressures)
+        R, before = tip.pose[:3, :3], friction.sliding(pressures)
         C = R @ tip.compliance[:3, :3] @ R.T
-        doubt = (t.deviation / t.usual_push) ** 2
-        push = C @ np.linalg.solve(C @ C + doubt * np.eye(3), off)
+        if sticks:
+            before = friction.normals(pressures)
+            C = C + friction.tip @ self.approach.hold.sticking.per_push
+        usual = self._usual(R)
+        push = usual @ C.T @ np.linalg.solve(C @ usual @ C.T + t.deviation**2 * np.eye(3), off)
         feels = self._feels(off, push, before)
         if settles or not feels or self._pushed > t.longest_push:
             time = t.settling_time if settles else t.error_time
@@ -239,8 +253,10 @@ class Bracing:
             self._warned.clear()
             return
         self._pushed += elapsed
+        if sticks:  # what stays is creep in the end
+            self._error = self._error + min(elapsed / t.push_creeps, 1.0) * raw
         self.push, self.displacement = push, off
-        self.covariance[:] = np.linalg.inv(C @ C / t.deviation**2 + np.eye(3) / t.usual_push**2)
+        self.covariance[:] = np.linalg.inv(C.T @ C / t.deviation**2 + np.linalg.inv(usual))
         self._judge(before, elapsed)
 
     def _feels(self, off: Array, push: Array, before: Array) -> bool:
@@ -249,21 +265,44 @@ class Bracing:
         It is if it is large, or if its push uses up a share of what a contact holds: an arm that is
         stiff loses its contact before the tip has moved far. `before`: normal forces (k,).
         """
-        assert self.approach is not None
+        assert self._friction is not None
         t, size = self._tuning, float(np.linalg.norm(off))
-        uses = float((-(self.approach.hold.per_push @ push) / np.maximum(before, 1e-6)).max())
+        uses = float((-(self._per_push @ push) / np.maximum(before, 1e-6)).max())
+        if self._sticks and push.any():
+            force = float(np.linalg.norm(push))
+            uses = max(uses, force / max(self._friction.left(push / force, before), 1e-6))
         return size > t.felt or (size > t.least_felt and uses > t.felt_share)
+
+    def _usual(self, rotation: Array) -> Array:
+        """Return the covariance (3, 3) of pushes before the tip is seen, in N^2; base axes.
+
+        An arm whose contacts are to stick hardly moves along its axis. There, pushes are expected
+        rather along the directions in which the task wants it to be stiff.
+        """
+        t, share = self._tuning, self._tuning.aside if self._sticks else 1.0
+        turns = {"base": np.eye(3), "tip": rotation}
+        ways = np.array([turns[m.frame] @ m.direction for m in maximised(self.task)]).T
+        along = ways @ np.linalg.pinv(ways)
+        found: Array = t.usual_push**2 * (share**2 * np.eye(3) + (1 - share**2) * along)
+        return found
+
+    @property
+    def _per_push(self) -> Array:
+        """Derivatives (k, 3) of the contacts' normal forces by a push."""
+        assert self.approach is not None
+        assert self._friction is not None
+        return self._friction.per_push if self._sticks else self.approach.hold.per_push
+
+    @property
+    def _settling(self) -> float:
+        """Time in which the tip goes to its target, and friction is relieved, in s."""
+        t = self._tuning
+        return t.settling + (t.relief if self._sticks else 0.0)
 
     @property
     def _sticks(self) -> bool:
         """True if a contact that slips counts as lost."""
         return self.task.brace is not None and self.task.brace.contacts == "sticking"
-
-    def _slips_at(self, push: Array) -> float:
-        """Return the push in N at which a contact slips, in about the direction of a push (3,)."""
-        assert self.approach is not None
-        hold = self.approach.hold
-        return float(hold.slips[int(np.argmax(hold.directions @ push))])
 
     def _free_tip(self) -> Array:
         """Return the position (3,) of the tip of a free arm at the present place of the way."""
@@ -282,38 +321,34 @@ class Bracing:
         found: Array = float(np.clip(share, -1.0, 1.0)) * self._corrected
         return found
 
-    def _forces(self, pressures: Array) -> Array:
-        """Return normal forces (k,) of the contacts at pressures (n,), without a push."""
-        assert self.approach is not None
-        hold, planned = self.approach.hold, self.approach.pressures[-1]
-        found: Array = hold.forces + hold.per_pressure @ (pressures - planned)
-        return found
-
     def _judge(self, before: Array, elapsed: float) -> None:
         """Judge whether the contacts hold the estimated push; `before`: normal forces (k,).
 
         Silicone is stiffer to a quick push, so while one grows, less is left than estimated.
         """
         assert self.approach is not None
-        hold, size = self.approach.hold, float(np.linalg.norm(self.push))
-        change = hold.per_push @ self.push
+        assert self._friction is not None
+        t, size = self._tuning, float(np.linalg.norm(self.push))
+        change = self._per_push @ self.push
         forces = before + change
         weakest = int(forces.argmin())
         falls = change < 0
-        left = size * float(np.min(forces[falls] / -change[falls], initial=math.inf))
-        slip = self._slips_at(self.push) - size
+        left = size * float(np.min(before[falls] / -change[falls], initial=math.inf))
+        if self._sticks:
+            left = min(left, self._friction.left(self.push / size, before))
+        slips = float(self._friction.slid(self.push, before).max(initial=0.0)) > t.slid
         self.force = float(forces[weakest])
-        self.margin = max(min(left, slip) if self._sticks else left, 0.0)
-        t, share = self._tuning, self.force / max(float(before[weakest]), 1e-6)
+        self.margin = max(left - size, 0.0)
+        share = self.force / max(float(before[weakest]), 1e-6)
         self._share += min(elapsed / t.grown_time, 1.0) * (share - self._share)
         none = t.lost_share + min(max(self._share - share, 0.0), t.grown_share)
-        how = "lifts off" if share <= none else "slips" if self._sticks and slip <= 0 else ""
+        how = "lifts off" if share <= none else "slips" if self._sticks and slips else ""
         where = f"on '{self.approach.contacts[weakest].object}'"
         words = f"under a push of {1e3 * size:.0f} mN"
         if how:
             self.release(why=f"the contact {where} {how} {words}")
             return
-        if slip <= 0:
+        if slips:
             self._warn("brace-slips", f"the contact {where} slips {words}")
         if share < t.weak_share:
             left_over = f"{1e3 * max(self.force, 0.0):.0f} of {1e3 * before[weakest]:.0f} mN"
@@ -328,8 +363,13 @@ class Bracing:
     def _notify(self, kind: str, text: str, severity: Severity = Severity.INFO) -> None:
         self._notices.append(Notice(kind, text, severity))
 
-    def correct(self, elapsed: float, error: Array, jacobian: Array) -> None:
+    def correct(
+        self, elapsed: float, error: Array, jacobian: Array, limits: tuple[Array, Array]
+    ) -> None:
         """Move the braced tip slowly to its target, with constant contact forces.
+
+        Then also relieve contacts that are to stick of the friction that the way into contact left:
+        the pressures change the tangential forces while the tip stays.
 
         Parameters
         ----------
@@ -338,10 +378,12 @@ class Bracing:
         error :
             Of the tip (3,), in m; zero in components that the target leaves open.
         jacobian :
-            Of the braced tip's position, base axes (3, n), in m/Pa.
+            Of the position of a tip whose contacts slide, base axes (3, n), in m/Pa.
+        limits :
+            Smallest and largest pressures (n,), in Pa.
         """
-        if self.displacement.any() or self.approach is None:  # a push is not compensated
-            return
+        if self.displacement.any() or self.approach is None or self._friction is None:
+            return  # a push is not compensated
         t = self._tuning
         off, (least, since) = float(np.linalg.norm(error)), self._nearest
         if off < (1 - t.progress) * least:
@@ -350,10 +392,14 @@ class Bracing:
             self._is_off = True
             text = f"the tip stays {1e3 * off:.1f} mm from its target while the arm leans"
             self._notify("brace-off-target", text, Severity.WARNING)
-        rows = np.vstack([jacobian, t.force_weight * self.approach.hold.per_pressure])
-        wanted = np.concatenate([error, np.zeros(len(rows) - 3)])
-        H = rows.T @ rows + t.pressure_weight**2 * np.eye(rows.shape[1])
-        step = np.linalg.solve(H, rows.T @ wanted) * elapsed
+        hold, friction = self.approach.hold, self._friction
+        rows, wanted = [jacobian, t.force_weight * hold.per_pressure], [error]
+        if self._sticks and self._held >= t.settling:  # the tip has come to its target
+            rates = hold.sticking.per_pressure
+            jacobian = jacobian + friction.tip @ rates
+            rows = [jacobian, t.force_weight * friction.per_pressure, t.force_weight * rates]
+            wanted = [error, np.zeros(len(hold.forces)), -t.force_weight * friction.forces]
+        step = elapsed * self._step(np.vstack(rows), np.concatenate(wanted), limits)
         time, speed = t.first_time, t.first_speed
         if self._held >= t.settling:  # so slow that a push which is not felt yet is quicker
             time, speed = t.time, t.correction_speed
@@ -362,6 +408,31 @@ class Bracing:
         before = self._change
         self._change = np.clip(before + step, -t.most_change, t.most_change)
         self._corrected = self._corrected + jacobian @ (self._change - before)
+
+    def _step(self, rows: Array, wanted: Array, limits: tuple[Array, Array]) -> Array:
+        """Return the change (n,) of pressures that fits rows (m, n) @ it best.
+
+        To relieve friction takes all channels, so those at their limits are known to stay there.
+        `wanted` may lack zeros at its end. A channel that comes to its limit stays there for this
+        step, even if the others could then do better without that: the next steps make it up.
+        """
+        t, n = self._tuning, len(self._change)
+        A = np.vstack([rows, t.pressure_weight * np.eye(n)])
+        b = np.concatenate([wanted, np.zeros(len(A) - len(wanted))])
+        low, high = np.full(n, -np.inf), np.full(n, np.inf)
+        if self._sticks:
+            now, most = self.pressures, t.most_change
+            low = np.clip(limits[0] - now, -most - self._change, 0.0)
+            high = np.clip(limits[1] - now, 0.0, most - self._change)
+        step, free = np.zeros(n), np.ones(n, dtype=bool)
+        while free.any():
+            B = A[:, free]
+            step[free] = np.linalg.solve(B.T @ B, B.T @ (b - A[:, ~free] @ step[~free]))
+            beyond = (step < low) | (step > high)
+            if not beyond.any():
+                break
+            step, free = np.clip(step, low, high), free & ~beyond
+        return step
 
     def notices(self) -> tuple[Notice, ...]:
         """Return events since the last call, and alarms."""

@@ -500,14 +500,17 @@ class TipController:
         )
 
     def _correct_brace(self, course: Bracing, now: float) -> None:
-        """Bring the braced tip to its target."""
+        """Bring the braced tip to its target; without one for its position it stays."""
         tip = self._arm.modelled
         wanted, _, _ = target_arrays(course.task.target)
-        if tip is None or wanted is None:
+        if tip is None:
             return
-        error = np.nan_to_num(wanted - self._arm.tip.position)
+        position = self._arm.tip.position
+        error = np.nan_to_num((position if wanted is None else wanted) - position)
         elapsed = min(now - self._computed_at, _HELD * self._period)
-        course.correct(elapsed, error, tip.pose[:3, :3] @ tip.jacobian[:3])
+        offset = self._arm.pressures.command_offset
+        limits = self._permitted[0] + offset, self._permitted[1] + offset
+        course.correct(elapsed, error, tip.pose[:3, :3] @ tip.jacobian[:3], limits)
 
     def _shift(self, change: Array) -> None:
         """Shift reference and feedback by a change of the offset (6,), without a jump."""

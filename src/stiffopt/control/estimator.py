@@ -143,6 +143,11 @@ class TipEstimator:
         return self._past[-1].driven + self._free
 
     @property
+    def deviation(self) -> float:
+        """Standard deviation of the offset's position along the axis where it is largest, in m."""
+        return math.sqrt(max(float(self._covariance[2, 2]), float(self._variances[0])))
+
+    @property
     def turn_known(self) -> bool:
         """Whether the tracker measures orientations."""
         return self.sample is not None and self.sample.quaternion is not None

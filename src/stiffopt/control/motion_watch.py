@@ -100,6 +100,7 @@ class MotionWatch:
         # shares of the turn of a push that are missing in the latest samples
         self._slips: deque[float] = deque(maxlen=self._tuning.slips)
         self._bends_until = -math.inf  # end of the pause after a push, in s
+        self._known_from = math.inf  # time from which the estimator knows the tip's offset, in s
         self._path = 0.0  # length of the way of r, in m
         self._intended: deque[tuple[float, Array]] = deque(maxlen=self._kept)
         self._swings = [_Swings(self._tuning) for _ in range(3)]
@@ -147,6 +148,7 @@ class MotionWatch:
         *,
         turns: bool,
         swings: tuple[float, float] = (0.0, 0.0),
+        deviation: float = 0.0,
     ) -> None:
         """Take in a sample of the tracker.
 
@@ -166,6 +168,8 @@ class MotionWatch:
             Whether the tracker measures orientations.
         swings :
             Amplitudes of the vibration that the pressures drive, and of the free one, in m.
+        deviation :
+            Standard deviation of the offset's position along an axis, in m.
         """
         intended = self._intended_at(time)
         if intended is None or self._is_early(time) or self.doubt is not None:
@@ -186,7 +190,11 @@ class MotionWatch:
             axis.take(_Turn(time, error, self._path))
         jacobian = tip.pose[:3, :3] @ tip.jacobian[:3]
         self.doubt = self._no_response(jacobian, tip.pose[:3, 2])
-        if turns:
+        if not turns:
+            self._known_from = math.inf
+        elif 3 * deviation < self._min_motion / 2:  # the least displacement that is a slip
+            self._known_from = min(self._known_from, time)
+        if self._known_from <= time:
             self.doubt = self.doubt or self._slip(jacobian, tip)
         bending = turn_of_a_push(tip) if turns else None
         self.doubt = self.doubt or self._drift(jacobian, bending) or self._swing()
@@ -330,8 +338,12 @@ class MotionWatch:
         return _Miss(share, float(distance[first]), float(np.linalg.norm(seen[first])), error)
 
     def _slip(self, jacobian: Array, tip: TipAt) -> Doubt | None:
-        """Test whether the offset has changed as no force, wherever it acts, changes it."""
-        tuning, rows = self._tuning, self._since(self._tuning.slip_window)
+        """Test whether the offset has changed as no force, wherever it acts, changes it.
+
+        In the first samples the estimator cannot tell an offset from a vibration; both change then.
+        """
+        tuning, known = self._tuning, float(self._rows[self._count - 1, _TIME]) - self._known_from
+        rows = self._since(min(tuning.slip_window, known))
         way = rows[-1] - rows[0]
         moved, turned = way[_OFFSET], way[_TURN]
         least = self._min_motion / 2

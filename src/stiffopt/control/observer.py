@@ -205,6 +205,7 @@ class ArmObserver:
         self.watch.take(
             sample.time, sample.position - pushed, predicted, self.tip.offset,
             effective, tip, turns=self.tip.turn_known, swings=self.tip.swings,
+            deviation=self.tip.deviation,
         )  # fmt: skip
 
     def lean_on(self, leaning: LeaningTip | None) -> Array:

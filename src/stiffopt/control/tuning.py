@@ -537,12 +537,26 @@ class BracingTuning:
     # constant, in s
     settling: float = 8.0
     settling_time: float = 0.3
+    # time after that in which contacts that are to stick are relieved of friction, in s
+    relief: float = 8.0
+    # time constant with which friction follows the pressures, whose noise would move it, in s; and
+    # the slide of a contact, as the estimated push foretells it, that is a slip, in m
+    even_time: float = 0.5
+    # creep beyond the model's, which lengthens an arm that friction holds: share by which pressures
+    # count more, per e-fold of the time since the way into contact, and of a time before, in s
+    creep: float = 0.01
+    creep_time: float = 3.0
+    slid: float = 1e-4
     # time for which friction at the contacts may withhold a correction of the tip, in s
     withheld_time: float = 5.0
     longest_push: float = 60.0  # after which a push becomes the model's error too, in s
     # deviation of that displacement, in m, and of pushes, in N
     deviation: float = 2e-4
     usual_push: float = 0.1
+    # where contacts are to stick: share of that for pushes aside from the directions of stiffness;
+    # and the time constant with which what a push displaces becomes creep, in s
+    aside: float = 0.3
+    push_creeps: float = 30.0
     # of its force, below which the estimate cannot tell it from none; what may be added to that for
     # what a growing push has taken of late, and how long that is, in s
     lost_share: float = 0.15

@@ -349,28 +349,39 @@ def _channels(found: Fit) -> list[int]:
 def _unsettled(found: Fit) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Return the RMS (n,) of effective minus commanded pressures in held and in moving rows.
 
-    Each is empty where there are too few rows.
+    Each is empty where there are too few rows.  The RMS in moving rows is that of a motion of all n
+    channels: if a slower channel has any speed up to that of the fastest, with a mean square of a
+    third, then k moving channels together have (k + 2) / 3 times that of the fastest.
     """
     samples = found.problem.samples
-    moves = np.concatenate([is_moving(each.recording.time, each.recording.pressures)[each.rows]
-                            for each in samples])  # fmt: skip
+    moves = np.concatenate([
+        moving_channels(each.recording.time, each.recording.pressures)[each.rows]
+        for each in samples
+    ])  # fmt: skip
     difference = found.predicted.effective - commanded(samples)
+    count, channels = moves.sum(axis=1), moves.shape[1]
     answer: list[tuple[float, ...]] = []
-    for rows in (~moves, moves):
+    for rows, together in ((count == 0, 0), (count > 0, channels)):
         if rows.sum() < ERRORS.least_rows:
             answer.append(())
         else:
-            squares = np.sqrt(np.mean(difference[rows] ** 2, axis=0))
+            all_of_them = (together + 2) / (count[rows].mean() + 2)
+            squares = np.sqrt(np.mean(difference[rows] ** 2, axis=0) * all_of_them)
             answer.append(tuple(float(f"{each:.4g}") for each in squares))
     return answer[0], answer[1]
 
 
 def is_moving(time: Array, pressures: Array) -> Rows:
-    """Return at which rows (N,) pressures (N, n) changed within the last `ERRORS.hold` seconds."""
+    """Return at which rows (N,) any of the `moving_channels` moves."""
+    return np.asarray(moving_channels(time, pressures).any(axis=1))
+
+
+def moving_channels(time: Array, pressures: Array) -> Rows:
+    """Return which pressures (N, n) changed within the last `ERRORS.hold` seconds."""
     step = ERRORS.still * max(float(np.ptp(pressures, axis=0).max()), 1.0)
     before = np.searchsorted(time, time - ERRORS.hold)
     lowest, highest = pressures.copy(), pressures.copy()
     for row, first in enumerate(before):
         lowest[row] = pressures[first : row + 1].min(axis=0)
         highest[row] = pressures[first : row + 1].max(axis=0)
-    return np.asarray((highest - lowest > step).any(axis=1))
+    return np.asarray(highest - lowest > step)

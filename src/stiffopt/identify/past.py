@@ -160,26 +160,33 @@ class Past:
             parts = enumerate(history.parts)
             return sum((p.share * held(states, j) for j, p in parts), np.zeros_like(states[:, 0]))
 
-        def mixed(states: Array) -> Array:
-            return np.asarray(states[:, 0] + memory * slow(states))
+        x, slowly = values[:, 0], memory * slow(values)
+        by_x, by_slow = history.slopes_at_fixed_modulus(x, slowly)
+
+        def times(matrices: Array, vectors: Array) -> Array:
+            return np.asarray((matrices @ vectors[..., np.newaxis])[..., 0])
+
+        def mixed(slopes: Array) -> Array:
+            own = slopes[:, 0]
+            return np.asarray(own + times(by_x, own) + times(by_slow, memory * slow(slopes)))
 
         per_number = {
             "lag": mixed(by_lag),
             "lag_falling": mixed(by_falling),
             "dead_time": mixed(by_dead),
         }
-        slowly = slow(values)
         for channel, own in enumerate(np.eye(c)):
-            per_number[f"memory[{channel}]"] = slowly * own
+            per_number[f"memory[{channel}]"] = times(by_slow, slow(values) * own)
         plays = len(history.play)
         for j in range(len(history.parts)):
             name = f"play[{j}]" if j < plays else f"creep[{j - plays}]"
-            per_number[f"{name}.share"] = held(values, j) * memory
+            per_number[f"{name}.share"] = times(by_slow, held(values, j) * memory)
         end = self._rested(self._start(state, pressures[-1]), history)
-        per_side = np.stack([mixed(each) for each in by_side], axis=2)
-        if len(by_side) < c:  # the side of a channel moves no other
-            per_side = per_side * np.eye(c)
-        return Effective(mixed(values), per_number, per_side, end)
+        sides = np.stack([memory * slow(each) for each in by_side], axis=2)
+        if len(by_side) < c:  # the side of a channel moves no other's plays
+            sides = sides * np.eye(c)
+        u = x + history.at_fixed_modulus(x, slowly)
+        return Effective(u, per_number, by_slow @ sides, end)
 
     def _rested(self, end: Start, history: History) -> Start:
         """Return the state `FIT.between_logs` later, at the last pressures."""

@@ -278,8 +278,8 @@ class ErrorSettings:
     rows: int = 800
     representatives: int = 60
     spacing: float = 0.04
-    hold: float = 2.0
-    still: float = 0.01
+    hold: float = 1.0
+    still: float = 0.005
     compared: int = 1000
     least_rows: int = 20
 

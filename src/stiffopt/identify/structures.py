@@ -117,6 +117,7 @@ class ModelStructure:
             Creep(time=time, share=START.creep_share) for time in START.creep_times
         )
         return History(
+            softening=_softening(segment) if self.creep else 0.0,  # else play stands for creep
             dead_time=(given.dead_time or START.dead_time) if self.lag and fine else 0.0,
             lag=(given.lag or START.lag) if self.lag else 0.0,
             lag_falling=(given.lag_falling or given.lag or START.lag) if self.falling else 0.0,
@@ -124,6 +125,14 @@ class ModelStructure:
             play=plays if self.play else (),
             creep=creeps if self.creep else (),
         )
+
+
+def _softening(segment: Segment) -> float:
+    """Return the modulus' relative change per pressure, in 1/Pa; at most 0, and 0 if not linear."""
+    known = segment.compensation or Compensation()
+    if known.modulus_law != "linear":
+        return 0.0
+    return min(known.modulus_per_pressure / segment.material.youngs_modulus, 0.0)
 
 
 _BASIC = (

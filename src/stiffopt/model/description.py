@@ -510,6 +510,7 @@ class RobotDescription(Schema):
                     f"({self.channel_name(index)})",
                 )
         self._check_dead_bands()
+        self._check_softening()
         self._check_recordings()
         self._check_calibration()
         if any(self.gravity):
@@ -532,6 +533,19 @@ class RobotDescription(Schema):
                     f"segments.{index}.corrections.dead_band",
                     "a dead band is for pressures from 0 on, but those of this segment may be down "
                     f"to {low * 1e-5:g} bar; remove it or raise pressure.min",
+                )
+
+    def _check_softening(self) -> None:
+        """Reject a softening that would leave no modulus at the highest pressures."""
+        highest = iter(self.pressure_max)
+        for index, segment in enumerate(self.segments):
+            most = math.hypot(*itertools.islice(highest, segment.n_channels))
+            softening = segment.history.softening if segment.history is not None else 0.0
+            if 1 + softening * most <= 0:
+                raise BadKeyError(
+                    f"segments.{index}.history.softening",
+                    f"{softening:g} per Pa leaves no modulus at the highest pressures, with a "
+                    f"norm of {most * 1e-5:g} bar; expected between {-1 / most:.3g} and 0",
                 )
 
     def _check_recordings(self) -> None:

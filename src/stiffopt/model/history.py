@@ -10,7 +10,7 @@ shape. It follows from a channel's commanded pressure p by, in this order,
   ``x - width_j <= y_j <= x + width_j``;
 * creep, ``time_k z_k' = x - z_k``;
 
-and ``u = x + sum_j share_j (y_j - x) + sum_k share_k (z_k - x)``.
+and ``u = x + s`` with ``s = sum_j share_j (y_j - x) + sum_k share_k (z_k - x)``.
 
 Silicone remembers its stretch rather than pressures, and its elongation more than its bending, so
 chambers stay stretched after they were deflated.  A segment's elongation depends on the mean of its
@@ -18,6 +18,13 @@ pressures, and its bending on their deviations from it.  So an operator may act 
 parts instead of on each channel.  With the projection A on that part (elongation: 1/c everywhere
 for c channels; bending: identity minus that), y_j and z_k follow ``A x``, and the operator adds
 ``share A (y_j - x)``, which does not affect or depend on the other part.
+
+Silicone that pressure makes softer, with a modulus of ``E (1 + c |x|)`` for the pressures x of a
+segment, stretches further with each pressure: by the stress, and by the softening.  What it
+remembers is a stress, which does not soften it.  So along x, where softening makes a pressure act
+``1 / (1 + c |x|)`` times as much as at the same modulus, s counts less, ::
+
+    u = x + s + c x (x . s) / |x|.
 
 Settled, and in the middle between loading and unloading, ``u = p``: a history does not change the
 equilibrium, which the strain law describes.  After a long monotone change of all pressures u
@@ -41,7 +48,7 @@ from pydantic import Field, model_validator
 
 from stiffopt.errors import InputError
 from stiffopt.schema import BadKeyError, Items, Schema
-from stiffopt.units import Duration, Pressure, Ratio
+from stiffopt.units import Duration, Number, Pressure, Ratio
 
 Array = NDArray[np.float64]
 
@@ -51,6 +58,7 @@ Part = Literal["pressure", "elongation", "bending"]
 _Share = Annotated[Ratio, Field(ge=0, lt=1)]
 
 _SAME = 1e-9  # s; times that differ by less are equal up to rounding
+_NONE = 1e-3  # Pa; rounds the norm of pressures at zero
 _CLOSE = 1e-3  # below it, a series is more accurate than a difference of exponentials
 
 
@@ -97,6 +105,7 @@ class History(Schema):
     lag_falling : the same while the pressure falls, in s, as chambers empty at another rate than
         they fill; 0: the same.
     memory : factor on the shares of play and creep for each channel; one for all if empty.
+    softening : c, relative change of the modulus per norm of the segment's pressures, in 1/Pa.
     play : hysteresis.
     creep : slow effects.
     """
@@ -105,6 +114,7 @@ class History(Schema):
     lag: Annotated[Duration, Field(ge=0)] = 0.0
     lag_falling: Annotated[Duration, Field(ge=0)] = 0.0
     memory: Items[Annotated[Ratio, Field(ge=0)]] = ()
+    softening: Annotated[Number, Field(le=0)] = 0.0
     play: Items[Play] = ()
     creep: Items[Creep] = ()
 
@@ -212,7 +222,29 @@ class History(Schema):
         slow = 0 * x
         for index, part in enumerate(self.parts, start=1):
             slow += part.share * part_of(state[index, :] - x, part.of)
-        return x + memory * slow
+        return x + self.at_fixed_modulus(x, memory * slow)
+
+    def at_fixed_modulus(self, pressures: Any, remembered: Any) -> Any:
+        """Return the effect on u of remembered pressures s (..., c) at pressures x (..., c)."""
+        if not self.softening:
+            return remembered
+        if isinstance(pressures, np.ndarray):
+            norm = np.sqrt((pressures**2).sum(axis=-1, keepdims=True) + _NONE**2)
+            along = (pressures * remembered).sum(axis=-1, keepdims=True)
+        else:
+            norm = ca.sqrt(ca.sumsqr(pressures) + _NONE**2)
+            along = ca.sum2(pressures * remembered)
+        return remembered + self.softening * along / norm * pressures
+
+    def slopes_at_fixed_modulus(self, pressures: Array, remembered: Array) -> tuple[Array, Array]:
+        """Return the derivatives (N, c, c) of `at_fixed_modulus` by both arguments (N, c)."""
+        x, s, one = pressures, remembered, np.eye(pressures.shape[-1])
+        norm = np.sqrt((x**2).sum(axis=-1) + _NONE**2)[:, np.newaxis, np.newaxis]
+        along = (x * s).sum(axis=-1)[:, np.newaxis, np.newaxis] / norm
+        outer = x[:, :, np.newaxis] * x[:, np.newaxis] / norm
+        mixed = x[:, :, np.newaxis] * s[:, np.newaxis] / norm
+        by_pressures = self.softening * (along * (one - outer / norm) + mixed)
+        return by_pressures, one + self.softening * outer
 
     def memory_of(self, channel: int) -> float:
         """Return the factor on the shares of a channel of the segment, from 0."""

@@ -44,7 +44,7 @@ Part = Literal["parameters", "hysteresis", "discrepancy", "residual"]
 
 _LEVEL = 0.95  # probability of the reported regions
 _WAYS = 256  # ways to given pressures
-_HELD = 0.9  # share of a fit's hysteresis that held poses show; the rest was creep
+_HELD = 0.9  # share of these variances that held poses show; the rest was creep and motion
 _STIFFEST = 0.25  # least softness, over that at recorded pressures: a dead band has none
 _SINGULAR = 1e-9  # smallest variance of a direction, over that of all
 NORMAL_QUANTILE = 1.959963984540054  # of 97.5 %, for two-sided intervals of 95 %
@@ -233,10 +233,12 @@ class Uncertainty:
         before = self._typical_moves if time is None else fading_mean(time, moves)
         errors = self._calibration.errors
         residual = self._calibration.position_residual if errors is None else errors.residual
+        discrepancy = even_variance(moves, before, self._memory)
         if effective is None:
-            still = moving if moving is not None else np.zeros(len(pressures), dtype=bool)
+            moved = moving if moving is not None else np.zeros(len(pressures), dtype=bool)
             ways = self._remembered(pressures, per_pressure)
-            hysteresis = per_pressure @ self._hysteresis(ways, still) @ transposed
+            hysteresis = per_pressure @ self._hysteresis(ways, moved) @ transposed
+            discrepancy *= np.where(moved, 1.0, _HELD)
         else:
             ways, hysteresis = np.zeros((len(u), 1, u.shape[1])), np.zeros((len(u), 3, 3))
         if rates is not None and errors is not None:
@@ -246,8 +248,7 @@ class Uncertainty:
             position=position,
             parameters=per_number @ self._covariance @ np.swapaxes(per_number, 1, 2),
             hysteresis=hysteresis,
-            discrepancy=even_variance(moves, before, self._memory)[:, np.newaxis, np.newaxis]
-            * np.eye(3),
+            discrepancy=discrepancy[:, np.newaxis, np.newaxis] * np.eye(3),
             residual=np.broadcast_to(np.eye(3) * residual**2, (len(u), 3, 3)),
             shape=np.full(len(u), 3.0),
         )
@@ -337,13 +338,16 @@ class Uncertainty:
                 for x in (*part_of(self._visited[..., own], play.of), end):
                     held = np.clip(held, x - play.width, x + play.width)
                 found[..., own] += memory * play.share * part_of(held - end, play.of)
+            found[..., own] = history.at_fixed_modulus(
+                pressures[:, np.newaxis, own], found[..., own]
+            )
         errors = self._calibration.errors
         if errors is not None and errors.settled:
             size = np.sqrt(np.mean(found**2, axis=1, keepdims=True))
             found *= np.minimum(1.0, errors.settled / np.maximum(size, 1e-9))
         if errors is not None:
             softness = self._softness(per_pressure) / self._recorded_softness
-            found *= _HELD / np.sqrt(np.maximum(softness, _STIFFEST))[:, np.newaxis]
+            found *= np.sqrt(_HELD / np.maximum(softness, _STIFFEST))[:, np.newaxis]
         return found
 
     def _softness(self, per_pressure: Vector) -> Vector:

@@ -8,7 +8,6 @@ they do not end in the wanted one, the motion is refused. Played backwards, it r
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -17,7 +16,7 @@ from numpy.typing import NDArray
 from stiffopt.display import display_units
 from stiffopt.errors import EquilibriumError
 from stiffopt.model.arm_clearance import measured_scene
-from stiffopt.model.contact.equilibrium import Contact, ContactEquilibrium
+from stiffopt.model.contact.equilibrium import Contact, ContactEquilibrium, Sticking
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.scene import Scene
 from stiffopt.optimise.brace import kept_clear_of, leant_on, quoted
@@ -36,6 +35,7 @@ _STATIONS = 41  # of the body
 _SAME = 2e-4  # m; tips that are nearer belong to the same equilibrium
 _AS_STIFF = 0.05  # largest difference of stiffnesses in the same equilibrium
 _PUSH = 2e-3  # N, step of finite differences by a push at the tip
+_TANGENTIAL = 1e-4  # m/N, compliance of a contact that sticks: a hundredth of an arm's along itself
 _FORGIVEN = 1e-4  # m, tolerated lack of clearance from other objects
 
 
@@ -47,15 +47,13 @@ class Hold(NamedTuple):
     forces : along the normals (k,), in N.
     per_pressure : their derivatives by pressures (k, n), in N/Pa.
     per_push : their derivatives by a force at the tip (k, 3), in base axes.
-    directions : unit vectors (m, 3), base axes, of pushes at the tip.
-    slips : push (m,) in each direction at which a contact slips, in N; infinite if none does.
+    sticking : how friction holds those that have some.
     """
 
     forces: Vector
     per_pressure: Vector
     per_push: Vector
-    directions: Vector
-    slips: Vector
+    sticking: Sticking
 
 
 @dataclass(frozen=True)
@@ -235,11 +233,8 @@ def _hold(eq: ContactEquilibrium) -> Hold:
         (eq.shifted(push=step).normal_forces - eq.shifted(push=-step).normal_forces) / (2 * _PUSH)
         for step in _PUSH * np.eye(3)
     ]
-    ways = np.array([way for way in product((-1.0, 0.0, 1.0), repeat=3) if any(way)])
-    ways /= np.linalg.norm(ways, axis=1, keepdims=True)
-    losses = [eq.lift_off(way, contacts="sticking") for way in ways]
-    slips = [loss.force if loss.how == "slips" else np.inf for loss in losses]
-    return Hold(eq.normal_forces, eq.force_gradients, np.array(pushed).T, ways, np.array(slips))
+    sticking = eq.sticking.softened(_TANGENTIAL)
+    return Hold(eq.normal_forces, eq.force_gradients, np.array(pushed).T, sticking)
 
 
 def _largest(eq: ContactEquilibrium) -> float:

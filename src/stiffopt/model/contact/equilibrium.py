@@ -17,7 +17,7 @@ from stiffopt.model.arm_clearance import SceneKey, measured_scene
 from stiffopt.model.compliance import Boundary, Frame, Kind, stiffness_of
 from stiffopt.model.contact.lines import SPACINGS
 from stiffopt.model.contact.push import ContactLoss, GrowingPush, rigid_if_huge
-from stiffopt.model.contact.rod import Condition, Rod, hat, rotations
+from stiffopt.model.contact.rod import Condition, Rod, rotations
 from stiffopt.model.contact.solve import ContactProblem
 from stiffopt.model.contact.surface import ContactSurface
 from stiffopt.model.contact.system import ContactSystem, LeaningArm
@@ -66,6 +66,55 @@ class FrictionBounds(NamedTuple):
 
     tip: float
     forces: Vector
+
+
+class Sticking(NamedTuple):
+    """How the k contacts with friction hold, linear about an equilibrium without their friction.
+
+    Each has a tangential force with two components, on the arm. They change with pressures and
+    pushes while the body does not slide, and with its slides. Those without friction stay closed.
+
+    Attributes
+    ----------
+    own : their indices among all contacts (k,).
+    friction : coefficients (k,).
+    per_pressure : derivatives of the forces (2k, n), in N/Pa.
+    per_push : by a force at the tip in base axes (2k, 3).
+    per_slide : by slides of the body (2k, 2k), in N/m.
+    tip : derivatives of the tip's place, base axes, by the slides (3, 2k).
+    normals : of the normal forces of all contacts by the slides (contacts, 2k), in N/m.
+    """
+
+    own: tuple[int, ...]
+    friction: Vector
+    per_pressure: Vector
+    per_push: Vector
+    per_slide: Vector
+    tip: Vector
+    normals: Vector
+
+    def slides(self, forces: Vector) -> Vector:
+        """Return the slides (2k,), in m, that tangential forces (2k,) withhold."""
+        return np.asarray(-np.linalg.solve(self.per_slide, forces))
+
+    def softened(self, compliance: float) -> Sticking:
+        """Return the same for contacts whose surfaces give way along themselves, by so many m/N.
+
+        Two contacts that stick at almost the same station hold almost the same thing, so that K,
+        the stiffness against slides, is huge in one direction, or negative by rounding. With the
+        compliance c, ``G = (1 + c K)^-1`` is the share of a slide that the body takes part in.
+        """
+        stiffness, axes = np.linalg.eigh((self.per_slide + self.per_slide.T) / 2)
+        rigid = stiffness <= 0
+        share = np.where(rigid, 0.0, 1 / (1 + compliance * np.maximum(stiffness, 0.0)))
+        given = axes * share @ axes.T
+        return self._replace(
+            per_pressure=given @ self.per_pressure,
+            per_push=given @ self.per_push,
+            per_slide=axes * np.where(rigid, 1 / compliance, stiffness * share) @ axes.T,
+            tip=self.tip @ given,
+            normals=self.normals @ given,
+        )
 
 
 class ContactEquilibrium:
@@ -235,20 +284,54 @@ class ContactEquilibrium:
         coefficient of friction times the normal force, in the direction in which it changes tip and
         forces most. The contacts stay closed.
         """
-        system = self._system_for("tip wrench")
-        u, tip, forces = system.linear.unknowns, 0.0, np.zeros(len(self.contacts))
-        for j in self._with_friction():
-            touch, row, first = self._arm.state.touches[j], self._arm.rows[j], 3 + 7 * j
-            largest = self._arm.problem.surfaces[touch.surface].friction * touch.normal_force
-            across = np.linalg.svd(row.point.normal[None])[2][1:].T
-            right = np.zeros((len(system.matrix), 2))
-            right[first : first + 3] = across
-            right[first + 3 : first + 6] = hat(-row.radius * row.point.normal) @ across
-            solution = np.linalg.solve(system.matrix, right)
-            moved = system.linear.moves[0][:, :u] @ solution[:u]
-            tip += largest * float(np.linalg.norm(moved, 2))
-            forces += largest * np.linalg.norm(solution[u:], axis=1)
+        held, tip, forces = self.sticking, 0.0, np.zeros(len(self.contacts))
+        for i, j in enumerate(held.own):
+            slid = held.slides(np.eye(2 * len(held.own))[:, 2 * i : 2 * i + 2])
+            largest = held.friction[i] * self._arm.state.touches[j].normal_force
+            tip += largest * float(np.linalg.norm(held.tip @ slid, 2))
+            forces += largest * np.linalg.norm(held.normals @ slid, axis=1)
         return FrictionBounds(tip, forces)
+
+    @cached_property
+    def sticking(self) -> Sticking:
+        """How contacts with friction hold, to first order."""
+        arm, own = self._arm, self._with_friction()
+        system = self._system_for("tip wrench", own)
+        u, firsts = system.linear.unknowns, [3 + 7 * j for j in own]
+        normals = [arm.rows[j].point.normal for j in own]
+        across = [np.linalg.svd(n[None])[2][1:] for n in normals]
+
+        def tangential(solution: Vector, moves: Vector) -> Vector:
+            """Changes (2k, e) of the tangential forces; a normal force turns with its normal."""
+            found = [
+                axes
+                @ (
+                    solution[first : first + 3]
+                    - arm.state.touches[j].normal_force
+                    * arm.rows[j].point.curvature
+                    @ moves[arm.state.mesh.node[j]]
+                )
+                for j, first, axes in zip(own, firsts, across, strict=True)
+            ]
+            return np.concatenate([np.zeros((0, solution.shape[1])), *found])
+
+        right = np.zeros((len(system.matrix), 2 * len(own)))
+        for i, first in enumerate(firsts):  # of the equations that the body does not slide
+            right[first + 1 : first + 3, 2 * i : 2 * i + 2] = np.eye(2)
+        slid: Vector = np.asarray(np.linalg.solve(system.matrix, right), dtype=float)
+        moves = system.linear.moves[..., :u] @ slid[:u]
+        pushed, pressed = system.solution(), self._system_for("pressures", own)
+        by_pressure = pressed.solution()
+        surfaces = arm.problem.surfaces
+        return Sticking(
+            tuple(own),
+            np.array([surfaces[arm.state.touches[j].surface].friction for j in own]),
+            tangential(by_pressure, pressed.along(by_pressure)[1]),
+            tangential(pushed, system.along(pushed)[1])[:, :3],
+            tangential(slid, moves),
+            moves[0],
+            slid[u:],
+        )
 
     # -- derivatives ------------------------------------------------------------------------
 

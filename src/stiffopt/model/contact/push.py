@@ -274,7 +274,7 @@ def _first_loss(
             turning = N * row.point.curvature @ tangent.moves[arm.state.mesh.node[j]]
             changing = own - rate * n - turning
             ways.append(
-                ("slips", _until_equal(across, changing, friction[j] * N, friction[j] * rate))
+                ("slips", until_equal(across, changing, friction[j] * N, friction[j] * rate))
             )
         for name, push in ways:
             if push < first:
@@ -282,10 +282,10 @@ def _first_loss(
     return first, lost, how
 
 
-def _until_equal(a: Vector, b: Vector, c: float, d: float) -> float:
+def until_equal(a: Vector, b: Vector, c: float, d: float) -> float:
     """Return the least x > 0 at which ``|a + b x| = c + d x``; infinite if there is none."""
     square, double, rest = b @ b - d * d, a @ b - c * d, a @ a - c * c
-    if rest >= 0:
+    if c <= 0 or rest >= 0:
         return 0.0
     root = double * double - square * rest
     if root < 0 or double + np.sqrt(root) <= 0:
