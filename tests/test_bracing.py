@@ -453,7 +453,6 @@ def test_the_loop_leans_holds_tells_a_lift_off_and_lets_go(solution, approach, m
     assert loop.status.brace_force == pytest.approx(loop.force, rel=0.15)
     assert not loop.status.touches
     plant = loop.rig.world.plant
-    print(loop.controller._bracing._change, approach.pressures[-1])
     for push in (0.05, 0.09):
         plant.set_load(PlantLoad(force=(push, 0, 0)))
         loop.wait(0.5)

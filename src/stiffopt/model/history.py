@@ -29,7 +29,7 @@ remembers is a stress, which does not soften it.  So along x, where softening ma
 Settled, and in the middle between loading and unloading, ``u = p``: a history does not change the
 equilibrium, which the strain law describes.  After a long monotone change of all pressures u
 differs from p by ``sum_j share_j width_j`` (without operators of bending), the most that it can;
-operators of bending contribute up to twice as much.
+operators of bending contribute up to twice as much.  Softening makes this less, along x.
 
 This module does not depend on the rest of the model, so that a simulated plant, an estimator and a
 calibration can use the same operators.

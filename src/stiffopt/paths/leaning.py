@@ -35,7 +35,7 @@ _STATIONS = 41  # of the body
 _SAME = 2e-4  # m; tips that are nearer belong to the same equilibrium
 _AS_STIFF = 0.05  # largest difference of stiffnesses in the same equilibrium
 _PUSH = 2e-3  # N, step of finite differences by a push at the tip
-_TANGENTIAL = 1e-4  # m/N, compliance of a contact that sticks: a hundredth of an arm's along itself
+_TANGENTIAL = 1e-4  # m/N, compliance of a contact that sticks; an arm along itself has 40 times it
 _FORGIVEN = 1e-4  # m, tolerated lack of clearance from other objects
 
 
