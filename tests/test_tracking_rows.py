@@ -7,7 +7,7 @@ import pytest
 from scipy.linalg import expm
 
 from stiffopt import Target, lie
-from stiffopt.control.feedback import prescribed_components, tracking_rows
+from stiffopt.control.feedback import prescribed_components, tracking_rows, with_offsets
 from stiffopt.control.formula import Formula
 from stiffopt.control.tuning import FeedbackTuning
 from stiffopt.control.vibration import BendingMode
@@ -103,3 +103,34 @@ def test_feedback_of_an_arm_that_swings(seed):
     assert weight > 1
     assert rows[9:] == pytest.approx(weight * own, rel=1e-9)
     assert values[9:] == pytest.approx(weight * (home + feedback), rel=1e-9)
+
+
+@pytest.mark.parametrize("most", [np.inf, 1e-3])
+@pytest.mark.parametrize("arm", [ARM, None])
+def test_the_law_finds_its_correction_from_the_offset_and_its_average(arm, most):
+    """The average counts, the present offset along a stiff axis; what grows with motion is led."""
+    pose, jacobian, _, swing = drawn(5)
+    rng = np.random.default_rng(6)
+    accounted, offset = rng.normal(size=(2, 6)) * 1e-3
+    average = np.concatenate([rng.normal(size=6) * 1e-3, pose[:3, 3] + rng.normal(size=3) * 1e-2])
+    slope, stiff, rate, delay = (
+        0.1 * rng.normal(size=(3, 3)),
+        np.diag([0.0, 0.3, 0.9]),
+        swing[4],
+        0.1,
+    )
+    velocity = pose[:3, :3] @ jacobian[:3] @ rate
+    grown = slope @ (pose[:3, 3] - average[6:])
+    corrected = average[:6].copy()
+    corrected[:3] += grown + slope @ velocity * delay
+    corrected[:3] += stiff @ (offset[:3] - average[:3] - grown)
+    correction = accounted - corrected
+    size = np.linalg.norm(correction[:3])
+    assert size > 1e-3
+    correction *= min(1.0, most / size)
+    law, dynamic = tracking_rows(N, arm, DAMPING, DEAD_TIME), swing if arm else ()
+    known = (accounted, offset, average, slope, stiff, rate, delay, most)
+    plain = evaluated(law, pose, jacobian, np.ones(5), correction, *dynamic)
+    found = evaluated(with_offsets(law), pose, jacobian, np.ones(5), *dynamic, *known)
+    for value, expected in zip(found, plain, strict=True):
+        assert value == pytest.approx(expected, rel=1e-9, abs=1e-15)

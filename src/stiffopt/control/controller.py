@@ -47,6 +47,7 @@ from stiffopt.rig.interface import PoseSample, PressureLimits, PressureReading
 from stiffopt.rig.settings import ControlSettings, Safety
 
 Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
 
 _HELD = 2.5  # periods without `compute`, after which others have commanded the pressures
 
@@ -328,10 +329,13 @@ class TipController:
         """Compute the next command; see `Controller.compute`."""
         output = self._compute(now)
         self._computed_at = now
-        posture = output.pressures + self._arm.pressures.command_offset
-        return ControlOutput(
-            output.pressures, output.valid, output.saturated, posture, self._arm.leaning is not None
-        )
+        return output
+
+    def _output(self, pressures: Array, saturated: Flags, *, valid: bool = True) -> ControlOutput:
+        """Return commands (n,) with what is known of them."""
+        posture = pressures + self._arm.pressures.command_offset
+        leans = self._arm.leaning is not None
+        return ControlOutput(pressures, valid, saturated.copy(), posture, leans)
 
     def _compute(self, now: float) -> ControlOutput:
         reference, pressures = self._reference, self._arm.pressures
@@ -343,7 +347,7 @@ class TipController:
         if plan is None:  # no pursuit, or no plan yet
             self._at_rest = True
             _, high = self._arm.channels.commands(last, *self._permitted)
-            return ControlOutput(np.minimum(last, high), True, np.zeros(n, dtype=bool))
+            return self._output(np.minimum(last, high), np.zeros(n, dtype=bool))
         lost = self._arm.channels.lost
         newly_lost = lost is not self._lost and (lost & ~self._lost).any()
         if self._at_rest or newly_lost:  # they are not where the reference is
@@ -356,7 +360,7 @@ class TipController:
             plan = self._reference.path
         self._lost = lost
         if self._model_is_wrong():
-            return ControlOutput(last.copy(), False, self._feedback.saturated.copy())
+            return self._output(last.copy(), self._feedback.saturated, valid=False)
         self._set_reference_rate()
         reference.omega = self._arm.tip.omega
         reference.advance(self._awaited(plan, now))
@@ -365,8 +369,7 @@ class TipController:
         tip = self._arm.on_path(reference.path[:n])
         if now - self._went_back_at > self._tuning.adaptation.blind_time:
             self._arm.watch.intend(now, tip.pose[:3, 3] + reference.path[n : n + 3])
-        moves = np.abs(reference.motion[1, :n]).max() > self._tuning.reference.at_rest
-        if self._arm.channels.pace == 0 and moves and self._ways:
+        if self._arm.channels.pace == 0 and self._ways and self._moves():
             return self._feedforward(self._without_feedback, last)
         course = self.replanner.pursuit.course
         self._led_to = None
@@ -384,9 +387,9 @@ class TipController:
             self._first_motion.largest_correction(tip.pose[:3, 3]),
         )
         if command is None:
-            return ControlOutput(last.copy(), False, self._feedback.saturated.copy())
+            return self._output(last.copy(), self._feedback.saturated, valid=False)
         self._ways.append((reference.path.copy(), command - goal))
-        return ControlOutput(command, True, self._feedback.saturated.copy())
+        return self._output(command, self._feedback.saturated)
 
     def stop(self, now: float) -> Array | None:
         """Stop a doubted motion; see `Controller.stop`.
@@ -439,7 +442,7 @@ class TipController:
         low, high = self._arm.channels.commands(self._reference.path[: len(last)], *self._permitted)
         command = np.clip(np.clip(pressures, last - step, last + step), low, high)
         self._feedback.saturated = np.zeros(len(last), dtype=bool)
-        return ControlOutput(command, True, self._feedback.saturated.copy())
+        return self._output(command, self._feedback.saturated)
 
     def _plan(self, now: float) -> Array | None:
         """Return the reference's next goal, pressures and offset (n + 6,); None without a plan."""
@@ -493,11 +496,13 @@ class TipController:
 
     def _is_near(self, pressures: Array) -> bool:
         """Whether the reference rests at pressures (n,)."""
-        n, tuning = len(pressures), self._tuning.reference
-        off = float(np.abs(self._reference.path[:n] - pressures).max())
-        return off <= tuning.there and bool(
-            np.abs(self._reference.motion[1, :n]).max() <= tuning.at_rest
-        )
+        off = float(np.abs(self._reference.path[: len(pressures)] - pressures).max())
+        return off <= self._tuning.reference.there and not self._moves()
+
+    def _moves(self) -> bool:
+        """Whether the pressures of the reference change."""
+        rate = self._reference.motion[1, : self.robot.n_pressures]
+        return not np.abs(rate).max() <= self._tuning.reference.at_rest
 
     def _correct_brace(self, course: Bracing, now: float) -> None:
         """Bring the braced tip to its target; without one for its position it stays."""
@@ -721,5 +726,4 @@ class TipController:
 
     def _model_is_wrong(self) -> bool:
         """Whether the offset is too large to be an error of this arm's model."""
-        offset = self._arm.tip.offset[:3]
-        return float(offset @ offset) > self._largest_offset**2
+        return math.hypot(*self._arm.tip.offset[:3].tolist()) > self._largest_offset

@@ -17,7 +17,7 @@ has rows of its own.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import casadi as ca
@@ -122,6 +122,39 @@ def tracking_rows(
     values = [position @ shift, pointing * (sideways @ turn), orientation * turn]
     rows = ca.vertcat(*task, *mode_rows)
     return TrackingRows(inputs, [jacobian], rows, ca.vertcat(*values, *mode_values), linear, 9)
+
+
+def with_offsets(law: TrackingRows) -> TrackingRows:
+    """Return a feedback law that finds the correction of the tip itself.
+
+    The correction is what the plan accounts for minus what feedback corrects now: the offset,
+    averaged over a vibration, except along a stiff axis, and except for the part that is known to
+    grow with the motion. The regulators delay that part.
+
+    In place of the correction, the last inputs are: the offset (6,) that the plan accounts for;
+    the present estimate (6,); the average (9,) of offset and position of the tip on the reference;
+    the slope (3, 3) and the stiff axis (3, 3), see `MotionErrorEstimator` and `TipEstimator`; the
+    rate (n,) of the reference's path; the regulators' delay, in s; and the greatest correction of
+    the position, in m.
+    """
+    pose, jacobian, prescribed, correction, *others = law.inputs
+    accounted, offset = ca.SX.sym("accounted", 6), ca.SX.sym("offset", 6)
+    average, slope = ca.SX.sym("average", 9), ca.SX.sym("slope", 3, 3)
+    stiff_axis, rate = ca.SX.sym("stiff_axis", 3, 3), ca.SX.sym("rate", jacobian.shape[1])
+    delay, most = ca.SX.sym("delay"), ca.SX.sym("most")
+    grown = slope @ (pose[:3, 3] - average[6:])
+    behind = offset[:3] - average[:3] - grown
+    ahead = slope @ (pose[:3, :3] @ (jacobian[:3, :] @ rate)) * delay
+    corrected = average[:3] + grown + ahead + stiff_axis @ behind
+    found = accounted - ca.vertcat(corrected, average[3:6])
+    size = ca.norm_2(found[:3])
+    found *= ca.if_else(size > most, most / size, 1)
+    own = [accounted, offset, average, slope, stiff_axis, rate, delay, most]
+    return replace(
+        law,
+        inputs=[pose, jacobian, prescribed, *others, *own],
+        values=ca.substitute(law.values, correction, found),
+    )
 
 
 class GainSchedule:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stiffopt.control.allocation import Allocation
-from stiffopt.control.feedback import GainSchedule, tracking_rows
+from stiffopt.control.feedback import GainSchedule, tracking_rows, with_offsets
 from stiffopt.control.motion_error import MotionErrorEstimator
 from stiffopt.control.observer import ArmObserver
 from stiffopt.control.reference import Reference, VibrationFilter
@@ -64,7 +64,7 @@ class TipFeedback:
         if mode is not None:
             self._gains = GainSchedule(period, lag, control.damping, tuning.effort)
         self._allocation = Allocation(
-            tracking_rows(len(slew), mode, control.damping, dead_time, tuning),
+            with_offsets(tracking_rows(len(slew), mode, control.damping, dead_time, tuning)),
             limits.low,
             limits.high,
             slew * period,
@@ -121,18 +121,20 @@ class TipFeedback:
         most :
             Largest correction of the position, in m.
         """
-        n = len(goal)
-        self._learn(tip.pose[:3, 3], follows)
-        correction = reference.path[n:] - self._correctable(offset, tip, reference)
-        size = float(np.linalg.norm(correction[:3]))
-        if size > most:
-            correction = correction * (most / size)
+        n, arm = len(goal), self._arm
+        position = tip.pose[:3, 3]
+        self._learn(position, follows)
+        average = self._average(np.concatenate([offset, position]))
         self._allocation.limit(*limits)
         command, held, residual = self._allocation.solve(
-            (tip.pose, tip.jacobian, prescribed, correction, *self._vibration_inputs(reference)),
+            (
+                tip.pose, tip.jacobian, prescribed, *self._vibration_inputs(reference),
+                reference.path[n:], offset, average, self._motion_error.slope, arm.tip.stiff_axis,
+                reference.motion[1, :n], arm.pressures.lag + arm.pressures.dead_time, most,
+            ),
             goal,
-            self._arm.pressures.command,
-        )
+            arm.pressures.command,
+        )  # fmt: skip
         if command is not None:
             reported = residual > self._tuning.unreported_error
             self.saturated = held if reported else np.zeros(n, dtype=bool)
@@ -150,28 +152,13 @@ class TipFeedback:
         elif modelled is not None:
             self._motion_error.learn(self._period, modelled.pose[:3, 3], self._arm.tip.offset[:3])
 
-    def _correctable(self, offset: Array, tip: TipAt, reference: Reference) -> Array:
-        """Return the offset (6,) that feedback corrects now.
-
-        For an arm that vibrates it is averaged over a vibration, except along a stiff axis, and
-        except for the part that is known to grow with the motion; the regulators delay that part.
-        """
-        arm, slope, position = self._arm, self._motion_error.slope, tip.pose[:3, 3]
-        now = np.concatenate([offset, position])
+    def _average(self, now: Array) -> Array:
+        """Return offset and position (9,) of the tip, averaged over a vibration."""
         if self._is_new:
             self._averaged.begin(now)
             self._is_new = False
-        self._averaged.advance(now, arm.tip.omega)
-        corrected = self._averaged.value[:6].copy()
-        behind = offset[:3] - corrected[:3]
-        if self._motion_error.knows:
-            n = len(arm.pressures.command)
-            velocity = tip.pose[:3, :3] @ (tip.jacobian[:3] @ reference.motion[1, :n])
-            ahead = slope @ velocity * (arm.pressures.lag + arm.pressures.dead_time)
-            behind -= slope @ (position - self._averaged.value[6:])
-            corrected[:3] = offset[:3] - behind + ahead
-        corrected[:3] += arm.tip.stiff_axis @ behind
-        return corrected
+        self._averaged.advance(now, self._arm.tip.omega)
+        return self._averaged.value
 
     def _vibration_inputs(self, reference: Reference) -> tuple[ArrayLike, ...]:
         """Return the inputs of `tracking_rows` for an arm that vibrates."""

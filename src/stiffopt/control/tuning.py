@@ -109,9 +109,8 @@ class ReferenceTuning:
     rigid_rate: float = 100.0
     # share of the slew that the reference may take; the rest is for feedback
     slew_share: float = 0.9
-    # change of pressure (norm over all channels) over which the model on the reference is not
-    # linearised again, in Pa
-    model_range: float = 3e3
+    # motion over which the model on the reference is not linearised again; see `LinearisedTip`
+    model_range: float = 0.07
     # time by which a doubted motion of an arm that vibrates is taken back, in s
     taken_back: float = 0.3
     # distance from the plan at which it has arrived, in Pa, and rate below which it rests, in Pa/s
