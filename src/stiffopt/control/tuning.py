@@ -393,15 +393,17 @@ class CreepTuning:
 
     times: tuple[float, ...] = (1.5, 6.0, 25.0)  # time constants, in s
     # shares that creep with each of them and their deviation; the latter for an arm whose creep
-    # was calibrated
+    # was calibrated; and the correlation of the shares of an arm
     share: float = 0.02
     deviation: float = 0.025
     known: float = 0.008
+    alike: float = 0.5
     changes: float = 0.2  # growth of a share's deviation with the way, in 1/m
     first_error: float = 0.02  # deviation of the model's error, in m
     model_error: float = 0.05  # its growth, as a share of the recent way
     drift: float = 5e-5  # its growth at rest, in m / sqrt(s)
     noise: float = 1e-4  # of a mean of positions, in m
+    unfelt: float = 0.02  # the same along axes in which no force is felt, in m
     late: float = 0.02  # by which the tip may move later than the model's, in s
     every: float = 0.1  # time over which samples are averaged, in s
 
