@@ -436,7 +436,7 @@ class PressureSupply(Supply):
     def exchange(self, pressures: ArrayLike | PressureCommand) -> PressureReading:
         """Set the pressures and read the measured ones, in one exchange if the device can."""
         with self._lock:
-            last = self._checked(pressures)
+            last = self.limits.clamp(self._checked(pressures))
             self._look_for_others()
             values = self._exchange(last)
             if values is None:
