@@ -382,6 +382,7 @@ class TipController:
             self._arm.channels.commands(reference.path[:n], *self._permitted, goal),
             None if isinstance(course, PostureCourse | Pressing) else course is not None,
             self._first_motion.largest_correction(tip.pose[:3, 3]),
+            None if isinstance(course, PostureCourse) else self.replanner.bent,
         )
         if command is None:
             return ControlOutput(last.copy(), False, self._feedback.saturated.copy())
@@ -457,6 +458,7 @@ class TipController:
         found = replanner.update(
             now, self._offset, self._arm.pressures.command_offset, estimator.omega,
             reference.delay, self._arm.channels.available(), way, self._windows.windows,
+            reference.path[: self.robot.n_pressures] if self._vibrates else None,
         )  # fmt: skip
         if isinstance(course, Bracing):
             return self._brace_planned(course, found, now)

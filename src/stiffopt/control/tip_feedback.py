@@ -13,7 +13,7 @@ from stiffopt.control.motion_error import MotionErrorEstimator
 from stiffopt.control.observer import ArmObserver
 from stiffopt.control.reference import Reference, VibrationFilter
 from stiffopt.control.tuning import FeedbackTuning, MotionErrorTuning
-from stiffopt.control.vibration import BendingMode
+from stiffopt.control.vibration import BendingMode, BentMode
 from stiffopt.optimise.tip import TipAt
 from stiffopt.rig.interface import PressureLimits
 from stiffopt.rig.settings import ControlSettings, Safety
@@ -60,11 +60,11 @@ class TipFeedback:
         self._period, self._ended = period, step_error.ended
         self._on_trajectories = MotionErrorEstimator(motion_error)
         self._motion_error = self._in_steps = MotionErrorEstimator(step_error)
-        self._gains: GainSchedule | None = None
+        self._mode, self._gains = mode, None
         if mode is not None:
             self._gains = GainSchedule(period, lag, control.damping, tuning.effort)
         self._allocation = Allocation(
-            tracking_rows(len(slew), mode, control.damping, dead_time, tuning),
+            tracking_rows(len(slew), mode is not None, control.damping, dead_time, tuning),
             limits.low,
             limits.high,
             slew * period,
@@ -98,6 +98,7 @@ class TipFeedback:
         limits: tuple[Array, Array],
         follows: bool | None = False,
         most: float = math.inf,
+        bent: BentMode | None = None,
     ) -> Array | None:
         """Return the next command (n,), in Pa; None if the solver failed.
 
@@ -120,6 +121,8 @@ class TipFeedback:
             motion does to the offset is not learned.
         most :
             Largest correction of the position, in m.
+        bent :
+            Modes of the arm near here; None: those of the straight arm.
         """
         n = len(goal)
         self._learn(tip.pose[:3, 3], follows)
@@ -128,8 +131,9 @@ class TipFeedback:
         if size > most:
             correction = correction * (most / size)
         self._allocation.limit(*limits)
+        vibration = self._vibration_inputs(tip, reference, bent)
         command, held, residual = self._allocation.solve(
-            (tip.pose, tip.jacobian, prescribed, correction, *self._vibration_inputs(reference)),
+            (tip.pose, tip.jacobian, prescribed, correction, *vibration),
             goal,
             self._arm.pressures.command,
         )
@@ -173,14 +177,22 @@ class TipFeedback:
         corrected[:3] += arm.tip.stiff_axis @ behind
         return corrected
 
-    def _vibration_inputs(self, reference: Reference) -> tuple[ArrayLike, ...]:
+    def _vibration_inputs(
+        self, tip: TipAt, reference: Reference, bent: BentMode | None
+    ) -> tuple[ArrayLike, ...]:
         """Return the inputs of `tracking_rows` for an arm that vibrates."""
-        if self._gains is None:
+        if self._mode is None or self._gains is None:
             return ()
         estimator, pressures = self._arm.tip, self._arm.pressures
         motion, n = reference.motion, len(pressures.command)
+        linear, shares = tip.pose[:3, :3] @ tip.jacobian[:3], self._mode.participation
+        if bent is None:
+            plane = estimator.soft_plane
+            jacobian = plane @ (linear * shares)
+        else:
+            plane, jacobian = bent.plane, bent.near(linear, shares)
         return (
-            estimator.vibration, estimator.soft_plane, estimator.omega,
+            estimator.vibration, plane, jacobian, estimator.omega,
             self._gains.at(estimator.omega), pressures.effective_ahead,
             reference.chamber, motion[0, :n], motion[1, :n],
             motion[:2, n : n + 3] - self._averaged.motion[:, :3],

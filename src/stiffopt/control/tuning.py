@@ -282,6 +282,7 @@ class PlanningTuning:
     patience: int = 20
     # change of a pressure from plan to plan on the way to another configuration, in Pa
     change_step: float = 7e2
+    bent_step: float = 3e3  # change of a pressure after which the modes are new, in Pa
     position_tolerance: float = 1e-5  # of plans, in m
     angle_tolerance: float = 1e-3  # of plans, in rad
 
