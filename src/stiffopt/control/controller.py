@@ -34,7 +34,7 @@ from stiffopt.control.state import AdaptedNumber, ControllerStatus, Severity
 from stiffopt.control.tip_errors import TipErrors, target_arrays
 from stiffopt.control.tip_feedback import TipFeedback
 from stiffopt.control.tuning import ControlTuning
-from stiffopt.control.vibration import BendingMode
+from stiffopt.control.vibration import BendingMode, BentMode
 from stiffopt.control.windows import WindowWatch
 from stiffopt.errors import InputError
 from stiffopt.model.manipulator import Manipulator
@@ -114,7 +114,8 @@ class TipController:
         self._reference = Reference(
             period, slew, lag, control.damping, 6, tuning.reference.slew_share
         )
-        self._vibrates = mode is not None
+        self._mode, self._vibrates = mode, mode is not None
+        self._bent: BentMode | None = None  # modes that the estimator has
         self._feedback = TipFeedback(
             self._arm,
             limits,
@@ -369,6 +370,7 @@ class TipController:
         if self._arm.channels.pace == 0 and moves and self._ways:
             return self._feedforward(self._without_feedback, last)
         course = self.replanner.pursuit.course
+        bent = self._bend(None if isinstance(course, PostureCourse) else self.replanner.bent)
         self._led_to = None
         if isinstance(course, PostureCourse):
             self._led_to = course.target(tip.pose, reference.path[n:])
@@ -382,12 +384,19 @@ class TipController:
             self._arm.channels.commands(reference.path[:n], *self._permitted, goal),
             None if isinstance(course, PostureCourse | Pressing) else course is not None,
             self._first_motion.largest_correction(tip.pose[:3, 3]),
-            None if isinstance(course, PostureCourse) else self.replanner.bent,
+            bent,
         )
         if command is None:
             return ControlOutput(last.copy(), False, self._feedback.saturated.copy())
         self._ways.append((reference.path.copy(), command - goal))
         return ControlOutput(command, True, self._feedback.saturated.copy())
+
+    def _bend(self, bent: BentMode | None) -> BentMode | None:
+        """Let the estimator have the modes of the bent arm, and return them."""
+        if bent is not self._bent and self._mode is not None:
+            self._bent, none = bent, np.zeros((3, self.robot.n_pressures))
+            self._arm.tip.excess = none if bent is None else bent.excess(self._mode.participation)
+        return self._bent
 
     def stop(self, now: float) -> Array | None:
         """Stop a doubted motion; see `Controller.stop`.

@@ -122,7 +122,8 @@ class TipFeedback:
         most :
             Largest correction of the position, in m.
         bent :
-            Modes of the arm near here; None: those of the straight arm.
+            Modes of the arm near here, from which the estimator's `excess` is; None: those of the
+            straight arm.
         """
         n = len(goal)
         self._learn(tip.pose[:3, 3], follows)
@@ -186,13 +187,10 @@ class TipFeedback:
         estimator, pressures = self._arm.tip, self._arm.pressures
         motion, n = reference.motion, len(pressures.command)
         linear, shares = tip.pose[:3, :3] @ tip.jacobian[:3], self._mode.participation
-        if bent is None:
-            plane = estimator.soft_plane
-            jacobian = plane @ (linear * shares)
-        else:
-            plane, jacobian = bent.plane, bent.near(linear, shares)
+        plane = estimator.soft_plane if bent is None else bent.plane
         return (
-            estimator.vibration, plane, jacobian, estimator.omega,
+            estimator.vibration, plane, plane @ (linear * shares) + estimator.excess,
+            estimator.omega,
             self._gains.at(estimator.omega), pressures.effective_ahead,
             reference.chamber, motion[0, :n], motion[1, :n],
             motion[:2, n : n + 3] - self._averaged.motion[:, :3],

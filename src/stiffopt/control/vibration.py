@@ -129,13 +129,10 @@ class BentMode:
         axes = np.linalg.svd(tips)[0][:, :2]
         return cls(tips @ modes.T @ (root * shapes), shapes[-3:], axes @ axes.T)
 
-    def near(self, linear: Array, participation: Array) -> Array:
-        """Return the modes' Jacobian (3, n) where that of the tip is another one (3, n).
-
-        What the tip's Jacobian has changed by takes part as in the straight arm.
-        """
-        changed: Array = self.plane @ ((linear - self.linear) * participation)
-        return self.jacobian + changed
+    def excess(self, participation: Array) -> Array:
+        """Return by how much the Jacobian (3, n) exceeds that by shares (n,) of a straight arm."""
+        excess: Array = self.jacobian - self.plane @ (self.linear * participation)
+        return excess
 
 
 def _stations(robot: RobotDescription) -> tuple[Array, Array]:
