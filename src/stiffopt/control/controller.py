@@ -35,7 +35,7 @@ from stiffopt.control.state import ControllerStatus
 from stiffopt.control.tip_errors import target_arrays
 from stiffopt.control.tip_feedback import TipFeedback
 from stiffopt.control.tuning import ControlTuning
-from stiffopt.control.vibration import BendingMode
+from stiffopt.control.vibration import BendingMode, BentMode
 from stiffopt.control.windows import WindowWatch
 from stiffopt.errors import InputError
 from stiffopt.model.manipulator import Manipulator
@@ -47,6 +47,7 @@ from stiffopt.rig.interface import PoseSample, PressureLimits, PressureReading
 from stiffopt.rig.settings import ControlSettings, Safety
 
 Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
 
 _HELD = 2.5  # periods without `compute`, after which others have commanded the pressures
 
@@ -114,7 +115,8 @@ class TipController:
         self._reference = Reference(
             period, slew, lag, control.damping, 6, tuning.reference.slew_share
         )
-        self._vibrates = mode is not None
+        self._mode, self._vibrates = mode, mode is not None
+        self._bent: BentMode | None = None  # modes that the estimator has
         self._feedback = TipFeedback(
             self._arm,
             limits,
@@ -329,10 +331,13 @@ class TipController:
         """Compute the next command; see `Controller.compute`."""
         output = self._compute(now)
         self._computed_at = now
-        posture = output.pressures + self._arm.pressures.command_offset
-        return ControlOutput(
-            output.pressures, output.valid, output.saturated, posture, self._arm.leaning is not None
-        )
+        return output
+
+    def _output(self, pressures: Array, saturated: Flags, *, valid: bool = True) -> ControlOutput:
+        """Return commands (n,) with what is known of them."""
+        posture = pressures + self._arm.pressures.command_offset
+        leans = self._arm.leaning is not None
+        return ControlOutput(pressures, valid, saturated.copy(), posture, leans)
 
     def _compute(self, now: float) -> ControlOutput:
         reference, pressures = self._reference, self._arm.pressures
@@ -344,7 +349,7 @@ class TipController:
         if plan is None:  # no pursuit, or no plan yet
             self._at_rest = True
             _, high = self._arm.channels.commands(last, *self._permitted)
-            return ControlOutput(np.minimum(last, high), True, np.zeros(n, dtype=bool))
+            return self._output(np.minimum(last, high), np.zeros(n, dtype=bool))
         lost = self._arm.channels.lost
         newly_lost = lost is not self._lost and (lost & ~self._lost).any()
         if self._at_rest or newly_lost:  # they are not where the reference is
@@ -357,7 +362,7 @@ class TipController:
             plan = self._reference.path
         self._lost = lost
         if self._report.model_is_wrong:
-            return ControlOutput(last.copy(), False, self._feedback.saturated.copy())
+            return self._output(last.copy(), self._feedback.saturated, valid=False)
         self._set_reference_rate()
         reference.omega = self._arm.tip.omega
         reference.advance(self._awaited(plan, now))
@@ -366,10 +371,10 @@ class TipController:
         tip = self._arm.on_path(reference.path[:n])
         if now - self._went_back_at > self._tuning.adaptation.blind_time:
             self._arm.watch.intend(now, tip.pose[:3, 3] + reference.path[n : n + 3])
-        moves = np.abs(reference.motion[1, :n]).max() > self._tuning.reference.at_rest
-        if self._arm.channels.pace == 0 and moves and self._ways:
+        if self._arm.channels.pace == 0 and self._ways and self._moves():
             return self._feedforward(self._without_feedback, last)
         course = self.replanner.pursuit.course
+        bent = self._bend(None if isinstance(course, PostureCourse) else self.replanner.bent)
         self._led_to = None
         if isinstance(course, PostureCourse):
             self._led_to = course.target(tip.pose, reference.path[n:])
@@ -383,11 +388,19 @@ class TipController:
             self._arm.channels.commands(reference.path[:n], *self._permitted, goal),
             None if isinstance(course, PostureCourse | Pressing) else course is not None,
             self._first_motion.largest_correction(tip.pose[:3, 3]),
+            bent,
         )
         if command is None:
-            return ControlOutput(last.copy(), False, self._feedback.saturated.copy())
+            return self._output(last.copy(), self._feedback.saturated, valid=False)
         self._ways.append((reference.path.copy(), command - goal))
-        return ControlOutput(command, True, self._feedback.saturated.copy())
+        return self._output(command, self._feedback.saturated)
+
+    def _bend(self, bent: BentMode | None) -> BentMode | None:
+        """Let the estimator have the modes of the bent arm, and return them."""
+        if bent is not self._bent and self._mode is not None:
+            self._bent, none = bent, np.zeros((3, self.robot.n_pressures))
+            self._arm.tip.excess = none if bent is None else bent.excess(self._mode.participation)
+        return self._bent
 
     def stop(self, now: float) -> Array | None:
         """Stop a doubted motion; see `Controller.stop`.
@@ -440,7 +453,7 @@ class TipController:
         low, high = self._arm.channels.commands(self._reference.path[: len(last)], *self._permitted)
         command = np.clip(np.clip(pressures, last - step, last + step), low, high)
         self._feedback.saturated = np.zeros(len(last), dtype=bool)
-        return ControlOutput(command, True, self._feedback.saturated.copy())
+        return self._output(command, self._feedback.saturated)
 
     def _plan(self, now: float) -> Array | None:
         """Return the reference's next goal, pressures and offset (n + 6,); None without a plan."""
@@ -458,6 +471,7 @@ class TipController:
         found = replanner.update(
             now, self._offset, self._arm.pressures.command_offset, estimator.omega,
             reference.delay, self._arm.channels.available(), way, self._windows.windows,
+            reference.path[: self.robot.n_pressures] if self._vibrates else None,
         )  # fmt: skip
         if isinstance(course, Bracing):
             return self._brace_planned(course, found, now)
@@ -494,11 +508,13 @@ class TipController:
 
     def _is_near(self, pressures: Array) -> bool:
         """Whether the reference rests at pressures (n,)."""
-        n, tuning = len(pressures), self._tuning.reference
-        off = float(np.abs(self._reference.path[:n] - pressures).max())
-        return off <= tuning.there and bool(
-            np.abs(self._reference.motion[1, :n]).max() <= tuning.at_rest
-        )
+        off = float(np.abs(self._reference.path[: len(pressures)] - pressures).max())
+        return off <= self._tuning.reference.there and not self._moves()
+
+    def _moves(self) -> bool:
+        """Whether the pressures of the reference change."""
+        rate = self._reference.motion[1, : self.robot.n_pressures]
+        return not np.abs(rate).max() <= self._tuning.reference.at_rest
 
     def _correct_brace(self, course: Bracing, now: float) -> None:
         """Bring the braced tip to its target; without one for its position it stays."""

@@ -46,8 +46,7 @@ class Report:
     @property
     def model_is_wrong(self) -> bool:
         """Whether the offset is too large to be an error of this arm's model."""
-        offset = self._arm.tip.offset[:3]
-        return float(offset @ offset) > self._largest_offset**2
+        return math.hypot(*self._arm.tip.offset[:3].tolist()) > self._largest_offset
 
     def status(self, now: float, led: tuple[Target, Array] | None) -> ControllerStatus:
         """Return the controller's part of the state.
