@@ -253,6 +253,8 @@ class Bracing:
             self._warned.clear()
             return
         self._pushed += elapsed
+        if sticks:  # what stays is creep in the end
+            self._error = self._error + min(elapsed / t.push_creeps, 1.0) * raw
         self.push, self.displacement = push, off
         self.covariance[:] = np.linalg.inv(C.T @ C / t.deviation**2 + np.linalg.inv(usual))
         self._judge(before, elapsed)

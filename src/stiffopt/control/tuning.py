@@ -555,8 +555,10 @@ class BracingTuning:
     # deviation of that displacement, in m, and of pushes, in N
     deviation: float = 2e-4
     usual_push: float = 0.1
-    # where contacts are to stick: share of that for pushes aside from the directions of stiffness
+    # where contacts are to stick: share of that for pushes aside from the directions of stiffness;
+    # and the time constant with which what a push displaces becomes creep, in s
     aside: float = 0.3
+    push_creeps: float = 30.0
     # of its force, below which the estimate cannot tell it from none; what may be added to that for
     # what a growing push has taken of late, and how long that is, in s
     lost_share: float = 0.15
