@@ -132,9 +132,9 @@ def uncommissioned(now: float, rig: Rig, controller: Controller, tracker: Tracke
     if settings.supply.simulated and not is_far:
         return ""
     text = (
-        "no record of a commissioning fits this rig. The loop takes a turned tracker frame and a "
-        "sensor in another place for an offset of the arm, and leads the tip off its target by as "
-        "much without a word"
+        "no record of a commissioning fits this rig. The loop cannot tell a turned tracker frame or "
+        "a displaced sensor from an offset of the arm: the tip may then miss its target by that "
+        "displacement, while the reported error is small"
     )
     if is_far:
         text += f"; the vented tip is seen {1e3 * off:.1f} mm from where the model has it"

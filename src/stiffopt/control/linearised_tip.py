@@ -114,7 +114,8 @@ class LinearisedTip:
     linear_range :
         Motion over which the model counts as linear, as a turn in rad: the change of the pressures
         times the Jacobian, as norms, a displacement being divided by the arm's length. Over 0.03
-        the position is accurate to a few micrometres, over 0.07 the Jacobian to a few percent.
+        the position is accurate to some micrometres, over 0.07 the Jacobian to a few percent, or to
+        a sixth where an arm bends by nearly half a turn.
     """
 
     def __init__(self, robot: Manipulator, linear_range: float = 0.03) -> None:

@@ -169,7 +169,7 @@ class Planning:
         self._bent_at = pressures
         try:
             return BentMode.of(self._robot, pressures)
-        except StiffoptError:  # no equilibrium: the last ones stay
+        except (StiffoptError, np.linalg.LinAlgError):  # no equilibrium: the last ones stay
             return None
 
     def _checked(self, request: PlanRequest) -> Plan:
