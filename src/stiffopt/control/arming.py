@@ -132,8 +132,8 @@ def uncommissioned(now: float, rig: Rig, controller: Controller, tracker: Tracke
     if settings.supply.simulated and not is_far:
         return ""
     text = (
-        "no record of a commissioning fits this rig. The loop cannot tell a turned tracker frame or "
-        "a displaced sensor from an offset of the arm: the tip may then miss its target by that "
+        "no record of a commissioning fits this rig. The loop cannot tell a turned tracker frame "
+        "or a displaced sensor from an offset of the arm: the tip may then miss its target by that "
         "displacement, while the reported error is small"
     )
     if is_far:
