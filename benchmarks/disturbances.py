@@ -72,6 +72,7 @@ DOUBTS = (
     "tracker-lost",
     "unreachable",
 )
+SET_UP = ("uncommissioned", *DOUBTS)  # what is told of faults of the set-up, also at arming
 FAULTS = ("leak", "regulator-stuck", "pressure-reading", "tracker-jumps", "guard", "device")
 
 
@@ -448,7 +449,11 @@ def run_row(case: Case, row: Row, dynamics: str, *, frozen: bool = False) -> Out
                 run.go(1.0)
         events, _ = run.loop.events.since(0)
         kinds = DOUBTS if row.is_fault else DOUBTS[:-1]  # what is pushed may reach less
-        told = [event for event in events if event.kind in kinds and event.time >= began]
+        if row.at_once:
+            kinds, since = SET_UP, -np.inf
+        else:
+            since = began
+        told = [event for event in events if event.kind in kinds and event.time >= since]
         ways = np.concatenate([trace.tips for trace in traces])
         if run.loop.snapshot().state is State.FAULT:  # venting takes the arm to rest
             after = ended - next(e.time for e in events if e.kind in FAULTS)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -165,6 +165,18 @@ def test_what_is_held_back_has_no_say() -> None:
     assert not value[rows].any()
     assert not slope[rows].any()
     assert np.abs(value[: rows.start]).max() > 0
+
+
+def test_what_is_held_back_is_forgotten() -> None:
+    """The fit without a fold begins where that to all rows ended, and goes on to its own end."""
+    problem = problem_of(
+        [(name, log_of(i)) for i, name in enumerate("abc")], structure="progressive"
+    )
+    found = fit(problem, [np.zeros(problem.size)], rounds=0)
+    far = np.random.default_rng(3).normal(0, 0.7, problem.size)
+    part = held_back(replace(found, x=far), 2.0, lambda: None)["c"].fit
+    other = fit(part.problem, [found.x], rounds=0)
+    assert part.cost == pytest.approx(other.cost, abs=0.01)
 
 
 def test_the_beginning_of_a_log_in_an_unknown_state_is_for_its_state() -> None:

@@ -587,6 +587,38 @@ def test_arming_asks_for_a_record_that_fits(tmp_path: Path) -> None:
     assert "cannot be read" in armed.refused()
 
 
+def test_arming_without_a_record_says_what_it_does_not_know(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On a real rig always; on a simulated one if the vented tip is far from the model's."""
+
+    def warnings(off: float, *, real: bool, commissioned: bool = False) -> list[str]:
+        armed = Armed(tmp_path)
+        lab, tip = armed.lab, armed.lab.controller.tip
+        if not commissioned:
+            update = {"required": False, "record": str(tmp_path / "none.yaml")}
+            settings = lab.rig.settings
+            changed = settings.commissioning.model_copy(update=update)
+            lab.rig.settings = settings.model_copy(update={"commissioning": changed})
+        if real:
+            monkeypatch.setattr(type(lab.rig.settings.supply), "simulated", False)
+        lab.controller.tip = tip + np.array([off, 0.0, 0.0])
+        lab.arm()
+        monkeypatch.undo()
+        events, _ = lab.loop.events.since(0)
+        return [event.text for event in events if event.kind == "uncommissioned"]
+
+    assert warnings(2e-3, real=False) == []
+    assert warnings(6e-3, real=True, commissioned=True) == []
+    (told,) = warnings(2e-3, real=True)
+    assert "no record of a commissioning fits" in told
+    assert "run 'stiffopt commission'" in told.lower()
+    assert "is seen" not in told
+    for real in (False, True):
+        (told,) = warnings(6e-3, real=real)
+        assert "the vented tip is seen 6.0 mm from where the model has it" in told
+
+
 def test_the_loop_gets_the_swing_that_was_found(tmp_path: Path) -> None:
     swing = {
         "frequency": 1.7, "frequency_deviation": 1e-3, "damping": 0.035,

@@ -38,7 +38,7 @@ def learned(
         if extra is not None and time > 3.0:
             away = away + extra * (time - 3.0)
         way = float(np.linalg.norm(WAY)) if steps else 0.0
-        estimator.learn(FRAME, away, way**2, way / FRAME)
+        estimator.learn(FRAME, away, way**2, way / FRAME, np.eye(3))
     return estimator
 
 
@@ -97,5 +97,28 @@ def test_a_jacobian_that_changes_between_two_corrections_teaches_nothing(until: 
     estimator.take_over(1.5 * JACOBIAN)
     for time in until + FRAME * np.arange(4):
         estimator.advance(FRAME, STEP, 1.5 * JACOBIAN)
-        estimator.learn(FRAME, 0.08 * WAY + creep(time, shares, times), 0.0, 0.0)
+        estimator.learn(FRAME, 0.08 * WAY + creep(time, shares, times), 0.0, 0.0, np.eye(3))
     np.testing.assert_allclose(estimator.shares, before, atol=4e-3)
+
+
+def test_creep_that_is_soon_seen_tells_of_the_creep_to_come() -> None:
+    """A rest of a few seconds by itself shows nothing of a time constant of 25 s."""
+    shares = learned((0.06, 0.06), (2.0, 20.0), 4.0).shares
+    assert shares[2] > CreepTuning().share + 0.004
+
+
+def test_elongation_creeps_otherwise_and_teaches_nothing() -> None:
+    """Nothing creeps across the arm, much along it, where no force is felt."""
+    along = STEP @ JACOBIAN.T
+    along = along / np.linalg.norm(along)
+    across = np.eye(3) - np.outer(along, along)
+    estimators = [CreepEstimator(3, False, CreepTuning()) for _ in range(2)]
+    for time in np.arange(0, 6.0, FRAME):
+        moved = time >= 1.0
+        away = 0.08 * WAY * moved + creep(time, (0.1,), (2.0,))
+        for estimator, felt in zip(estimators, (np.eye(3), across), strict=True):
+            estimator.advance(FRAME if time else np.inf, moved * STEP, JACOBIAN)
+            estimator.learn(FRAME, away, 0.0, 0.0, felt)
+    told, untold = (np.abs(each.shares - CreepTuning().share).max() for each in estimators)
+    assert told > 0.02
+    assert untold < 1e-3

@@ -535,17 +535,17 @@ def test_an_arm_that_buckles_during_the_fit_says_so() -> None:
 
 
 class Broken:
-    """A problem of one unknown that is a line, but not finite beyond a limit."""
+    """A problem of one unknown that is a line; slopes, and perhaps values, fail beyond a limit."""
 
     size, low, high = 1, np.full(1, -np.inf), np.full(1, np.inf)
     description, n_shared = ONE, 0
 
-    def __init__(self, limit: float, slope: float = 3.0) -> None:
-        self.limit, self.slope = limit, slope
+    def __init__(self, limit: float, slope: float = 3.0, beyond: float = np.nan) -> None:
+        self.limit, self.slope, self.beyond = limit, slope, beyond
 
     def residuals(self, x: Array) -> tuple[Array, Array]:
         if x[0] > self.limit:
-            return np.full(1, np.nan), np.full((1, 1), np.nan)
+            return self.beyond * (3 * x - 6), np.full((1, 1), np.nan)
         return 3 * x - 6, np.full((1, 1), self.slope)
 
 
@@ -554,7 +554,8 @@ def test_a_model_that_is_not_finite_cannot_be_fitted() -> None:
         return float(fit(problem, [np.array([start])], rounds=0).x[0])
 
     assert fitted(Broken(10.0), 0.0) == pytest.approx(1.8, abs=0.1)
-    assert fitted(Broken(1.0), 0.0) == pytest.approx(1.0, abs=0.1)  # steps beyond are taken back
+    for beyond in (np.nan, 1.0):  # steps to where slopes alone fail are taken back too
+        assert fitted(Broken(1.0, beyond=beyond), 0.0) == pytest.approx(1.0, abs=0.1)
     with pytest.raises(InputError, match="not finite"):
         fitted(Broken(1.0), 2.0)
     with pytest.raises(InputError, match="not finite"):

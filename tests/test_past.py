@@ -19,7 +19,7 @@ KPA = 1e3
 PLAYS = (Play(width=4 * KPA, share=0.2), Play(width=15 * KPA, share=0.15))
 CREEPS = (Creep(time=0.7, share=0.1), Creep(time=20.0, share=0.05))
 FULL = History(
-    dead_time=0.1313,  # no multiple of `FINE`: there are kinks where rows meet delayed rows
+    dead_time=0.1313,
     lag=0.3,
     lag_falling=0.7,
     memory=(0.5, 1.2, 0.9),
@@ -40,6 +40,7 @@ KINDS = {
     "play": History(play=PLAYS),
     "creep": History(creep=CREEPS),
     "lag and creep": History(lag=0.2, creep=CREEPS),
+    "lag, creep and dead time": History(lag=0.2, creep=CREEPS, dead_time=0.132),
     "all but dead time": FULL.model_copy(update={"dead_time": 0.0}),
     "all": FULL,
     "elongation": History(play=[play.model_copy(update={"of": "elongation"}) for play in PLAYS]),
@@ -90,8 +91,8 @@ def test_along_a_log_it_is_what_a_memory_does_in_fine_steps(kind: str) -> None:
     before = np.array([60.0, 10.0, 30.0]) * KPA
     found = run(history, time, pressures, Start.from_rest(history, before)).pressures
     expected = in_fine_steps(history, time, pressures, before)
-    # rows are 0.08 s apart; what turns or is delayed between two of them is met by interpolation
-    exact = history.lag and not (history.play or history.lag_falling or history.dead_time)
+    # rows are 0.08 s apart; what turns between two of them is met by interpolation
+    exact = history.lag and not (history.play or history.lag_falling)
     assert found == pytest.approx(expected, abs=2.0 if exact else 300.0)
     assert np.sqrt(np.mean((found - expected) ** 2)) < 50.0
     if kind != "none":
@@ -117,6 +118,31 @@ def test_a_step_of_pressure_arrives_a_dead_time_and_a_lag_later() -> None:
     expected = 50 * KPA * (1 - np.exp(-np.maximum(time + 0.005 - 0.3, 0) / 0.4))
     assert found == pytest.approx(expected, abs=100.0)  # the step takes one row of 0.01 s
     assert (found[time < 0.28] == 0).all()
+
+
+def test_a_dead_time_ends_between_rows_that_are_far_apart() -> None:
+    time = np.array([0.0, 0.1, 0.11, 2.0, 4.0])  # rows on straight lines were left out
+    pressures = np.array([[0.0, 0.0, 50.0, 50.0, 50.0]]).T * KPA
+    found = run(History(dead_time=0.7, lag=0.9), time, pressures).pressures[:, 0]
+    expected = 50 * KPA * (1 - np.exp(-np.maximum(time - 0.105 - 0.7, 0) / 0.9))
+    assert found == pytest.approx(expected, abs=2.0)
+
+
+@pytest.mark.parametrize("kind", ["lag", "all", "parts"])
+def test_a_dead_time_of_whole_rows_is_no_corner(kind: str) -> None:
+    """Where a row meets a delayed row, errors have a slope by the dead time like elsewhere."""
+    time, pressures = course(300, even=0.08)
+
+    def at(dead_time: float) -> Effective:
+        return run(KINDS[kind].model_copy(update={"dead_time": dead_time}), time, pressures)
+
+    middle, step = at(0.16), 1e-6
+    before = (middle.pressures - at(0.16 - step).pressures) / step
+    after = (at(0.16 + step).pressures - middle.pressures) / step
+    scale = np.abs(before).max()
+    assert np.quantile(np.abs(after - before), 0.95) < 1e-3 * scale
+    found = middle.per_number["dead_time"]
+    assert np.quantile(np.abs(found - before), 0.95) < 1e-3 * scale
 
 
 # -- derivatives ----------------------------------------------------------------------------

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 import stiffopt as so
 from stiffopt.control.planner import InlinePlanner, ProcessPlanner
 from stiffopt.control.planning import Planning, PlanRequest, model_target
+from stiffopt.control.vibration import BentMode
 from stiffopt.errors import StiffoptError
 from stiffopt.optimise.goal import StiffnessGoal, StiffnessMeasure
 from stiffopt.optimise.target import Target
@@ -165,6 +166,25 @@ def test_plans_leave_room_for_the_pressure_offset_within_the_limits(off):
     again = planning.plan(PlanRequest(1, task, task.target, np.zeros(6), 1.1 * offset))
     assert np.all(again.pressures - 1.1 * offset <= arm.pressure_max + 1)
     assert np.all(again.pressures - 1.1 * offset >= arm.pressure_min - 1)
+
+
+def test_the_modes_come_with_a_plan_if_the_arm_is_elsewhere(robot):
+    """They are sent once: after 30 mbar, for a new task, and for another model."""
+    planning, here = Planning(robot), PRESSURES
+
+    def modes(pressures, serial=1):
+        return planning.plan(request(robot, serial, here=pressures)).bent
+
+    assert planning.plan(request(robot)).bent is None
+    found, own = modes(here), BentMode.of(robot, here)
+    assert found.jacobian == pytest.approx(own.jacobian, rel=1e-6, abs=1e-12)
+    assert modes(here + 0.02 * BAR) is None
+    assert modes(here + 0.04 * BAR) is not None
+    assert modes(here + 0.05 * BAR) is None
+    assert modes(here + 0.05 * BAR, serial=2) is not None
+    beyond = modes(np.full(3, 100 * BAR), serial=2)  # what acts may be beyond the limits
+    limit = BentMode.of(robot, np.array(robot.description.pressure_max))
+    assert beyond.jacobian == pytest.approx(limit.jacobian, rel=1e-6, abs=1e-12)
 
 
 def test_a_plan_that_stays_changes_the_pressures_least(robot):

@@ -20,6 +20,7 @@ from stiffopt.control.adaptation import Learning, Window
 from stiffopt.control.planner import PlannerEnd, PlanningEnd, ProcessPlanner
 from stiffopt.control.planning import Plan, PlanRequest
 from stiffopt.control.tuning import AdaptationTuning
+from stiffopt.control.vibration import BentMode
 from stiffopt.optimise.goal import StiffnessGoal, StiffnessMeasure
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import Task
@@ -63,6 +64,7 @@ def assert_same(one: PlanRequest, other: PlanRequest) -> None:
     assert one.offset.tobytes() == other.offset.tobytes()
     assert one.pressure_offset.tobytes() == other.pressure_offset.tobytes()
     assert (one.low.tolist(), one.high.tolist()) == (other.low.tolist(), other.high.tolist())
+    assert one.here.tolist() == other.here.tolist()
 
 
 def test_requests_arrive_as_they_were_whatever_changes(ends: Ends) -> None:
@@ -76,6 +78,7 @@ def test_requests_arrive_as_they_were_whatever_changes(ends: Ends) -> None:
         {"offset": 2 * OFFSET},
         {"pressure_offset": 2 * BESIDE},
         {"low": BESIDE, "high": 3 * BESIDE},
+        {"here": BESIDE},
         {"search": False},
         {"stay": True},
         elsewhere,
@@ -108,7 +111,7 @@ def test_a_task_is_sent_once_and_again_on_a_new_line(ends: Ends) -> None:
         del line.connection.send_bytes
         return set(pickle.loads(sent.pop()))
 
-    arrays = {"offset", "pressure_offset", "low", "high", "way"}
+    arrays = {"offset", "pressure_offset", "low", "high", "way", "here"}
     objects = {"serial", "task", "target", "search", "stay", "last", "windows", "adapted"}
     everything = objects | arrays
     assert news(ends.ours, first) == everything
@@ -124,7 +127,10 @@ def test_plans_arrive_as_they_were(ends: Ends) -> None:
     for reached, stiffness, message in ((True, 123.4, ""), (False, math.nan, "it is far")):
         known = ends.passes(request)
         pressures = np.array([1e5 / 3, 0.0, -0.0])
-        plan = Plan(4, pressures, known.offset, known.target, reached, stiffness, message)
+        bent = BentMode(np.ones((3, 3)), np.full((3, 3), 2.0), np.eye(3)) if reached else None
+        plan = Plan(
+            4, pressures, known.offset, known.target, reached, stiffness, message, bent=bent
+        )
         ends.theirs.answer(plan)
         found = ends.ours.receive()
         assert isinstance(found, Plan)
@@ -133,6 +139,12 @@ def test_plans_arrive_as_they_were(ends: Ends) -> None:
         assert found.target is request.target
         assert (found.serial, found.reached, found.message) == (4, reached, message)
         assert found.stiffness == pytest.approx(stiffness, abs=0, nan_ok=True)
+        if bent is None or found.bent is None:
+            assert found.bent is bent
+        else:
+            assert found.bent.jacobian.tolist() == bent.jacobian.tolist()
+            assert found.bent.linear.tolist() == bent.linear.tolist()
+            assert found.bent.plane.tolist() == bent.plane.tolist()
 
 
 def test_it_says_whether_there_is_an_answer() -> None:

@@ -7,14 +7,12 @@ import pytest
 from scipy.linalg import expm
 
 from stiffopt import Target, lie
-from stiffopt.control.feedback import prescribed_components, tracking_rows
+from stiffopt.control.feedback import prescribed_components, tracking_rows, with_offsets
 from stiffopt.control.formula import Formula
 from stiffopt.control.tuning import FeedbackTuning
-from stiffopt.control.vibration import BendingMode
 
 LEVER = FeedbackTuning().lever
 N, DAMPING, DEAD_TIME = 6, 0.04, 0.013
-ARM = BendingMode(0.04, np.array([0.9, 0.9, 0.9, 0.6, 0.7, 0.6]))
 TARGETS = {
     "position": Target(position=(0.01, 0.0, 0.2)),
     "height": Target(position=(None, None, 0.2)),
@@ -31,7 +29,8 @@ def drawn(seed):
     correction = rng.normal(size=6) * np.repeat([1e-3, 1e-2], 3)
     root = rng.normal(size=(3, 3))
     swing = (
-        rng.normal(size=(2, 3)) * [[1e-3], [1e-2]], root @ root.T / 4, 9.0,
+        rng.normal(size=(2, 3)) * [[1e-3], [1e-2]], root @ root.T / 4,
+        rng.normal(size=(3, N)) * 3e-7, 9.0,
         rng.uniform(0, 1, 3), *(rng.uniform(0, 1e5, N) for _ in range(3)), rng.normal(size=N) * 1e5,
         rng.normal(size=(2, 3)) * [[1e-3], [1e-2]],
     )  # fmt: skip
@@ -67,10 +66,10 @@ def task(pose, jacobian, correction, target, feedback):
 @pytest.mark.parametrize("name", list(TARGETS))
 @pytest.mark.parametrize("swings", [True, False])
 def test_rows_are_those_of_the_task(name, swings):
-    target, system = TARGETS[name], tracking_rows(N, ARM if swings else None, DAMPING, DEAD_TIME)
+    target, system = TARGETS[name], tracking_rows(N, swings, DAMPING, DEAD_TIME)
     pose, jacobian, correction, swing = drawn(3)
     if swings:  # without feedback
-        swing = (*swing[:3], np.zeros(3), *swing[4:])
+        swing = (*swing[:4], np.zeros(3), *swing[5:])
     given = (pose, jacobian, prescribed_components(target), correction, *(swing if swings else ()))
     rows, values, linear = evaluated(system, *given)
     expected, wanted = task(pose, jacobian, correction, target, np.zeros(3))
@@ -84,12 +83,11 @@ def test_rows_are_those_of_the_task(name, swings):
 
 @pytest.mark.parametrize("seed", range(4))
 def test_feedback_of_an_arm_that_swings(seed):
-    target, system = TARGETS["position"], tracking_rows(N, ARM, DAMPING, DEAD_TIME)
+    target, system = TARGETS["position"], tracking_rows(N, True, DAMPING, DEAD_TIME)
     pose, jacobian, correction, swing = drawn(seed)
-    now, across, omega, gains, ahead, chamber, path, rate, intended = swing
+    now, across, own, omega, gains, ahead, chamber, path, rate, intended = swing
     given = (pose, jacobian, prescribed_components(target), correction, *swing)
-    rows, values, linear = evaluated(system, *given)
-    own = across @ linear @ np.diag(ARM.participation)  # of the mode
+    rows, values, _ = evaluated(system, *given)
     home, (there, moving) = across @ correction[:3], intended @ across
     free = np.array([[0, 1], [-(omega**2), -2 * DAMPING * omega]])
     later = expm(DEAD_TIME * free) @ now
@@ -103,3 +101,34 @@ def test_feedback_of_an_arm_that_swings(seed):
     assert weight > 1
     assert rows[9:] == pytest.approx(weight * own, rel=1e-9)
     assert values[9:] == pytest.approx(weight * (home + feedback), rel=1e-9)
+
+
+@pytest.mark.parametrize("most", [np.inf, 1e-3])
+@pytest.mark.parametrize("swings", [True, False])
+def test_the_law_finds_its_correction_from_the_offset_and_its_average(swings, most):
+    """The average counts, the present offset along a stiff axis; what grows with motion is led."""
+    pose, jacobian, _, swing = drawn(5)
+    rng = np.random.default_rng(6)
+    accounted, offset = rng.normal(size=(2, 6)) * 1e-3
+    average = np.concatenate([rng.normal(size=6) * 1e-3, pose[:3, 3] + rng.normal(size=3) * 1e-2])
+    slope, stiff, rate, delay = (
+        0.1 * rng.normal(size=(3, 3)),
+        np.diag([0.0, 0.3, 0.9]),
+        swing[8],
+        0.1,
+    )
+    velocity = pose[:3, :3] @ jacobian[:3] @ rate
+    grown = slope @ (pose[:3, 3] - average[6:])
+    corrected = average[:6].copy()
+    corrected[:3] += grown + slope @ velocity * delay
+    corrected[:3] += stiff @ (offset[:3] - average[:3] - grown)
+    correction = accounted - corrected
+    size = np.linalg.norm(correction[:3])
+    assert size > 1e-3
+    correction *= min(1.0, most / size)
+    law, dynamic = tracking_rows(N, swings, DAMPING, DEAD_TIME), swing if swings else ()
+    known = (accounted, offset, average, slope, stiff, rate, delay, most)
+    plain = evaluated(law, pose, jacobian, np.ones(5), correction, *dynamic)
+    found = evaluated(with_offsets(law), pose, jacobian, np.ones(5), *dynamic, *known)
+    for value, expected in zip(found, plain, strict=True):
+        assert value == pytest.approx(expected, rel=1e-9, abs=1e-15)

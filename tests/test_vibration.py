@@ -11,12 +11,13 @@ from scipy.linalg import eigh
 
 import stiffopt as so
 from independent import FLOP, Arm
-from stiffopt.control.vibration import BendingMode
+from stiffopt.control.vibration import BendingMode, BentMode
 from stiffopt.model.robot_files import load_description
 from stiffopt.plant.plant import Plant
-from stiffopt.plant.settings import PlantSettings
+from stiffopt.plant.settings import PlantSettings, Silicone
 
 TWO = "stiff-flop-2-hanging"
+STILL = Silicone(law="linear", damping=0.0, creep=(), hysteresis=())
 
 
 def drawn(*lengths: float, tip_mass: float = 0.0, **changes: Any) -> so.RobotDescription:
@@ -184,3 +185,46 @@ def test_frequency_is_that_of_the_simulated_arm(name, share):
         softness = np.linalg.eigvalsh(R @ model.tip_compliance(p)[:3, :3] @ R.T)
         found = vibration.frequency(2 / float(softness[1] + softness[2])) / (2 * np.pi)
         assert found == pytest.approx(0.5 * (first + second), rel=share)
+
+
+@pytest.mark.parametrize("name", [TWO, "stiff-flop-1", "stiff-flop-2"])
+def test_modes_of_an_arm_that_hangs_straight_are_those_of_the_beam(name):
+    model = so.load_robot(name)
+    n, shares = model.n_pressures, BendingMode.of(model.description).participation
+    found = BentMode.of(model, np.zeros(n))
+    assert found.plane == pytest.approx(np.diag([1.0, 1.0, 0.0]), abs=1e-3)
+    own = found.plane @ (found.linear * shares)
+    assert np.abs(found.jacobian - own).max() < 0.08 * np.abs(own).max()
+    assert found.excess(shares) == pytest.approx(found.jacobian - own, abs=1e-15)
+
+
+@pytest.mark.parametrize(("channels", "share"), [((0, -1, 1), 1.4), ((-2, 1, 1), 1.0)])
+def test_a_bent_arm_swings_as_its_own_modes_say(channels, share):
+    """Where the upper segment stands out sideways, the lower one takes part by far more.
+
+    The plant without damping swings about its new equilibrium, by the tip's displacement in the
+    modes; that of higher modes is not compared.
+    """
+    name, p = TWO, np.array([0.81, 0.45, 0.49, 0.0, 1.5, 1.5]) * 1e5
+    robot, model = load_description(name), so.load_robot(name)
+    change = np.array([*channels, 0, 0, 0]) * 2e3
+    plant = Plant(robot, PlantSettings(dynamics="full", silicone=STILL))
+    plant.settle(p + change)
+    rest = plant.tip_pose()[:3, 3].copy()
+    plant.settle(p)
+    (first, second), _ = plant.modes(2)
+    steps = round(4.0 / plant.step)
+    trace, tips = np.tile(p + change, (10, 1)), []
+    for _ in range(steps // 10):
+        plant.follow(trace)
+        tips.append(plant.tip_pose()[:3, 3] - rest)
+    found = BentMode.of(model, p)
+    expected = found.jacobian @ change
+    axis = expected / np.linalg.norm(expected)
+    times = 10 * plant.step * np.arange(1, len(tips) + 1)
+    angles = np.pi * (first + second) * times
+    waves = np.stack([np.cos(angles), np.sin(angles), np.ones_like(times)], axis=1)
+    fit, *_ = np.linalg.lstsq(waves, np.array(tips) @ axis, rcond=None)
+    assert np.linalg.norm(expected) == pytest.approx(np.hypot(*fit[:2]), rel=0.1)
+    straight = found.plane @ (found.linear * BendingMode.of(robot).participation) @ change
+    assert axis @ expected == pytest.approx(share * (axis @ straight), rel=0.07)

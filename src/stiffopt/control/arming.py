@@ -7,9 +7,11 @@ import os
 from collections.abc import Iterator
 
 import numpy as np
+from numpy.typing import NDArray
 
 from stiffopt.commissioning.record import (
     CommissioningRecord,
+    is_commissioned,
     is_record_of,
     load_record,
     problems_of_record,
@@ -30,6 +32,10 @@ _MAX_MOVED = 0.04  # share of its length; hysteresis and creep take about half o
 _NOISE_FACTOR, _MIN_NOISE = 2.5, 2e-5  # growth of the tracker's noise; lower bound of it, in m
 _MAX_DELAY = 0.05  # s, growth of the age of samples
 _MAX_GAUGE_CHANGE = 0.3  # share of `Safety.max_pressure_error`
+
+# offset of a vented tip from the model's, as a share of the arm's length, that is told without a
+# record: tolerances of the base, 2 mm and 2 degrees, make it 0.046
+_UNUSUAL = 0.05
 
 
 def check_rig(rig: Rig, outlet: Outlet, controller: Controller) -> Iterator[str]:
@@ -94,10 +100,7 @@ def check_vented_arm(
     if tracker.sight(now) is not Sight.SEEN:
         yield "tracker: the tip is not seen now; bring the sensor into its field"
         return
-    status = controller.status(now)
-    modelled = status.model_position
-    if modelled is None:
-        modelled = status.tip_position - status.disturbance
+    modelled = _modelled(now, controller)
     off = float(np.linalg.norm(tracker.position - modelled))
     if not off <= max_offset * rig.robot.length:  # NaN fails too
         seen, model = (", ".join(f"{1e3 * x:.1f}" for x in p) for p in (tracker.position, modelled))
@@ -106,6 +109,36 @@ def check_vented_arm(
             f"the model has it, ({model}) mm; check the tracker's registration and the robot file "
             "('stiffopt calibrate' makes one)"
         )
+
+
+def _modelled(now: float, controller: Controller) -> NDArray[np.float64]:
+    """Return where the model has the tip (3,), in m."""
+    status = controller.status(now)
+    if status.model_position is not None:
+        return status.model_position
+    return status.tip_position - status.disturbance
+
+
+def uncommissioned(now: float, rig: Rig, controller: Controller, tracker: TrackerWatch) -> str:
+    """Return a warning if no record of a commissioning fits the rig; otherwise an empty text.
+
+    A simulated rig has it only if the vented tip is far from where the model has it.
+    """
+    settings = rig.settings
+    if settings is None or is_commissioned(settings, rig.robot):
+        return ""
+    off = float(np.linalg.norm(tracker.position - _modelled(now, controller)))
+    is_far = off > _UNUSUAL * rig.robot.length
+    if settings.supply.simulated and not is_far:
+        return ""
+    text = (
+        "no record of a commissioning fits this rig. The loop cannot tell a turned tracker frame "
+        "or a displaced sensor from an offset of the arm: the tip may then miss its target by that "
+        "displacement, while the reported error is small"
+    )
+    if is_far:
+        text += f"; the vented tip is seen {1e3 * off:.1f} mm from where the model has it"
+    return f"{text}. Run 'stiffopt commission'"
 
 
 def check_commissioned(

@@ -29,17 +29,17 @@ from stiffopt.control.posture import PostureCourse
 from stiffopt.control.pressing import Phase, Pressing
 from stiffopt.control.reference import Reference
 from stiffopt.control.replanning import Pursuit, Replanner
+from stiffopt.control.report import Report
 from stiffopt.control.requests import Requests
-from stiffopt.control.state import AdaptedNumber, ControllerStatus, Severity
-from stiffopt.control.tip_errors import TipErrors, target_arrays
+from stiffopt.control.state import ControllerStatus
+from stiffopt.control.tip_errors import target_arrays
 from stiffopt.control.tip_feedback import TipFeedback
 from stiffopt.control.tuning import ControlTuning
-from stiffopt.control.vibration import BendingMode
+from stiffopt.control.vibration import BendingMode, BentMode
 from stiffopt.control.windows import WindowWatch
 from stiffopt.errors import InputError
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.scene import Scene
-from stiffopt.model.uncertainty import NORMAL_QUANTILE
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import Task
 from stiffopt.paths.trajectory import Trajectory
@@ -47,6 +47,7 @@ from stiffopt.rig.interface import PoseSample, PressureLimits, PressureReading
 from stiffopt.rig.settings import ControlSettings, Safety
 
 Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
 
 _HELD = 2.5  # periods without `compute`, after which others have commanded the pressures
 
@@ -114,7 +115,8 @@ class TipController:
         self._reference = Reference(
             period, slew, lag, control.damping, 6, tuning.reference.slew_share
         )
-        self._vibrates = mode is not None
+        self._mode, self._vibrates = mode, mode is not None
+        self._bent: BentMode | None = None  # modes that the estimator has
         self._feedback = TipFeedback(
             self._arm,
             limits,
@@ -139,8 +141,9 @@ class TipController:
         if scene is not None:
             self.forecast = Forecast(Planner(robot, scene), tuning.forecast)
         self._lead = dead_time + 0.5 * period
-        self._largest_offset = tuning.feedback.max_offset * robot.length
-        self._errors = TipErrors()
+        self._report = Report(
+            robot, self._arm, self.replanner, tuning.feedback.max_offset * robot.length
+        )
         self._windows = WindowWatch(tuning.windows)
         self._adapts = control.adaptation != "none"
         self.begin(0.0)
@@ -328,10 +331,13 @@ class TipController:
         """Compute the next command; see `Controller.compute`."""
         output = self._compute(now)
         self._computed_at = now
-        posture = output.pressures + self._arm.pressures.command_offset
-        return ControlOutput(
-            output.pressures, output.valid, output.saturated, posture, self._arm.leaning is not None
-        )
+        return output
+
+    def _output(self, pressures: Array, saturated: Flags, *, valid: bool = True) -> ControlOutput:
+        """Return commands (n,) with what is known of them."""
+        posture = pressures + self._arm.pressures.command_offset
+        leans = self._arm.leaning is not None
+        return ControlOutput(pressures, valid, saturated.copy(), posture, leans)
 
     def _compute(self, now: float) -> ControlOutput:
         reference, pressures = self._reference, self._arm.pressures
@@ -343,7 +349,7 @@ class TipController:
         if plan is None:  # no pursuit, or no plan yet
             self._at_rest = True
             _, high = self._arm.channels.commands(last, *self._permitted)
-            return ControlOutput(np.minimum(last, high), True, np.zeros(n, dtype=bool))
+            return self._output(np.minimum(last, high), np.zeros(n, dtype=bool))
         lost = self._arm.channels.lost
         newly_lost = lost is not self._lost and (lost & ~self._lost).any()
         if self._at_rest or newly_lost:  # they are not where the reference is
@@ -355,8 +361,8 @@ class TipController:
             )
             plan = self._reference.path
         self._lost = lost
-        if self._model_is_wrong():
-            return ControlOutput(last.copy(), False, self._feedback.saturated.copy())
+        if self._report.model_is_wrong:
+            return self._output(last.copy(), self._feedback.saturated, valid=False)
         self._set_reference_rate()
         reference.omega = self._arm.tip.omega
         reference.advance(self._awaited(plan, now))
@@ -365,10 +371,10 @@ class TipController:
         tip = self._arm.on_path(reference.path[:n])
         if now - self._went_back_at > self._tuning.adaptation.blind_time:
             self._arm.watch.intend(now, tip.pose[:3, 3] + reference.path[n : n + 3])
-        moves = np.abs(reference.motion[1, :n]).max() > self._tuning.reference.at_rest
-        if self._arm.channels.pace == 0 and moves and self._ways:
+        if self._arm.channels.pace == 0 and self._ways and self._moves():
             return self._feedforward(self._without_feedback, last)
         course = self.replanner.pursuit.course
+        bent = self._bend(None if isinstance(course, PostureCourse) else self.replanner.bent)
         self._led_to = None
         if isinstance(course, PostureCourse):
             self._led_to = course.target(tip.pose, reference.path[n:])
@@ -382,11 +388,19 @@ class TipController:
             self._arm.channels.commands(reference.path[:n], *self._permitted, goal),
             None if isinstance(course, PostureCourse | Pressing) else course is not None,
             self._first_motion.largest_correction(tip.pose[:3, 3]),
+            bent,
         )
         if command is None:
-            return ControlOutput(last.copy(), False, self._feedback.saturated.copy())
+            return self._output(last.copy(), self._feedback.saturated, valid=False)
         self._ways.append((reference.path.copy(), command - goal))
-        return ControlOutput(command, True, self._feedback.saturated.copy())
+        return self._output(command, self._feedback.saturated)
+
+    def _bend(self, bent: BentMode | None) -> BentMode | None:
+        """Let the estimator have the modes of the bent arm, and return them."""
+        if bent is not self._bent and self._mode is not None:
+            self._bent, none = bent, np.zeros((3, self.robot.n_pressures))
+            self._arm.tip.excess = none if bent is None else bent.excess(self._mode.participation)
+        return self._bent
 
     def stop(self, now: float) -> Array | None:
         """Stop a doubted motion; see `Controller.stop`.
@@ -439,7 +453,7 @@ class TipController:
         low, high = self._arm.channels.commands(self._reference.path[: len(last)], *self._permitted)
         command = np.clip(np.clip(pressures, last - step, last + step), low, high)
         self._feedback.saturated = np.zeros(len(last), dtype=bool)
-        return ControlOutput(command, True, self._feedback.saturated.copy())
+        return self._output(command, self._feedback.saturated)
 
     def _plan(self, now: float) -> Array | None:
         """Return the reference's next goal, pressures and offset (n + 6,); None without a plan."""
@@ -457,6 +471,7 @@ class TipController:
         found = replanner.update(
             now, self._offset, self._arm.pressures.command_offset, estimator.omega,
             reference.delay, self._arm.channels.available(), way, self._windows.windows,
+            reference.path[: self.robot.n_pressures] if self._vibrates else None,
         )  # fmt: skip
         if isinstance(course, Bracing):
             return self._brace_planned(course, found, now)
@@ -493,11 +508,13 @@ class TipController:
 
     def _is_near(self, pressures: Array) -> bool:
         """Whether the reference rests at pressures (n,)."""
-        n, tuning = len(pressures), self._tuning.reference
-        off = float(np.abs(self._reference.path[:n] - pressures).max())
-        return off <= tuning.there and bool(
-            np.abs(self._reference.motion[1, :n]).max() <= tuning.at_rest
-        )
+        off = float(np.abs(self._reference.path[: len(pressures)] - pressures).max())
+        return off <= self._tuning.reference.there and not self._moves()
+
+    def _moves(self) -> bool:
+        """Whether the pressures of the reference change."""
+        rate = self._reference.motion[1, : self.robot.n_pressures]
+        return not np.abs(rate).max() <= self._tuning.reference.at_rest
 
     def _correct_brace(self, course: Bracing, now: float) -> None:
         """Bring the braced tip to its target; without one for its position it stays."""
@@ -614,112 +631,26 @@ class TipController:
 
     def status(self, now: float) -> ControllerStatus:
         """Return the controller's part of the state; see `Controller.status`."""
-        n, tip, pursuit = self.robot.n_pressures, self._arm.modelled, self.replanner.pursuit
-        if tip is None:
-            return ControllerStatus(plan=np.full(n, np.nan))
-        estimate = self._arm.tip.estimate
-        felt, bracing = self._arm.touch.felt, self._bracing
-        touches, force, covariance = felt.touches, felt.force, felt.covariance
-        if bracing is not None and bracing.leans:
-            force, covariance = bracing.push, bracing.covariance
-            touches = bool(force.any())
-        target, press_force, press_goal = self._led_to or pursuit.target_at(now), math.nan, math.nan
-        if isinstance(pursuit.course, Pressing):
-            target = pursuit.course.shown(estimate.position)
-            press_force, press_goal = pursuit.course.force, pursuit.course.press.force
-            touches = touches or pursuit.course.touches
-        position, pointing, quaternion = target_arrays(target)
-        position_error, angle_error = self._errors.at(target, estimate.position, estimate.rotation)
-        sample, plan = self._arm.tip.sample, self.replanner.plan
-        stiffness = math.nan
-        if pursuit.stiffness is not None:
-            stiffness = pursuit.stiffness(tip.compliance, tip.pose[:3, :3])
-        ratio = math.exp(NORMAL_QUANTILE * self.replanner.deviation)  # NaN if unknown
-        planned = np.full(n, np.nan)
-        if self._led_to is not None:
-            planned = self._reference.goal[:n] - self._arm.pressures.history_offset
-        elif plan is not None:
-            planned = plan.pressures - self._arm.pressures.history_offset
-        return ControllerStatus(
-            plan=planned,
-            tip_position=estimate.position,
-            tip_quaternion=estimate.quaternion,
-            seen_position=np.full(3, np.nan) if sample is None else sample.position,
-            seen_age=math.inf if sample is None else now - sample.time,
-            target_position=position,
-            target_quaternion=quaternion,
-            target_pointing=pointing,
-            position_error=position_error,
-            angle_error=angle_error,
-            stiffness=stiffness,
-            stiffness_low=stiffness / ratio,
-            stiffness_high=stiffness * ratio,
-            adapted=self._adapted_numbers(),
-            best_stiffness=math.nan if plan is None else plan.stiffness,
-            disturbance=estimate.offset,
-            touches=touches,
-            wrench=np.concatenate([force, np.zeros(3)]),
-            wrench_covariance=covariance.ravel(),
-            press_force=press_force,
-            press_goal=press_goal,
-            brace="" if bracing is None else bracing.phase.value,
-            brace_force=math.nan if bracing is None else bracing.force,
-            brace_margin=math.nan if bracing is None else bracing.margin,
-            task=pursuit.kind,
-            stiffness_unit=pursuit.unit,
-            model_position=estimate.static,
-            lost=self._arm.channels.lost,
-            shortfall=self._arm.channels.shortfall,
-        )
-
-    def _adapted_numbers(self) -> tuple[AdaptedNumber, ...]:
-        known, lags = self.replanner.known, self._arm.pressures.lags
-        numbers = () if known is None else known.numbers
-        if lags is None:
-            return numbers
-        found = zip(lags.lag.tolist(), lags.deviation.tolist(), strict=True)
-        return *numbers, *(
-            AdaptedNumber(f"regulator_lag[{channel}]", *each) for channel, each in enumerate(found)
-        )
+        led = self._led_to
+        at = None if led is None else (led, self._reference.goal[: self.robot.n_pressures])
+        return self._report.status(now, at)
 
     def notices(self) -> tuple[Notice, ...]:
         """Return alarms and events."""
-        notices = (*self.replanner.notices(self._away()), *self._arm.channels.notices())
-        course = self.replanner.pursuit.course
-        if isinstance(course, Pressing | Bracing):
-            notices = (*notices, *course.notices())
-        if self._model_is_wrong():
-            away = 1e3 * float(np.linalg.norm(self._arm.tip.offset[:3]))
-            text = (
-                f"the tip is seen {away:.0f} mm from where the model has it; check the tracker's "
-                "registration and sensor, the tubes, and that the robot file is this arm's"
-            )
-            notices = (*notices, Notice("implausible", text, Severity.ERROR, standing=True))
-        if doubt := self._arm.watch.doubt:
-            held = Notice(doubt.kind, doubt.text, Severity.ERROR, True, True, doubt.undo)
-            notices = (*notices, held)
-        return notices
+        return self._report.notices(self._rests_short())
 
-    def _away(self) -> tuple[float, float] | None:
-        """Return distance and angle from the target, in m and rad, if the tip rests short of it.
+    def _rests_short(self) -> bool:
+        """Whether the tip rests short of a target that is out of reach.
 
         So it does if it has arrived, and if the pressures are held: then the plan is an old one.
         """
         plan, pursuit = self.replanner.plan, self.replanner.pursuit
         if plan is None or plan.reached or pursuit.course is not None:
-            return None
-        if not self._is_held(self._now) and not self._has_arrived():
-            return None
-        estimate = self._arm.tip.estimate
-        return self._errors.at(pursuit.target, estimate.position, estimate.rotation)
+            return False
+        return self._is_held(self._now) or self._has_arrived()
 
     def close(self) -> None:
         """End the planners."""
         self.replanner.close()
         if self.forecast is not None:
             self.forecast.close()
-
-    def _model_is_wrong(self) -> bool:
-        """Whether the offset is too large to be an error of this arm's model."""
-        offset = self._arm.tip.offset[:3]
-        return float(offset @ offset) > self._largest_offset**2

@@ -7,10 +7,15 @@ model of an arm that does not creep, by
     q = sum_k a_k phi_k,    phi_k = J (z_k - p),
 
 with the Jacobian J of the tip. The pressures' past determines phi, so a few numbers a_k, the same
-for all motions and axes, describe the creep of the arm. A Kalman filter estimates them together
-with the remaining error e of the model, which changes with motion; what changes at rest in the
-directions and at the rates of phi is creep. It learns while nothing touches the tip. Then q is
+for all motions and lateral axes, describe the creep of the arm. A Kalman filter estimates them
+together with the remaining error e of the model, which changes with motion; what changes at rest in
+the directions and at the rates of phi is creep. It learns while nothing touches the tip. Then q is
 known, with its covariance, also while something does.
+
+An arm elongates with other shares than it bends: its weight, which does not creep, holds a hanging
+arm straight. Only displacements in which a force would be felt count, so the a_k are those of
+bending. A rest of seconds shows nothing of what creeps for a minute. But silicone creeps at many
+rates at once, so an arm of which much creeps soon also creeps more later: the a_k are correlated.
 
 A robot file or a calibration may have a creep of its own: effective pressures contain it, and a_k
 is what is missing from it.
@@ -61,13 +66,14 @@ class CreepEstimator:
         error[:] = self._covariance[:, :3] = 0.0
         error[:, :3] = np.eye(3) * self._tuning.first_error**2
         self._sum, self._count, self._elapsed = np.zeros((3, 1 + len(self._times))), 0, 0.0
-        self._noise = 0.0
+        self._noise, self._felt = 0.0, np.eye(3)
 
     def _unlearn(self) -> None:
         """Restart from what is believed about any arm."""
         share, deviation = self._prior
         self._mean[3:] = share
-        self._covariance[:] = deviation**2 * np.eye(len(self._mean))
+        count, alike = len(self._times), self._tuning.alike
+        self._covariance[3:, 3:] = deviation**2 * ((1 - alike) * np.eye(count) + alike)
         self.begin()
 
     @property
@@ -118,7 +124,7 @@ class CreepEstimator:
         self._mean[:3] += change
         self._sum[:, 0] += self._count * change
 
-    def learn(self, elapsed: float, away: Array, grown: float, speed: float) -> None:
+    def learn(self, elapsed: float, away: Array, grown: float, speed: float, felt: Array) -> None:
         """Take in a sample of a tip that nothing touches.
 
         Parameters
@@ -131,6 +137,8 @@ class CreepEstimator:
             Growth of the square of the model's recent way, in m^2.
         speed :
             Of the model's tip, in m/s.
+        felt :
+            Projection (3, 3) on the directions in which the arm feels a force.
         """
         t, P = self._tuning, self._covariance
         error = np.arange(3)
@@ -139,7 +147,7 @@ class CreepEstimator:
         P[share, share] += t.changes**2 * max(grown, 0.0)
         self._sum[:, 0] += away
         self._sum[:, 1:] += self._phi
-        self._noise = max(self._noise, t.noise**2 + (t.late * speed) ** 2)
+        self._noise, self._felt = max(self._noise, t.noise**2 + (t.late * speed) ** 2), felt
         self._count, self._elapsed = self._count + 1, self._elapsed + elapsed
         if self._elapsed >= t.every:
             self._correct()
@@ -149,7 +157,7 @@ class CreepEstimator:
         m, P, rows = self._mean, self._covariance, self._sum / self._count
         H = np.hstack([np.eye(3), rows[:, 1:]])
         missed = rows[:, 0] - H @ m
-        noise = self._noise * np.eye(3)
+        noise = self._noise * self._felt + self._tuning.unfelt**2 * (np.eye(3) - self._felt)
         S = H @ P @ H.T + noise
         if missed @ np.linalg.solve(S, missed) > _FAR:  # a jump of the model's error
             jump = np.eye(3) * float(missed @ missed)

@@ -95,6 +95,8 @@ class TipEstimator:
         self._orientation = _orientation()
         self.omega = math.inf  # of the vibration, in rad/s; infinite before it is known
         self._times = np.array([1.0, period])  # omega, and duration of the step
+        # displacement (3, n) of the mode per pressure beyond that of the straight arm, in m/Pa
+        self.excess: Array = np.zeros((3, n))
         self.begin()
 
     def begin(self) -> None:
@@ -167,7 +169,7 @@ class TipEstimator:
             self._times[1] = now - last.time  # longer than the period in a loop that is late
             static, driven, self._free, displacements = self._predict(
                 tip.pose, tip.jacobian, last.static, last.driven, self._free, self.soft_plane,
-                pressures - self._pressures, self._times,
+                pressures - self._pressures, self._times, self.excess,
             )  # fmt: skip
             self._displacements += displacements
             self._past.append(_PastTip(now, static, rotation, driven))
@@ -324,13 +326,15 @@ def _prediction(mode: BendingMode | None, n: int, damping: float) -> Formula:
     """Return the formula of one step of the state.
 
     Inputs: pose (4, 4) and Jacobian (6, n) of the model's tip, its last position (3,), driven and
-    free vibration (2, 3), soft plane (3, 3), change of the pressures (n,), (omega, duration).
+    free vibration (2, 3), soft plane (3, 3), change of the pressures (n,), (omega, duration), and
+    the mode's displacement per pressure (3, n) beyond that of the straight arm.
     Outputs: position (3,), both vibrations, and the displacements (2,) of tip and mode.
     """
     pose, jacobian = ca.SX.sym("pose", 4, 4), ca.SX.sym("jacobian", 6, n)
     before, change = ca.SX.sym("before", 3), ca.SX.sym("change", n)
     driven, free = ca.SX.sym("driven", 2, 3), ca.SX.sym("free", 2, 3)
     soft_plane, times = ca.SX.sym("soft_plane", 3, 3), ca.SX.sym("times", 2)
+    excess = ca.SX.sym("excess", 3, n)
     position, excitation = pose[:3, 3], ca.SX.zeros(3)
     driven_after, free_after = driven, free
     if mode is not None:
@@ -338,12 +342,14 @@ def _prediction(mode: BendingMode | None, n: int, damping: float) -> Formula:
         excitation = soft_plane @ (
             pose[:3, :3] @ (jacobian[:3, :] @ (ca.DM(mode.participation) * change))
         )
+        excitation += excess @ change
         half = ca.vertcat(0.5 * excitation.T, ca.SX.zeros(1, 3))
         F = transition(times[0], damping, times[1])
         driven_after, free_after = F @ (driven - half) - half, F @ free
     displacements = ca.vertcat(ca.norm_2(position - before), ca.norm_2(excitation))
-    inputs = [pose, jacobian, before, driven, free, soft_plane, change, times]
-    return Formula(inputs, [position, driven_after, free_after, displacements], [jacobian])
+    inputs = [pose, jacobian, before, driven, free, soft_plane, change, times, excess]
+    outputs = [position, driven_after, free_after, displacements]
+    return Formula(inputs, outputs, [jacobian, excess])
 
 
 def _correction(tuning: EstimatorTuning, vibrates: bool) -> Formula:

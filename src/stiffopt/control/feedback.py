@@ -17,7 +17,7 @@ has rows of its own.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import casadi as ca
@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from scipy.linalg import expm, solve_discrete_are
 
 from stiffopt.control.tuning import FeedbackTuning
-from stiffopt.control.vibration import BendingMode, transition
+from stiffopt.control.vibration import transition
 from stiffopt.optimise.target import Target
 
 Array = NDArray[np.float64]
@@ -62,7 +62,7 @@ def prescribed_components(target: Target) -> Array:
 
 def tracking_rows(
     n: int,
-    mode: BendingMode | None,
+    vibrates: bool,
     damping: float = 0.0,
     dead_time: float = 0.0,
     tuning: FeedbackTuning | None = None,
@@ -75,7 +75,8 @@ def tracking_rows(
     converts angles to displacements.
 
     For an arm that vibrates there are also: its vibration and the vibration's speed (2, 3); the
-    soft plane (3, 3); omega, in rad/s; gains K (3,), see `GainSchedule`; the effective pressures
+    plane (3, 3) in which it moves the tip, and the Jacobian (3, n) of the tip's displacement in it,
+    see `BentMode`; omega, in rad/s; gains K (3,), see `GainSchedule`; the effective pressures
     (n,) a dead time from now; those that the reference has in the chambers then; those on the
     reference's path; the rate of the latter (n,); and the vibration intended, as the first (2, 3).
 
@@ -83,8 +84,8 @@ def tracking_rows(
     ----------
     n :
         Number of channels.
-    mode :
-        The arm's first bending mode; None for an arm that does not vibrate.
+    vibrates :
+        Whether the arm vibrates.
     damping, dead_time :
         Damping ratio of the mode; dead time of the regulators, in s.
     tuning :
@@ -97,17 +98,19 @@ def tracking_rows(
     rotation, shift, turn = pose[:3, :3], correction[:3], correction[3:]
     linear, angular = rotation @ jacobian[:3, :], rotation @ jacobian[3:, :]
     inputs, mode_rows, mode_values = [pose, jacobian, prescribed, correction], [], []
-    if mode is not None:
-        vibration, soft_plane = ca.SX.sym("vibration", 2, 3), ca.SX.sym("soft_plane", 3, 3)
+    matrices = [jacobian]
+    if vibrates:
+        vibration, plane = ca.SX.sym("vibration", 2, 3), ca.SX.sym("plane", 3, 3)
+        M = ca.SX.sym("mode", 3, n)  # Jacobian of the mode
         intended = ca.SX.sym("intended", 2, 3)
         omega, gains = ca.SX.sym("omega"), ca.SX.sym("gains", 3)
         ahead, chamber = ca.SX.sym("ahead", n), ca.SX.sym("chamber", n)
         path, rate = ca.SX.sym("path", n), ca.SX.sym("rate", n)
-        inputs += [vibration, soft_plane, omega, gains, ahead, chamber, path, rate, intended]
-        M = soft_plane @ (linear @ ca.diag(ca.DM(mode.participation)))  # Jacobian of the mode
+        inputs += [vibration, plane, M, omega, gains, ahead, chamber, path, rate, intended]
+        matrices.append(M)
         later = transition(omega, damping, dead_time) @ vibration
-        goal = soft_plane @ shift
-        reached = intended @ soft_plane
+        goal = plane @ shift
+        reached = intended @ plane
         sigma = M @ (ahead - chamber) - goal
         epsilon = M @ (ahead - path) + later[0, :].T - reached[0, :].T
         speed = later[1, :].T - M @ rate - reached[1, :].T
@@ -121,7 +124,40 @@ def tracking_rows(
     task = [position @ linear, pointing * (sideways @ angular), orientation * angular]
     values = [position @ shift, pointing * (sideways @ turn), orientation * turn]
     rows = ca.vertcat(*task, *mode_rows)
-    return TrackingRows(inputs, [jacobian], rows, ca.vertcat(*values, *mode_values), linear, 9)
+    return TrackingRows(inputs, matrices, rows, ca.vertcat(*values, *mode_values), linear, 9)
+
+
+def with_offsets(law: TrackingRows) -> TrackingRows:
+    """Return a feedback law that finds the correction of the tip itself.
+
+    The correction is what the plan accounts for minus what feedback corrects now: the offset,
+    averaged over a vibration, except along a stiff axis, and except for the part that is known to
+    grow with the motion. The regulators delay that part.
+
+    In place of the correction, the last inputs are: the offset (6,) that the plan accounts for;
+    the present estimate (6,); the average (9,) of offset and position of the tip on the reference;
+    the slope (3, 3) and the stiff axis (3, 3), see `MotionErrorEstimator` and `TipEstimator`; the
+    rate (n,) of the reference's path; the regulators' delay, in s; and the greatest correction of
+    the position, in m.
+    """
+    pose, jacobian, prescribed, correction, *others = law.inputs
+    accounted, offset = ca.SX.sym("accounted", 6), ca.SX.sym("offset", 6)
+    average, slope = ca.SX.sym("average", 9), ca.SX.sym("slope", 3, 3)
+    stiff_axis, rate = ca.SX.sym("stiff_axis", 3, 3), ca.SX.sym("rate", jacobian.shape[1])
+    delay, most = ca.SX.sym("delay"), ca.SX.sym("most")
+    grown = slope @ (pose[:3, 3] - average[6:])
+    behind = offset[:3] - average[:3] - grown
+    ahead = slope @ (pose[:3, :3] @ (jacobian[:3, :] @ rate)) * delay
+    corrected = average[:3] + grown + ahead + stiff_axis @ behind
+    found = accounted - ca.vertcat(corrected, average[3:6])
+    size = ca.norm_2(found[:3])
+    found *= ca.if_else(size > most, most / size, 1)
+    own = [accounted, offset, average, slope, stiff_axis, rate, delay, most]
+    return replace(
+        law,
+        inputs=[pose, jacobian, prescribed, *others, *own],
+        values=ca.substitute(law.values, correction, found),
+    )
 
 
 class GainSchedule:

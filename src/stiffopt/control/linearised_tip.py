@@ -10,6 +10,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt import lie
 from stiffopt.control.formula import Formula
 from stiffopt.errors import EquilibriumError, InputError, PressureError, StiffoptError
 from stiffopt.model.manipulator import Manipulator
@@ -52,7 +53,7 @@ class ArmModel:
     robot :
         The arm.
     path_range :
-        Change of pressure over which the tip on the reference's path counts as linear, in Pa.
+        As `linear_range` of `LinearisedTip`, for the tip on the reference's path.
 
     Attributes
     ----------
@@ -111,16 +112,18 @@ class LinearisedTip:
     robot :
         The arm.
     linear_range :
-        Change of pressure over which the model counts as linear, in Pa, as the norm over all
-        channels. Over 600 Pa the position is accurate to a few micrometres, over 3 kPa the Jacobian
-        to a few percent.
+        Motion over which the model counts as linear, as a turn in rad: the change of the pressures
+        times the Jacobian, as norms, a displacement being divided by the arm's length. Over 0.03
+        the position is accurate to some micrometres, over 0.07 the Jacobian to a few percent, or to
+        a sixth where an arm bends by nearly half a turn.
     """
 
-    def __init__(self, robot: Manipulator, linear_range: float = 600.0) -> None:
+    def __init__(self, robot: Manipulator, linear_range: float = 0.03) -> None:
         self._model = TipModel(robot)
         self._leaning: LeaningTip | None = None
         self._linear_range = linear_range
-        self._linearisation = _linearisation(robot.pressure_min, robot.pressure_max)
+        low, high = robot.pressure_min, robot.pressure_max
+        self._linearisation = _linearisation(low, high, robot.length)
         self._tip: TipAt | None = None  # at the operating point
         self._operating_point = np.full(robot.n_pressures, np.inf)
 
@@ -146,8 +149,8 @@ class LinearisedTip:
         if tip is None:
             p, _, _ = self._linearisation(pressures, point, np.eye(4), np.zeros((6, len(point))))
         else:
-            p, distance, pose = self._linearisation(pressures, point, tip.pose, tip.jacobian)
-            if distance[0] < self._linear_range and self._leaning is None:
+            p, motion, pose = self._linearisation(pressures, point, tip.pose, tip.jacobian)
+            if motion[0] < self._linear_range and self._leaning is None:
                 return TipAt(pose, tip.jacobian, tip.compliance)
         try:
             self._tip = (self._leaning or self._model).at(p)
@@ -157,12 +160,13 @@ class LinearisedTip:
         return self._tip
 
 
-def _linearisation(low: Array, high: Array) -> Formula:
+def _linearisation(low: Array, high: Array, length: float) -> Formula:
     """Return the formula of a linearisation about an operating point.
 
     Inputs: pressures (n,); pressures (n,), pose (4, 4) and Jacobian (6, n) of the operating point.
-    Outputs: the pressures within limits (n,), their distance from the operating point, and the pose
-    there, with the orientation of the operating point.
+    Outputs: the pressures within limits (n,), the motion from the operating point, see
+    `LinearisedTip`, and the pose there. In the tip's axes the Jacobian hardly changes as the arm
+    bends, so the pose follows by its exponential.
     """
     n = len(low)
     pressures, point = ca.SX.sym("pressures", n), ca.SX.sym("point", n)
@@ -170,7 +174,7 @@ def _linearisation(low: Array, high: Array) -> Formula:
     within = ca.fmin(ca.fmax(pressures, ca.DM(low)), ca.DM(high))
     p = ca.if_else(ca.fabs(pressures) < np.inf, within, np.nan)
     change = p - point
-    displaced = ca.SX(pose)
-    displaced[:3, 3] += pose[:3, :3] @ (jacobian[:3, :] @ change)
-    outputs = [p, ca.norm_2(change), displaced]
+    scaled = ca.vertcat(jacobian[:3, :] / length, jacobian[3:, :])
+    motion = ca.norm_2(change) * ca.norm_fro(scaled)
+    outputs = [p, motion, pose @ lie.exp(jacobian @ change)]
     return Formula([pressures, point, pose, jacobian], outputs, [jacobian])

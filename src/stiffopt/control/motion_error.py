@@ -27,7 +27,6 @@ class MotionErrorEstimator:
     Attributes
     ----------
     slope : A (3, 3), displacement of the tip per displacement of the model's; zero before `learn`.
-    knows : whether anything has been learned.
     """
 
     def __init__(self, tuning: MotionErrorTuning) -> None:
@@ -39,7 +38,6 @@ class MotionErrorEstimator:
         self._elapsed = 0.0
         self._start: Array | None = None
         self.slope: Array = np.zeros((3, 3))
-        self.knows = False
 
     def learn(self, elapsed: float, position: Array, offset: Array) -> None:
         """Take in the position (3,) of the model's tip and its offset (3,), in m.
@@ -59,5 +57,5 @@ class MotionErrorEstimator:
             gain = P @ h / (h @ P @ h + t.noise**2 + (t.late * speed) ** 2)
             self._mean = self._mean + np.outer(gain, offset - h @ self._mean)
             self._covariance = P - np.outer(gain, h @ P)
-            self.slope, self.knows = self._mean[:3].T, True
+            self.slope = self._mean[:3].T
             self._last, self._elapsed = position.copy(), 0.0

@@ -36,7 +36,7 @@ _PREPARATION = 0.5  # s; preparing a new task for longer is reported
 _NICE = 5  # of the process: the control loop comes first
 _IDLE = 1.0  # s without a request until the process compiles code
 # fields of a request: arrays are sent every time
-_ARRAYS = ("offset", "pressure_offset", "low", "high", "way")
+_ARRAYS = ("offset", "pressure_offset", "low", "high", "way", "here")
 # immutable fields are sent if they are other objects than in the last request
 _OBJECTS = ("serial", "task", "target", "search", "stay", "last", "windows", "adapted")
 
@@ -254,7 +254,7 @@ class PlanningEnd:
         if isinstance(answer, Plan):
             names = (
                 *("reached", "stiffness", "message", "far", "blocked", "doubt"),
-                *("deviation", "estimate", "approach"),
+                *("deviation", "estimate", "approach", "bent"),
             )
             own = {name: getattr(answer, name) for name in names}
             self.connection.send({"pressures": answer.pressures.tolist(), **own})

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from stiffopt.control.adaptation import Adapted, Estimate, Learning, Window
 from stiffopt.control.tip_errors import TipErrors, stiffness_function
 from stiffopt.control.tuning import AdaptationTuning, FeedbackTuning, NearestTuning, PlanningTuning
+from stiffopt.control.vibration import BentMode
 from stiffopt.control.ways import Ways
 from stiffopt.errors import InputError, StiffoptError
 from stiffopt.model.arguments import checked_measure
@@ -68,6 +69,8 @@ class PlanRequest:
     adapted: Adapted | None = None  # the model that the offset refers to; None: the robot file's
     stay: bool = False  # whether to follow the target by the least change of the last pressures
     step: float = math.inf  # largest change of a pressure from the last plan, in Pa
+    # effective pressures (n,) of the reference now, whose modes are wanted, in Pa; empty: none are
+    here: Array = field(default_factory=lambda: np.zeros(0))
 
 
 @dataclass(frozen=True)
@@ -88,6 +91,7 @@ class Plan:
     deviation: float = math.nan  # of the stiffness there, relative
     estimate: Estimate | None = None  # of the model's numbers, if it is new
     approach: BraceApproach | None = None  # from rest until the arm leans on objects there
+    bent: BentMode | None = None  # modes at the request's `here`, if they are new
 
 
 class Planning:
@@ -110,6 +114,7 @@ class Planning:
     def _put(self, robot: Manipulator) -> None:
         """Use this model from now on."""
         self._robot, self._tip = robot, TipModel(robot)
+        self._bent_at = np.full(robot.n_pressures, np.inf)  # of the last modes, in Pa
         self._ways = None if self._scene is None else Ways(robot, self._scene)
         self._search = NearestSearch(self._tip, FeedbackTuning().lever, NearestTuning())
         self._solver: PressureSolver | None = None
@@ -148,10 +153,24 @@ class Planning:
         deviation = self._deviation(plan, request.task)
         plan = replace(plan, deviation=deviation, estimate=estimate)
         plan = replace(plan, doubt=self._robot.description.extrapolation(plan.pressures))
+        if request.here.size:
+            plan = replace(plan, bent=self._bent(request.here))
         if self._ways is None or not len(request.way) or plan.approach or plan.blocked:
             return plan
         blocked = self._ways.blocked(np.vstack([request.way, plan.pressures]))
         return replace(plan, blocked=blocked)
+
+    def _bent(self, here: Array) -> BentMode | None:
+        """Return the modes at pressures (n,); None where they are those of the last call."""
+        description = self._robot.description
+        pressures = np.clip(here, description.pressure_min, description.pressure_max)
+        if float(np.abs(pressures - self._bent_at).max()) < self._tuning.bent_step:
+            return None
+        self._bent_at = pressures
+        try:
+            return BentMode.of(self._robot, pressures)
+        except (StiffoptError, np.linalg.LinAlgError):  # no equilibrium: the last ones stay
+            return None
 
     def _checked(self, request: PlanRequest) -> Plan:
         """Check a request's way through waypoints; the result holds no new plan."""
@@ -170,6 +189,7 @@ class Planning:
             task = task.unbraced
         if request.serial != self._serial:
             self._serial, self._last, self._solver = request.serial, None, None
+            self._bent_at = np.full(self._robot.n_pressures, np.inf)
             self._change = None
         if self._solver is None or self._last is None:
             exact = asked.model_copy(update={"tolerance": _EXACT})

@@ -37,7 +37,9 @@ Array = NDArray[np.float64]
 class RegulatorModel:
     """Pressures behind the regulators of n channels, in steps of `period`, in s.
 
-    The regulators have lags (n,) and a dead time, in s, and a greatest slew (n,), in Pa/s.
+    The regulators have lags (n,) and a dead time, in s, and a greatest slew (n,), in Pa/s. The
+    healthy range has the least and greatest pressures of regulators that follow at once, or more
+    slowly than these by a factor (`RegulatorTuning.slow`). Readings do not correct that range.
     """
 
     def __init__(
@@ -48,21 +50,25 @@ class RegulatorModel:
         slew: Array,
         tuning: RegulatorTuning | None = None,
     ) -> None:
-        self._period = period
-        self.set_lag(np.broadcast_to(np.asarray(lag, dtype=float), len(slew)))
-        self._depth = round(dead_time / period) + 1
-        self._step = _step(slew * period, self._depth, period, tuning or RegulatorTuning())
+        self._period, tuning = period, tuning or RegulatorTuning()
+        lag = np.broadcast_to(np.asarray(lag, dtype=float), len(slew))
+        self.set_lag(lag)
+        slow = _share(period, tuning.slow * lag), round(tuning.slow * dead_time / period) + 1
+        depth = round(dead_time / period) + 1
+        self._depth = max(depth, slow[1])
+        self._step = _step(slew * period, depth, slow, period, tuning)
         self.begin(np.zeros(len(slew)))
 
     def set_lag(self, lag: Array) -> None:
         """Change the lags (n,), in s."""
-        self._share = 1 - np.exp(-self._period / np.maximum(lag, 1e-6))
+        self._share = _share(self._period, lag)
 
     def begin(self, pressures: Array) -> None:
         """Restart, settled at pressures (n,)."""
         self.pressures = pressures.copy()  # now, in Pa
         self.offset = np.zeros_like(pressures)  # b, in Pa: settled pressures relative to commands
         self.ahead = self.pressures  # a dead time from now; no further command can change them
+        self.healthy = np.stack([pressures, pressures])  # healthy range (2, n), in Pa
         self._sent = np.tile(pressures, (self._depth, 1))  # commands under way, the oldest first
 
     def advance(self, commanded: Array, reading: Array) -> Array:
@@ -73,37 +79,10 @@ class RegulatorModel:
         sent = self._sent
         sent[:-1] = sent[1:]
         sent[-1] = commanded
-        self.pressures, self.offset, self.ahead = self._step(
-            self.pressures, self.offset, sent, reading, self._share
+        self.pressures, self.offset, self.ahead, self.healthy = self._step(
+            self.pressures, self.offset, sent, reading, self._share, self.healthy
         )
         return self.pressures
-
-
-class HealthyRange:
-    """Least and greatest pressures of n regulators that are not slower than a model.
-
-    Each may follow at once, or as slowly as this lag (n,), dead time, in s, and slew (n,), in Pa/s,
-    let it; in steps of `period`, in s. Readings do not correct the range.
-    """
-
-    def __init__(self, period: float, lag: Array, dead_time: float, slew: Array) -> None:
-        share = 1 - np.exp(-period / np.maximum(lag, 1e-6))
-        self._depth = round(dead_time / period) + 1
-        self._step = _range_step(share, slew * period, self._depth)
-        self.begin(np.zeros(len(slew)))
-
-    def begin(self, pressures: Array) -> None:
-        """Restart, settled at pressures (n,)."""
-        self._range = np.stack([pressures, pressures])
-        self._sent = np.tile(pressures, (self._depth, 1))  # commands under way, the oldest first
-
-    def advance(self, commanded: Array) -> Array:
-        """Take a step with commands (n,); return the range (2, n) after it, in Pa."""
-        sent = self._sent
-        sent[:-1] = sent[1:]
-        sent[-1] = commanded
-        (self._range,) = self._step(self._range, sent)
-        return self._range
 
 
 class PressureEstimator:
@@ -126,7 +105,6 @@ class PressureEstimator:
         self.lag = float(np.mean(lag))  # of all channels, in s
         self._robot, self._period, self.channels = robot, period, channels
         self._regulators = RegulatorModel(period, lag, self.dead_time, slew, tuning)
-        self._healthy = HealthyRange(period, tuning.slow * lag, tuning.slow * self.dead_time, slew)
         self._lag_tuning = lag_tuning or LagTuning()
         self.lags: LagEstimator | None = None
         if control.adaptation != "none" and not _has_lags(robot):
@@ -139,7 +117,6 @@ class PressureEstimator:
         zero = np.zeros(self._robot.n_pressures)
         self._memory = _memory(self._robot)
         self._regulators.begin(zero)
-        self._healthy.begin(zero)
         if self.lags is not None:
             self.lags.begin()
         self.channels.begin()
@@ -154,11 +131,10 @@ class PressureEstimator:
         """Take steps with commands (n,) and readings (n,) in Pa; NaN: not measured."""
         for _ in range(steps):
             self.chamber = self._regulators.advance(commanded, reading)
-            healthy = self._healthy.advance(commanded)
             if self.lags is not None:
                 self.lags.advance(commanded, reading, self.channels.lost)
         elapsed, offset = steps * self._period, self._regulators.offset
-        self.channels.update(elapsed, commanded, reading, offset, healthy)
+        self.channels.update(elapsed, commanded, reading, offset, self._regulators.healthy)
         self.command = commanded.copy()
         self.effective = self.chamber
         if self._memory is not None:
@@ -187,46 +163,49 @@ class PressureEstimator:
         return self._regulators.ahead + self.history_offset
 
 
-def _step(reach: Array, depth: int, period: float, tuning: RegulatorTuning) -> Formula:
-    """Return the formula of a step: pressures, offset and pressures ahead (n,) after it.
+def _share(period: float, lag: Array) -> Array:
+    """Return the shares (n,) of their way that pressures with lags (n,) go in a step."""
+    share: Array = 1 - np.exp(-period / np.maximum(lag, 1e-6))
+    return share
 
-    Inputs: pressures and offset (n,), the commands under way (depth, n), readings (n,), and the
-    share (n,) of its way that a pressure goes in a step.
+
+def _step(
+    reach: Array, depth: int, slow: tuple[Array, int], period: float, tuning: RegulatorTuning
+) -> Formula:
+    """Return the formula of a step: pressures, offset, pressures ahead (n,), healthy range (2, n).
+
+    Inputs: pressures and offset (n,), the commands under way, of which the pressures know the last
+    `depth`, readings (n,), the share (n,) of its way that a pressure goes in a step, and the
+    healthy range (2, n). `slow` are share and depth of the slowest healthy regulators.
     """
-    n = len(reach)
+    n, most = len(reach), max(depth, slow[1])
     share = ca.SX.sym("share", n)
     x, offset, reading = ca.SX.sym("x", n), ca.SX.sym("offset", n), ca.SX.sym("reading", n)
-    sent = ca.SX.sym("sent", depth, n)
+    sent, healthy = ca.SX.sym("sent", most, n), ca.SX.sym("healthy", 2, n)
+
+    def limited(change: Any) -> Any:
+        return ca.fmin(ca.fmax(change, -ca.DM(reach)), ca.DM(reach))
 
     def lagged(x: Any, offset: Any, command: Any) -> Any:
-        change = share * (command.T + offset - x)
-        return x + ca.fmin(ca.fmax(change, -ca.DM(reach)), ca.DM(reach))
+        return x + limited(share * (command.T + offset - x))
 
-    now = lagged(x, offset, sent[0, :])
+    now = lagged(x, offset, sent[most - depth, :])
     error = ca.if_else(ca.fabs(reading) < np.inf, reading - now, 0)  # 0 for NaN
     offset_after = offset + tuning.offset_gain * period**2 * error / share
     now = now + min(1.0, tuning.pressure_gain * period) * error
     ahead = now
-    for k in range(1, depth):
+    for k in range(most - depth + 1, most):
         ahead = lagged(ahead, offset_after, sent[k, :])
-    return Formula([x, offset, sent, reading, share], [now, offset_after, ahead], [sent])
-
-
-def _range_step(share: Array, reach: Array, depth: int) -> Formula:
-    """Return the formula of a step of the range (2, n), from the range and the commands under way.
-
-    The commands are (depth, n).
-    """
-    n = len(share)
-    bounds, sent = ca.SX.sym("bounds", 2, n), ca.SX.sym("sent", depth, n)
-    least, most = (
-        ca.horzcat(*(choose(sent[:, k]) for k in range(n))) for choose in (ca.mmin, ca.mmax)
+    late = sent[most - slow[1] :, :]
+    least, greatest = (
+        ca.vertcat(*(choose(late[:, k]) for k in range(n))) for choose in (ca.mmin, ca.mmax)
     )
-    slow, most_step = ca.DM(share).T, ca.DM(reach).T
-    low = ca.fmin(least, bounds[0, :] + ca.fmin(slow * (least - bounds[0, :]), most_step))
-    high = ca.fmax(most, bounds[1, :] + ca.fmax(slow * (most - bounds[1, :]), -most_step))
-    after = ca.vertcat(low, high)
-    return Formula([bounds, sent], [after], [bounds, sent, after])
+    low, high = healthy[0, :].T, healthy[1, :].T
+    low = ca.fmin(least, low + limited(ca.DM(slow[0]) * (least - low)))
+    high = ca.fmax(greatest, high + limited(ca.DM(slow[0]) * (greatest - high)))
+    after = ca.horzcat(low, high).T
+    inputs = [x, offset, sent, reading, share, healthy]
+    return Formula(inputs, [now, offset_after, ahead, after], [sent, healthy, after])
 
 
 def _regulation(robot: RobotDescription, control: ControlSettings) -> tuple[Array, float]:

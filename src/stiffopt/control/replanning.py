@@ -20,6 +20,7 @@ from stiffopt.control.posture import PostureCourse
 from stiffopt.control.pressing import Phase, Pressing
 from stiffopt.control.tip_errors import stiffness_function, target_arrays
 from stiffopt.control.tuning import ReplanningTuning
+from stiffopt.control.vibration import BentMode
 from stiffopt.errors import InputError
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import Task
@@ -114,6 +115,7 @@ class Replanner:
         self._offset = np.zeros(6)
         self.deviation = math.nan  # of the plan's stiffness, relative
         self._available: Array | None = None  # (2, n), see `update`
+        self.bent: BentMode | None = None  # modes of the arm where the reference was last
         self._renew()
 
     def pursue(self, pursuit: Pursuit) -> None:
@@ -178,6 +180,7 @@ class Replanner:
         available: tuple[Array, Array],
         way: Array | None = None,
         windows: tuple[Window, ...] = (),
+        here: Array | None = None,
     ) -> Array | None:
         """Request a plan when it is time; return the newest.
 
@@ -196,8 +199,8 @@ class Replanner:
             than a little starts a search of all configurations.
         way :
             See `PlanRequest`; None without a scene.
-        windows :
-            See `PlanRequest`.
+        windows, here :
+            See `PlanRequest`; `here` is None for an arm that does not vibrate.
 
         Returns
         -------
@@ -227,6 +230,7 @@ class Replanner:
                 *available, windows=windows, adapted=self.adapted, stay=stay,
                 last=self._detour_from,
                 step=math.inf if detour is None else self._tuning.detour_step,
+                here=np.zeros(0) if here is None else here,
             )  # fmt: skip
             self._detour_from = None
             self._planner.request(request if way is None else replace(request, way=way))
@@ -264,6 +268,7 @@ class Replanner:
                 self._end_detour(plan, self._newest)
             self._newest, self.deviation = plan, plan.deviation
             self.known = plan.estimate or self.known
+            self.bent = plan.bent or self.bent
             self._blocked = plan.blocked
             if not plan.blocked and plan.adapted is self.adapted:
                 self.plan = plan

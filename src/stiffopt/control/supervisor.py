@@ -12,7 +12,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from stiffopt.control.arming import check_commissioned, check_rig, check_vented_arm, late_ticks
+from stiffopt.control.arming import (
+    check_commissioned,
+    check_rig,
+    check_vented_arm,
+    late_ticks,
+    uncommissioned,
+)
 from stiffopt.control.checks import highest_pressures, refusing
 from stiffopt.control.gauge_watch import GaugeWatch
 from stiffopt.control.interface import Controller, ControlOutput
@@ -529,6 +535,9 @@ class Supervisor:
                 self._tuning.vented_offset,
             )  # fmt: skip
             problems += check_commissioned(self.rig, self._gauges, self._tracker, reading)
+            unknown = ""
+            if not problems:
+                unknown = uncommissioned(now, self.rig, self.controller, self._tracker)
             load = load_of_processors() if self.lifecycle.in_real_time else 0.0
             late = late_ticks(lateness, self._safety.guard_timeout, load)
             if lateness >= self._safety.guard_timeout:
@@ -561,6 +570,8 @@ class Supervisor:
         self.events.add(now, "armed", "armed: pressures may change from now on")
         if late:
             self.events.add(now, "timing", late, Severity.WARNING)
+        if unknown:
+            self.events.add(now, "uncommissioned", unknown, Severity.WARNING)
 
     def disarm(self, now: float, reason: str = "disarmed") -> None:
         """Begin to let down; see `ControlLoop.disarm`."""

@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stiffopt.control.allocation import Allocation
-from stiffopt.control.feedback import GainSchedule, tracking_rows
+from stiffopt.control.feedback import GainSchedule, tracking_rows, with_offsets
 from stiffopt.control.motion_error import MotionErrorEstimator
 from stiffopt.control.observer import ArmObserver
 from stiffopt.control.reference import Reference, VibrationFilter
 from stiffopt.control.tuning import FeedbackTuning, MotionErrorTuning
-from stiffopt.control.vibration import BendingMode
+from stiffopt.control.vibration import BendingMode, BentMode
 from stiffopt.optimise.tip import TipAt
 from stiffopt.rig.interface import PressureLimits
 from stiffopt.rig.settings import ControlSettings, Safety
@@ -60,11 +60,13 @@ class TipFeedback:
         self._period, self._ended = period, step_error.ended
         self._on_trajectories = MotionErrorEstimator(motion_error)
         self._motion_error = self._in_steps = MotionErrorEstimator(step_error)
-        self._gains: GainSchedule | None = None
+        self._mode, self._gains = mode, None
         if mode is not None:
             self._gains = GainSchedule(period, lag, control.damping, tuning.effort)
         self._allocation = Allocation(
-            tracking_rows(len(slew), mode, control.damping, dead_time, tuning),
+            with_offsets(
+                tracking_rows(len(slew), mode is not None, control.damping, dead_time, tuning)
+            ),
             limits.low,
             limits.high,
             slew * period,
@@ -98,6 +100,7 @@ class TipFeedback:
         limits: tuple[Array, Array],
         follows: bool | None = False,
         most: float = math.inf,
+        bent: BentMode | None = None,
     ) -> Array | None:
         """Return the next command (n,), in Pa; None if the solver failed.
 
@@ -120,19 +123,25 @@ class TipFeedback:
             motion does to the offset is not learned.
         most :
             Largest correction of the position, in m.
+        bent :
+            Modes of the arm near here, from which the estimator's `excess` is; None: those of the
+            straight arm.
         """
-        n = len(goal)
-        self._learn(tip.pose[:3, 3], follows)
-        correction = reference.path[n:] - self._correctable(offset, tip, reference)
-        size = float(np.linalg.norm(correction[:3]))
-        if size > most:
-            correction = correction * (most / size)
+        n, arm = len(goal), self._arm
+        position = tip.pose[:3, 3]
+        self._learn(position, follows)
+        average = self._average(np.concatenate([offset, position]))
         self._allocation.limit(*limits)
+        vibration = self._vibration_inputs(tip, reference, bent)
         command, held, residual = self._allocation.solve(
-            (tip.pose, tip.jacobian, prescribed, correction, *self._vibration_inputs(reference)),
+            (
+                tip.pose, tip.jacobian, prescribed, *vibration,
+                reference.path[n:], offset, average, self._motion_error.slope, arm.tip.stiff_axis,
+                reference.motion[1, :n], arm.pressures.lag + arm.pressures.dead_time, most,
+            ),
             goal,
-            self._arm.pressures.command,
-        )
+            arm.pressures.command,
+        )  # fmt: skip
         if command is not None:
             reported = residual > self._tuning.unreported_error
             self.saturated = held if reported else np.zeros(n, dtype=bool)
@@ -150,37 +159,27 @@ class TipFeedback:
         elif modelled is not None:
             self._motion_error.learn(self._period, modelled.pose[:3, 3], self._arm.tip.offset[:3])
 
-    def _correctable(self, offset: Array, tip: TipAt, reference: Reference) -> Array:
-        """Return the offset (6,) that feedback corrects now.
-
-        For an arm that vibrates it is averaged over a vibration, except along a stiff axis, and
-        except for the part that is known to grow with the motion; the regulators delay that part.
-        """
-        arm, slope, position = self._arm, self._motion_error.slope, tip.pose[:3, 3]
-        now = np.concatenate([offset, position])
+    def _average(self, now: Array) -> Array:
+        """Return offset and position (9,) of the tip, averaged over a vibration."""
         if self._is_new:
             self._averaged.begin(now)
             self._is_new = False
-        self._averaged.advance(now, arm.tip.omega)
-        corrected = self._averaged.value[:6].copy()
-        behind = offset[:3] - corrected[:3]
-        if self._motion_error.knows:
-            n = len(arm.pressures.command)
-            velocity = tip.pose[:3, :3] @ (tip.jacobian[:3] @ reference.motion[1, :n])
-            ahead = slope @ velocity * (arm.pressures.lag + arm.pressures.dead_time)
-            behind -= slope @ (position - self._averaged.value[6:])
-            corrected[:3] = offset[:3] - behind + ahead
-        corrected[:3] += arm.tip.stiff_axis @ behind
-        return corrected
+        self._averaged.advance(now, self._arm.tip.omega)
+        return self._averaged.value
 
-    def _vibration_inputs(self, reference: Reference) -> tuple[ArrayLike, ...]:
+    def _vibration_inputs(
+        self, tip: TipAt, reference: Reference, bent: BentMode | None
+    ) -> tuple[ArrayLike, ...]:
         """Return the inputs of `tracking_rows` for an arm that vibrates."""
-        if self._gains is None:
+        if self._mode is None or self._gains is None:
             return ()
         estimator, pressures = self._arm.tip, self._arm.pressures
         motion, n = reference.motion, len(pressures.command)
+        linear, shares = tip.pose[:3, :3] @ tip.jacobian[:3], self._mode.participation
+        plane = estimator.soft_plane if bent is None else bent.plane
         return (
-            estimator.vibration, estimator.soft_plane, estimator.omega,
+            estimator.vibration, plane, plane @ (linear * shares) + estimator.excess,
+            estimator.omega,
             self._gains.at(estimator.omega), pressures.effective_ahead,
             reference.chamber, motion[0, :n], motion[1, :n],
             motion[:2, n : n + 3] - self._averaged.motion[:, :3],

@@ -258,7 +258,8 @@ class TouchEstimator:
         elif self._approach is None:
             grown = self._way**2 - (before * math.exp(-elapsed / t.motion_time)) ** 2
             known = self.creep.displacement
-            self.creep.learn(elapsed, away - self._filters.means[0, _XI], grown, speed)
+            still = away - self._filters.means[0, _XI]
+            self.creep.learn(elapsed, still, grown, speed, self._felt_axes)
             # what is now taken for creep was taken for an error of the model: nothing has moved
             self._filters.means[:, _E] -= self.creep.displacement - known
         self.felt = self._force()

@@ -109,9 +109,8 @@ class ReferenceTuning:
     rigid_rate: float = 100.0
     # share of the slew that the reference may take; the rest is for feedback
     slew_share: float = 0.9
-    # change of pressure (norm over all channels) over which the model on the reference is not
-    # linearised again, in Pa
-    model_range: float = 3e3
+    # motion over which the model on the reference is not linearised again; see `LinearisedTip`
+    model_range: float = 0.07
     # time by which a doubted motion of an arm that vibrates is taken back, in s
     taken_back: float = 0.3
     # distance from the plan at which it has arrived, in Pa, and rate below which it rests, in Pa/s
@@ -282,6 +281,7 @@ class PlanningTuning:
     patience: int = 20
     # change of a pressure from plan to plan on the way to another configuration, in Pa
     change_step: float = 7e2
+    bent_step: float = 3e3  # change of a pressure after which the modes are new, in Pa
     position_tolerance: float = 1e-5  # of plans, in m
     angle_tolerance: float = 1e-3  # of plans, in rad
 
@@ -394,15 +394,17 @@ class CreepTuning:
 
     times: tuple[float, ...] = (1.5, 6.0, 25.0)  # time constants, in s
     # shares that creep with each of them and their deviation; the latter for an arm whose creep
-    # was calibrated
+    # was calibrated; and the correlation of the shares of an arm
     share: float = 0.02
     deviation: float = 0.025
     known: float = 0.008
+    alike: float = 0.5
     changes: float = 0.2  # growth of a share's deviation with the way, in 1/m
     first_error: float = 0.02  # deviation of the model's error, in m
     model_error: float = 0.05  # its growth, as a share of the recent way
     drift: float = 5e-5  # its growth at rest, in m / sqrt(s)
     noise: float = 1e-4  # of a mean of positions, in m
+    unfelt: float = 0.02  # the same along axes in which no force is felt, in m
     late: float = 0.02  # by which the tip may move later than the model's, in s
     every: float = 0.1  # time over which samples are averaged, in s
 

@@ -15,6 +15,9 @@ weight that pulls at it. The weight straightens phi: with it, a segment near the
 a half instead of three quarters, as in the simulated arm. For m, phi is the shape of the cantilever
 under a force at its tip: over many configurations, the modal masses from frequencies and
 stiffnesses of the simulated arm are within 4 % of each other.
+
+A bent arm differs: where the segment near the tip stands out sideways, the other segment takes part
+with up to one and a half times the tip's displacement. `BentMode` has the modes of the equilibrium.
 """
 
 from __future__ import annotations
@@ -29,11 +32,14 @@ from scipy.linalg import eigh
 
 from stiffopt.model.actuation import SectionGeometry
 from stiffopt.model.description import RobotDescription
+from stiffopt.model.manipulator import Manipulator
 
 Array = NDArray[np.float64]
 Symbols = Any  # of CasADi
 
 _PIECES = 30  # per segment
+_STATIONS = 3  # per segment of a bent arm; more change the shares by a few per cent
+_LEAST_MASS = 1e-6  # kg, at the tip
 _SILICONE = 1070.0  # kg/m^3, if the robot file gives no density
 
 
@@ -81,6 +87,65 @@ def transition(omega: Symbols, damping: float, duration: Symbols) -> Symbols:
     decay = ca.exp(-damping * omega * duration)
     c, s = decay * ca.cos(damped * duration), decay * ca.sin(damped * duration) / damped
     return ca.blockcat([[c + damping * omega * s, s], [-(omega**2) * s, c - damping * omega * s]])
+
+
+@dataclass(frozen=True)
+class BentMode:
+    """The two first bending modes of an arm in equilibrium, which have about the same frequency.
+
+    With C the compliance between stations along the arm, which includes the effect of loads, and m
+    their masses, the modes are the eigenvectors of ``C m`` of the two largest eigenvalues.
+
+    Attributes
+    ----------
+    jacobian : (3, n)
+        Displacement of the tip in these modes per pressure, at rest, in m/Pa, base axes.
+    linear : (3, n)
+        The whole displacement of the tip per pressure there.
+    plane : (3, 3)
+        Projection on the plane in which the modes move the tip.
+    """
+
+    jacobian: Array
+    linear: Array
+    plane: Array
+
+    @classmethod
+    def of(cls, robot: Manipulator, pressures: Array) -> BentMode:
+        """Compute the modes at pressures (n,), in Pa.
+
+        `EquilibriumError` or `PressureError` if the arm has no equilibrium there.
+        """
+        at, masses = _stations(robot.description)
+        k, root = len(at), np.sqrt(np.repeat(masses, 3))[:, None]
+        rotations = robot.pose(pressures, at)[:, :3, :3]
+        shapes = (rotations @ robot.body_jacobian(pressures, at)[:, :3]).reshape(3 * k, -1)
+        first, second = (grid.ravel() for grid in np.meshgrid(at, at, indexing="ij"))
+        blocks = robot.compliance_between(pressures, first, second)[:, :3, :3]
+        C = blocks.reshape(k, k, 3, 3).swapaxes(1, 2).reshape(3 * k, 3 * k)
+        _, vectors = np.linalg.eigh(root * (C + C.T) / 2 * root.T)
+        modes = vectors[:, -2:]  # of unit modal mass, times the root of the masses
+        tips = modes[-3:] / root[-1]
+        axes = np.linalg.svd(tips)[0][:, :2]
+        return cls(tips @ modes.T @ (root * shapes), shapes[-3:], axes @ axes.T)
+
+    def excess(self, participation: Array) -> Array:
+        """Return by how much the Jacobian (3, n) exceeds that by shares (n,) of a straight arm."""
+        excess: Array = self.jacobian - self.plane @ (self.linear * participation)
+        return excess
+
+
+def _stations(robot: RobotDescription) -> tuple[Array, Array]:
+    """Return arc lengths (k,) of an arm's masses, the last one at the tip, and the masses (k,)."""
+    start, rows = 0.0, []
+    for segment in robot.segments:
+        length = segment.length / _STATIONS
+        area = SectionGeometry.of(segment).area
+        mass = (segment.material.density or _SILICONE) * area * length
+        rows += [(start + (index + 0.5) * length, mass) for index in range(_STATIONS)]
+        start += segment.length + segment.connector
+    at, masses = np.array([*rows, (start, max(robot.tip_mass, _LEAST_MASS))]).T
+    return at, masses
 
 
 @dataclass(frozen=True)

@@ -65,6 +65,7 @@ def fit(
     on_evaluation: Callable[[], None] = lambda: None,
     rounds: int = FIT.rounds,
     most: int = FIT.evaluations,
+    tolerance: float = FIT.tolerance,
 ) -> Fit:
     """Fit from several starts and return the best minimum.
 
@@ -76,19 +77,24 @@ def fit(
     on_evaluation : called at every evaluation of the problem; it may raise to stop the fit.
     rounds : how often noise and weights are estimated anew and the fit is repeated.
     most : largest number of evaluations of the problem from each start, and in each round.
+    tolerance : relative, of cost, step and gradient.
     """
     different = {start.tobytes(): start for start in starts}.values()
-    begun = [_minimum(problem, start, on_evaluation, most) for start in different]
+    begun = [_minimum(problem, start, on_evaluation, most, tolerance) for start in different]
     x, cost = min(begun, key=lambda found: found[1])
     independent = 1.0
     for _ in range(rounds):
         problem, independent = _reweighted(problem, x, independent)
-        x, cost = _minimum(problem, x, on_evaluation, most)
+        x, cost = _minimum(problem, x, on_evaluation, most, tolerance)
     return Fit(problem, x, cost, *_covariance(problem, x), independent)
 
 
 def _minimum(
-    problem: CalibrationProblem, start: Array, on_evaluation: Callable[[], None], most: int
+    problem: CalibrationProblem,
+    start: Array,
+    on_evaluation: Callable[[], None],
+    most: int,
+    tolerance: float,
 ) -> tuple[Array, float]:
     """Return scaled coordinates (d,) of a minimum near a start, and its cost."""
     from scipy.optimize import least_squares  # a large library; only fits need it
@@ -101,14 +107,15 @@ def _minimum(
             on_evaluation()
             memory.clear()
             value, slope = problem.residuals(x)
-            # the solver takes back a step to where the model fails; elsewhere it needs slopes
-            fails = not np.isfinite(value).all()
-            if (fails and np.array_equal(x, inside)) or not (fails or np.isfinite(slope).all()):
+            # the solver takes back a step to where values fail, so they do where slopes fail
+            fails = not (np.isfinite(value).all() and np.isfinite(slope).all())
+            if fails and np.array_equal(x, inside):
                 raise InputError(
                     f"the model of robot '{problem.description.name}' has values or slopes that "
                     "are not finite, so that it cannot be fitted; look at its limits of pressure "
                     "and its modulus"
                 )
+            value = np.full_like(value, np.nan) if fails else value
             memory[key] = np.concatenate([value, x]), np.vstack([slope, np.eye(problem.size)])
         return memory[key]
 
@@ -121,9 +128,9 @@ def _minimum(
         bounds=(problem.low, problem.high),
         method="trf",
         loss=_loss(problem.size),
-        ftol=FIT.tolerance,
-        xtol=FIT.tolerance,
-        gtol=FIT.tolerance,
+        ftol=tolerance,
+        xtol=tolerance,
+        gtol=tolerance,
         max_nfev=most,
     )
     return np.asarray(found.x), float(found.cost)

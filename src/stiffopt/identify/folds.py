@@ -50,8 +50,8 @@ def held_back(found: Fit, settle: float, on_evaluation: Callable[[], None]) -> d
         if not any(each.any() for each in kept):
             continue  # the log is shorter than its beginning
         rows = np.concatenate(kept)
-        others = fit(
-            problem.without(kept), [found.x], on_evaluation, rounds=0, most=CHOICE.evaluations
+        others = fit(  # ended early, it would still know the held-back rows from its start
+            problem.without(kept), [found.x], on_evaluation, rounds=0, tolerance=CHOICE.tolerance
         )
         distances = np.linalg.norm(others.predicted.errors[0], axis=1)
         errors = Errors.of(distances[rows], None)

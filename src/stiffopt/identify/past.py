@@ -2,6 +2,11 @@
 
 The operators are those of `stiffopt.model.history`.  This module runs them over a whole log at
 once, with derivatives by lag, dead time, shares and the initial state.
+
+A dead time shifts the answer in time, and nothing else.  So the operators run along the commands
+as they were given, whose corners they meet exactly, and each row reads its state a dead time
+before it.  Were the delayed commands interpolated between rows, the errors of a fit would have a
+corner at each dead time at which a row meets a delayed one, and a fit would end there.
 """
 
 from __future__ import annotations
@@ -25,7 +30,8 @@ _CHUNKS = (1, 8, 32, 128, 512, 2048)  # rows per call; shorter blocks are padded
 _MAX_PADDING = 0.25  # largest padded share of a chunk; beyond it, a smaller chunk is run
 _WORTH_PADDING = 128  # rows from which machine code pays, though it always runs the largest chunk
 _WORTH_COMPILING = 100_000  # rows from which machine code pays; compiling takes a second
-_TIMES = 3  # lag, falling lag and dead time
+_TIMES = 2  # lag and falling lag
+_AT_END = 1e-6  # Pa; a play this near to an end of its width is there
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,8 +44,8 @@ class Start:
     per_side : derivatives (s, m, c) of the states by the sides of the channels, see
         `History.settled`; s = 1, by all sides at once, if no operator couples channels, else s = c.
     before : pressures (c,) until the first row, in Pa.
-    per_time : derivatives (3, m, c) of the states by lag, falling lag and dead time, carried over
-        from the previous log; None without one.
+    per_time : derivatives (2, m, c) of the states by lag and falling lag, carried over from the
+        previous log; None without one.
     """
 
     states: Array
@@ -131,27 +137,33 @@ class Past:
         start : state before the first row.
         history : the values to use; its operators must be those of this object.
         """
-        delayed, slope = _delayed(time, pressures, start.before, history.dead_time)
-        steps = np.diff(time, prepend=time[0] - np.median(np.diff(time)) if len(time) > 1 else 1.0)
-        before = np.vstack([start.before, delayed[:-1]])
-        # a longer dead time delays the command: d p(t - dead) / d dead = -p'
-        changes = np.vstack([np.zeros(self._channels), -slope[:-1]]), -slope
+        first = time[0] - (np.median(np.diff(time)) if len(time) > 1 else 1.0)
+        knots, values = np.concatenate([[first], time]), np.vstack([start.before, pressures])
         run, lags = self._run(history), (history.lag, history.lag_falling)
+        at = time[wanted] - history.dead_time
+        places = np.maximum(np.searchsorted(knots, at) - 1, 0)  # of the last knots before
         state = _carried(start)
         kept = np.empty((len(wanted), *state.shape))
         for block in run.blocks(len(time)):
-            found = run(
-                state, before[block], delayed[block], changes[0][block], changes[1][block],
-                steps[block], lags,
-            )  # fmt: skip
-            inside = (wanted >= block.start) & (wanted < block.stop)
-            kept[inside] = found[wanted[inside] - block.start]
+            found = run(state, values[:-1][block], pressures[block], np.diff(knots)[block], lags)
+            along = np.concatenate([state[np.newaxis], found])
+            inside = (places >= block.start) & (places < block.stop)
+            kept[inside] = along[places[inside] - block.start + (history.dead_time == 0)]
             state = found[-1]
+        slope = (np.diff(values, axis=0) / np.diff(knots)[:, np.newaxis])[places]
+        command = values[places] + slope * (at - knots[places])[:, np.newaxis]
+        falls = command < kept[:, 0, : self._channels]
+        if history.dead_time:
+            late = at > first
+            steps = (at - knots[places])[late]
+            kept[late] = run.aside(kept[late], values[places][late], command[late], steps, lags)
+            slope[~late], command[~late] = 0.0, start.before
         memory = np.array([history.memory_of(channel) for channel in range(self._channels)])
         c = self._channels
-        values, by_lag, by_falling, by_dead, *by_side = (
+        states, by_lag, by_falling, *by_side = (
             kept[:, :, k : k + c] for k in range(0, kept.shape[2], c)
         )
+        rates = _rates(history, states, command, slope, falls)
 
         def held(states: Array, j: int) -> Array:
             return np.asarray(part_of(states[:, 1 + j] - states[:, 0], history.parts[j].of))
@@ -160,7 +172,7 @@ class Past:
             parts = enumerate(history.parts)
             return sum((p.share * held(states, j) for j, p in parts), np.zeros_like(states[:, 0]))
 
-        x, slowly = values[:, 0], memory * slow(values)
+        x, slowly = states[:, 0], memory * slow(states)
         by_x, by_slow = history.slopes_at_fixed_modulus(x, slowly)
 
         def times(matrices: Array, vectors: Array) -> Array:
@@ -173,14 +185,14 @@ class Past:
         per_number = {
             "lag": mixed(by_lag),
             "lag_falling": mixed(by_falling),
-            "dead_time": mixed(by_dead),
+            "dead_time": -mixed(rates),
         }
         for channel, own in enumerate(np.eye(c)):
-            per_number[f"memory[{channel}]"] = times(by_slow, slow(values) * own)
+            per_number[f"memory[{channel}]"] = times(by_slow, slow(states) * own)
         plays = len(history.play)
         for j in range(len(history.parts)):
             name = f"play[{j}]" if j < plays else f"creep[{j - plays}]"
-            per_number[f"{name}.share"] = times(by_slow, held(values, j) * memory)
+            per_number[f"{name}.share"] = times(by_slow, held(states, j) * memory)
         end = self._rested(self._start(state, pressures[-1]), history)
         sides = np.stack([memory * slow(each) for each in by_side], axis=2)
         if len(by_side) < c:  # the side of a channel moves no other's plays
@@ -190,11 +202,9 @@ class Past:
 
     def _rested(self, end: Start, history: History) -> Start:
         """Return the state `FIT.between_logs` later, at the last pressures."""
-        same, none = end.before[np.newaxis], np.zeros((1, self._channels))
-        (state,) = self._run(history)(
-            _carried(end), same, same, none, none, np.array([FIT.between_logs]),
-            (history.lag, history.lag_falling),
-        )  # fmt: skip
+        same, pause = end.before[np.newaxis], np.array([FIT.between_logs])
+        lags = (history.lag, history.lag_falling)
+        (state,) = self._run(history)(_carried(end), same, same, pause, lags)
         return self._start(state, end.before)
 
     def _start(self, state: Array, before: Array) -> Start:
@@ -215,7 +225,7 @@ def _sides(history: History, channels: int) -> int:
 
 
 def _carried(start: Start) -> Array:
-    """Convert a start to a state (m, (4 + s) c) of `_HistoryRun`."""
+    """Convert a start to a state (m, (3 + s) c) of `_HistoryRun`."""
     none = np.zeros((_TIMES, *start.states.shape))
     per_time = none if start.per_time is None else start.per_time
     return np.concatenate([start.states, *per_time, *start.per_side], axis=1)
@@ -224,16 +234,17 @@ def _carried(start: Start) -> Array:
 class _HistoryRun:
     """Runs the operators of several channels over many rows, with their derivatives.
 
-    A state (m, (4 + s) c) holds the operators of each channel, then their derivatives by lag,
-    falling lag, dead time and sides.
+    A state (m, (3 + s) c) holds the operators of each channel, then their derivatives by lag,
+    falling lag and sides.
     """
 
     def __init__(self, history: History, channels: int, lags: bool, falls: bool) -> None:
         self._shape = (history.n_states, (1 + _TIMES + _sides(history, channels)) * channels)
         self._step = _steps(history, channels, lags, falls)
         self._interpreted: dict[int, InterpretedFunction] = {}
+        self._aside: dict[int, InterpretedFunction] = {}
         operators = [part.model_dump(exclude={"share"}) for part in history.parts]
-        self._content = ("past", operators, channels, lags, falls, _CHUNKS[-1])
+        self._content = ("past along commands", operators, channels, lags, falls, _CHUNKS[-1])
         self._compiled: CompiledFunction | None = None
         self._interpreted_rows = 0
 
@@ -259,25 +270,36 @@ class _HistoryRun:
         state: Array,
         before: Array,
         now: Array,
-        before_change: Array,
-        now_change: Array,
         steps: Array,
         lags: tuple[float, float],
     ) -> Array:
-        """Return the states (N, m, (4 + s) c) after N steps; pressures and changes are (N, c)."""
+        """Return the states (N, m, (3 + s) c) after N steps between pressures (N, c)."""
         count = len(steps)
         size = self._at_once(count)
         given = np.broadcast_to(np.array(lags), (count, 2))
-        arguments = (
-            state,
-            *(
-                _columns(each, size)
-                for each in (before, now, before_change, now_change, steps, given)
-            ),
-        )
+        arguments = (state, *(_columns(each, size) for each in (before, now, steps, given)))
         rows, width = self._shape
         found = self._function(size)(*arguments)[0].reshape(rows, size, width)
         return np.asarray(np.swapaxes(found[:, :count], 0, 1))
+
+    def aside(
+        self, states: Array, before: Array, now: Array, steps: Array, lags: tuple[float, float]
+    ) -> Array:
+        """Return the states (M, m, (3 + s) c) one step after each of others (M, m, (3 + s) c)."""
+        rows, width = self._shape
+        ends = np.empty_like(states)
+        given = np.broadcast_to(np.array(lags), (len(steps), 2))
+        size = next((each for each in _CHUNKS if each >= len(steps)), _CHUNKS[-1])
+        if size not in self._aside:
+            self._aside[size] = InterpretedFunction(dense(self._step.map(size)))
+        for begin in range(0, len(steps), size):
+            own = slice(begin, min(begin + size, len(steps)))
+            first = _columns(states[own].reshape(own.stop - begin, -1), size)
+            first = np.swapaxes(first.reshape(rows, width, size), 1, 2).reshape(rows, -1)
+            others = (_columns(each[own], size) for each in (before, now, steps, given))
+            found = self._aside[size](first, *others)[0].reshape(rows, size, width)
+            ends[own] = np.swapaxes(found[:, : own.stop - begin], 0, 1)
+        return ends
 
     def _function(self, rows: int) -> CompiledFunction | InterpretedFunction:
         """Return the function that runs `rows` steps; the largest one compiled, once it pays."""
@@ -310,11 +332,11 @@ def _columns(values: Array, count: int) -> Array:
 
 
 def _steps(history: History, channels: int, lags: bool, falls: bool) -> ca.Function:
-    """Return one step of `_HistoryRun`: from state, pressures, changes, step and lags to state."""
+    """Return one step of `_HistoryRun`: from state, pressures, step and lags to state."""
     blocks = 1 + _TIMES + _sides(history, channels)
     state = ca.SX.sym("state", history.n_states, blocks * channels)
     value, *slopes = ca.horzsplit(state, channels)
-    before, now, before_change, now_change = (ca.SX.sym(name, channels) for name in "abcd")
+    before, now = (ca.SX.sym(name, channels) for name in ("before", "now"))
     step, lag = ca.SX.sym("step"), ca.SX.sym("lag", 2)
     update = {"lag": lag[0] if lags else 0.0, "lag_falling": lag[1] if falls else 0.0}
     end = history.model_copy(update=update).next_state(value, before, now, step)
@@ -328,25 +350,27 @@ def _steps(history: History, channels: int, lags: bool, falls: bool) -> ca.Funct
         end,
         change([value, lag], [slopes[0], one, none]),
         change([value, lag], [slopes[1], none, one]),
-        change([value, before, now], [slopes[2], before_change, now_change]),
         *(change([value], [slope]) for slope in slopes[_TIMES:]),
     )
-    return ca.Function("step", [state, before, now, before_change, now_change, step, lag], [ends])
+    return ca.Function("step", [state, before, now, step, lag], [ends])
 
 
-def _delayed(time: Array, pressures: Array, before: Array, dead_time: float) -> tuple[Array, Array]:
-    """Return the pressures (N, c) commanded a dead time earlier, and their time derivatives."""
-    if dead_time == 0:
-        slope = np.zeros_like(pressures)
-        if len(time) > 1:
-            slope[1:] = np.diff(pressures, axis=0) / np.diff(time)[:, np.newaxis]
-        return pressures, slope
-    first = time[0] - (np.median(np.diff(time)) if len(time) > 1 else 1.0)
-    knots = np.concatenate([[first], time])
-    values = np.vstack([before, pressures])
-    at = time - dead_time
-    interval = np.clip(np.searchsorted(knots, at, side="left") - 1, 0, len(knots) - 2)
-    slope = np.diff(values, axis=0) / np.diff(knots)[:, np.newaxis]
-    slope = np.where((at < first)[:, np.newaxis], 0.0, slope[interval])
-    base = np.where((at < first)[:, np.newaxis], before, values[interval])
-    return base + slope * (at - knots[interval])[:, np.newaxis], slope
+def _rates(
+    history: History, states: Array, commands: Array, slopes: Array, falls: NDArray[np.bool_]
+) -> Array:
+    """Return the time derivatives (M, m, c) of states, under commands (M, c) with slopes (M, c).
+
+    `falls` says which channels (M, c) have the lag of falling pressures.
+    """
+    x = states[:, 0]
+    lags = np.where(falls & (history.lag_falling > 0), history.lag_falling, history.lag)
+    moves = (commands - x) / lags if history.lag else slopes
+    rates = [moves]
+    for y, play in zip(np.moveaxis(states, 1, 0)[1:], history.play, strict=False):
+        ahead, move = part_of(x, play.of) - y, part_of(moves, play.of)
+        rates.append(np.where(np.abs(ahead) > play.width - _AT_END, move, 0.0))
+    for z, creep in zip(
+        np.moveaxis(states, 1, 0)[1 + len(history.play) :], history.creep, strict=True
+    ):
+        rates.append((part_of(x, creep.of) - z) / creep.time)
+    return np.stack(rates, axis=1)

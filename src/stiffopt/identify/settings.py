@@ -217,7 +217,8 @@ class ChoiceSettings:
     parts : number of folds in time.
     top : share of the rows in the fold of the highest pressures, and in that of the lowest.
     regions, rounds : number of clusters of pressure, and of the iterations that find them.
-    evaluations : largest number of evaluations of a fit without a fold, which begins near its end.
+    tolerance : of a fit without a fold, relative: less than a tenth of a unit of cost, of which
+        half is one standard deviation of a number.
     no_worse : relative increase of error that a simpler model may have.
     held, held_still, held_for : creep can be identified if pressures are held for more than the
         share `held` of the time; held means a change by less than the share `held_still` of their
@@ -229,7 +230,7 @@ class ChoiceSettings:
     top: float = 0.2
     regions: int = 3
     rounds: int = 10
-    evaluations: int = 20
+    tolerance: float = 1e-4
     no_worse: float = 0.04
     held: float = 0.2
     held_still: float = 1e-3

@@ -159,16 +159,19 @@ STRUCTURES = (
     ModelStructure("creep", "lag, play and creep", _BASIC, lag=True, play=True, creep=True),
     ModelStructure(
         "progressive",
-        "lag and play; a dead band, and bending that stiffens and lengthens",
+        "lags when rising and falling, play; a dead band, and bending that stiffens and lengthens",
         _PROGRESSIVE,
         lag=True,
+        falling=True,
         play=True,
     ),
     ModelStructure(
         "progressive-creep",
-        "lag, play and creep; a dead band, and bending that stiffens and lengthens",
+        "lags when rising and falling, play, creep; a dead band, and bending that stiffens and "
+        "lengthens",
         _PROGRESSIVE,
         lag=True,
+        falling=True,
         play=True,
         after=("creep", "progressive"),
         creep=True,
@@ -191,7 +194,6 @@ STRUCTURES = (
         play=True,
         elongation=True,
         creep=True,
-        after=("hysteresis", "creep", "channel-hysteresis"),
     ),
 )
 """Those with the fewest numbers first."""
