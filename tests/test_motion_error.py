@@ -56,7 +56,7 @@ def test_what_was_learned_can_be_forgotten() -> None:
 
 
 @pytest.mark.usefixtures("compiled")
-@pytest.mark.parametrize("modulus", [0.8, 1.25])
+@pytest.mark.parametrize("modulus", [0.8, 1.3])
 def test_on_a_trajectory_a_wrong_modulus_delays_the_tip_little(
     modulus: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -90,5 +90,5 @@ def test_on_a_trajectory_a_wrong_modulus_delays_the_tip_little(
     with_it = delay()
     monkeypatch.setattr(MotionErrorEstimator, "learn", lambda *_: None)
     without = delay()
-    assert without > 0.01
+    assert without > 0.015
     assert with_it < 0.6 * without

@@ -512,7 +512,7 @@ class TipController:
         return off <= self._tuning.reference.there and not self._moves()
 
     def _moves(self) -> bool:
-        """Whether the pressures of the reference change."""
+        """Return whether the reference is still moving."""
         rate = self._reference.motion[1, : self.robot.n_pressures]
         return not np.abs(rate).max() <= self._tuning.reference.at_rest
 
@@ -640,9 +640,9 @@ class TipController:
         return self._report.notices(self._rests_short())
 
     def _rests_short(self) -> bool:
-        """Whether the tip rests short of a target that is out of reach.
+        """Return whether the tip is at rest although its target, out of reach, is elsewhere.
 
-        So it does if it has arrived, and if the pressures are held: then the plan is an old one.
+        It is at rest at the end of its plan, and while the pressures are held.
         """
         plan, pursuit = self.replanner.plan, self.replanner.pursuit
         if plan is None or plan.reached or pursuit.course is not None:

@@ -1,4 +1,4 @@
-"""What the controller reports: its part of the state, its alarms and its events."""
+"""`Report`: the state, the alarms and the events that the controller publishes."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Report:
 
     @property
     def model_is_wrong(self) -> bool:
-        """Whether the offset is too large to be an error of this arm's model."""
+        """Whether the measured tip is too far from the model's tip to believe the model."""
         return math.hypot(*self._arm.tip.offset[:3].tolist()) > self._largest_offset
 
     def status(self, now: float, led: tuple[Target, Array] | None) -> ControllerStatus:
