@@ -8,7 +8,7 @@ three seconds. An estimate is right if, one second after the push began, its err
 observable part of the push is at most 20 % + 3 mN. False alarms are counted while nothing touches
 the arm as it goes to targets, rests and follows circles. Presses of 15 to 40 mN, onto flat surfaces
 of 100 to 1,000 N/m at 2 to 8 mm distance, are judged by the true force of the last three seconds.
-They press away from the vented tip: an arm that begins beyond its target would begin in the surface.
+They press away from the vented tip, since an arm that began beyond the surface would begin in it.
 With ``--what inside`` the targets of such presses are 0.5 to 4 mm inside surfaces of 100 to 2,000
 N/m instead. Then the loop must not press on: it has to go back, or to hold with a reason.
 """
@@ -251,7 +251,10 @@ def inside(name: str, seed: int, dynamics: str, found: Found) -> None:
     if drawn is None:
         return
     task, pose, way = drawn
-    stiffness, deep = float(np.exp(rng.uniform(np.log(100), np.log(2000)))), rng.uniform(5e-4, DEEPEST)
+    stiffness, deep = (
+        float(np.exp(rng.uniform(np.log(100), np.log(2000)))),
+        rng.uniform(5e-4, DEEPEST),
+    )
     with Arm(name, seed, dynamics, surface_at(pose, way, -deep, stiffness)) as arm:
         arm.controller.set_task(task)
         course, forces, why = arm.controller.replanner.pursuit.course, [], ""

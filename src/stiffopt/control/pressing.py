@@ -225,8 +225,8 @@ class Pressing:
         """Tell at the beginning if the tip is beyond the target, in m, where the object may be."""
         if not self._told and beyond > self._tuning.beyond:
             text = (
-                f"the tip begins {1e3 * beyond:.0f} mm beyond the target along the direction of the "
-                "press; what it is to press on may be in its way, and is hit at ordinary speed"
+                f"the tip begins {1e3 * beyond:.0f} mm beyond the target of its press; the object "
+                "may be in its way, and would be hit at ordinary speed"
             )
             self._notify("press-beyond", text)
         self._told = True
