@@ -7,7 +7,12 @@ import pytest
 from scipy.linalg import expm
 
 from stiffopt import Target, lie
-from stiffopt.control.feedback import prescribed_components, tracking_rows, with_offsets
+from stiffopt.control.feedback import (
+    prescribed_components,
+    tracking_rows,
+    with_excess,
+    with_offsets,
+)
 from stiffopt.control.formula import Formula
 from stiffopt.control.tuning import FeedbackTuning
 
@@ -132,3 +137,19 @@ def test_the_law_finds_its_correction_from_the_offset_and_its_average(swings, mo
     found = evaluated(with_offsets(law), pose, jacobian, np.ones(5), *dynamic, *known)
     for value, expected in zip(found, plain, strict=True):
         assert value == pytest.approx(expected, rel=1e-9, abs=1e-15)
+
+
+def test_the_law_finds_the_mode_from_the_shares_of_its_channels_and_an_excess():
+    pose, jacobian, correction, swing = drawn(7)
+    now, across, excess, *others = swing
+    shares = np.random.default_rng(8).uniform(0.3, 1.5, N)
+    own = across @ pose[:3, :3] @ jacobian[:3] * shares + excess
+    law, given = (
+        tracking_rows(N, True, DAMPING, DEAD_TIME),
+        (pose, jacobian, np.ones(5), correction),
+    )
+    plain = evaluated(law, *given, now, across, own, *others)
+    found = evaluated(with_excess(law, shares), *given, now, across, excess, *others)
+    for value, expected in zip(found, plain, strict=True):
+        assert value == pytest.approx(expected, rel=1e-9, abs=1e-15)
+    assert np.abs(own - excess).max() > 0.1 * np.abs(excess).max()

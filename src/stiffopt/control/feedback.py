@@ -160,6 +160,24 @@ def with_offsets(law: TrackingRows) -> TrackingRows:
     )
 
 
+def with_excess(law: TrackingRows, participation: Array) -> TrackingRows:
+    """Return a feedback law that finds the Jacobian of the mode itself.
+
+    It is that of the tip's position in the plane, by the shares (n,) with which a straight arm's
+    channels take part, plus an excess (3, n), see `BentMode`, which replaces it as an input.
+    """
+    pose, jacobian, prescribed, correction, vibration, plane, mode, *others = law.inputs
+    excess = ca.SX.sym("excess", *mode.shape)
+    found = plane @ pose[:3, :3] @ jacobian[:3, :] @ ca.diag(ca.DM(participation)) + excess
+    return replace(
+        law,
+        inputs=[pose, jacobian, prescribed, correction, vibration, plane, excess, *others],
+        matrices=[jacobian, excess],
+        rows=ca.substitute(law.rows, mode, found),
+        values=ca.substitute(law.values, mode, found),
+    )
+
+
 class GainSchedule:
     """Gains K (3,) of the linear-quadratic regulator over the frequency of the vibration.
 

@@ -505,6 +505,7 @@ class PressingTuning:
     # motion of the arm without contact for it, in m
     clear: float = 3e-3
     most_back: float = 0.03
+    beyond: float = 2e-3  # distance of the tip beyond the target that an event reports, in m
     obstruction: ObstructionTuning = field(default_factory=ObstructionTuning)
 
 
