@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -26,6 +28,7 @@ from stiffopt.schema import BadKeyError
 Array = NDArray[np.float64]
 
 _SLACK = 1e-3  # Pa, for rounding at limits
+_ROUNDING = 1e-6  # share of a speed
 
 
 class Requests:
@@ -37,6 +40,8 @@ class Requests:
     ----------
     robot, limits, slew, scene, tuning :
         See `TipController`; slew (n,), in Pa/s.
+    tip_speed :
+        See `ControlSettings`.
     """
 
     def __init__(
@@ -46,7 +51,9 @@ class Requests:
         slew: Array,
         scene: Scene | None,
         tuning: ControlTuning,
+        tip_speed: float | None = None,
     ) -> None:
+        self._tip_speed = math.inf if tip_speed is None else tip_speed
         self._robot, self._limits, self._slew = robot, limits, slew
         self._scene, self._tuning = scene, tuning
 
@@ -54,6 +61,8 @@ class Requests:
         """Return the pursuit of a task, which may press or brace."""
         course: AnyCourse | None = None
         if task.press is not None:
+            if task.press.speed > self._tip_speed:
+                raise InputError(f"press.speed: {self._too_fast(task.press.speed)}")
             course = Pressing(task.press, task.target, self._tuning.pressing)
         elif task.brace is not None:
             task = self._in_the_rigs_scene(task)
@@ -62,6 +71,8 @@ class Requests:
 
     def of_target(self, target: Target, last: Pursuit, course: AnyCourse | None = None) -> Pursuit:
         """Return the pursuit of a target, with goal and limits of the last task if there is one."""
+        if isinstance(course, Course):
+            self._check_speed(*course.sampled())
         if last.task is not None:
             return last.to(target, course)
         task = Task(robot=self._robot.description.name, target=target)
@@ -96,7 +107,8 @@ class Requests:
         Waypoints with pressures must have an equilibrium by the present model, `adapted` or not.
         """
         if isinstance(request, Trajectory) and request.pressures is not None:
-            self._check_equilibria(request.pressures, adapted)
+            tips = self._tips_at(request.pressures, adapted)
+            self._check_speed(np.array([each.time for each in request.waypoints]), tips)
         if isinstance(request, Task):
             check_press(self._robot, self._limits, request)
             if request.brace is not None:
@@ -136,18 +148,38 @@ class Requests:
         # without its load, whose actual effect is part of the tip's offset
         return task.model_copy(update={"pressure": pressure, "load": None, "press": None})
 
-    def _check_equilibria(self, pressures: Array, adapted: Adapted | None) -> None:
-        """Refuse waypoints' pressures (k, n) at which the model has no equilibrium."""
+    def _tips_at(self, pressures: Array, adapted: Adapted | None) -> Array:
+        """Return the tips (k, 3) by the model; refuse pressures (k, n) without an equilibrium."""
         arm = self._robot if adapted is None else Manipulator(adapted.description)
         model, tip = "adapted model" if adapted else "robot file", TipModel(arm)
+        tips = []
         for index, each in enumerate(pressures):
             try:
-                tip.at(each)
+                tips.append(tip.at(each).pose[:3, 3])
             except EquilibriumError as error:
                 raise InputError(
                     f"waypoints[{index}].pressures: by the {model} the arm has no equilibrium "
                     f"there ({error}); give this waypoint other pressures, or plan again"
                 ) from None
+        return np.array(tips)
+
+    def _check_speed(self, times: Array, tips: Array) -> None:
+        """Refuse tips (k, 3) at times (k,), in s, between which the arm would be too fast."""
+        with np.errstate(all="ignore"):
+            speeds = np.linalg.norm(np.diff(tips, axis=0), axis=1) / np.diff(times)
+        if not (speeds > (1 + _ROUNDING) * self._tip_speed).any():
+            return
+        k = int(np.argmax(speeds))
+        raise InputError(
+            f"waypoints: between {times[k]:.2f} and {times[k + 1]:.2f} s "
+            f"{self._too_fast(speeds[k])}; give them more time"
+        )
+
+    def _too_fast(self, speed: float) -> str:
+        return (
+            f"the tip would move at {1e3 * speed:.1f} mm/s, and the rig file permits "
+            f"{1e3 * self._tip_speed:.1f} mm/s (control.tip_speed)"
+        )
 
     def _check_first(self, first: Array, start: Array) -> None:
         """Refuse pressures (n,) of a waypoint at 0 s that differ from the arm's start (n,)."""
