@@ -199,20 +199,20 @@ def test_arrives_and_stays(robot, dynamics, kind, duration):
     assert standing.task == "target"
 
 
-@pytest.mark.parametrize("dynamics", ["quasi-static", "full"])
+@pytest.mark.parametrize("dynamics", ["full", pytest.param("quasi-static", marks=pytest.mark.long)])
 def test_on_its_way_the_tip_is_no_faster_than_the_rig_file_asks(dynamics):
     """The rest is for an arm that moves farther than its file says, and for feedback."""
     speed, fastest = 0.02, []
-    for control in (ControlSettings(), ControlSettings(tip_speed=speed)):
+    for control, intervals in ((ControlSettings(), 4), (ControlSettings(tip_speed=speed), 17)):
         bench = Bench(HANGING, dynamics, control=control, period=PERIOD)
         position = tuple(map(float, bench.pose_at(np.array([0, 0.9, 0, 0.3, 0, 0.5]) * BAR)[:3, 3]))
         bench.controller.set_task(bench.task(position=position))
         tips = [bench.tip[:3, 3].copy()]
-        for _ in range(25):
+        for _ in range(intervals):
             errors = bench.run(0.2, position)
             tips.append(bench.tip[:3, 3].copy())
-        assert errors.max() < 1e-3
         fastest.append(np.linalg.norm(np.diff(tips, axis=0), axis=1).max() / 0.2)
+    assert errors.max() < 1e-3
     assert fastest[0] > 2.5 * speed
     assert fastest[1] < 1.3 * speed
 
@@ -224,19 +224,19 @@ def test_what_asks_for_a_faster_tip_is_refused_and_changes_nothing():
     x, y, z = middle(bench)
     fast = [Waypoint(time=t, target=Target(position=(x + 0.03 * t, y, z))) for t in (0.0, 1.0)]
     with pytest.raises(
-        InputError, match=r"the tip would move at 4\d\.\d mm/s, .* permits 20\.0 mm"
+        InputError, match=r"would have 4\d\.\d mm/s; the rig file permits 20\.0 mm/s"
     ):
         bench.controller.follow(Trajectory(waypoints=fast), bench.rig.clock.now())
-    bent = np.array([[0.0, 0.0, 0.0], [0.9, 0.0, 0.0]]) * BAR
+    against = np.array([[0.0, 0.9, 0.0], [0.9, 0.0, 0.0]]) * BAR
     way = [
         Waypoint(time=t, target=Target(position=(x, y, z)), pressures=tuple(p))
-        for t, p in zip((0.0, 1.0), bent.tolist(), strict=True)
+        for t, p in zip((0.0, 1.0), against.tolist(), strict=True)
     ]
-    with pytest.raises(InputError, match=r"between 0\.00 and 1\.00 s the tip would move at"):
+    with pytest.raises(InputError, match=r"between 0\.00 and 1\.00 s the tip, or its motion by"):
         bench.controller.check_ahead(Trajectory(waypoints=way))
     press = Press(force=0.03, direction=(1.0, 0.0, 0.0), speed=0.03)
     task = bench.task(position=middle(bench)).model_copy(update={"press": press})
-    with pytest.raises(InputError, match=r"press\.speed: the tip would move at 30\.0 mm/s"):
+    with pytest.raises(InputError, match=r"press\.speed: the tip, .* would have 30\.0 mm/s"):
         bench.controller.set_task(task)
     assert bench.controller.replanner.pursuit is before
     slow = [Waypoint(time=5 * t, target=each.target) for t, each in zip((0, 1), fast, strict=True)]

@@ -72,7 +72,8 @@ class Requests:
     def of_target(self, target: Target, last: Pursuit, course: AnyCourse | None = None) -> Pursuit:
         """Return the pursuit of a target, with goal and limits of the last task if there is one."""
         if isinstance(course, Course):
-            self._check_speed(*course.sampled())
+            times, tips = course.sampled()
+            self._check_speed(times, np.diff(tips, axis=0)[:, :, None])
         if last.task is not None:
             return last.to(target, course)
         task = Task(robot=self._robot.description.name, target=target)
@@ -107,8 +108,8 @@ class Requests:
         Waypoints with pressures must have an equilibrium by the present model, `adapted` or not.
         """
         if isinstance(request, Trajectory) and request.pressures is not None:
-            tips = self._tips_at(request.pressures, adapted)
-            self._check_speed(np.array([each.time for each in request.waypoints]), tips)
+            times = np.array([waypoint.time for waypoint in request.waypoints])
+            self._check_speed(times, self._parts(request.pressures, adapted))
         if isinstance(request, Task):
             check_press(self._robot, self._limits, request)
             if request.brace is not None:
@@ -148,25 +149,35 @@ class Requests:
         # without its load, whose actual effect is part of the tip's offset
         return task.model_copy(update={"pressure": pressure, "load": None, "press": None})
 
-    def _tips_at(self, pressures: Array, adapted: Adapted | None) -> Array:
-        """Return the tips (k, 3) by the model; refuse pressures (k, n) without an equilibrium."""
+    def _parts(self, pressures: Array, adapted: Adapted | None) -> Array:
+        """Return the motion of the tip between waypoints by each channel (k - 1, 3, n), in m.
+
+        Refuse pressures (k, n) at which the model has no equilibrium.
+        """
         arm = self._robot if adapted is None else Manipulator(adapted.description)
-        model, tip = "adapted model" if adapted else "robot file", TipModel(arm)
-        tips = []
+        model, tip, jacobians = "adapted model" if adapted else "robot file", TipModel(arm), []
         for index, each in enumerate(pressures):
             try:
-                tips.append(tip.at(each).pose[:3, 3])
+                at = tip.at(each)
             except EquilibriumError as error:
                 raise InputError(
                     f"waypoints[{index}].pressures: by the {model} the arm has no equilibrium "
                     f"there ({error}); give this waypoint other pressures, or plan again"
                 ) from None
-        return np.array(tips)
+            jacobians.append(at.pose[:3, :3] @ at.jacobian[:3])
+        J = np.array(jacobians)
+        parts: Array = (J[1:] + J[:-1]) / 2 * np.diff(pressures, axis=0)[:, None, :]
+        return parts
 
-    def _check_speed(self, times: Array, tips: Array) -> None:
-        """Refuse tips (k, 3) at times (k,), in s, between which the arm would be too fast."""
+    def _check_speed(self, times: Array, parts: Array) -> None:
+        """Refuse waypoints at times (k,), in s, between which the arm would be too fast.
+
+        `parts` (k - 1, 3, m), in m, add up to the motion of the tip, and none may be too fast.
+        """
         with np.errstate(all="ignore"):
-            speeds = np.linalg.norm(np.diff(tips, axis=0), axis=1) / np.diff(times)
+            alone = np.linalg.norm(parts, axis=1).max(axis=1)
+            together = np.linalg.norm(parts.sum(axis=2), axis=1)
+            speeds = np.maximum(alone, together) / np.diff(times)
         if not (speeds > (1 + _ROUNDING) * self._tip_speed).any():
             return
         k = int(np.argmax(speeds))
@@ -177,8 +188,8 @@ class Requests:
 
     def _too_fast(self, speed: float) -> str:
         return (
-            f"the tip would move at {1e3 * speed:.1f} mm/s, and the rig file permits "
-            f"{1e3 * self._tip_speed:.1f} mm/s (control.tip_speed)"
+            f"the tip, or its motion by one channel, would have {1e3 * speed:.1f} mm/s; the rig "
+            f"file permits {1e3 * self._tip_speed:.1f} mm/s (control.tip_speed)"
         )
 
     def _check_first(self, first: Array, start: Array) -> None:
