@@ -245,7 +245,7 @@ def main() -> None:
         while count < given.tasks and number < 8 * given.tasks:
             number += 1
             held = leant(case, believed, [arm, number, 25], slips=True)
-            if not isinstance(held, Held):
+            if not isinstance(held, Held) or held.row["false"]:
                 continue
             count += 1
             rows += rows_of(held, arm, given.grows, given.model / 100, given.creep / 100)
