@@ -30,7 +30,7 @@ class EstimatorTuning:
     # large motion, so that it is slower than a small swing), deviation, random change with the way
     # of the mode, in 1 / sqrt(m), and largest size
     frequency_offset: float = -0.025
-    frequency_deviation: float = 0.05
+    frequency_deviation: float = 0.03
     frequency_change: float = 0.1
     frequency_bound: float = 0.15
     # time by which viscosity makes the tip late, except in the first mode, in s
