@@ -36,7 +36,7 @@ def drawn(seed):
     swing = (
         rng.normal(size=(2, 3)) * [[1e-3], [1e-2]], root @ root.T / 4,
         rng.normal(size=(3, N)) * 3e-7, 9.0,
-        rng.uniform(0, 1, 3), *(rng.uniform(0, 1e5, N) for _ in range(3)), rng.normal(size=N) * 1e5,
+        rng.uniform(0, 1, 3), *(rng.uniform(0, 1e5, N) for _ in range(4)), rng.normal(size=N) * 1e5,
         rng.normal(size=(2, 3)) * [[1e-3], [1e-2]],
     )  # fmt: skip
     return pose, jacobian, correction, swing
@@ -90,14 +90,14 @@ def test_rows_are_those_of_the_task(name, swings):
 def test_feedback_of_an_arm_that_swings(seed):
     target, system = TARGETS["position"], tracking_rows(N, True, DAMPING, DEAD_TIME)
     pose, jacobian, correction, swing = drawn(seed)
-    now, across, own, omega, gains, ahead, chamber, path, rate, intended = swing
+    now, across, own, omega, gains, ahead, strained, chamber, path, rate, intended = swing
     given = (pose, jacobian, prescribed_components(target), correction, *swing)
     rows, values, _ = evaluated(system, *given)
     home, (there, moving) = across @ correction[:3], intended @ across
     free = np.array([[0, 1], [-(omega**2), -2 * DAMPING * omega]])
     later = expm(DEAD_TIME * free) @ now
     sigma = own @ (ahead - chamber) - home
-    tip, speed = own @ (ahead - path) + later[0] - there, later[1] - own @ rate - moving
+    tip, speed = own @ (strained - path) + later[0] - there, later[1] - own @ rate - moving
     feedback = -(gains[0] * sigma + gains[1] * tip + gains[2] * speed)
     expected, wanted = task(pose, jacobian, correction, target, feedback)
     assert rows[:3] == pytest.approx(expected, rel=1e-12)

@@ -77,8 +77,9 @@ def tracking_rows(
     For an arm that vibrates there are also: its vibration and the vibration's speed (2, 3); the
     plane (3, 3) in which it moves the tip, and the Jacobian (3, n) of the tip's displacement in it,
     see `BentMode`; omega, in rad/s; gains K (3,), see `GainSchedule`; the effective pressures
-    (n,) a dead time from now; those that the reference has in the chambers then; those on the
-    reference's path; the rate of the latter (n,); and the vibration intended, as the first (2, 3).
+    (n,) a dead time from now; those that the shape has followed then; those that the reference has
+    in the chambers then; those on the reference's path; the rate of the latter (n,); and the
+    vibration intended, as the first (2, 3).
 
     Parameters
     ----------
@@ -105,14 +106,16 @@ def tracking_rows(
         intended = ca.SX.sym("intended", 2, 3)
         omega, gains = ca.SX.sym("omega"), ca.SX.sym("gains", 3)
         ahead, chamber = ca.SX.sym("ahead", n), ca.SX.sym("chamber", n)
+        strained = ca.SX.sym("strained", n)
         path, rate = ca.SX.sym("path", n), ca.SX.sym("rate", n)
-        inputs += [vibration, plane, M, omega, gains, ahead, chamber, path, rate, intended]
+        inputs += [vibration, plane, M, omega, gains, ahead, strained, chamber, path, rate]
+        inputs += [intended]
         matrices.append(M)
         later = transition(omega, damping, dead_time) @ vibration
         goal = plane @ shift
         reached = intended @ plane
         sigma = M @ (ahead - chamber) - goal
-        epsilon = M @ (ahead - path) + later[0, :].T - reached[0, :].T
+        epsilon = M @ (strained - path) + later[0, :].T - reached[0, :].T
         speed = later[1, :].T - M @ rate - reached[1, :].T
         feedback = -(gains[0] * sigma + gains[1] * epsilon + gains[2] * speed)
         shift = shift + feedback

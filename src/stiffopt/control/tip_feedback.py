@@ -179,6 +179,6 @@ class TipFeedback:
         return (
             estimator.vibration, plane, estimator.excess, estimator.omega,
             self._gains.at(estimator.omega), pressures.effective_ahead,
-            reference.chamber, motion[0, :n], motion[1, :n],
+            self._arm.strained_ahead, reference.chamber, motion[0, :n], motion[1, :n],
             motion[:2, n : n + 3] - self._averaged.motion[:, :3],
         )  # fmt: skip
