@@ -556,7 +556,7 @@ class BracingTuning:
     even_time: float = 0.5
     # creep beyond the model's, which lengthens an arm that friction holds: share by which pressures
     # count more, per e-fold of the time since the way into contact, and of a time before, in s
-    creep: float = 0.02
+    creep: float = 0.01
     creep_time: float = 3.0
     slid: float = 1e-4
     # time for which friction at the contacts may withhold a correction of the tip, in s
