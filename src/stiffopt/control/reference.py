@@ -211,4 +211,4 @@ def _step(reach: Array, extra: int) -> Formula:
     pressures = motion[:, :n].T
     inputs = [states, plan, transition, differences, command, chamber, slew_share, motion_share]
     outputs = [after, motion, pressures @ command, pressures @ chamber]
-    return Formula(inputs, outputs, [states, after, motion])
+    return Formula(inputs, outputs, [states, motion_share, after, motion])
