@@ -34,6 +34,7 @@ from __future__ import annotations
 import argparse
 import copy
 import json
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -51,7 +52,7 @@ from stiffopt.plant.settings import PlantLoad
 
 Array = NDArray[np.float64]
 
-SAMPLES, TICKS = 100, 3  # of a course, and steps of the plant between them
+SAMPLES, STEP = 100, 0.02  # of a course, and the longest step of the plant, in s
 NOISE = np.repeat([5e-5, 1e-3], 3)  # of a sample of the tracker, in m and rad
 RATE, LATENCY, BEFORE = 40.0, 0.025, 5.0  # 1/s, s, s
 PUSH, NUDGE = 0.1, 2e-3  # N, deviation of pushes and step of the response
@@ -95,17 +96,18 @@ class Pushed:
     ) -> tuple[Array, Array]:
         """Place and turn (T, 6) of the tip against the beginning, and slides (T,) in m."""
         plant = copy.deepcopy(plant)
-        step = duration / SAMPLES / TICKS
+        ticks = max(3, math.ceil(duration / SAMPLES / STEP))  # between samples
+        step = duration / SAMPLES / ticks
         settings = plant.settings
         steps = settings.discretisation.model_copy(update={"step": step})
         plant.settings = settings.model_copy(update={"discretisation": steps})
         first, slide = plant.tip_pose(), Slide(plant, self.normal)
         slide.update(plant)
         tips, slides = [], []
-        for k in range(1, SAMPLES * TICKS + 1):
+        for k in range(1, SAMPLES * ticks + 1):
             plant._load = PlantLoad(force=tuple(push(k * step)))  # `set_load` would be slow
             plant.follow(self.pressures[None])
-            if k % TICKS == 0:
+            if k % ticks == 0:
                 slides.append(slide.update(plant))
                 T = plant.tip_pose()
                 turn = lie.quaternion_from_rotation(T[:3, :3] @ first[:3, :3].T)
