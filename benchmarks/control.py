@@ -40,6 +40,7 @@ from control_baselines import CONTROLLERS
 from control_cases import (
     DYNAMICS,
     Case,
+    at_tip_speed,
     draw_case,
     draw_path,
     with_calibrated_file,
@@ -64,9 +65,11 @@ def one_case(
     keep: Path | None,
     paths: bool,
     in_loop: bool,
+    tip_speed: float | None,
 ) -> list[Step | Follow]:
     """All that one arm has to show."""
     case = with_file(draw_case(seed, 1 if paths else targets, payload), robot_file, keep)
+    case = at_tip_speed(case, tip_speed)
     found: list[Step | Follow] = []
     path = draw_path(case) if paths else None
     for kind in dynamics:
@@ -205,6 +208,7 @@ def main() -> int:
     parser.add_argument("--keep", type=Path, help="keep calibrated files here and use them again")
     parser.add_argument("--paths", action="store_true", help="figures-of-eight, not targets")
     parser.add_argument("--loop", action="store_true", help="in the whole control loop")
+    parser.add_argument("--tip-speed", type=float, help="`control.tip_speed` of the rig, in m/s")
     parser.add_argument("--jobs", type=int, default=1, help="processes")
     parser.add_argument("--out", type=Path, help="JSON file for all that was measured")
     given = parser.parse_args()
@@ -213,7 +217,7 @@ def main() -> int:
     work = partial(
         one_case, dynamics=given.dynamics, targets=given.targets, controllers=given.controller,
         payload=given.payload, robot_file=given.robot_file, keep=given.keep, paths=given.paths,
-        in_loop=given.loop,
+        in_loop=given.loop, tip_speed=given.tip_speed,
     )  # fmt: skip
     found: list[Any] = []
     for part in in_processes(work, seeds, given.jobs):

@@ -150,6 +150,14 @@ def with_true_file(case: Case) -> Case:
     return replace(case, believed=case.truth.model.description.model_copy(update=update))
 
 
+def at_tip_speed(case: Case, speed: float | None) -> Case:
+    """The case whose rig file has a `control.tip_speed`, in m/s; None: as it is."""
+    if speed is None:
+        return case
+    control = case.description.control.model_copy(update={"tip_speed": speed})
+    return replace(case, description=case.description.model_copy(update={"control": control}))
+
+
 def draw_case(seed: int, targets: int = 3, payload: float = 0.0, *, ranked: bool = True) -> Case:
     """Draw an arm and targets for it; the controller gets the nominal robot file.
 

@@ -37,7 +37,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from control_baselines import PERIOD
-from control_cases import DYNAMICS, Case, draw_case
+from control_cases import DYNAMICS, Case, at_tip_speed, draw_case
 from control_runs import LoopRun
 from report import table
 from stiffopt import lie, load_robot
@@ -572,8 +572,11 @@ def main() -> None:
     parser.add_argument("--dynamics", choices=DYNAMICS, nargs="+", default=list(DYNAMICS))
     parser.add_argument("--rows", nargs="+", help="only rows whose name has one of these words")
     parser.add_argument("--commission", action="store_true", help="look for faults of the set-up")
+    parser.add_argument("--tip-speed", type=float, help="`control.tip_speed` of the rig, in m/s")
     arguments = parser.parse_args()
-    cases = [draw_case(arguments.seed + k, 2, ranked=False) for k in range(arguments.cases)]
+    seeds = range(arguments.seed, arguments.seed + arguments.cases)
+    drawn = [draw_case(seed, 2, ranked=False) for seed in seeds]
+    cases = [at_tip_speed(case, arguments.tip_speed) for case in drawn]
     words = arguments.rows or [""]
     rows = [row for row in ROWS if any(word in row.name for word in words)]
     if arguments.commission:

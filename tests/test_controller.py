@@ -20,6 +20,7 @@ from stiffopt.errors import InputError
 from stiffopt.model.calibration import Calibration, ErrorModel
 from stiffopt.model.robot_files import load_description, save_robot
 from stiffopt.optimise.goal import StiffnessGoal, StiffnessMeasure
+from stiffopt.optimise.press import Press
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import PressureRange, Task
 from stiffopt.paths.trajectory import Trajectory, Waypoint
@@ -196,6 +197,51 @@ def test_arrives_and_stays(robot, dynamics, kind, duration):
     assert standing.tip_position == pytest.approx(bench.tip[:3, 3], abs=3e-4)
     assert standing.stiffness == pytest.approx(standing.best_stiffness, rel=0.05)
     assert standing.task == "target"
+
+
+@pytest.mark.parametrize("dynamics", ["full", pytest.param("quasi-static", marks=pytest.mark.long)])
+def test_on_its_way_the_tip_is_no_faster_than_the_rig_file_asks(dynamics):
+    """The rest is for an arm that moves farther than its file says, and for feedback."""
+    speed, fastest = 0.02, []
+    for control, intervals in ((ControlSettings(), 4), (ControlSettings(tip_speed=speed), 17)):
+        bench = Bench(HANGING, dynamics, control=control, period=PERIOD)
+        position = tuple(map(float, bench.pose_at(np.array([0, 0.9, 0, 0.3, 0, 0.5]) * BAR)[:3, 3]))
+        bench.controller.set_task(bench.task(position=position))
+        tips = [bench.tip[:3, 3].copy()]
+        for _ in range(intervals):
+            errors = bench.run(0.2, position)
+            tips.append(bench.tip[:3, 3].copy())
+        fastest.append(np.linalg.norm(np.diff(tips, axis=0), axis=1).max() / 0.2)
+    assert errors.max() < 1e-3
+    assert fastest[0] > 2.5 * speed
+    assert fastest[1] < 1.3 * speed
+
+
+def test_what_asks_for_a_faster_tip_is_refused_and_changes_nothing():
+    bench = Bench(ONE, control=ControlSettings(tip_speed=0.02), period=PERIOD)
+    bench.controller.set_task(bench.task(position=middle(bench)))
+    before = bench.controller.replanner.pursuit
+    x, y, z = middle(bench)
+    fast = [Waypoint(time=t, target=Target(position=(x + 0.03 * t, y, z))) for t in (0.0, 1.0)]
+    with pytest.raises(
+        InputError, match=r"would have 4\d\.\d mm/s; the rig file permits 20\.0 mm/s"
+    ):
+        bench.controller.follow(Trajectory(waypoints=fast), bench.rig.clock.now())
+    against = np.array([[0.0, 0.9, 0.0], [0.9, 0.0, 0.0]]) * BAR
+    way = [
+        Waypoint(time=t, target=Target(position=(x, y, z)), pressures=tuple(p))
+        for t, p in zip((0.0, 1.0), against.tolist(), strict=True)
+    ]
+    with pytest.raises(InputError, match=r"between 0\.00 and 1\.00 s the tip, or its motion by"):
+        bench.controller.check_ahead(Trajectory(waypoints=way))
+    press = Press(force=0.03, direction=(1.0, 0.0, 0.0), speed=0.03)
+    task = bench.task(position=middle(bench)).model_copy(update={"press": press})
+    with pytest.raises(InputError, match=r"press\.speed: the tip, .* would have 30\.0 mm/s"):
+        bench.controller.set_task(task)
+    assert bench.controller.replanner.pursuit is before
+    slow = [Waypoint(time=5 * t, target=each.target) for t, each in zip((0, 1), fast, strict=True)]
+    bench.controller.follow(Trajectory(waypoints=slow), bench.rig.clock.now())
+    assert bench.controller.replanner.pursuit is not before
 
 
 def test_new_target_of_another_kind():

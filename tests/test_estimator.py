@@ -28,7 +28,10 @@ BASE = np.array([0.01, 0.0, 0.18])
 J = np.array([[3e-7, 0.0], [0.0, 3e-7], [0.0, 0.5e-7]])
 SHARES = np.array([0.9, 0.6])
 SWINGING = BendingMode(MASS, SHARES)
-PLAIN = EstimatorTuning(model_error=0.0, excitation_error=0.0, frequency_error=0.0, damping=ZETA)
+PLAIN = EstimatorTuning(
+    model_error=0.0, excitation_error=0.0, frequency_error=0.0, damping=ZETA,
+    frequency_offset=0.0, frequency_deviation=0.0,
+)  # fmt: skip
 
 
 def tip_at(p, rotation=None):
@@ -220,6 +223,57 @@ def test_an_arm_that_has_no_stiffness_left_does_no_harm(softness):
         estimator.advance(now + k * PERIOD, truth.p, tip_at(truth.p))
         estimator.take([sample(now + k * PERIOD, truth.position)])
     assert estimator.estimate.position == pytest.approx(truth.position, abs=1e-3)
+
+
+# -- frequency and viscosity --------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("modelled", [0.93, 1.0, 1.06])
+def test_a_frequency_that_is_modelled_wrongly_is_learned_in_motion(modelled):
+    settings = replace(PLAIN, frequency_offset=-0.025, frequency_deviation=0.05)
+    estimator, truth = TipEstimator(PERIOD, 2, SWINGING, settings), Truth()
+    estimator.set_frequency(modelled * OMEGA, tip_at(np.zeros(2)))
+    estimator.advance(0.0, np.zeros(2), tip_at(np.zeros(2)))
+    begun = settings.frequency_offset
+    assert estimator.omega == pytest.approx((1 + begun) * modelled * OMEGA, rel=1e-9)
+    errors = follow(estimator, truth, 1000, 5e-5, 0.025)
+    assert estimator.omega == pytest.approx(OMEGA, rel=0.01)
+    error, variance = estimator.detuning
+    assert error == pytest.approx(1 / modelled - 1, abs=0.01)
+    assert 0 < variance < (0.6 * settings.frequency_deviation) ** 2
+    assert np.sqrt((errors[600:] ** 2).mean()) < 1e-4
+
+
+def test_a_frequency_that_is_far_off_stays_within_its_bound():
+    settings = replace(PLAIN, frequency_deviation=0.05, frequency_bound=0.03)
+    estimator = TipEstimator(PERIOD, 2, SWINGING, settings)
+    estimator.set_frequency(1.1 * OMEGA, tip_at(np.zeros(2)))
+    follow(estimator, Truth(), 1000, 5e-5, 0.025)
+    assert -settings.frequency_bound <= estimator.detuning[0] < -0.9 * settings.frequency_bound
+    assert estimator.omega >= (1 - settings.frequency_bound) * 1.1 * OMEGA
+
+
+@pytest.mark.parametrize("lag", [0.02, 0.06])
+def test_a_shape_that_viscosity_makes_late_while_the_mode_is_not(lag):
+    """The truth: x = s(late) + m - s_v(late), with m the mode's response to the pressures."""
+    step, known = 1e-3, TipEstimator(PERIOD, 2, SWINGING, PLAIN)
+    plain = TipEstimator(PERIOD, 2, SWINGING, PLAIN)
+    A, moves = mode(), J[:2] * SHARES
+    F, state, late, errors = expm(step * A), np.zeros((2, 2)), np.zeros(2), []
+    for k in range(1, 800):
+        for fine in range(10):
+            p = pressures(k - 1 + (fine + 1) / 10)
+            late = late + (1 - math.exp(-step / lag)) * (p - late)
+            rest = np.array([moves @ p, np.zeros(2)])
+            state = rest + F @ (state - rest)
+        position = BASE + J @ late + np.append(state[0] - moves @ late, 0.0)
+        known.advance(k * PERIOD, late, tip_at(late), p - late)
+        plain.advance(k * PERIOD, p, tip_at(p))
+        for estimator in (known, plain):
+            estimator.take([sample(k * PERIOD, position)])
+        errors.append([e.estimate.offset for e in (known, plain)])
+    errors = np.abs(np.array(errors)[200:]).max(axis=(0, 2))
+    assert errors[0] < 0.2 * errors[1]
 
 
 # -- against a filter that is run again ---------------------------------------------------------

@@ -109,6 +109,30 @@ def test_slew_is_kept_by_path_and_by_all_channels_together():
     assert now == pytest.approx(goal, rel=0.02)
 
 
+def test_neither_the_tip_nor_its_part_by_a_channel_is_faster_than_asked():
+    """Channels that move the tip in opposite directions go no faster than one alone."""
+    period, speed = 0.01, 0.02
+    for jacobian, fastest in (
+        ([[3e-7, 2e-7], [0.0, 0.0], [0.0, 0.0]], 1.0),  # the tip: they add up
+        ([[3e-7, -3e-7], [0.0, 0.0], [0.0, 0.0]], 1.0),  # the first one; the tip hardly moves
+        ([[0.0, 0.0]] * 3, np.inf),
+    ):
+        reference, J = made(period, omega=np.inf), np.array(jacobian)
+        reference.motion_share = J / (speed * period)
+        goal, rates = np.array([1.2 * BAR, 0.9 * BAR]), []
+        for _ in range(400):
+            reference.advance(goal)
+            rates.append(reference.motion[1].copy())
+        moved = J * np.array(rates)[:, None, :]
+        parts = np.linalg.norm(moved, axis=1).max()
+        tip = np.linalg.norm(moved.sum(axis=2), axis=1).max()
+        if np.isfinite(fastest):
+            assert max(parts, tip) == pytest.approx(speed, rel=1e-3)
+        else:
+            assert np.linalg.norm(rates, axis=1).max() > 4 * speed / 3e-7  # as fast as its lags
+        assert reference.path == pytest.approx(goal, rel=1e-3)
+
+
 def test_what_goes_with_the_pressures_is_on_the_same_way():
     reference = made(extra=1)
     goal = np.array([1.0 * BAR, 0.5 * BAR, 7e-3])

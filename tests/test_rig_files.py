@@ -240,6 +240,14 @@ def written(tmp_path: Path, text: str) -> Path:
         ("supply: {driver: simulated}\n", MODBUS, 8, "2 channels; the robot"),
         ("tracker: {driver: simulated}", "safety: {max_pressure: 2 bar}", 5, "above the robot's"),
         ("tracker: {driver: simulated}", "safety: {max_slew: 9 bar/s}", 5, "above the robot's"),
+        ("tracker: {driver: simulated}", "control: {tip_speed: 0 mm/s}", 5, "greater than 0"),
+        ("tracker: {driver: simulated}", "control: {tip_speed: 20}", 5, "no unit"),
+        (
+            "tracker: {driver: simulated}",
+            "control: {tip_speed: 700 mm/s}",
+            5,
+            "700 mm/s is above safety.max_tip_speed, 600 mm/s",
+        ),
         (
             "tracker: {driver: simulated}",
             "safety: {max_pressure: [1 bar, 1 bar]}",

@@ -385,6 +385,30 @@ def test_it_does_not_begin_while_something_touches_the_tip() -> None:
     assert [notice.kind for notice in pressing.notices()] == ["press-waits"]
 
 
+@pytest.mark.parametrize(
+    ("tip", "kinds"),
+    [
+        ([0.023, 0.03, 0.1], ["press-beyond"]),
+        ([0.021, 0.0, 0.1], []),  # about at its target
+        ([-0.02, 0.03, 0.1], []),
+    ],
+)
+def test_a_press_that_begins_beyond_its_target_is_told_once(
+    tip: list[float], kinds: list[str]
+) -> None:
+    pressing, free = (
+        Pressing(PRESS, TARGET, PressingTuning()),
+        TipForce(False, np.zeros(3), 1e-6 * np.eye(3), np.zeros(3)),
+    )
+    still, found = CreepEstimator(3, False, CreepTuning()), []
+    for place in (np.array(tip), np.array([0.03, 0.0, 0.1])):  # it overshoots later
+        pressing.advance(
+            0.01, False, True, place, np.zeros(6), free, still, np.eye(3), COMPLIANCE
+        )  # fmt: skip
+        found += [notice.kind for notice in pressing.notices()]
+    assert found == kinds
+
+
 def test_the_creep_that_is_predicted_moves_the_pressed_arm_back() -> None:
     arm = Spring(0.003, 200.0)
     arm.run(6.0)

@@ -7,7 +7,12 @@ import pytest
 from scipy.linalg import expm
 
 from stiffopt import Target, lie
-from stiffopt.control.feedback import prescribed_components, tracking_rows, with_offsets
+from stiffopt.control.feedback import (
+    prescribed_components,
+    tracking_rows,
+    with_excess,
+    with_offsets,
+)
 from stiffopt.control.formula import Formula
 from stiffopt.control.tuning import FeedbackTuning
 
@@ -31,7 +36,7 @@ def drawn(seed):
     swing = (
         rng.normal(size=(2, 3)) * [[1e-3], [1e-2]], root @ root.T / 4,
         rng.normal(size=(3, N)) * 3e-7, 9.0,
-        rng.uniform(0, 1, 3), *(rng.uniform(0, 1e5, N) for _ in range(3)), rng.normal(size=N) * 1e5,
+        rng.uniform(0, 1, 3), *(rng.uniform(0, 1e5, N) for _ in range(4)), rng.normal(size=N) * 1e5,
         rng.normal(size=(2, 3)) * [[1e-3], [1e-2]],
     )  # fmt: skip
     return pose, jacobian, correction, swing
@@ -85,14 +90,14 @@ def test_rows_are_those_of_the_task(name, swings):
 def test_feedback_of_an_arm_that_swings(seed):
     target, system = TARGETS["position"], tracking_rows(N, True, DAMPING, DEAD_TIME)
     pose, jacobian, correction, swing = drawn(seed)
-    now, across, own, omega, gains, ahead, chamber, path, rate, intended = swing
+    now, across, own, omega, gains, ahead, strained, chamber, path, rate, intended = swing
     given = (pose, jacobian, prescribed_components(target), correction, *swing)
     rows, values, _ = evaluated(system, *given)
     home, (there, moving) = across @ correction[:3], intended @ across
     free = np.array([[0, 1], [-(omega**2), -2 * DAMPING * omega]])
     later = expm(DEAD_TIME * free) @ now
     sigma = own @ (ahead - chamber) - home
-    tip, speed = own @ (ahead - path) + later[0] - there, later[1] - own @ rate - moving
+    tip, speed = own @ (strained - path) + later[0] - there, later[1] - own @ rate - moving
     feedback = -(gains[0] * sigma + gains[1] * tip + gains[2] * speed)
     expected, wanted = task(pose, jacobian, correction, target, feedback)
     assert rows[:3] == pytest.approx(expected, rel=1e-12)
@@ -132,3 +137,19 @@ def test_the_law_finds_its_correction_from_the_offset_and_its_average(swings, mo
     found = evaluated(with_offsets(law), pose, jacobian, np.ones(5), *dynamic, *known)
     for value, expected in zip(found, plain, strict=True):
         assert value == pytest.approx(expected, rel=1e-9, abs=1e-15)
+
+
+def test_the_law_finds_the_mode_from_the_shares_of_its_channels_and_an_excess():
+    pose, jacobian, correction, swing = drawn(7)
+    now, across, excess, *others = swing
+    shares = np.random.default_rng(8).uniform(0.3, 1.5, N)
+    own = across @ pose[:3, :3] @ jacobian[:3] * shares + excess
+    law, given = (
+        tracking_rows(N, True, DAMPING, DEAD_TIME),
+        (pose, jacobian, np.ones(5), correction),
+    )
+    plain = evaluated(law, *given, now, across, own, *others)
+    found = evaluated(with_excess(law, shares), *given, now, across, excess, *others)
+    for value, expected in zip(found, plain, strict=True):
+        assert value == pytest.approx(expected, rel=1e-9, abs=1e-15)
+    assert np.abs(own - excess).max() > 0.1 * np.abs(excess).max()

@@ -134,7 +134,7 @@ class TipController:
             maxlen=max(1, round(tuning.reference.taken_back / period))
         )
         self._first_motion = FirstMotion(commissioned, tuning.first_motion)
-        self._requests = Requests(robot, limits, slew, scene, tuning)
+        self._requests = Requests(robot, limits, slew, scene, tuning, control.tip_speed)
         Planner = ProcessPlanner if plan_in_process else InlinePlanner
         self.replanner = Replanner(Planner(robot, scene), tuning.replanning, period, dead_time)
         self.forecast: Forecast | None = None
@@ -145,7 +145,7 @@ class TipController:
             robot, self._arm, self.replanner, tuning.feedback.max_offset * robot.length
         )
         self._windows = WindowWatch(tuning.windows)
-        self._adapts = control.adaptation != "none"
+        self._adapts, self._tip_speed = control.adaptation != "none", control.tip_speed
         self.begin(0.0)
 
     def check(self) -> None:
@@ -365,6 +365,7 @@ class TipController:
             return self._output(last.copy(), self._feedback.saturated, valid=False)
         self._set_reference_rate()
         reference.omega = self._arm.tip.omega
+        reference.motion_share = self._motion_share(reference.path[:n])
         reference.advance(self._awaited(plan, now))
         if self._arm.leaning is not None:
             return self._feedforward(reference.command - pressures.command_offset, last)
@@ -394,6 +395,13 @@ class TipController:
             return self._output(last.copy(), self._feedback.saturated, valid=False)
         self._ways.append((reference.path.copy(), command - goal))
         return self._output(command, self._feedback.saturated)
+
+    def _motion_share(self, path: Array) -> Array:
+        """Return the motion of the tip per pressure (3, n), over its greatest one in a period."""
+        if self._tip_speed is None or self._bracing is not None:
+            return np.zeros((3, len(path)))
+        motion: Array = self._arm.on_path(path).jacobian[:3] / (self._tip_speed * self._period)
+        return motion
 
     def _bend(self, bent: BentMode | None) -> BentMode | None:
         """Let the estimator have the modes of the bent arm, and return them."""

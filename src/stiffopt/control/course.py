@@ -23,6 +23,7 @@ _SHORT = 0.05  # length below which an interpolated direction is undefined
 # with u = s / a, by differences at these times, in delays 4 / a; weights of the positions there.
 _AROUND = (-1.0, -0.5, 0.0, 0.5, 1.0)
 _INVERSE = np.array([1.0, -36.0, 126.0, -52.0, 9.0]) / 48
+_SAMPLES = 16  # between two waypoints, to find the greatest speed
 _BETWEEN = np.arange(1, 8) / 8  # shares of the way between waypoints at which that is checked
 
 
@@ -74,6 +75,18 @@ class Course:
             self._orientation = _checked(_spline(knots, _nearer_signs(rows)), knots)
         self._knots = knots
         self.begin, self.end = begin, begin + times[-1]
+
+    def sampled(self) -> tuple[Array, Array]:
+        """Return times (k,) from its beginning, in s, and positions (k, 3) there; free axes are 0.
+
+        They are so close together that the greatest speed is seen.
+        """
+        shares = np.arange(_SAMPLES) / _SAMPLES
+        inner = self._knots[:-1, None] + np.diff(self._knots)[:, None] * shares
+        times = np.append(inner, self._knots[-1])
+        if self._position is None:
+            return times, np.zeros((len(times), 3))
+        return times, self._position(times)
 
     def at(self, now: float, delay: float = 0.0) -> Target:
         """Return the target at a time, in s, for a reference that smooths it.

@@ -14,6 +14,13 @@ which samples correct. A sample is compared with the state at its capture: the d
 that time, and the free one propagated back to it. The correction is propagated to the present,
 which for a linear system equals filtering again from the time of capture. The model's error grows
 with the tip's displacement, and so does the process noise of d and xi.
+
+Viscosity makes the shape follow other pressures p, which are late. The mode has inertia, and feels
+pressures that are ahead of these by a: to w' comes ``omega^2 s_v(a)``.
+
+The frequency is ``omega = (1 + e)`` times that of the model. The filter also has the derivatives of
+its state by e, with which each sample corrects e (recursive prediction error method, L. Ljung,
+System Identification, 1999, section 11.4), and the state as if e had been known.
 """
 
 from __future__ import annotations
@@ -50,6 +57,7 @@ class _PastTip(NamedTuple):
     static: Array  # (3,)
     rotation: Array  # (3, 3)
     driven: Array  # (2, 3): xi, w
+    slope: Array  # (2, 3): their derivative by the relative frequency
 
 
 @dataclass(frozen=True)
@@ -103,6 +111,12 @@ class TipEstimator:
         """Restart with an arm at rest."""
         self._past.clear()
         self._free = np.zeros((2, 3))
+        # derivatives by the relative frequency, as far as samples have changed them: of vibration
+        # and speed (2, 3), and of the offset (3,)
+        self._free_slope, self._offset_slope = np.zeros((2, 3)), np.zeros(3)
+        # relative error of the mode's frequency, and its variance
+        t = self._tuning
+        self.detuning = np.array([t.frequency_offset, t.frequency_deviation**2])
         self.offset = np.zeros(6)  # tip pose relative to the model's: d in m, and a rotation vector
         self.soft_plane = np.diag([1.0, 1.0, 0.0])  # projection on the directions of low stiffness
         self.stiff_axis = np.diag([0.0, 0.0, 1.0])  # on those of a stiffness that is far higher
@@ -154,25 +168,28 @@ class TipEstimator:
         """Whether the tracker measures orientations."""
         return self.sample is not None and self.sample.quaternion is not None
 
-    def advance(self, now: float, pressures: Array, tip: TipAt) -> None:
+    def advance(self, now: float, pressures: Array, tip: TipAt, ahead: Array | float = 0.0) -> None:
         """Predict the state at the end of a step, at the time `now`, in s.
 
-        `pressures` (n,) are effective ones, in Pa; `tip` is the model's tip there.
+        `pressures` (n,), in Pa, are those that the shape has followed; `tip` is the model's tip
+        there. The mode feels pressures that are `ahead` (n,) of these.
         """
         if self._mode is not None:
             self._update_mode(tip)
         rotation = tip.pose[:3, :3]
         if self._pressures is None:
-            self._past.append(_PastTip(now, tip.pose[:3, 3].copy(), rotation, np.zeros((2, 3))))
+            none = np.zeros((2, 3))
+            self._past.append(_PastTip(now, tip.pose[:3, 3].copy(), rotation, none, none))
         else:
             last = self._past[-1]
             self._times[1] = now - last.time  # longer than the period in a loop that is late
-            static, driven, self._free, displacements = self._predict(
-                tip.pose, tip.jacobian, last.static, last.driven, self._free, self.soft_plane,
-                pressures - self._pressures, self._times, self.excess,
+            static, driven, self._free, slope, self._free_slope, displacements = self._predict(
+                tip.pose, tip.jacobian, last.static, last.driven, self._free, last.slope,
+                self._free_slope, self.soft_plane, pressures - self._pressures, ahead, self._times,
+                self.excess,
             )  # fmt: skip
             self._displacements += displacements
-            self._past.append(_PastTip(now, static, rotation, driven))
+            self._past.append(_PastTip(now, static, rotation, driven, slope))
         self._pressures = pressures.copy()
 
     def take(self, samples: Sequence[PoseSample]) -> SampleCounts:
@@ -214,7 +231,7 @@ class TipEstimator:
         offset = np.concatenate([self.offset[:3] - shift, left])
         change, self.offset = offset - self.offset, offset
         past = [
-            _PastTip(each.time, each.static + shift, turn @ each.rotation, each.driven)
+            each._replace(static=each.static + shift, rotation=turn @ each.rotation)
             for each in self._past
         ]
         self._past.clear()
@@ -243,7 +260,7 @@ class TipEstimator:
         self.soft_plane = axes * share @ axes.T
         share = np.maximum(0.0, 1 - compliances / (self._tuning.stiff_share * compliances[2]))
         self.stiff_axis = axes * share @ axes.T
-        omega = self._mode.frequency(lateral_stiffness(compliances))
+        omega = (1 + self.detuning[0]) * self._mode.frequency(lateral_stiffness(compliances))
         self.omega = max(self._tuning.least_frequency, omega)
         self._times[0] = self.omega
         turning = rotation @ tip.compliance[3:, :3] @ rotation.T
@@ -277,6 +294,7 @@ class TipEstimator:
             before.static + share * (after.static - before.static),
             before.rotation if share < 0.5 else after.rotation,
             before.driven + share * (after.driven - before.driven),
+            before.slope + share * (after.slope - before.slope),
         )
 
     def _is_plausible(self, sample: PoseSample, past: _PastTip) -> bool:
@@ -308,11 +326,15 @@ class TipEstimator:
         elapsed = 0.0 if first else sample.time - self._used_until
         age = self._past[-1].time - past.time
         has_orientation = sample.quaternion is not None
-        self._free, offset, turn, self._covariance, self._variances = self._correct(
+        (
+            self._free, offset, turn, self._covariance, self._variances, self._free_slope,
+            self._offset_slope, self.detuning,
+        ) = self._correct(
             past.static, past.rotation, past.driven, self._free, self.offset[:3], self.offset[3:],
             self.soft_plane, self._lean, self._covariance, self._variances,
             (age, elapsed, self.omega), self._displacements, sample.position,
-            sample.quaternion if has_orientation else _NO_ROTATION, has_orientation,
+            sample.quaternion if has_orientation else _NO_ROTATION, has_orientation, past.slope,
+            self._past[-1].slope, self._free_slope, self._offset_slope, self.detuning,
         )  # fmt: skip
         self.offset = np.concatenate([offset, turn])
         self._displacements = np.zeros(2)
@@ -326,29 +348,39 @@ def _prediction(mode: BendingMode | None, n: int, damping: float) -> Formula:
     """Return the formula of one step of the state.
 
     Inputs: pose (4, 4) and Jacobian (6, n) of the model's tip, its last position (3,), driven and
-    free vibration (2, 3), soft plane (3, 3), change of the pressures (n,), (omega, duration), and
-    the mode's displacement per pressure (3, n) beyond that of the straight arm.
-    Outputs: position (3,), both vibrations, and the displacements (2,) of tip and mode.
+    free vibration (2, 3) and their slopes, soft plane (3, 3), change of the pressures (n,), by how
+    much those that the mode feels are ahead (n,), (omega, duration), and the mode's displacement
+    per pressure (3, n) beyond that of the straight arm.
+    Outputs: position (3,), both vibrations and slopes, and the displacements (2,) of tip and mode.
     """
     pose, jacobian = ca.SX.sym("pose", 4, 4), ca.SX.sym("jacobian", 6, n)
     before, change = ca.SX.sym("before", 3), ca.SX.sym("change", n)
     driven, free = ca.SX.sym("driven", 2, 3), ca.SX.sym("free", 2, 3)
     soft_plane, times = ca.SX.sym("soft_plane", 3, 3), ca.SX.sym("times", 2)
     excess = ca.SX.sym("excess", 3, n)
+    slope, free_slope = ca.SX.sym("slope", 2, 3), ca.SX.sym("free_slope", 2, 3)
+    ahead = ca.SX.sym("ahead", n)
     position, excitation = pose[:3, 3], ca.SX.zeros(3)
-    driven_after, free_after = driven, free
+    driven_after, free_after, slope_after, free_slope_after = driven, free, slope, free_slope
     if mode is not None:
-        # half of the excitation acts at the beginning of the step, half at its end
-        excitation = soft_plane @ (
-            pose[:3, :3] @ (jacobian[:3, :] @ (ca.DM(mode.participation) * change))
-        )
-        excitation += excess @ change
-        half = ca.vertcat(0.5 * excitation.T, ca.SX.zeros(1, 3))
-        F = transition(times[0], damping, times[1])
-        driven_after, free_after = F @ (driven - half) - half, F @ free
+        moves = soft_plane @ pose[:3, :3] @ jacobian[:3, :] @ ca.diag(ca.DM(mode.participation))
+        excitation, pull = (moves + excess) @ change, (moves + excess) @ ahead
+        omega, elapsed = times[0], times[1]
+        F = transition(omega, damping, elapsed)
+        # half of what acts on the mode does so at the beginning of the step, half at its end
+        half = 0.5 * ca.vertcat(-excitation.T, elapsed * omega**2 * pull.T)
+        driven_after, free_after = F @ (driven + half) + half, F @ free
+        xi, w = ca.vertsplit(0.5 * (driven + free + driven_after + free_after))
+        force = -2 * omega**2 * (xi - pull.T) - 2 * damping * omega * w
+        half = 0.5 * ca.vertcat(ca.SX.zeros(1, 3), elapsed * force)
+        slope_after, free_slope_after = F @ (slope + half) + half, F @ free_slope
     displacements = ca.vertcat(ca.norm_2(position - before), ca.norm_2(excitation))
-    inputs = [pose, jacobian, before, driven, free, soft_plane, change, times, excess]
-    outputs = [position, driven_after, free_after, displacements]
+    inputs = [
+        pose, jacobian, before, driven, free, slope, free_slope, soft_plane, change, ahead, times,
+        excess,
+    ]  # fmt: skip
+    vibrations = [driven_after, free_after, slope_after, free_slope_after]
+    outputs = [position, *vibrations, displacements]
     return Formula(inputs, outputs, [jacobian, excess])
 
 
@@ -359,8 +391,10 @@ def _correction(tuning: EstimatorTuning, vibrates: bool) -> Formula:
     Now: free vibration (2, 3), offset and turn (3,), soft plane and lean (3, 3), covariance (3, 3)
     of xi, w and d in the soft plane, variances (2,) of d along the stiff axis and of the turn.
     Of the sample: (age, time since the last sample, omega), displacements (2,) since then, position
-    (3,), quaternion (4,), and 1 if it has one. Outputs: free vibration, offset, turn, covariance
-    and variances.
+    (3,), quaternion (4,), and 1 if it has one. Slopes (2, 3) of the driven vibration at the
+    capture and now, of the free one, and of the offset (3,); and (error of the frequency, its
+    variance). Outputs: free vibration, offset, turn, covariance, variances, both slopes, and the
+    frequency's error with its variance.
     """
     t = tuning
     static, rotation = ca.SX.sym("static", 3), ca.SX.sym("rotation", 3, 3)
@@ -371,6 +405,9 @@ def _correction(tuning: EstimatorTuning, vibrates: bool) -> Formula:
     times, displacements = ca.SX.sym("times", 3), ca.SX.sym("displacements", 2)
     position, quaternion = ca.SX.sym("position", 3), ca.SX.sym("quaternion", 4)
     has_orientation = ca.SX.sym("has_orientation")
+    slope, slope_now = ca.SX.sym("slope", 2, 3), ca.SX.sym("slope_now", 2, 3)
+    free_slope, offset_slope = ca.SX.sym("free_slope", 2, 3), ca.SX.sym("offset_slope", 3)
+    detuning = ca.SX.sym("detuning", 2)
     age, elapsed, omega = times[0], times[1], times[2]
 
     # process noise, from the time and the displacement since the last sample
@@ -399,22 +436,38 @@ def _correction(tuning: EstimatorTuning, vibrates: bool) -> Formula:
     gain = PH / (H.T @ PH + noise)
     axial_gain = axial / (axial + noise)
     soft = soft_plane @ innovation if vibrates else innovation
-    free_after = free
-    if vibrates:
-        free_after = free + transition(omega, t.damping, age) @ (gain[:2] @ soft.T)
+    free_after, free_slope_after = free, free_slope
+    offset_slope_after, detuning_after = offset_slope, detuning
     offset_after = offset + gain[2] * soft + axial_gain * (innovation - soft)
+    if vibrates:
+        F = transition(omega, t.damping, age)
+        before = slope + transition(omega, t.damping, -age) @ free_slope
+        psi = soft_plane @ (before[0, :].T + offset_slope)  # of the expected position
+        free_slope_after = free_slope - F @ (gain[:2] @ psi.T)
+        offset_slope_after = offset_slope - gain[2] * psi
+        variance = detuning[1] + t.frequency_change**2 * displacements[1]
+        variance = ca.fmin(variance, t.frequency_deviation**2)
+        variance /= 1 + variance * ca.sumsqr(psi) / (H.T @ PH + noise)
+        error = detuning[0] + variance * ca.dot(psi, soft) / (H.T @ PH + noise)
+        error = ca.fmin(ca.fmax(error, -t.frequency_bound), t.frequency_bound)
+        detuning_after = ca.vertcat(error, variance)
+        change = error - detuning[0]
+        free_after = free + F @ (gain[:2] @ soft.T) + change * (slope_now + free_slope_after)
+        offset_after += change * offset_slope_after
 
     expected = _rotation(turn + lean @ vibration[0, :].T) @ rotation
     between = lie.rotation_from_quaternion(quaternion) @ expected.T
-    error = lie.rotation_vector_from_quaternion(lie.quaternion_from_rotation(between))
+    angle = lie.rotation_vector_from_quaternion(lie.quaternion_from_rotation(between))
     angular_gain = has_orientation * angular / (angular + t.angular_noise**2)
     inputs = [
         static, rotation, driven, free, offset, turn, soft_plane, lean, covariance, variances,
-        times, displacements, position, quaternion, has_orientation,
+        times, displacements, position, quaternion, has_orientation, slope, slope_now, free_slope,
+        offset_slope, detuning,
     ]  # fmt: skip
     variances_after = ca.vertcat((1 - axial_gain) * axial, (1 - angular_gain) * angular)
     outputs = [
-        free_after, offset_after, turn + angular_gain * error, P - gain @ PH.T, variances_after,
+        free_after, offset_after, turn + angular_gain * angle, P - gain @ PH.T, variances_after,
+        free_slope_after, offset_slope_after, detuning_after,
     ]  # fmt: skip
     return Formula(inputs, outputs)
 

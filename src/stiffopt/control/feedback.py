@@ -77,8 +77,9 @@ def tracking_rows(
     For an arm that vibrates there are also: its vibration and the vibration's speed (2, 3); the
     plane (3, 3) in which it moves the tip, and the Jacobian (3, n) of the tip's displacement in it,
     see `BentMode`; omega, in rad/s; gains K (3,), see `GainSchedule`; the effective pressures
-    (n,) a dead time from now; those that the reference has in the chambers then; those on the
-    reference's path; the rate of the latter (n,); and the vibration intended, as the first (2, 3).
+    (n,) a dead time from now; those that the shape has followed then; those that the reference has
+    in the chambers then; those on the reference's path; the rate of the latter (n,); and the
+    vibration intended, as the first (2, 3).
 
     Parameters
     ----------
@@ -105,14 +106,16 @@ def tracking_rows(
         intended = ca.SX.sym("intended", 2, 3)
         omega, gains = ca.SX.sym("omega"), ca.SX.sym("gains", 3)
         ahead, chamber = ca.SX.sym("ahead", n), ca.SX.sym("chamber", n)
+        strained = ca.SX.sym("strained", n)
         path, rate = ca.SX.sym("path", n), ca.SX.sym("rate", n)
-        inputs += [vibration, plane, M, omega, gains, ahead, chamber, path, rate, intended]
+        inputs += [vibration, plane, M, omega, gains, ahead, strained, chamber, path, rate]
+        inputs += [intended]
         matrices.append(M)
         later = transition(omega, damping, dead_time) @ vibration
         goal = plane @ shift
         reached = intended @ plane
         sigma = M @ (ahead - chamber) - goal
-        epsilon = M @ (ahead - path) + later[0, :].T - reached[0, :].T
+        epsilon = M @ (strained - path) + later[0, :].T - reached[0, :].T
         speed = later[1, :].T - M @ rate - reached[1, :].T
         feedback = -(gains[0] * sigma + gains[1] * epsilon + gains[2] * speed)
         shift = shift + feedback
@@ -157,6 +160,24 @@ def with_offsets(law: TrackingRows) -> TrackingRows:
         law,
         inputs=[pose, jacobian, prescribed, *others, *own],
         values=ca.substitute(law.values, correction, found),
+    )
+
+
+def with_excess(law: TrackingRows, participation: Array) -> TrackingRows:
+    """Return a feedback law that finds the Jacobian of the mode itself.
+
+    It is that of the tip's position in the plane, by the shares (n,) with which a straight arm's
+    channels take part, plus an excess (3, n), see `BentMode`, which replaces it as an input.
+    """
+    pose, jacobian, prescribed, correction, vibration, plane, mode, *others = law.inputs
+    excess = ca.SX.sym("excess", *mode.shape)
+    found = plane @ pose[:3, :3] @ jacobian[:3, :] @ ca.diag(ca.DM(participation)) + excess
+    return replace(
+        law,
+        inputs=[pose, jacobian, prescribed, correction, vibration, plane, excess, *others],
+        matrices=[jacobian, excess],
+        rows=ca.substitute(law.rows, mode, found),
+        values=ca.substitute(law.values, mode, found),
     )
 
 

@@ -73,6 +73,7 @@ class Pressing:
         self._waited = self._felt_nothing = self._within = self._off = 0.0
         self._pushed = 0.0  # how long something has pushed the tip before the approach, in s
         self._touched, self._why = False, ""
+        self._told = False  # whether the tip comes from beyond the target
         self._watch = ObstructionWatch(tuning.obstruction)
         self._free = False  # the approach has shown if the tip was free when it began
         self._blocked = False  # it was not free, or an object keeps it from the target
@@ -189,6 +190,7 @@ class Pressing:
             self._waited = self._waited + elapsed if arrived else 0.0
             self._pushed = self._pushed + elapsed if felt.touches else 0.0
             n = self.press.direction_in_base(rotation)
+            self._tell_from_where(float(n @ np.nan_to_num(tip - aim)))
             deviation = creep.deviation(n, t.foresight) / float(n @ compliance @ n)
             allowed = t.creep_share * (FELT_SHARE * self.press.force + FELT_FORCE)
             known = known and deviation <= allowed
@@ -218,6 +220,16 @@ class Pressing:
                 self._go_clear(gone, way, tip)
             elif self._shift <= 0.0:
                 self._end()
+
+    def _tell_from_where(self, beyond: float) -> None:
+        """Tell at the beginning if the tip is beyond the target, in m, where the object may be."""
+        if not self._told and beyond > self._tuning.beyond:
+            text = (
+                f"the tip begins {1e3 * beyond:.0f} mm beyond the target of its press; the object "
+                "may be in its way, and would be hit at ordinary speed"
+            )
+            self._notify("press-beyond", text)
+        self._told = True
 
     def _end(self) -> None:
         self._shift, self.phase, self.force = 0.0, Phase.ENDED, math.nan

@@ -1,8 +1,8 @@
 """The reference: a smooth path from the present pressures to those of the plan.
 
-Plans jump. Their pressures, and the tip's offset that belongs to them, pass a slew limit and four
-equal lags ``a / (s + a)``, which give a path x(t) with three derivatives. The command that makes
-the arm follow this path is ::
+Plans jump. Their pressures, and the tip's offset that belongs to them, pass a limit of the slew and
+perhaps of the tip's speed, and four equal lags ``a / (s + a)``, which give a path x(t) with three
+derivatives. The command that makes the arm follow this path is ::
 
     x_command = (1 + tau s) (1 + 2 zeta / omega s + s^2 / omega^2) x,
 
@@ -50,6 +50,8 @@ class Reference:
         self._period, self._lag, self._damping = period, lag, damping
         self._step = _step(slew * period, extra)
         self.slew_share = slew_share  # share of the slew that the pressures may use
+        # motion of the tip per pressure (3, n), over the greatest one in a step; 0: no bound
+        self.motion_share: Array = np.zeros((3, len(slew)))
         self._filter_of: tuple[float, float] | None = None  # rate and omega
         self._filter: tuple[Array, ...] = ()
         self.rate = 1.0  # a of the four lags, in 1/s
@@ -98,7 +100,7 @@ class Reference:
         if self._filter_of != (self.rate, self.omega):
             self._filter_of, self._filter = (self.rate, self.omega), self._matrices()
         self._states, self.motion, self.command, self.chamber = self._step(
-            self._states, plan, *self._filter, self.slew_share
+            self._states, plan, *self._filter, self.slew_share, self.motion_share
         )
 
     def _matrices(self) -> tuple[Array, ...]:
@@ -187,22 +189,26 @@ def _step(reach: Array, extra: int) -> Formula:
 
     Inputs: states, the first being the input of the lags; the plan (n + m,); transition
     matrix (5, 5); differences (4, 5); weights (4,) of the motion in command and chamber; the share
-    of `reach`, the greatest change of the n pressures in a step, that may be used.
+    of `reach`, the greatest change of the n pressures in a step, that may be used; the motion of
+    the tip per pressure (3, n), over the greatest one in a step, of all channels or of one.
     """
     n = len(reach)
     states, plan = ca.SX.sym("states", _LAGS + 1, n + extra), ca.SX.sym("plan", n + extra)
     transition = ca.SX.sym("transition", _LAGS + 1, _LAGS + 1)
     differences = ca.SX.sym("differences", _LAGS, _LAGS + 1)
     command, chamber = ca.SX.sym("command", _LAGS), ca.SX.sym("chamber", _LAGS)
-    slew_share = ca.SX.sym("slew_share")
+    slew_share, motion_share = ca.SX.sym("slew_share"), ca.SX.sym("motion_share", 3, n)
     way = plan.T - states[0, :]
     # all channels take the share of their way that the slowest one can cover in a step
-    needed = ca.mmax(ca.fabs(way[:n]).T / ca.DM(reach))
-    share = ca.if_else(needed > slew_share, slew_share / needed, 1)
+    steps = ca.mmax(ca.fabs(way[:n]).T / ca.DM(reach)) / slew_share
+    moved = motion_share @ ca.diag(way[:n])
+    squares = ca.vertcat(ca.sum1(moved**2).T, ca.sumsqr(ca.sum2(moved)))
+    steps = ca.fmax(steps, ca.sqrt(ca.mmax(squares)))
+    share = ca.if_else(steps > 1, 1 / steps, 1)
     begun = ca.vertcat(states[0, :] + share * way, states[1:, :])
     after = transition @ begun
     motion = differences @ after
     pressures = motion[:, :n].T
-    inputs = [states, plan, transition, differences, command, chamber, slew_share]
+    inputs = [states, plan, transition, differences, command, chamber, slew_share, motion_share]
     outputs = [after, motion, pressures @ command, pressures @ chamber]
-    return Formula(inputs, outputs, [states, after, motion])
+    return Formula(inputs, outputs, [states, motion_share, after, motion])

@@ -104,10 +104,11 @@ class PressureEstimator:
         lag, self.dead_time = _regulation(robot, control)
         self.lag = float(np.mean(lag))  # of all channels, in s
         self._robot, self._period, self.channels = robot, period, channels
+        self.lags_are_regulators = not _has_lags(robot)  # not those of the arm as well
         self._regulators = RegulatorModel(period, lag, self.dead_time, slew, tuning)
         self._lag_tuning = lag_tuning or LagTuning()
         self.lags: LagEstimator | None = None
-        if control.adaptation != "none" and not _has_lags(robot):
+        if control.adaptation != "none" and self.lags_are_regulators:
             self.lags = LagEstimator(period, lag, self.dead_time, slew, self._lag_tuning)
         self._modelled_lags = lag
         self.begin()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -26,6 +28,7 @@ from stiffopt.schema import BadKeyError
 Array = NDArray[np.float64]
 
 _SLACK = 1e-3  # Pa, for rounding at limits
+_ROUNDING = 1e-6  # share of a speed
 
 
 class Requests:
@@ -37,6 +40,8 @@ class Requests:
     ----------
     robot, limits, slew, scene, tuning :
         See `TipController`; slew (n,), in Pa/s.
+    tip_speed :
+        See `ControlSettings`.
     """
 
     def __init__(
@@ -46,7 +51,9 @@ class Requests:
         slew: Array,
         scene: Scene | None,
         tuning: ControlTuning,
+        tip_speed: float | None = None,
     ) -> None:
+        self._tip_speed = math.inf if tip_speed is None else tip_speed
         self._robot, self._limits, self._slew = robot, limits, slew
         self._scene, self._tuning = scene, tuning
 
@@ -54,6 +61,8 @@ class Requests:
         """Return the pursuit of a task, which may press or brace."""
         course: AnyCourse | None = None
         if task.press is not None:
+            if task.press.speed > self._tip_speed:
+                raise InputError(f"press.speed: {self._too_fast(task.press.speed)}")
             course = Pressing(task.press, task.target, self._tuning.pressing)
         elif task.brace is not None:
             task = self._in_the_rigs_scene(task)
@@ -62,6 +71,9 @@ class Requests:
 
     def of_target(self, target: Target, last: Pursuit, course: AnyCourse | None = None) -> Pursuit:
         """Return the pursuit of a target, with goal and limits of the last task if there is one."""
+        if isinstance(course, Course):
+            times, tips = course.sampled()
+            self._check_speed(times, np.diff(tips, axis=0)[:, :, None])
         if last.task is not None:
             return last.to(target, course)
         task = Task(robot=self._robot.description.name, target=target)
@@ -96,7 +108,8 @@ class Requests:
         Waypoints with pressures must have an equilibrium by the present model, `adapted` or not.
         """
         if isinstance(request, Trajectory) and request.pressures is not None:
-            self._check_equilibria(request.pressures, adapted)
+            times = np.array([waypoint.time for waypoint in request.waypoints])
+            self._check_speed(times, self._parts(request.pressures, adapted))
         if isinstance(request, Task):
             check_press(self._robot, self._limits, request)
             if request.brace is not None:
@@ -136,18 +149,48 @@ class Requests:
         # without its load, whose actual effect is part of the tip's offset
         return task.model_copy(update={"pressure": pressure, "load": None, "press": None})
 
-    def _check_equilibria(self, pressures: Array, adapted: Adapted | None) -> None:
-        """Refuse waypoints' pressures (k, n) at which the model has no equilibrium."""
+    def _parts(self, pressures: Array, adapted: Adapted | None) -> Array:
+        """Return the motion of the tip between waypoints by each channel (k - 1, 3, n), in m.
+
+        Refuse pressures (k, n) at which the model has no equilibrium.
+        """
         arm = self._robot if adapted is None else Manipulator(adapted.description)
-        model, tip = "adapted model" if adapted else "robot file", TipModel(arm)
+        model, tip, jacobians = "adapted model" if adapted else "robot file", TipModel(arm), []
         for index, each in enumerate(pressures):
             try:
-                tip.at(each)
+                at = tip.at(each)
             except EquilibriumError as error:
                 raise InputError(
                     f"waypoints[{index}].pressures: by the {model} the arm has no equilibrium "
                     f"there ({error}); give this waypoint other pressures, or plan again"
                 ) from None
+            jacobians.append(at.pose[:3, :3] @ at.jacobian[:3])
+        J = np.array(jacobians)
+        parts: Array = (J[1:] + J[:-1]) / 2 * np.diff(pressures, axis=0)[:, None, :]
+        return parts
+
+    def _check_speed(self, times: Array, parts: Array) -> None:
+        """Refuse waypoints at times (k,), in s, between which the arm would be too fast.
+
+        `parts` (k - 1, 3, m), in m, add up to the motion of the tip, and none may be too fast.
+        """
+        with np.errstate(all="ignore"):
+            alone = np.linalg.norm(parts, axis=1).max(axis=1)
+            together = np.linalg.norm(parts.sum(axis=2), axis=1)
+            speeds = np.maximum(alone, together) / np.diff(times)
+        if not (speeds > (1 + _ROUNDING) * self._tip_speed).any():
+            return
+        k = int(np.argmax(speeds))
+        raise InputError(
+            f"waypoints: between {times[k]:.2f} and {times[k + 1]:.2f} s "
+            f"{self._too_fast(speeds[k])}; give them more time"
+        )
+
+    def _too_fast(self, speed: float) -> str:
+        return (
+            f"the tip, or its motion by one channel, would have {1e3 * speed:.1f} mm/s; the rig "
+            f"file permits {1e3 * self._tip_speed:.1f} mm/s (control.tip_speed)"
+        )
 
     def _check_first(self, first: Array, start: Array) -> None:
         """Refuse pressures (n,) of a waypoint at 0 s that differ from the arm's start (n,)."""

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stiffopt.control.allocation import Allocation
-from stiffopt.control.feedback import GainSchedule, tracking_rows, with_offsets
+from stiffopt.control.feedback import GainSchedule, tracking_rows, with_excess, with_offsets
 from stiffopt.control.motion_error import MotionErrorEstimator
 from stiffopt.control.observer import ArmObserver
 from stiffopt.control.reference import Reference, VibrationFilter
@@ -60,13 +60,13 @@ class TipFeedback:
         self._period, self._ended = period, step_error.ended
         self._on_trajectories = MotionErrorEstimator(motion_error)
         self._motion_error = self._in_steps = MotionErrorEstimator(step_error)
-        self._mode, self._gains = mode, None
+        self._gains = None
+        law = tracking_rows(len(slew), mode is not None, control.damping, dead_time, tuning)
         if mode is not None:
             self._gains = GainSchedule(period, lag, control.damping, tuning.effort)
+            law = with_excess(law, mode.participation)
         self._allocation = Allocation(
-            with_offsets(
-                tracking_rows(len(slew), mode is not None, control.damping, dead_time, tuning)
-            ),
+            with_offsets(law),
             limits.low,
             limits.high,
             slew * period,
@@ -132,7 +132,7 @@ class TipFeedback:
         self._learn(position, follows)
         average = self._average(np.concatenate([offset, position]))
         self._allocation.limit(*limits)
-        vibration = self._vibration_inputs(tip, reference, bent)
+        vibration = self._vibration_inputs(reference, bent)
         command, held, residual = self._allocation.solve(
             (
                 tip.pose, tip.jacobian, prescribed, *vibration,
@@ -168,19 +168,17 @@ class TipFeedback:
         return self._averaged.value
 
     def _vibration_inputs(
-        self, tip: TipAt, reference: Reference, bent: BentMode | None
+        self, reference: Reference, bent: BentMode | None
     ) -> tuple[ArrayLike, ...]:
-        """Return the inputs of `tracking_rows` for an arm that vibrates."""
-        if self._mode is None or self._gains is None:
+        """Return the inputs of `tracking_rows` and `with_excess` for an arm that vibrates."""
+        if self._gains is None:
             return ()
         estimator, pressures = self._arm.tip, self._arm.pressures
         motion, n = reference.motion, len(pressures.command)
-        linear, shares = tip.pose[:3, :3] @ tip.jacobian[:3], self._mode.participation
         plane = estimator.soft_plane if bent is None else bent.plane
         return (
-            estimator.vibration, plane, plane @ (linear * shares) + estimator.excess,
-            estimator.omega,
+            estimator.vibration, plane, estimator.excess, estimator.omega,
             self._gains.at(estimator.omega), pressures.effective_ahead,
-            reference.chamber, motion[0, :n], motion[1, :n],
+            self._arm.strained_ahead, reference.chamber, motion[0, :n], motion[1, :n],
             motion[:2, n : n + 3] - self._averaged.motion[:, :3],
         )  # fmt: skip

@@ -26,6 +26,15 @@ class EstimatorTuning:
     # growth of the standard deviation of the vibration's speed, in m/s / sqrt(s)
     agitation: float = 2e-3
     frequency_error: float = 0.1  # relative error of the square of the vibration's frequency
+    # the same of the frequency itself, as it is learned in motion: its mean (hysteresis slips in a
+    # large motion, so that it is slower than a small swing), deviation, random change with the way
+    # of the mode, in 1 / sqrt(m), and largest size
+    frequency_offset: float = -0.025
+    frequency_deviation: float = 0.03
+    frequency_change: float = 0.1
+    frequency_bound: float = 0.15
+    # time by which viscosity makes the tip late, except in the first mode, in s
+    viscous_lag: float = 0.035
     damping: float = 0.04  # damping ratio of the vibration
     memory: float = 0.4  # age beyond which a sample is dropped, in s
     # compliance, as a share of the largest, below which a direction vibrates less
@@ -104,7 +113,7 @@ class ReferenceTuning:
     """Bandwidth of the reference filter."""
 
     # rate of its lags over the angular frequency of an arm that vibrates
-    vibrating_rate: float = 1.4
+    vibrating_rate: float = 1.7
     # largest rate of its lags, and that of an arm that does not vibrate, in 1/s
     rigid_rate: float = 100.0
     # share of the slew that the reference may take; the rest is for feedback
@@ -505,6 +514,7 @@ class PressingTuning:
     # motion of the arm without contact for it, in m
     clear: float = 3e-3
     most_back: float = 0.03
+    beyond: float = 2e-3  # distance of the tip beyond the target that an event reports, in m
     obstruction: ObstructionTuning = field(default_factory=ObstructionTuning)
 
 

@@ -249,6 +249,12 @@ def _check_against(description: RigDescription, robot: RobotDescription) -> None
                     "safety",
                     "max_pressure",
                 )
+    speed, plausible = description.control.tip_speed, description.safety.max_tip_speed
+    if speed is not None and speed > plausible:
+        raise MisfitError(
+            f"{1e3 * speed:g} mm/s is above safety.max_tip_speed, {1e3 * plausible:g} mm/s",
+            *("control", "tip_speed"),
+        )
     tracker = description.tracker
     if tracker is not None:
         try:

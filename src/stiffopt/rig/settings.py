@@ -113,6 +113,9 @@ class ControlSettings(Schema):
     solver : solver of each tick's small quadratic program.
     adaptation : ``auto``: the model's numbers are adapted to where the tip is seen at rest;
         ``none``: they are not.
+    tip_speed : speed that neither the tip nor the part of its motion by any channel exceeds on the
+        way to a plan, in m/s, so that a fault that only the tip shows moves it less before it is
+        told. Feedback comes on top. None: the slew alone bounds it.
     """
 
     regulator_lag: Annotated[Duration, Field(ge=0, le=2)] = 0.06
@@ -123,6 +126,7 @@ class ControlSettings(Schema):
     frequency: Annotated[Frequency, Field(gt=0, le=50)] | None = None
     solver: Literal["daqp", "osqp"] = "daqp"
     adaptation: Literal["auto", "none"] = "auto"
+    tip_speed: Annotated[Speed, Field(gt=0)] | None = None
 
 
 class ServiceSettings(Schema):
