@@ -287,8 +287,9 @@ def rows_of(
 def report(rows: list[dict[str, Any]]) -> None:
     """Print the table."""
     head = ["arm", "tangential and normal force, mN", "slides in 20 s, mm", "grows, 1/s",
-            "told within 0.3 s, mm", "by the position alone", "after a slide of 0.1, 0.3, 0.5 mm, s",
-            "told of those drawn, expected", "false"]  # fmt: skip
+            "told within 0.3 s, mm", "by the position alone",
+            "after a slide of 0.1, 0.3, 0.5 mm, s", "told of those drawn, expected",
+            "false"]  # fmt: skip
     lines = [
         [
             f"{row['arm']}", f"{1e3 * row['used']:.0f}, {1e3 * row['pressed']:.0f}",
