@@ -583,27 +583,6 @@ def test_what_cannot_be_held_or_felt_is_refused(press: Press, why: str) -> None:
 
 
 @pytest.mark.usefixtures("compiled")
-def test_a_press_must_be_possible_in_all_of_its_travel() -> None:
-    """Up and sideways, where the arm is as short as without pressure."""
-    limits, target = limits_of(*_rig()), Target(position=(0.0336, 0.0203, 0.1899))
-    controller = TipController(HANGING, limits, np.full(6, 5e5), period=0.01, vibrates=False)
-
-    def press(travel: float) -> Press:
-        return Press(force=0.0228, direction=(0.73, 0.15, -0.667), travel=travel)
-
-    with pytest.raises(InputError, match=r"press\.travel: .* 22\.8 mN up to 4 mm .* not at 10 mm"):
-        controller.check_ahead(asked(target=target, press=press(0.01)))
-    controller.check_ahead(asked(target=target, press=press(0.004)))
-    controller.close()
-    at, n = np.array(target.position), np.array(press(0.01).direction)
-    for way, holds in ((0.004, True), (0.005, False)):  # by another search
-        moved = target.model_copy(update={"position": tuple((at + way * n).tolist())})
-        assert (
-            PressureSolver(HANGING, asked(target=moved, press=press(0.01))).solve().found is holds
-        )
-
-
-@pytest.mark.usefixtures("compiled")
 def test_a_pose_out_of_reach_is_no_fault_of_the_press() -> None:
     solution = PressureSolver(HANGING, asked(target=Target(position=(0.2, 0.0, 0.195)))).solve()
     assert not solution.found
