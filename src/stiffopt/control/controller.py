@@ -551,12 +551,13 @@ class TipController:
         course, tip = self.replanner.pursuit.course, self._arm.modelled
         if not isinstance(course, Pressing) or tip is None:
             return
-        R = tip.pose[:3, :3]
+        R, plan = tip.pose[:3, :3], self.replanner.current
+        short = np.zeros(3) if plan is None else np.array(plan.short)
         elapsed = min(now - self._computed_at, _HELD * self._period)
         course.advance(
             elapsed, self._rests(now), self._is_known(now), self._arm.tip.estimate.position,
             self._arm.tip.offset, self._arm.touch.felt, self._arm.touch.creep,
-            R, R @ tip.compliance[:3, :3] @ R.T,
+            R, R @ tip.compliance[:3, :3] @ R.T, short,
         )  # fmt: skip
 
     def _is_known(self, now: float) -> bool:

@@ -506,6 +506,7 @@ class PressingTuning:
     # how much more the tip may be held back, in m
     most_force: float = 1.6
     held_back: float = 2e-3
+    out_of_reach: float = 2e-3  # distance of the arm's nearest pose that ends the press, in m
     settled: float = 0.5  # time within the tolerance after which an event reports it, in s
     patience: float = 5.0  # time beyond the tolerance after which there is an alarm, in s
     # way of the arm without contact, in m, on which the tip follows by at least this share, unless
