@@ -103,6 +103,9 @@ class TipEstimator:
         self._orientation = _orientation()
         self.omega = math.inf  # of the vibration, in rad/s; infinite before it is known
         self._times = np.array([1.0, period])  # omega, and duration of the step
+        # the model's compliance (6, 6) for which the following numbers are; see `_directions_of`
+        self._compliance: Array | None = None
+        self._directions, self._stiffness = np.zeros((3, 3, 3)), 0.0
         # displacement (3, n) of the mode per pressure beyond that of the straight arm, in m/Pa
         self.excess: Array = np.zeros((3, n))
         self.begin()
@@ -252,19 +255,25 @@ class TipEstimator:
         self._ticks += 1
         if self._ticks % _MODE_EVERY != 1 or self._mode is None:
             return
+        if tip.compliance is not self._compliance:
+            self._compliance = tip.compliance
+            self._directions, self._stiffness = self._directions_of(tip.compliance)
         rotation = tip.pose[:3, :3]
-        linear = rotation @ tip.compliance[:3, :3] @ rotation.T
-        compliances, axes = np.linalg.eigh(linear)
-        # in a strongly bent arm no direction is entirely stiff
-        share = np.minimum(1.0, compliances / (self._tuning.soft_share * compliances[2]))
-        self.soft_plane = axes * share @ axes.T
-        share = np.maximum(0.0, 1 - compliances / (self._tuning.stiff_share * compliances[2]))
-        self.stiff_axis = axes * share @ axes.T
-        omega = (1 + self.detuning[0]) * self._mode.frequency(lateral_stiffness(compliances))
+        self.soft_plane, self.stiff_axis, self._lean = rotation @ self._directions @ rotation.T
+        omega = (1 + self.detuning[0]) * self._mode.frequency(self._stiffness)
         self.omega = max(self._tuning.least_frequency, omega)
         self._times[0] = self.omega
-        turning = rotation @ tip.compliance[3:, :3] @ rotation.T
-        self._lean = turning @ axes[:, 1:] @ np.diag(1 / compliances[1:]) @ axes[:, 1:].T
+
+    def _directions_of(self, compliance: Array) -> tuple[Array, float]:
+        """Return soft plane, stiff axis and lean (3, 3, 3), tip axes, and the lateral stiffness."""
+        compliances, axes = np.linalg.eigh(compliance[:3, :3])
+        # in a strongly bent arm no direction is entirely stiff
+        share = np.minimum(1.0, compliances / (self._tuning.soft_share * compliances[2]))
+        soft_plane = axes * share @ axes.T
+        share = np.maximum(0.0, 1 - compliances / (self._tuning.stiff_share * compliances[2]))
+        stiff_axis = axes * share @ axes.T
+        lean = compliance[3:, :3] @ (axes[:, 1:] / compliances[1:] @ axes[:, 1:].T)
+        return np.stack([soft_plane, stiff_axis, lean]), lateral_stiffness(compliances)
 
     def _amplitude(self, vibration: Array) -> float:
         """Return the amplitude of a vibration (2, 3), in m."""

@@ -17,6 +17,7 @@ has rows of its own.
 
 from __future__ import annotations
 
+from bisect import bisect
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -32,7 +33,7 @@ from stiffopt.optimise.target import Target
 Array = NDArray[np.float64]
 Symbols = Any  # of CasADi
 
-_FREQUENCIES = np.geomspace(2.0, 200.0, 60)  # rad/s, of the table of gains
+_FREQUENCIES = np.geomspace(2.0, 200.0, 60).tolist()  # rad/s, of the table of gains
 
 
 @dataclass(frozen=True)
@@ -196,8 +197,10 @@ class GainSchedule:
     def at(self, omega: float) -> Array:
         """Return gains (3,) at an angular frequency in rad/s; the last gain is in s."""
         if omega != self._last[0]:
-            columns = [np.interp(omega, _FREQUENCIES, column) for column in self._table.T]
-            self._last = omega, np.array(columns)
+            above = min(max(bisect(_FREQUENCIES, omega), 1), len(_FREQUENCIES) - 1)
+            low, high = _FREQUENCIES[above - 1 : above + 1]
+            share = min(max((omega - low) / (high - low), 0.0), 1.0)
+            self._last = omega, (1 - share) * self._table[above - 1] + share * self._table[above]
         return self._last[1]
 
 
