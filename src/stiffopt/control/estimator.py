@@ -372,8 +372,11 @@ def _prediction(mode: BendingMode | None, n: int, damping: float) -> Formula:
     position, excitation = pose[:3, 3], ca.SX.zeros(3)
     driven_after, free_after, slope_after, free_slope_after = driven, free, slope, free_slope
     if mode is not None:
-        moves = soft_plane @ pose[:3, :3] @ jacobian[:3, :] @ ca.diag(ca.DM(mode.participation))
-        excitation, pull = (moves + excess) @ change, (moves + excess) @ ahead
+        excitation, pull = (
+            soft_plane @ (pose[:3, :3] @ (jacobian[:3, :] @ (ca.DM(mode.participation) * p)))
+            + excess @ p
+            for p in (change, ahead)
+        )
         omega, elapsed = times[0], times[1]
         F = transition(omega, damping, elapsed)
         # half of what acts on the mode does so at the beginning of the step, half at its end

@@ -98,7 +98,7 @@ def tracking_rows(
     pose, jacobian = ca.SX.sym("pose", 4, 4), ca.SX.sym("jacobian", 6, n)
     prescribed, correction = ca.SX.sym("prescribed", 5), ca.SX.sym("correction", 6)
     rotation, shift, turn = pose[:3, :3], correction[:3], correction[3:]
-    linear, angular = rotation @ jacobian[:3, :], rotation @ jacobian[3:, :]
+    linear, angular = rotation @ jacobian[:3, :], jacobian[3:, :]  # base axes, tip axes
     inputs, mode_rows, mode_values = [pose, jacobian, prescribed, correction], [], []
     matrices = [jacobian]
     if vibrates:
@@ -121,14 +121,14 @@ def tracking_rows(
         feedback = -(gains[0] * sigma + gains[1] * epsilon + gains[2] * speed)
         shift = shift + feedback
         mode_rows, mode_values = [mode_weight * M], [mode_weight * (goal + feedback)]
-    axis = rotation[:, 2]
-    sideways = ca.SX.eye(3) - axis @ axis.T
+    turn = rotation.T @ turn
     position = ca.diag(prescribed[:3])
     pointing, orientation = lever * prescribed[3], lever * prescribed[4]
-    task = [position @ linear, pointing * (sideways @ angular), orientation * angular]
-    values = [position @ shift, pointing * (sideways @ turn), orientation * turn]
+    # turning about the tip's own axis leaves its direction as it is
+    task = [position @ linear, pointing * angular[:2, :], orientation * angular]
+    values = [position @ shift, pointing * turn[:2], orientation * turn]
     rows = ca.vertcat(*task, *mode_rows)
-    return TrackingRows(inputs, matrices, rows, ca.vertcat(*values, *mode_values), linear, 9)
+    return TrackingRows(inputs, matrices, rows, ca.vertcat(*values, *mode_values), linear, 8)
 
 
 def with_offsets(law: TrackingRows) -> TrackingRows:
@@ -172,7 +172,7 @@ def with_excess(law: TrackingRows, participation: Array) -> TrackingRows:
     """
     pose, jacobian, prescribed, correction, vibration, plane, mode, *others = law.inputs
     excess = ca.SX.sym("excess", *mode.shape)
-    found = plane @ pose[:3, :3] @ jacobian[:3, :] @ ca.diag(ca.DM(participation)) + excess
+    found = plane @ law.linear @ ca.diag(ca.DM(participation)) + excess
     return replace(
         law,
         inputs=[pose, jacobian, prescribed, correction, vibration, plane, excess, *others],
