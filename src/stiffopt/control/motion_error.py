@@ -13,6 +13,8 @@ noise, so it has one covariance (4, 4).
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -51,11 +53,13 @@ class MotionErrorEstimator:
             self._mean = np.vstack([np.zeros((3, 3)), offset])
             self._covariance = np.diag([t.deviation**2] * 3 + [t.noise**2])
         elif self._elapsed >= t.every:
-            P, h = self._covariance, np.append(position - self._start, 1.0)
-            speed = float(np.linalg.norm(position - self._last)) / self._elapsed
+            P, h = self._covariance, np.ones(4)
+            h[:3] = position - self._start
+            speed = math.dist(position, self._last) / self._elapsed
             P[3, 3] += t.drift**2 * self._elapsed
-            gain = P @ h / (h @ P @ h + t.noise**2 + (t.late * speed) ** 2)
-            self._mean = self._mean + np.outer(gain, offset - h @ self._mean)
-            self._covariance = P - np.outer(gain, h @ P)
+            seen_with = P @ h
+            gain = seen_with / (h @ seen_with + t.noise**2 + (t.late * speed) ** 2)
+            self._mean = self._mean + gain[:, None] * (offset - h @ self._mean)
+            self._covariance = P - gain[:, None] * seen_with
             self.slope = self._mean[:3].T
             self._last, self._elapsed = position.copy(), 0.0

@@ -114,6 +114,7 @@ class VibrationFilter:
     def __init__(self, period: float, damping: float, m: int) -> None:
         self._period, self._damping = period, damping
         self._kept = 2 * math.ceil(_LONGEST / period) + 4
+        self._times = np.arange(float(self._kept))  # in steps
         self.begin(np.zeros(m))
 
     def begin(self, values: Array) -> None:
@@ -148,18 +149,18 @@ class VibrationFilter:
             return np.array([[1.0, 0.0], [1.0, 0.0], [1 / self._period, -1 / self._period]])
         decay = self._damping * omega * self._period
         later = 1 / (1 + math.exp(decay * half))
-        k, quarter = int(half) + 2, int(half / 2)
-        rows = np.zeros((2, k))  # two steps, and the path of the mode
-        rows[0, 0] = 1 - later
-        rows[0, -2:] += later * (1 - half % 1), later * (half % 1)
-        times: Array = np.arange(float(k))
-        mode = np.exp(-decay * times) * np.maximum(np.sin(math.pi / half * times), 0.0)
-        rows[1] = mode / mode.sum()
+        k, quarter, share = int(half) + 2, int(half / 2), half / 2 % 1
+        rows = np.zeros((2, k))  # halves of the two steps, and of the path of the mode
+        rows[0, 0] = 0.5 * (1 - later)
+        rows[0, -2] += 0.5 * later * (1 - half % 1)
+        rows[0, -1] = 0.5 * later * (half % 1)
+        mode = np.exp((1j * math.pi / half - decay) * self._times[: k - 1]).imag
+        rows[1, :-1] = 0.5 / mode.sum() * mode
         weights = np.zeros((3, k + quarter + 1))
-        average, share = weights[:2], half / 2 % 1
-        average[:, :k] = 0.5 * rows
-        average[:, quarter : quarter + k] += 0.5 * (1 - share) * rows
-        average[:, quarter + 1 :] += 0.5 * share * rows
+        average = weights[:2]  # of these rows, and the same a quarter later
+        average[:, :k] = rows
+        average[:, quarter:-1] += (1 - share) * rows
+        average[:, quarter + 1 :] += share * rows
         weights[2] = average[1] / self._period
         weights[2, 1:] -= average[1, :-1] / self._period
         return weights
