@@ -267,13 +267,19 @@ class TipEstimator:
     def _directions_of(self, compliance: Array) -> tuple[Array, float]:
         """Return soft plane, stiff axis and lean (3, 3, 3), tip axes, and the lateral stiffness."""
         compliances, axes = np.linalg.eigh(compliance[:3, :3])
-        # in a strongly bent arm no direction is entirely stiff
-        share = np.minimum(1.0, compliances / (self._tuning.soft_share * compliances[2]))
-        soft_plane = axes * share @ axes.T
-        share = np.maximum(0.0, 1 - compliances / (self._tuning.stiff_share * compliances[2]))
-        stiff_axis = axes * share @ axes.T
-        lean = compliance[3:, :3] @ (axes[:, 1:] / compliances[1:] @ axes[:, 1:].T)
-        return np.stack([soft_plane, stiff_axis, lean]), lateral_stiffness(compliances)
+        _, second, softest = values = compliances.tolist()
+        least, most = self._tuning.stiff_share * softest, self._tuning.soft_share * softest
+        weights = np.array(
+            [
+                # in a strongly bent arm no direction is entirely stiff
+                [min(1.0, value / most) for value in values],
+                [max(0.0, 1 - value / least) for value in values],
+                [0.0, 1 / second, 1 / softest],
+            ]
+        )
+        directions = axes * weights[:, None] @ axes.T
+        directions[2] = compliance[3:, :3] @ directions[2]
+        return directions, lateral_stiffness(compliances)
 
     def _amplitude(self, vibration: Array) -> float:
         """Return the amplitude of a vibration (2, 3), in m."""

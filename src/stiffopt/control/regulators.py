@@ -144,7 +144,7 @@ class PressureEstimator:
             self.effective = self._memory.advance(steps * self._period, self.chamber)
         self.history_offset = self.effective - self.chamber
         self.effective_ahead = self._regulators.ahead + self.history_offset
-        self.command_offset = self.history_offset + self.channels.compensated(offset)
+        self.command_offset = self.history_offset + self.channels.compensated
 
     def adapt(self) -> bool:
         """Use the adapted lags from now on, at rest; return whether that changes anything."""
