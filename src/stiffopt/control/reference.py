@@ -149,20 +149,23 @@ class VibrationFilter:
             return np.array([[1.0, 0.0], [1.0, 0.0], [1 / self._period, -1 / self._period]])
         decay = self._damping * omega * self._period
         later = 1 / (1 + math.exp(decay * half))
-        k, quarter, share = int(half) + 2, int(half / 2), half / 2 % 1
-        rows = np.zeros((2, k))  # halves of the two steps, and of the path of the mode
-        rows[0, 0] = 0.5 * (1 - later)
-        rows[0, -2] += 0.5 * later * (1 - half % 1)
-        rows[0, -1] = 0.5 * later * (half % 1)
-        mode = np.exp((1j * math.pi / half - decay) * self._times[: k - 1]).imag
-        rows[1, :-1] = 0.5 / mode.sum() * mode
-        weights = np.zeros((3, k + quarter + 1))
-        average = weights[:2]  # of these rows, and the same a quarter later
-        average[:, :k] = rows
-        average[:, quarter:-1] += (1 - share) * rows
-        average[:, quarter + 1 :] += share * rows
-        weights[2] = average[1] / self._period
-        weights[2, 1:] -= average[1, :-1] / self._period
+        whole, quarter = int(half), int(half / 2)
+        mode = np.exp((1j * math.pi / half - decay) * self._times[: whole + 1]).imag
+        mode /= mode.sum()
+        steps = (
+            (0, 1 - later),
+            (whole, later * (1 - half % 1)),
+            (whole + 1, later * (half % 1)),
+        )
+        weights = np.zeros((3, whole + quarter + 3))
+        # the mean of two values a quarter of T apart, between two samples in part
+        share = half / 2 % 1
+        for delay, part in ((0, 0.5), (quarter, 0.5 * (1 - share)), (quarter + 1, 0.5 * share)):
+            for at, height in steps:
+                weights[0, delay + at] += part * height
+            weights[1, delay : delay + whole + 1] += part * mode
+        weights[2] = weights[1] / self._period
+        weights[2, 1:] -= weights[1, :-1] / self._period
         return weights
 
 
