@@ -24,7 +24,9 @@ from stiffopt.paths.leaning import BraceApproach
 Array = NDArray[np.float64]
 Symbols = Any  # of CasADi
 
-_AHEAD = 0.8  # share of the range by which an operating point is ahead
+# share of the range by which an operating point is ahead of pressures that have just left the last
+# one's; less for faster ones, and none for those that leave a range in every step anyway
+_AHEAD = 0.7
 
 
 class LeaningTip:
@@ -198,6 +200,6 @@ def _linearisation(low: Array, high: Array, length: float, linear_range: float) 
     change = p - point
     scaled = ca.vertcat(jacobian[:3, :] / length, jacobian[3:, :])
     motion = ca.norm_2(change) * ca.norm_fro(scaled)
-    ahead = within(p + _AHEAD * ca.fmin(1, linear_range / motion) * change)
+    ahead = within(p + _AHEAD * ca.fmax(2 * linear_range / motion - 1, 0) * change)
     outputs = [p, motion, pose @ lie.exp(jacobian @ change), ahead]
     return Formula([pressures, point, pose, jacobian], outputs, [jacobian])
