@@ -401,6 +401,13 @@ def calibrated_file(case: Case, folder: Path) -> RobotDescription:
     return load_description(path)
 
 
+def believed_file(case: Case, folder: Path, *, true: bool) -> RobotDescription:
+    """The robot file of a case's arm with its true values, or as `calibrated_file`."""
+    if true:
+        return with_true_values(case.robot, case.description.plant.mismatch)
+    return calibrated_file(case, folder)
+
+
 def with_calibrated_file(case: Case, folder: Path) -> Case:
     """The case whose controller gets that file."""
     return replace(case, believed=calibrated_file(case, folder))

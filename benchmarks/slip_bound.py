@@ -45,8 +45,7 @@ from numpy.typing import NDArray
 from scipy.stats import norm
 
 from brace_hold import LONGEST, SLIDES, WITHIN, Held, Slide, leant
-from calibration import with_true_values
-from control_cases import calibrated_file, draw_case
+from control_cases import believed_file, draw_case
 from report import table
 from stiffopt import lie
 from stiffopt.plant.plant import SimulationError
@@ -239,12 +238,7 @@ def main() -> None:
     rows: list[dict[str, Any]] = []
     for arm in given.arms:
         case = draw_case(arm, ranked=False)
-        mismatch = case.description.plant.mismatch
-        believed = (
-            with_true_values(case.robot, mismatch)
-            if given.true
-            else calibrated_file(case, given.keep)
-        )
+        believed = believed_file(case, given.keep, true=given.true)
         count = number = 0
         while count < given.tasks and number < 8 * given.tasks:
             number += 1

@@ -251,10 +251,8 @@ def inside(name: str, seed: int, dynamics: str, found: Found) -> None:
     if drawn is None:
         return
     task, pose, way = drawn
-    stiffness, deep = (
-        float(np.exp(rng.uniform(np.log(100), np.log(2000)))),
-        rng.uniform(5e-4, DEEPEST),
-    )
+    stiffness = float(np.exp(rng.uniform(np.log(100), np.log(2000))))
+    deep = rng.uniform(5e-4, DEEPEST)
     with Arm(name, seed, dynamics, surface_at(pose, way, -deep, stiffness)) as arm:
         arm.controller.set_task(task)
         course, forces, why = arm.controller.replanner.pursuit.course, [], ""

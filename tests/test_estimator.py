@@ -102,6 +102,7 @@ def pressures(k):
 
 def follow(estimator, truth, ticks, noise, latency, every=0.025, jitter=0.0, seed=1, spoil=None):
     """Let both run; return errors (ticks, 3) of the estimated position."""
+    estimator.learns = True
     rng = np.random.default_rng(seed)
     waiting, errors, due, frame = [], [], every, 0
     for k in range(1, ticks + 1):
@@ -251,6 +252,38 @@ def test_a_frequency_that_is_far_off_stays_within_its_bound():
     follow(estimator, Truth(), 1000, 5e-5, 0.025)
     assert -settings.frequency_bound <= estimator.detuning[0] < -0.9 * settings.frequency_bound
     assert estimator.omega >= (1 - settings.frequency_bound) * 1.1 * OMEGA
+
+
+def test_what_shakes_the_arm_does_not_change_its_frequency_while_it_is_to_rest():
+    settings = replace(PLAIN, frequency_deviation=0.05)
+    for learns in (True, False):
+        estimator = TipEstimator(PERIOD, 2, SWINGING, settings)
+        estimator.set_frequency(OMEGA, tip_at(np.zeros(2)))
+        follow(estimator, Truth(), 200, 5e-5, 0.025)
+        estimator.learns, known = learns, estimator.detuning[0]
+        for k in range(201, 1200):
+            estimator.advance(k * PERIOD, pressures(200), tip_at(pressures(200)))
+            shaken = np.array([2e-3 * math.sin(0.5 * OMEGA * k * PERIOD), 0.0, 0.0])
+            estimator.take([sample(k * PERIOD, BASE + J @ pressures(200) + shaken)])
+        assert estimator.frequency_is_bounded is learns
+        assert (estimator.detuning[0] == known) is not learns
+
+
+def test_a_model_of_another_frequency_keeps_what_samples_have_told_of_it():
+    """Independent: two normal likelihoods of the frequency, one of the prior, one of samples."""
+    settings = replace(PLAIN, frequency_offset=-0.025, frequency_deviation=0.03)
+    for told, ratio in [(0.0, 0.9), (0.01, 0.9), (0.01, 1.05)]:  # deviation by samples, in parts
+        estimator = TipEstimator(PERIOD, 2, SWINGING, settings)
+        prior, seen = np.array([settings.frequency_offset, 0.03**-2]), np.array([-0.06, 0.0])
+        if told:
+            seen[1] = told**-2
+        precision = prior[1] + seen[1]
+        mean = (prior[0] * prior[1] + seen[0] * seen[1]) / precision
+        estimator.detuning = np.array([mean, 1 / precision])
+        estimator.change_frequency(OMEGA, ratio * OMEGA)
+        seen[0] = (1 + seen[0]) / ratio - 1  # the same frequency
+        expected = (prior[0] * prior[1] + seen[0] * seen[1]) / precision
+        assert estimator.detuning == pytest.approx([expected, 1 / precision], abs=2e-3)
 
 
 @pytest.mark.parametrize("lag", [0.02, 0.06])

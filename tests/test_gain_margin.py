@@ -52,6 +52,7 @@ def swing(
     samples: list[PoseSample] = []
     for tick in range(round(duration / PERIOD)):
         now, pose = tick * PERIOD, np.eye(4)
+        estimator.learns = now < LEARNS.swings_on  # as after a motion
         pose[:3, 3] = p, 0.0, 0.18
         estimator.advance(now, np.array([p]), TipAt(pose, jacobian, compliance))
         estimator.take([s for s in samples if s.time + LATENCY <= now + 1e-9])

@@ -165,6 +165,7 @@ class TipController:
         self._feedback.begin()
         self._permitted = self.limits.low, self.limits.high  # commands (n,) that the task permits
         self._at_rest = True  # the reference begins at the present pressures
+        self._moved_at = -math.inf  # last time at which the reference moved
         self._computed_at = now
         self._adapted_at = -math.inf  # last adaptation of the model since the last request
         self._went_back_at = -math.inf  # last return to an earlier model
@@ -368,6 +369,9 @@ class TipController:
         reference.omega = self._arm.tip.omega
         reference.motion_share = self._motion_share(reference.path[:n])
         reference.advance(self._awaited(plan, now))
+        if self._moves():
+            self._moved_at = now
+        self._arm.tip.learns = now - self._moved_at < self._tuning.estimator.swings_on
         if self._arm.leaning is not None:
             return self._feedforward(reference.command - pressures.command_offset, last)
         tip = self._arm.on_path(reference.path[:n])

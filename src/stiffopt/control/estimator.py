@@ -105,9 +105,13 @@ class TipEstimator:
         self._times = np.array([1.0, period])  # omega, and duration of the step
         # the model's compliance (6, 6) for which the following numbers are; see `_directions_of`
         self._compliance: Array | None = None
-        self._directions, self._stiffness = np.zeros((3, 3, 3)), 0.0
+        self._directions: Array = np.zeros((3, 3, 3))
+        self._principal: Array = np.zeros(3)
         # displacement (3, n) of the mode per pressure beyond that of the straight arm, in m/Pa
         self.excess: Array = np.zeros((3, n))
+        # whether samples correct the frequency: only while a planned motion swings the arm, since
+        # what shakes it from outside has another frequency
+        self.learns = False
         self.begin()
 
     def begin(self) -> None:
@@ -165,6 +169,18 @@ class TipEstimator:
     def deviation(self) -> float:
         """Standard deviation of the offset's position along the axis where it is largest, in m."""
         return math.sqrt(max(float(self._covariance[2, 2]), float(self._variances[0])))
+
+    @property
+    def frequency_factor(self) -> tuple[float, float]:
+        """The vibration's frequency over that of the model, and its standard deviation."""
+        error, variance = self.detuning.tolist()
+        return 1 + error, math.sqrt(variance)
+
+    @property
+    def frequency_is_bounded(self) -> bool:
+        """Whether the frequency is as far from the model's as the estimator permits."""
+        error = abs(float(self.detuning[0]))
+        return self._mode is not None and error >= self._tuning.frequency_bound
 
     @property
     def turn_known(self) -> bool:
@@ -250,6 +266,30 @@ class TipEstimator:
             compliances = np.linalg.eigvalsh(tip.compliance[:3, :3])
             self._mode = self._mode.at_frequency(omega, lateral_stiffness(compliances))
 
+    def frequency_at(self, tip: TipAt) -> float:
+        """Return the model's frequency, in rad/s, where its tip is `tip`; NaN without vibration."""
+        return self._modelled_frequency(np.linalg.eigvalsh(tip.compliance[:3, :3]))
+
+    def _modelled_frequency(self, compliances: NDArray[Any]) -> float:
+        if self._mode is None:
+            return math.nan
+        omega = self._mode.frequency(lateral_stiffness(compliances))
+        return max(self._tuning.least_frequency, omega)
+
+    def change_frequency(self, before: float, after: float) -> None:
+        """Change e with the model's frequency, in rad/s, at the present configuration.
+
+        What samples have told of the frequency stays. The prior goes with the model. So e takes up
+        a share of the change: one less its variance over that of the prior.
+        """
+        if self._mode is None:
+            return
+        error, variance = self.detuning
+        t = self._tuning
+        told = 1 - variance / t.frequency_deviation**2 if t.frequency_deviation > 0 else 0.0
+        error += told * (1 + error) * (before / after - 1)
+        self.detuning = np.array([np.clip(error, -t.frequency_bound, t.frequency_bound), variance])
+
     def _update_mode(self, tip: TipAt) -> None:
         """Update frequency, soft plane and lean from the compliance, every few steps."""
         self._ticks += 1
@@ -257,15 +297,14 @@ class TipEstimator:
             return
         if tip.compliance is not self._compliance:
             self._compliance = tip.compliance
-            self._directions, self._stiffness = self._directions_of(tip.compliance)
+            self._directions, self._principal = self._directions_of(tip.compliance)
         rotation = tip.pose[:3, :3]
         self.soft_plane, self.stiff_axis, self._lean = rotation @ self._directions @ rotation.T
-        omega = (1 + self.detuning[0]) * self._mode.frequency(self._stiffness)
-        self.omega = max(self._tuning.least_frequency, omega)
-        self._times[0] = self.omega
+        omega = (1 + self.detuning[0]) * self._modelled_frequency(self._principal)
+        self._times[0] = self.omega = omega
 
-    def _directions_of(self, compliance: Array) -> tuple[Array, float]:
-        """Return soft plane, stiff axis and lean (3, 3, 3), tip axes, and the lateral stiffness."""
+    def _directions_of(self, compliance: Array) -> tuple[Array, Array]:
+        """Return soft plane, stiff axis, lean (3, 3, 3), tip axes, and principal compliances."""
         compliances, axes = np.linalg.eigh(compliance[:3, :3])
         _, second, softest = values = compliances.tolist()
         least, most = self._tuning.stiff_share * softest, self._tuning.soft_share * softest
@@ -279,7 +318,7 @@ class TipEstimator:
         )
         directions = axes * weights[:, None] @ axes.T
         directions[2] = compliance[3:, :3] @ directions[2]
-        return directions, lateral_stiffness(compliances)
+        return directions, compliances
 
     def _amplitude(self, vibration: Array) -> float:
         """Return the amplitude of a vibration (2, 3), in m."""
@@ -347,7 +386,7 @@ class TipEstimator:
         ) = self._correct(
             past.static, past.rotation, past.driven, self._free, self.offset[:3], self.offset[3:],
             self.soft_plane, self._lean, self._covariance, self._variances,
-            (age, elapsed, self.omega), self._displacements, sample.position,
+            (age, elapsed, self.omega, self.learns), self._displacements, sample.position,
             sample.quaternion if has_orientation else _NO_ROTATION, has_orientation, past.slope,
             self._past[-1].slope, self._free_slope, self._offset_slope, self.detuning,
         )  # fmt: skip
@@ -408,11 +447,12 @@ def _correction(tuning: EstimatorTuning, vibrates: bool) -> Formula:
     Inputs at the capture: the model's position (3,) and rotation (3, 3), driven vibration (2, 3).
     Now: free vibration (2, 3), offset and turn (3,), soft plane and lean (3, 3), covariance (3, 3)
     of xi, w and d in the soft plane, variances (2,) of d along the stiff axis and of the turn.
-    Of the sample: (age, time since the last sample, omega), displacements (2,) since then, position
-    (3,), quaternion (4,), and 1 if it has one. Slopes (2, 3) of the driven vibration at the
-    capture and now, of the free one, and of the offset (3,); and (error of the frequency, its
-    variance). Outputs: free vibration, offset, turn, covariance, variances, both slopes, and the
-    frequency's error with its variance.
+    Of the sample: (age, time since the last sample, omega, 1 if it may correct the frequency),
+    displacements (2,) since the last sample, position (3,), quaternion (4,), and 1 if it has one.
+    Slopes (2, 3) of the driven vibration at the capture and now, of the free one, and of the offset
+    (3,); and (error of the frequency, its variance).
+    Outputs: free vibration, offset, turn, covariance, variances, both slopes, and the frequency's
+    error with its variance.
     """
     t = tuning
     static, rotation = ca.SX.sym("static", 3), ca.SX.sym("rotation", 3, 3)
@@ -420,13 +460,13 @@ def _correction(tuning: EstimatorTuning, vibrates: bool) -> Formula:
     offset, turn = ca.SX.sym("offset", 3), ca.SX.sym("turn", 3)
     soft_plane, lean = ca.SX.sym("soft_plane", 3, 3), ca.SX.sym("lean", 3, 3)
     covariance, variances = ca.SX.sym("covariance", 3, 3), ca.SX.sym("variances", 2)
-    times, displacements = ca.SX.sym("times", 3), ca.SX.sym("displacements", 2)
+    times, displacements = ca.SX.sym("times", 4), ca.SX.sym("displacements", 2)
     position, quaternion = ca.SX.sym("position", 3), ca.SX.sym("quaternion", 4)
     has_orientation = ca.SX.sym("has_orientation")
     slope, slope_now = ca.SX.sym("slope", 2, 3), ca.SX.sym("slope_now", 2, 3)
     free_slope, offset_slope = ca.SX.sym("free_slope", 2, 3), ca.SX.sym("offset_slope", 3)
     detuning = ca.SX.sym("detuning", 2)
-    age, elapsed, omega = times[0], times[1], times[2]
+    age, elapsed, omega, learns = ca.vertsplit(times)
 
     # process noise, from the time and the displacement since the last sample
     model_error = (t.model_error * displacements[0]) ** 2
@@ -465,8 +505,9 @@ def _correction(tuning: EstimatorTuning, vibrates: bool) -> Formula:
         offset_slope_after = offset_slope - gain[2] * psi
         variance = detuning[1] + t.frequency_change**2 * displacements[1]
         variance = ca.fmin(variance, t.frequency_deviation**2)
-        variance /= 1 + variance * ca.sumsqr(psi) / (H.T @ PH + noise)
-        error = detuning[0] + variance * ca.dot(psi, soft) / (H.T @ PH + noise)
+        weight = learns / (H.T @ PH + noise)
+        variance /= 1 + variance * ca.sumsqr(psi) * weight
+        error = detuning[0] + variance * ca.dot(psi, soft) * weight
         error = ca.fmin(ca.fmax(error, -t.frequency_bound), t.frequency_bound)
         detuning_after = ca.vertcat(error, variance)
         change = error - detuning[0]

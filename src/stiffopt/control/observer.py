@@ -232,11 +232,11 @@ class ArmObserver:
 
         Return the change (6,) of the tip's offset, which takes up the change of the model.
         """
-        model, effective = self.compiled.chambers, self.pressures.effective
-        before = model.at(effective)
+        model = self.compiled.chambers
+        before = model.at(self._modelled_at)
         self.leaning = leaning
         model.lean(leaning)
-        change = self._shift(before, model.at(effective))
+        change = self._shift(before, model.at(self._modelled_at))
         self.touch.begin()
         self.watch.go_on()
         return change
@@ -251,11 +251,13 @@ class ArmObserver:
         """
         model, before = self.compiled, self.modelled
         assert before is not None  # compiled
+        frequency = self.tip.frequency_at(before)
         try:
             after = model.change(Manipulator(description), self._modelled_at, ahead)
         except StiffoptError:
             return None
         self._set_frequency()
+        self.tip.change_frequency(frequency, self.tip.frequency_at(after))
         return self._shift(before, after)
 
     def _shift(self, before: TipAt, after: TipAt) -> Array:

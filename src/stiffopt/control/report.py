@@ -121,6 +121,10 @@ class Report:
     def _adapted_numbers(self) -> tuple[AdaptedNumber, ...]:
         known, lags = self._replanner.known, self._arm.pressures.lags
         numbers = () if known is None else known.numbers
+        tip = self._arm.tip
+        if math.isfinite(tip.omega):  # it vibrates
+            factor = AdaptedNumber("frequency_factor", *tip.frequency_factor)
+            numbers = (*numbers, factor)
         if lags is None:
             return numbers
         found = zip(lags.lag.tolist(), lags.deviation.tolist(), strict=True)
@@ -148,6 +152,13 @@ class Report:
                 "arm's"
             )
             notices = (*notices, Notice("implausible", text, Severity.ERROR, standing=True))
+        if arm.tip.frequency_is_bounded:
+            factor, _ = arm.tip.frequency_factor
+            text = (
+                f"the arm vibrates at {factor:.2f} of the model's frequency or beyond, so that it "
+                "swings after its motions; run 'stiffopt commission', and check the robot file"
+            )
+            notices = (*notices, Notice("frequency", text, standing=True))
         if doubt := arm.watch.doubt:
             held = Notice(doubt.kind, doubt.text, Severity.ERROR, True, True, doubt.undo)
             notices = (*notices, held)

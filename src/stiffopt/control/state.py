@@ -96,7 +96,10 @@ class AdaptedNumber:
 
     key: Annotated[
         str,
-        Shown("its key in the robot file; `base.`: tilts in rad; `regulator_lag`: of the rig file"),
+        Shown(
+            "its key in the robot file; `base.`: tilts in rad; `regulator_lag`: of the rig file; "
+            "`frequency_factor`: vibration's frequency over the model's"
+        ),
     ]
     value: Annotated[float, Shown("its value, in SI")]
     deviation: Annotated[float, Shown("its standard deviation, in SI")]

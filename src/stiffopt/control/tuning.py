@@ -33,6 +33,8 @@ class EstimatorTuning:
     frequency_deviation: float = 0.03
     frequency_change: float = 0.1
     frequency_bound: float = 0.15
+    # time after a planned motion for which the arm swings on, and shows its frequency, in s
+    swings_on: float = 1.5
     # time by which viscosity makes the tip late, except in the first mode, in s
     viscous_lag: float = 0.035
     damping: float = 0.04  # damping ratio of the vibration
@@ -41,7 +43,7 @@ class EstimatorTuning:
     soft_share: float = 0.15
     # the same, above which a direction vibrates slowly enough for fast corrections to excite it
     stiff_share: float = 0.05
-    # lower bound of the vibration's angular frequency, in rad/s; it is 0 for an arm about to buckle
+    # lower bound of the model's angular frequency, in rad/s; it is 0 for an arm about to buckle
     least_frequency: float = 0.5
     # displacement of the model, in m, after which an exactly unchanged pose is a frozen reading
     frozen: float = 2e-3
