@@ -21,6 +21,7 @@ from stiffopt.control.checks import refusing
 from stiffopt.control.course import Course
 from stiffopt.control.first_motion import FirstMotion
 from stiffopt.control.forecast import Forecast, Present
+from stiffopt.control.formula import are_within
 from stiffopt.control.interface import ControlOutput, Notice, SampleCounts
 from stiffopt.control.linearised_tip import LeaningTip
 from stiffopt.control.observer import ArmObserver
@@ -520,13 +521,13 @@ class TipController:
 
     def _is_near(self, pressures: Array) -> bool:
         """Whether the reference rests at pressures (n,)."""
-        off = float(np.abs(self._reference.path[: len(pressures)] - pressures).max())
-        return off <= self._tuning.reference.there and not self._moves()
+        off = self._reference.path[: len(pressures)] - pressures
+        return are_within(self._tuning.reference.there, off) and not self._moves()
 
     def _moves(self) -> bool:
         """Return whether the reference is still moving."""
         rate = self._reference.motion[1, : self.robot.n_pressures]
-        return not np.abs(rate).max() <= self._tuning.reference.at_rest
+        return not are_within(self._tuning.reference.at_rest, rate)
 
     def _correct_brace(self, course: Bracing, now: float) -> None:
         """Bring the braced tip to its target; without one for its position it stays."""
@@ -594,7 +595,7 @@ class TipController:
         goes = course is None or (isinstance(course, Pressing) and course.phase is Phase.GOING)
         if not goes or not self._has_arrived():
             return False
-        return float(np.abs(estimator.vibration[0]).max()) < t.vibration
+        return are_within(t.vibration, estimator.vibration[0])
 
     def _go_on_with(self, adapted: Adapted) -> None:
         """Change the model's numbers so that nothing moves at this time."""
@@ -633,8 +634,8 @@ class TipController:
         plan = self.replanner.plan
         if plan is None or not self._is_near(plan.pressures):
             return False
-        off = np.abs(self._reference.goal[: len(plan.pressures)] - plan.pressures)
-        return bool(off.max() <= self._tuning.reference.there)
+        off = self._reference.goal[: len(plan.pressures)] - plan.pressures
+        return are_within(self._tuning.reference.there, off)
 
     def _set_reference_rate(self) -> None:
         tuning, rate = self._tuning.reference, self._tuning.reference.rigid_rate
