@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -135,7 +136,10 @@ class TipController:
             maxlen=max(1, round(tuning.reference.taken_back / period))
         )
         self._first_motion = FirstMotion(commissioned, tuning.first_motion)
-        self._requests = Requests(robot, limits, slew, scene, tuning, control.tip_speed)
+        sliding = replace(tuning.bracing.sliding, noise=control.tracker_noise)
+        bracing = replace(tuning.bracing, sliding=sliding)
+        own = replace(tuning, bracing=bracing)
+        self._requests = Requests(robot, limits, slew, scene, own, control.tip_speed)
         Planner = ProcessPlanner if plan_in_process else InlinePlanner
         self.replanner = Replanner(Planner(robot, scene), tuning.replanning, period, dead_time)
         self.forecast: Forecast | None = None
