@@ -377,6 +377,26 @@ def test_fibres_balance_the_pressure_however_far_they_bend(tube: Tube) -> None:
         assert found / size == pytest.approx(np.linalg.inv(K) / size, abs=1e-5)
 
 
+@pytest.mark.parametrize("stiffening", [0.0, 0.1, 2.0])
+def test_fibres_balance_high_pressures_or_refuse_them(stiffening: float) -> None:
+    soft = fibres(replace(FLOP, youngs_modulus=8e3))
+    geometry = SectionGeometry.of(segment_of(soft))
+    law = function_of(with_stiffening(soft, stiffening))
+    accepted = []
+    for p in 1e5 * np.array([[0.1, 0, 0], [1, 1, 0], [2, 2, 2], [1, 0, 0], [4, 0, 0], [20, 0, 0]]):
+        strain, _, margin = (each.full() for each in law(p))
+        accepted.append(margin.item() > 0)
+        if accepted[-1]:
+            force = geometry.channel_force @ p
+            x, y = geometry.channel_moment.T @ p
+            found = pull(soft, stiffening, strain.ravel()[2:5])
+            wanted = np.array([force, y, -x])
+            scale = force * np.array([1, soft.offset, soft.offset])
+            assert found / scale == pytest.approx(wanted / scale, abs=1e-4)
+    assert accepted[0]
+    assert not all(accepted)
+
+
 def test_bent_fibres_are_longer_than_straight_ones_under_the_same_force() -> None:
     """The neo-Hookean law leaves this out."""
     bent, straight = np.array([1.2e5, 0, 0]), np.full(3, 0.4e5)

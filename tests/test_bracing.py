@@ -367,6 +367,17 @@ def test_a_slide_that_the_tip_shows_is_told_without_a_push_that_is_felt(approach
     assert "has slid by 0." in course.notices()[-1].text or not slide
 
 
+@pytest.mark.parametrize("roll", [0.05, 1.0])
+def test_a_sensor_that_turns_about_its_own_axis_is_no_slide(approach, roll):
+    course, tip, p = held(approach, contacts="sticking"), approach.tips[-1], approach.pressures[-1]
+    rolled = tip.pose[:3, :3] @ lie.exp(np.array([0, 0, 0, 0, 0, roll]))[:3, :3]
+    for k in range(1600):
+        R = rolled if k > 800 else tip.pose[:3, :3]
+        course.look(0.025, tip.pose[:3, 3], tip, p, lie.quaternion_from_rotation(R))
+    assert course.phase is BracePhase.HELD
+    assert np.abs(course._slides.slides).max() < 1e-4
+
+
 def test_an_arm_without_contact_is_told_whatever_pushes_it(approach):
     course = held(approach)
     apart = approach.free_tips[-1] - approach.tips[-1].pose[:3, 3]

@@ -312,6 +312,8 @@ class TipController:
         course = self.replanner.pursuit.course
         if isinstance(course, Bracing):
             course.is_steered = not self._is_held(now)
+        swings = not self._is_held(now) and now - self._moved_at < self._tuning.estimator.swings_on
+        self._arm.tip.learns = swings
         counts = self._arm.observe(now, commanded, reading, samples, course)
         if counts.used and (sample := self._arm.tip.sample) is not None:
             self._first_motion.take(self._arm.tip.predicted, sample.position)
@@ -375,7 +377,6 @@ class TipController:
         reference.advance(self._awaited(plan, now))
         if self._moves():
             self._moved_at = now
-        self._arm.tip.learns = now - self._moved_at < self._tuning.estimator.swings_on
         if self._arm.leaning is not None:
             return self._feedforward(reference.command - pressures.command_offset, last)
         tip = self._arm.on_path(reference.path[:n])

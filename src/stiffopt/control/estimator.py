@@ -109,9 +109,6 @@ class TipEstimator:
         self._principal: Array = np.zeros(3)
         # displacement (3, n) of the mode per pressure beyond that of the straight arm, in m/Pa
         self.excess: Array = np.zeros((3, n))
-        # whether samples correct the frequency: only while a planned motion swings the arm, since
-        # what shakes it from outside has another frequency
-        self.learns = False
         self.begin()
 
     def begin(self) -> None:
@@ -124,6 +121,9 @@ class TipEstimator:
         # relative error of the mode's frequency, and its variance
         t = self._tuning
         self.detuning = np.array([t.frequency_offset, t.frequency_deviation**2])
+        # whether samples correct the frequency: only while a planned motion swings the arm, since
+        # what shakes it from outside has another frequency
+        self.learns = False
         self.offset = np.zeros(6)  # tip pose relative to the model's: d in m, and a rotation vector
         self.soft_plane = np.diag([1.0, 1.0, 0.0])  # projection on the directions of low stiffness
         self.stiff_axis = np.diag([0.0, 0.0, 1.0])  # on those of a stiffness that is far higher
@@ -177,10 +177,9 @@ class TipEstimator:
         return 1 + error, math.sqrt(variance)
 
     @property
-    def frequency_is_bounded(self) -> bool:
-        """Whether the frequency is as far from the model's as the estimator permits."""
-        error = abs(float(self.detuning[0]))
-        return self._mode is not None and error >= self._tuning.frequency_bound
+    def frequency_off(self) -> float:
+        """The size of e, over the largest that the estimator permits."""
+        return abs(float(self.detuning[0])) / self._tuning.frequency_bound
 
     @property
     def turn_known(self) -> bool:
@@ -503,7 +502,7 @@ def _correction(tuning: EstimatorTuning, vibrates: bool) -> Formula:
         psi = soft_plane @ (before[0, :].T + offset_slope)  # of the expected position
         free_slope_after = free_slope - F @ (gain[:2] @ psi.T)
         offset_slope_after = offset_slope - gain[2] * psi
-        variance = detuning[1] + t.frequency_change**2 * displacements[1]
+        variance = detuning[1] + learns * t.frequency_change**2 * displacements[1]
         variance = ca.fmin(variance, t.frequency_deviation**2)
         weight = learns / (H.T @ PH + noise)
         variance /= 1 + variance * ca.sumsqr(psi) * weight

@@ -87,7 +87,8 @@ class Plan:
     blocked: str = ""  # why the way to the plan is not clear of the scene
     doubt: str = ""  # a warning if the model extrapolates there
     far: bool = False  # whether it is the pose that is not reached, not only the stiffness
-    short: tuple[float, ...] = (0.0, 0.0, 0.0)  # from the tip of a far plan to its target, in m
+    # from its tip to the target, in m, of a plan that follows a target by the least change
+    short: tuple[float, ...] = (0.0, 0.0, 0.0)
     adapted: Adapted | None = None  # the model that it was made with, as in the request
     deviation: float = math.nan  # of the stiffness there, relative
     estimate: Estimate | None = None  # of the model's numbers, if it is new
@@ -359,7 +360,7 @@ class Planning:
         if stays and self._stiffness is not None:
             tip = self._tip.at(pressures)
             stiffness = self._stiffness(tip.compliance, tip.pose[:3, :3])
-        if far and target.position is not None:
+        if request.stay and target.position is not None:
             away = np.array(target.position, dtype=float) - self._tip.at(pressures).pose[:3, 3]
             short = np.nan_to_num(away)
         return Plan(

@@ -8,7 +8,8 @@ with the model's error b, the compliance C (6, 3) to a push F at the tip, and th
 of slides s. Silicone creeps, so b grows by c (6,) per e-fold of the time in contact. Nobody knows b
 and c beforehand: a Kalman filter learns them while the arm holds. A push comes and goes, and moves
 the tip in three of six directions. What moves it otherwise, and quicker than it creeps, is a slide.
-One that stays becomes part of b in the end, as all that drifts slowly does.
+One that stays becomes part of b in the end, as all that drifts slowly does. A turn that has jumped
+alone, as that of a sensor about its own axis may, does not count any more.
 """
 
 from __future__ import annotations
@@ -59,6 +60,7 @@ class SlideEstimator:
         deviations = np.full(count, t.noise)  # of slides at first
         deviations[:_FIRST] = np.repeat([*t.error, *t.creep, 0.0], 3)
         self._state, self._covariance = np.zeros(count), np.diag(deviations**2)
+        self._jumps = 0  # successive samples in which the turn has jumped without the place
         self._drift = np.diag(np.repeat(t.drift, 3) ** 2)
 
     def take(
@@ -82,12 +84,26 @@ class SlideEstimator:
             off[3:] = lie.rotation_vector_from_quaternion(turned)
         off -= self._per_pressure @ (pressures - self._pressures)
         self._go_on(elapsed, held)
-        rows = slice(0, 3 if quaternion is None else 6)
-        H, P = self._rows[rows], self._covariance
-        gain = np.linalg.solve(H @ P @ H.T + self._noise[rows, rows], H @ P).T
-        self._state = self._state + gain @ (off[rows] - H @ self._state)
+        H, P = self._rows[:6], self._covariance
+        innovation, S = off - H @ self._state, H @ P @ H.T + self._noise
+        measured = quaternion is not None and self._is_turn(innovation, S)
+        rows = slice(0, 6 if measured else 3)
+        H = H[rows]
+        gain = np.linalg.solve(S[rows, rows], H @ P).T
+        self._state = self._state + gain @ innovation[rows]
         P = P - gain @ H @ P
         self._covariance = (P + P.T) / 2
+
+    def _is_turn(self, innovation: Array, S: Array) -> bool:
+        """Return whether a measured turn counts, by the innovation (6,) and its covariance (6, 6).
+
+        Once it has jumped alone, in a few samples, it does not count any more.
+        """
+        jumps = np.abs(innovation) > self._tuning.jump * np.sqrt(np.diag(S))
+        alone = bool(jumps[3:].any() and not jumps[:3].any())
+        if self._jumps < self._tuning.samples:
+            self._jumps = self._jumps + 1 if alone else 0
+        return not alone and self._jumps < self._tuning.samples
 
     def _go_on(self, elapsed: float, held: float) -> None:
         """Predict the state after a time in s."""

@@ -284,7 +284,7 @@ class StrainLaw(ABC):
     def _bent(self, omega: ca.SX, flexibility: ca.SX) -> tuple[ca.SX, ca.SX]:
         """Return curvature (2,) and flexibility, limited by the least bending radius.
 
-        The flexibility (k, k) is that of bending, or of something else and bending, which is last.
+        The flexibility (k, k) may have other rows before its last two, which are those of bending.
         """
         radius = self.compensation.bending_radius
         if ca.SX(radius).is_zero():

@@ -14,7 +14,8 @@ from stiffopt.model.laws.neo_hookean import NeoHookeanLaw, neo_hookean_stretch
 from stiffopt.schema import Schema
 from stiffopt.units import Ratio
 
-_STEPS = (2, 3)  # of Newton's method: for the straight section, for the bent one
+_STEPS = (6, 5)  # of Newton's method: for the straight section, for the bent one
+_LAST_STEP = 1e-3  # of lambda or c, beyond which Newton's method has not converged
 _THINNEST = 1e-3  # squared stretch below which the energy of a fibre is cut off
 
 
@@ -63,13 +64,18 @@ class FibresLaw(NeoHookeanLaw):
     words = "incompressible hyperelastic fibres that stretch and bend together"
     complexity = 3
     Keys = FibresKeys
-    limit = "the pressure compresses fibres of this segment to nothing"
+    limit = "the pressure stretches or compresses fibres of this segment too far"
 
     def margin(self, p: ca.SX) -> ca.SX:
-        """Return the squared stretch of the most compressed fibre, or another law's margin."""
+        """Return the least of three margins.
+
+        They are the squared stretch of the most compressed fibre, how far Newton's method has
+        converged, and the margin of the neo-Hookean law.
+        """
         bent = self._bent_by(p)
         thinnest = bent.stretch**2 - (1 + bent.width) * bent.spread - 10 * _THINNEST
-        return ca.fmin(super().margin(p), thinnest)
+        converged = 1 - ca.sumsqr(bent.last_step / _LAST_STEP)
+        return ca.fmin(super().margin(p), ca.fmin(thinnest, converged))
 
     def radius(self, p: ca.SX) -> ca.SX:
         """Return the outer radius ``r lambda^-1/2`` of the stretched section, in m."""
@@ -113,15 +119,17 @@ class FibresLaw(NeoHookeanLaw):
         c = 1 / (0.5 + stretch**-3 + stiffening * stiffened)  # of the straight section
         c /= ca.sqrt(1 + (1 + width) * squared * c**2 / stretch**2)  # no fibre is compressed away
         for _ in range(bent):
+            before = ca.vertcat(stretch, c)
             stretch, c = _newton()(stretch, c, load, squared, stiffening, width)
-        return _Bent(stretch, c**2 * squared, c / 2 * turned, inertia, width)
+        last_step = ca.vertcat(stretch, c) - before
+        return _Bent(stretch, c**2 * squared, c / 2 * turned, inertia, width, last_step)
 
 
 class _Bent(NamedTuple):
     """A bent section: stretch of its centroid, D, curvature (2,), bending matrix, and width.
 
-    The squared distance of its fibres from the centroid is (1 - width) to (1 + width) times its
-    mean.
+    `last_step` (2,) is by how much the last step of Newton's method changed lambda and c. The
+    squared distance of its fibres from the centroid is (1 - width) to (1 + width) times its mean.
     """
 
     stretch: ca.SX
@@ -129,6 +137,7 @@ class _Bent(NamedTuple):
     omega: ca.SX
     inertia: ca.SX
     width: ca.SX
+    last_step: ca.SX
 
 
 @cache
