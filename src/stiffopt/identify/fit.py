@@ -158,10 +158,10 @@ def _reweighted(
 
     The part that rows share follows the noise too, so what is left of the errors is less than the
     noise.  The expected covariance of the noise, given the errors, is that of what is left plus
-    that of the shared part: a step of expectation maximisation (A. P. Dempster et al., 1977) towards
-    the noise of greatest likelihood.  Without the second, less noise lets the shared part follow
-    more of it, until nothing but its outliers is left.  Few steps, one in each round, stop short of
-    that: on recordings, noise of greatest likelihood predicts other runs less well.
+    that of the shared part: a step of expectation maximisation (A. P. Dempster et al., 1977)
+    towards the noise of greatest likelihood.  Without the second, less noise lets the shared part
+    follow more of it, until nothing but its outliers is left.  One step in each of few rounds stops
+    short of that: on recordings, noise of greatest likelihood predicts other runs less well.
     """
     if not problem.samples:
         return problem, 1.0
