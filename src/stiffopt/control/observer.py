@@ -251,8 +251,8 @@ class ArmObserver:
         """
         model, before = self.compiled, self.modelled
         assert before is not None  # compiled
+        frequency = self.tip.frequency_at(before)
         try:
-            frequency = self.tip.frequency_at(model.waypoints.at(self._modelled_at))
             after = model.change(Manipulator(description), self._modelled_at, ahead)
         except StiffoptError:
             return None
