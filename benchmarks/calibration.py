@@ -1,6 +1,7 @@
 """Measure the accuracy of calibrated robot files on the simulated rig, where the truth is known.
 
     python benchmarks/calibration.py [--quick] [--arms NAME ...] [--seeds N] [--structure NAME]
+        [--strain-law keep]
 
 Each seed gives another arm, which differs from its robot file by a draw from the rig file's spread.
 One kinematics experiment is recorded, and `calibrate` fits the robot file to it. Three robot files
@@ -25,7 +26,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from time import perf_counter
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -96,7 +97,7 @@ class Sizes:
     ----------
     seeds : of the arms, one each.
     repetitions, poses : of the kinematics experiment.
-    structure, rows, trial_rows : see `CalibrationSettings`.
+    structure, strain_law, rows, trial_rows : see `CalibrationSettings`.
     held : held-out pressures.
     probed : pressures at which the probe measures; 0 for none.
     """
@@ -105,6 +106,7 @@ class Sizes:
     repetitions: int = 5
     poses: int = 24
     structure: str = "auto"
+    strain_law: Literal["auto", "keep"] = "auto"
     rows: int = 2000
     trial_rows: int = 600
     held: int = 40
@@ -287,8 +289,9 @@ def measure(case: Case, seed: int, sizes: Sizes, folder: Path) -> Found:
     description, robot = described(case, seed)
     logs = recorded(description, robot, sizes, folder)
     settings = CalibrationSettings(
-        structure=sizes.structure, sequence=True, rows=sizes.rows, trial_rows=sizes.trial_rows
-    )
+        structure=sizes.structure, strain_law=sizes.strain_law, sequence=True,
+        rows=sizes.rows, trial_rows=sizes.trial_rows,
+    )  # fmt: skip
     result = calibrate(robot, logs, settings=settings)
     plant = Plant(robot, description.plant)
     best = with_true_values(robot, plant.mismatch)
@@ -356,6 +359,10 @@ def main() -> int:
     parser.add_argument("--first", type=int, default=0, help="the first of the seeds")
     parser.add_argument("--structure", default=usual.structure, help="model to fit, or auto")
     parser.add_argument(
+        "--strain-law", choices=("auto", "keep"), default=usual.strain_law,
+        help="compare strain laws, or keep that of the robot file",
+    )  # fmt: skip
+    parser.add_argument(
         "--repetitions", type=int, default=usual.repetitions, help="of the kinematics experiment"
     )
     parser.add_argument("--probed", type=int, default=usual.probed, help="pressures to probe at")
@@ -364,8 +371,8 @@ def main() -> int:
     given = parser.parse_args()
     seeds = tuple(range(given.first, given.first + given.seeds))
     sizes = replace(
-        usual, seeds=seeds, structure=given.structure, repetitions=given.repetitions,
-        probed=given.probed,
+        usual, seeds=seeds, structure=given.structure, strain_law=given.strain_law,
+        repetitions=given.repetitions, probed=given.probed,
     )  # fmt: skip
     if given.quick:
         sizes = QUICK

@@ -50,6 +50,7 @@ ROBOTS = ("stiff-flop-1", "stiff-flop-2-hanging")
 TARGETS, REST, PUSHED, AFTER = 4, 4.0, 3.0, 2.0  # s
 ALLOWED, ALLOWED_FORCE = 0.2, 3e-3  # share, and N
 REACH = 0.7  # of the pressures that targets are drawn from
+FARTHEST = 8e-3  # m, of surfaces in front of a target
 DEEPEST = 4e-3  # m, of targets inside a surface
 
 
@@ -227,12 +228,16 @@ def drawn_press(
                 continue
             way = -way if begins > 0 else way
             asked = Press(force=rng.uniform(0.015, 0.04), direction=tuple(way.tolist()))
-            task = Task(target=Target(position=tuple(pose[:3, 3].tolist())), press=asked)
+            tasks = [
+                Task(target=Target(position=tuple((pose[:3, 3] + far * way).tolist())), press=asked)
+                for far in (0.0, FARTHEST)
+            ]
             try:
-                arm.controller.check_ahead(task)
+                for task in tasks:
+                    arm.controller.check_ahead(task)
             except InputError:
                 continue  # it cannot press like that there
-            return task, pose, way
+            return tasks[0], pose, way
     return None
 
 
@@ -275,7 +280,10 @@ def press(name: str, seed: int, dynamics: str, found: Found) -> None:
         return
     task, pose, way = drawn
     wanted = task.press.force
-    stiffness, away = float(np.exp(rng.uniform(np.log(100), np.log(1000)))), rng.uniform(2e-3, 8e-3)
+    stiffness, away = (
+        float(np.exp(rng.uniform(np.log(100), np.log(1000)))),
+        rng.uniform(2e-3, FARTHEST),
+    )
     surface = surface_at(pose, way, away, stiffness)
     with Arm(name, seed, dynamics, surface) as arm:
         arm.controller.set_task(task)

@@ -29,6 +29,7 @@ from independent import (
     rod_section,
     section,
     shift,
+    silicone,
     wrench_map,
 )
 from stiffopt.errors import InputError
@@ -232,11 +233,12 @@ def test_neo_hookean_stretch_against_root_finding(load: float) -> None:
     assert float(slope) == pytest.approx(1 / (1 + 2 * root**-3), rel=1e-11)
 
 
+@pytest.mark.parametrize("law", ["neo-hookean", "fibres"])
 @pytest.mark.parametrize("name", TUBES)
-def test_little_pressure_gives_the_linear_law_per_length_at_rest(name: str) -> None:
+def test_little_pressure_gives_the_linear_law_per_length_at_rest(name: str, law: str) -> None:
     """Both laws strain alike at first order, and agree in the compliance at rest."""
     linear = replace(TUBES[name], factors=None, poisson_ratio=0.5)
-    hyper = neo_hookean(linear)
+    hyper = LAWS[law](linear) if law in LAWS else fibres(linear)
     rest = np.zeros(len(linear.channels))
     strains, compliances = zip(
         *(strain_and_compliance(tube, rest) for tube in (linear, hyper)), strict=True
@@ -313,6 +315,106 @@ def test_neo_hookean_strain_balances_the_pressure_to_first_order_in_curvature(na
         errors.append(np.abs((resultant(tube, shrink, strain) - applied) / size).max())
     assert errors[0] / errors[1] == pytest.approx(4, rel=0.1)
     assert errors[1] < 1e-3
+
+
+# -- fibres ---------------------------------------------------------------------------------
+
+
+def fibres(tube: Tube) -> Tube:
+    """The same segment with the law of fibres, and stiffening."""
+    return replace(tube, law="fibres", factors=None, poisson_ratio=0.5)
+
+
+def with_stiffening(tube: Tube, stiffening: float = 0.2, **keys: Any) -> Segment:
+    """Segment of a tube with the law of fibres."""
+    return Segment(**fibres(tube).mapping(), law={"stiffening": stiffening}, **keys)
+
+
+def annulus(tube: Tube) -> tuple[Vector, Vector]:
+    """Points (2, k) about the centroid, and weights, of an annulus stretched to an ellipse.
+
+    It has the tube's outer radius, its area and its second moments.
+    """
+    solid, outer = silicone(tube), tube.outer_radius**2
+    mean = np.trace(solid.about_centroid) / solid.area
+    assert outer < 2 * mean  # the inner radius is not imaginary
+    nodes, weights = np.polynomial.legendre.leggauss(12)
+    t = 2 * np.pi * np.arange(48) / 48
+    r = np.sqrt(mean + nodes * (outer - mean))[:, np.newaxis]
+    values, axes = np.linalg.eigh(solid.about_centroid / solid.area)
+    root = axes @ np.diag(np.sqrt(values / (mean / 2))) @ axes.T
+    points = root @ np.array([r * np.cos(t), r * np.sin(t)]).reshape(2, -1)
+    return points, np.repeat(weights / 2 / 48, 48) * solid.area
+
+
+def pull(tube: Tube, stiffening: float, strain: Vector) -> Vector:
+    """Force along and moments (3,) of Yeoh's stresses, for stretch and curvatures (3,)."""
+    (x, y), weights = annulus(tube)
+    L = strain[0] + strain[1] * y - strain[2] * x
+    stress = (L - L**-2) * (1 + 2 * stiffening * (L**2 + 2 / L - 3))
+    return tube.youngs_modulus / 3 * np.array([stress, y * stress, -x * stress]) @ weights
+
+
+@pytest.mark.parametrize("tube", [FLOP, LOPSIDED], ids=["flop", "lopsided"])
+def test_fibres_balance_the_pressure_however_far_they_bend(tube: Tube) -> None:
+    geometry = SectionGeometry.of(segment_of(tube))
+    one = 0.8e5 * np.eye(len(tube.channels))[0]
+    c = geometry.centroid
+    for p in (one, one + 0.5e5, some_pressures(tube)):
+        strain, C = evaluated(with_stiffening(tube), p)
+        stretch = strain[2] - strain[4] * c[0] + strain[3] * c[1]
+        bent = np.array([stretch, *strain[3:5]])
+        force = geometry.channel_force @ p
+        x, y = geometry.channel_moment.T @ p - force * c
+        scale = force * np.array([1, tube.offset, tube.offset])
+        assert pull(tube, 0.2, bent) / scale == pytest.approx(
+            np.array([force, y, -x]) / scale, abs=1e-6
+        )
+        K = derivative(lambda strain: pull(tube, 0.2, strain), bent, 1e-4)
+        about = wrench_map(shift(*c, 0))
+        found = (about.T @ C @ about)[2:5, 2:5]
+        size = np.sqrt(np.outer(np.diag(found), np.diag(found)))
+        assert found / size == pytest.approx(np.linalg.inv(K) / size, abs=1e-5)
+
+
+@pytest.mark.parametrize("stiffening", [0.0, 0.1, 2.0])
+def test_fibres_balance_high_pressures_or_refuse_them(stiffening: float) -> None:
+    soft = fibres(replace(FLOP, youngs_modulus=8e3))
+    geometry = SectionGeometry.of(segment_of(soft))
+    law = function_of(with_stiffening(soft, stiffening))
+    accepted = []
+    for p in 1e5 * np.array([[0.1, 0, 0], [1, 1, 0], [2, 2, 2], [1, 0, 0], [4, 0, 0], [20, 0, 0]]):
+        strain, _, margin = (each.full() for each in law(p))
+        accepted.append(margin.item() > 0)
+        if accepted[-1]:
+            force = geometry.channel_force @ p
+            x, y = geometry.channel_moment.T @ p
+            found = pull(soft, stiffening, strain.ravel()[2:5])
+            wanted = np.array([force, y, -x])
+            scale = force * np.array([1, soft.offset, soft.offset])
+            assert found / scale == pytest.approx(wanted / scale, abs=1e-4)
+    assert accepted[0]
+    assert not all(accepted)
+
+
+def test_bent_fibres_are_longer_than_straight_ones_under_the_same_force() -> None:
+    """The neo-Hookean law leaves this out."""
+    bent, straight = np.array([1.2e5, 0, 0]), np.full(3, 0.4e5)
+    soft = {tube.law: tube for tube in (neo_hookean(FLOP), fibres(FLOP))}
+    longer = {
+        law: strain_and_compliance(tube, bent)[0][2] - strain_and_compliance(tube, straight)[0][2]
+        for law, tube in soft.items()
+    }
+    assert longer["neo-hookean"] == pytest.approx(0, abs=1e-12)
+    assert longer["fibres"] > 0.005
+
+
+def test_fibres_that_pressure_compresses_to_nothing_are_out_of_range() -> None:
+    segment = with_stiffening(replace(FLOP, youngs_modulus=1.2e4), 0.0)
+    law = function_of(segment)
+    assert float(law(np.array([0.1e5, 0, 0]))[2]) > 0
+    assert float(law(np.array([2.0e5, 0, 0]))[2]) < 0
+    assert np.isfinite(law(np.array([2.0e5, 0, 0]))[0].full()).all()
 
 
 # -- compensation ---------------------------------------------------------------------------

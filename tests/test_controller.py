@@ -244,6 +244,21 @@ def test_what_asks_for_a_faster_tip_is_refused_and_changes_nothing():
     assert bench.controller.replanner.pursuit is not before
 
 
+def test_a_press_of_the_default_speed_is_told_what_to_write_where_the_rig_is_slower():
+    bench = Bench(ONE, control=ControlSettings(tip_speed=4e-3), period=PERIOD)
+    press = Press(force=0.03, direction=(1.0, 0.0, 0.0))
+    task = bench.task(position=middle(bench)).model_copy(update={"press": press})
+    told = (
+        r"would have 5\.0 mm/s; the rig file permits 4\.0 mm/s .*write 'speed: 4 mm/s' or less in "
+        r"the task's press \(a press without it has 5 mm/s\)"
+    )
+    with pytest.raises(InputError, match=told):
+        bench.controller.set_task(task)
+    slower = task.model_copy(update={"press": press.model_copy(update={"speed": 4e-3})})
+    bench.controller.set_task(slower)
+    assert bench.controller.replanner.pursuit.kind == "press"
+
+
 def test_new_target_of_another_kind():
     bench = Bench(FREE, period=PERIOD)
     x, y, _ = bench.settled(duration=1.5)

@@ -21,7 +21,10 @@ def test_the_systematic_part_is_its_mean_given_the_errors() -> None:
     functions, errors = RANDOM.normal(size=(30, 4)), RANDOM.normal(size=(30, 2))
     covariance = functions @ functions.T
     expected = covariance @ np.linalg.solve(np.eye(30) + covariance, errors)
-    np.testing.assert_allclose(Systematic.of(functions).part(errors), expected, atol=1e-12)
+    found = Systematic.of(functions)
+    np.testing.assert_allclose(found.part(errors), expected, atol=1e-12)
+    left = covariance - covariance @ np.linalg.solve(np.eye(30) + covariance, covariance)
+    np.testing.assert_allclose(found.root @ found.root.T, left, atol=1e-12)
 
 
 def test_smooth_functions_are_a_gaussian_process_of_pressure() -> None:

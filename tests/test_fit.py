@@ -15,7 +15,8 @@ from made_logs import course, made_log, reddened
 from stiffopt import lie
 from stiffopt.errors import EquilibriumError, InputError
 from stiffopt.identify.calibration import CalibrationResult, calibrate
-from stiffopt.identify.fit import Fit, fit
+from stiffopt.identify.discrepancy import smooth_functions
+from stiffopt.identify.fit import Fit, _reweighted, fit
 from stiffopt.identify.problem import CalibrationProblem
 from stiffopt.identify.settings import FIT, CalibrationSettings
 from stiffopt.identify.setup import Setup, recordings_of
@@ -201,6 +202,30 @@ def test_rows_in_which_pressures_change_count_less_if_they_are_wrong(
     weighted = missed()
     monkeypatch.setattr("stiffopt.identify.fit.FIT", replace(FIT, uneven=np.inf))
     assert weighted < 0.7 * missed()
+
+
+@pytest.mark.parametrize("rho", [0.0, 0.9])
+def test_noise_is_found_beside_errors_that_rows_share(rho: float) -> None:
+    """What the shared errors' fit takes from the noise is given back to size and correlation."""
+    told, deviation = settings("static"), 4e-4
+    found = []
+    for seed in range(6):
+        random = np.random.default_rng(seed)
+        time, pressures = course(3, 60.0, seed)
+        functions = FIT.systematic * ONE.length * smooth_functions(pressures)
+        errors = deviation * reddened(random, len(time), rho)
+        errors += functions @ random.normal(size=(functions.shape[1], 3))
+        log = made_log(ONE, time, pressures, noise=0.0)
+        log = replace(log, tip_position=log.tip_position + errors)
+        setup = Setup.of(ONE, recordings_of(ONE, [("a", log)], told), [], told)
+        problem, independent = setup.problem(BY_NAME["static"], len(time)), 1.0
+        for _ in range(15):
+            problem, independent = _reweighted(problem, np.zeros(problem.size), independent)
+        found.append((problem.noise.position / deviation, independent))
+    noise, independent = np.transpose(found)
+    assert np.mean(noise) == pytest.approx(1.0, abs=0.15)
+    true = (1 + rho) / (1 - rho)  # variance of an independent row: noise by which rows are divided
+    assert np.mean(noise**2 * independent) == pytest.approx(true, rel=0.2)
 
 
 KNOWN = ONE.model_copy(

@@ -36,8 +36,26 @@ def test_a_frequency_at_its_bound_is_told():
     (notice,) = bench.controller.notices()
     assert (notice.kind, notice.standing, notice.hold) == ("frequency", True, False)
     assert "0.85 of the model's frequency" in notice.text
+    tip.detuning = np.array([-0.13, 4e-4])  # it comes and goes by as much with each sample
+    assert [notice.kind for notice in bench.controller.notices()] == ["frequency"]
+    tip.detuning = np.array([-0.11, 4e-4])
+    assert bench.controller.notices() == ()
     tip.detuning = np.array([-0.14, 4e-4])
     assert bench.controller.notices() == ()
+
+
+def test_the_frequency_is_not_learned_while_the_pressures_are_held():
+    bench = Bench(HANGING, "full")
+    bench.settled(duration=0.3)
+    tip = bench.controller._arm.tip
+    assert tip.learns
+    bench.run(0.1, steer=False)
+    assert not tip.learns
+    known = tip.detuning.copy()
+    bench.run(0.5, steer=False)
+    assert (tip.detuning == known).all()
+    bench.controller.begin(bench.rig.clock.now())
+    assert not tip.learns
 
 
 @pytest.mark.parametrize("dynamics", ["quasi-static", "full"])

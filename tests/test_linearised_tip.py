@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
 from stiffopt import load_robot
 from stiffopt.control.linearised_tip import LinearisedTip
-from stiffopt.errors import StiffoptError
+from stiffopt.errors import EquilibriumError, StiffoptError
 
 
 @pytest.fixture(scope="module")
@@ -29,6 +31,41 @@ def test_a_walk_of_small_and_large_steps_is_the_models(robot):
             robot.tip_jacobian(p), abs=0.02 * np.abs(tip.jacobian).max()
         )
     assert len(evaluated) < 100
+
+
+def test_on_a_straight_way_the_model_is_evaluated_ahead(robot):
+    nearby, evaluated, motion = LinearisedTip(robot), [], 0.0
+    way = np.linspace(0.2, 0.6, 500)[:, None] * robot.pressure_max * np.linspace(1.0, 0.5, 6)
+    for before, p in pairwise(way):
+        tip = nearby.at(p)
+        if not any(tip.jacobian is each for each in evaluated[-1:]):
+            evaluated.append(tip.jacobian)
+        assert tip.pose[:3, 3] == pytest.approx(robot.tip_pose(p)[:3, 3], abs=6e-6)
+        scaled = np.vstack([tip.jacobian[:3] / robot.length, tip.jacobian[3:]])
+        motion += np.linalg.norm(p - before) * np.linalg.norm(scaled)
+    assert motion > 10 * 0.03
+    assert len(evaluated) < motion / (1.5 * 0.03)
+
+
+def test_where_the_arm_ahead_has_no_equilibrium_it_is_evaluated_here(robot, monkeypatch):
+    nearby, p = LinearisedTip(robot), 0.4 * robot.pressure_max
+    at = nearby._model.at
+
+    def below(pressures):
+        if pressures[0] > most:
+            raise EquilibriumError("it buckles")
+        return at(pressures)
+
+    monkeypatch.setattr(nearby._model, "at", below)
+    most = p[0]
+    nearby.at(p)
+    for _ in range(60):
+        p = p + np.eye(6)[0] * 300.0
+        most = p[0] + 200.0  # the next pressures are beyond it
+        assert nearby.at(p).pose == pytest.approx(robot.tip_pose(p), abs=3e-4)
+    most = p[0]
+    with pytest.raises(StiffoptError):
+        nearby.at(p + np.eye(6)[0] * 2e4)
 
 
 def test_the_jacobian_is_nearly_the_same_a_little_further_away(robot):

@@ -85,7 +85,7 @@ def rebuilt(name: str, law: str, coordinates: Vector) -> Manipulator:
 
 
 @pytest.mark.one_in(3)
-@pytest.mark.parametrize("law", ["paper", "rest-length", "neo-hookean"])
+@pytest.mark.parametrize("law", ["paper", "rest-length", "neo-hookean", "fibres"])
 @pytest.mark.parametrize("name", ARMS)
 def test_it_is_the_robot_that_is_built_anew(name: str, law: str) -> None:
     """At its own values and at others; poses, their Jacobian, stiffnesses and their gradient."""

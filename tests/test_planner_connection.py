@@ -129,8 +129,9 @@ def test_plans_arrive_as_they_were(ends: Ends) -> None:
         pressures = np.array([1e5 / 3, 0.0, -0.0])
         bent = BentMode(np.ones((3, 3)), np.full((3, 3), 2.0), np.eye(3)) if reached else None
         plan = Plan(
-            4, pressures, known.offset, known.target, reached, stiffness, message, bent=bent
-        )
+            4, pressures, known.offset, known.target, reached, stiffness, message, bent=bent,
+            short=(0.0, 0.1 / 3, -1e-3),
+        )  # fmt: skip
         ends.theirs.answer(plan)
         found = ends.ours.receive()
         assert isinstance(found, Plan)
@@ -139,6 +140,7 @@ def test_plans_arrive_as_they_were(ends: Ends) -> None:
         assert found.target is request.target
         assert (found.serial, found.reached, found.message) == (4, reached, message)
         assert found.stiffness == pytest.approx(stiffness, abs=0, nan_ok=True)
+        assert found.short == plan.short
         if bent is None or found.bent is None:
             assert found.bent is bent
         else:

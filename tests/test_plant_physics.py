@@ -29,6 +29,7 @@ from references import (
     tip_compliance,
 )
 from stiffopt.model.description import RobotDescription
+from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.robot_files import load_description
 from stiffopt.plant import jit
 from stiffopt.plant.plant import Plant
@@ -285,6 +286,26 @@ def test_hyperelastic_bending(law):
     expected = [radius * (1 - np.cos(angle)), 0, radius * np.sin(angle)]
     assert angle > 1.4
     assert np.linalg.norm(T[:3, 3] - expected) < (1e-6 if law == "linear" else 1e-4)
+
+
+@pytest.mark.parametrize("arm", [ONE, TWO], ids=["one segment", "two"])
+@pytest.mark.parametrize("bar", [[1.2, 0.1, 0.0], [1.0, 1.0, 1.2]], ids=["bent", "stretched"])
+def test_the_law_of_fibres_predicts_the_settled_arm(arm, bar):
+    """The plant sums over a few fibres, under any load; the law is a formula of the section."""
+    rubber, mapping = material(law="yeoh", stiffening=0.2), arm.mapping()
+    for segment in mapping["segments"]:
+        segment |= {"strain_law": "fibres", "law": {"stiffening": 0.2}}
+    model = Manipulator(RobotDescription(**mapping))
+    p = BAR * np.array([*bar, *bar[::-1]][: arm.n])
+    T = settled(arm, p, silicone=rubber)
+    assert np.linalg.norm(model.tip_pose(p)[:3, 3] - T[:3, 3]) < 1e-3 * arm.length
+    for axis in np.eye(3):
+        push = 1e-3 * axis
+        there, back = (
+            settled(arm, p, PlantLoad(force=tuple(sign * push)), silicone=rubber)[:3, 3] @ axis
+            for sign in (1, -1)
+        )
+        assert model.stiffness(p, axis) == pytest.approx(2e-3 / (there - back), rel=5e-3)
 
 
 # -- vibration ------------------------------------------------------------------------------

@@ -207,11 +207,18 @@ PRESS = Press(force=0.03, direction=(1, 0, 0), travel=0.01)
 class Spring:
     """An arm as a spring, before a surface: what a `Pressing` sees of them.
 
-    `late` is how late the force is felt, in ticks of 10 ms.
+    `late` is how late the force is felt, in ticks of 10 ms; the free arm moves by `reach` at most.
     """
 
-    def __init__(self, at: float, stiffness: float, press: Press = PRESS, late: int = 10) -> None:
-        self.pressing = Pressing(press, TARGET, PressingTuning())
+    def __init__(
+        self,
+        at: float,
+        stiffness: float,
+        press: Press = PRESS,
+        late: int = 10,
+        reach: float = math.inf,
+    ) -> None:
+        self.pressing, self.reach = Pressing(press, TARGET, PressingTuning()), reach
         self.creep = CreepEstimator(3, False, CreepTuning())  # of an arm that has not moved
         self.at, self.stiffness, self.late = at, stiffness, late
         self.forces: list[float] = []
@@ -221,7 +228,8 @@ class Spring:
         for _ in range(round(seconds / 0.01)):
             position = self.pressing.at(0.0).position
             assert position is not None
-            free = cast("float", position[0]) - 0.02
+            asked = cast("float", position[0]) - 0.02
+            free = min(asked, self.reach)
             depth = max(0.0, free - self.at) / (1 + self.stiffness * COMPLIANCE[0, 0])
             self.forces.append(self.stiffness * depth)
             tip = np.array([0.02 + free - COMPLIANCE[0, 0] * self.forces[-1], 0.0, 0.1])
@@ -229,8 +237,9 @@ class Spring:
             force = TipForce(seen > 3e-3, -seen * N, 1e-6 * np.eye(3), -0.1 * seen * N)
             offset = np.concatenate([tip - [0.02 + free, 0.0, 0.1], np.zeros(3)])
             self.pressing.advance(
-                0.01, True, True, tip, offset, force, self.creep, np.eye(3), COMPLIANCE
-            )
+                0.01, True, True, tip, offset, force, self.creep, np.eye(3), COMPLIANCE,
+                (asked - free) * N,
+            )  # fmt: skip
             self.kinds += [n.kind for n in self.pressing.notices() if n.kind not in self.kinds]
 
 
@@ -298,6 +307,43 @@ def test_it_goes_back_when_too_much_is_felt_or_nothing_although_it_is_held_back(
     assert max(numb.forces) < 0.06
 
 
+@pytest.mark.parametrize(
+    ("at", "reach", "late", "why"),
+    [
+        (0.05, 0.004, 10, "no farther than 4.0 mm along the direction, and nothing is felt there"),
+        (
+            0.003,
+            0.005,
+            10,
+            "no farther than 3.0 mm along the direction, and it presses with 20 mN of",
+        ),
+        (0.003, 0.009, 10_000, "held back"),  # it could go on
+        (0.003, 0.007, 10_000, "no farther than 3.0 mm along the direction"),
+    ],
+)
+def test_the_end_of_the_arms_reach_is_told_from_something_that_holds_the_tip_back(
+    at: float, reach: float, late: int, why: str
+) -> None:
+    arm = Spring(at, 1e3, late=late, reach=reach)
+    arm.run(10.0)
+    assert why in arm.pressing.notices()[0].text
+    assert arm.forces[-1] == 0.0
+    assert max(arm.forces) < 0.06
+
+
+def test_a_force_is_kept_where_the_pose_is_a_little_out_of_reach() -> None:
+    arm = Spring(0.003, 1e3, reach=0.0062)  # 6.03 mm are needed
+    arm.run(8.0)
+    arm.reach = 0.0052
+    arm.run(1.0)
+    assert arm.pressing.phase is Phase.PRESSING
+    arm.reach = 0.0035
+    arm.run(4.0)
+    text = arm.pressing.notices()[0].text
+    assert "no farther than 3.0 mm along the direction, and it presses with" in text
+    assert "of 30 mN" in text
+
+
 @pytest.mark.parametrize("inside", [0.0, 3e-4])
 def test_it_goes_back_when_the_tip_touched_something_before_the_approach(inside: float) -> None:
     arm = Spring(-inside, 200.0, late=10_000)
@@ -332,7 +378,9 @@ def test_it_goes_back_from_an_object_on_the_way_that_lets_the_target_unreached(
         forces.append(max(0.0, stiffness * (free - wall) / (1 + stiffness * c)))
         tip = np.array([free - c * forces[-1], 0.0, 0.1])
         offset = np.array([tip[0] - free, 0.0, 0.0, 0.0, 0.0, 0.0])
-        pressing.advance(0.01, False, True, tip, offset, none, creep, np.eye(3), COMPLIANCE)
+        pressing.advance(
+            0.01, False, True, tip, offset, none, creep, np.eye(3), COMPLIANCE, np.zeros(3)
+        )  # fmt: skip
         position = pressing.at(0.0).position
         assert position is not None
         goal = cast("float", position[0]) - pressing.corrected(offset)[0]
@@ -379,7 +427,9 @@ def test_it_does_not_begin_while_something_touches_the_tip() -> None:
     )
     still, tip, offset = CreepEstimator(3, False, CreepTuning()), np.zeros(3), np.zeros(6)
     for _ in range(900):
-        pressing.advance(0.01, True, True, tip, offset, force, still, np.eye(3), COMPLIANCE)
+        pressing.advance(
+            0.01, True, True, tip, offset, force, still, np.eye(3), COMPLIANCE, np.zeros(3)
+        )  # fmt: skip
     assert pressing.phase is Phase.GOING
     assert pressing.begins_free
     assert [notice.kind for notice in pressing.notices()] == ["press-waits"]
@@ -403,7 +453,7 @@ def test_a_press_that_begins_beyond_its_target_is_told_once(
     still, found = CreepEstimator(3, False, CreepTuning()), []
     for place in (np.array(tip), np.array([0.03, 0.0, 0.1])):  # it overshoots later
         pressing.advance(
-            0.01, False, True, place, np.zeros(6), free, still, np.eye(3), COMPLIANCE
+            0.01, False, True, place, np.zeros(6), free, still, np.eye(3), COMPLIANCE, np.zeros(3)
         )  # fmt: skip
         found += [notice.kind for notice in pressing.notices()]
     assert found == kinds

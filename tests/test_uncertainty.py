@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from stiffopt.errors import InputError, PressureError
 from stiffopt.model.calibration import Calibration, ErrorModel, FittedParameter
 from stiffopt.model.description import Corrections, RobotDescription
-from stiffopt.model.history import History, Memory, Part, Play
+from stiffopt.model.history import Creep, History, Memory, Part, Play
 from stiffopt.model.manipulator import Manipulator, load_robot
 from stiffopt.model.parameters import Parameter, with_values
 from stiffopt.model.robot_files import load_description
@@ -274,6 +274,32 @@ def test_hysteresis_is_at_most_what_was_recorded() -> None:
     ]
     assert acting[1][0, 0] == pytest.approx(0.9 * 200.0**2)
     np.testing.assert_allclose(acting[1][1:, 1:], acting[0][1:, 1:])
+
+
+@pytest.mark.parametrize("size", [2e3, 4e3, 1e6])
+def test_creep_is_left_as_far_as_was_recorded(size: float) -> None:
+    """A pressure creeps from the last one, which was anywhere from 0 to 1 bar, to its own."""
+    shares, recorded = (0.05, 0.08), np.array([P, [0.2e5, 0.9e5, 0.4e5]])
+    history = History(
+        creep=tuple(Creep(time=t, share=s) for t, s in zip((2.0, 20.0), shares, strict=True))
+    )
+    errors = ErrorModel(
+        residual=1e-4, discrepancy=0.0, reach=1e4, gain=0.0, degrees_of_freedom=9.0,
+        recorded=tuple(map(tuple, recorded.tolist())), settled=(size,) * 3,
+    )  # fmt: skip
+    robot = calibrated(history=history, errors=errors, parameters=(), correlation=())
+    arm = Manipulator(robot)
+    squares = []
+    for p in recorded:
+        slope = arm.tip_pose(p)[:3, :3] @ arm.tip_jacobian(p)[:3]
+        inverse = np.linalg.inv(slope)
+        softness = (slope**2).sum()
+        squares.append((np.diag(inverse @ arm.tip_uncertainty(p).hysteresis @ inverse.T), softness))
+    found, soft = (np.array(each) for each in zip(*squares, strict=True))
+    found *= soft[:, np.newaxis] / np.median(soft) / 0.9
+    all_of_it = sum(shares) ** 2 * (1e5**2 / 12 + (recorded - 0.5e5) ** 2)
+    left = np.minimum(1.0, size**2 / all_of_it.mean(axis=0))
+    np.testing.assert_allclose(found, left * all_of_it, rtol=0.02)
 
 
 def test_hysteresis_moves_the_tip_less_where_the_arm_is_soft() -> None:

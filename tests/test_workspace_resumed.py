@@ -8,6 +8,7 @@ import subprocess
 import sys
 import textwrap
 import time
+from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,9 @@ from stiffopt.errors import CancelledError, FileError, InputError, OutOfTimeErro
 from stiffopt.model.manipulator import Manipulator, load_robot
 from stiffopt.model.scene import Scene
 from stiffopt.workspace import MapPlan, WorkspaceMap, map_workspace, open_workspace_map, store
+from stiffopt.workspace.plan import TUNING
 from stiffopt.workspace.table import CellTable, Gathering
+from stiffopt.workspace.workers import ResultLostError, results
 from workspace_maps import BLOCK, Stop, _blocks, _raise_at, assert_same, robot_fixture  # noqa: F401
 
 SAMPLES = 2 * BLOCK + BLOCK // 8  # three blocks
@@ -252,6 +255,37 @@ def test_a_cluster_makes_no_difference_even_if_it_loses_a_worker(
     whole = map_workspace(robot, samples=samples, cell=0.004)
     for name in ("a.zarr", "b.zarr"):
         assert_same(open_workspace_map(tmp_path / name), whole)
+
+
+class Losing:
+    """Workers that lose the result of a block so many times: the block is its own future."""
+
+    width = 2
+
+    def __init__(self, block: int, times: int) -> None:
+        self._block, self._times, self.begun = block, times, list[int]()
+
+    def submit(self, index: int, done: Callable[[int, Any], None]) -> None:
+        self.begun.append(index)
+        done(index, index)
+
+    def result(self, future: Any) -> Any:
+        if future == self._block and self._times:
+            self._times -= 1
+            raise ResultLostError("lost")
+        return future
+
+    def check(self) -> None:
+        """Do nothing."""
+
+
+def test_a_block_whose_result_is_lost_is_computed_again() -> None:
+    workers: Any = Losing(1, times=TUNING.retries)
+    assert list(results(workers, range(3))) == [0, 1, 2]
+    assert sorted(workers.begun) == [0, *[1] * (1 + TUNING.retries), 2]
+    workers = Losing(0, times=TUNING.retries + 1)
+    with pytest.raises(ResultLostError):
+        list(results(workers, range(3)))
 
 
 @pytest.mark.skipif(find_spec("distributed") is None, reason="distributed is not installed")

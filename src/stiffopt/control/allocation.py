@@ -173,7 +173,7 @@ def _program(law: TrackingRows, step: Array, tip_step: float, weight: float) -> 
     low, high = ca.SX.sym("low", n), ca.SX.sym("high", n)
     scaled, G = J * (_BAR / weight), law.linear * _BAR
     before, reach = last / _BAR, ca.DM(step)
-    H = scaled.T @ scaled + ca.SX.eye(n)
+    H = ca.tril2symm(ca.tril(scaled.T @ scaled)) + ca.SX.eye(n)
     f = scaled.T @ (v / -weight) - H @ (reference / _BAR - before)
     # a limit may be below the last pressures: go down as fast as the slew allows
     upper = ca.fmax(ca.fmin(high - before, reach), -reach)

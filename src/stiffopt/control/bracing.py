@@ -11,7 +11,8 @@ sigma of y - s - b and f of pushes,
 
     F = C (C C + (sigma / f)^2)^-1 (y - s - b).
 
-The contacts count as held as long as the model's contacts hold under this push.
+The contacts count as held as long as the model's contacts hold under this push, and, where they
+are to stick, as long as the tip does not show that they slide (`SlideEstimator`).
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from numpy.typing import NDArray
 
 from stiffopt.control.friction import Friction
 from stiffopt.control.interface import Notice
+from stiffopt.control.sliding import SlideEstimator
 from stiffopt.control.state import Severity
 from stiffopt.control.tuning import BracingTuning
 from stiffopt.optimise.target import Target
@@ -81,6 +83,8 @@ class Bracing:
         self._held = self._pushed = 0.0  # durations, in s
         self.approach: BraceApproach | None = None
         self._friction: Friction | None = None
+        self._slides: SlideEstimator | None = None
+        self._slid = 0  # successive samples at which a contact has slid
         self._start: Array = np.zeros(0)  # pressures (n,) from which the arm goes to rest
         self._left = 1.0  # share of `_start` that is left
         self._time = 0.0  # along the approach, in s
@@ -180,7 +184,14 @@ class Bracing:
         ]
         return f"the arm leans on {' and '.join(where)}"
 
-    def look(self, elapsed: float, seen: Array, tip: TipAt, pressures: Array) -> None:
+    def look(
+        self,
+        elapsed: float,
+        seen: Array,
+        tip: TipAt,
+        pressures: Array,
+        quaternion: Array | None = None,
+    ) -> None:
         """Check at a sample of the tracker whether the contacts hold.
 
         If the tip is nearer to its place on a free arm, the contact is lost, whatever pushes it.
@@ -195,6 +206,8 @@ class Bracing:
             Model of the braced tip at the present pressures.
         pressures :
             Effective pressures (n,), in Pa.
+        quaternion :
+            Measured orientation (4,) of the tip, w first; None if it is not measured.
         """
         t, held, friction = self._tuning, self.phase is BracePhase.HELD, self._friction
         if self.approach is None or friction is None:
@@ -209,7 +222,7 @@ class Bracing:
         friction.follow(pressures, min(elapsed / t.even_time, 1.0), creep)
         residual = seen - tip.pose[:3, 3]
         if sticks:
-            residual = residual - friction.tip @ friction.forces
+            residual = residual - friction.tip[:3] @ friction.forces
         if self._error is None:
             self._residual = residual
         self._residual = self._residual + min(elapsed / t.swing_time, 1.0) * (
@@ -239,7 +252,9 @@ class Bracing:
         C = R @ tip.compliance[:3, :3] @ R.T
         if sticks:
             before = friction.normals(pressures)
-            C = C + friction.tip @ self.approach.hold.sticking.per_push
+            C = C + friction.tip[:3] @ self.approach.hold.sticking.per_push
+            if not settles and self._has_slid(elapsed, seen, quaternion, pressures):
+                return
         usual = self._usual(R)
         push = usual @ C.T @ np.linalg.solve(C @ usual @ C.T + t.deviation**2 * np.eye(3), off)
         feels = self._feels(off, push, before)
@@ -258,6 +273,32 @@ class Bracing:
         self.push, self.displacement = push, off
         self.covariance[:] = np.linalg.inv(C.T @ C / t.deviation**2 + np.linalg.inv(usual))
         self._judge(before, elapsed)
+
+    def _has_slid(
+        self, elapsed: float, seen: Array, quaternion: Array | None, pressures: Array
+    ) -> bool:
+        """Return whether place and turn of the tip tell that a contact has slid; then let go.
+
+        See `look` for the arguments.
+        """
+        assert self.approach is not None
+        assert self._friction is not None
+        t, approach = self._tuning.sliding, self.approach
+        if not approach.hold.sticking.own:
+            return False
+        if self._slides is None:
+            usual = self._usual(approach.tips[-1].pose[:3, :3])
+            self._slides = SlideEstimator(approach, self._friction, usual, t)
+        self._slides.take(elapsed, self._held, seen, quaternion, pressures)
+        sizes = np.linalg.norm(self._slides.slides, axis=1)
+        slid = (sizes > t.told) & (self._slides.deviations() > t.surely)
+        self._slid = self._slid + 1 if slid.any() else 0
+        if self._slid < t.samples:
+            return False
+        most = int(np.where(slid, sizes, 0.0).argmax())
+        where = approach.contacts[approach.hold.sticking.own[most]].object
+        self.release(why=f"the contact on '{where}' has slid by {1e3 * sizes[most]:.1f} mm")
+        return True
 
     def _feels(self, off: Array, push: Array, before: Array) -> bool:
         """Return whether a displacement (3,) of the tip is more than the model's error.
@@ -396,7 +437,7 @@ class Bracing:
         rows, wanted = [jacobian, t.force_weight * hold.per_pressure], [error]
         if self._sticks and self._held >= t.settling:  # the tip has come to its target
             rates = hold.sticking.per_pressure
-            jacobian = jacobian + friction.tip @ rates
+            jacobian = jacobian + friction.tip[:3] @ rates
             rows = [jacobian, t.force_weight * friction.per_pressure, t.force_weight * rates]
             wanted = [error, np.zeros(len(hold.forces)), -t.force_weight * friction.forces]
         step = elapsed * self._step(np.vstack(rows), np.concatenate(wanted), limits)

@@ -92,6 +92,7 @@ class Channels:
         # offset; and these, in Pa (3, n)
         self._followed: Array = np.zeros((3, n))
         self._smoothed: Array = np.zeros(n)  # smoothed readings, in Pa
+        self._made_up: Array = np.zeros(n)  # see `compensated`, if no channel is short, in Pa
         self._ceiling: Array = np.where(self.out, self._empty, self._limits.high)
         self._rest = _Rest(n, self._tuning)
         self.pace = 1.0
@@ -144,7 +145,7 @@ class Channels:
         self.shortfall = -offset
         self._rest.advance(elapsed, command, self.shortfall)
         share = -math.expm1(-elapsed / self._tuning.reading_time)
-        self._smoothed, now, follows, strays, sound = self._look(
+        self._smoothed, self._made_up, now, follows, strays, sound = self._look(
             share, self._smoothed, reading, self.shortfall, healthy
         )
         if self._any_out:
@@ -219,14 +220,14 @@ class Channels:
         )
         self.stuck = (self.stuck | stuck) & self.limited
 
-    def compensated(self, offset: Array) -> Array:
-        """Return the part of `offset` (n,), see `update`, that commands compensate, in Pa."""
+    @property
+    def compensated(self) -> Array:
+        """The part of the regulators' offset (n,), see `update`, that commands compensate."""
         if self._quiet:
-            most = above = self._min_allowed
-        else:
-            most = np.where(self.limited, np.inf, self._allowed)
-            above = np.where(self.limited, np.inf, self._min_allowed)
-        part: Array = np.minimum(np.maximum(offset, -most), above)
+            return self._made_up
+        most = np.where(self.limited, np.inf, self._allowed)
+        above = np.where(self.limited, np.inf, self._min_allowed)
+        part: Array = np.minimum(np.maximum(-self.shortfall, -most), above)
         return part
 
     def available(self) -> tuple[Array, Array]:
@@ -309,23 +310,26 @@ def _look(n: int, tuning: RegulatorTuning) -> Formula:
     """Return the formula of the checks that every tick makes.
 
     Inputs: share by which smoothed readings (n,) follow; these; readings and shortfalls (n,); least
-    and greatest healthy pressures (2, n). Outputs: smoothed readings; readings, these without the
-    regulators' offset, and readings again (3, n); 1 for channels (n,) that follow; 1 for those (n,)
-    that are beyond the healthy pressures; and 1 if all follow and none is beyond them.
+    and greatest healthy pressures (2, n). Outputs: smoothed readings; the part of the regulators'
+    offset that commands compensate if no channel is short (n,); readings, these without that
+    offset, and readings again (3, n); 1 for channels (n,) that follow; 1 for those (n,) that are
+    beyond the healthy pressures; and 1 if all follow and none is beyond them.
     """
     share, smoothed = ca.SX.sym("share"), ca.SX.sym("smoothed", n)
     reading, short = ca.SX.sym("reading", n), ca.SX.sym("short", n)
     healthy = ca.SX.sym("healthy", 2, n)
     change = share * (reading - smoothed)
     after = smoothed + ca.if_else(ca.fabs(change) < np.inf, change, 0)  # 0 for NaN
+    most = tuning.max_compensation
+    made_up = ca.fmin(ca.fmax(-short, -most), most)
     settled = reading + short
-    follows = ca.fabs(short) <= tuning.max_compensation
+    follows = ca.fabs(short) <= most
     below, above = healthy[0, :].T - settled, settled - healthy[1, :].T
     strays = ca.logic_or(below > tuning.unmoved, above > tuning.unmoved)
     sound = ca.logic_and(ca.mmin(follows) > 0, ca.mmax(strays) < 1)
     now = ca.vertcat(reading.T, settled.T, reading.T)
     return Formula(
-        [share, smoothed, reading, short, healthy], [after, now, follows, strays, sound],
+        [share, smoothed, reading, short, healthy], [after, made_up, now, follows, strays, sound],
         [healthy, now],
     )  # fmt: skip
 
@@ -339,7 +343,7 @@ class _Rest:
     """
 
     def __init__(self, n: int, tuning: RegulatorTuning) -> None:
-        self._tuning, self._elapsed = tuning, 0.0
+        self._tuning, self._elapsed, self._step = tuning, 0.0, _rest(n, tuning)
         self._near: Array = np.zeros(n)  # the commands when they came to rest, in Pa
         self._rested: Array = np.zeros(n)  # for how long, in s
         self._usual: Array = np.zeros(n)  # shortfall of the channel at rest, in Pa
@@ -347,21 +351,37 @@ class _Rest:
 
     def advance(self, elapsed: float, command: Array, short: Array) -> None:
         """Take in commands and shortfalls (n,), in Pa."""
-        tuning = self._tuning
         self._elapsed += elapsed
-        if self._elapsed < tuning.rest_interval:
+        if self._elapsed < self._tuning.rest_interval:
             return
         elapsed, self._elapsed = self._elapsed, 0.0
-        moved = np.abs(command - self._near) > tuning.rest_range
-        self._near = np.where(moved, command, self._near)
-        self._rested = np.where(moved, 0.0, self._rested + elapsed)
-        settled = self._rested > tuning.rest_time
-        least = tuning.unmoved + tuning.gain_error * np.abs(command - self._near)
-        change, size = np.abs(short - self._usual), np.abs(short)
-        grown = (change > least) & (size > least)
-        stays = self.changed & (change > least / 2) & (size > least / 2)
-        self.changed = (settled & grown) | stays
-        slow = -math.expm1(-elapsed / tuning.usual_time)
-        share = np.where(settled & (size > np.abs(self._usual)), slow, 1.0)
-        share[self.changed] = 0.0
-        self._usual = self._usual + share * (short - self._usual)
+        self._near, self._rested, self._usual, changed = self._step(
+            elapsed, command, short, self._near, self._rested, self._usual, self.changed
+        )
+        self.changed = changed > 0
+
+
+def _rest(n: int, tuning: RegulatorTuning) -> Formula:
+    """Return the formula of the test of shortfalls at rest.
+
+    Inputs: the elapsed time, in s; commands and shortfalls (n,), in Pa; and what `_Rest` knows of
+    each channel, (n,) each. Outputs: the latter after that time.
+    """
+    elapsed = ca.SX.sym("elapsed")
+    command, short = ca.SX.sym("command", n), ca.SX.sym("short", n)
+    near, rested = ca.SX.sym("near", n), ca.SX.sym("rested", n)
+    usual, changed = ca.SX.sym("usual", n), ca.SX.sym("changed", n)
+    inputs = [elapsed, command, short, near, rested, usual, changed]
+    moved = ca.fabs(command - near) > tuning.rest_range
+    near = ca.if_else(moved, command, near)
+    rested = ca.if_else(moved, 0, rested + elapsed)
+    settled = rested > tuning.rest_time
+    least = tuning.unmoved + tuning.gain_error * ca.fabs(command - near)
+    change, size = ca.fabs(short - usual), ca.fabs(short)
+    grown = ca.logic_and(change > least, size > least)
+    stays = ca.logic_and(changed, ca.logic_and(change > least / 2, size > least / 2))
+    changed = ca.logic_or(ca.logic_and(settled, grown), stays)
+    slow = -ca.expm1(-elapsed / tuning.usual_time)
+    share = ca.if_else(ca.logic_and(settled, size > ca.fabs(usual)), slow, 1)
+    usual = usual + ca.if_else(changed, 0, share) * (short - usual)
+    return Formula(inputs, [near, rested, usual, changed])

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,6 +22,7 @@ from stiffopt.control.checks import refusing
 from stiffopt.control.course import Course
 from stiffopt.control.first_motion import FirstMotion
 from stiffopt.control.forecast import Forecast, Present
+from stiffopt.control.formula import are_within
 from stiffopt.control.interface import ControlOutput, Notice, SampleCounts
 from stiffopt.control.linearised_tip import LeaningTip
 from stiffopt.control.observer import ArmObserver
@@ -134,7 +136,10 @@ class TipController:
             maxlen=max(1, round(tuning.reference.taken_back / period))
         )
         self._first_motion = FirstMotion(commissioned, tuning.first_motion)
-        self._requests = Requests(robot, limits, slew, scene, tuning, control.tip_speed)
+        sliding = replace(tuning.bracing.sliding, noise=control.tracker_noise)
+        bracing = replace(tuning.bracing, sliding=sliding)
+        own = replace(tuning, bracing=bracing)
+        self._requests = Requests(robot, limits, slew, scene, own, control.tip_speed)
         Planner = ProcessPlanner if plan_in_process else InlinePlanner
         self.replanner = Replanner(Planner(robot, scene), tuning.replanning, period, dead_time)
         self.forecast: Forecast | None = None
@@ -307,6 +312,8 @@ class TipController:
         course = self.replanner.pursuit.course
         if isinstance(course, Bracing):
             course.is_steered = not self._is_held(now)
+        swings = not self._is_held(now) and now - self._moved_at < self._tuning.estimator.swings_on
+        self._arm.tip.learns = swings
         counts = self._arm.observe(now, commanded, reading, samples, course)
         if counts.used and (sample := self._arm.tip.sample) is not None:
             self._first_motion.take(self._arm.tip.predicted, sample.position)
@@ -370,7 +377,6 @@ class TipController:
         reference.advance(self._awaited(plan, now))
         if self._moves():
             self._moved_at = now
-        self._arm.tip.learns = now - self._moved_at < self._tuning.estimator.swings_on
         if self._arm.leaning is not None:
             return self._feedforward(reference.command - pressures.command_offset, last)
         tip = self._arm.on_path(reference.path[:n])
@@ -520,13 +526,13 @@ class TipController:
 
     def _is_near(self, pressures: Array) -> bool:
         """Whether the reference rests at pressures (n,)."""
-        off = float(np.abs(self._reference.path[: len(pressures)] - pressures).max())
-        return off <= self._tuning.reference.there and not self._moves()
+        off = self._reference.path[: len(pressures)] - pressures
+        return are_within(self._tuning.reference.there, off) and not self._moves()
 
     def _moves(self) -> bool:
         """Return whether the reference is still moving."""
         rate = self._reference.motion[1, : self.robot.n_pressures]
-        return not np.abs(rate).max() <= self._tuning.reference.at_rest
+        return not are_within(self._tuning.reference.at_rest, rate)
 
     def _correct_brace(self, course: Bracing, now: float) -> None:
         """Bring the braced tip to its target; without one for its position it stays."""
@@ -551,12 +557,13 @@ class TipController:
         course, tip = self.replanner.pursuit.course, self._arm.modelled
         if not isinstance(course, Pressing) or tip is None:
             return
-        R = tip.pose[:3, :3]
+        R, plan = tip.pose[:3, :3], self.replanner.current
+        short = np.zeros(3) if plan is None else np.array(plan.short)
         elapsed = min(now - self._computed_at, _HELD * self._period)
         course.advance(
             elapsed, self._rests(now), self._is_known(now), self._arm.tip.estimate.position,
             self._arm.tip.offset, self._arm.touch.felt, self._arm.touch.creep,
-            R, R @ tip.compliance[:3, :3] @ R.T,
+            R, R @ tip.compliance[:3, :3] @ R.T, short,
         )  # fmt: skip
 
     def _is_known(self, now: float) -> bool:
@@ -593,7 +600,7 @@ class TipController:
         goes = course is None or (isinstance(course, Pressing) and course.phase is Phase.GOING)
         if not goes or not self._has_arrived():
             return False
-        return float(np.abs(estimator.vibration[0]).max()) < t.vibration
+        return are_within(t.vibration, estimator.vibration[0])
 
     def _go_on_with(self, adapted: Adapted) -> None:
         """Change the model's numbers so that nothing moves at this time."""
@@ -632,8 +639,8 @@ class TipController:
         plan = self.replanner.plan
         if plan is None or not self._is_near(plan.pressures):
             return False
-        off = np.abs(self._reference.goal[: len(plan.pressures)] - plan.pressures)
-        return bool(off.max() <= self._tuning.reference.there)
+        off = self._reference.goal[: len(plan.pressures)] - plan.pressures
+        return are_within(self._tuning.reference.there, off)
 
     def _set_reference_rate(self) -> None:
         tuning, rate = self._tuning.reference, self._tuning.reference.rigid_rate

@@ -103,11 +103,12 @@ class TipEstimator:
         self._orientation = _orientation()
         self.omega = math.inf  # of the vibration, in rad/s; infinite before it is known
         self._times = np.array([1.0, period])  # omega, and duration of the step
+        # the model's compliance (6, 6) for which the following numbers are; see `_directions_of`
+        self._compliance: Array | None = None
+        self._directions: Array = np.zeros((3, 3, 3))
+        self._principal: Array = np.zeros(3)
         # displacement (3, n) of the mode per pressure beyond that of the straight arm, in m/Pa
         self.excess: Array = np.zeros((3, n))
-        # whether samples correct the frequency: only while a planned motion swings the arm, since
-        # what shakes it from outside has another frequency
-        self.learns = False
         self.begin()
 
     def begin(self) -> None:
@@ -120,6 +121,9 @@ class TipEstimator:
         # relative error of the mode's frequency, and its variance
         t = self._tuning
         self.detuning = np.array([t.frequency_offset, t.frequency_deviation**2])
+        # whether samples correct the frequency: only while a planned motion swings the arm, since
+        # what shakes it from outside has another frequency
+        self.learns = False
         self.offset = np.zeros(6)  # tip pose relative to the model's: d in m, and a rotation vector
         self.soft_plane = np.diag([1.0, 1.0, 0.0])  # projection on the directions of low stiffness
         self.stiff_axis = np.diag([0.0, 0.0, 1.0])  # on those of a stiffness that is far higher
@@ -173,10 +177,9 @@ class TipEstimator:
         return 1 + error, math.sqrt(variance)
 
     @property
-    def frequency_is_bounded(self) -> bool:
-        """Whether the frequency is as far from the model's as the estimator permits."""
-        error = abs(float(self.detuning[0]))
-        return self._mode is not None and error >= self._tuning.frequency_bound
+    def frequency_off(self) -> float:
+        """The size of e, over the largest that the estimator permits."""
+        return abs(float(self.detuning[0])) / self._tuning.frequency_bound
 
     @property
     def turn_known(self) -> bool:
@@ -291,17 +294,30 @@ class TipEstimator:
         self._ticks += 1
         if self._ticks % _MODE_EVERY != 1 or self._mode is None:
             return
+        if tip.compliance is not self._compliance:
+            self._compliance = tip.compliance
+            self._directions, self._principal = self._directions_of(tip.compliance)
         rotation = tip.pose[:3, :3]
-        linear = rotation @ tip.compliance[:3, :3] @ rotation.T
-        compliances, axes = np.linalg.eigh(linear)
-        # in a strongly bent arm no direction is entirely stiff
-        share = np.minimum(1.0, compliances / (self._tuning.soft_share * compliances[2]))
-        self.soft_plane = axes * share @ axes.T
-        share = np.maximum(0.0, 1 - compliances / (self._tuning.stiff_share * compliances[2]))
-        self.stiff_axis = axes * share @ axes.T
-        self._times[0] = self.omega = (1 + self.detuning[0]) * self._modelled_frequency(compliances)
-        turning = rotation @ tip.compliance[3:, :3] @ rotation.T
-        self._lean = turning @ axes[:, 1:] @ np.diag(1 / compliances[1:]) @ axes[:, 1:].T
+        self.soft_plane, self.stiff_axis, self._lean = rotation @ self._directions @ rotation.T
+        omega = (1 + self.detuning[0]) * self._modelled_frequency(self._principal)
+        self._times[0] = self.omega = omega
+
+    def _directions_of(self, compliance: Array) -> tuple[Array, Array]:
+        """Return soft plane, stiff axis, lean (3, 3, 3), tip axes, and principal compliances."""
+        compliances, axes = np.linalg.eigh(compliance[:3, :3])
+        _, second, softest = values = compliances.tolist()
+        least, most = self._tuning.stiff_share * softest, self._tuning.soft_share * softest
+        weights = np.array(
+            [
+                # in a strongly bent arm no direction is entirely stiff
+                [min(1.0, value / most) for value in values],
+                [max(0.0, 1 - value / least) for value in values],
+                [0.0, 1 / second, 1 / softest],
+            ]
+        )
+        directions = axes * weights[:, None] @ axes.T
+        directions[2] = compliance[3:, :3] @ directions[2]
+        return directions, compliances
 
     def _amplitude(self, vibration: Array) -> float:
         """Return the amplitude of a vibration (2, 3), in m."""
@@ -400,8 +416,11 @@ def _prediction(mode: BendingMode | None, n: int, damping: float) -> Formula:
     position, excitation = pose[:3, 3], ca.SX.zeros(3)
     driven_after, free_after, slope_after, free_slope_after = driven, free, slope, free_slope
     if mode is not None:
-        moves = soft_plane @ pose[:3, :3] @ jacobian[:3, :] @ ca.diag(ca.DM(mode.participation))
-        excitation, pull = (moves + excess) @ change, (moves + excess) @ ahead
+        excitation, pull = (
+            soft_plane @ (pose[:3, :3] @ (jacobian[:3, :] @ (ca.DM(mode.participation) * p)))
+            + excess @ p
+            for p in (change, ahead)
+        )
         omega, elapsed = times[0], times[1]
         F = transition(omega, damping, elapsed)
         # half of what acts on the mode does so at the beginning of the step, half at its end
@@ -483,7 +502,7 @@ def _correction(tuning: EstimatorTuning, vibrates: bool) -> Formula:
         psi = soft_plane @ (before[0, :].T + offset_slope)  # of the expected position
         free_slope_after = free_slope - F @ (gain[:2] @ psi.T)
         offset_slope_after = offset_slope - gain[2] * psi
-        variance = detuning[1] + t.frequency_change**2 * displacements[1]
+        variance = detuning[1] + learns * t.frequency_change**2 * displacements[1]
         variance = ca.fmin(variance, t.frequency_deviation**2)
         weight = learns / (H.T @ PH + noise)
         variance /= 1 + variance * ca.sumsqr(psi) * weight

@@ -17,6 +17,7 @@ has rows of its own.
 
 from __future__ import annotations
 
+from bisect import bisect
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -32,7 +33,7 @@ from stiffopt.optimise.target import Target
 Array = NDArray[np.float64]
 Symbols = Any  # of CasADi
 
-_FREQUENCIES = np.geomspace(2.0, 200.0, 60)  # rad/s, of the table of gains
+_FREQUENCIES = np.geomspace(2.0, 200.0, 60).tolist()  # rad/s, of the table of gains
 
 
 @dataclass(frozen=True)
@@ -97,7 +98,7 @@ def tracking_rows(
     pose, jacobian = ca.SX.sym("pose", 4, 4), ca.SX.sym("jacobian", 6, n)
     prescribed, correction = ca.SX.sym("prescribed", 5), ca.SX.sym("correction", 6)
     rotation, shift, turn = pose[:3, :3], correction[:3], correction[3:]
-    linear, angular = rotation @ jacobian[:3, :], rotation @ jacobian[3:, :]
+    linear, angular = rotation @ jacobian[:3, :], jacobian[3:, :]  # base axes, tip axes
     inputs, mode_rows, mode_values = [pose, jacobian, prescribed, correction], [], []
     matrices = [jacobian]
     if vibrates:
@@ -120,14 +121,14 @@ def tracking_rows(
         feedback = -(gains[0] * sigma + gains[1] * epsilon + gains[2] * speed)
         shift = shift + feedback
         mode_rows, mode_values = [mode_weight * M], [mode_weight * (goal + feedback)]
-    axis = rotation[:, 2]
-    sideways = ca.SX.eye(3) - axis @ axis.T
+    turn = rotation.T @ turn
     position = ca.diag(prescribed[:3])
     pointing, orientation = lever * prescribed[3], lever * prescribed[4]
-    task = [position @ linear, pointing * (sideways @ angular), orientation * angular]
-    values = [position @ shift, pointing * (sideways @ turn), orientation * turn]
+    # turning about the tip's own axis leaves its direction as it is
+    task = [position @ linear, pointing * angular[:2, :], orientation * angular]
+    values = [position @ shift, pointing * turn[:2], orientation * turn]
     rows = ca.vertcat(*task, *mode_rows)
-    return TrackingRows(inputs, matrices, rows, ca.vertcat(*values, *mode_values), linear, 9)
+    return TrackingRows(inputs, matrices, rows, ca.vertcat(*values, *mode_values), linear, 8)
 
 
 def with_offsets(law: TrackingRows) -> TrackingRows:
@@ -171,7 +172,7 @@ def with_excess(law: TrackingRows, participation: Array) -> TrackingRows:
     """
     pose, jacobian, prescribed, correction, vibration, plane, mode, *others = law.inputs
     excess = ca.SX.sym("excess", *mode.shape)
-    found = plane @ pose[:3, :3] @ jacobian[:3, :] @ ca.diag(ca.DM(participation)) + excess
+    found = plane @ law.linear @ ca.diag(ca.DM(participation)) + excess
     return replace(
         law,
         inputs=[pose, jacobian, prescribed, correction, vibration, plane, excess, *others],
@@ -196,8 +197,10 @@ class GainSchedule:
     def at(self, omega: float) -> Array:
         """Return gains (3,) at an angular frequency in rad/s; the last gain is in s."""
         if omega != self._last[0]:
-            columns = [np.interp(omega, _FREQUENCIES, column) for column in self._table.T]
-            self._last = omega, np.array(columns)
+            above = min(max(bisect(_FREQUENCIES, omega), 1), len(_FREQUENCIES) - 1)
+            low, high = _FREQUENCIES[above - 1 : above + 1]
+            share = min(max((omega - low) / (high - low), 0.0), 1.0)
+            self._last = omega, (1 - share) * self._table[above - 1] + share * self._table[above]
         return self._last[1]
 
 

@@ -18,6 +18,11 @@ from stiffopt.model.batch import Buffer
 Array = NDArray[np.float64]
 
 
+def are_within(bound: float, values: Array) -> bool:
+    """Whether no value (k,) is farther from 0 than a bound; NaN is. For a few values."""
+    return all(abs(value) <= bound for value in values.tolist())
+
+
 class Formula:
     """A function of arrays, given by CasADi symbols and expressions; for one thread at a time.
 

@@ -40,6 +40,7 @@ class Friction:
     Attributes
     ----------
     forces : (2k,), on the arm, in N; see `Sticking`.
+    tip : derivatives (6, 2k) of the tip's place and turn by them, base axes.
     """
 
     def __init__(self, hold: Hold, planned: Array) -> None:

@@ -52,7 +52,7 @@ class LagEstimator:
         """
         self._sent[:-1] = self._sent[1:]
         self._sent[-1] = commanded
-        seen = np.where(lost, np.nan, reading) if lost.any() else reading
+        seen = np.where(lost, np.nan, reading) if any(lost.tolist()) else reading
         self._motion, self._known, self._variances = self._step(
             self._motion, self._known, self._variances, self._sent[0], seen
         )

@@ -13,9 +13,11 @@ noise, so it has one covariance (4, 4).
 
 from __future__ import annotations
 
+import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.control.formula import Formula
 from stiffopt.control.tuning import MotionErrorTuning
 
 Array = NDArray[np.float64]
@@ -30,7 +32,7 @@ class MotionErrorEstimator:
     """
 
     def __init__(self, tuning: MotionErrorTuning) -> None:
-        self._tuning = tuning
+        self._tuning, self._correct = tuning, _correction(tuning)
         self.stop()
 
     def stop(self) -> None:
@@ -51,11 +53,28 @@ class MotionErrorEstimator:
             self._mean = np.vstack([np.zeros((3, 3)), offset])
             self._covariance = np.diag([t.deviation**2] * 3 + [t.noise**2])
         elif self._elapsed >= t.every:
-            P, h = self._covariance, np.append(position - self._start, 1.0)
-            speed = float(np.linalg.norm(position - self._last)) / self._elapsed
-            P[3, 3] += t.drift**2 * self._elapsed
-            gain = P @ h / (h @ P @ h + t.noise**2 + (t.late * speed) ** 2)
-            self._mean = self._mean + np.outer(gain, offset - h @ self._mean)
-            self._covariance = P - np.outer(gain, h @ P)
+            self._mean, self._covariance = self._correct(
+                self._mean, self._covariance, position, self._start, self._last, offset,
+                self._elapsed,
+            )  # fmt: skip
             self.slope = self._mean[:3].T
             self._last, self._elapsed = position.copy(), 0.0
+
+
+def _correction(tuning: MotionErrorTuning) -> Formula:
+    """Return the formula of the measurement update.
+
+    Inputs: mean (4, 3) and covariance (4, 4), the position (3,) now, at the first and at the last
+    update, the offset (3,), and the time since the last update. Outputs: mean and covariance.
+    """
+    t = tuning
+    mean, P = ca.SX.sym("mean", 4, 3), ca.SX.sym("covariance", 4, 4)
+    position, start = ca.SX.sym("position", 3), ca.SX.sym("start", 3)
+    last, offset, elapsed = ca.SX.sym("last", 3), ca.SX.sym("offset", 3), ca.SX.sym("elapsed")
+    h = ca.vertcat(position - start, 1)
+    speed = ca.norm_2(position - last) / elapsed
+    grown = P + ca.diag(ca.vertcat(0, 0, 0, t.drift**2 * elapsed))
+    seen_with = grown @ h
+    gain = seen_with / (h.T @ seen_with + t.noise**2 + (t.late * speed) ** 2)
+    outputs = [mean + gain @ (offset - mean.T @ h).T, grown - gain @ seen_with.T]
+    return Formula([mean, P, position, start, last, offset, elapsed], outputs)

@@ -196,8 +196,7 @@ class MotionWatch:
             self._known_from = min(self._known_from, time)
         if self._known_from <= time:
             self.doubt = self.doubt or self._slip(jacobian, tip)
-        bending = turn_of_a_push(tip) if turns else None
-        self.doubt = self.doubt or self._drift(jacobian, bending) or self._swing()
+        self.doubt = self.doubt or self._drift(jacobian, tip if turns else None) or self._swing()
 
     def _is_pushed(self) -> bool:
         """Return whether something has just displaced the tip while the reference rested."""
@@ -405,14 +404,13 @@ class MotionWatch:
         is_along = aside < tuning.aside * float(np.linalg.norm(moved))
         return share if is_along and abs(share) < tuning.largest_error else 0.0
 
-    def _drift(self, jacobian: Array, bending: Array | None) -> Doubt | None:
+    def _drift(self, jacobian: Array, turning: TipAt | None) -> Doubt | None:
         """Test whether the tip keeps moving without a cause in the pressures.
 
-        `bending` (3, 3) is the turn of the tip by the displacement of a push; None if the tracker
-        measures no orientations.
+        `turning` is the model's tip; None if the tracker measures no orientations.
         """
         for scale in self._tuning.scales:
-            if speed := self._drift_speed(scale, jacobian, bending):
+            if speed := self._drift_speed(scale, jacobian, turning):
                 return Doubt(
                     "drift",
                     f"the tip seems to move on at {1e3 * speed:.1f} mm/s although its pressures do "
@@ -421,7 +419,7 @@ class MotionWatch:
                 )
         return None
 
-    def _drift_speed(self, scale: DriftScale, jacobian: Array, bending: Array | None) -> float:
+    def _drift_speed(self, scale: DriftScale, jacobian: Array, turning: TipAt | None) -> float:
         """Return the speed of a drift over all intervals of a scale, in m/s; 0 if there is none."""
         duration = scale.interval * scale.count
         first = self._rows[0, _TIME] if self._count else np.inf
@@ -438,20 +436,20 @@ class MotionWatch:
             return 0.0
         along = np.diff(offsets, axis=0) @ drift / max(size, 1e-9)
         explained = self._explained(np.diff(marks, axis=0), jacobian)
-        if (along - explained < least).any() or self._is_push(marks[-1] - marks[0], bending):
+        if (along - explained < least).any() or self._is_push(marks[-1] - marks[0], turning):
             return 0.0
         return size / duration
 
-    def _is_push(self, change: Array, bending: Array | None) -> bool:
+    def _is_push(self, change: Array, turning: TipAt | None) -> bool:
         """Return whether a growing push explains the change: it turns the tip too.
 
         A tracker's frame that turns about the base does so as well, by somewhat less, so the turn
         by a large push must be about that which is expected.
         """
         moved, tuning = change[_OFFSET], self._tuning
-        if bending is None:
+        if turning is None:
             return False
-        bent = bending @ moved
+        bent = turn_of_a_push(turning) @ moved
         size, missing = float(np.linalg.norm(bent)), self._missed_turn(bent, change[_TURN])
         is_large = float(np.linalg.norm(moved)) > tuning.largest_push
         share = tuning.slip_of_large if is_large else tuning.slip

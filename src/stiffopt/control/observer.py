@@ -168,7 +168,7 @@ class ArmObserver:
         if counts.used and sample is not None:
             if isinstance(course, Bracing) and self.leaning is not None:
                 elapsed = sample.time - self._looked_at
-                course.look(elapsed, sample.position, tip, effective)
+                course.look(elapsed, sample.position, tip, effective, sample.quaternion)
                 self._looked_at = sample.time
             else:
                 self._feel(sample, effective, tip, course)

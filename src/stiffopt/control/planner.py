@@ -253,7 +253,7 @@ class PlanningEnd:
         """Send the plan for the last request, or the reason for none; None: ready."""
         if isinstance(answer, Plan):
             names = (
-                *("reached", "stiffness", "message", "far", "blocked", "doubt"),
+                *("reached", "stiffness", "message", "far", "short", "blocked", "doubt"),
                 *("deviation", "estimate", "approach", "bent"),
             )
             own = {name: getattr(answer, name) for name in names}

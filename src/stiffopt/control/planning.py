@@ -87,6 +87,8 @@ class Plan:
     blocked: str = ""  # why the way to the plan is not clear of the scene
     doubt: str = ""  # a warning if the model extrapolates there
     far: bool = False  # whether it is the pose that is not reached, not only the stiffness
+    # from its tip to the target, in m, of a plan that follows a target by the least change
+    short: tuple[float, ...] = (0.0, 0.0, 0.0)
     adapted: Adapted | None = None  # the model that it was made with, as in the request
     deviation: float = math.nan  # of the stiffness there, relative
     estimate: Estimate | None = None  # of the model's numbers, if it is new
@@ -354,14 +356,17 @@ class Planning:
         pressures, distance, angle = self._search.find(target, self._limits, start)
         tolerance = task.target.tolerance
         far = distance > tolerance.position or angle > tolerance.angle
-        stays, stiffness = request.stay and not far, math.nan
+        stays, stiffness, short = request.stay and not far, math.nan, np.zeros(3)
         if stays and self._stiffness is not None:
             tip = self._tip.at(pressures)
             stiffness = self._stiffness(tip.compliance, tip.pose[:3, :3])
+        if request.stay and target.position is not None:
+            away = np.array(target.position, dtype=float) - self._tip.at(pressures).pose[:3, 3]
+            short = np.nan_to_num(away)
         return Plan(
             request.serial, pressures, request.offset, request.target, stays or distant, stiffness,
             "" if stays else nearest_words(distance, angle, tolerance), far=far,
-            adapted=request.adapted,
+            short=tuple(short.tolist()), adapted=request.adapted,
         )  # fmt: skip
 
     def _displacement(self, last: Plan, target: Target) -> Array:

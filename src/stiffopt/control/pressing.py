@@ -158,6 +158,7 @@ class Pressing:
         creep: CreepEstimator,
         rotation: Array,
         compliance: Array,
+        short: Array,
     ) -> None:
         """Advance by a tick.
 
@@ -178,6 +179,9 @@ class Pressing:
         rotation, compliance :
             Rotation (3, 3) of the model's tip, and compliance (3, 3) of its position, in m/N, both
             in base axes.
+        short :
+            Way (3,) from the nearest pose that the arm reaches by its model to the present target,
+            in m.
         """
         t = self._tuning
         is_free = self.phase in (Phase.GOING, Phase.ENDED)
@@ -210,10 +214,14 @@ class Pressing:
             self._free = way > self._tuning.free_way
             if self._free and gone < self._tuning.free_share * way:
                 self._block(gone, way)
-        if self.phase is Phase.APPROACHING:
-            self._approach(elapsed, gone, feeling.compliance)
+        held_back = self._shift - float(n @ short) - gone  # needs no estimate of the force
+        goes_on = self.phase in (Phase.APPROACHING, Phase.PRESSING)
+        if goes_on and np.linalg.norm(short) > t.out_of_reach:
+            self._retreat(self._out_of_reach(gone))
+        elif self.phase is Phase.APPROACHING:
+            self._approach(elapsed, gone, held_back, feeling.compliance)
         elif self.phase is Phase.PRESSING:
-            self._keep_the_force(elapsed, gone, feeling.compliance)
+            self._keep_the_force(elapsed, gone, held_back, feeling.compliance)
         elif self.phase is Phase.RETREATING:
             self._shift -= self.press.speed * elapsed
             if self._blocked:
@@ -250,18 +258,20 @@ class Pressing:
             self._target = self._target.model_copy(update={"position": tuple(tip.tolist())})
             self._end()
 
-    def _approach(self, elapsed: float, gone: float, compliance: float) -> None:
+    def _approach(self, elapsed: float, gone: float, held_back: float, compliance: float) -> None:
         press, t = self.press, self._tuning
         if self.force > t.touch_share * press.force:
             self.phase = Phase.PRESSING
         elif gone > press.travel:
             self._retreat(f"nothing was felt within {1e3 * press.travel:g} mm")
-        elif self._held_back(gone) > press.force * compliance + t.held_back:
+        elif held_back > press.force * compliance + t.held_back:
             self._retreat("the tip is held back, and no force is felt that explains it")
         else:
             self._shift += press.speed * elapsed
 
-    def _keep_the_force(self, elapsed: float, gone: float, compliance: float) -> None:
+    def _keep_the_force(
+        self, elapsed: float, gone: float, held_back: float, compliance: float
+    ) -> None:
         press, t = self.press, self._tuning
         missing = press.force - self.force
         lost = self.force < t.touch_share / 2 * press.force
@@ -280,7 +290,7 @@ class Pressing:
                 self._retreat(f"{1e3 * press.force:g} mN were not reached within {way}")
         elif self.force > t.most_force * press.force + press.tolerance:
             self._retreat(f"it presses with {1e3 * self.force:.0f} mN")
-        elif self._held_back(gone) > t.most_force * press.force * compliance + t.held_back:
+        elif held_back > t.most_force * press.force * compliance + t.held_back:
             self._retreat("the tip is held back by more than the force that is felt explains")
         else:
             rate = compliance * missing / t.time
@@ -293,9 +303,14 @@ class Pressing:
             self._why = "held"
             self._notify("pressing", f"presses with {1e3 * self.force:.0f} mN")
 
-    def _held_back(self, gone: float) -> float:
-        """Return by how much the tip is held back, in m: needs no estimate of the force."""
-        return self._shift - gone
+    def _out_of_reach(self, gone: float) -> str:
+        """Return why a press ends whose tip has gone as far as it can, by a way in m."""
+        felt = "nothing is felt there"
+        if self.phase is Phase.PRESSING:
+            felt = f"it presses with {1e3 * self.force:.0f} mN of {1e3 * self.press.force:g} mN"
+        return (
+            f"the arm reaches no farther than {1e3 * gone:.1f} mm along the direction, and {felt}"
+        )
 
     def _leave(self, tip: Array, offset: Array, creep: CreepEstimator) -> None:
         """Begin to go back from an object at the target, or that has come there; nothing jumps."""

@@ -14,6 +14,7 @@ limit can be violated, and reach the plan together.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -22,13 +23,12 @@ from numpy.typing import NDArray
 from stiffopt.control.formula import Formula
 
 Array = NDArray[np.float64]
+Symbols = Any  # of CasADi
 
 _LAGS = 4
 _LONGEST = 2.0  # s, longest half period of a vibration that is averaged over
 # from the lags' states to the last state and its derivatives, in units of the rate
-_DIFFERENCES = np.array(
-    [[0, 0, 0, 0, 1], [0, 0, 0, 1, -1], [0, 0, 1, -2, 1], [0, 1, -3, 3, -1]], dtype=float
-)
+_DIFFERENCES = ((0, 0, 0, 0, 1), (0, 0, 0, 1, -1), (0, 0, 1, -2, 1), (0, 1, -3, 3, -1))
 
 
 class Reference:
@@ -47,13 +47,11 @@ class Reference:
         extra: int = 0,
         slew_share: float = 0.9,
     ) -> None:
-        self._period, self._lag, self._damping = period, lag, damping
-        self._step = _step(slew * period, extra)
+        self._lag = lag
+        self._step = _step(period, slew, damping, extra)
         self.slew_share = slew_share  # share of the slew that the pressures may use
         # motion of the tip per pressure (3, n), over the greatest one in a step; 0: no bound
         self.motion_share: Array = np.zeros((3, len(slew)))
-        self._filter_of: tuple[float, float] | None = None  # rate and omega
-        self._filter: tuple[Array, ...] = ()
         self.rate = 1.0  # a of the four lags, in 1/s
         self.omega = math.inf  # of the vibration, in rad/s; infinite where there is none
         self.begin(np.zeros(len(slew) + extra))
@@ -72,7 +70,7 @@ class Reference:
 
     def set_lag(self, lag: float) -> None:
         """Change the regulators' lag, in s; without a jump if the path rests."""
-        self._lag, self._filter_of = lag, None
+        self._lag = lag
 
     @property
     def delay(self) -> float:
@@ -97,29 +95,10 @@ class Reference:
         This sets `command`, the pressures (n,) to command, and `chamber`, those in the chambers
         when the command acts, in Pa.
         """
-        if self._filter_of != (self.rate, self.omega):
-            self._filter_of, self._filter = (self.rate, self.omega), self._matrices()
         self._states, self.motion, self.command, self.chamber = self._step(
-            self._states, plan, *self._filter, self.slew_share, self.motion_share
-        )
-
-    def _matrices(self) -> tuple[Array, ...]:
-        """Return the transition matrix (5, 5) under a constant input, and weights; see `_step`."""
-        a, x = self.rate, self.rate * self._period
-        # the step response of k lags in series is 1 minus the sum of the first k terms
-        terms = [math.exp(-x) * x**k / math.factorial(k) for k in range(_LAGS)]
-        M = np.eye(_LAGS + 1)
-        for i in range(1, _LAGS + 1):
-            M[i, 0] = 1 - sum(terms[:i])
-            for k in range(i):
-                M[i, i - k] = terms[k]
-        c1, c2, tau = 2 * self._damping / self.omega, 1 / self.omega**2, self._lag
-        return (
-            M,
-            np.array([[1.0], [a], [a**2], [a**3]]) * _DIFFERENCES,
-            np.array([1.0, c1 + tau, c2 + tau * c1, tau * c2]),
-            np.array([1.0, c1, c2, 0.0]),
-        )
+            self._states, plan, self.rate, self.omega, self._lag, self.slew_share,
+            self.motion_share,
+        )  # fmt: skip
 
 
 class VibrationFilter:
@@ -135,6 +114,7 @@ class VibrationFilter:
     def __init__(self, period: float, damping: float, m: int) -> None:
         self._period, self._damping = period, damping
         self._kept = 2 * math.ceil(_LONGEST / period) + 4
+        self._times = np.arange(float(self._kept))  # in steps
         self.begin(np.zeros(m))
 
     def begin(self, values: Array) -> None:
@@ -167,48 +147,68 @@ class VibrationFilter:
         half = min(math.pi / omega, _LONGEST) / self._period
         if half < 1:
             return np.array([[1.0, 0.0], [1.0, 0.0], [1 / self._period, -1 / self._period]])
-        later = 1 / (1 + math.exp(self._damping * omega * self._period * half))
-        times: Array = np.arange(math.ceil(half) + 1.0)
-        steps = (1 - later) * _impulse(times, 0.0) + later * _impulse(times, half)
-        mode = np.exp(-self._damping * omega * self._period * times)
-        mode *= np.maximum(np.sin(math.pi * times / half), 0.0)
-        pair = (_impulse(times, 0.0) + _impulse(times, half / 2)) / 2
-        value, path = np.convolve(steps, pair), np.convolve(mode / mode.sum(), pair)
-        rate = np.diff(path, prepend=0.0) / self._period
-        return np.stack([value, path, rate])
+        decay = self._damping * omega * self._period
+        later = 1 / (1 + math.exp(decay * half))
+        whole, quarter = int(half), int(half / 2)
+        mode = np.exp((1j * math.pi / half - decay) * self._times[: whole + 1]).imag
+        mode /= mode.sum()
+        steps = (
+            (0, 1 - later),
+            (whole, later * (1 - half % 1)),
+            (whole + 1, later * (half % 1)),
+        )
+        weights = np.zeros((3, whole + quarter + 3))
+        # the mean of two values a quarter of T apart, between two samples in part
+        share = half / 2 % 1
+        for delay, part in ((0, 0.5), (quarter, 0.5 * (1 - share)), (quarter + 1, 0.5 * share)):
+            for at, height in steps:
+                weights[0, delay + at] += part * height
+            weights[1, delay : delay + whole + 1] += part * mode
+        weights[2] = weights[1] / self._period
+        weights[2, 1:] -= weights[1, :-1] / self._period
+        return weights
 
 
-def _impulse(times: Array, at: float) -> Array:
-    """Return weights (k,), of sum 1, of a value at a time between two whole ones."""
-    weights: Array = np.maximum(1 - np.abs(times - at), 0.0)
-    return weights
-
-
-def _step(reach: Array, extra: int) -> Formula:
+def _step(period: float, slew: Array, damping: float, extra: int) -> Formula:
     """Return the formula of a step: states (5, n + m), motion (4, n + m), command, chamber (n,).
 
-    Inputs: states, the first being the input of the lags; the plan (n + m,); transition
-    matrix (5, 5); differences (4, 5); weights (4,) of the motion in command and chamber; the share
-    of `reach`, the greatest change of the n pressures in a step, that may be used; the motion of
-    the tip per pressure (3, n), over the greatest one in a step, of all channels or of one.
+    Inputs: states, the first being the input of the lags; the plan (n + m,); the rate of the lags,
+    in 1/s; omega of the vibration, in rad/s; the regulators' lag, in s; the share of `slew`, the
+    greatest rate of the n pressures, that may be used; the motion of the tip per pressure (3, n),
+    over the greatest one in a step, of all channels or of one.
     """
-    n = len(reach)
+    n = len(slew)
     states, plan = ca.SX.sym("states", _LAGS + 1, n + extra), ca.SX.sym("plan", n + extra)
-    transition = ca.SX.sym("transition", _LAGS + 1, _LAGS + 1)
-    differences = ca.SX.sym("differences", _LAGS, _LAGS + 1)
-    command, chamber = ca.SX.sym("command", _LAGS), ca.SX.sym("chamber", _LAGS)
+    rate, omega, lag = ca.SX.sym("rate"), ca.SX.sym("omega"), ca.SX.sym("lag")
     slew_share, motion_share = ca.SX.sym("slew_share"), ca.SX.sym("motion_share", 3, n)
     way = plan.T - states[0, :]
     # all channels take the share of their way that the slowest one can cover in a step
-    steps = ca.mmax(ca.fabs(way[:n]).T / ca.DM(reach)) / slew_share
+    steps = ca.mmax(ca.fabs(way[:n]).T / ca.DM(slew * period)) / slew_share
     moved = motion_share @ ca.diag(way[:n])
     squares = ca.vertcat(ca.sum1(moved**2).T, ca.sumsqr(ca.sum2(moved)))
     steps = ca.fmax(steps, ca.sqrt(ca.mmax(squares)))
     share = ca.if_else(steps > 1, 1 / steps, 1)
     begun = ca.vertcat(states[0, :] + share * way, states[1:, :])
-    after = transition @ begun
-    motion = differences @ after
+    after = _transition(rate * period) @ begun
+    powers = ca.vertcat(1, rate, rate**2, rate**3)
+    motion = ca.diag(powers) @ (ca.DM(_DIFFERENCES) @ after)
+    # weights of the path and its derivatives in the pressures of the chambers, and in the command
+    first, second = 2 * damping / omega, 1 / omega**2
+    in_chamber = ca.vertcat(1, first, second, 0)
+    in_command = in_chamber + lag * ca.vertcat(0, in_chamber[:3])
     pressures = motion[:, :n].T
-    inputs = [states, plan, transition, differences, command, chamber, slew_share, motion_share]
-    outputs = [after, motion, pressures @ command, pressures @ chamber]
+    inputs = [states, plan, rate, omega, lag, slew_share, motion_share]
+    outputs = [after, motion, pressures @ in_command, pressures @ in_chamber]
     return Formula(inputs, outputs, [states, motion_share, after, motion])
+
+
+def _transition(duration: Symbols) -> Symbols:
+    """Return the transition (5, 5) of the lags under a constant input, over a number of lags."""
+    M = ca.SX.eye(_LAGS + 1)
+    # the step response of k lags in series is 1 minus the sum of the first k terms
+    terms = [ca.exp(-duration) * duration**k / math.factorial(k) for k in range(_LAGS)]
+    for i in range(1, _LAGS + 1):
+        M[i, 0] = 1 - sum(terms[:i])
+        for k in range(i):
+            M[i, i - k] = terms[k]
+    return M

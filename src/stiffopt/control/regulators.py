@@ -124,6 +124,8 @@ class PressureEstimator:
         self.command = zero  # last commanded pressures, in Pa
         self.chamber = zero  # pressures in the chambers
         self.effective = zero  # pressures that would give a settled arm its present shape
+        self.history_offset = zero  # effective pressures relative to those in the chambers
+        self.effective_ahead = zero  # effective pressures a dead time from now
         # settled effective pressures relative to commands (n,), in Pa; they contain the part of the
         # regulators' offset that commands may compensate
         self.command_offset = zero
@@ -140,7 +142,9 @@ class PressureEstimator:
         self.effective = self.chamber
         if self._memory is not None:
             self.effective = self._memory.advance(steps * self._period, self.chamber)
-        self.command_offset = self.history_offset + self.channels.compensated(offset)
+        self.history_offset = self.effective - self.chamber
+        self.effective_ahead = self._regulators.ahead + self.history_offset
+        self.command_offset = self.history_offset + self.channels.compensated
 
     def adapt(self) -> bool:
         """Use the adapted lags from now on, at rest; return whether that changes anything."""
@@ -152,16 +156,6 @@ class PressureEstimator:
         self._modelled_lags, self.lag = found, float(np.mean(found))
         self._regulators.set_lag(found)
         return True
-
-    @property
-    def history_offset(self) -> Array:
-        """Effective pressures relative to those in the chambers (n,), in Pa."""
-        return self.effective - self.chamber
-
-    @property
-    def effective_ahead(self) -> Array:
-        """Effective pressures a dead time from now (n,), in Pa."""
-        return self._regulators.ahead + self.history_offset
 
 
 def _share(period: float, lag: Array) -> Array:

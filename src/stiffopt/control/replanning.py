@@ -102,6 +102,8 @@ class Replanner:
         self.known: Estimate | None = None  # of the model's numbers
         self.adapted: Adapted | None = None  # the model that plans use; None: the robot file's
         self._newest: Plan | None = None  # the last that `latest` took
+        self._goal_of: Plan | None = None  # the last of which it returned pressures and offset
+        self._goal: Array = np.zeros(0)
         self._lead = dead_time + 0.5 * period
         self._serial, self._search = 0, True
         self.begin()
@@ -114,7 +116,7 @@ class Replanner:
         self._detour_from: Plan | None = None  # where it begins, until that is planned from
         self._offset = np.zeros(6)
         self.deviation = math.nan  # of the plan's stiffness, relative
-        self._available: Array | None = None  # (2, n), see `update`
+        self._available: tuple[Array, Array] | None = None  # see `update`
         self.bent: BentMode | None = None  # modes of the arm where the reference was last
         self._renew()
 
@@ -254,11 +256,13 @@ class Replanner:
 
     def _note_available(self, available: tuple[Array, Array]) -> None:
         """Have all configurations searched after a change of the available pressures."""
-        now = np.stack(available)
-        if self._available is None:
-            self._available = now
-        elif (np.abs(now - self._available) > self._tuning.other_pressure).any():
-            self._available, self._search = now, True
+        before = self._available
+        if before is None:
+            self._available = available
+        elif before[0] is not available[0] or before[1] is not available[1]:
+            change = np.abs(np.stack(available) - np.stack(before))
+            if (change > self._tuning.other_pressure).any():
+                self._available, self._search = available, True
 
     def latest(self) -> Array | None:
         """Take the newest plan, unless its way is blocked; return as `update` does."""
@@ -272,9 +276,10 @@ class Replanner:
             self._blocked = plan.blocked
             if not plan.blocked and plan.adapted is self.adapted:
                 self.plan = plan
-        if self.plan is None:
-            return None
-        return np.concatenate([self.plan.pressures, self.plan.offset])
+        plan = self.plan
+        if plan is not None and plan is not self._goal_of:
+            self._goal_of, self._goal = plan, np.concatenate([plan.pressures, plan.offset])
+        return None if plan is None else self._goal
 
     def _end_detour(self, plan: Plan, before: Plan) -> None:
         """End a detour whose last plans rest at its end; search further if that is short of it."""

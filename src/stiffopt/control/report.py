@@ -20,6 +20,8 @@ from stiffopt.optimise.target import Target
 
 Array = NDArray[np.float64]
 
+_WELL_WITHIN = 0.8  # share of the bound on the frequency's error below which its alarm ends
+
 
 class Report:
     """Reports what the controller pursues, and what it knows of the arm.
@@ -42,6 +44,7 @@ class Report:
         self._robot, self._arm, self._replanner = robot, arm, replanner
         self._largest_offset = largest_offset
         self._errors = TipErrors()
+        self._is_detuned = False  # whether the frequency is as far off as it may be
 
     @property
     def model_is_wrong(self) -> bool:
@@ -152,7 +155,10 @@ class Report:
                 "arm's"
             )
             notices = (*notices, Notice("implausible", text, Severity.ERROR, standing=True))
-        if arm.tip.frequency_is_bounded:
+        # e leaves its bound with every other sample; its alarm lasts until it is well within
+        off = arm.tip.frequency_off
+        self._is_detuned = off >= (_WELL_WITHIN if self._is_detuned else 1.0)
+        if self._is_detuned:
             factor, _ = arm.tip.frequency_factor
             text = (
                 f"the arm vibrates at {factor:.2f} of the model's frequency or beyond, so that it "

@@ -18,6 +18,7 @@ from stiffopt.control.tuning import ControlTuning
 from stiffopt.errors import EquilibriumError, InputError, dotted
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.scene import Scene
+from stiffopt.optimise.press import Press
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import PressureRange, Task
 from stiffopt.optimise.tip import TipModel
@@ -62,7 +63,12 @@ class Requests:
         course: AnyCourse | None = None
         if task.press is not None:
             if task.press.speed > self._tip_speed:
-                raise InputError(f"press.speed: {self._too_fast(task.press.speed)}")
+                default = float(Press.model_fields["speed"].default)
+                raise InputError(
+                    f"press.speed: {self._too_fast(task.press.speed)}; write 'speed: "
+                    f"{1e3 * self._tip_speed:.3g} mm/s' or less in the task's press (a press "
+                    f"without it has {1e3 * default:g} mm/s)"
+                )
             course = Pressing(task.press, task.target, self._tuning.pressing)
         elif task.brace is not None:
             task = self._in_the_rigs_scene(task)

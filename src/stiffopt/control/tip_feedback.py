@@ -153,7 +153,9 @@ class TipFeedback:
         if follows is None or other is not self._motion_error:
             self._motion_error.stop()
         self._motion_error, modelled = other, self._arm.modelled
-        behind = 0.0 if self._is_new else math.dist(position, self._averaged.value[6:])
+        behind = 0.0
+        if not self._is_new:
+            behind = math.dist(position.tolist(), self._averaged.value[6:].tolist())
         if follows is None or (not follows and behind < self._ended):
             self._motion_error.stop()
         elif modelled is not None:

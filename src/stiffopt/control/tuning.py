@@ -506,6 +506,7 @@ class PressingTuning:
     # how much more the tip may be held back, in m
     most_force: float = 1.6
     held_back: float = 2e-3
+    out_of_reach: float = 2e-3  # distance of the arm's nearest pose that ends the press, in m
     settled: float = 0.5  # time within the tolerance after which an event reports it, in s
     patience: float = 5.0  # time beyond the tolerance after which there is an alarm, in s
     # way of the arm without contact, in m, on which the tip follows by at least this share, unless
@@ -518,6 +519,31 @@ class PressingTuning:
     most_back: float = 0.03
     beyond: float = 2e-3  # distance of the tip beyond the target that an event reports, in m
     obstruction: ObstructionTuning = field(default_factory=ObstructionTuning)
+
+
+@dataclass(frozen=True)
+class SlidingTuning:
+    """What is expected of a braced tip, of pushes and of slides (`SlideEstimator`)."""
+
+    # deviation of a tracked position in each axis, in m; of a turn over that, in rad/m
+    noise: float = 5e-5
+    turn: float = 40.0
+    jump: float = 6.0  # deviation of a turn, in its own ones, from which on it jumps
+    # deviations of the model's error for place and turn, in m and rad: at first; by creep, per
+    # e-fold of the time in contact and of a time before, in s; and by drift in a second
+    error: tuple[float, float] = (1e-2, 3e-2)
+    creep: tuple[float, float] = (2e-4, 3e-3)
+    creep_time: float = 3.0
+    drift: tuple[float, float] = (1e-5, 2e-4)
+    push_time: float = 5.0  # in which a push comes or goes, in s
+    # deviation of a slide in a second, in m; time after which one is the model's error, in s
+    slide: float = 1e-4
+    longest: float = 60.0
+    # slide that is told, in m, so many times its deviation, in so many samples in a row, in which
+    # a turn must jump, too
+    told: float = 2e-4
+    surely: float = 2.0
+    samples: int = 3
 
 
 @dataclass(frozen=True)
@@ -590,6 +616,7 @@ class BracingTuning:
     off_target: float = 1e-3
     progress: float = 0.1
     patience: float = 10.0
+    sliding: SlidingTuning = field(default_factory=SlidingTuning)
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,7 @@ with up to one and a half times the tip's displacement. `BentMode` has the modes
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -66,7 +67,7 @@ class BendingMode:
 
     def frequency(self, stiffness: float) -> float:
         """Return the angular frequency, in rad/s, at a lateral stiffness of the tip, in N/m."""
-        return float(np.sqrt(max(stiffness, 0.0) / self.mass))
+        return math.sqrt(max(stiffness, 0.0) / self.mass)
 
     def at_frequency(self, omega: float, stiffness: float) -> BendingMode:
         """Return this mode with the mass for a frequency, in rad/s, at a stiffness, in N/m."""

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt.control.adaptation import Window
 from stiffopt.control.estimator import TipEstimator
+from stiffopt.control.formula import are_within
 from stiffopt.control.tuning import WindowTuning
 
 Array = NDArray[np.float64]
@@ -43,12 +46,13 @@ class WindowWatch:
         if now - self._since < t.wait:
             return
         n, values = len(pressures), np.concatenate([pressures, estimator.position])
-        if not np.isfinite(values).all():
+        if not all(map(math.isfinite, values.tolist())):
             return
         if self._first is None:
             self._first, self._sum, self._count, self._begun = values, 0 * values, 0, now
-        moved = np.abs(values - self._first)
-        if moved[:n].max() > t.drift_pressure or moved[n:].max() > t.drift_position:
+        moved = values - self._first
+        rests = are_within(t.drift_pressure, moved[:n]) and are_within(t.drift_position, moved[n:])
+        if not rests:
             self._first = None  # the arm still creeps
             return
         self._sum += values

@@ -99,3 +99,11 @@ class Systematic:
         """Return the systematic part ``Z b`` (M, c) of errors (M, c)."""
         taken = self._orthogonal[: len(errors)].T @ errors
         return np.asarray(self.functions @ np.linalg.solve(self._triangle, taken))
+
+    @property
+    def root(self) -> Array:
+        """Root U (M, m) of the covariance ``U U' = Z (1 + Z'Z)^-1 Z'`` of `part`, for each axis.
+
+        That is how far the systematic part may still be from `part`, its mean given the errors.
+        """
+        return self._orthogonal[: len(self.functions)]

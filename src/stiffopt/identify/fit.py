@@ -154,17 +154,25 @@ def _loss(n_prior: int) -> Callable[[Array], Array]:
 def _reweighted(
     problem: CalibrationProblem, x: Array, independent: float
 ) -> tuple[CalibrationProblem, float]:
-    """Return the problem with noise and weights estimated at x, and rows per independent row."""
+    """Return the problem with noise and weights estimated at x, and rows per independent row.
+
+    The part that rows share follows the noise too, so what is left of the errors is less than the
+    noise.  The expected covariance of the noise, given the errors, is that of what is left plus
+    that of the shared part: a step of expectation maximisation (A. P. Dempster et al., 1977)
+    towards the noise of greatest likelihood.  Without the second, less noise lets the shared part
+    follow more of it, until nothing but its outliers is left.  One step in each of few rounds stops
+    short of that: on recordings, noise of greatest likelihood predicts other runs less well.
+    """
     if not problem.samples:
         return problem, 1.0
     predicted = problem.predict(x)
     moves = [problem.unshared(errors, "position") for errors in predicted.errors]
-    position = _spread(np.concatenate(moves), FIT.least_position)
+    position = _spread(*_stacked(moves), FIT.least_position)
     read = [read.turn for read in predicted.read if read.turn is not None]
     turns = [problem.unshared(turn, "angle") for turn in read]
-    angle = _spread(np.concatenate(turns), FIT.least_angle) if turns else problem.noise.angle
-    spread = _spread_by_change(problem, moves[0])
-    found = _rows_per_independent(problem, moves[0] / spread)
+    angle = _spread(*_stacked(turns), FIT.least_angle) if turns else problem.noise.angle
+    spread = _spread_by_change(problem, *moves[0])
+    found = _rows_per_independent(problem, *(each / spread for each in moves[0]))
     factor = np.sqrt(independent / found)
     parts = np.split(spread[:, 0], problem.starts[1:-1])
     samples = [
@@ -174,18 +182,31 @@ def _reweighted(
     return problem.with_samples(samples, Noise(position, angle, FIT.systematic)), found
 
 
-def _spread(errors: Array, least: float) -> float:
-    """Return the robust root mean square, over all axes, of errors (M, 3); at least `least`."""
-    known = errors[np.isfinite(errors).all(axis=1)]
-    if not len(known):
+def _stacked(pairs: Sequence[tuple[Array, Array]]) -> tuple[Array, Array]:
+    """Stack errors, and roots of covariances, of several points."""
+    errors, roots = zip(*pairs, strict=True)
+    return np.concatenate(errors), np.concatenate(roots)
+
+
+def _spread(errors: Array, root: Array, least: float) -> float:
+    """Return the robust root mean square of errors' axes; at least `least`.
+
+    Parameters
+    ----------
+    errors : (M, 3), without their shared part.
+    root : U (M, m), of that part's covariance ``U U'``.
+    """
+    known = np.isfinite(errors).all(axis=1)
+    if not known.any():
         return least
-    middle = 1.4826 * float(np.median(np.abs(known)))
-    kept = np.clip(known, -4 * middle, 4 * middle)
-    return max(float(np.sqrt(np.mean(kept**2))), least)
+    middle = 1.4826 * float(np.median(np.abs(errors[known])))
+    kept = np.clip(errors[known], -4 * middle, 4 * middle)
+    squares = np.mean(kept**2) + np.mean((root[known] ** 2).sum(axis=1))
+    return max(float(np.sqrt(squares)), least)
 
 
-def _spread_by_change(problem: CalibrationProblem, errors: Array) -> Array:
-    """Return the spread (M, 1) of errors (M, 3), over that of all, by change of pressure.
+def _spread_by_change(problem: CalibrationProblem, errors: Array, root: Array) -> Array:
+    """Return the `_spread` (M, 1) of errors, over that of all, by change of pressure.
 
     A tracker that is read a moment late, or a lag that is not quite so, is wrong only where the
     pressures have just changed. The rows are divided into classes of equal size by how much they
@@ -194,7 +215,7 @@ def _spread_by_change(problem: CalibrationProblem, errors: Array) -> Array:
     """
     same = np.ones((len(errors), 1))
     counted = problem.counted & np.isfinite(errors).all(axis=1)
-    independent = counted.sum() / _rows_per_independent(problem, errors)
+    independent = counted.sum() / _rows_per_independent(problem, errors, root)
     classes = min(FIT.classes, int(independent / FIT.class_rows))
     if classes < 2:
         return same
@@ -203,11 +224,12 @@ def _spread_by_change(problem: CalibrationProblem, errors: Array) -> Array:
     edges = np.unique(np.quantile(change[counted], shares, method="lower"))
     edges = edges[edges < change[counted].max()]  # so that no class is empty
     own = np.searchsorted(edges, change)
-    members = [errors[counted & (own == each)] for each in range(len(edges) + 1)]
-    spreads = np.maximum.accumulate([_spread(each, FIT.least_position) for each in members])
+    members = [counted & (own == each) for each in range(len(edges) + 1)]
+    found = [_spread(errors[rows], root[rows], FIT.least_position) for rows in members]
+    spreads = np.maximum.accumulate(found)
     if spreads[-1] < FIT.uneven * spreads[0]:
         return same
-    return np.asarray(spreads[own][:, np.newaxis] / _spread(errors, FIT.least_position))
+    return np.asarray(spreads[own][:, np.newaxis] / _spread(errors, root, FIT.least_position))
 
 
 def _recent_change(sample: Sample) -> Array:
@@ -218,14 +240,17 @@ def _recent_change(sample: Sample) -> Array:
     return np.asarray((travelled - travelled[before])[sample.rows])
 
 
-def _rows_per_independent(problem: CalibrationProblem, moves: Array) -> float:
-    """Return the integrated autocorrelation of the tip's errors (M, 3) along rows; at least 1."""
+def _rows_per_independent(problem: CalibrationProblem, errors: Array, root: Array) -> float:
+    """Return the integrated autocorrelation of the tip's errors along rows; at least 1.
+
+    `errors` and `root` as in `_spread`.
+    """
+    columns = np.hstack([errors, np.sqrt(errors.shape[1]) * root])
     starts = problem.starts
     longest = max(1, max(len(sample.rows) for sample in problem.samples) // 3)
     total: Array = np.zeros(longest)
     for begin, end in pairwise(starts):
-        errors = moves[begin:end]
-        known = np.where(np.isfinite(errors), errors, 0.0)
+        known = np.where(np.isfinite(columns[begin:end]), columns[begin:end], 0.0)
         size = len(known) + longest  # zero padding, against circular correlation
         spectrum = np.abs(np.fft.rfft(known, size, axis=0)) ** 2
         products: Array = np.fft.irfft(spectrum, size, axis=0)

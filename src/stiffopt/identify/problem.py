@@ -308,16 +308,19 @@ class CalibrationProblem:
             slope = systematic.residuals(slope.reshape(len(slope), -1))
         return value.ravel(), slope.reshape(-1, self.size)
 
-    def unshared(self, error: Array, kind: Kind) -> Array:
-        """Return errors (M, 3) minus the part that rows at nearby pressures share."""
+    def unshared(self, error: Array, kind: Kind) -> tuple[Array, Array]:
+        """Return errors (M, 3) minus the part that rows at nearby pressures share, and U (M, m).
+
+        ``U U'`` is the covariance of what that part may be wrong by, between rows, for each axis.
+        """
         known = ~np.isnan(error.sum(axis=1))
         systematic, weight = self._systematic(known, kind)
         if systematic is None:
-            return error
+            return error, np.zeros((len(error), 0))
         part = systematic.part(np.where(known[:, np.newaxis], error, 0.0) * weight)
-        return np.asarray(
-            error - np.divide(part, weight, out=np.zeros_like(part), where=weight > 0)
-        )
+        found = np.hstack([part, systematic.root])
+        found = np.divide(found, weight, out=np.zeros_like(found), where=weight > 0)
+        return np.asarray(error - found[:, :3]), found[:, 3:]
 
     def _systematic(self, known: NDArray[np.bool_], kind: Kind) -> tuple[Systematic | None, Array]:
         """Return the systematic errors' model for known rows (M,), and all weights (M, 1)."""

@@ -282,11 +282,15 @@ class StrainLaw(ABC):
         return self._modulus(self._acting(p)) / (1e-3 * self.segment.material.youngs_modulus) - 1
 
     def _bent(self, omega: ca.SX, flexibility: ca.SX) -> tuple[ca.SX, ca.SX]:
-        """Return curvature (2,) and flexibility (2, 2), limited by the least bending radius."""
+        """Return curvature (2,) and flexibility, limited by the least bending radius.
+
+        The flexibility (k, k) may have other rows before its last two, which are those of bending.
+        """
         radius = self.compensation.bending_radius
         if ca.SX(radius).is_zero():
             return omega, flexibility
         omega, less = _limited(omega, radius)
+        less = ca.diagcat(ca.SX.eye(flexibility.shape[0] - 2), less)
         return omega, less @ flexibility @ less
 
     def _lengthened(self, stretch: ca.SX, omega: ca.SX) -> ca.SX:

@@ -53,7 +53,7 @@ class Arm:
     ) -> None:
         if not isinstance(description, RobotDescription):
             raise InputError(f"expected a RobotDescription, not {shown(description)}")
-        self.description = description
+        self.description, self._n = description, description.n_pressures
         self.resolution = checked_integer("resolution", resolution, 1)
         self._tip_load = _tip_load(force, moment, load_frame)
         self._kept: dict[Hashable, Any] = {}
@@ -68,7 +68,7 @@ class Arm:
     @property
     def n_pressures(self) -> int:
         """Number of channels n."""
-        return self.description.n_pressures
+        return self._n
 
     @property
     def n_segments(self) -> int:

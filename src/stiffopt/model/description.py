@@ -183,7 +183,8 @@ class Segment(Schema):
     connector : rigid length after the segment, in m.
     strain_law : how pressures strain the segment, by the name of a law of `stiffopt.model.laws`:
         ``paper``, linear per deformed length; ``rest-length``, the same per length at rest;
-        ``neo-hookean``; or any other that is registered.
+        ``neo-hookean``; ``fibres``, which stretch and bend together; or any other that is
+        registered.
     law : the keys that only this law has, or None; of the type `StrainLaw.Keys`.
     """
 

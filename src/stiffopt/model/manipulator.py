@@ -121,9 +121,9 @@ class Manipulator(Arm, ShownInNotebook):
     def body_radius(self, p: ArrayLike, at: ArrayLike) -> Any:
         """Return the outer radius in m of the pressurised section at arc length `at` (m, at rest).
 
-        The strain law `neo-hookean` has ``r lambda^-1/2`` (see `NeoHookeanLaw`), the linear ones
-        the radius at rest; a rigid connector is as wide as the segment before it.  The effect of
-        loads on the section is neglected.
+        The strain laws `neo-hookean` and `fibres` have ``r lambda^-1/2`` (see `NeoHookeanLaw`), the
+        linear ones the radius at rest; a rigid connector is as wide as the segment before it.  The
+        effect of loads on the section is neglected.
 
         Returns
         -------

@@ -324,31 +324,57 @@ class Uncertainty:
 
         `per_pressure` are the tip's slopes (N, 3, n) there. Silicone remembers its stretch, so the
         ways leave the tip about as far away at all pressures, though a pressure moves it further
-        where the arm is soft. At the median of the recorded pressures they are those of the plays.
+        where the arm is soft. At the median of the recorded pressures they are those of the plays,
+        and of the creep that is left.
         """
+        errors = self._calibration.errors
+        found, crept = self._ways(pressures)
+        if errors is None:
+            return found
+        if errors.settled:
+            found += crept * self._creep_left
+        softness = self._softness(per_pressure) / self._recorded_softness
+        found *= np.sqrt(_HELD / np.maximum(softness, _STIFFEST))[:, np.newaxis]
+        return found
+
+    def _ways(self, pressures: Vector) -> tuple[Vector, Vector]:
+        """Return what plays leave after W ways to pressures (N, n), and all creep (N, W, n)."""
         robot, first = self._description, 0
         found = np.zeros((len(pressures), _WAYS, robot.n_pressures))
+        crept = np.zeros_like(found)
         for segment in robot.segments:
             own = slice(first, first := first + segment.n_channels)
-            history = segment.history or NO_HISTORY
+            history, x = segment.history or NO_HISTORY, pressures[:, np.newaxis, own]
             memory = np.array([history.memory_of(c) for c in range(segment.n_channels)])
             for play in history.play:
-                end = part_of(pressures[:, own], play.of)[:, np.newaxis]
-                held = np.zeros(1)
-                for x in (*part_of(self._visited[..., own], play.of), end):
-                    held = np.clip(held, x - play.width, x + play.width)
+                end, held = part_of(x, play.of), np.zeros(1)
+                for visited in (*part_of(self._visited[..., own], play.of), end):
+                    held = np.clip(held, visited - play.width, visited + play.width)
                 found[..., own] += memory * play.share * part_of(held - end, play.of)
-            found[..., own] = history.at_fixed_modulus(
-                pressures[:, np.newaxis, own], found[..., own]
-            )
+            for creep in history.creep:
+                last = part_of(self._visited[-1][:, own] - x, creep.of)
+                crept[..., own] += memory * creep.share * last
+            for each in (found, crept):
+                each[..., own] = history.at_fixed_modulus(x, each[..., own])
         errors = self._calibration.errors
         if errors is not None and errors.settled:
             size = np.sqrt(np.mean(found**2, axis=1, keepdims=True))
             found *= np.minimum(1.0, errors.settled / np.maximum(size, 1e-9))
-        if errors is not None:
-            softness = self._softness(per_pressure) / self._recorded_softness
-            found *= np.sqrt(_HELD / np.maximum(softness, _STIFFEST))[:, np.newaxis]
-        return found
+        return found, crept
+
+    @cached_property
+    def _creep_left(self) -> Vector:
+        """Share (n,) of all creep that is left at held pressures, as recorded.
+
+        With it, plays and creep have the mean square of `ErrorModel.settled` at recorded pressures.
+        """
+        errors = self._calibration.errors
+        assert errors is not None  # a caller's condition
+        found, crept = self._ways(np.array(errors.recorded))
+        a, b, c = (np.mean(each, axis=(0, 1)) for each in (crept**2, found * crept, found**2))
+        missing = np.maximum(np.square(errors.settled) - c, 0.0)
+        share = (np.sqrt(b**2 + a * missing) - b) / np.maximum(a, 1e-9)
+        return np.asarray(np.clip(share, 0.0, 1.0))
 
     def _softness(self, per_pressure: Vector) -> Vector:
         """Return the squared slopes (N, n) of the tip by all pressures of a channel's segment."""

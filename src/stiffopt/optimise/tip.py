@@ -135,12 +135,13 @@ class _LoadedTip:
         self._arm.change(robot)
 
     def __call__(self, pressures: Vector) -> TipAt | None:
-        self._pressures[:] = pressures
+        self._pressures[:], before = pressures, self._state.copy()
         outcome = self._tip(*self._call)
         if outcome == _FOUND:
             found = self._found.copy()
             jacobian = found[16:-36].reshape(6, self._n)
             return TipAt(found[:16].reshape(4, 4), jacobian, found[-36:].reshape(6, 6))
+        self._state[:] = before  # so that the next call stays on this branch
         if outcome == _BEYOND_LAW:
             return None
         bars = ", ".join(f"{value / 1e5:.4g}" for value in pressures)

@@ -4,12 +4,13 @@ Results come in the order of the blocks, each exactly once, even if its evaluati
 repeated; the number of blocks in progress is bounded.
 """
 
+import itertools
 import os
 import pickle
 import queue
 import threading
 import uuid
-from collections import OrderedDict
+from collections import Counter, OrderedDict
 from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError, ThreadPoolExecutor
 from contextlib import AbstractContextManager
@@ -28,25 +29,43 @@ class ClusterError(StiffoptError):
     """The cluster cannot be reached, or failed; what was done so far is kept."""
 
 
+class ResultLostError(ClusterError):
+    """The worker that had a result was lost before it had been fetched."""
+
+
 def results(
     workers: "Threads | Cluster", blocks: range, poll: Callable[[], None] = lambda: None
 ) -> Iterator[MapPart]:
-    """Yield the results of blocks in order; `poll` is called now and then while waiting."""
+    """Yield the results of blocks in order; `poll` is called now and then while waiting.
+
+    A block whose result is lost is computed again, a few times.
+    """
     finished: queue.SimpleQueue[tuple[int, Any]] = queue.SimpleQueue()
     ready: dict[int, MapPart] = {}
+    lost: Counter[int] = Counter()
     following = blocks.start
+
+    def submit(number: int) -> None:
+        workers.submit(number, lambda index, future: finished.put((index, future)))
+
     for index in blocks:
         while index not in ready:
             while following < min(blocks.stop, index + workers.width):
-                workers.submit(following, lambda number, future: finished.put((number, future)))
+                submit(following)
                 following += 1
             try:
                 number, future = finished.get(timeout=_POLL)
             except queue.Empty:
                 poll()
                 workers.check()
-            else:
+                continue
+            try:
                 ready[number] = workers.result(future)
+            except ResultLostError:
+                lost[number] += 1
+                if lost[number] > TUNING.retries:
+                    raise
+                submit(number)
         yield ready.pop(index)
 
 
@@ -100,6 +119,7 @@ class Cluster(AbstractContextManager["Cluster"]):
             self._token = plan.token
             self._run = uuid.uuid4().hex  # distinguishes the results of runs
             self._futures: set[Any] = set()
+            self._serial = itertools.count()
             self._seen = monotonic()
             self._threads = self._count_threads(wait=TUNING.cluster_patience)
         except BaseException:
@@ -132,18 +152,21 @@ class Cluster(AbstractContextManager["Cluster"]):
         """Start a block; see `Threads.submit`."""
         future = self._client.submit(
             _evaluate_on_worker, self._token, self._payload, index,
-            key=f"stiffopt-map-{self._run}-{index}", pure=False, retries=TUNING.retries,
+            key=f"stiffopt-map-{self._run}-{index}-{next(self._serial)}", pure=False,
+            retries=TUNING.retries,
         )  # fmt: skip
         self._futures.add(future)
         future.add_done_callback(lambda finished: done(index, finished))
 
     def result(self, future: Any) -> MapPart:
-        """Return a done future's result; `ClusterError` if the cluster gave up on it."""
+        """Return a done future's result; `ClusterError` if it is lost or the cluster gave up."""
         self._futures.discard(future)
         try:
             token, block = future.result(timeout=TUNING.cluster_patience)
         except StiffoptError:
             raise
+        except TimeoutError as error:  # it was done, so nothing but its transfer can take long
+            raise ResultLostError("the cluster has lost a result that was done") from error
         except (Exception, CancelledError) as error:
             raise ClusterError(
                 f"the cluster failed: {type(error).__name__}: {str(error) or 'no reason given'}"

@@ -17,7 +17,7 @@ from stiffopt.model.arm_clearance import SceneKey, measured_scene
 from stiffopt.model.compliance import Boundary, Frame, Kind, stiffness_of
 from stiffopt.model.contact.lines import SPACINGS
 from stiffopt.model.contact.push import ContactLoss, GrowingPush, rigid_if_huge
-from stiffopt.model.contact.rod import Condition, Rod, rotations
+from stiffopt.model.contact.rod import TURN, Condition, Rod, rotations
 from stiffopt.model.contact.solve import ContactProblem
 from stiffopt.model.contact.surface import ContactSurface
 from stiffopt.model.contact.system import ContactSystem, LeaningArm
@@ -81,7 +81,7 @@ class Sticking(NamedTuple):
     per_pressure : derivatives of the forces (2k, n), in N/Pa.
     per_push : by a force at the tip in base axes (2k, 3).
     per_slide : by slides of the body (2k, 2k), in N/m.
-    tip : derivatives of the tip's place, base axes, by the slides (3, 2k).
+    tip : derivatives of the tip's place and turn, base axes, by the slides (6, 2k).
     normals : of the normal forces of all contacts by the slides (contacts, 2k), in N/m.
     """
 
@@ -288,7 +288,7 @@ class ContactEquilibrium:
         for i, j in enumerate(held.own):
             slid = held.slides(np.eye(2 * len(held.own))[:, 2 * i : 2 * i + 2])
             largest = held.friction[i] * self._arm.state.touches[j].normal_force
-            tip += largest * float(np.linalg.norm(held.tip @ slid, 2))
+            tip += largest * float(np.linalg.norm(held.tip[:3] @ slid, 2))
             forces += largest * np.linalg.norm(held.normals @ slid, axis=1)
         return FrictionBounds(tip, forces)
 
@@ -320,6 +320,7 @@ class ContactEquilibrium:
             right[first + 1 : first + 3, 2 * i : 2 * i + 2] = np.eye(2)
         slid: Vector = np.asarray(np.linalg.solve(system.matrix, right), dtype=float)
         moves = system.linear.moves[..., :u] @ slid[:u]
+        turn = system.linear.changes[0, TURN, :u] @ slid[:u]
         pushed, pressed = system.solution(), self._system_for("pressures", own)
         by_pressure = pressed.solution()
         surfaces = arm.problem.surfaces
@@ -329,7 +330,7 @@ class ContactEquilibrium:
             tangential(by_pressure, pressed.along(by_pressure)[1]),
             tangential(pushed, system.along(pushed)[1])[:, :3],
             tangential(slid, moves),
-            moves[0],
+            np.concatenate([moves[0], turn]),
             slid[u:],
         )
 

@@ -42,7 +42,7 @@ class NeoHookeanLaw(StrainLaw):
         if segment.material.poisson_ratio != 0.5:
             raise BadKeyError(
                 "material.poisson_ratio",
-                "the neo-hookean law is incompressible; expected 0.5, "
+                f"the {cls.name} law is incompressible; expected 0.5, "
                 f"not {segment.material.poisson_ratio:g}",
             )
 
