@@ -280,10 +280,8 @@ def press(name: str, seed: int, dynamics: str, found: Found) -> None:
         return
     task, pose, way = drawn
     wanted = task.press.force
-    stiffness, away = (
-        float(np.exp(rng.uniform(np.log(100), np.log(1000)))),
-        rng.uniform(2e-3, FARTHEST),
-    )
+    stiffness = float(np.exp(rng.uniform(np.log(100), np.log(1000))))
+    away = rng.uniform(2e-3, FARTHEST)
     surface = surface_at(pose, way, away, stiffness)
     with Arm(name, seed, dynamics, surface) as arm:
         arm.controller.set_task(task)

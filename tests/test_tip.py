@@ -154,6 +154,22 @@ def test_says_when_there_is_no_equilibrium_and_goes_on(compiled):
     assert tip.at(p).pose == pytest.approx(mild.tip_pose(p), abs=1e-9)
 
 
+def test_pressures_without_an_equilibrium_do_not_lose_the_branch(compiled):
+    description = so.load_robot("stiff-flop-2-hanging").description
+    segments = []
+    for segment in description.segments:
+        modulus = 0.6 * segment.material.youngs_modulus
+        soft = segment.material.model_copy(update={"youngs_modulus": modulus})
+        segments.append(segment.model_copy(update={"material": soft}))
+    tip = TipModel(so.Manipulator(description.model_copy(update={"segments": tuple(segments)})))
+    tip.at(np.full(6, 0.2e5))
+    followed = tip._code._state.copy()
+    with pytest.raises(EquilibriumError):
+        tip.at(np.array([1.43e5, 1.07e5, 1.37e5, 1.41e5, 1.2e5, 0.18e5]))
+    assert np.isfinite(followed).all()
+    assert (tip._code._state == followed).all()
+
+
 def test_falls_over_at_rest(compiled):
     arm = Arm((FLOP, FLOP)).under((0.0, 0.0, -9.81), 0.3)
     with pytest.raises(EquilibriumError, match="falls over"):

@@ -309,11 +309,11 @@ class TipController:
         """Estimate pressures and tip; see `Controller.observe`."""
         self._now = now
         self._arm.touch.stiffness_error = self.replanner.deviation
-        course = self.replanner.pursuit.course
+        course, steers = self.replanner.pursuit.course, not self._is_held(now)
         if isinstance(course, Bracing):
-            course.is_steered = not self._is_held(now)
-        swings = not self._is_held(now) and now - self._moved_at < self._tuning.estimator.swings_on
-        self._arm.tip.learns = swings
+            course.is_steered = steers
+        swings = now - self._moved_at < self._tuning.estimator.swings_on
+        self._arm.tip.learns = steers and swings
         counts = self._arm.observe(now, commanded, reading, samples, course)
         if counts.used and (sample := self._arm.tip.sample) is not None:
             self._first_motion.take(self._arm.tip.predicted, sample.position)

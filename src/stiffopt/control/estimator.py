@@ -276,10 +276,11 @@ class TipEstimator:
         return max(self._tuning.least_frequency, omega)
 
     def change_frequency(self, before: float, after: float) -> None:
-        """Change e with the model's frequency, in rad/s, at the present configuration.
+        """Change e as the model's frequency, in rad/s, at the present configuration changes.
 
-        What samples have told of the frequency stays. The prior goes with the model. So e takes up
-        a share of the change: one less its variance over that of the prior.
+        What samples have told of the frequency stays, and the prior goes with the model. With v
+        the variance of e and v0 that of the prior, e takes up the share ``1 - v / v0`` of the
+        change.
         """
         if self._mode is None:
             return
@@ -303,7 +304,10 @@ class TipEstimator:
         self._times[0] = self.omega = omega
 
     def _directions_of(self, compliance: Array) -> tuple[Array, Array]:
-        """Return soft plane, stiff axis, lean (3, 3, 3), tip axes, and principal compliances."""
+        """Return three matrices (3, 3, 3) in tip axes, and the principal compliances (3,).
+
+        The matrices are those of `soft_plane`, `stiff_axis` and the lean.
+        """
         compliances, axes = np.linalg.eigh(compliance[:3, :3])
         _, second, softest = values = compliances.tolist()
         least, most = self._tuning.stiff_share * softest, self._tuning.soft_share * softest

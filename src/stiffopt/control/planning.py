@@ -357,12 +357,13 @@ class Planning:
         tolerance = task.target.tolerance
         far = distance > tolerance.position or angle > tolerance.angle
         stays, stiffness, short = request.stay and not far, math.nan, np.zeros(3)
-        if stays and self._stiffness is not None:
+        if request.stay:
             tip = self._tip.at(pressures)
-            stiffness = self._stiffness(tip.compliance, tip.pose[:3, :3])
-        if request.stay and target.position is not None:
-            away = np.array(target.position, dtype=float) - self._tip.at(pressures).pose[:3, 3]
-            short = np.nan_to_num(away)
+            if stays and self._stiffness is not None:
+                stiffness = self._stiffness(tip.compliance, tip.pose[:3, :3])
+            if target.position is not None:
+                away = np.array(target.position, dtype=float) - tip.pose[:3, 3]
+                short = np.nan_to_num(away)
         return Plan(
             request.serial, pressures, request.offset, request.target, stays or distant, stiffness,
             "" if stays else nearest_words(distance, angle, tolerance), far=far,

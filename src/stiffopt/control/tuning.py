@@ -523,12 +523,13 @@ class PressingTuning:
 
 @dataclass(frozen=True)
 class SlidingTuning:
-    """What is expected of a braced tip, of pushes and of slides (`SlideEstimator`)."""
+    """How slides of a braced arm are estimated and told (`SlideEstimator`)."""
 
     # deviation of a tracked position in each axis, in m; of a turn over that, in rad/m
     noise: float = 5e-5
     turn: float = 40.0
-    jump: float = 6.0  # deviation of a turn, in its own ones, from which on it jumps
+    # a turn jumps if it differs from the prediction by so many standard deviations
+    jump: float = 6.0
     # deviations of the model's error for place and turn, in m and rad: at first; by creep, per
     # e-fold of the time in contact and of a time before, in s; and by drift in a second
     error: tuple[float, float] = (1e-2, 3e-2)
@@ -539,11 +540,10 @@ class SlidingTuning:
     # deviation of a slide in a second, in m; time after which one is the model's error, in s
     slide: float = 1e-4
     longest: float = 60.0
-    # slide that is told, in m, so many times its deviation, in so many samples in a row, in which
-    # a turn must jump, too
+    # least size of a slide that is told, in m, and over its standard deviation
     told: float = 2e-4
     surely: float = 2.0
-    samples: int = 3
+    samples: int = 3  # in a row, in which a slide is that large, or the turn jumps
 
 
 @dataclass(frozen=True)
