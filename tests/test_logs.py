@@ -128,7 +128,7 @@ def test_columns_may_be_in_any_order(tmp_path: Path) -> None:
         (f"{NAMES},tip_qw\n0,1,2,3,4,5,6\n", 1, "'tip_qx' is missing"),
         (f"{NAMES},mid_x_m\n0,1,2,3,4,5,6\n", 1, "'mid_y_m' is missing"),
         (f"{NAMES},forze_n\n0,1,2,3,4,5,6\n", 1, "'forze_n'; did you mean 'force_n'"),
-        (f"{NAMES},p1_pa\n0,1,2,3,4,5,6\n", 1, "'p1_pa' is there twice"),
+        (f"{NAMES},p1_pa\n0,1,2,3,4,5,6\n", 1, "'p1_pa' appears twice"),
         (f"{NAMES}\n0,1,2,3,4,5\n1,1,2,3,4\n2,1,2,3,4,5\n", 3, "expected 6 fields, found 5"),
         (f"{NAMES}\n0,1,2,3,4,5\n1,1,2", 3, "cut short"),
         (f"{NAMES}\n0,1,2,3,4,5,6\n", 2, "expected 6 fields, found 7"),

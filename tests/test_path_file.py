@@ -356,7 +356,7 @@ def test_a_mistake_in_a_path_file(tmp_path: FilePath, line: int, text: str, mess
     [
         (1, "x_m,y_m\n0,0\n0,1\n", "the column 'z_m' is missing; expected time_s (or none)"),
         (1, "x_m,y_m,z_m,w\n0,0,0,0\n0,0,1,0\n", "the column 'w' is unknown"),
-        (1, "x_m,y_m,z_m,x_m\n0,0,0,0\n0,0,1,0\n", "the column 'x_m' is there twice"),
+        (1, "x_m,y_m,z_m,x_m\n0,0,0,0\n0,0,1,0\n", "the column 'x_m' appears twice"),
         (1, "x_m,y_m,z_m,qw\n0,0,0,1\n0,0,1,1\n", "the column 'qx' is missing"),
         (3, "x_m,y_m,z_m\n0,0,0.18\n0,,0.18\n", "y_m is missing"),
         (3, "x_m,y_m,z_m\n0,0,0.18\n0,nan,0.18\n", "'nan' is not a finite number"),

@@ -337,7 +337,7 @@ def test_what_the_studio_does_not_show_is_told(tmp_path: Path) -> None:
     assert kind_of(str(TASK)) == "task"
     path = tmp_path / "result.yaml"
     path.write_text("format: stiffopt-result/1\n", encoding="utf-8")
-    with pytest.raises(FileError, match="nothing that the studio shows"):
+    with pytest.raises(FileError, match="cannot be shown in the studio"):
         kind_of(str(path))
     with pytest.raises(FileError, match="no such file"):
         kind_of("nowhere.yaml")

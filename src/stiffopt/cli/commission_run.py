@@ -45,7 +45,7 @@ def run(
     with interruptible(), warnings_as_notes(quiet=quiet):
         rig, name, rate, log_folder = rig_of(rig_file)
         if rig.tracker is None:
-            raise InputError("this rig has no tracker; without one nothing can be found out")
+            raise InputError("this rig has no tracker, which commissioning needs")
         rig.supply.check_arming()
         expected = expected_steps(rig.robot, rig.supply.limits)
         _check_record(rig.settings.commissioning.record)
@@ -141,5 +141,5 @@ def _reported(
     elif not quiet:
         show(report.renderable(str(folder), path))
     if out is not None and not changed and not quiet:
-        report_note("nothing in the rig file has to be corrected, or can be: none was written")
+        report_note("there is nothing in the rig file to correct; no file was written")
     return SOLVED if found.fits else MISFIT

@@ -68,7 +68,7 @@ def write_first_file(
     check_ending(path, (".yaml", ".yml"))
     check_writable(path)
     if os.path.lexists(path) and not force:
-        raise FileError(path, "exists; give another name, or --force to write in its place")
+        raise FileError(path, "exists; give another name, or --force to overwrite it")
     answers = _Answers(given, ask, Path(path).parent)
     body, advice = _TEXTS[kind](answers, path)
     typed = shlex.quote(path)
@@ -321,7 +321,7 @@ def _task(answers: _Answers, path: str) -> tuple[str, list[str]]:
 
 def _path(answers: _Answers, path: str) -> tuple[str, list[str]]:
     _, written, robot = answers.robot()
-    begin = answers.position("from", "Begin of the line", _middle(robot, -0.06))
+    begin = answers.position("from", "Start of the line", _middle(robot, -0.06))
     end = answers.position("to", "End of the line", _middle(robot, 0.06))
     speed = answers.quantity("speed", "Speed of the tip", "10 mm/s", "m/s", "speed")
     direction = answers.vector("direction", "Direction in which the tip shall be stiff", "1, 0, 0")

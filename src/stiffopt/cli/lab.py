@@ -28,12 +28,11 @@ Start a simulated arm in real time behind the protocols of a rig file's devices.
 
 The devices of RIG are emulated on this machine: a Modbus server, an NDI Aurora on a
 pseudo-terminal, an OpenIGTLink server, an NI-DAQ gRPC server, a Zaber stage on TCP, the firmware of
-an open regulator in a simulated microcontroller. The rig file
-that is printed drives them with the real drivers. Simulated devices of RIG are replaced by real
-ones (--supply, --tracker). Ends with Ctrl-C.
+an open regulator in a simulated microcontroller. The printed rig file has the real drivers for
+them. Simulated devices of RIG are replaced by real ones (--supply, --tracker). Ends with Ctrl-C.
 
-While it runs it takes commands, one a line: 'fault DEVICE NAME [CHANNEL]' (if the rig file enables
-faults), 'mount X Y Z' (turn the probe's rail), 'status', 'quit'.
+While it runs it accepts commands, one per line: 'fault DEVICE NAME [CHANNEL]' (if the rig file
+enables faults), 'mount X Y Z' (turns the probe's rail), 'status', 'quit'.
 """
 
 LAB_EPILOG = """\
@@ -60,7 +59,7 @@ def lab(
         str,
         option(
             "DRIVER",
-            "In place of a simulated supply: modbus, nidaq, open-regulator or a package's.",
+            "In place of a simulated supply: modbus, nidaq, open-regulator or that of a package.",
         ),
     ] = "modbus",
     tracker: Annotated[

@@ -293,8 +293,8 @@ class MotionWatch:
             )
         return Doubt(
             "no-response",
-            f"{text} another way: channels are swapped, the tracker's frame is turned, the sensor "
-            "has slipped, or something pushes the arm; run 'stiffopt commission'",
+            f"{text} in another direction: channels are swapped, the tracker's frame is turned, "
+            "the sensor has slipped, or something pushes the arm; run 'stiffopt commission'",
         )
 
     def _missed(self, rows: Array, by_segments: Array, P: Array) -> _Miss:
@@ -379,7 +379,7 @@ class MotionWatch:
         return Doubt(
             "slip",
             f"the tip seems to have been displaced by {1e3 * distance:.1f} mm without being "
-            "turned, as no push or payload does it: the sensor has slipped, or tracker or base "
+            "turned, which no push or payload does: the sensor has slipped, or tracker or base "
             "have been moved; run 'stiffopt commission'",
         )
 

@@ -186,7 +186,7 @@ class Client:
                 raise CommandError(f"the arm does not move; it is {state.state}{reason}")
             errors = (state.position_error, state.angle_error)
             if all(map(math.isnan, errors)):
-                raise CommandError("nothing is asked of the tip; set a target first")
+                raise CommandError("the tip has no target; set one first")
             limits = (position_tolerance, angle_tolerance)
             near = not any(e > limit for e, limit in zip(errors, limits, strict=True))
             near_since = min(near_since, now) if near else math.inf
@@ -564,7 +564,7 @@ def _token(given: str | os.PathLike[str] | None) -> str | None:
             raise InputError(f"the token's file '{os.fspath(given)}' cannot be read") from None
         token = given
     if not (token.isascii() and token.isprintable()):
-        raise InputError("the token has characters that no token has")
+        raise InputError("the token has characters that a token cannot have")
     return token
 
 

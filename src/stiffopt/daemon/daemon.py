@@ -224,7 +224,7 @@ class Daemon:
             The guard does not start.
         """
         if self._started:
-            raise InputError("a daemon is started once; make another one")
+            raise InputError("a daemon can be started only once; make another one")
         self._started = True
         try:
             self._log.attach()

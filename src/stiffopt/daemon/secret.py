@@ -50,7 +50,7 @@ def _check_folder(folder: Path) -> None:
     if found.st_mode & stat.S_IWOTH and not found.st_mode & stat.S_ISVTX:
         raise FileError(
             folder,
-            f"is writable for all, so that anyone can exchange files there; take that right away "
+            f"is writable for all, so that anyone can exchange files there; remove that permission "
             f"(chmod o-w), or {_OTHERWISE}",
         )
 

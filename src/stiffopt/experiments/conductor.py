@@ -164,7 +164,7 @@ class Conductor:
         pause = now - self._last
         if pause > self._valid and not self.rig.supply.armed:
             raise DeviceError(
-                f"the experiment stood still for {pause:.3g} s, so that the arm was let down and "
+                f"the experiment stalled for {pause:.3g} s, so the arm was let down and "
                 "vented; go on with --resume"
             )
         self._last = now

@@ -84,7 +84,7 @@ class LogLayout:
         names = set(columns)
         for name in columns:
             if columns.count(name) > 1:
-                raise FileError(path, f"the column {shown(name)} is there twice", line=1)
+                raise FileError(path, f"the column {shown(name)} appears twice", line=1)
         n = next(k for k in count() if f"p{k + 1}_pa" not in names)
         bodies = {}
         for found in filter(None, map(_BODY.fullmatch, columns)):

@@ -357,7 +357,7 @@ class Recordings(Schema):
             if column in self.channels[:index]:
                 raise BadKeyError(
                     f"channels.{index}",
-                    f"column {column} is there twice; expected another for each channel",
+                    f"column {column} appears twice; expected a different one for each channel",
                 )
         return self
 

@@ -170,8 +170,8 @@ class Uncertainty:
     ) -> None:
         if description.calibration is None:
             raise InputError(
-                f"robot '{description.name}' was not calibrated, so that nothing is known of its "
-                "errors; fit it to recordings with 'stiffopt calibrate'"
+                f"robot '{description.name}' was not calibrated, so its errors are unknown; fit it "
+                "to recordings with 'stiffopt calibrate'"
             )
         self._description = description
         self._channels = [segment.n_channels for segment in description.segments]

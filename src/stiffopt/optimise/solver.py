@@ -98,7 +98,7 @@ class PressureSolver:
             once for a kind of task (formulas, machine code) is always completed.
         cancel : threading.Event or callable, optional
             Gives up in the same way as soon as the event is set or the callable returns true.  It
-            is polled every 10 ms, maybe from another thread.
+            is polled every 10 ms, possibly from another thread.
         """
         if target is not None and not isinstance(target, Target):
             raise InputError(f"target must be a Target; got {shown(target)}")

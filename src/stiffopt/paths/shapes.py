@@ -291,7 +291,7 @@ def _check_columns(file: FilePath, columns: tuple[str, ...]) -> None:
     wanted = _COLUMNS[1:4] + (_COLUMNS[4:] if any(c in columns for c in _COLUMNS[4:]) else ())
     wrong: list[tuple[Callable[[str], bool], tuple[str, ...], str]] = [
         (lambda name: name not in _COLUMNS, columns, "is unknown"),
-        (lambda name: columns.count(name) > 1, columns, "is there twice"),
+        (lambda name: columns.count(name) > 1, columns, "appears twice"),
         (lambda name: name not in columns, wanted, "is missing"),
     ]
     for is_wrong, names, what in wrong:

@@ -89,8 +89,8 @@ class Safety(Schema):
         if self.hold_timeout is None and self.unlimited_hold != "accepted":
             raise BadKeyError(
                 "hold_timeout",
-                "without one, pressures may be held for ever on an arm that is not understood; "
-                "give a time, or say 'unlimited_hold: accepted' as well",
+                "without one, pressures may be held for ever on an arm whose motion is not "
+                "explained; give a time, or add 'unlimited_hold: accepted'",
             )
         return self
 

@@ -44,7 +44,7 @@ def kind_of(file: str) -> str:
     if kind not in _KINDS:
         known = ", ".join(_KINDS)
         raise FileError(
-            file, f"is nothing that the studio shows; expected a file of a {known} or recording"
+            file, f"cannot be shown in the studio; expected a file of a {known} or recording"
         )
     return kind
 

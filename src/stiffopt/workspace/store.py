@@ -140,7 +140,7 @@ class MapStore:
             return None
         except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile):
             raise FileError(
-                path, "is damaged, so the map cannot be resumed; begin anew with --overwrite"
+                path, "is damaged, so the map cannot be resumed; start again with --overwrite"
             ) from None
 
     # -- complete maps ----------------------------------------------------------------------
@@ -183,7 +183,8 @@ class MapStore:
             lost = int(self.attributes["samples_without_equilibrium"])
         except Exception as error:  # a damaged file may raise anything in zarr's decoders
             raise FileError(
-                self.path, f"is damaged: {type(error).__name__}: {error}; begin anew (--overwrite)"
+                self.path,
+                f"is damaged: {type(error).__name__}: {error}; start again with --overwrite",
             ) from None
         return MapPart(0, lost, low, high, table)
 

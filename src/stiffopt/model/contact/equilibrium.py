@@ -280,7 +280,7 @@ class ContactEquilibrium:
     def friction(self) -> FrictionBounds:
         """Bounds on how far friction can change this equilibrium, to first order.
 
-        They hold for every approach. At each touched point acts a tangential force of at most the
+        They hold for every approach. At each touched point a tangential force acts, of at most the
         coefficient of friction times the normal force, in the direction in which it changes tip and
         forces most. The contacts stay closed.
         """
@@ -442,7 +442,7 @@ class ContactEquilibrium:
     def foretold_loss(self, direction: ArrayLike, contacts: Grip = "sliding") -> float:
         """Return the push in N of `lift_off` to first order in the push; infinite if there is none.
 
-        It takes a small part of the time, and knows no contacts that the push adds.  Parameters are
+        It takes a small part of the time, and ignores contacts that the push adds.  Parameters are
         those of `lift_off`.
         """
         d = np.asarray(checked_measure(direction, "translation", "free", "base").direction)

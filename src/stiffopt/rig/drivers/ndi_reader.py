@@ -99,7 +99,7 @@ def find_port() -> str:
         if port.vid == NDI_VENDOR or (port.vid, port.pid) in NDI_IDS
     ]
     if not ports:
-        raise LostError(f"no USB port says that it is NDI's; {known_ports()}")
+        raise LostError(f"no USB port identifies itself as NDI's; {known_ports()}")
     if len(ports) > 1:
         raise LostError(f"there are several NDI devices, at {', '.join(ports)}; name one")
     return str(ports[0])

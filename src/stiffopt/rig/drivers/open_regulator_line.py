@@ -256,7 +256,7 @@ class BoardLine:
             self._doubtful = False
         elif self._serial.in_waiting:
             raise DeviceError(
-                f"{self} says what nobody has asked for: is there a second board or a second "
+                f"{self} sent an unrequested message: is there a second board or a second "
                 "program on this line?"
             )
         return self._serial
@@ -277,7 +277,7 @@ class BoardLine:
         if body is None:
             raise DeviceError(f"{self} was not understood when asked to {_NAMES[kind]}: noise")
         if body[2] != self._sequence or body[3] not in (kind | REPLY, ERROR_REPLY):
-            raise DeviceError(f"{self} answers something else than what it was asked")
+            raise DeviceError(f"{self} sent an answer to another request")
         return body
 
 
