@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from stiffopt.cli.console import report_error, report_note, warnings_as_notes, write_line
-from stiffopt.cli.exits import FAULT, SOLVED, with_exit_code
+from stiffopt.cli.exits import ENDING_SIGNALS, FAULT, SOLVED, handled, with_exit_code
 from stiffopt.cli.options import Units, option
 from stiffopt.errors import InputError
 
@@ -177,18 +177,10 @@ def _direction(words: list[str]) -> list[float]:
 
 @contextmanager
 def _until_signal() -> Iterator[threading.Event]:
-    """Context with an event that Ctrl-C and SIGTERM set."""
+    """Context with an event that Ctrl-C and other signals to end set."""
     ended = threading.Event()
-
-    def end(number: int, frame: Any) -> None:
-        ended.set()
-
-    handlers: dict[int, Any] = {signal.SIGINT: end, signal.SIGTERM: end}
+    handlers: dict[int, Any] = dict.fromkeys(ENDING_SIGNALS, lambda number, frame: ended.set())
     if hasattr(signal, "SIGTTIN"):  # reading the terminal from the background would stop the lab
         handlers[signal.SIGTTIN] = signal.SIG_IGN
-    before = {number: signal.signal(number, handler) for number, handler in handlers.items()}
-    try:
+    with handled(handlers):
         yield ended
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)

@@ -17,7 +17,7 @@ from stiffopt.cli.solve_files import check_result_file, names_for_each, picture_
 from stiffopt.documents import write_file, write_whole
 from stiffopt.errors import EquilibriumError, FileError, InputError
 from stiffopt.model.manipulator import load_robot
-from stiffopt.paths.motion_file import RESULT_FORMAT
+from stiffopt.paths.motion_file import RESULT_FORMAT, is_motion_csv
 from stiffopt.paths.path import load_path
 from stiffopt.paths.solution import PathSolution
 
@@ -115,5 +115,5 @@ def check_csv(out: str, files: Sequence[str]) -> None:
     """Check the paths of CSV files: only the output of an earlier command is overwritten."""
     for name in map(FilePath, names_for_each(out, files)):
         check_writable(str(name))
-        if name.is_file() and name.stat().st_size and not path_records.is_result_csv(name):
+        if name.is_file() and name.stat().st_size and not is_motion_csv(name):
             raise FileError(name, "exists and is no CSV of a path's solution; give another name")

@@ -20,9 +20,10 @@ from stiffopt.control.lifecycle import ARMED
 from stiffopt.control.loop import ControlLoop
 from stiffopt.control.state import Severity, Snapshot, State
 from stiffopt.control.ways import ClearanceWatch
+from stiffopt.daemon.address import bracketed
 from stiffopt.daemon.calls import call_in_thread, ends_within
 from stiffopt.daemon.keeper import Keeper, LogEvents, ServiceManager
-from stiffopt.daemon.secret import Secret, bracketed, check_exposure
+from stiffopt.daemon.secret import Secret, check_exposure
 from stiffopt.errors import CommandError, FileError, InputError, MissingExtraError, StiffoptError
 from stiffopt.files import file_text
 from stiffopt.model.manipulator import load_robot

@@ -76,8 +76,6 @@ class TimelineView:
 
     def _add_panel(self) -> None:
         gui, timeline = self.server.gui, self.timeline
-        gui.configure_theme(show_logo=False, show_share_button=False)
-        gui.main_panel.set_width(400)
         self._words = gui.add_html("")
         self._button = gui.add_button("play")
         self._button.on_click(self._pressed)
