@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path as FilePath
 
-import numpy as np
-
 from stiffopt.cli import exits, path_records, quantities
 from stiffopt.cli.batch import Batch
 from stiffopt.cli.console import show, warnings_as_notes, write_json
@@ -72,10 +70,7 @@ class PathBatch(Batch[SolvedPath]):
             try:
                 solution = solve_path(robot, path, seed=self.seed)
             except EquilibriumError as error:
-                none = np.empty((0, robot.n_pressures))
-                solution = PathSolution(
-                    "failed", str(error), robot, np.empty(0), none, np.empty((0, 4, 4))
-                )
+                solution = PathSolution.without_answer("failed", str(error), robot, None)
             return SolvedPath(file, path, solution)
         except FileError:
             raise

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from pydantic import (
     BeforeValidator,
     Discriminator,
@@ -468,6 +468,18 @@ class RobotDescription(Schema):
     def pressure_slew(self) -> tuple[float, ...] | None:
         """Greatest rate of change of each channel, in Pa/s, or None."""
         return None if self.pressure.slew is None else self._per_channel(self.pressure.slew)
+
+    def slew_limits(self, further: ArrayLike | None = None) -> NDArray[np.float64] | None:
+        """Return the greatest rates of change (n,), in Pa/s, or None if there is no limit.
+
+        They are the smaller of the robot's and further ones, (n,) or one for all.
+        """
+        known = [rates for rates in (self.pressure_slew, further) if rates is not None]
+        if not known:
+            return None
+        rows = [np.broadcast_to(np.asarray(rates, float), self.n_pressures) for rates in known]
+        smallest: NDArray[np.float64] = np.min(rows, axis=0)
+        return smallest
 
     @property
     def channel_areas(self) -> tuple[float, ...]:

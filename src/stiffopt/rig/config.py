@@ -285,12 +285,7 @@ def limits_of(description: RigDescription, robot: RobotDescription) -> PressureL
 
 def slew_of(description: RigDescription, robot: RobotDescription) -> NDArray[np.float64] | None:
     """Return the greatest rates of change (n,), in Pa/s, or None if there is no limit."""
-    rates = [r for r in (robot.pressure_slew, description.safety.max_slew) if r is not None]
-    if not rates:
-        return None
-    broadcast = [np.broadcast_to(rate, robot.n_pressures).astype(float) for rate in rates]
-    slew: NDArray[np.float64] = np.minimum.reduce(broadcast)
-    return slew
+    return robot.slew_limits(description.safety.max_slew)
 
 
 def registration_of(tracker: TrackerSettings, robot: RobotDescription) -> Registration:
