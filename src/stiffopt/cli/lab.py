@@ -78,19 +78,18 @@ def lab(
     # here, so that --help waits for no numerics; the lab needs numba
     from stiffopt.files import file_text, save_file
     from stiffopt.lab.virtual import VirtualLab
-    from stiffopt.model.robot_files import load_description, robot_path
-    from stiffopt.rig.config import load_rig_description
+    from stiffopt.model.robot_files import robot_path
+    from stiffopt.rig.config import load_rig
 
     if out is not None and Path(out).exists() and Path(rig).exists() and Path(out).samefile(rig):
         raise InputError(f"--out {out} is the rig file itself; give another name")
-    description = load_rig_description(rig)
-    folder = Path(rig).parent
-    robot = load_description(description.robot, base=folder)
+    description, robot = load_rig(rig)
     with warnings_as_notes(quiet=quiet):
         virtual_lab = VirtualLab(description, robot, supply, tracker)
     with virtual_lab, _until_signal() as ended:
         addressed = virtual_lab.start()
-        addressed = addressed.model_copy(update={"robot": robot_path(description.robot, folder)})
+        known = robot_path(description.robot, Path(rig).parent)
+        addressed = addressed.model_copy(update={"robot": known})
         if out is None:
             write_line(file_text("rig", addressed).rstrip())
         else:

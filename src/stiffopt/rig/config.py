@@ -170,7 +170,12 @@ class RigDescription(Schema):
 
 
 def load_rig_description(path: str | os.PathLike[str]) -> RigDescription:
-    """Read a rig file and check it against its robot.
+    """Read a rig file and check it against its robot; see `load_rig`."""
+    return load_rig(path)[0]
+
+
+def load_rig(path: str | os.PathLike[str]) -> tuple[RigDescription, RobotDescription]:
+    """Read a rig file and the file of its robot; check that they fit.
 
     Raises
     ------
@@ -191,11 +196,11 @@ def load_rig_description(path: str | os.PathLike[str]) -> RigDescription:
         ) from None
     except InputError as error:
         raise FileError(path, str(error), line=line_of(path, "robot"), key="robot") from None
-    if description.commissioning.record is not None:
-        return description
-    record = str(Path(path).absolute().with_suffix(".commissioning.yaml"))
-    settings = description.commissioning.model_copy(update={"record": record})
-    return description.model_copy(update={"commissioning": settings})
+    if description.commissioning.record is None:
+        record = str(Path(path).absolute().with_suffix(".commissioning.yaml"))
+        settings = description.commissioning.model_copy(update={"record": record})
+        description = description.model_copy(update={"commissioning": settings})
+    return description, robot
 
 
 def _check_against(description: RigDescription, robot: RobotDescription) -> None:
