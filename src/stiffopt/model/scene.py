@@ -93,6 +93,11 @@ class SceneObject(_Shapes):
         (found,) = self._given().values()
         return found
 
+    @property
+    def may_be_leant_on(self) -> bool:
+        """Whether the arm may touch it."""
+        return self.contact is not None and self.contact.allowed
+
     def _given(self) -> dict[str, Obstacle]:
         shapes = ((key, getattr(self, key)) for key in OBSTACLES)
         return {key: shape for key, shape in shapes if shape is not None}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path as FilePath
 from typing import NamedTuple
 
@@ -86,7 +86,7 @@ class Timeline:
     headline: str = ""
     asked: Vector | None = None
     seen: Vector | None = None
-    events: tuple[tuple[float, str], ...] = field(default=())
+    events: tuple[tuple[float, str], ...] = ()
     scene: Scene | None = None
 
     @property
