@@ -316,7 +316,7 @@ def draw_solution(
         The solution has no pressures, or the view is invalid.
     """
     _require_pressures(solution)
-    arm = _loaded(robot, solution.task)
+    arm = solution.task.loaded(robot)
     drawing = _Drawing(axes, arm, solution)
     drawing.draw_base()
     leaning = solution.equilibrium
@@ -361,7 +361,7 @@ def draw_task(axes: Any, robot: Manipulator, task: Task, *, view: View | None = 
     InputError
         The view is invalid.
     """
-    arm = _loaded(robot, task)
+    arm = task.loaded(robot)
     start = arm.pressure_min
     drawing = _Drawing(axes, arm, PressureSolution("failed", "", task, start, arm.tip_pose(start)))
     drawing.draw_base()
@@ -373,11 +373,6 @@ def draw_task(axes: Any, robot: Manipulator, task: Task, *, view: View | None = 
     if task.scene is not None:
         drawing.draw_objects(task.scene)
     return drawing.finish(view)
-
-
-def _loaded(robot: Manipulator, task: Task) -> Manipulator:
-    load = task.tip_load
-    return robot.with_load(load.force, load.moment, load.frame) if load else robot
 
 
 def _require_pressures(solution: PressureSolution) -> None:
