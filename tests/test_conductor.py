@@ -22,8 +22,8 @@ from experiment_runs import (
 )
 from fake_rig import PERIOD, fake_rig, world_of
 from stiffopt.errors import DeviceError, InputError, StiffoptError
-from stiffopt.experiments import PressureSequence, run_kinematics
 from stiffopt.experiments.conductor import Conductor
+from stiffopt.experiments.kinematics import PressureSequence, run_kinematics
 from stiffopt.rig.settings import Safety
 from stiffopt.safety.gate import effective_slew
 from stiffopt.safety.settings import COMMANDS

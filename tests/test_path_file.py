@@ -18,7 +18,7 @@ from stiffopt.optimise.goal import StiffnessGoal, StiffnessMeasure
 from stiffopt.optimise.target import Target, Tolerance
 from stiffopt.paths.geometry import path_axes
 from stiffopt.paths.path import MAX_POINTS, Path, load_path
-from stiffopt.paths.rates import least_times, slew_limits, step_limits
+from stiffopt.paths.rates import least_times, step_limits
 
 HEAD = "format: stiffopt-path/1\nrobot: stiff-flop-2\n"
 LINE = "path: {line: {from: [-30 mm, -20 mm, 190 mm], to: [-30 mm, 20 mm, 190 mm]}}\n"
@@ -244,13 +244,13 @@ def test_a_direction_turns_with_the_path() -> None:
 
 def test_the_smaller_rate_holds() -> None:
     unknown = TWO.model_copy(update={"pressure": TWO.pressure.model_copy(update={"slew": None})})
-    assert slew_limits(unknown) is None
-    assert slew_limits(unknown, 2e5) == pytest.approx(np.full(6, 2e5))
+    assert unknown.slew_limits() is None
+    assert unknown.slew_limits(2e5) == pytest.approx(np.full(6, 2e5))
     limits = TWO.pressure.model_copy(update={"slew": (1e5, 3e5) * 3})
     robot = TWO.model_copy(update={"pressure": limits})
-    assert slew_limits(robot) == pytest.approx([1e5, 3e5] * 3)
-    assert slew_limits(robot, 2e5) == pytest.approx([1e5, 2e5] * 3)
-    assert slew_limits(robot, (5e5,) * 6) == pytest.approx([1e5, 3e5] * 3)
+    assert robot.slew_limits() == pytest.approx([1e5, 3e5] * 3)
+    assert robot.slew_limits(2e5) == pytest.approx([1e5, 2e5] * 3)
+    assert robot.slew_limits((5e5,) * 6) == pytest.approx([1e5, 3e5] * 3)
 
 
 def test_steps_and_their_times() -> None:

@@ -153,8 +153,9 @@ class _Answers:
 
         return self.text(name, f"{question} ({', '.join(allowed)})", allowed[0], check)
 
-    def vector(self, name: str, question: str, default: str) -> str:
-        """Return three numbers without a unit."""
+    def direction(self) -> str:
+        """Return the direction of a stiffness, three numbers."""
+        default = "1, 0, 0"
 
         def check(text: str) -> str:
             parts = text.strip("[] ").replace(",", " ").split()
@@ -163,11 +164,12 @@ class _Answers:
                     raise ValueError
             except ValueError:
                 raise InputError(
-                    f"{_option(name)}: expected a direction such as '{default}', not {shown(text)}"
+                    f"--direction: expected a direction such as '{default}', not {shown(text)}"
                 ) from None
             return f"[{', '.join(parts)}]"
 
-        return self.text(name, question, default, check)
+        question = "Direction in which the tip shall be stiff"
+        return self.text("direction", question, default, check)
 
     def position(self, name: str, question: str, default: str, *, free: bool = False) -> str:
         """Return three lengths; axes may be `free` if allowed."""
@@ -304,7 +306,7 @@ def _task(answers: _Answers, path: str) -> tuple[str, list[str]]:
     position = answers.position(
         "position", "Tip position in the base frame", _middle(robot), free=True
     )
-    direction = answers.vector("direction", "Direction in which the tip shall be stiff", "1, 0, 0")
+    direction = answers.direction()
     text = f"""
     robot: {written}
     target:
@@ -324,7 +326,7 @@ def _path(answers: _Answers, path: str) -> tuple[str, list[str]]:
     begin = answers.position("from", "Start of the line", _middle(robot, -0.06))
     end = answers.position("to", "End of the line", _middle(robot, 0.06))
     speed = answers.quantity("speed", "Speed of the tip", "10 mm/s", "m/s", "speed")
-    direction = answers.vector("direction", "Direction in which the tip shall be stiff", "1, 0, 0")
+    direction = answers.direction()
     text = f"""
     robot: {written}
     path:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from stiffopt.cli.console import report_error, report_note, warnings_as_notes, write_line
-from stiffopt.cli.exits import FAULT, SOLVED, with_exit_code
+from stiffopt.cli.exits import ENDING_SIGNALS, FAULT, SOLVED, handled, with_exit_code
 from stiffopt.cli.options import Units, option
 from stiffopt.errors import InputError
 
@@ -77,19 +77,18 @@ def lab(
     # here, so that --help waits for no numerics; the lab needs numba
     from stiffopt.files import file_text, save_file
     from stiffopt.lab.virtual import VirtualLab
-    from stiffopt.model.robot_files import load_description, robot_path
-    from stiffopt.rig.config import load_rig_description
+    from stiffopt.model.robot_files import robot_path
+    from stiffopt.rig.config import load_rig
 
     if out is not None and Path(out).exists() and Path(rig).exists() and Path(out).samefile(rig):
         raise InputError(f"--out {out} is the rig file itself; give another name")
-    description = load_rig_description(rig)
-    folder = Path(rig).parent
-    robot = load_description(description.robot, base=folder)
+    description, robot = load_rig(rig)
     with warnings_as_notes(quiet=quiet):
         virtual_lab = VirtualLab(description, robot, supply, tracker)
     with virtual_lab, _until_signal() as ended:
         addressed = virtual_lab.start()
-        addressed = addressed.model_copy(update={"robot": robot_path(description.robot, folder)})
+        known = robot_path(description.robot, Path(rig).parent)
+        addressed = addressed.model_copy(update={"robot": known})
         if out is None:
             write_line(file_text("rig", addressed).rstrip())
         else:
@@ -176,18 +175,10 @@ def _direction(words: list[str]) -> list[float]:
 
 @contextmanager
 def _until_signal() -> Iterator[threading.Event]:
-    """Context with an event that Ctrl-C and SIGTERM set."""
+    """Context with an event that Ctrl-C and other signals to end set."""
     ended = threading.Event()
-
-    def end(number: int, frame: Any) -> None:
-        ended.set()
-
-    handlers: dict[int, Any] = {signal.SIGINT: end, signal.SIGTERM: end}
+    handlers: dict[int, Any] = dict.fromkeys(ENDING_SIGNALS, lambda number, frame: ended.set())
     if hasattr(signal, "SIGTTIN"):  # reading the terminal from the background would stop the lab
         handlers[signal.SIGTTIN] = signal.SIG_IGN
-    before = {number: signal.signal(number, handler) for number, handler in handlers.items()}
-    try:
+    with handled(handlers):
         yield ended
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)

@@ -17,9 +17,9 @@ from urllib.parse import urlsplit
 from numpy.typing import ArrayLike
 
 from stiffopt.control.state import Event, Snapshot, State
+from stiffopt.daemon.address import local_url
 from stiffopt.daemon.messages import TargetMessage, TaskMessage, TrajectoryMessage
 from stiffopt.daemon.reports import LEASE_HEADER, RobotReport, error_of
-from stiffopt.daemon.secret import bracketed
 from stiffopt.daemon.state_json import record_of
 from stiffopt.errors import (
     CommandError,
@@ -549,8 +549,7 @@ class ClientStream:
 
 def daemon_url(service: ServiceSettings) -> str:
     """Return the URL of a daemon for clients on its machine, from the rig file's `service`."""
-    host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(service.host, service.host)
-    return f"http://{bracketed(host)}:{service.port}"
+    return local_url(service.host, service.port)
 
 
 def _token(given: str | os.PathLike[str] | None) -> str | None:

@@ -10,8 +10,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from urllib.parse import urlsplit
 
+from stiffopt.daemon.address import is_address
 from stiffopt.daemon.reports import RefusalError
-from stiffopt.daemon.secret import is_address
 
 
 def check_place(

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from stiffopt.errors import FileError, os_reason, require_package, shown
 from stiffopt.workspace.map import FILL, WorkspaceMap
-from stiffopt.workspace.table import CellTable, MapPart, cell_keys
+from stiffopt.workspace.table import CellTable, MapPart, cell_keys, merged
 
 FORMAT = "stiffopt-map/1"
 _METADATA = "zarr.json"
@@ -255,9 +255,7 @@ def read_table(path: Path, first: NDArray[np.int64]) -> CellTable:
         inside: Any = (..., *where)
         key = cell_keys(np.stack(where, axis=1) + first + np.array([start, 0, 0]))
         parts.append(CellTable(key, **{name: box[inside] for name, box in slab.items()}))
-    names = list(parts[0].arrays)
-    # slabs are in order along x, so keys ascend
-    return CellTable(*(np.concatenate([getattr(p, n) for p in parts], axis=-1) for n in names))
+    return merged(parts)
 
 
 # metadata ----------------------------------------------------------------------------------------

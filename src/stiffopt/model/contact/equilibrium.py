@@ -537,12 +537,5 @@ def contact_problem(arm: Manipulator, scene: Scene, spacing: float = SPACINGS[0]
 def _problem(rod: Rod, key: SceneKey, spacing: float) -> ContactProblem:
     measured = measured_scene(key.scene, rod.arm.description)
     pairs = zip(key.scene.objects, measured.items, strict=True)
-    return ContactProblem(
-        rod,
-        tuple(
-            ContactSurface(item, known.begin)
-            for item, known in pairs
-            if item.contact is not None and item.contact.allowed
-        ),
-        spacing,
-    )
+    surfaces = (ContactSurface(item, near.begin) for item, near in pairs if item.may_be_leant_on)
+    return ContactProblem(rod, tuple(surfaces), spacing)

@@ -140,19 +140,6 @@ def body_of(frame: bytes) -> bytes | None:
     return None
 
 
-class BoardRefusedError(DeviceError):
-    """The board has refused the request.
-
-    Attributes
-    ----------
-    code : see docs/open-regulator.md.
-    """
-
-    def __init__(self, message: str, code: int) -> None:
-        super().__init__(message)
-        self.code = code
-
-
 class BoardLine:
     """Sends requests to a board and returns its answers; nothing is sent twice.
 
@@ -205,10 +192,8 @@ class BoardLine:
 
         Raises
         ------
-        BoardRefusedError
-            The board refuses.
         DeviceError
-            It does not answer, or answers wrongly.
+            The board refuses, does not answer, or answers wrongly.
         """
         body = self._exchange(kind, payload, self.board, self.timeout)
         if body[0] != VERSION:
@@ -217,13 +202,13 @@ class BoardLine:
             raise self._refusal(kind, body[4:])
         return body[4:]
 
-    def _refusal(self, kind: int, payload: bytes) -> BoardRefusedError:
+    def _refusal(self, kind: int, payload: bytes) -> DeviceError:
         code, _, cause, channel, fault, faulty = payload[:6]
         if code == IS_VENTED:
             told = f"it has vented: {in_words(cause, channel)}"
         else:
             told = _ERRORS.get(code, f"error {code}").format(fault=in_words(fault, faulty))
-        return BoardRefusedError(f"{self} does not {_NAMES[kind]}: {told}", code)
+        return DeviceError(f"{self} does not {_NAMES[kind]}: {told}")
 
     def _exchange(self, kind: int, payload: bytes, board: int, timeout: float) -> bytes:
         with self._lock:
