@@ -17,6 +17,7 @@ agree where they describe the same regulator.
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import casadi as ca
@@ -65,30 +66,34 @@ class RegulatorModel:
 
     def begin(self, pressures: Array) -> None:
         """Restart, settled at pressures (n,)."""
-        self.pressures = pressures.copy()  # now, in Pa
-        self.offset = np.zeros_like(pressures)  # b, in Pa: settled pressures relative to commands
-        self.ahead = self.pressures  # a dead time from now; no further command can change them
-        self.healthy = np.stack([pressures, pressures])  # healthy range (2, n), in Pa
-        self._sent = np.tile(pressures, (self._depth, 1))  # commands under way, the oldest first
+        state = np.tile(pressures, (5 + self._depth, 1))
+        state[1] = 0.0
+        self._set(state)
+
+    def _set(self, state: Array) -> None:
+        """Set the state (5 + k, n); its last rows are k commands under way, the oldest first."""
+        self._state = state
+        self.pressures: Array = state[0]  # now, in Pa
+        self.offset: Array = state[1]  # b, in Pa: settled pressures relative to commands
+        self.ahead: Array = state[2]  # a dead time from now; no further command can change them
+        self.healthy: Array = state[3:5]  # healthy range (2, n), in Pa
 
     def advance(self, commanded: Array, reading: Array) -> Array:
         """Take a step with commands (n,) and, at its end, readings (n,); NaN: not measured.
 
         Return the pressures (n,) after it, in Pa.
         """
-        sent = self._sent
-        sent[:-1] = sent[1:]
-        sent[-1] = commanded
-        self.pressures, self.offset, self.ahead, self.healthy = self._step(
-            self.pressures, self.offset, sent, reading, self._share, self.healthy
-        )
+        (state,) = self._step(self._state, commanded, reading, self._share)
+        self._set(state)
         return self.pressures
 
 
 class PressureEstimator:
     """Commanded, chamber and effective pressures of an arm, in steps of `period`, in s.
 
-    The robot may have a history: hysteresis, creep, and a lag that replaces the regulators'.
+    The robot may have a history: hysteresis, creep, and a lag that replaces the regulators'. The
+    shape, but for its first mode, follows the effective pressures with the lag `viscous_lag`, in s,
+    unless the lag of the robot file contains that already.
     """
 
     def __init__(
@@ -100,6 +105,7 @@ class PressureEstimator:
         tuning: RegulatorTuning,
         channels: Channels,
         lag_tuning: LagTuning | None = None,
+        viscous_lag: float = 0.0,
     ) -> None:
         lag, self.dead_time = _regulation(robot, control)
         self.lag = float(np.mean(lag))  # of all channels, in s
@@ -111,6 +117,8 @@ class PressureEstimator:
         if control.adaptation != "none" and self.lags_are_regulators:
             self.lags = LagEstimator(period, lag, self.dead_time, slew, self._lag_tuning)
         self._modelled_lags = lag
+        self._viscous_lag = viscous_lag if self.lags_are_regulators else 0.0
+        self._follow = _following(len(slew))
         self.begin()
 
     def begin(self) -> None:
@@ -129,6 +137,9 @@ class PressureEstimator:
         # settled effective pressures relative to commands (n,), in Pa; they contain the part of the
         # regulators' offset that commands may compensate
         self.command_offset = zero
+        self.strained = zero  # effective pressures that the shape has followed
+        self.strained_ahead = zero  # these, with what the effective ones change in a dead time
+        self.unstrained = zero  # effective pressures relative to those that the shape has followed
 
     def advance(self, steps: int, commanded: Array, reading: Array) -> None:
         """Take steps with commands (n,) and readings (n,) in Pa; NaN: not measured."""
@@ -141,10 +152,14 @@ class PressureEstimator:
         self.command = commanded.copy()
         self.effective = self.chamber
         if self._memory is not None:
-            self.effective = self._memory.advance(steps * self._period, self.chamber)
-        self.history_offset = self.effective - self.chamber
-        self.effective_ahead = self._regulators.ahead + self.history_offset
-        self.command_offset = self.history_offset + self.channels.compensated
+            self.effective = self._memory.advance(elapsed, self.chamber)
+        share = 1.0 if self._viscous_lag == 0 else 1 - math.exp(-elapsed / self._viscous_lag)
+        (found,) = self._follow(
+            self.chamber, self.effective, self._regulators.ahead, self.channels.compensated,
+            self.strained, share,
+        )  # fmt: skip
+        self.history_offset, self.effective_ahead, self.command_offset = found[:3]
+        self.strained, self.strained_ahead, self.unstrained = found[3:]
 
     def adapt(self) -> bool:
         """Use the adapted lags from now on, at rest; return whether that changes anything."""
@@ -158,6 +173,26 @@ class PressureEstimator:
         return True
 
 
+def _following(n: int) -> Formula:
+    """Return the formula of all pressures (6, n) that follow from those in the chambers.
+
+    Inputs, (n,) each, in Pa: those in the chambers, the effective ones, those in the chambers a
+    dead time from now, the part of the regulators' offset that commands compensate, and the
+    effective ones that the shape had followed; and the share of the rest that it follows.
+    Output: the last six attributes of `PressureEstimator`.
+    """
+    names = ("chamber", "effective", "ahead", "compensated", "strained")
+    inputs = [*(ca.SX.sym(name, n) for name in names), ca.SX.sym("share")]
+    chamber, effective, ahead, compensated, strained, share = inputs
+    history_offset = effective - chamber
+    ahead, strained = ahead + history_offset, strained + share * (effective - strained)
+    found = ca.horzcat(
+        history_offset, ahead, history_offset + compensated, strained,
+        strained + (ahead - effective), effective - strained,
+    ).T  # fmt: skip
+    return Formula(inputs, [found], [found])
+
+
 def _share(period: float, lag: Array) -> Array:
     """Return the shares (n,) of their way that pressures with lags (n,) go in a step."""
     share: Array = 1 - np.exp(-period / np.maximum(lag, 1e-6))
@@ -167,16 +202,17 @@ def _share(period: float, lag: Array) -> Array:
 def _step(
     reach: Array, depth: int, slow: tuple[Array, int], period: float, tuning: RegulatorTuning
 ) -> Formula:
-    """Return the formula of a step: pressures, offset, pressures ahead (n,), healthy range (2, n).
+    """Return the formula of a step of the state (5 + k, n), see `RegulatorModel`.
 
-    Inputs: pressures and offset (n,), the commands under way, of which the pressures know the last
-    `depth`, readings (n,), the share (n,) of its way that a pressure goes in a step, and the
-    healthy range (2, n). `slow` are share and depth of the slowest healthy regulators.
+    Inputs: the state, commands and readings (n,), and the share (n,) of its way that a pressure
+    goes in a step. Of the k commands under way the pressures know the last `depth`; `slow` are
+    share and depth of the slowest healthy regulators.
     """
     n, most = len(reach), max(depth, slow[1])
-    share = ca.SX.sym("share", n)
-    x, offset, reading = ca.SX.sym("x", n), ca.SX.sym("offset", n), ca.SX.sym("reading", n)
-    sent, healthy = ca.SX.sym("sent", most, n), ca.SX.sym("healthy", 2, n)
+    state, commanded = ca.SX.sym("state", 5 + most, n), ca.SX.sym("commanded", n)
+    reading, share = ca.SX.sym("reading", n), ca.SX.sym("share", n)
+    x, offset, low, high = (state[row, :].T for row in (0, 1, 3, 4))
+    sent = ca.vertcat(state[6:, :], commanded.T)
 
     def limited(change: Any) -> Any:
         return ca.fmin(ca.fmax(change, -ca.DM(reach)), ca.DM(reach))
@@ -195,12 +231,10 @@ def _step(
     least, greatest = (
         ca.vertcat(*(choose(late[:, k]) for k in range(n))) for choose in (ca.mmin, ca.mmax)
     )
-    low, high = healthy[0, :].T, healthy[1, :].T
     low = ca.fmin(least, low + limited(ca.DM(slow[0]) * (least - low)))
     high = ca.fmax(greatest, high + limited(ca.DM(slow[0]) * (greatest - high)))
-    after = ca.horzcat(low, high).T
-    inputs = [x, offset, sent, reading, share, healthy]
-    return Formula(inputs, [now, offset_after, ahead, after], [sent, healthy, after])
+    after = ca.vertcat(ca.horzcat(now, offset_after, ahead, low, high).T, sent)
+    return Formula([state, commanded, reading, share], [after], [state, after])
 
 
 def _regulation(robot: RobotDescription, control: ControlSettings) -> tuple[Array, float]:
