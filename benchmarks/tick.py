@@ -4,8 +4,9 @@
 
 Runs two hanging segments on the simulator with a simulated clock, so that a tick does not include
 the cost of the simulation. Plans are made in parallel, as in the daemon. The quadratic programs for
-which the solver is asked are recorded and solved again by both solvers in turn. On a shared machine other programs
-slow a tick down by up to two times: with repeats, the least of all runs counts for each tick.
+which the solver is asked are recorded, and solved again by both solvers in turn. On a shared
+machine other programs slow a tick down by up to two times: with repeats, the least of all runs
+counts for each tick.
 """
 
 import argparse

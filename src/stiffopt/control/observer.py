@@ -78,9 +78,8 @@ class ArmObserver:
         tolerance = np.broadcast_to(np.asarray(safety.max_pressure_error, dtype=float), n)
         self.channels = Channels(limits, slew, tolerance, tuning.regulators)
         self.pressures = PressureEstimator(
-            robot.description, control, period, slew, tuning.regulators, self.channels, tuning.lags,
-            tuning.estimator.viscous_lag if mode is not None else 0.0,
-        )  # fmt: skip
+            robot.description, control, period, slew, tuning.regulators, self.channels, tuning.lags
+        )
         filter_tuning = replace(
             tuning.estimator,
             noise=control.tracker_noise,
@@ -88,6 +87,9 @@ class ArmObserver:
             damping=control.damping,
         )
         self.tip = TipEstimator(period, n, mode, filter_tuning)
+        # the lag of a calibrated robot file includes the arm's own
+        viscous = mode is not None and self.pressures.lags_are_regulators
+        self._viscous_lag = tuning.estimator.viscous_lag if viscous else 0.0
         self.touch = TouchEstimator(
             [segment.n_channels for segment in robot.description.segments],
             vibrates=mode is not None,
@@ -128,6 +130,8 @@ class ArmObserver:
         """Restart with a vented arm."""
         self._now = now
         self.pressures.begin()
+        # effective pressures (n,) that the shape has followed, but for the first mode, in Pa
+        self.strained = self.pressures.effective
         self.tip.begin()
         self.touch.begin()
         self.watch.begin()
@@ -152,12 +156,13 @@ class ArmObserver:
         steps = min(max(1, round((now - self._now) / self._period)), _MAX_STEPS)
         self._now = now
         self.pressures.advance(steps, commanded, reading.pressures)
-        effective = self.pressures.strained  # of the shape
+        effective = self._strain(steps * self._period)
+        ahead = self.pressures.effective - effective
         tip = self._at(self.compiled.chambers, effective)
         self.modelled, self._modelled_at = tip, effective
         for step in range(steps):
             moment = now - (steps - 1 - step) * self._period
-            self.tip.advance(moment, effective, tip, self.pressures.unstrained)
+            self.tip.advance(moment, effective, tip, ahead)
         counts = self.tip.take(samples)
         sample = self.tip.sample
         if counts.used and sample is not None:
@@ -168,6 +173,19 @@ class ArmObserver:
             else:
                 self._feel(sample, effective, tip, course)
         return counts
+
+    def _strain(self, elapsed: float) -> Array:
+        """Let the shape follow the effective pressures for a time in s; return `strained` (n,)."""
+        share = 1.0 if self._viscous_lag == 0 else 1 - math.exp(-elapsed / self._viscous_lag)
+        self.strained = self.strained + share * (self.pressures.effective - self.strained)
+        return self.strained
+
+    @property
+    def strained_ahead(self) -> Array:
+        """`strained` (n,), with what the effective pressures change in a dead time, in Pa."""
+        p = self.pressures
+        ahead: Array = self.strained + (p.effective_ahead - p.effective)
+        return ahead
 
     def on_path(self, pressures: Array) -> TipAt:
         """Return the model's tip at pressures (n,) on the reference's path."""

@@ -216,7 +216,7 @@ class PlannerEnd:
             for name in _OBJECTS
             if before is None or getattr(request, name) is not getattr(before, name)
         }
-        for name in _ARRAYS:  # as lists: to pickle an array takes twenty times longer
+        for name in _ARRAYS:  # as lists: pickling an array takes twenty times longer
             news[name] = getattr(request, name).tolist()
         self.connection.send_bytes(pickle.dumps(news, pickle.HIGHEST_PROTOCOL))
         self._sent = request

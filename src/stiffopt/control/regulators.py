@@ -17,7 +17,6 @@ agree where they describe the same regulator.
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import casadi as ca
@@ -91,9 +90,7 @@ class RegulatorModel:
 class PressureEstimator:
     """Commanded, chamber and effective pressures of an arm, in steps of `period`, in s.
 
-    The robot may have a history: hysteresis, creep, and a lag that replaces the regulators'. The
-    shape, but for its first mode, follows the effective pressures with the lag `viscous_lag`, in s,
-    unless the lag of the robot file contains that already.
+    The robot may have a history: hysteresis, creep, and a lag that replaces the regulators'.
     """
 
     def __init__(
@@ -105,7 +102,6 @@ class PressureEstimator:
         tuning: RegulatorTuning,
         channels: Channels,
         lag_tuning: LagTuning | None = None,
-        viscous_lag: float = 0.0,
     ) -> None:
         lag, self.dead_time = _regulation(robot, control)
         self.lag = float(np.mean(lag))  # of all channels, in s
@@ -117,8 +113,6 @@ class PressureEstimator:
         if control.adaptation != "none" and self.lags_are_regulators:
             self.lags = LagEstimator(period, lag, self.dead_time, slew, self._lag_tuning)
         self._modelled_lags = lag
-        self._viscous_lag = viscous_lag if self.lags_are_regulators else 0.0
-        self._follow = _following(len(slew))
         self.begin()
 
     def begin(self) -> None:
@@ -137,9 +131,6 @@ class PressureEstimator:
         # settled effective pressures relative to commands (n,), in Pa; they contain the part of the
         # regulators' offset that commands may compensate
         self.command_offset = zero
-        self.strained = zero  # effective pressures that the shape has followed
-        self.strained_ahead = zero  # these, with what the effective ones change in a dead time
-        self.unstrained = zero  # effective pressures relative to those that the shape has followed
 
     def advance(self, steps: int, commanded: Array, reading: Array) -> None:
         """Take steps with commands (n,) and readings (n,) in Pa; NaN: not measured."""
@@ -152,14 +143,10 @@ class PressureEstimator:
         self.command = commanded.copy()
         self.effective = self.chamber
         if self._memory is not None:
-            self.effective = self._memory.advance(elapsed, self.chamber)
-        share = 1.0 if self._viscous_lag == 0 else 1 - math.exp(-elapsed / self._viscous_lag)
-        (found,) = self._follow(
-            self.chamber, self.effective, self._regulators.ahead, self.channels.compensated,
-            self.strained, share,
-        )  # fmt: skip
-        self.history_offset, self.effective_ahead, self.command_offset = found[:3]
-        self.strained, self.strained_ahead, self.unstrained = found[3:]
+            self.effective = self._memory.advance(steps * self._period, self.chamber)
+        self.history_offset = self.effective - self.chamber
+        self.effective_ahead = self._regulators.ahead + self.history_offset
+        self.command_offset = self.history_offset + self.channels.compensated
 
     def adapt(self) -> bool:
         """Use the adapted lags from now on, at rest; return whether that changes anything."""
@@ -171,26 +158,6 @@ class PressureEstimator:
         self._modelled_lags, self.lag = found, float(np.mean(found))
         self._regulators.set_lag(found)
         return True
-
-
-def _following(n: int) -> Formula:
-    """Return the formula of all pressures (6, n) that follow from those in the chambers.
-
-    Inputs, (n,) each, in Pa: those in the chambers, the effective ones, those in the chambers a
-    dead time from now, the part of the regulators' offset that commands compensate, and the
-    effective ones that the shape had followed; and the share of the rest that it follows.
-    Output: the last six attributes of `PressureEstimator`.
-    """
-    names = ("chamber", "effective", "ahead", "compensated", "strained")
-    inputs = [*(ca.SX.sym(name, n) for name in names), ca.SX.sym("share")]
-    chamber, effective, ahead, compensated, strained, share = inputs
-    history_offset = effective - chamber
-    ahead, strained = ahead + history_offset, strained + share * (effective - strained)
-    found = ca.horzcat(
-        history_offset, ahead, history_offset + compensated, strained,
-        strained + (ahead - effective), effective - strained,
-    ).T  # fmt: skip
-    return Formula(inputs, [found], [found])
 
 
 def _share(period: float, lag: Array) -> Array:

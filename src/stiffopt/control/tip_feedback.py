@@ -182,10 +182,10 @@ class TipFeedback:
         """
         if self._gains is None:
             return ()
-        estimator, pressures = self._arm.tip, self._arm.pressures
+        estimator = self._arm.tip
         plane = estimator.soft_plane if bent is None else bent.plane
         return (
             estimator.vibration, plane, estimator.excess, estimator.omega,
-            self._gains.at(estimator.omega), pressures.effective_ahead, pressures.strained_ahead,
-            reference.chamber,
+            self._gains.at(estimator.omega), self._arm.pressures.effective_ahead,
+            self._arm.strained_ahead, reference.chamber,
         )  # fmt: skip
