@@ -104,6 +104,7 @@ class TipController:
         control, safety = control or ControlSettings(), safety or Safety()
         self._tuning = tuning = tuning or ControlTuning()
         self._period, n = period, robot.n_pressures
+        self._no_motion: Array = np.zeros((3, n))
         self._slew = slew = np.broadcast_to(np.asarray(slew, dtype=float), n).copy()
         if control.vibration != "auto":
             vibrates = control.vibration == "modelled"
@@ -375,14 +376,15 @@ class TipController:
         reference.omega = self._arm.tip.omega
         reference.motion_share = self._motion_share(reference.path[:n])
         reference.advance(self._awaited(plan, now))
-        if self._moves():
+        moves = self._moves()
+        if moves:
             self._moved_at = now
         if self._arm.leaning is not None:
             return self._feedforward(reference.command - pressures.command_offset, last)
         tip = self._arm.on_path(reference.path[:n])
         if now - self._went_back_at > self._tuning.adaptation.blind_time:
             self._arm.watch.intend(now, tip.pose[:3, 3] + reference.path[n : n + 3])
-        if self._arm.channels.pace == 0 and self._ways and self._moves():
+        if self._arm.channels.pace == 0 and self._ways and moves:
             return self._feedforward(self._without_feedback, last)
         course = self.replanner.pursuit.course
         bent = self._bend(None if isinstance(course, PostureCourse) else self.replanner.bent)
@@ -409,7 +411,7 @@ class TipController:
     def _motion_share(self, path: Array) -> Array:
         """Return the motion of the tip per pressure (3, n), over its greatest one in a period."""
         if self._tip_speed is None or self._bracing is not None:
-            return np.zeros((3, len(path)))
+            return self._no_motion
         motion: Array = self._arm.on_path(path).jacobian[:3] / (self._tip_speed * self._period)
         return motion
 

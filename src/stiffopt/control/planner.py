@@ -27,6 +27,7 @@ import numpy as np
 from stiffopt.control.interface import Notice
 from stiffopt.control.planning import Plan, Planning, PlanRequest
 from stiffopt.control.state import Severity
+from stiffopt.control.vibration import BentMode
 from stiffopt.errors import StiffoptError
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.scene import Scene
@@ -226,9 +227,12 @@ class PlannerEnd:
         request = self._sent
         if request is None or answer is None or isinstance(answer, str):
             return None if answer is None else str(answer)
+        if bent := answer.pop("bent"):
+            bent = BentMode(*map(np.array, bent))
         return Plan(
             serial=request.serial,
             pressures=np.array(answer.pop("pressures")),
+            bent=bent,
             offset=request.offset,
             target=request.target,
             adapted=request.adapted,
@@ -254,10 +258,12 @@ class PlanningEnd:
         if isinstance(answer, Plan):
             names = (
                 *("reached", "stiffness", "message", "far", "short", "blocked", "doubt"),
-                *("deviation", "estimate", "approach", "bent"),
+                *("deviation", "estimate", "approach"),
             )
-            own = {name: getattr(answer, name) for name in names}
-            self.connection.send({"pressures": answer.pressures.tolist(), **own})
+            news: dict[str, Any] = {name: getattr(answer, name) for name in names}
+            bent = answer.bent  # the tick receives it, so its arrays are lists as well
+            modes = bent and [each.tolist() for each in (bent.jacobian, bent.linear, bent.plane)]
+            self.connection.send({"pressures": answer.pressures.tolist(), "bent": modes, **news})
         else:
             self.connection.send(answer)
 

@@ -109,6 +109,10 @@ class VibrationFilter:
     of them. The first mode, with damping ratio zeta, follows the average on a path without residual
     vibration: the average is two steps of half the height, T / 2 apart (zero-vibration shaping), of
     the mean of two values that are T / 4 apart. It is late by 3 / 8 T.
+
+    Attributes
+    ----------
+    averages : the average, and path and speed of the mode (3, m).
     """
 
     def __init__(self, period: float, damping: float, m: int) -> None:
@@ -123,14 +127,24 @@ class VibrationFilter:
         self._past = np.tile(values, (2 * self._kept, 1))
         self._newest = self._kept
         self._omega, self._weights = math.inf, np.array([[1.0], [1.0], [0.0]])
-        self.value = values  # the average
-        self.motion = np.stack([values, np.zeros(len(values))])  # path and speed of the mode
+        self.averages: Array = np.stack([values, values, np.zeros(len(values))])
 
     def shift(self, change: Array) -> None:
         """Add a change (m,) to all values, past ones as well."""
         self._past += change
-        self.value = self.value + change
-        self.motion = self.motion + np.stack([change, np.zeros(len(change))])
+        self.averages = self.averages + np.stack([change, change, np.zeros(len(change))])
+
+    @property
+    def value(self) -> Array:
+        """The average (m,)."""
+        value: Array = self.averages[0]
+        return value
+
+    @property
+    def motion(self) -> Array:
+        """Path and speed of the mode (2, m)."""
+        motion: Array = self.averages[1:]
+        return motion
 
     def advance(self, values: Array, omega: float) -> None:
         """Take in values (m,) with a vibration of `omega`, in rad/s; infinite: no vibration."""
@@ -139,8 +153,7 @@ class VibrationFilter:
         if omega != self._omega:
             self._omega, self._weights = omega, self._shape(omega)
         past = self._past[self._newest : self._newest + self._weights.shape[1]]
-        averaged = self._weights @ past
-        self.value, self.motion = averaged[0], averaged[1:]
+        self.averages = self._weights.dot(past)
 
     def _shape(self, omega: float) -> Array:
         """Return weights (3, k) of average, path and speed, for the newest value first."""

@@ -1,5 +1,7 @@
 """Call functions on NumPy arrays, row by row: machine code or the CasADi VM."""
 
+from __future__ import annotations
+
 import ctypes
 import os
 import threading
@@ -174,19 +176,32 @@ class InterpretedFunction(BatchFunction):
 class Buffer:
     """A CasADi function, mapped over a number of rows, with its own memory.
 
+    Parameters
+    ----------
+    function, rows :
+        The function, and the number of rows.
+    before :
+        A buffer whose results are the first arguments: both share their memory.
+
     Attributes
     ----------
     targets, results : views (rows, r, c) of arguments and results, without the leading axis for one
-        row; arguments that are columns lack the last axis.
+        row; arguments that are columns lack the last axis. Arguments from `before` are left out.
     evaluate : callable
     """
 
-    def __init__(self, function: ca.Function, rows: int) -> None:
+    def __init__(self, function: ca.Function, rows: int, before: Buffer | None = None) -> None:
         mapped = function if rows == 1 else function.map(rows)
         buffer, self.evaluate = mapped.buffer()
         self._keep: list[Any] = [mapped, buffer]
-        self.targets, self.results = [], []
-        for k in range(function.n_in()):
+        self.targets: list[Array] = []
+        self.results: list[Array] = []
+        shared = [] if before is None else before.results
+        for k, result in enumerate(shared):
+            if result.size:  # its memory is by columns
+                buffer.set_arg(k, result.swapaxes(-1, -2).reshape(-1).data)
+        self._keep.append(before)
+        for k in range(len(shared), function.n_in()):
             view = self._memory(rows, function.size_in(k), buffer.set_arg, k)
             self.targets.append(view[..., 0] if view.shape[-1] == 1 else view)
         for k in range(function.n_out()):
