@@ -219,7 +219,7 @@ def test_lowest_pressures_raised_above_the_last(solver, tip_step):
 
 
 @SOLVER
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e200])
 @pytest.mark.parametrize("where", ["jacobian", "wanted", "reference", "last", "tip"])
 def test_what_is_not_finite_has_no_answer_and_does_no_harm(solver, bad, where):
     case = Case(5)

@@ -474,6 +474,7 @@ def test_bad_input(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert commissioned(path) == 2
     assert "the record cannot be written" in capsys.readouterr().err
     path = rig_file(tmp_path)
+    (tmp_path / "experiment.yaml").touch()  # 'stiffopt commission' cannot continue one
     assert commissioned(path, "--folder", str(tmp_path)) == 2
     assert "is not empty" in capsys.readouterr().err
     path.write_text(path.read_text().replace("tracker:", "# tracker:"), encoding="utf-8")

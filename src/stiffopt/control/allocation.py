@@ -162,10 +162,10 @@ class Allocation:
         H, f, G, lower, upper, finite, _, _, _, p, held, residual, is_solution = self._program.view(
             *inputs, reference, last, self._low, self._high, self._active
         )
-        if is_solution[0]:
-            return p.copy(), held > 0, float(residual[0])
         if not math.isfinite(finite[0]):
             return None, self._none_held, math.nan
+        if is_solution[0]:
+            return p.copy(), held > 0, float(residual[0])
         change = self._solver.solve(H.T, f, G.T, lower, upper)
         if change is None or change.shape != last.shape:
             return None, self._none_held, math.nan

@@ -49,6 +49,7 @@ Symbols = Any  # of CasADi
 
 _MODE_EVERY = 8  # steps between updates of frequency and soft plane, which change slowly
 _NO_ROTATION = (1.0, 0.0, 0.0, 0.0)
+_GIVES = 1e-9  # least compliance in a direction, over the greatest, that is not rounding
 
 
 class _PastTip(NamedTuple):
@@ -521,7 +522,9 @@ def _directions(tuning: EstimatorTuning) -> Formula:
     # in a strongly bent arm no direction is entirely stiff
     soft = ca.fmin(1, values / (tuning.soft_share * softest))
     stiff = ca.fmax(0, 1 - values / (tuning.stiff_share * softest))
-    turns = compliance[3:, :3] @ axes @ ca.diag(ca.vertcat(0, 1 / values[1:]))
+    # a tip that leans on objects may give way in one direction only
+    gives = ca.logic_and(values > _GIVES * softest, ca.DM([0, 1, 1]))
+    turns = compliance[3:, :3] @ axes @ ca.diag(gives / ca.if_else(gives, values, 1))
     outputs = [
         rotation @ matrix @ axes.T @ rotation.T
         for matrix in (axes @ ca.diag(soft), axes @ ca.diag(stiff), turns)

@@ -8,6 +8,7 @@ in it for nearly twice as long, and the tip hardly jumps where one linearisation
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import casadi as ca
@@ -170,6 +171,8 @@ class LinearisedTip:
             tip = (self._leaning or self._model).at(pressures)
         except (EquilibriumError, PressureError) as error:
             raise StiffoptError(f"the model has no answer: {error}") from error
+        if not math.isfinite(tip.compliance.sum()):
+            raise StiffoptError("the model has no answer: its compliance is not finite")
         self._linearisation.view(pressures, pressures, tip.pose, tip.jacobian)
         self._tip = tip
         return tip

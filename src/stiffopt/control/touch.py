@@ -453,7 +453,8 @@ def _feeling() -> Formula:
     pose, compliance = ca.SX.sym("pose", 4, 4), ca.SX.sym("compliance", 6, 6)
     values, axes = principal_axes(compliance[:3, :3])
     axes, soft = pose[:3, :3] @ axes, values > SOFT_SHARE * values[2]
-    stiffness, felt = (axes @ ca.diag(each) @ axes.T for each in (soft / values, soft))
+    stiff = soft / ca.if_else(soft, values, 1)  # where the tip leans on an object, values may be 0
+    stiffness, felt = (axes @ ca.diag(each) @ axes.T for each in (stiff, soft))
     return Formula([pose, compliance], [stiffness, felt, values[2]])
 
 

@@ -46,8 +46,6 @@ def empty_folder(path: Path) -> Path:
     """Make a folder, and return it; it may exist if it is empty."""
     try:
         path.mkdir(parents=True, exist_ok=True)
-        if (path / SETTINGS).exists():
-            raise FileError(path, f"holds an experiment; continue it with --resume {path}")
         if any(path.iterdir()):
             raise FileError(path, "is not empty; give another folder")
     except OSError as error:
@@ -57,6 +55,8 @@ def empty_folder(path: Path) -> Path:
 
 def create_folder(path: Path, settings: Schema) -> None:
     """Create the folder of a new experiment and write its settings there."""
+    if (path / SETTINGS).exists():
+        raise FileError(path, f"holds an experiment; continue it with --resume {path}")
     empty_folder(path)
     save_file(path / SETTINGS, "experiment", settings)
 

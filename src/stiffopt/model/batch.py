@@ -198,6 +198,7 @@ class Buffer:
         self.results: list[Array] = []
         shared = [] if before is None else before.results
         for k, result in enumerate(shared):
+            assert function.size_in(k) == result.shape[-2:]  # CasADi would read on
             if result.size:  # its memory is by columns
                 buffer.set_arg(k, result.swapaxes(-1, -2).reshape(-1).data)
         self._keep.append(before)
