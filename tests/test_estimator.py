@@ -591,7 +591,7 @@ def test_a_tip_that_objects_hold_in_two_directions_turns_with_the_third_alone() 
     held.compliance[:3, :3] = np.diag([0.0, 2e-3, 0.0])
     held.compliance[5, 1] = 0.01  # rad/N
     estimator.advance(0.0, p, held)
-    estimator.take([sample(0.0, BASE + [0.0, 1e-3, 0.0], (1.0, 0.0, 0.0, 0.0))])
+    estimator.take([sample(0.0, BASE + np.array([0.0, 1e-3, 0.0]), (1.0, 0.0, 0.0, 0.0))])
     estimator.advance(PERIOD, p, held)
     assert np.isfinite(state(estimator)).all()
     assert estimator._lean[2, 1] == pytest.approx(5.0)  # rad/m
