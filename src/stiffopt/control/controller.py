@@ -316,8 +316,10 @@ class TipController:
         swings = now - self._moved_at < self._tuning.estimator.swings_on
         self._arm.tip.learns = steers and swings
         counts = self._arm.observe(now, commanded, reading, samples, course)
-        if counts.used and (sample := self._arm.tip.sample) is not None:
-            self._first_motion.take(self._arm.tip.predicted, sample.position)
+        tip, sample = self._arm.modelled, self._arm.tip.sample
+        if counts.used and sample and tip and not self._first_motion.is_over:
+            parts = tip.pose[:3, :3] @ tip.jacobian[:3] * self._arm.pressures.effective
+            self._first_motion.take(self._arm.tip.predicted, sample.position, parts)
         if self.forecast is not None:
             self.forecast.present = self._present(now)
         return counts
@@ -486,7 +488,7 @@ class TipController:
             return self._brace(course, now)
         calm = now - self._adapted_at < tuning.adaptation.calm_time
         share = tuning.adaptation.slew_share if calm else tuning.reference.slew_share
-        reference.slew_share = min(share, self._first_motion.slew_share)
+        reference.slew_share = np.fmin(share, self._first_motion.slew_share)
         way = None if self.forecast is None else self._way(now)
         found = replanner.update(
             now, self._offset, self._arm.pressures.command_offset, estimator.omega,

@@ -49,7 +49,8 @@ class Reference:
     ) -> None:
         self._lag = lag
         self._step = _step(period, slew, damping, extra)
-        self.slew_share = slew_share  # share of the slew that the pressures may use
+        # share of the slew that the pressures may use, of each (n,) or all
+        self.slew_share: float | Array = slew_share
         # motion of the tip per pressure (3, n), over the greatest one in a step; 0: no bound
         self.motion_share: Array = np.zeros((3, len(slew)))
         self.rate = 1.0  # a of the four lags, in 1/s
@@ -186,17 +187,17 @@ def _step(period: float, slew: Array, damping: float, extra: int) -> Formula:
     """Return the formula of a step: states (5, n + m), motion (4, n + m), command, chamber (n,).
 
     Inputs: states, the first being the input of the lags; the plan (n + m,); the rate of the lags,
-    in 1/s; omega of the vibration, in rad/s; the regulators' lag, in s; the share of `slew`, the
-    greatest rate of the n pressures, that may be used; the motion of the tip per pressure (3, n),
+    in 1/s; omega of the vibration, in rad/s; the regulators' lag, in s; the shares of `slew`, the
+    greatest rates of the n pressures, that may be used; the motion of the tip per pressure (3, n),
     over the greatest one in a step, of all channels or of one.
     """
     n = len(slew)
     states, plan = ca.SX.sym("states", _LAGS + 1, n + extra), ca.SX.sym("plan", n + extra)
     rate, omega, lag = ca.SX.sym("rate"), ca.SX.sym("omega"), ca.SX.sym("lag")
-    slew_share, motion_share = ca.SX.sym("slew_share"), ca.SX.sym("motion_share", 3, n)
+    slew_share, motion_share = ca.SX.sym("slew_share", n), ca.SX.sym("motion_share", 3, n)
     way = plan.T - states[0, :]
     # all channels take the share of their way that the slowest one can cover in a step
-    steps = ca.mmax(ca.fabs(way[:n]).T / ca.DM(slew * period)) / slew_share
+    steps = ca.mmax(ca.fabs(way[:n]).T / ca.DM(slew * period) / slew_share)
     moved = motion_share @ ca.diag(way[:n])
     squares = ca.vertcat(ca.sum1(moved**2).T, ca.sumsqr(ca.sum2(moved)))
     steps = ca.fmax(steps, ca.sqrt(ca.mmax(squares)))
