@@ -215,7 +215,7 @@ def test_a_crowd_that_connects_and_says_nothing_does_not_touch_control(
 
 
 def test_it_is_started_once(daemon: tuple[Daemon, Client]) -> None:
-    with pytest.raises(InputError, match="started once"):
+    with pytest.raises(InputError, match="started only once"):
         daemon[0].start()
 
 
