@@ -168,7 +168,7 @@ class _Answers:
                 ) from None
             return f"[{', '.join(parts)}]"
 
-        question = "Direction in which the tip shall be stiff"
+        question = "Direction in which the tip should be stiff"
         return self.text("direction", question, default, check)
 
     def position(self, name: str, question: str, default: str, *, free: bool = False) -> str:
@@ -311,7 +311,7 @@ def _task(answers: _Answers, path: str) -> tuple[str, list[str]]:
     robot: {written}
     target:
       position: {position}    # of the tip, in the base frame; an axis may be `free`
-      # pointing: [0, 0, 1]                # where the tip's axis shall point
+      # pointing: [0, 0, 1]                # where the tip's axis should point
     stiffness:
       maximise: {{direction: {direction}}}    # newtons for each metre of displacement that way
     """

@@ -347,7 +347,7 @@ def _supports(found: SupportMap) -> Iterable[Line]:
             where = f"through {point} {length}, normal {normal}"
         yield (
             "" if number > 1 else "would help",
-            f"{number} {each.kind}: {stiffness}, {found.times(each):.3g} times as stiff; "
+            f"{number}. {each.kind}: {stiffness}, {found.times(each):.3g} times as stiff; "
             f"{each.touched}; {where}",
         )
 

@@ -33,7 +33,7 @@ from stiffopt.control.reference import Reference
 from stiffopt.control.replanning import Pursuit, Replanner
 from stiffopt.control.report import Report
 from stiffopt.control.requests import Requests
-from stiffopt.control.state import ControllerStatus
+from stiffopt.control.state import ControllerStatus, Severity
 from stiffopt.control.tip_errors import target_arrays
 from stiffopt.control.tip_feedback import TipFeedback
 from stiffopt.control.tuning import ControlTuning
@@ -173,6 +173,7 @@ class TipController:
         self._moved_at = -math.inf  # last time at which the reference moved
         self._computed_at = now
         self._adapted_at = -math.inf  # last adaptation of the model since the last request
+        self._untold: list[Notice] = []  # events since the last call of `notices`
         self._went_back_at = -math.inf  # last return to an earlier model
         self._watched_at = -math.inf  # last check whether the tip rests
         self._lost = self._arm.channels.lost
@@ -505,6 +506,8 @@ class TipController:
         if plan is None:
             return None if self._at_rest else self._start(now)
         if plan.approach is None:  # the plan keeps clear of the objects
+            text = "no posture that leans is stiffer at this target: the arm keeps clear of objects"
+            self._untold.append(Notice("brace-clear", text, Severity.INFO))
             self.replanner.pursue(self.replanner.pursuit.to(course.task.target))
             return found
         course.begin(plan.approach, self._start(now)[: self.robot.n_pressures])
@@ -660,7 +663,8 @@ class TipController:
 
     def notices(self) -> tuple[Notice, ...]:
         """Return alarms and events."""
-        return self._report.notices(self._rests_short())
+        untold, self._untold = self._untold, []
+        return (*untold, *self._report.notices(self._rests_short()))
 
     def _rests_short(self) -> bool:
         """Return whether the tip is at rest although its target, out of reach, is elsewhere.

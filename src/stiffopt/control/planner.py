@@ -17,6 +17,7 @@ import socket
 import subprocess
 import sys
 import time
+import warnings
 from contextlib import suppress
 from dataclasses import replace
 from multiprocessing.connection import Connection
@@ -28,7 +29,7 @@ from stiffopt.control.interface import Notice
 from stiffopt.control.planning import Plan, Planning, PlanRequest
 from stiffopt.control.state import Severity
 from stiffopt.control.vibration import BentMode
-from stiffopt.errors import StiffoptError
+from stiffopt.errors import SlowWarning, StiffoptError
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.scene import Scene
 
@@ -273,6 +274,7 @@ def main(end: PlanningEnd) -> None:
 
     It ends when the other end is closed.
     """
+    warnings.simplefilter("ignore", SlowWarning)  # the loop reports that a plan takes long
     robot, scene = end.connection.recv()
     planning = Planning(robot, scene)
     end.answer(None)

@@ -19,6 +19,7 @@ Array = NDArray[np.float64]
 _TIME = "time_s"
 _AXES = ("x", "y", "z")
 _PARTS = ("qw", "qx", "qy", "qz")
+_PRESSURE = re.compile(r"pm?\d+_pa")
 _BODY = re.compile(r"([a-z][a-z0-9]*(?:_[a-z0-9]+)*)_(?:[xyz]_m|q[wxyz])")
 
 
@@ -291,7 +292,8 @@ def _pressures(prefix: str, n: int) -> list[str]:
 
 
 def _missing(name: str, unknown: Sequence[str]) -> str:
-    near = difflib.get_close_matches(name, unknown, n=1)
+    misnamed = [each for each in unknown if not _PRESSURE.fullmatch(each)]
+    near = difflib.get_close_matches(name, misnamed, n=1)
     hint = f" (is {shown(near[0])} meant to be that?)" if near else ""
     return f"the column '{name}' is missing{hint}; a log starts with a row of names"
 

@@ -186,10 +186,11 @@ class _PathSolver:
         if times is None:
             times = self._fastest(pressures)
         solution = self._answers.judged(tasks, pressures, times, attempts.alone, self._unreachable)
-        branches = max(map(len, layers))
+        branches, crossings = max(map(len, layers)), route.crossings
         confidence = (
-            f"{starts} starts found at most {branches} local optima at a point; "
-            f"the best sequence crosses between branches at full rate {route.crossings} times"
+            f"{starts} starts found at most {branches} local "
+            f"{'optimum' if branches == 1 else 'optima'} at a point; the best sequence crosses "
+            f"between branches at full rate {crossings} time{'' if crossings == 1 else 's'}"
         )
         solution = replace(solution, confidence=confidence)
         if stuck is not None:

@@ -86,7 +86,10 @@ def known_ports() -> str:
     from serial.tools import list_ports
 
     names = sorted(port.device for port in list_ports.comports())
-    return f"the ports here are {', '.join(names)}" if names else "this computer has none now"
+    if not names:
+        return "this computer has none now"
+    are = "port here is" if len(names) == 1 else "ports here are"
+    return f"the {are} {', '.join(names)}"
 
 
 def find_port() -> str:
