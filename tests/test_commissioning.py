@@ -416,6 +416,23 @@ def test_a_swap_on_the_rig(
     assert not load_record(tmp_path / "rig.commissioning.yaml").fits
 
 
+def test_set_points_that_are_swapped_are_no_leak(
+    tmp_path: Path, touched: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Each gauge reads its own chamber, which has shown the other channel's step."""
+
+    def crossed(rig: Any) -> None:
+        command = rig.tracker._world.command
+        rig.tracker._world.command = lambda p: command(np.asarray(p)[[1, 0, 2]])
+
+    touched(crossed)
+    path = rig_file(tmp_path)
+    assert main(["commission", str(path), "--no-plot"]) == 6
+    told = capsys.readouterr().out
+    assert "channels 1 and 2 seem swapped" in told
+    assert "the gauge of channel 2 follows the command of channel 1" in told
+
+
 def test_the_corrected_rig_file_fits(
     tmp_path: Path, touched: Any, capsys: pytest.CaptureFixture[str]
 ) -> None:

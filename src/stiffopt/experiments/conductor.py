@@ -154,6 +154,10 @@ class Conductor:
                 )
             self.tick(self._target)
 
+    def forget_pressures(self) -> None:
+        """Restart the pressure monitor: what the channels have reached so far no longer counts."""
+        self._monitor.clear()
+
     def tick(self, target: ArrayLike) -> None:
         """Command pressures (n,), in Pa, as the gate's goal, and wait for the next tick.
 
