@@ -14,6 +14,7 @@ import time
 import numpy as np
 
 from stiffopt.errors import DeviceError
+from stiffopt.rig.config import load_rig
 from stiffopt.rig.interface import PressureCommand
 from stiffopt.safety.realtime import real_time
 from stiffopt.safety.rigs import guarded_rig
@@ -22,7 +23,7 @@ PERIOD, RISE, PRESSURE = 0.01, 15, 0.4e5  # s, ticks, Pa
 
 
 def main(path: str) -> None:
-    rig, link = guarded_rig(path)
+    rig, link = guarded_rig(*load_rig(path))
     signal.signal(signal.SIGUSR1, lambda *_: time.sleep(0.5))
     with rig, real_time():
         while True:

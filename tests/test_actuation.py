@@ -781,7 +781,7 @@ def test_the_simulated_arm_has_the_dead_band_of_the_model() -> None:
 def test_the_simulated_arm_says_what_it_cannot_do(name: str) -> None:
     mapping = Arm((FLOP, FLOP)).mapping()
     mapping["segments"][1]["compensation"] = {name: 0.05}
-    with pytest.raises(InputError, match=rf"knows no segments\[1\]\.compensation\.{name}"):
+    with pytest.raises(InputError, match=rf"has no segments\[1\]\.compensation\.{name}"):
         plant_of(RobotDescription(**mapping))
 
 

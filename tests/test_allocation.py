@@ -219,7 +219,7 @@ def test_lowest_pressures_raised_above_the_last(solver, tip_step):
 
 
 @SOLVER
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e200])
 @pytest.mark.parametrize("where", ["jacobian", "wanted", "reference", "last", "tip"])
 def test_what_is_not_finite_has_no_answer_and_does_no_harm(solver, bad, where):
     case = Case(5)
@@ -247,8 +247,47 @@ def test_solver_that_gives_nonsense_is_not_believed():
     case = Case(7)
     for nonsense in (np.full(6, 2e9), np.full(6, np.nan), np.zeros(5), None, np.full(6, 0.06)):
         allocation = case.made()
+        allocation._active[:] = np.nan  # so that the solver is asked
         allocation._solver.solve = lambda *_, answer=nonsense: answer
         assert case.answer(allocation)[0] is None
+
+
+@pytest.mark.parametrize("n", [1, 6])
+@pytest.mark.parametrize("kind", ["full", "tall", "none", "zero", "rank 1", "huge", "tiny"])
+def test_the_solution_depends_on_no_bounds_that_were_active(kind, n):
+    rng, speeds = np.random.default_rng(11), (FAR, 1e-3)
+    for seed in range(20):
+        case = Case(seed, n, kind)
+        allocation, fresh = (
+            case.made(tip_step=speeds[seed % 2]),
+            case.made(tip_step=speeds[seed % 2]),
+        )
+        fresh._active[:] = np.nan  # so that the solver is asked
+        expected, held = case.answer(fresh)
+        residual = case.missing
+        for _ in range(8):
+            allocation._active = rng.integers(-1, 2, n).astype(float)
+            p, flags = case.answer(allocation)
+            assert p == pytest.approx(expected, abs=1e-5)
+            assert flags.tolist() == held.tolist()
+            assert case.missing == pytest.approx(residual, abs=1e-9)
+
+
+def test_the_solver_is_asked_only_if_other_bounds_are_active():
+    case, asked = Case(12), []
+    allocation = case.made()
+    solve = allocation._solver.solve
+    allocation._solver.solve = lambda *problem: asked.append(1) or solve(*problem)
+    first, held = case.answer(allocation)
+    assert held.any()
+    assert asked == [1]
+    again, _ = case.answer(allocation)
+    assert again == pytest.approx(first, abs=1e-5)
+    assert asked == [1]
+    case.reference = case.last.copy()
+    case.wanted = -case.wanted
+    case.answer(allocation)
+    assert asked == [1, 1]
 
 
 def test_osqp_recovers_after_what_it_could_not_solve():

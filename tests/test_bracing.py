@@ -545,6 +545,24 @@ def test_the_loop_leans_holds_tells_a_lift_off_and_lets_go(solution, approach, m
     loop.controller.close()
 
 
+def test_an_arm_that_better_keeps_clear_is_told_of(solution, monkeypatch):
+    """The search finds no posture that leans, so that the task is pursued without its brace."""
+
+    def solver(robot: Any, task: stiffopt.Task) -> Any:
+        known = SimpleNamespace(solve=lambda: replace(solution, contacts=()))
+        return known if task.brace is not None else PressureSolver(robot, task)
+
+    monkeypatch.setattr(planning, "PressureSolver", solver)
+    loop = Loop()
+    loop.wait(1.0)
+    loop.controller.set_task(TASK)
+    loop.wait(3.0)
+    assert loop.told == ["brace-clear"]
+    assert (loop.status.task, loop.status.brace) == ("target", "")
+    assert loop.force == 0
+    loop.controller.close()
+
+
 def test_an_object_that_is_not_there_is_told_on_the_way(solution, monkeypatch):
     """The object of the scene stands elsewhere on the rig, so that nothing is touched."""
     known = SimpleNamespace(solve=lambda: solution)

@@ -514,7 +514,10 @@ _CALIBRATE = ("calibrate", "--robot", "stiff-flop-1", "--out", "{tmp}/new.yaml")
             "old.yaml: exists; give another name",
         ),
         (("validate", "--robot", "stiff-flop-1", "{tmp}/no.csv"), "there is no such file"),
-        (("validate", "--robot", "stiff-flop-1", "{tmp}/six.csv"), "say with --channels"),
+        (
+            ("validate", "--robot", "stiff-flop-1", "{tmp}/six.csv"),
+            "give the column of each channel with --channels",
+        ),
         (("validate", "--robot", "stiff-flop-1", "{log}", "--report", "{tmp}"), "exists"),
     ],
 )

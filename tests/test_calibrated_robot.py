@@ -80,7 +80,7 @@ MISTAKES: list[tuple[tuple[str | int, ...], Any, str]] = [
     (
         ("recordings", "channels"),
         [1, 2, 3, 4, 5, 2],
-        r"recordings\.channels\[5\]: column 2 is there twice; expected another",
+        r"recordings\.channels\[5\]: column 2 appears twice; expected a different",
     ),
     (
         ("recordings", "bodies", "mid", "at"),
@@ -105,7 +105,7 @@ MISTAKES: list[tuple[tuple[str | int, ...], Any, str]] = [
     (
         ("calibration", "parameters", 4, "key"),
         KEYS[0],
-        r"calibration\.parameters\[4\]\.key: 'segments\[0\]\.length' is there twice",
+        r"calibration\.parameters\[4\]\.key: 'segments\[0\]\.length' appears twice",
     ),
     (
         ("calibration", "pressure_min"),

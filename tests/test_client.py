@@ -502,7 +502,7 @@ def test_waiting_ends_where_it_is_in_vain(loop: FakeLoop, client: Client) -> Non
     with pytest.raises(CommandError, match="it is inactive: tracker lost"):
         client.wait_until_settled(1e-3, timeout=20)
     loop.now = replace(loop.now, state=State.ACTIVE)
-    with pytest.raises(CommandError, match="nothing is asked"):
+    with pytest.raises(CommandError, match="the tip has no target"):
         client.wait_until_settled(1e-3, timeout=20)
     loop.now = replace(loop.now, position_error=3e-3)
     with pytest.raises(ServiceError, match=r"not settle within 0\.1 s; its error is 3 mm"):

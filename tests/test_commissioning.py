@@ -237,7 +237,7 @@ def test_positions_alone_do_not_tell_an_order_from_a_turn() -> None:
     text = only_wrong(findings).text
     assert "another order" in text
     assert "turned by" in text
-    assert "does not tell these apart" in text
+    assert "not distinguish these" in text
     assert "by hand" in only_wrong(findings).advice
     _, findings = explained(seen_by(SHORT, wiring=cycle), SHORT)
     assert "turned by" not in only_wrong(findings).text
@@ -416,6 +416,23 @@ def test_a_swap_on_the_rig(
     assert not load_record(tmp_path / "rig.commissioning.yaml").fits
 
 
+def test_set_points_that_are_swapped_are_no_leak(
+    tmp_path: Path, touched: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Each gauge reads its own chamber, which has shown the other channel's step."""
+
+    def crossed(rig: Any) -> None:
+        command = rig.tracker._world.command
+        rig.tracker._world.command = lambda p: command(np.asarray(p)[[1, 0, 2]])
+
+    touched(crossed)
+    path = rig_file(tmp_path)
+    assert main(["commission", str(path), "--no-plot"]) == 6
+    told = capsys.readouterr().out
+    assert "channels 1 and 2 seem swapped" in told
+    assert "the gauge of channel 2 follows the command of channel 1" in told
+
+
 def test_the_corrected_rig_file_fits(
     tmp_path: Path, touched: Any, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -474,6 +491,7 @@ def test_bad_input(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert commissioned(path) == 2
     assert "the record cannot be written" in capsys.readouterr().err
     path = rig_file(tmp_path)
+    (tmp_path / "experiment.yaml").touch()  # 'stiffopt commission' cannot continue one
     assert commissioned(path, "--folder", str(tmp_path)) == 2
     assert "is not empty" in capsys.readouterr().err
     path.write_text(path.read_text().replace("tracker:", "# tracker:"), encoding="utf-8")

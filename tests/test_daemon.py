@@ -32,10 +32,11 @@ from stiffopt.control.lifecycle import EventBuffer
 from stiffopt.control.state import Severity, Snapshot, State
 from stiffopt.daemon import daemon as daemon_module
 from stiffopt.daemon import secret as secret_module
+from stiffopt.daemon.address import is_loopback
 from stiffopt.daemon.client import Client
 from stiffopt.daemon.daemon import TIMES, Daemon
 from stiffopt.daemon.keeper import Keeper, LogEvents, ServiceManager
-from stiffopt.daemon.secret import Secret, check_exposure, is_loopback
+from stiffopt.daemon.secret import Secret, check_exposure
 from stiffopt.daemon.server import MAX_CONNECTIONS
 from stiffopt.errors import CommandError, DeviceError, FileError, InputError
 from stiffopt.rig.settings import Safety, ServiceSettings
@@ -214,7 +215,7 @@ def test_a_crowd_that_connects_and_says_nothing_does_not_touch_control(
 
 
 def test_it_is_started_once(daemon: tuple[Daemon, Client]) -> None:
-    with pytest.raises(InputError, match="started once"):
+    with pytest.raises(InputError, match="started only once"):
         daemon[0].start()
 
 

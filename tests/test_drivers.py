@@ -25,7 +25,7 @@ from stiffopt.files import file_text, save_file
 from stiffopt.lab.virtual import VirtualLab
 from stiffopt.model.robot_files import load_description
 from stiffopt.rig import drivers
-from stiffopt.rig.config import RigDescription, load_rig_description
+from stiffopt.rig.config import RigDescription, load_rig, load_rig_description
 from stiffopt.rig.device import DeviceSettings
 from stiffopt.rig.registry import KINDS, driver_class, driver_names, load
 from stiffopt.safety.rigs import guarded_rig, open_rig
@@ -178,7 +178,7 @@ def test_when_the_guard_is_killed_the_supply_is_vented_directly(
     rig_file: Any, regulators: tuple[FakeBench, int]
 ) -> None:
     bench, port = regulators
-    rig, link = guarded_rig(rig_file("line", port))
+    rig, link = guarded_rig(*load_rig(rig_file("line", port)))
     with rig:
         rig.supply.arm()
         rig.command([5e4, 0.0, 0.0], valid_for=9.0)

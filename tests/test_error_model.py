@@ -23,7 +23,7 @@ from stiffopt.identify.problem import CalibrationProblem
 from stiffopt.identify.results import LEVELS, Comparison, coverage
 from stiffopt.identify.settings import ERRORS, CalibrationSettings
 from stiffopt.identify.setup import Setup, recordings_of
-from stiffopt.identify.structures import STRUCTURES
+from stiffopt.identify.structures import STRUCTURES, ModelStructure
 from stiffopt.identify.validation import validate
 from stiffopt.logs import Log
 from stiffopt.model.calibration import Calibration, ErrorModel, FittedParameter, RelativeErrors
@@ -46,13 +46,18 @@ KNOWN = ErrorModel(
 ROUGH = KNOWN.model_copy(update={"gain": 0.0})
 
 
-def problem_of(pressures: Array, rng: np.random.Generator, noise: float) -> CalibrationProblem:
+def problem_of(
+    pressures: Array,
+    rng: np.random.Generator,
+    noise: float,
+    structure: ModelStructure = STRUCTURES[0],
+) -> CalibrationProblem:
     """An arm held at some pressures, seen with errors that are independent."""
     tips = Manipulator(ONE).tip_pose(pressures)[:, :3, 3]
     log = Log(np.arange(len(tips)) * 10.0, pressures, tips + noise * rng.normal(size=tips.shape))
     settings = CalibrationSettings()
     setup = Setup.of(ONE, recordings_of(ONE, [("log", log)], settings), [], settings)
-    return setup.problem(STRUCTURES[0], 400)
+    return setup.problem(structure, 400)
 
 
 # -- the distance from what was recorded ------------------------------------------------------
@@ -373,6 +378,18 @@ def test_an_arm_that_is_as_the_model_has_no_discrepancy_and_the_residual_of_its_
     assert known.discrepancy * slope < 2e-4
     assert known.moving == ()  # every row was held for 10 s
     assert known.settled == (0.0, 0.0, 0.0)
+
+
+def test_a_model_with_creep_has_the_state_of_the_silicone() -> None:
+    """Of what differs between sessions, the zero of the tracker is left."""
+    squares = []
+    for name in ("hysteresis", "creep"):
+        (structure,) = (each for each in STRUCTURES if each.name == name)
+        rng = np.random.default_rng(8)
+        problem = problem_of(rng.uniform(0, 1e5, (30, 3)), rng, 3e-4, structure)
+        found = fit(problem, [np.zeros(problem.size)], rounds=0, most=1)
+        squares.append((error_model(found, {}).residual / problem.description.length) ** 2)
+    assert squares[0] - squares[1] == pytest.approx(0.005**2 - 0.001**2, rel=0.01)
 
 
 @pytest.mark.parametrize("together", [True, False])

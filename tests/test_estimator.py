@@ -583,3 +583,16 @@ def test_only_a_direction_that_hardly_gives_is_a_stiff_axis(ratio: float, share:
     tip.compliance[2, 2] = ratio * tip.compliance[0, 0]
     estimator.advance(0.0, np.zeros(2), tip)
     assert estimator.stiff_axis == pytest.approx(np.diag([0.0, 0.0, share]), abs=1e-6)
+
+
+def test_a_tip_that_objects_hold_in_two_directions_turns_with_the_third_alone() -> None:
+    estimator = TipEstimator(PERIOD, 2, SWINGING, PLAIN)
+    p, held = np.zeros(2), tip_at(np.zeros(2))
+    held.compliance[:3, :3] = np.diag([0.0, 2e-3, 0.0])
+    held.compliance[5, 1] = 0.01  # rad/N
+    estimator.advance(0.0, p, held)
+    estimator.take([sample(0.0, BASE + np.array([0.0, 1e-3, 0.0]), (1.0, 0.0, 0.0, 0.0))])
+    estimator.advance(PERIOD, p, held)
+    assert np.isfinite(state(estimator)).all()
+    assert estimator._lean[2, 1] == pytest.approx(5.0)  # rad/m
+    assert np.abs(np.delete(estimator._lean, 7)).max() < 1e-12

@@ -376,7 +376,7 @@ def test_an_alignment_that_takes_long_ends_with_a_vented_arm(tmp_path: Path) -> 
 
     probe.align = slowly  # type: ignore[method-assign, assignment]
     settings = quick(directions=((1.0, 0.0, 0.0),))
-    with rig, pytest.raises(DeviceError, match=r"stood still for 60 s.*--resume"):
+    with rig, pytest.raises(DeviceError, match=r"stalled for 60 s.*--resume"):
         run_stiffness(rig, tmp_path, settings, model(), rate=50.0)
     late = [value for time, value in world.writes if time > 100 + 60]
     assert late

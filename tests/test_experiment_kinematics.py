@@ -10,13 +10,8 @@ import pytest
 from experiment_runs import assert_gentle, first_row_alone, model, short, stop_at, whole_mcap  # noqa: F401
 from fake_rig import fake_rig, world_of
 from stiffopt.errors import DeviceError, InputError
-from stiffopt.experiments import (
-    KinematicsSettings,
-    PressureSequence,
-    evaluate_kinematics,
-    run_kinematics,
-)
-from stiffopt.experiments.kinematics_result import read_recordings
+from stiffopt.experiments.kinematics import KinematicsSettings, PressureSequence, run_kinematics
+from stiffopt.experiments.kinematics_result import evaluate_kinematics, read_recordings
 from stiffopt.logs import read_log, read_mcap_log
 
 pytestmark = pytest.mark.usefixtures("first_row_alone")

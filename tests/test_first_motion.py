@@ -19,6 +19,11 @@ X, Y = np.eye(3)[:2]
 BASE = np.array([0.01, 0.0, 0.2])
 
 
+def parts(way: np.ndarray, *shares: float) -> np.ndarray:
+    """Parts (3, n) of the channels in a way (3,)."""
+    return way[:, None] * np.array(shares)
+
+
 @pytest.mark.parametrize(
     ("seen", "responds"),
     [(X, True), (0.6 * X, True), (1.4 * X, True), (0 * X, False), (-X, False), (Y, False)],
@@ -26,12 +31,32 @@ BASE = np.array([0.01, 0.0, 0.2])
 def test_it_ends_when_the_tip_has_followed_the_model(seen: np.ndarray, responds: bool) -> None:
     first = FirstMotion(False, TUNING)
     for way in np.linspace(0.0, 2 * TUNING.way, 20):
-        first.take(BASE + way * X, BASE + [0.0, 2e-3, 0.0] + way * seen)
+        first.take(BASE + way * X, BASE + [0.0, 2e-3, 0.0] + way * seen, parts(way * X, 0.9, 0.1))
         if way < TUNING.way:
-            assert first.slew_share == TUNING.slew_share
-    assert (first.slew_share == math.inf) is responds
+            assert np.all(first.slew_share == TUNING.slew_share)
+    assert first.slew_share[0] == (math.inf if responds else TUNING.slew_share)
+    assert first.slew_share[1] == TUNING.slew_share
+    assert not first.is_over
     first.begin()
     assert first.slew_share == TUNING.slew_share
+
+
+@pytest.mark.parametrize(("seen", "responds"), [(X, True), (Y, False)])
+def test_a_channel_that_comes_later_is_slow_until_the_tip_follows_it(
+    seen: np.ndarray, responds: bool
+) -> None:
+    """The way before it, on which the tip has followed the others, does not count for it."""
+    first = FirstMotion(False, TUNING)
+    for way in np.linspace(0.0, 0.04, 20):
+        first.take(BASE + way * X, BASE + way * X, parts(way * X, 1.0, 0.0))
+    assert first.slew_share.tolist() == [math.inf, TUNING.slew_share]
+    here = BASE + 0.04 * X
+    for way in np.linspace(0.0, 2 * TUNING.way, 20):
+        both = parts(0.04 * X, 1.0, 0.0) + parts(way * X, 0.0, 1.0)
+        first.take(here + way * X, here + way * seen, both)
+        if way < TUNING.way:
+            assert first.slew_share[1] == TUNING.slew_share
+    assert first.is_over is responds
 
 
 def test_an_arm_that_was_commissioned_is_fast_at_once() -> None:
@@ -45,8 +70,8 @@ def test_until_then_feedback_corrects_no_more_than_an_error_of_the_model() -> No
     assert first.largest_correction(BASE) == TUNING.correction
     later = first.largest_correction(BASE + 0.004 * X)
     assert later == pytest.approx(TUNING.correction + 0.004 * TUNING.error)
-    first.take(BASE, BASE)
-    first.take(BASE + 0.02 * X, BASE + 0.02 * X)
+    first.take(BASE, BASE, parts(0 * X, 1.0))
+    first.take(BASE + 0.02 * X, BASE + 0.02 * X, parts(0.02 * X, 1.0))
     assert first.largest_correction(BASE) == math.inf
     first.begin()
     assert first.largest_correction(BASE + 0.1 * X) == TUNING.correction

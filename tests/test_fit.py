@@ -565,11 +565,13 @@ class Broken:
     size, low, high = 1, np.full(1, -np.inf), np.full(1, np.inf)
     description, n_shared = ONE, 0
 
-    def __init__(self, limit: float, slope: float = 3.0, beyond: float = np.nan) -> None:
+    def __init__(self, limit: float, slope: float = 3.0, beyond: float | None = np.nan) -> None:
         self.limit, self.slope, self.beyond = limit, slope, beyond
 
     def residuals(self, x: Array) -> tuple[Array, Array]:
         if x[0] > self.limit:
+            if self.beyond is None:
+                raise EquilibriumError("no equilibrium was found")
             return self.beyond * (3 * x - 6), np.full((1, 1), np.nan)
         return 3 * x - 6, np.full((1, 1), self.slope)
 
@@ -581,6 +583,10 @@ def test_a_model_that_is_not_finite_cannot_be_fitted() -> None:
     assert fitted(Broken(10.0), 0.0) == pytest.approx(1.8, abs=0.1)
     for beyond in (np.nan, 1.0):  # steps to where slopes alone fail are taken back too
         assert fitted(Broken(1.0, beyond=beyond), 0.0) == pytest.approx(1.0, abs=0.1)
+    falling = Broken(1.0, beyond=None)  # so are steps to where the arm has no equilibrium
+    assert fitted(falling, 0.0) == pytest.approx(1.0, abs=0.1)
+    with pytest.raises(EquilibriumError):
+        fitted(falling, 2.0)
     with pytest.raises(InputError, match="not finite"):
         fitted(Broken(1.0), 2.0)
     with pytest.raises(InputError, match="not finite"):

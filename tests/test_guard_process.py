@@ -19,12 +19,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from stiffopt.errors import CommandError, DeviceError, InputError, MissingExtraError, SlowWarning
+from stiffopt.errors import CommandError, DeviceError, MissingExtraError, SlowWarning
 from stiffopt.files import save_file
 from stiffopt.lab.virtual import VirtualLab
 from stiffopt.model.robot_files import load_description
 from stiffopt.plant.settings import PlantSettings
-from stiffopt.rig.config import load_rig_description
+from stiffopt.rig.config import load_rig, load_rig_description
 from stiffopt.rig.interface import PressureCommand, Rig
 from stiffopt.safety import guard_client
 from stiffopt.safety.gate import Applied
@@ -194,7 +194,7 @@ def test_the_pressures_fall_when_the_loop_is_lost(lab: tuple[VirtualLab, Path]) 
 
 @pytest.fixture(scope="module")
 def kept_rig(patient_file: Path) -> Iterator[tuple[Rig, GuardLink]]:
-    rig, link = guarded_rig(patient_file)
+    rig, link = guarded_rig(*load_rig(patient_file))
     with rig:
         yield rig, link
 
@@ -215,7 +215,7 @@ def guarded(kept_rig: tuple[Rig, GuardLink]) -> Iterator[tuple[Rig, GuardLink]]:
 @pytest.fixture
 def doomed(patient_file: Path) -> Iterator[tuple[Rig, GuardLink]]:
     """A rig whose guard may be killed."""
-    rig, link = guarded_rig(patient_file)
+    rig, link = guarded_rig(*load_rig(patient_file))
     rig.open()
     pid = link.pid
     assert pid is not None
@@ -444,14 +444,9 @@ def test_a_guard_that_can_not_connect_says_why(lab: tuple[VirtualLab, Path]) -> 
 
 
 def test_a_real_rig_opens_its_own_tracker() -> None:
-    rig, _ = guarded_rig(RIGS / "modbus-aurora.yaml")
+    rig, _ = guarded_rig(*load_rig(RIGS / "modbus-aurora.yaml"))
     assert type(rig.tracker).__name__ == "AuroraTracker"
     assert rig.clock is rig.tracker.clock  # type: ignore[union-attr]
-
-
-def test_content_of_a_rig_file_needs_its_robot() -> None:
-    with pytest.raises(InputError, match="robot"):
-        guarded_rig(load_rig_description(RIGS / "sim.yaml"))
 
 
 # the start ---------------------------------------------------------------------------------------
@@ -471,7 +466,7 @@ def stubbed(folder: Path, monkeypatch: pytest.MonkeyPatch, body: str) -> GuardLi
     python.write_text(f'#!/bin/sh\nexec {sys.executable} {folder}/stub.py "$4"\n')
     python.chmod(0o755)
     monkeypatch.setattr(sys, "executable", str(python))
-    return guarded_rig(RIGS / "sim.yaml")[1]
+    return guarded_rig(*load_rig(RIGS / "sim.yaml"))[1]
 
 
 @pytest.mark.parametrize(

@@ -166,7 +166,7 @@ def test_a_simulated_rig_is_hosted_whole() -> None:
     assert -0.1 < time.monotonic() - supply.epoch - samples[-1].received < 1.0
     assert np.shape(rest.ask("truth", {})) == (4, 4)
     assert np.shape(rest.ask("pressures", {})) == (6,)
-    with pytest.raises(DeviceError, match="knows nothing of 'future'"):
+    with pytest.raises(DeviceError, match="has no 'future'"):
         rest.ask("future", {})
     rest.ask("inject", {"device": "supply", "fault": "off", "channel": None})
     with pytest.raises(DeviceError):

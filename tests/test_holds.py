@@ -271,4 +271,5 @@ def test_a_computer_with_more_to_do_than_processors_is_told_of() -> None:
     text = late_ticks(0.001, 0.05, load=3.2)
     assert text.startswith("timing: 3.2 processes want each processor")
     assert "guard_timeout: 100 ms" in text
+    assert "set safety.guard_timeout" not in late_ticks(0.001, 0.2, load=3.2), "patient already"
     assert load_of_processors() > 0

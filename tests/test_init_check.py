@@ -46,10 +46,10 @@ def test_a_first_file_is_right_and_says_what_comes_next(kind: str) -> None:
 
 
 def test_first_files_lead_to_an_answer() -> None:
-    """The way of a new user: one's own arm of three segments, a task, a path, a scene, a rig."""
-    assert run("init", "robot", "arm.yaml", "--segments", "3", "--length", "60 mm").exit_code == 0
+    """The way of a new user: one's own arm, a task, a path, a scene, a rig."""
+    assert run("init", "robot", "arm.yaml", "--segments", "2", "--length", "60 mm").exit_code == 0
     robot = stiffopt.load_robot("arm.yaml")
-    assert (robot.n_pressures, robot.length) == (9, pytest.approx(0.18))
+    assert (robot.n_pressures, robot.length) == (6, pytest.approx(0.12))
     os.mkdir("tasks")
     assert run("init", "task", "tasks/task.yaml", "--robot", "arm.yaml").exit_code == 0
     task = stiffopt.load_task("tasks/task.yaml")
@@ -62,10 +62,10 @@ def test_first_files_lead_to_an_answer() -> None:
     solver = stiffopt.PressureSolver(robot, task)
     assert all(solver.reachable(targets[k]) for k in (0, -1))
     assert run("init", "scene", "--robot", "arm.yaml", "--clearance", "1 mm").exit_code == 0
-    assert robot.clearance([0.0] * 9, stiffopt.load_scene("my-scene.yaml")) > 1e-3
+    assert robot.clearance([0.0] * 6, stiffopt.load_scene("my-scene.yaml")) > 1e-3
     assert run("init", "rig", "--robot", "arm.yaml").exit_code == 0
     with stiffopt.open_rig("my-rig.yaml") as rig:
-        assert rig.supply.limits.n == 9
+        assert rig.supply.limits.n == 6
 
 
 @pytest.mark.parametrize("segments", ["1", "2"])

@@ -110,3 +110,13 @@ def test_what_is_not_finite_has_no_tip_and_does_no_harm(robot, bad):
     with pytest.raises(StiffoptError):
         nearby.at(spoilt)
     assert nearby.at(p).pose == pytest.approx(before, abs=1e-12)
+
+
+def test_a_compliance_that_is_not_finite_is_no_answer(robot, monkeypatch):
+    nearby, p = LinearisedTip(robot), 0.4 * robot.pressure_max
+    broken = robot.tip_compliance(p).copy()
+    broken[1, 2] = np.nan
+    tip = nearby._model.at(p)._replace(compliance=broken)
+    monkeypatch.setattr(nearby._model, "at", lambda _: tip)
+    with pytest.raises(StiffoptError, match="not finite"):
+        nearby.at(p)

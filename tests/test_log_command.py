@@ -79,7 +79,7 @@ def test_a_recording_that_was_cut_short_is_exported_as_far_as_it_goes(
     data = run_file.read_bytes()
     cut.write_bytes(data[: len(data) // 2])
     assert main(["log", "export", str(cut), "--csv"]) == 0
-    assert "cut short" in capsys.readouterr().err
+    assert "truncated" in capsys.readouterr().err
     assert 10 < len(read_log(tmp_path / "cut.csv")) < 150
     assert main(["log", "plot", str(cut)]) == 0
     assert (tmp_path / "cut.png").stat().st_size > 10_000
@@ -110,7 +110,7 @@ def test_bad_input_is_one_sentence(
         "text.mcap": (b"time_s,p1_pa\n0,0\n", "no recording"),
         "noise.mcap": (np.random.default_rng(0).bytes(5000), "no recording"),
         "head.mcap": (data[:60], "no recording"),
-        "early.mcap": (data[: first + 100], "cut short too early"),
+        "early.mcap": (data[: first + 100], "truncated too early"),
     }
     for name, (content, _) in files.items():
         (tmp_path / name).write_bytes(content)

@@ -166,7 +166,7 @@ def gentle_tasks(more: float | None) -> list[tuple[Task, str]]:
 @pytest.mark.parametrize("index", range(len(gentle_tasks(1.0))))
 def test_what_a_message_cannot_say_is_refused_and_named(index: int) -> None:
     given, key = gentle_tasks(1.0)[index]
-    with pytest.raises(InputError, match="cannot say this, and it would be lost") as caught:
+    with pytest.raises(InputError, match="cannot contain this, so it would be lost") as caught:
         TaskMessage.of(given)
     assert str(caught.value).startswith(f"{key}: ")
     with pytest.raises(InputError, match="unknown key") as caught:
@@ -179,7 +179,7 @@ def test_what_a_message_cannot_say_is_refused_and_named(index: int) -> None:
 
 def test_a_message_of_a_target_or_trajectory_says_all_of_it() -> None:
     target = GentleTarget(position=TASK.target.position, speed=0.1)
-    with pytest.raises(InputError, match="speed: the daemon's messages cannot say this"):
+    with pytest.raises(InputError, match="speed: the daemon's messages cannot contain this"):
         TargetMessage.of(target)
     with pytest.raises(InputError, match=r"Target\.speed: unknown key"):
         check_target(target)
@@ -189,7 +189,7 @@ def test_a_message_of_a_target_or_trajectory_says_all_of_it() -> None:
         (Trajectory(waypoints=(GentleWaypoint(time=1.0, target=TASK.target, speed=1.0),)), "speed"),
         (GentleTrajectory(waypoints=(plain,), repeat=2), "repeat"),
     ):
-        with pytest.raises(InputError, match=f"{key}: the daemon's messages cannot say"):
+        with pytest.raises(InputError, match=f"{key}: the daemon's messages cannot contain"):
             TrajectoryMessage.of(trajectory)
         with pytest.raises(InputError, match=f"{key}: unknown key"):
             check_trajectory(trajectory, LIMITS, SLEW)

@@ -205,7 +205,7 @@ def test_what_is_on_the_wire_is_within_both_limits(
 def test_limits_between_two_counts_leave_nothing() -> None:
     made = settings(channels=[{"setpoint": 0}])
     with pytest.raises(
-        InputError, match=r"channel 1: its register can say nothing from 0\.3004 to"
+        InputError, match=r"channel 1: its register cannot represent any pressure from 0\.3004 to"
     ):
         made.device(PressureLimits(np.array([30040.0]), np.array([30060.0])))
     made.device(PressureLimits(np.array([0.0]), np.array([60.0])))
@@ -436,7 +436,7 @@ def test_close_without_a_peer_ends_in_time(device: HandmadeDevice) -> None:
 def test_an_answer_to_something_else_is_no_answer(device: HandmadeDevice, other: str) -> None:
     with opened(device, verify=False) as supply:
         device.answers[16] = lambda request: bytes.fromhex(other)
-        with pytest.raises(DeviceError, match="answers something else: write channels 1, 2, 3"):
+        with pytest.raises(DeviceError, match="sent an unexpected answer: write channels 1, 2, 3"):
             supply.command(P)
         device.answers.clear()
         supply.command(P)

@@ -56,7 +56,7 @@ def test_settings_from_a_file(tmp_path: Path) -> None:
         ("scale: 1 mbar", "scale: 1", "scale: bare number 1 has no unit"),
         ("scale: 1 mbar", "scale: 1 mm", "scale: '1 mm': 'mm' is not a unit of pressure per count"),
         ("tcp: {host: 192.168.1.10}", "timeout: 1 s", "one of the keys 'tcp' and 'serial'"),
-        ("reading: 0}", "reading: 70000}", "must be at most 65535"),
+        ("reading: 0}", "reading: 70000}", "[0].reading: must be at most 65535, not 70000"),
         ("[0, 32767]", "[5, 5]", "scale.counts: the two points must differ"),
         ("reading: 0}", "reading: 0, max: 0 bar, min: 1 bar}", "[0].max: must be above min"),
         ("type: uint16, scale: 1 mbar", "scale: {counts: [0, 1], pressure: [4 bar, 5 bar]}, "

@@ -356,13 +356,15 @@ def test_the_margin_of_a_calibrated_robot() -> None:
     motion = plan_motion(robot, low, high, scene=scene_of(table), slew=1e5)
     assert motion.found, motion.message
     largest = max(robot.tip_uncertainty(p).semi_axes[0] for p in motion.pressures)
-    kept = re.search(r"([\d.]+) mm of it are kept for what the calibration", motion.message)
+    kept = re.search(
+        r"([\d.]+) mm of it are kept for the uncertainty of the calibration", motion.message
+    )
     assert kept
     assert largest <= 1e-3 * float(kept[1]) * 1.005 < 1.1 * largest
     near = {"name": "near", "half_space": {"point": (0, 0, 0.13), "normal": (0, 0, -1)}}
     refused = plan_motion(robot, low, high, scene=scene_of(near), slew=1e5)
     assert refused.status == "unreachable"
-    assert "of them for what the calibration leaves open" in refused.message
+    assert "of them for the uncertainty of the calibration" in refused.message
 
 
 # -- shorter, rounder, timed ----------------------------------------------------------------

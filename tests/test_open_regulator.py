@@ -176,7 +176,7 @@ def test_another_program_is_noticed() -> None:
 
 # faults: each ends vented and told ----------------------------------------------------------------
 
-LINE = r"does not answer|noise|something else|nobody has asked"
+LINE = r"does not answer|noise|another request|unrequested"
 FAULTS = {
     "noise": LINE,
     "losses": LINE,
@@ -319,7 +319,7 @@ def test_two_boards_on_one_line_end_vented_and_told() -> None:
             press(supply, bench)
             line.joined = 2
             told = end_of(supply)
-            assert re.search("second board|noise|something else|does not (take|hold|answer)", told)
+            assert re.search("second board|noise|another request|does not (take|hold|answer)", told)
             wait_for(lambda: vented(first, bench))
             assert second.dump_open
             with suppress(DeviceError):

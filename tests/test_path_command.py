@@ -26,7 +26,7 @@ from stiffopt.cli.path_records import rate_margins
 from stiffopt.documents import read_document
 from stiffopt.errors import EquilibriumError, InputError
 from stiffopt.paths import path as description
-from stiffopt.paths.rates import least_times, slew_limits
+from stiffopt.paths.rates import least_times
 from stiffopt.paths.solution import PathSolution
 from stiffopt.units import parse_quantity
 
@@ -64,7 +64,7 @@ def followed(path: Any) -> PathSolution:
     for target in points.targets[1:]:
         found.append(solver.solve(target, guess=found[-1].pressures))
     pressures = np.array([each.pressures for each in found])
-    slew = slew_limits(robot.description, path.pressure.slew)
+    slew = robot.description.slew_limits(path.pressure.slew)
     times = points.times
     if times is None and slew is not None:
         times = np.concatenate([[0.0], np.cumsum(least_times(pressures, slew))])

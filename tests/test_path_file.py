@@ -18,7 +18,7 @@ from stiffopt.optimise.goal import StiffnessGoal, StiffnessMeasure
 from stiffopt.optimise.target import Target, Tolerance
 from stiffopt.paths.geometry import path_axes
 from stiffopt.paths.path import MAX_POINTS, Path, load_path
-from stiffopt.paths.rates import least_times, slew_limits, step_limits
+from stiffopt.paths.rates import least_times, step_limits
 
 HEAD = "format: stiffopt-path/1\nrobot: stiff-flop-2\n"
 LINE = "path: {line: {from: [-30 mm, -20 mm, 190 mm], to: [-30 mm, 20 mm, 190 mm]}}\n"
@@ -244,13 +244,13 @@ def test_a_direction_turns_with_the_path() -> None:
 
 def test_the_smaller_rate_holds() -> None:
     unknown = TWO.model_copy(update={"pressure": TWO.pressure.model_copy(update={"slew": None})})
-    assert slew_limits(unknown) is None
-    assert slew_limits(unknown, 2e5) == pytest.approx(np.full(6, 2e5))
+    assert unknown.slew_limits() is None
+    assert unknown.slew_limits(2e5) == pytest.approx(np.full(6, 2e5))
     limits = TWO.pressure.model_copy(update={"slew": (1e5, 3e5) * 3})
     robot = TWO.model_copy(update={"pressure": limits})
-    assert slew_limits(robot) == pytest.approx([1e5, 3e5] * 3)
-    assert slew_limits(robot, 2e5) == pytest.approx([1e5, 2e5] * 3)
-    assert slew_limits(robot, (5e5,) * 6) == pytest.approx([1e5, 3e5] * 3)
+    assert robot.slew_limits() == pytest.approx([1e5, 3e5] * 3)
+    assert robot.slew_limits(2e5) == pytest.approx([1e5, 2e5] * 3)
+    assert robot.slew_limits((5e5,) * 6) == pytest.approx([1e5, 3e5] * 3)
 
 
 def test_steps_and_their_times() -> None:
@@ -356,7 +356,7 @@ def test_a_mistake_in_a_path_file(tmp_path: FilePath, line: int, text: str, mess
     [
         (1, "x_m,y_m\n0,0\n0,1\n", "the column 'z_m' is missing; expected time_s (or none)"),
         (1, "x_m,y_m,z_m,w\n0,0,0,0\n0,0,1,0\n", "the column 'w' is unknown"),
-        (1, "x_m,y_m,z_m,x_m\n0,0,0,0\n0,0,1,0\n", "the column 'x_m' is there twice"),
+        (1, "x_m,y_m,z_m,x_m\n0,0,0,0\n0,0,1,0\n", "the column 'x_m' appears twice"),
         (1, "x_m,y_m,z_m,qw\n0,0,0,1\n0,0,1,1\n", "the column 'qx' is missing"),
         (3, "x_m,y_m,z_m\n0,0,0.18\n0,,0.18\n", "y_m is missing"),
         (3, "x_m,y_m,z_m\n0,0,0.18\n0,nan,0.18\n", "'nan' is not a finite number"),

@@ -526,7 +526,7 @@ def test_over_the_daemon_a_way_is_refused_or_followed(tmp_path: Path, compiled: 
             def refusal() -> str:
                 with pytest.raises(InputError) as caught:
                     client.set_target(position=there.tolist())
-                return "" if "ask again" in str(caught.value) else str(caught.value)
+                return "" if "try again" in str(caught.value) else str(caught.value)
 
             assert re.fullmatch(REFUSED.format("there"), wait_for(refusal, 200.0))
             with pytest.raises(InputError, match="expected 3, one for each channel, not 2"):

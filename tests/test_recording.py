@@ -523,7 +523,7 @@ def test_bodies_that_are_not_there() -> None:
         prepared(log, frame="bse")
     with pytest.raises(InputError, match="no body 'elbow'"):
         prepared(log, bodies=("elbow",))
-    with pytest.raises(InputError, match="asked for twice"):
+    with pytest.raises(InputError, match="named twice"):
         prepared(log, bodies=("mid", "mid"))
     with pytest.raises(InputError, match="there is none but the tip"):
         prepare(point_only(), "a", ONE, frame="base")

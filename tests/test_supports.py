@@ -6,6 +6,7 @@ import json
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -92,11 +93,12 @@ def test_what_is_suggested_is_an_answer_of_the_solver(found):
         assert 0.4 < estimate / found.times(each) < 2.5
 
 
-def test_a_support_is_clear_of_the_arm_at_rest_and_leaves_the_scene_as_it_is(found):
+def test_a_support_is_clear_of_the_arm_at_rest_and_leaves_the_scene_as_it_is(found, monkeypatch):
     for each in found.supports:
         scene = stiffopt.Scene(objects=[each.object])
         assert ROBOT.clearance(np.zeros(6), scene) > 0
     rib = {"name": "new post", "sphere": {"centre": (0.0, 0.06, 0.15), "radius": 0.005}}
+    monkeypatch.setattr(supports, "_TESTS", 1)
     crowded = task(scene={"clearance": 0.001, "objects": [rib]})
     for each in suggest_supports(ROBOT, crowded, 0.2).supports:
         assert each.object.name in ("new post 2", "new wall")
@@ -117,14 +119,24 @@ def test_tasks_for_which_nothing_can_be_suggested():
         suggest_supports(ROBOT, task(target={"position": (0.0, 0.0, 0.5)}))
 
 
-def test_the_command_prints_and_draws_it(write: Write, tmp_path: Path) -> None:
+def test_the_command_prints_and_draws_it(
+    write: Write, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     pytest.importorskip("matplotlib")
+    known: list[SupportMap] = []  # of the first of both commands
+
+    def once(*given: Any, **options: Any) -> SupportMap:
+        known.extend([] if known else [suggest_supports(*given, **options)])
+        return known[0]
+
+    monkeypatch.setattr("stiffopt.cli.solved_task.suggest_supports", once)
     picture, path = tmp_path / "post.png", write("two.yaml", TWO)
     result = run("--suggest-post", str(picture), "--post-force", "0.25 N", path)
     assert result.exit_code == 0
     assert "would help" in result.stdout
     assert "times as stiff" in result.stdout
     assert picture.stat().st_size > 10_000
+    assert {each.object.contact.max_force for each in known[0].supports} == {0.25}
     result = run("--suggest-post", str(picture), "--json", path)
     (record,) = lines(result.stdout)
     best = record["supports"][0]

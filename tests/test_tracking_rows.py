@@ -12,6 +12,7 @@ from stiffopt.control.feedback import (
     tracking_rows,
     with_excess,
     with_offsets,
+    with_reference,
 )
 from stiffopt.control.formula import Formula
 from stiffopt.control.tuning import FeedbackTuning
@@ -133,6 +134,26 @@ def test_the_law_finds_its_correction_from_the_offset_and_its_average(swings, mo
     known = (accounted, offset, average, slope, stiff, rate, delay, most)
     plain = evaluated(law, pose, jacobian, np.ones(5), correction, *dynamic)
     found = evaluated(with_offsets(law), pose, jacobian, np.ones(5), *dynamic, *known)
+    for value, expected in zip(found, plain, strict=True):
+        assert value == pytest.approx(expected, rel=1e-9, abs=1e-15)
+
+
+@pytest.mark.parametrize("swings", [True, False])
+def test_the_law_takes_what_it_needs_from_reference_and_averages(swings):
+    pose, jacobian, _, swing = drawn(9)
+    rng = np.random.default_rng(10)
+    motion, averages = rng.normal(size=(4, N + 6)), rng.normal(size=(3, 9)) * 1e-2
+    offset, slope, stiff = rng.normal(size=6), rng.normal(size=(3, 3)), np.diag([0.0, 0.3, 0.9])
+    path, rate = motion[:2]
+    dynamic = ()
+    if swings:
+        intended = motion[:2, N : N + 3] - averages[1:, :3]
+        dynamic = (*swing[:8], path[:N], rate[:N], intended)
+    known = (path[N:], offset, averages[0], slope, stiff, rate[:N], 0.1, np.inf)
+    law = with_offsets(tracking_rows(N, swings, DAMPING, DEAD_TIME))
+    plain = evaluated(law, pose, jacobian, np.ones(5), *dynamic, *known)
+    given = (*dynamic[:8], offset, slope, stiff, 0.1, np.inf, motion, averages)
+    found = evaluated(with_reference(law), pose, jacobian, np.ones(5), *given)
     for value, expected in zip(found, plain, strict=True):
         assert value == pytest.approx(expected, rel=1e-9, abs=1e-15)
 

@@ -23,7 +23,7 @@ from stiffopt.files import save_file
 from stiffopt.lab.virtual import VirtualLab
 from stiffopt.model.robot_files import load_description
 from stiffopt.rig.assembly import make_rig
-from stiffopt.rig.config import load_rig_description
+from stiffopt.rig.config import load_rig, load_rig_description
 from stiffopt.rig.interface import PressureCommand, PressureSupply
 from stiffopt.safety import vent as vent_module
 from stiffopt.safety.claim import Claim
@@ -99,7 +99,7 @@ def bare_supply(path: Path) -> PressureSupply:
 @pytest.fixture
 def commanded(lab: tuple[VirtualLab, Path]) -> Iterator[GuardLink]:
     """The rig in the hands of a guard, under pressure by a goal."""
-    rig, link = guarded_rig(lab[1])
+    rig, link = guarded_rig(*load_rig(lab[1]))
     with rig:
         rig.supply.arm()
         rig.supply.command(PressureCommand(np.full(3, 3e4), rig.clock.now(), 60.0))
@@ -199,7 +199,7 @@ def test_a_simulated_rig_is_vented_by_its_guards(tmp_path: Path) -> None:
     description = load_rig_description(RIGS / "sim.yaml")
     path = tmp_path / "rig.yaml"
     save_file(path, "rig", description.model_copy(update={"name": f"arm of {tmp_path.name}"}))
-    rig, link = guarded_rig(path)
+    rig, link = guarded_rig(*load_rig(path))
     with rig:
         rig.supply.arm()
         rig.supply.command(PressureCommand(np.full(3, 3e4), rig.clock.now(), 60.0))

@@ -147,6 +147,6 @@ def test_ctrl_c_stops_and_the_same_command_goes_on(tmp_path: Path) -> None:
     assert stopped, said
     assert said.endswith(f"goes on with {path} interrupted")
     going_on = stopped[1] != "0"
-    said = interrupted(path, "goes on after" if going_on else "")
+    said = interrupted(path, "continues after" if going_on else "")
     if going_on:
-        assert f"goes on after {stopped[1]} of 100,000 samples" in said
+        assert f"continues after {stopped[1]} of 100,000 samples" in said

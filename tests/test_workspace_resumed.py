@@ -19,8 +19,8 @@ from conftest import is_long
 from stiffopt.errors import CancelledError, FileError, InputError, OutOfTimeError
 from stiffopt.model.manipulator import Manipulator, load_robot
 from stiffopt.model.scene import Scene
-from stiffopt.workspace import MapPlan, WorkspaceMap, map_workspace, open_workspace_map, store
-from stiffopt.workspace.plan import TUNING
+from stiffopt.workspace import WorkspaceMap, map_workspace, open_workspace_map, store
+from stiffopt.workspace.plan import TUNING, MapPlan
 from stiffopt.workspace.table import CellTable, Gathering
 from stiffopt.workspace.workers import ResultLostError, results
 from workspace_maps import BLOCK, Stop, _blocks, _raise_at, assert_same, robot_fixture  # noqa: F401

@@ -174,7 +174,7 @@ class _Composer:
         self.next()  # end of the document
         after = self.next()
         if not isinstance(after, yaml.StreamEndEvent):
-            raise self.error(after, "a second document begins here; expected one document a file")
+            raise self.error(after, "a second document begins here; expected one document per file")
         if data is None:
             raise FileError(self.path, "is empty")
         if not isinstance(data, dict):

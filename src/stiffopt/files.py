@@ -9,7 +9,7 @@ from __future__ import annotations
 import difflib
 import os
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -70,6 +70,11 @@ def from_document(document: Document, kind: str, model: type[ModelT]) -> ModelT:
         return model.model_validate(data, context=context)
     except ValidationError as error:
         raise _file_error(document, model, error) from None
+
+
+def folder_of(info: ValidationInfo) -> Path:
+    """Return the folder of the file that is validated; in a call, the working directory."""
+    return Path(info.context.get("folder", "") if isinstance(info.context, Mapping) else "")
 
 
 def line_of(path: str | os.PathLike[str], *loc: str | int) -> int | None:

@@ -17,6 +17,7 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 Array = Any  # an ndarray, or a casadi SX, MX or DM
 
@@ -236,6 +237,14 @@ def quaternion_from_rotation(rotation: Array) -> Array:
         best = _where(larger, _column(candidate), best)
     q = best / (2 * _sqrt(best_square))
     return _where(q[0] < 0, -q, q)
+
+
+def quaternion_along(direction: ArrayLike) -> NDArray[np.float64]:
+    """Return the quaternion (w first) of the smallest rotation from z to a direction (3,)."""
+    x, y, z = np.asarray(direction, dtype=float) / np.linalg.norm(direction)
+    half = np.array([1 + z, -y, x, 0.0])
+    length = np.linalg.norm(half)
+    return half / length if length > 1e-9 else np.array([0.0, 1.0, 0.0, 0.0])
 
 
 def rotation_vector_from_quaternion(q: Array) -> Array:

@@ -166,6 +166,8 @@ def _place(raw: Loc, data: Mapping[str, Any] | None) -> Loc:
             continue
         if isinstance(value, dict) and step not in value and index < len(steps) - 1:
             continue
+        if isinstance(value, str | int | float):  # written for a mapping or a list
+            break
         loc = (*loc, step)
         value = _at(data, loc)
     return loc

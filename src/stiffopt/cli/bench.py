@@ -21,9 +21,9 @@ bench_app = command_group(help="Measure methods on recordings of real arms.")
 BENCH_HELP = """\
 Fit methods to some recordings of real arms, and measure how well they predict others.
 
-DIR is the folder of the recordings, which do not come with stiffopt. Which of its files train and
-which test stands in a file (--splits). Rows are thinned, and stiffopt fits one model quickly unless
---full is given.
+DIR is the folder of the recordings, which do not come with stiffopt. A file (--splits) states which
+of them are for training and which for testing. Rows are thinned, and stiffopt fits one model
+quickly unless --full is given.
 """
 
 _EPILOG = """\
@@ -54,7 +54,7 @@ def _bench() -> None:
 def recordings(
     folder: Annotated[str, typer.Argument(metavar="DIR", show_default=False)],
     splits: Annotated[
-        str | None, option("FILE.yaml", "Arms and their files; by default stiffopt's.")
+        str | None, option("FILE.yaml", "Arms and their files; by default those of stiffopt.")
     ] = None,
     methods: Annotated[
         str | None,

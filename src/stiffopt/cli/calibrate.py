@@ -8,16 +8,16 @@ from stiffopt.cli.exits import with_exit_code
 from stiffopt.cli.options import Json, Quiet, Units, option
 
 CALIBRATE_HELP = """\
-Fit a robot file to recordings of the arm, and write how well each number in it is then known.
+Fit a robot file to recordings of the arm, and report how well each number in it is known.
 
-The fit begins at the values of the robot file; its tolerances say how far from them it is expected
-to end. Several models are fitted. The one that predicts held-back logs best is taken; of those that
-are as good, the simplest. A LOG is a recording, log v1 (.csv) or MCAP (.mcap), in the order in
-which they were made.
+The fit begins at the values of the robot file; its tolerances are their expected errors. Several
+models are fitted. The one that predicts held-back data best is taken; of equally good ones, the
+simplest. Each LOG is a recording, log v1 (.csv) or MCAP (.mcap); give them in the order in which
+they were made.
 """
 
 VALIDATE_HELP = """\
-Say how well a robot file predicts recordings that it was not fitted to.
+Measure how well a robot file predicts recordings that it was not fitted to.
 
 The model is run along the commanded pressures of each LOG, a recording, log v1 (.csv) or MCAP
 (.mcap), and compared with the measured tip. Nothing of the robot is fitted.
@@ -30,7 +30,7 @@ Exit codes:
   2    bad input, or a file cannot be written; nothing is written
 """
 _UNFIT = """\
-  4    the fit misses its own logs by more than 10 % of the arm; the file is marked as unfit
+  4    the fit misses its own logs by more than 10 % of the arm's length: it is marked as unfit
 """
 
 CALIBRATE_EPILOG = f"""\
@@ -148,7 +148,7 @@ def calibrate(
             "nothing is held back.",
         ),
     ] = False,
-    timeout: Annotated[str | None, option("TIME", "After which to stop, as by Ctrl-C.")] = None,
+    timeout: Annotated[str | None, option("TIME", "Stop after this time, as by Ctrl-C.")] = None,
     sequence: Sequence = False,
     rezero: Rezero = False,
     pressures: Pressures = "commanded",

@@ -88,7 +88,7 @@ def run_calibrate(
         if suggest is not None:
             check_new_file(suggest, _ENDINGS)
         if report and Path(report).resolve() == Path(out).resolve():
-            raise InputError(f"{out}: the robot file and the report cannot have one name")
+            raise InputError(f"{out}: the robot file and the report cannot have the same name")
         if not recordings.logs and not tables:
             raise InputError(
                 "there is nothing to fit to; expected a LOG or a table of stiffness (--stiffness)"
@@ -375,7 +375,7 @@ def _check_channels(path: str, log: Log, robot: RobotDescription) -> None:
         raise FileError(
             path,
             f"has {log.n} pressures, the robot '{robot.name}' has {robot.n_pressures} channels; "
-            f"say with --channels which column each channel has, such as --channels {example}",
+            f"give the column of each channel with --channels {example}",
         )
 
 

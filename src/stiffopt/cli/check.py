@@ -8,7 +8,7 @@ from stiffopt.cli.exits import with_exit_code
 from stiffopt.cli.options import Quiet
 
 CHECK_HELP = """\
-Check files without using them: all mistakes at once, one a line, with file, line and key.
+Check files without using them: all mistakes at once, one per line, with file, line and key.
 
 Robot, task, path, scene and rig files are checked together with the files that they name; logs
 (.csv, .mcap) are read. Nothing is solved and no device is touched.
@@ -32,7 +32,7 @@ def check(
     files: Annotated[list[str], typer.Argument(metavar="FILE...", help="Any files of stiffopt.")],
     as_json: Annotated[
         bool,
-        typer.Option("--json", help="Print one JSON object a file: file, kind, mistakes."),
+        typer.Option("--json", help="Print one JSON object per file: file, kind, mistakes."),
     ] = False,
     quiet: Quiet = False,
 ) -> int:

@@ -45,13 +45,14 @@ def commission(
         ),
     ] = False,
     out: Annotated[
-        str | None, option("FILE.yaml", "Write the corrected rig file there, if there is one.")
+        str | None,
+        option("FILE.yaml", "Write a corrected rig file, if there is something to correct."),
     ] = None,
     folder: Annotated[
         str | None,
         option(
             "DIR",
-            "For recording, page and figure, made here; by default a new one in the rig's "
+            "New folder for recording, page and figure; by default a new one in the rig's "
             "log folder.",
         ),
     ] = None,

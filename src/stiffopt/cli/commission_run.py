@@ -16,7 +16,8 @@ from stiffopt.commissioning.correction import check_place, corrections, write_co
 from stiffopt.commissioning.expected import ExpectedSteps, expected_steps
 from stiffopt.commissioning.procedure import LOG, StepReadings, run_steps
 from stiffopt.commissioning.record import save_record
-from stiffopt.errors import FileError, InputError, os_reason, require_package
+from stiffopt.errors import FileError, InputError, require_package
+from stiffopt.experiments.folder import empty_folder
 from stiffopt.rig.interface import Rig
 
 RECORD = "record.yaml"
@@ -45,12 +46,12 @@ def run(
     with interruptible(), warnings_as_notes(quiet=quiet):
         rig, name, rate, log_folder = rig_of(rig_file)
         if rig.tracker is None:
-            raise InputError("this rig has no tracker; without one nothing can be found out")
+            raise InputError("this rig has no tracker, which commissioning needs")
         rig.supply.check_arming()
         expected = expected_steps(rig.robot, rig.supply.limits)
         _check_record(rig.settings.commissioning.record)
         place = Path(log_folder) / new_name("commissioning", name) if folder is None else folder
-        target = _made(Path(place))
+        target = empty_folder(Path(place))
     try:
         readings = _moved(rig, expected, target, rate, fast=fast, quiet=quiet)
     except RigStoppedError as error:
@@ -67,17 +68,6 @@ def _check_record(path: str) -> None:
     folder = Path(path).resolve().parent
     if not os.access(folder, os.W_OK):
         raise FileError(path, f"the record cannot be written: {folder} is no folder to write to")
-
-
-def _made(folder: Path) -> Path:
-    """Make a folder; it may exist if it is empty."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        if any(folder.iterdir()):
-            raise FileError(folder, "is not empty; give another folder")
-    except OSError as error:
-        raise FileError(folder, f"cannot be made: {os_reason(error)}") from None
-    return folder
 
 
 def _moved(
@@ -141,5 +131,5 @@ def _reported(
     elif not quiet:
         show(report.renderable(str(folder), path))
     if out is not None and not changed and not quiet:
-        report_note("nothing in the rig file has to be corrected, or can be: none was written")
+        report_note("there is nothing in the rig file to correct; no file was written")
     return SOLVED if found.fits else MISFIT

@@ -55,16 +55,18 @@ Out = Annotated[
     str | None,
     option(
         "DIR",
-        "The folder of the experiment, made here; by default a new one in the rig's log folder.",
+        "New folder of the experiment; by default a new one in the rig's log folder.",
     ),
 ]
 Resume = Annotated[
-    str | None, option("DIR", "Go on with the experiment in this folder: what is missing.")
+    str | None, option("DIR", "Continue the experiment in this folder with what is missing.")
 ]
 Model = Annotated[
     str | None, option("ROBOT", "Compare with this robot instead of that of the rig file.")
 ]
-Repetitions = Annotated[int | None, option("N", "By default 5.", min=1, max=1000)]
+Repetitions = Annotated[
+    int | None, option("N", "Repetitions of all; by default 5.", min=1, max=1000)
+]
 NoPlot = Annotated[bool, typer.Option("--no-plot", help="Draw no figure.")]
 
 
@@ -97,13 +99,13 @@ def kinematics(
     ] = None,
     settle: Annotated[
         str | None,
-        option("TIME", "How long the arm may take to rest in each of these poses; by default 7 s."),
+        option("TIME", "Longest time to come to rest in each of these poses; by default 7 s."),
     ] = None,
     most: Annotated[
         str | None,
         option(
             "PRESSURE",
-            "No channel goes higher in these poses; by default the rig's limits.",
+            "Highest pressure of a channel in these poses; by default the rig's limits.",
             "--max",
         ),
     ] = None,
@@ -157,7 +159,7 @@ def stiffness(
         str | None,
         option(
             "FORCE",
-            "Displace it less where the model expects more force than this; by default 0.2 N.",
+            "Reduce the displacement if the model predicts more force; by default 0.2 N.",
         ),
     ] = None,
     steps: Annotated[
@@ -165,7 +167,7 @@ def stiffness(
     ] = None,
     repetitions: Repetitions = None,
     settle: Annotated[
-        str | None, option("TIME", "How long the arm may take to rest; by default 60 s.")
+        str | None, option("TIME", "Longest time to come to rest; by default 60 s.")
     ] = None,
     resume: Resume = None,
     model: Model = None,

@@ -115,7 +115,7 @@ def run(
     except (KeyboardInterrupt, RigStoppedError):
         if not quiet:
             report_note(
-                f"what was recorded is in {plan.folder}; go on with: "
+                f"the recording is in {plan.folder}; continue with: "
                 f"stiffopt experiment {experiment} {rig} --resume {plan.folder}"
             )
         raise
@@ -208,7 +208,7 @@ def _old_settings(experiment: str, folder: Path, given: Mapping[str, Any]) -> Se
     if given:
         raise InputError(
             f"--{next(iter(given))} cannot be changed when an experiment is resumed; "
-            f"{folder} says what is done"
+            f"{folder} has the settings"
         )
     if experiment == "stiffness":
         return open_folder(folder, StiffnessSettings)

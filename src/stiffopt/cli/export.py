@@ -21,8 +21,8 @@ MJCF_HELP = """\
 Write an arm under pressure as a model for MuJoCo.
 
 The model is a rod of hinges and slides with the shape and the stiffness of the sections at the
-given pressures, and the masses, the tip's mass and the gravity of the robot file. MuJoCo finds the
-sag by itself. The site 'tip' has the pose of the tip. For other pressures, export anew. ROBOT is
+given pressures, and the masses, the tip's mass and the gravity of the robot file. MuJoCo computes
+the sag itself. The site 'tip' has the pose of the tip. For other pressures, export again. ROBOT is
 the name of a built-in robot or a robot file.
 """
 _MJCF_EPILOG = f"""\

@@ -11,24 +11,24 @@ from stiffopt.cli.exits import with_exit_code
 from stiffopt.cli.options import command_group, option
 
 init_app = command_group(
-    help="Write a minimal file to begin with, with comments: it asks a few questions.",
+    help="Write a minimal file with comments, after a few questions.",
     no_args_is_help=True,
 )
 
 _EPILOG = """\
 \b
-On a terminal each option that is not given is asked for; elsewhere, and with --yes, it has its
-default. The file is checked before it is written. An existing file is left alone without --force.
+On a terminal the command asks for each option that is not given; elsewhere, and with --yes, it uses
+the default. An existing file is overwritten only with --force.
 
 \b
 Exit codes:
   0    the file was written
-  2    an answer is wrong, or there is such a file
+  2    an answer is wrong, or the file exists
   130  interrupted (Ctrl-C)
 """
 
 Yes = Annotated[bool, typer.Option("--yes", "-y", help="Ask nothing; take the defaults.")]
-Force = Annotated[bool, typer.Option("--force", help="Write in the place of a file that is there.")]
+Force = Annotated[bool, typer.Option("--force", help="Overwrite an existing file.")]
 Robot = Annotated[str | None, option("ROBOT", "A built-in robot, or a robot file (.yaml).")]
 
 
@@ -120,7 +120,7 @@ def init_task(
 def init_path(
     file: Annotated[str, _file("path")] = "my-path.yaml",
     robot: Robot = None,
-    begin: Annotated[str | None, option("'X, Y, Z'", "Begin of the line.", "--from")] = None,
+    begin: Annotated[str | None, option("'X, Y, Z'", "Start of the line.", "--from")] = None,
     end: Annotated[str | None, option("'X, Y, Z'", "End of the line.", "--to")] = None,
     speed: Annotated[str | None, option("SPEED", "Speed of the tip.")] = None,
     direction: Annotated[str | None, option("'X, Y, Z'", "Direction in which to be stiff.")] = None,

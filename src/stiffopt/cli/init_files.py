@@ -68,7 +68,7 @@ def write_first_file(
     check_ending(path, (".yaml", ".yml"))
     check_writable(path)
     if os.path.lexists(path) and not force:
-        raise FileError(path, "exists; give another name, or --force to write in its place")
+        raise FileError(path, "exists; give another name, or --force to overwrite it")
     answers = _Answers(given, ask, Path(path).parent)
     body, advice = _TEXTS[kind](answers, path)
     typed = shlex.quote(path)
@@ -153,8 +153,9 @@ class _Answers:
 
         return self.text(name, f"{question} ({', '.join(allowed)})", allowed[0], check)
 
-    def vector(self, name: str, question: str, default: str) -> str:
-        """Return three numbers without a unit."""
+    def direction(self) -> str:
+        """Return the direction of a stiffness, three numbers."""
+        default = "1, 0, 0"
 
         def check(text: str) -> str:
             parts = text.strip("[] ").replace(",", " ").split()
@@ -163,11 +164,12 @@ class _Answers:
                     raise ValueError
             except ValueError:
                 raise InputError(
-                    f"{_option(name)}: expected a direction such as '{default}', not {shown(text)}"
+                    f"--direction: expected a direction such as '{default}', not {shown(text)}"
                 ) from None
             return f"[{', '.join(parts)}]"
 
-        return self.text(name, question, default, check)
+        question = "Direction in which the tip should be stiff"
+        return self.text("direction", question, default, check)
 
     def position(self, name: str, question: str, default: str, *, free: bool = False) -> str:
         """Return three lengths; axes may be `free` if allowed."""
@@ -304,12 +306,12 @@ def _task(answers: _Answers, path: str) -> tuple[str, list[str]]:
     position = answers.position(
         "position", "Tip position in the base frame", _middle(robot), free=True
     )
-    direction = answers.vector("direction", "Direction in which the tip shall be stiff", "1, 0, 0")
+    direction = answers.direction()
     text = f"""
     robot: {written}
     target:
       position: {position}    # of the tip, in the base frame; an axis may be `free`
-      # pointing: [0, 0, 1]                # where the tip's axis shall point
+      # pointing: [0, 0, 1]                # where the tip's axis should point
     stiffness:
       maximise: {{direction: {direction}}}    # newtons for each metre of displacement that way
     """
@@ -321,10 +323,10 @@ def _task(answers: _Answers, path: str) -> tuple[str, list[str]]:
 
 def _path(answers: _Answers, path: str) -> tuple[str, list[str]]:
     _, written, robot = answers.robot()
-    begin = answers.position("from", "Begin of the line", _middle(robot, -0.06))
+    begin = answers.position("from", "Start of the line", _middle(robot, -0.06))
     end = answers.position("to", "End of the line", _middle(robot, 0.06))
     speed = answers.quantity("speed", "Speed of the tip", "10 mm/s", "m/s", "speed")
-    direction = answers.vector("direction", "Direction in which the tip shall be stiff", "1, 0, 0")
+    direction = answers.direction()
     text = f"""
     robot: {written}
     path:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from stiffopt.cli.console import report_error, report_note, warnings_as_notes, write_line
-from stiffopt.cli.exits import FAULT, SOLVED, with_exit_code
+from stiffopt.cli.exits import ENDING_SIGNALS, FAULT, SOLVED, handled, with_exit_code
 from stiffopt.cli.options import Units, option
 from stiffopt.errors import InputError
 
@@ -28,12 +28,11 @@ Start a simulated arm in real time behind the protocols of a rig file's devices.
 
 The devices of RIG are emulated on this machine: a Modbus server, an NDI Aurora on a
 pseudo-terminal, an OpenIGTLink server, an NI-DAQ gRPC server, a Zaber stage on TCP, the firmware of
-an open regulator in a simulated microcontroller. The rig file
-that is printed drives them with the real drivers. Simulated devices of RIG are replaced by real
-ones (--supply, --tracker). Ends with Ctrl-C.
+an open regulator in a simulated microcontroller. The printed rig file has the real drivers for
+them. Simulated devices of RIG are replaced by real ones (--supply, --tracker). Ends with Ctrl-C.
 
-While it runs it takes commands, one a line: 'fault DEVICE NAME [CHANNEL]' (if the rig file enables
-faults), 'mount X Y Z' (turn the probe's rail), 'status', 'quit'.
+While it runs it accepts commands, one per line: 'fault DEVICE NAME [CHANNEL]' (if the rig file
+enables faults), 'mount X Y Z' (turns the probe's rail), 'status', 'quit'.
 """
 
 LAB_EPILOG = """\
@@ -60,7 +59,7 @@ def lab(
         str,
         option(
             "DRIVER",
-            "In place of a simulated supply: modbus, nidaq, open-regulator or a package's.",
+            "In place of a simulated supply: modbus, nidaq, open-regulator or that of a package.",
         ),
     ] = "modbus",
     tracker: Annotated[
@@ -78,19 +77,18 @@ def lab(
     # here, so that --help waits for no numerics; the lab needs numba
     from stiffopt.files import file_text, save_file
     from stiffopt.lab.virtual import VirtualLab
-    from stiffopt.model.robot_files import load_description, robot_path
-    from stiffopt.rig.config import load_rig_description
+    from stiffopt.model.robot_files import robot_path
+    from stiffopt.rig.config import load_rig
 
     if out is not None and Path(out).exists() and Path(rig).exists() and Path(out).samefile(rig):
         raise InputError(f"--out {out} is the rig file itself; give another name")
-    description = load_rig_description(rig)
-    folder = Path(rig).parent
-    robot = load_description(description.robot, base=folder)
+    description, robot = load_rig(rig)
     with warnings_as_notes(quiet=quiet):
         virtual_lab = VirtualLab(description, robot, supply, tracker)
     with virtual_lab, _until_signal() as ended:
         addressed = virtual_lab.start()
-        addressed = addressed.model_copy(update={"robot": robot_path(description.robot, folder)})
+        known = robot_path(description.robot, Path(rig).parent)
+        addressed = addressed.model_copy(update={"robot": known})
         if out is None:
             write_line(file_text("rig", addressed).rstrip())
         else:
@@ -177,18 +175,10 @@ def _direction(words: list[str]) -> list[float]:
 
 @contextmanager
 def _until_signal() -> Iterator[threading.Event]:
-    """Context with an event that Ctrl-C and SIGTERM set."""
+    """Context with an event that Ctrl-C and other signals to end set."""
     ended = threading.Event()
-
-    def end(number: int, frame: Any) -> None:
-        ended.set()
-
-    handlers: dict[int, Any] = {signal.SIGINT: end, signal.SIGTERM: end}
+    handlers: dict[int, Any] = dict.fromkeys(ENDING_SIGNALS, lambda number, frame: ended.set())
     if hasattr(signal, "SIGTTIN"):  # reading the terminal from the background would stop the lab
         handlers[signal.SIGTTIN] = signal.SIG_IGN
-    before = {number: signal.signal(number, handler) for number, handler in handlers.items()}
-    try:
+    with handled(handlers):
         yield ended
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)

@@ -17,18 +17,18 @@ _CODES = """
 \b
 Exit codes:
   0    done
-  2    bad input: no recording, nothing whole in it, or the answer cannot be written
+  2    bad input: no recording, no complete data in it, or the file cannot be written
   130  interrupted (Ctrl-C)
 """
 
 EXPORT_HELP = """\
-Write a recording as CSV (log v1), from which 'stiffopt calibrate' can calibrate, or as a bag.
+Write a recording as CSV (log v1), for 'stiffopt calibrate', or as a bag of ROS 2.
 
-In CSV each row is a frame of the tracker, at the time at which it was captured, with the commanded
-and measured pressures of that moment; nothing is estimated. Rows without a tip are from times in
-which the tracker gave no credible reading. A bag (--bag, rosbag2 with MCAP) has what 'stiffopt ros'
-publishes, and needs the extra 'ros'. RUN is a recording (.mcap), whole or cut short; for CSV it may
-also be one of an experiment.
+In CSV each row is a frame of the tracker, at the time of its capture, with the commanded and
+measured pressures of that moment; nothing is estimated. Rows without a tip are from times in which
+the tracker gave no credible reading. A bag (--bag, rosbag2 with MCAP) has the topics that 'stiffopt
+ros' publishes, and needs the extra 'ros'. RUN is a recording (.mcap), complete or truncated; for
+CSV it may also be that of an experiment.
 """
 
 _EXPORT_EPILOG = f"""\
@@ -45,7 +45,7 @@ Draw a run on a page: target and tip, error, pressures, stiffness, states, alarm
 Errors on the way to a target and errors at it are reported separately: the tip is at the target
 once it has come within 1 mm and 1 deg.
 
-RUN is a recording (.mcap) of 'stiffopt run', whole or cut short.
+RUN is a recording (.mcap) of 'stiffopt run', complete or truncated.
 """
 
 _PLOT_EPILOG = f"""\
@@ -94,13 +94,13 @@ def export(
         check_new_file(path, (".csv",))
         log, whole = read_log_of_recording(run)
         if not len(log):
-            raise FileError(run, "has no row to export; it was cut short too early")
+            raise FileError(run, "has no row to export; it was truncated too early")
         write_log(path, log)
         check()
     if quiet:
         return
     if not whole:
-        report_note(f"{run} was cut short or damaged; what is whole was exported")
+        report_note(f"{run} was truncated or damaged; its complete part was exported")
     seen = int(np.isfinite(log.tip_position).all(axis=1).sum())
     write_line(f"{path}: {len(log)} rows, {seen} with a tip, {log.time[-1] - log.time[0]:.1f} s")
 
@@ -122,7 +122,7 @@ def _export_bag(run: str, out: str | None, *, quiet: bool) -> None:
     if quiet:
         return
     if not recorded.complete:
-        report_note(f"{run} was cut short or damaged; what is whole was exported")
+        report_note(f"{run} was truncated or damaged; its complete part was exported")
     write_line(f"{path}: {count} messages, {recorded.time[-1] - recorded.time[0]:.1f} s")
 
 
@@ -149,7 +149,7 @@ def plot(
         check_picture(path)
         recorded = read_run(run)
         if not recorded.complete and not quiet:
-            report_note(f"{run} was cut short or damaged; what is whole was drawn")
+            report_note(f"{run} was truncated or damaged; its complete part was drawn")
         save_figure(plot_run(recorded), path)
         check()
     if not quiet:

@@ -90,7 +90,7 @@ def workspace(
         str | None, option("FILE", "A scene file; samples without its clearance are left out.")
     ] = None,
     scheduler: Annotated[
-        str | None, option("ADDRESS", "Have the workers of this Dask scheduler do it.")
+        str | None, option("ADDRESS", "Use the workers of this Dask scheduler.")
     ] = None,
     timeout: Annotated[str | None, option("TIME", "Stop after this time, as by Ctrl-C.")] = None,
     plot: Annotated[str | None, option("FILE.png", "Draw sections through the workspace.")] = None,
@@ -125,7 +125,7 @@ def workspace(
         is_first, so_far = so_far is None, (done, total)
         interrupt.check()
         if is_first and done and not quiet:
-            report_note(f"{out} goes on after {done:,} of {total:,} samples")
+            report_note(f"{out} continues after {done:,} of {total:,} samples")
         bar.report(done, total, f"{done:,} of {total:,} samples")
 
     try:
@@ -161,7 +161,7 @@ def workspace(
 
 
 CONTACT_HELP = """\
-Lean an arm on the objects of a scene that allow contact, and say how stiff it is.
+Lean an arm on the objects of a scene that allow contact, and report its stiffness.
 
 Prints the contacts with their forces, the stiffness of the tip free and braced, with contacts that
 slide and that stick, and the pushes that lose the first contact. The equilibrium is the one reached
@@ -221,8 +221,8 @@ ARM_HELP = """\
 Map the stiffness along an arm, from near its base to its tip, as in figure 6 of the paper.
 
 Groups of channels are pressurised to several pressures: by default the first pair of each segment,
-then the first two. With --over 1,2 instead the stiffness of the tip over the pressures of these two
-channels. ROBOT is the name of a built-in robot or a robot file.
+then the first two. With --over 1,2 the map is that of the tip's stiffness over the pressures of
+these two channels. ROBOT is the name of a built-in robot or a robot file.
 """
 
 _ARM_EPILOG = f"""\

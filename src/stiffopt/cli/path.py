@@ -47,7 +47,7 @@ def path(
         bool,
         typer.Option(
             "--json",
-            help="Print one JSON object a line for each path, in SI units, instead of a table. "
+            help="Print one JSON object per path and line, in SI units, instead of a table. "
             "A path with bad input has no line.",
         ),
     ] = False,

@@ -3,21 +3,16 @@
 from __future__ import annotations
 
 from math import degrees
-from pathlib import Path as FilePath
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from stiffopt.cli.console import plain_data
-from stiffopt.logs.table import read_bytes
-from stiffopt.paths.motion_file import LEANING
+from stiffopt.paths.motion_file import LEANING, POSITION_ERROR
 from stiffopt.paths.path import Path
 from stiffopt.paths.rates import step_limits
 from stiffopt.paths.solution import PathSolution, Vector
 from stiffopt.units import unit_suffix
-
-_ERROR = "position_error_m"
-"""A column that no log has; it identifies a solution."""
 
 
 class SolvedPath(NamedTuple):
@@ -80,7 +75,7 @@ def csv_text(solution: PathSolution) -> str:
         "time_s": solution.times,
         **{f"p{k + 1}_pa": solution.pressures[:, k] for k in channels},
         **{f"tip_{axis}_m": solution.tip_poses[:, k, 3] for k, axis in enumerate("xyz")},
-        _ERROR: missing if solution.position_errors is None else solution.position_errors,
+        POSITION_ERROR: missing if solution.position_errors is None else solution.position_errors,
         "angle_error_rad": solution.angle_errors,
         stiffness: solution.stiffness,
         "clearance_m": solution.clearance,
@@ -90,11 +85,6 @@ def csv_text(solution: PathSolution) -> str:
     rows = np.column_stack(list(columns.values())).tolist()
     lines = [",".join("" if value != value else f"{value:.9g}" for value in row) for row in rows]
     return "\n".join([",".join(columns), *lines, ""])
-
-
-def is_result_csv(file: FilePath) -> bool:
-    """Whether a file was written by `csv_text`."""
-    return _ERROR.encode() in read_bytes(file).partition(b"\n")[0].split(b",")
 
 
 def result_record(solved: SolvedPath) -> dict[str, Any]:

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path as FilePath
 
-import numpy as np
-
 from stiffopt.cli import exits, path_records, quantities
 from stiffopt.cli.batch import Batch
 from stiffopt.cli.console import show, warnings_as_notes, write_json
@@ -17,7 +15,7 @@ from stiffopt.cli.solve_files import check_result_file, names_for_each, picture_
 from stiffopt.documents import write_file, write_whole
 from stiffopt.errors import EquilibriumError, FileError, InputError
 from stiffopt.model.manipulator import load_robot
-from stiffopt.paths.motion_file import RESULT_FORMAT
+from stiffopt.paths.motion_file import RESULT_FORMAT, is_motion_csv
 from stiffopt.paths.path import load_path
 from stiffopt.paths.solution import PathSolution
 
@@ -72,10 +70,7 @@ class PathBatch(Batch[SolvedPath]):
             try:
                 solution = solve_path(robot, path, seed=self.seed)
             except EquilibriumError as error:
-                none = np.empty((0, robot.n_pressures))
-                solution = PathSolution(
-                    "failed", str(error), robot, np.empty(0), none, np.empty((0, 4, 4))
-                )
+                solution = PathSolution.without_answer("failed", str(error), robot, None)
             return SolvedPath(file, path, solution)
         except FileError:
             raise
@@ -115,5 +110,5 @@ def check_csv(out: str, files: Sequence[str]) -> None:
     """Check the paths of CSV files: only the output of an earlier command is overwritten."""
     for name in map(FilePath, names_for_each(out, files)):
         check_writable(str(name))
-        if name.is_file() and name.stat().st_size and not path_records.is_result_csv(name):
+        if name.is_file() and name.stat().st_size and not is_motion_csv(name):
             raise FileError(name, "exists and is no CSV of a path's solution; give another name")

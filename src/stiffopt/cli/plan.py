@@ -47,7 +47,7 @@ def plan(
         str | None,
         option(
             "RATES",
-            "Largest rates, one or one per channel, such as '2 bar/s'; besides the robot's.",
+            "Largest rates, one or one per channel, such as '2 bar/s'; in addition to the robot's.",
         ),
     ] = None,
     as_json: Json = False,

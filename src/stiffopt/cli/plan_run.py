@@ -106,10 +106,10 @@ class PlanCommand:
         if self.robot is not None:
             return load_robot(self.robot)
         if not tasks:
-            raise InputError("--robot: name a robot; pressures alone do not say which one")
+            raise InputError("--robot: name a robot; pressures alone do not determine it")
         descriptions = [task.resolve_robot() for task in tasks]
         if any(each != descriptions[0] for each in descriptions):
-            raise InputError("--robot: the tasks name different robots; say which one is meant")
+            raise InputError("--robot: the tasks name different robots; name the one that is meant")
         return load_robot(descriptions[0])
 
     def _slew(self, robot: Manipulator) -> NDArray[np.float64] | None:

@@ -20,11 +20,12 @@ class RigStoppedError(RigFaultError):
 
 def rig_of(path: str) -> tuple[Rig, str, float, str]:
     """Return the rig of a file, its name, its rate in Hz and its log folder."""
-    from stiffopt.rig.config import load_rig_description
-    from stiffopt.safety.rigs import open_rig
+    from stiffopt.rig.config import load_rig
+    from stiffopt.safety.rigs import rig_for_programs
 
-    description = load_rig_description(path)
-    return open_rig(path), description.name, description.rate, description.log.folder
+    description, robot = load_rig(path)
+    rig = rig_for_programs(description, robot)
+    return rig, description.name, description.rate, description.log.folder
 
 
 def new_name(experiment: str, rig: str) -> str:

@@ -6,12 +6,12 @@ from stiffopt.cli.exits import with_exit_code
 from stiffopt.cli.options import RigArgument, option
 
 ROS_HELP = """\
-Put the arm of RIG on a ROS 2 graph, as a node; no ROS need be installed. Needs the extra 'ros'.
+Put the arm of RIG on a ROS 2 graph, as a node. ROS need not be installed. Needs the extra 'ros'.
 
 Publishes pressures, tip, target, force, frames, markers and diagnostics. If no daemon of RIG runs,
-one is started, and ended with this command. Only venting is taken from the graph, and only this
-machine is on it, unless the rig file says otherwise ('ros: {commands: true, interface: eth0}'): DDS
-has no token.
+one is started, and ended with this command. Unless the rig file permits more ('ros: {commands:
+true, interface: eth0}'), the node is reached from this machine alone and accepts only the command
+to vent, because DDS has no token.
 """
 
 ROS_EPILOG = """\

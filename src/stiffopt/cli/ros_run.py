@@ -22,8 +22,7 @@ from stiffopt.daemon.client import Client, daemon_url
 from stiffopt.daemon.secret import Secret
 from stiffopt.errors import InputError, ServiceError, require_package
 from stiffopt.model.manipulator import load_robot
-from stiffopt.model.robot_files import robot_path
-from stiffopt.rig.config import RigDescription, load_rig_description
+from stiffopt.rig.config import RigDescription, load_rig
 from stiffopt.rig.settings import RosSettings
 
 _START = 600.0  # s; a first start compiles the model
@@ -39,7 +38,7 @@ def run(rig: str, given: Mapping[str, Any], remap: Sequence[str], token_file: st
     from stiffopt.ros.names import NodeNames, remap_rules
     from stiffopt.ros.node import RosNode, network_interface
 
-    description = load_rig_description(rig)
+    description, robot = load_rig(rig)
     settings = _settings(description.ros, given, remap_rules(remap))
     description = description.model_copy(update={"ros": settings})
     names = NodeNames(settings.node, settings.namespace, settings.remap)
@@ -49,9 +48,8 @@ def run(rig: str, given: Mapping[str, Any], remap: Sequence[str], token_file: st
         )
     domain = _domain() if settings.domain is None else settings.domain
     network_interface(settings.interface)  # before a daemon is started
-    robot = load_robot(robot_path(description.robot, Path(rig).parent))
-    over = threading.Event()
-    daemon = _Daemon(rig, description, token_file)
+    arm, over = load_robot(robot), threading.Event()
+    daemon = _Daemon(rig, description, robot.name, token_file)
 
     def handle(number: int, frame: Any) -> None:
         over.set()
@@ -64,7 +62,7 @@ def run(rig: str, given: Mapping[str, Any], remap: Sequence[str], token_file: st
                 node = RosNode(
                     names, domain=domain, interface=settings.interface, distro=settings.distro
                 )
-                bridge = Bridge(rig, description, robot, url, token, node, report_note)
+                bridge = Bridge(rig, description, arm, url, token, node, report_note)
                 with closing(bridge):
                     _announce(names, domain, settings)
                     # a daemon started here stays visible, and can be vented, until it has ended
@@ -111,8 +109,11 @@ def _announce(names: Any, domain: int, settings: RosSettings) -> None:
 class _Daemon:
     """The daemon of a rig: one that already runs, or one that is started and ended here."""
 
-    def __init__(self, rig: str, description: RigDescription, token_file: str | None) -> None:
+    def __init__(
+        self, rig: str, description: RigDescription, robot: str, token_file: str | None
+    ) -> None:
         self._rig, self._description, self._token_file = rig, description, token_file
+        self._robot = robot
         self._process: subprocess.Popen[str] | None = None
         self._asked = False  # whether it was asked to end
         self.left = threading.Event()
@@ -138,9 +139,8 @@ class _Daemon:
                 robot = client.robot().name
         except ServiceError:
             return False
-        own = load_robot(robot_path(self._description.robot, Path(self._rig).parent)).description
-        if robot != own.name:
-            raise InputError(f"the daemon at {url} has the robot '{robot}', not '{own.name}'")
+        if robot != self._robot:
+            raise InputError(f"the daemon at {url} has the robot '{robot}', not '{self._robot}'")
         return True
 
     def _token(self, file: str | None) -> str:

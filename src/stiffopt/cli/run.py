@@ -13,11 +13,11 @@ Hold an arm at its task in closed loop: run the daemon of a rig in the foregroun
 
 It connects to the devices of RIG, vents, checks everything and waits, vented, for a client
 ('stiffopt.Client', or HTTP). With --arm it arms by itself and pursues TASK, or plays a motion: the
-arm goes to its first point, follows it and stays at its end. A process of its own, the guard, owns
-the pressures and vents when this one is killed, stopped or hangs.
+arm goes to its first point, follows it and stays at its end. A separate process, the guard, owns
+the supply, and vents when the daemon is killed, stopped or hangs.
 
-On a terminal it shows a live status; otherwise it prints one JSON object a line. Ctrl-C, SIGTERM or
-closing the terminal let the pressures down and vent; a second Ctrl-C vents at once.
+On a terminal it shows a live status; otherwise it prints one JSON object per line. Ctrl-C, SIGTERM
+or closing the terminal lower the pressures and vent; a second Ctrl-C vents at once.
 """
 
 RUN_EPILOG = """\
@@ -52,7 +52,7 @@ def run(
         ),
     ] = None,
     arm: Annotated[
-        bool, typer.Option("--arm", help="Arm at once: the arm MOVES without anybody asking.")
+        bool, typer.Option("--arm", help="Arm as soon as the tracker sees the tip: the arm MOVES.")
     ] = False,
     duration: Annotated[str | None, option("TIME", "End after this time, such as '20 s'.")] = None,
     no_service: Annotated[

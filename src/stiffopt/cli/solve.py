@@ -51,7 +51,7 @@ def solve(
         bool,
         typer.Option(
             "--json",
-            help="Print one JSON object a line for each task, in SI units, instead of a table. "
+            help="Print one JSON object per task and line, in SI units, instead of a table. "
             "A task with bad input has no line.",
         ),
     ] = False,

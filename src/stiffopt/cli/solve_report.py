@@ -88,12 +88,11 @@ def _pressures(solved: SolvedTask, pressures: Vector) -> RenderableType:
     """Return a table of pressures, a row for each segment, with marks at limits."""
     description, unit = solved.robot.description, display_units().pressure
     table = Table.grid(padding=(0, 2), pad_edge=False)
-    widest = max(segment.n_channels for segment in description.segments)
+    widest = max(map(len, description.channel_ranges))
     table.add_row("", *(Text(f"channel {k + 1}", "dim") for k in range(widest)))
-    index = 0
-    for number, segment in enumerate(description.segments, start=1):
+    for number, own in enumerate(description.channel_ranges, start=1):
         cells = []
-        for _ in range(segment.n_channels):
+        for index in own:
             limit = limit_of(solved.solution, description.channel_name(index))
             cells.append(
                 Text.assemble(
@@ -101,7 +100,6 @@ def _pressures(solved: SolvedTask, pressures: Vector) -> RenderableType:
                     (f" {limit}".rstrip(), "yellow"),
                 )
             )
-            index += 1
         table.add_row(Text(f"segment {number}", "dim"), *cells)
     return table
 
@@ -349,7 +347,7 @@ def _supports(found: SupportMap) -> Iterable[Line]:
             where = f"through {point} {length}, normal {normal}"
         yield (
             "" if number > 1 else "would help",
-            f"{number} {each.kind}: {stiffness}, {found.times(each):.3g} times as stiff; "
+            f"{number}. {each.kind}: {stiffness}, {found.times(each):.3g} times as stiff; "
             f"{each.touched}; {where}",
         )
 
@@ -389,12 +387,11 @@ def _errors(solution: PressureSolution) -> list[str]:
 
 def _list(solved: SolvedTask, solution: PressureSolution) -> str:
     """Return all pressures on one line, separated by segment."""
-    values = [] if solution.pressures is None else list(solution.pressures)
-    groups, unit = [], display_units().pressure
-    for segment in solved.robot.description.segments:
-        mine, values = values[: segment.n_channels], values[segment.n_channels :]
-        groups.append(" ".join(unit.number(value, ".2f") for value in mine))
-    return " | ".join(groups)
+    if solution.pressures is None:
+        return ""
+    texts = [display_units().pressure.number(p, ".2f") for p in solution.pressures]
+    ranges = solved.robot.description.channel_ranges
+    return " | ".join(" ".join(texts[own.start : own.stop]) for own in ranges)
 
 
 def summary_row(solved: SolvedTask, seconds: float) -> tuple[str, ...]:

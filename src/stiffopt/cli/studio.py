@@ -8,12 +8,12 @@ from stiffopt.cli.exits import with_exit_code
 from stiffopt.cli.options import Units, option
 
 STUDIO_HELP = """\
-Open a page in the browser in which a robot and a task are seen and changed by hand.
+Open a page in the browser that shows a robot and a task, to be changed by hand.
 
 FILE is a built-in robot, or a robot, task or scene file: drag the target and the arm follows, with
 its pressures and its stiffness. A path file, a motion (.csv of 'stiffopt plan') and a recording
-(.csv, .mcap) play. A rig file shows the arm of its running daemon, and only with the daemon's token
-commands it. The page is for this machine, and only the address that is printed opens it.
+(.csv, .mcap) are played. A rig file shows the arm of its running daemon; with the daemon's token
+the page can also command it. The page is for this machine, and only the printed address opens it.
 Needs the extra 'studio'.
 """
 

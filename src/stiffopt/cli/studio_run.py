@@ -10,7 +10,7 @@ from pathlib import Path
 
 from stiffopt.cli.console import report_note, warnings_as_notes, write_line
 from stiffopt.cli.exits import ENDING_SIGNALS, handled
-from stiffopt.daemon.secret import is_loopback
+from stiffopt.daemon.address import is_loopback
 from stiffopt.errors import require_package
 
 _TOKEN = "STIFFOPT_TOKEN"  # `stiffopt.Client` reads it too

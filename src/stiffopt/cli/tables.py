@@ -156,6 +156,6 @@ def _cell(text: str) -> str:
 def block_title(name: str, status: str, timings: Mapping[str, float]) -> Text:
     """Return the first line of a report: name, status and time."""
     seconds = f"  {timings.get('total', 0.0):.2f} s"
-    if "compilation" in timings:
+    if timings.get("compilation", 0.0) >= 0.5:
         seconds += f", after compiling once for {timings['compilation']:.0f} s"
     return Text.assemble((name, "bold"), "  ", (status, f"bold {STATUS_COLOURS[status]}"), seconds)

@@ -120,7 +120,7 @@ def _wiring(
     ]
     text, advice = wiring_words(best.wiring), ["pull the tubes in question and see which one blows"]
     if rivals:
-        text += f"; or {'; or '.join(rivals)}: the tip's motion does not tell these apart"
+        text += f"; or {'; or '.join(rivals)}: the tip's motion does not distinguish these"
         advice.append(_CHECKS["frame turned"])
     for k, source in enumerate(best.wiring):
         if source == () and np.isfinite(seen.gauge[k, k]):
@@ -128,7 +128,7 @@ def _wiring(
             advice.append(
                 f"the gauge of channel {k + 1} follows: look for a kinked, blocked or loose tube"
                 if reads
-                else f"the gauge of channel {k + 1} does not follow: its regulator or its air"
+                else f"the gauge of channel {k + 1} does not follow: check its regulator and air"
             )
     yield Finding("wiring", text, False, "; ".join(advice), ("supply.channels",))
 
@@ -182,7 +182,7 @@ def _causes(
         alternatives.pop(words, None)
         text = words
         if alternatives:
-            text += f"; or {'; or '.join(alternatives)}: what was seen does not tell these apart"
+            text += f"; or {'; or '.join(alternatives)}: the observations do not distinguish these"
         names = dict.fromkeys(each.name for each, _ in [(cause, best), *others])
         checks = "; ".join(dict.fromkeys(_CHECKS[name] for name in names))
         keys = tuple(dict.fromkeys(key for name in names for key in _KEYS[name]))
@@ -349,8 +349,8 @@ def _unexplained(expected: ExpectedSteps, best: SetupExplanation) -> Iterator[Fi
         if missed > max(LIMITS.unexplained * alone, 5e-4):
             yield Finding(
                 "unexplained",
-                f"channel {k + 1} moves the tip {1e3 * missed:.1f} mm away from where anything "
-                "that was tried has it",
+                f"channel {k + 1} moves the tip {1e3 * missed:.1f} mm away from every explanation "
+                "that was tried",
                 False,
                 "is the arm free of contact, and is the robot file that of this arm?",
                 ("robot",),
@@ -378,7 +378,7 @@ def _gauges(rig: Rig, seen: Responses, wiring: Wiring) -> Iterator[Finding]:
         if own < LIMITS.dead and crossed:
             yield Finding(
                 "gauge", f"the gauge of channel {crossed[0] + 1} follows the command of channel "
-                f"{k + 1}", False, "exchange the inputs, or the outputs if the tip says that they "
+                f"{k + 1}", False, "exchange the inputs, or the outputs if the tip shows that they "
                 "are swapped", ("supply.channels",),
             )  # fmt: skip
         elif own < LIMITS.dead and wiring[k]:

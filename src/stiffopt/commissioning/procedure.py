@@ -177,6 +177,8 @@ def run_steps(
         ready = conductor.clock.now()
         for channel in range(conductor.n):
             progress(channel + 1, conductor.n + 1, f"channel {channel + 1} of {conductor.n}")
+            # its gauge may have shown another channel's step; then it seems to leak in its own
+            conductor.forget_pressures()
             p, times = zero.copy(), list[float]()
             for share, hold in (
                 (PROCEDURE.first, PROCEDURE.first_hold),

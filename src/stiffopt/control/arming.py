@@ -228,9 +228,11 @@ def late_ticks(lateness: float, guard_timeout: float, load: float = 0.0) -> str:
     what = f"ticks began {1e3 * lateness:.0f} ms late in the last half minute"
     if lateness < half:
         what = f"{load:.1f} processes want each processor of this computer"
-    patience = max(0.1, math.ceil(20 * 2.5 * lateness) / 20)
-    return (
-        f"timing: {what}, and the guard vents after {1e3 * guard_timeout:.0f} ms; give the "
-        "computer less to do, this program real-time rights ('stiffopt run' says how when it "
-        f"starts), or set safety.guard_timeout: {1e3 * patience:.0f} ms"
+    advice = (
+        "give the computer less to do, or this program the real-time rights that it lacks "
+        "('stiffopt run' lists them when it starts)"
     )
+    patience = max(0.1, math.ceil(20 * 2.5 * lateness) / 20)
+    if patience > guard_timeout:
+        advice += f", or set safety.guard_timeout: {1e3 * patience:.0f} ms"
+    return f"timing: {what}, and the guard vents after {1e3 * guard_timeout:.0f} ms; {advice}"

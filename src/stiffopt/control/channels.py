@@ -142,12 +142,13 @@ class Channels:
         healthy :
             Least and greatest pressures (2, n) that regulators without a fault have now, in Pa.
         """
-        self.shortfall = -offset
-        self._rest.advance(elapsed, command, self.shortfall)
         share = -math.expm1(-elapsed / self._tuning.reading_time)
-        self._smoothed, self._made_up, now, follows, strays, sound = self._look(
-            share, self._smoothed, reading, self.shortfall, healthy
+        looked, follows, strays, sound = self._look.view(
+            share, self._smoothed, reading, offset, healthy
         )
+        looked = looked.copy()
+        self._smoothed, self._made_up, self.shortfall, now = *looked[:3], looked[3:]
+        self._rest.advance(elapsed, command, self.shortfall)
         if self._any_out:
             self._ceiling = np.where(
                 self.out, np.maximum(self._ceiling - self._let_down * elapsed, self._empty),
@@ -309,15 +310,15 @@ class Channels:
 def _look(n: int, tuning: RegulatorTuning) -> Formula:
     """Return the formula of the checks that every tick makes.
 
-    Inputs: share by which smoothed readings (n,) follow; these; readings and shortfalls (n,); least
-    and greatest healthy pressures (2, n). Outputs: smoothed readings; the part of the regulators'
-    offset that commands compensate if no channel is short (n,); readings, these without that
-    offset, and readings again (3, n); 1 for channels (n,) that follow; 1 for those (n,) that are
-    beyond the healthy pressures; and 1 if all follow and none is beyond them.
+    Inputs: share by which smoothed readings (n,) follow; these; readings and the regulators'
+    offsets (n,); least and greatest healthy pressures (2, n). Outputs: rows (6, n) of smoothed
+    readings, the part of the offset that commands compensate if no channel is short, shortfalls,
+    readings, these without the offset, and readings again; 1 for channels (n,) that follow; 1 for
+    those (n,) that are beyond the healthy pressures; and 1 if all follow and none is beyond them.
     """
     share, smoothed = ca.SX.sym("share"), ca.SX.sym("smoothed", n)
-    reading, short = ca.SX.sym("reading", n), ca.SX.sym("short", n)
-    healthy = ca.SX.sym("healthy", 2, n)
+    reading, offset = ca.SX.sym("reading", n), ca.SX.sym("offset", n)
+    healthy, short = ca.SX.sym("healthy", 2, n), -offset
     change = share * (reading - smoothed)
     after = smoothed + ca.if_else(ca.fabs(change) < np.inf, change, 0)  # 0 for NaN
     most = tuning.max_compensation
@@ -327,11 +328,9 @@ def _look(n: int, tuning: RegulatorTuning) -> Formula:
     below, above = healthy[0, :].T - settled, settled - healthy[1, :].T
     strays = ca.logic_or(below > tuning.unmoved, above > tuning.unmoved)
     sound = ca.logic_and(ca.mmin(follows) > 0, ca.mmax(strays) < 1)
-    now = ca.vertcat(reading.T, settled.T, reading.T)
-    return Formula(
-        [share, smoothed, reading, short, healthy], [after, made_up, now, follows, strays, sound],
-        [healthy, now],
-    )  # fmt: skip
+    looked = ca.horzcat(after, made_up, short, reading, settled, reading).T
+    inputs = [share, smoothed, reading, offset, healthy]
+    return Formula(inputs, [looked, follows, strays, sound], [healthy, looked])
 
 
 class _Rest:

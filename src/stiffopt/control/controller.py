@@ -33,7 +33,7 @@ from stiffopt.control.reference import Reference
 from stiffopt.control.replanning import Pursuit, Replanner
 from stiffopt.control.report import Report
 from stiffopt.control.requests import Requests
-from stiffopt.control.state import ControllerStatus
+from stiffopt.control.state import ControllerStatus, Severity
 from stiffopt.control.tip_errors import target_arrays
 from stiffopt.control.tip_feedback import TipFeedback
 from stiffopt.control.tuning import ControlTuning
@@ -104,6 +104,7 @@ class TipController:
         control, safety = control or ControlSettings(), safety or Safety()
         self._tuning = tuning = tuning or ControlTuning()
         self._period, n = period, robot.n_pressures
+        self._no_motion: Array = np.zeros((3, n))
         self._slew = slew = np.broadcast_to(np.asarray(slew, dtype=float), n).copy()
         if control.vibration != "auto":
             vibrates = control.vibration == "modelled"
@@ -172,6 +173,7 @@ class TipController:
         self._moved_at = -math.inf  # last time at which the reference moved
         self._computed_at = now
         self._adapted_at = -math.inf  # last adaptation of the model since the last request
+        self._untold: list[Notice] = []  # events since the last call of `notices`
         self._went_back_at = -math.inf  # last return to an earlier model
         self._watched_at = -math.inf  # last check whether the tip rests
         self._lost = self._arm.channels.lost
@@ -315,8 +317,10 @@ class TipController:
         swings = now - self._moved_at < self._tuning.estimator.swings_on
         self._arm.tip.learns = steers and swings
         counts = self._arm.observe(now, commanded, reading, samples, course)
-        if counts.used and (sample := self._arm.tip.sample) is not None:
-            self._first_motion.take(self._arm.tip.predicted, sample.position)
+        tip, sample = self._arm.modelled, self._arm.tip.sample
+        if counts.used and sample and tip and not self._first_motion.is_over:
+            parts = tip.pose[:3, :3] @ tip.jacobian[:3] * self._arm.pressures.effective
+            self._first_motion.take(self._arm.tip.predicted, sample.position, parts)
         if self.forecast is not None:
             self.forecast.present = self._present(now)
         return counts
@@ -375,14 +379,15 @@ class TipController:
         reference.omega = self._arm.tip.omega
         reference.motion_share = self._motion_share(reference.path[:n])
         reference.advance(self._awaited(plan, now))
-        if self._moves():
+        moves = self._moves()
+        if moves:
             self._moved_at = now
         if self._arm.leaning is not None:
             return self._feedforward(reference.command - pressures.command_offset, last)
         tip = self._arm.on_path(reference.path[:n])
         if now - self._went_back_at > self._tuning.adaptation.blind_time:
             self._arm.watch.intend(now, tip.pose[:3, 3] + reference.path[n : n + 3])
-        if self._arm.channels.pace == 0 and self._ways and self._moves():
+        if self._arm.channels.pace == 0 and self._ways and moves:
             return self._feedforward(self._without_feedback, last)
         course = self.replanner.pursuit.course
         bent = self._bend(None if isinstance(course, PostureCourse) else self.replanner.bent)
@@ -409,7 +414,7 @@ class TipController:
     def _motion_share(self, path: Array) -> Array:
         """Return the motion of the tip per pressure (3, n), over its greatest one in a period."""
         if self._tip_speed is None or self._bracing is not None:
-            return np.zeros((3, len(path)))
+            return self._no_motion
         motion: Array = self._arm.on_path(path).jacobian[:3] / (self._tip_speed * self._period)
         return motion
 
@@ -484,7 +489,7 @@ class TipController:
             return self._brace(course, now)
         calm = now - self._adapted_at < tuning.adaptation.calm_time
         share = tuning.adaptation.slew_share if calm else tuning.reference.slew_share
-        reference.slew_share = min(share, self._first_motion.slew_share)
+        reference.slew_share = np.fmin(share, self._first_motion.slew_share)
         way = None if self.forecast is None else self._way(now)
         found = replanner.update(
             now, self._offset, self._arm.pressures.command_offset, estimator.omega,
@@ -501,6 +506,8 @@ class TipController:
         if plan is None:
             return None if self._at_rest else self._start(now)
         if plan.approach is None:  # the plan keeps clear of the objects
+            text = "no posture that leans is stiffer at this target: the arm keeps clear of objects"
+            self._untold.append(Notice("brace-clear", text, Severity.INFO))
             self.replanner.pursue(self.replanner.pursuit.to(course.task.target))
             return found
         course.begin(plan.approach, self._start(now)[: self.robot.n_pressures])
@@ -656,7 +663,8 @@ class TipController:
 
     def notices(self) -> tuple[Notice, ...]:
         """Return alarms and events."""
-        return self._report.notices(self._rests_short())
+        untold, self._untold = self._untold, []
+        return (*untold, *self._report.notices(self._rests_short()))
 
     def _rests_short(self) -> bool:
         """Return whether the tip is at rest although its target, out of reach, is elsewhere.

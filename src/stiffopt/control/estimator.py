@@ -38,6 +38,7 @@ from numpy.typing import NDArray
 from stiffopt import lie
 from stiffopt.control.formula import Formula
 from stiffopt.control.interface import SampleCounts
+from stiffopt.control.principal import principal_axes
 from stiffopt.control.tuning import EstimatorTuning
 from stiffopt.control.vibration import BendingMode, lateral_stiffness, transition
 from stiffopt.optimise.tip import TipAt
@@ -48,16 +49,22 @@ Symbols = Any  # of CasADi
 
 _MODE_EVERY = 8  # steps between updates of frequency and soft plane, which change slowly
 _NO_ROTATION = (1.0, 0.0, 0.0, 0.0)
+_GIVES = 1e-9  # least compliance in a direction, over the greatest, that is not rounding
 
 
 class _PastTip(NamedTuple):
     """The tip at one time as the pressures alone predict it."""
 
     time: float
-    static: Array  # (3,)
+    # rows (5, 3): position, the driven xi and w, and their derivatives by the relative frequency
+    motion: Array
     rotation: Array  # (3, 3)
-    driven: Array  # (2, 3): xi, w
-    slope: Array  # (2, 3): their derivative by the relative frequency
+
+    @property
+    def static(self) -> Array:
+        """Position (3,)."""
+        static: Array = self.motion[0]
+        return static
 
 
 @dataclass(frozen=True)
@@ -103,10 +110,7 @@ class TipEstimator:
         self._orientation = _orientation()
         self.omega = math.inf  # of the vibration, in rad/s; infinite before it is known
         self._times = np.array([1.0, period])  # omega, and duration of the step
-        # the model's compliance (6, 6) for which the following numbers are; see `_directions_of`
-        self._compliance: Array | None = None
-        self._directions: Array = np.zeros((3, 3, 3))
-        self._principal: Array = np.zeros(3)
+        self._directions = _directions(tuning)
         # displacement (3, n) of the mode per pressure beyond that of the straight arm, in m/Pa
         self.excess: Array = np.zeros((3, n))
         self.begin()
@@ -114,10 +118,9 @@ class TipEstimator:
     def begin(self) -> None:
         """Restart with an arm at rest."""
         self._past.clear()
-        self._free = np.zeros((2, 3))
-        # derivatives by the relative frequency, as far as samples have changed them: of vibration
-        # and speed (2, 3), and of the offset (3,)
-        self._free_slope, self._offset_slope = np.zeros((2, 3)), np.zeros(3)
+        # free vibration xi and w with their derivatives by the relative frequency, as far as
+        # samples have changed them; and that of the offset
+        self._free, self._offset_slope = np.zeros((4, 3)), np.zeros(3)
         # relative error of the mode's frequency, and its variance
         t = self._tuning
         self.detuning = np.array([t.frequency_offset, t.frequency_deviation**2])
@@ -163,7 +166,7 @@ class TipEstimator:
     @property
     def vibration(self) -> Array:
         """Vibration and its speed (2, 3), in m and m/s."""
-        return self._past[-1].driven + self._free
+        return self._past[-1].motion[1:3] + self._free[:2]
 
     @property
     def deviation(self) -> float:
@@ -196,18 +199,16 @@ class TipEstimator:
             self._update_mode(tip)
         rotation = tip.pose[:3, :3]
         if self._pressures is None:
-            none = np.zeros((2, 3))
-            self._past.append(_PastTip(now, tip.pose[:3, 3].copy(), rotation, none, none))
+            motion = np.zeros((5, 3))
+            motion[0] = tip.pose[:3, 3]
         else:
             last = self._past[-1]
             self._times[1] = now - last.time  # longer than the period in a loop that is late
-            static, driven, self._free, slope, self._free_slope, displacements = self._predict(
-                tip.pose, tip.jacobian, last.static, last.driven, self._free, last.slope,
-                self._free_slope, self.soft_plane, pressures - self._pressures, ahead, self._times,
-                self.excess,
+            motion, self._free, self._displacements = self._predict(
+                tip.pose, tip.jacobian, last.motion, self._free, self.soft_plane, pressures,
+                self._pressures, ahead, self._times, self.excess, self._displacements,
             )  # fmt: skip
-            self._displacements += displacements
-            self._past.append(_PastTip(now, static, rotation, driven, slope))
+        self._past.append(_PastTip(now, motion, rotation))
         self._pressures = pressures.copy()
 
     def take(self, samples: Sequence[PoseSample]) -> SampleCounts:
@@ -248,8 +249,9 @@ class TipEstimator:
         left = np.asarray(lie.log(own @ lie.transform(turn.T, np.zeros(3))))[3:]
         offset = np.concatenate([self.offset[:3] - shift, left])
         change, self.offset = offset - self.offset, offset
+        moved = np.vstack([shift, np.zeros((4, 3))])
         past = [
-            each._replace(static=each.static + shift, rotation=turn @ each.rotation)
+            each._replace(motion=each.motion + moved, rotation=turn @ each.rotation)
             for each in self._past
         ]
         self._past.clear()
@@ -295,37 +297,11 @@ class TipEstimator:
         self._ticks += 1
         if self._ticks % _MODE_EVERY != 1 or self._mode is None:
             return
-        if tip.compliance is not self._compliance:
-            self._compliance = tip.compliance
-            self._directions, self._principal = self._directions_of(tip.compliance)
-        rotation = tip.pose[:3, :3]
-        self.soft_plane, self.stiff_axis, self._lean = rotation @ self._directions @ rotation.T
-        omega = (1 + self.detuning[0]) * self._modelled_frequency(self._principal)
-        self._times[0] = self.omega = omega
-
-    def _directions_of(self, compliance: Array) -> tuple[Array, Array]:
-        """Return three matrices (3, 3, 3) in tip axes, and the principal compliances (3,).
-
-        The matrices are those of `soft_plane`, `stiff_axis` and the lean.
-        """
-        compliances, axes = np.linalg.eigh(compliance[:3, :3])
-        _, second, softest = values = compliances.tolist()
-        least, most = self._tuning.stiff_share * softest, self._tuning.soft_share * softest
-        weights = np.array(
-            [
-                # in a strongly bent arm no direction is entirely stiff
-                [min(1.0, value / most) for value in values],
-                [max(0.0, 1 - value / least) for value in values],
-                [0.0, 1 / second, 1 / softest],
-            ]
+        self.soft_plane, self.stiff_axis, self._lean, compliances = self._directions(
+            tip.pose, tip.compliance
         )
-        directions = axes * weights[:, None] @ axes.T
-        directions[2] = compliance[3:, :3] @ directions[2]
-        return directions, compliances
-
-    def _amplitude(self, vibration: Array) -> float:
-        """Return the amplitude of a vibration (2, 3), in m."""
-        return math.hypot(*vibration[0].tolist(), *(vibration[1] / self.omega).tolist())
+        omega = (1 + float(self.detuning[0])) * self._modelled_frequency(compliances)
+        self._times[0] = self.omega = omega
 
     def _transition(self, duration: float) -> Array:
         """Return the transition matrix (2, 2) of the free vibration over a duration in s."""
@@ -346,13 +322,8 @@ class TipEstimator:
             return before
         after = past[index + 1]
         share = (time - before.time) / (after.time - before.time)
-        return _PastTip(
-            time,
-            before.static + share * (after.static - before.static),
-            before.rotation if share < 0.5 else after.rotation,
-            before.driven + share * (after.driven - before.driven),
-            before.slope + share * (after.slope - before.slope),
-        )
+        motion = before.motion + share * (after.motion - before.motion)
+        return _PastTip(time, motion, before.rotation if share < 0.5 else after.rotation)
 
     def _is_plausible(self, sample: PoseSample, past: _PastTip) -> bool:
         """Whether the tip can have moved there since the last sample, or is expected there."""
@@ -361,8 +332,8 @@ class TipEstimator:
             return before is not None and self._is_near(sample, before.position, before.time)
         if self._is_near(sample, self.sample.position, self._last_sample):
             return True
-        free = self._transition(past.time - self._past[-1].time) @ self._free
-        expected = past.static + past.driven[0] + free[0] + self.offset[:3]
+        free = self._transition(past.time - self._past[-1].time) @ self._free[:2]
+        expected = past.motion[0] + past.motion[1] + free[0] + self.offset[:3]
         return self._is_near(sample, expected, self._last_sample)
 
     def _is_near(self, sample: PoseSample, position: Array, since: float) -> bool:
@@ -384,46 +355,46 @@ class TipEstimator:
         age = self._past[-1].time - past.time
         has_orientation = sample.quaternion is not None
         (
-            self._free, offset, turn, self._covariance, self._variances, self._free_slope,
-            self._offset_slope, self.detuning,
+            self._free, self.offset, self._covariance, self._variances, self._offset_slope,
+            self.detuning, self.predicted, swings,
         ) = self._correct(
-            past.static, past.rotation, past.driven, self._free, self.offset[:3], self.offset[3:],
+            past.motion, past.rotation, self._past[-1].motion, self._free, self.offset,
             self.soft_plane, self._lean, self._covariance, self._variances,
             (age, elapsed, self.omega, self.learns), self._displacements, sample.position,
-            sample.quaternion if has_orientation else _NO_ROTATION, has_orientation, past.slope,
-            self._past[-1].slope, self._free_slope, self._offset_slope, self.detuning,
+            sample.quaternion if has_orientation else _NO_ROTATION, has_orientation,
+            self._offset_slope, self.detuning,
         )  # fmt: skip
-        self.offset = np.concatenate([offset, turn])
         self._displacements = np.zeros(2)
         self._used_until = sample.time
         self.sample, self._rejected = sample, 0
-        self.predicted = past.static + past.driven[0]
-        self.swings = self._amplitude(past.driven), self._amplitude(self._free)
+        self.swings = float(swings[0]), float(swings[1])
 
 
 def _prediction(mode: BendingMode | None, n: int, damping: float) -> Formula:
     """Return the formula of one step of the state.
 
-    Inputs: pose (4, 4) and Jacobian (6, n) of the model's tip, its last position (3,), driven and
-    free vibration (2, 3) and their slopes, soft plane (3, 3), change of the pressures (n,), by how
-    much those that the mode feels are ahead (n,), (omega, duration), and the mode's displacement
-    per pressure (3, n) beyond that of the straight arm.
-    Outputs: position (3,), both vibrations and slopes, and the displacements (2,) of tip and mode.
+    Inputs: pose (4, 4) and Jacobian (6, n) of the model's tip, the last motion (5, 3), see
+    `_PastTip`, the free vibration with its slope (4, 3), soft plane (3, 3), pressures (n,) now and
+    before, by how much those that the mode feels are ahead (n,), (omega, duration), the mode's
+    displacement per pressure (3, n) beyond that of the straight arm, and displacements (2,) of tip
+    and mode so far.
+    Outputs: motion, free vibration with its slope, and displacements.
     """
     pose, jacobian = ca.SX.sym("pose", 4, 4), ca.SX.sym("jacobian", 6, n)
-    before, change = ca.SX.sym("before", 3), ca.SX.sym("change", n)
-    driven, free = ca.SX.sym("driven", 2, 3), ca.SX.sym("free", 2, 3)
+    motion, free_motion = ca.SX.sym("motion", 5, 3), ca.SX.sym("free", 4, 3)
+    before, driven, slope = motion[0, :].T, motion[1:3, :], motion[3:, :]
+    free, free_slope = free_motion[:2, :], free_motion[2:, :]
+    now, last = ca.SX.sym("now", n), ca.SX.sym("last", n)
     soft_plane, times = ca.SX.sym("soft_plane", 3, 3), ca.SX.sym("times", 2)
-    excess = ca.SX.sym("excess", 3, n)
-    slope, free_slope = ca.SX.sym("slope", 2, 3), ca.SX.sym("free_slope", 2, 3)
-    ahead = ca.SX.sym("ahead", n)
+    excess, ahead = ca.SX.sym("excess", 3, n), ca.SX.sym("ahead", n)
+    so_far = ca.SX.sym("so_far", 2)
     position, excitation = pose[:3, 3], ca.SX.zeros(3)
     driven_after, free_after, slope_after, free_slope_after = driven, free, slope, free_slope
     if mode is not None:
         excitation, pull = (
             soft_plane @ (pose[:3, :3] @ (jacobian[:3, :] @ (ca.DM(mode.participation) * p)))
             + excess @ p
-            for p in (change, ahead)
+            for p in (now - last, ahead)
         )
         omega, elapsed = times[0], times[1]
         F = transition(omega, damping, elapsed)
@@ -436,39 +407,40 @@ def _prediction(mode: BendingMode | None, n: int, damping: float) -> Formula:
         slope_after, free_slope_after = F @ (slope + half) + half, F @ free_slope
     displacements = ca.vertcat(ca.norm_2(position - before), ca.norm_2(excitation))
     inputs = [
-        pose, jacobian, before, driven, free, slope, free_slope, soft_plane, change, ahead, times,
-        excess,
+        pose, jacobian, motion, free_motion, soft_plane, now, last, ahead, times, excess, so_far,
     ]  # fmt: skip
-    vibrations = [driven_after, free_after, slope_after, free_slope_after]
-    outputs = [position, *vibrations, displacements]
+    after = ca.vertcat(position.T, driven_after, slope_after)
+    outputs = [after, ca.vertcat(free_after, free_slope_after), so_far + displacements]
     return Formula(inputs, outputs, [jacobian, excess])
 
 
 def _correction(tuning: EstimatorTuning, vibrates: bool) -> Formula:
     """Return the formula of the measurement update by one sample.
 
-    Inputs at the capture: the model's position (3,) and rotation (3, 3), driven vibration (2, 3).
-    Now: free vibration (2, 3), offset and turn (3,), soft plane and lean (3, 3), covariance (3, 3)
-    of xi, w and d in the soft plane, variances (2,) of d along the stiff axis and of the turn.
+    Inputs at the capture: motion (5, 3), see `_PastTip`, and the model's rotation (3, 3).
+    Now: motion, free vibration with its slope (4, 3), offset of the pose (6,), soft plane and lean
+    (3, 3), covariance (3, 3) of xi, w and d in the soft plane, variances (2,) of d along the stiff
+    axis and of the turn.
     Of the sample: (age, time since the last sample, omega, 1 if it may correct the frequency),
     displacements (2,) since the last sample, position (3,), quaternion (4,), and 1 if it has one.
-    Slopes (2, 3) of the driven vibration at the capture and now, of the free one, and of the offset
-    (3,); and (error of the frequency, its variance).
-    Outputs: free vibration, offset, turn, covariance, variances, both slopes, and the frequency's
-    error with its variance.
+    Slope of the offset's position (3,); and (error of the frequency, its variance).
+    Outputs: free vibration with its slope, offset, covariance, variances, the offset's slope, the
+    frequency's error with its variance, the position (3,) expected without the offset and the free
+    vibration, and amplitudes (2,) of the driven and the free vibration.
     """
     t = tuning
-    static, rotation = ca.SX.sym("static", 3), ca.SX.sym("rotation", 3, 3)
-    driven, free = ca.SX.sym("driven", 2, 3), ca.SX.sym("free", 2, 3)
-    offset, turn = ca.SX.sym("offset", 3), ca.SX.sym("turn", 3)
+    motion, rotation = ca.SX.sym("motion", 5, 3), ca.SX.sym("rotation", 3, 3)
+    motion_now, free_motion = ca.SX.sym("motion_now", 5, 3), ca.SX.sym("free", 4, 3)
+    static, driven, slope = motion[0, :].T, motion[1:3, :], motion[3:, :]
+    slope_now, free, free_slope = motion_now[3:, :], free_motion[:2, :], free_motion[2:, :]
+    pose_offset = ca.SX.sym("offset", 6)
+    offset, turn = pose_offset[:3], pose_offset[3:]
     soft_plane, lean = ca.SX.sym("soft_plane", 3, 3), ca.SX.sym("lean", 3, 3)
     covariance, variances = ca.SX.sym("covariance", 3, 3), ca.SX.sym("variances", 2)
     times, displacements = ca.SX.sym("times", 4), ca.SX.sym("displacements", 2)
     position, quaternion = ca.SX.sym("position", 3), ca.SX.sym("quaternion", 4)
     has_orientation = ca.SX.sym("has_orientation")
-    slope, slope_now = ca.SX.sym("slope", 2, 3), ca.SX.sym("slope_now", 2, 3)
-    free_slope, offset_slope = ca.SX.sym("free_slope", 2, 3), ca.SX.sym("offset_slope", 3)
-    detuning = ca.SX.sym("detuning", 2)
+    offset_slope, detuning = ca.SX.sym("offset_slope", 3), ca.SX.sym("detuning", 2)
     age, elapsed, omega, learns = ca.vertsplit(times)
 
     # process noise, from the time and the displacement since the last sample
@@ -522,16 +494,42 @@ def _correction(tuning: EstimatorTuning, vibrates: bool) -> Formula:
     angle = lie.rotation_vector_from_quaternion(lie.quaternion_from_rotation(between))
     angular_gain = has_orientation * angular / (angular + t.angular_noise**2)
     inputs = [
-        static, rotation, driven, free, offset, turn, soft_plane, lean, covariance, variances,
-        times, displacements, position, quaternion, has_orientation, slope, slope_now, free_slope,
-        offset_slope, detuning,
+        motion, rotation, motion_now, free_motion, pose_offset, soft_plane, lean, covariance,
+        variances, times, displacements, position, quaternion, has_orientation, offset_slope,
+        detuning,
     ]  # fmt: skip
+    swings = [
+        ca.norm_2(ca.vertcat(each[0, :].T, each[1, :].T / omega)) for each in (driven, free_after)
+    ]
     variances_after = ca.vertcat((1 - axial_gain) * axial, (1 - angular_gain) * angular)
     outputs = [
-        free_after, offset_after, turn + angular_gain * angle, P - gain @ PH.T, variances_after,
-        free_slope_after, offset_slope_after, detuning_after,
+        ca.vertcat(free_after, free_slope_after),
+        ca.vertcat(offset_after, turn + angular_gain * angle), P - gain @ PH.T, variances_after,
+        offset_slope_after, detuning_after, static + driven[0, :].T, ca.vertcat(*swings),
     ]  # fmt: skip
     return Formula(inputs, outputs)
+
+
+def _directions(tuning: EstimatorTuning) -> Formula:
+    """Return the formula of the directions in which the tip vibrates, in base axes.
+
+    Inputs: pose (4, 4) and compliance (6, 6) of the model's tip.
+    Outputs: `soft_plane`, `stiff_axis` and the lean (3, 3), and the principal compliances (3,).
+    """
+    pose, compliance = ca.SX.sym("pose", 4, 4), ca.SX.sym("compliance", 6, 6)
+    values, axes = principal_axes(compliance[:3, :3])
+    rotation, softest = pose[:3, :3], values[2]
+    # in a strongly bent arm no direction is entirely stiff
+    soft = ca.fmin(1, values / (tuning.soft_share * softest))
+    stiff = ca.fmax(0, 1 - values / (tuning.stiff_share * softest))
+    # a tip that leans on objects may give way in one direction only
+    gives = ca.logic_and(values > _GIVES * softest, ca.DM([0, 1, 1]))
+    turns = compliance[3:, :3] @ axes @ ca.diag(gives / ca.if_else(gives, values, 1))
+    outputs = [
+        rotation @ matrix @ axes.T @ rotation.T
+        for matrix in (axes @ ca.diag(soft), axes @ ca.diag(stiff), turns)
+    ]
+    return Formula([pose, compliance], [*outputs, values])
 
 
 def _orientation() -> Formula:

@@ -164,6 +164,31 @@ def with_offsets(law: TrackingRows) -> TrackingRows:
     )
 
 
+def with_reference(law: TrackingRows) -> TrackingRows:
+    """Return a feedback law that takes what it needs from the reference and from averages of it.
+
+    `law` is one of `with_offsets`. In place of the inputs on the reference's path and rate (n,),
+    the vibration intended, the offset accounted for and the average, the last inputs are: the path
+    with its derivatives (4, n + 6), see `Reference.motion`, and the averages (3, 9), see
+    `VibrationFilter.averages`.
+    """
+    *others, accounted, offset, average, slope, stiff_axis, rate, delay, most = law.inputs
+    n = rate.shape[0]
+    motion, averages = ca.SX.sym("motion", 4, n + 6), ca.SX.sym("averages", 3, 9)
+    path, derivative = motion[0, :].T, motion[1, :].T
+    given = [(accounted, path[n:]), (average, averages[0, :].T), (rate, derivative[:n])]
+    if len(others) > 3:  # it vibrates
+        *others, on_path, path_rate, intended = others
+        reached = motion[:2, n : n + 3] - averages[1:, :3]
+        given += [(on_path, path[:n]), (path_rate, derivative[:n]), (intended, reached)]
+    replaced, by = zip(*given, strict=True)
+    return replace(
+        law,
+        inputs=[*others, offset, slope, stiff_axis, delay, most, motion, averages],
+        values=ca.substitute([law.values], list(replaced), list(by))[0],
+    )
+
+
 def with_excess(law: TrackingRows, participation: Array) -> TrackingRows:
     """Return a feedback law that finds the Jacobian of the mode itself.
 

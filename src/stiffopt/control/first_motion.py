@@ -1,9 +1,10 @@
-"""The first motion after arming: slow until the tip has been seen to go where the model goes.
+"""The first motion of each channel: slow until the tip has been seen to go where the model goes.
 
 On a rig that nobody has commissioned, channels may be swapped or the tracker's frame turned. The
 watch of the motion (`MotionWatch`) finds that after a few millimetres, but until the chambers obey
 its hold, a fast arm moves much farther than that. Meanwhile feedback corrects no more than an error
 of the model explains: with swapped channels it drives the tip away, the faster the farther it is.
+A channel that has had no part in the first motion is slow when it has one: what it does is unknown.
 """
 
 from __future__ import annotations
@@ -35,23 +36,37 @@ class FirstMotion:
 
     def begin(self) -> None:
         """Restart with a vented arm."""
-        self._responds = self._is_known
-        self._start: tuple[Array, Array] | None = None  # positions (3,) of model and tip
+        self._responds = np.array(self._is_known)  # of each channel (n,), once the tip is seen
+        # positions (n, 2, 3) of model and tip when each channel began to have a part in the motion
+        self._starts: Array | None = None
         self._on_path: Array | None = None  # position (3,) of the model on the reference's path
 
-    def take(self, modelled: Array, seen: Array) -> None:
-        """Take in where the model has the tip (3,), and where it is seen (3,), in m."""
-        if self._responds:
+    @property
+    def is_over(self) -> bool:
+        """Whether all channels are known to do what the model says."""
+        return bool(self._responds.all())
+
+    def take(self, modelled: Array, seen: Array, parts: Array) -> None:
+        """Take in where the model has the tip (3,), and where it is seen (3,), in m.
+
+        `parts` (3, n) are the parts that the channels' pressures have in the model's way, in m.
+        """
+        if self._is_known:
             return
-        if self._start is None:
-            self._start = modelled.copy(), seen.copy()
-        way, moved = modelled - self._start[0], seen - self._start[1]
-        size, off = float(np.linalg.norm(way)), float(np.linalg.norm(moved - way))
-        self._responds = size > self._tuning.way and off < self._tuning.error * size
+        now, sizes = np.stack([modelled, seen]), np.sqrt((parts**2).sum(axis=0))
+        if self._starts is None:
+            self._starts = np.tile(now, (len(sizes), 1, 1))
+            self._responds = np.zeros(len(sizes), dtype=bool)
+        self._starts[sizes < self._tuning.part] = now
+        way, moved = np.moveaxis(now - self._starts, 1, 0)
+        way_size = np.sqrt((way**2).sum(axis=1))
+        off = np.sqrt(((moved - way) ** 2).sum(axis=1))
+        follows = (way_size > self._tuning.way) & (off < self._tuning.error * way_size)
+        self._responds |= follows & (sizes > self._tuning.way)
 
     def largest_correction(self, on_path: Array) -> float:
         """Return the largest correction, in m, with the model's tip on the reference at (3,)."""
-        if self._responds:
+        if self._responds.any():
             return math.inf
         if self._on_path is None:
             self._on_path = on_path.copy()
@@ -59,6 +74,6 @@ class FirstMotion:
         return self._tuning.correction + self._tuning.error * way
 
     @property
-    def slew_share(self) -> float:
-        """Largest share of the slew that the reference may take now."""
-        return math.inf if self._responds else self._tuning.slew_share
+    def slew_share(self) -> Array:
+        """Largest share of the slew that the reference may take, of each channel (n,) or all."""
+        return np.where(self._responds, math.inf, self._tuning.slew_share)

@@ -128,7 +128,7 @@ class Forecast:
     def here(self) -> Present:
         """Return the controller's present state; `CommandError` if it is not known yet."""
         if self.present is None:
-            raise CommandError("it is not known yet where the arm is; ask again")
+            raise CommandError("the arm's position is not known yet; try again")
         return self.present
 
     def _answer(self, request: PlanRequest) -> Plan:
@@ -146,7 +146,7 @@ class Forecast:
             if requester.gone or time.monotonic() > self._deadline:
                 raise CommandError(
                     f"the way could not be checked within {self._tuning.patience:g} s; the first "
-                    "task of a kind takes longer, so ask again"
+                    "task of a kind takes longer, so try again"
                 )
             time.sleep(self._tuning.look)
 

@@ -38,18 +38,27 @@ class Formula:
     matrices :
         Inputs and outputs that stay matrices even with a single column, such as a Jacobian with
         one column per channel.
+    before :
+        A formula whose outputs are the first inputs. They stay where it leaves them, and are no
+        arguments of a call.
     """
 
     def __init__(
-        self, inputs: Sequence[Any], outputs: Sequence[Any], matrices: Sequence[Any] = ()
+        self,
+        inputs: Sequence[Any],
+        outputs: Sequence[Any],
+        matrices: Sequence[Any] = (),
+        before: Formula | None = None,
     ) -> None:
         dense = ca.cse([ca.densify(output) for output in outputs])
-        self._buffer = Buffer(ca.Function("formula", list(inputs), dense), 1)
+        function = ca.Function("formula", list(inputs), dense)
+        self._buffer: Buffer = Buffer(function, 1, None if before is None else before._buffer)
         self._evaluate = self._buffer.evaluate
         own = {id(matrix) for matrix in matrices}
+        asked = inputs[len(inputs) - len(self._buffer.targets) :]
         self._arguments = [
             target[:, None] if id(symbol) in own and target.ndim == 1 else target
-            for symbol, target in zip(inputs, self._buffer.targets, strict=True)
+            for symbol, target in zip(asked, self._buffer.targets, strict=True)
         ]
         self._results = [
             result[:, 0] if result.shape[1] == 1 and id(expression) not in own else result
@@ -58,7 +67,17 @@ class Formula:
 
     def __call__(self, *arguments: Any) -> list[Array]:
         """Return the outputs' values."""
+        return [result.copy() for result in self.view(*arguments)]
+
+    def view(self, *arguments: Any) -> list[Array]:
+        """Return the outputs' values, in memory that the next call overwrites."""
         for target, argument in zip(self._arguments, arguments, strict=True):
             target[...] = argument
         self._evaluate()
-        return [result.copy() for result in self._results]
+        return self._results
+
+    def again(self, first: Any) -> list[Array]:
+        """Return as `view` for another first argument; the others stay as they were."""
+        self._arguments[0][...] = first
+        self._evaluate()
+        return self._results

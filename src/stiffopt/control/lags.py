@@ -18,6 +18,8 @@ from stiffopt.control.tuning import LagTuning
 
 Array = NDArray[np.float64]
 
+_Z, _ZZ, _BB = 2, 4, 6  # rows of the state
+
 
 class LagEstimator:
     """Estimates the lags of n regulators, in steps of `period`, in s.
@@ -30,56 +32,52 @@ class LagEstimator:
         self, period: float, lag: Array, dead_time: float, slew: Array, tuning: LagTuning
     ) -> None:
         self._file, self._tuning = lag, tuning
-        self._step = _step(period, np.maximum(lag, 1e-6), slew * period, tuning)
-        self._sent: Array = np.zeros((round(dead_time / period) + 1, len(lag)))
-        # z and b, and their variances and covariance, rows of zz, zb and bb
-        self._known: Array = np.zeros((2, len(lag)))
-        self._variances: Array = np.zeros((3, len(lag)))
-        self._variances[0] = tuning.deviation**2
+        depth = round(dead_time / period) + 1
+        self._step = _step(period, np.maximum(lag, 1e-6), slew * period, depth, tuning)
+        # rows (n,): x and its derivative by z; z and b; their variances and covariance zz, zb and
+        # bb; and the commands under way, the oldest first
+        self._state: Array = np.zeros((7 + depth, len(lag)))
+        self._state[_ZZ] = tuning.deviation**2
         self.begin()
 
     def begin(self) -> None:
         """Restart with vented channels; what is known of the lags stays."""
-        self._sent[:] = 0.0
-        self._motion: Array = np.zeros_like(self._known)  # x, and its derivative by z
-        self._known[1], self._variances[1] = 0.0, 0.0
-        self._variances[2] = self._tuning.offset**2
+        lasting = self._state[[_Z, _ZZ]]
+        self._state[:] = 0.0
+        self._state[[_Z, _ZZ]] = lasting
+        self._state[_BB] = self._tuning.offset**2
 
     def advance(self, commanded: Array, reading: Array, lost: NDArray[np.bool_]) -> None:
         """Take a step with commands (n,) and, at its end, readings (n,); NaN: not measured.
 
         Channels that are `lost` (n,) do not follow their commands, and tell nothing.
         """
-        self._sent[:-1] = self._sent[1:]
-        self._sent[-1] = commanded
         seen = np.where(lost, np.nan, reading) if any(lost.tolist()) else reading
-        self._motion, self._known, self._variances = self._step(
-            self._motion, self._known, self._variances, self._sent[0], seen
-        )
+        (self._state,) = self._step(self._state, commanded, seen)
 
     @property
     def lag(self) -> Array:
         """The estimated lags (n,), in s."""
-        return np.asarray(self._file * np.exp(self._known[0]))
+        return np.asarray(self._file * np.exp(self._state[_Z]))
 
     @property
     def deviation(self) -> Array:
         """Their standard deviations (n,), in s."""
-        return np.asarray(self.lag * np.sqrt(self._variances[0]))
+        return np.asarray(self.lag * np.sqrt(self._state[_ZZ]))
 
 
-def _step(period: float, lag: Array, reach: Array, tuning: LagTuning) -> Formula:
-    """Return the formula of a step: motion (2, n), numbers (2, n) and variances (3, n) after it.
+def _step(period: float, lag: Array, reach: Array, depth: int, tuning: LagTuning) -> Formula:
+    """Return the formula of a step of the state (7 + depth, n), see `LagEstimator`.
 
-    Inputs: these, the command (n,) that acts now, and the readings (n,).
+    Inputs: the state, commands (n,), and readings (n,).
     """
     n = len(lag)
-    motion, known, variances = (ca.SX.sym(*a) for a in (("m", 2, n), ("k", 2, n), ("v", 3, n)))
-    command, reading = ca.SX.sym("command", n), ca.SX.sym("reading", n)
-    z, b, x, s = known[0, :], known[1, :], motion[0, :], motion[1, :]
-    zz, zb, bb = ca.vertsplit(variances)
+    state, commanded = ca.SX.sym("state", 7 + depth, n), ca.SX.sym("commanded", n)
+    reading = ca.SX.sym("reading", n)
+    x, s, z, b, zz, zb, bb, _, *sent = ca.vertsplit(state)
+    sent = [*sent, commanded.T]
     decay = ca.exp(-period / (ca.DM(lag).T * ca.exp(z)))
-    away = command.T - x
+    away = sent[0] - x
     free = (1 - decay) * away
     change = ca.fmin(ca.fmax(free, -ca.DM(reach).T), ca.DM(reach).T)
     x = x + change
@@ -101,6 +99,5 @@ def _step(period: float, lag: Array, reach: Array, tuning: LagTuning) -> Formula
     z, b, zz, zb, bb = (
         ca.if_else(tells, new, old) for new, old in zip(updated, (z, b, zz, zb, bb), strict=True)
     )
-    after = ca.vertcat(x, x_z), ca.vertcat(z, b), ca.vertcat(zz, zb, bb)
-    matrices = [motion, known, variances]
-    return Formula([*matrices, command, reading], after, [*matrices, *after])
+    after = ca.vertcat(x, x_z, z, b, zz, zb, bb, *sent)
+    return Formula([state, commanded, reading], [after], [state, after])

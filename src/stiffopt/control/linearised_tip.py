@@ -8,6 +8,7 @@ in it for nearly twice as long, and the tip hardly jumps where one linearisation
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import casadi as ca
@@ -134,7 +135,6 @@ class LinearisedTip:
         low, high = robot.pressure_min, robot.pressure_max
         self._linearisation = _linearisation(low, high, robot.length, linear_range)
         self._tip: TipAt | None = None  # at the operating point
-        self._operating_point = np.full(robot.n_pressures, np.inf)
 
     @property
     def is_fast(self) -> bool:
@@ -144,39 +144,38 @@ class LinearisedTip:
     def change(self, robot: Manipulator) -> None:
         """Change to another arm; see `TipModel.change`."""
         self._tip = None
-        self._operating_point = np.full(robot.n_pressures, np.inf)
         self._model.change(robot)
 
     def lean(self, leaning: LeaningTip | None) -> None:
         """Change to the model of an arm that leans on objects; None: of the free arm."""
         self._leaning, self._tip = leaning, None
-        self._operating_point = np.full_like(self._operating_point, np.inf)
 
     def at(self, pressures: Array) -> TipAt:
         """Return the tip at pressures (n,), in Pa; `StiffoptError` without an equilibrium there."""
-        tip, point = self._tip, self._operating_point
-        if tip is None:
-            p, *_ = self._linearisation(pressures, point, np.eye(4), np.zeros((6, len(point))))
-            return self._evaluate(p)
-        p, motion, pose, ahead = self._linearisation(pressures, point, tip.pose, tip.jacobian)
-        if self._leaning is not None:
-            return self._evaluate(p)
+        tip = self._tip
+        p, motion, pose, ahead = self._linearisation.again(pressures)
+        if tip is None or self._leaning is not None:
+            return self._evaluate(p.copy())
         if not motion[0] < self._linear_range:
+            p, ahead = p.copy(), ahead.copy()
             try:
                 tip = self._evaluate(ahead)
             except StiffoptError:
                 return self._evaluate(p)
-            _, _, pose, _ = self._linearisation(p, ahead, tip.pose, tip.jacobian)
-        return TipAt(pose, tip.jacobian, tip.compliance)
+            _, _, pose, _ = self._linearisation.again(p)
+        return TipAt(pose.copy(), tip.jacobian, tip.compliance)
 
     def _evaluate(self, pressures: Array) -> TipAt:
         """Return the tip at pressures (n,), about which it is linearised from now on."""
         try:
-            self._tip = (self._leaning or self._model).at(pressures)
+            tip = (self._leaning or self._model).at(pressures)
         except (EquilibriumError, PressureError) as error:
             raise StiffoptError(f"the model has no answer: {error}") from error
-        self._operating_point = pressures
-        return self._tip
+        if not math.isfinite(tip.compliance.sum()):
+            raise StiffoptError("the model has no answer: its compliance is not finite")
+        self._linearisation.view(pressures, pressures, tip.pose, tip.jacobian)
+        self._tip = tip
+        return tip
 
 
 def _linearisation(low: Array, high: Array, length: float, linear_range: float) -> Formula:

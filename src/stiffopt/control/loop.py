@@ -30,7 +30,7 @@ from stiffopt.safety.gate import Outlet
 
 _STARTING = (
     "not while unconfigured: it is still starting, connects to the rig and checks it, which takes "
-    "up to a minute or so; ask again when the state is inactive"
+    "up to a minute or so; try again when the state is inactive"
 )
 
 

@@ -200,11 +200,12 @@ class MotionWatch:
 
     def _is_pushed(self) -> bool:
         """Return whether something has just displaced the tip while the reference rested."""
-        tuning, rows = self._tuning, self._since(self._tuning.slip_window)
-        if np.ptp(rows[:, _INTENDED], axis=0).max() > tuning.noise:
+        tuning, now = self._tuning, self._rows[self._count - 1, _OFFSET]
+        before = self._since(tuning.push_time)[0, _OFFSET]
+        if not math.dist(before.tolist(), now.tolist()) > tuning.push:
             return False
-        jump = self._since(tuning.push_time)[0, _OFFSET] - rows[-1, _OFFSET]
-        return float(np.linalg.norm(jump)) > tuning.push
+        intended = self._since(tuning.slip_window)[:, _INTENDED]
+        return not np.ptp(intended, axis=0).max() > tuning.noise
 
     def _is_early(self, time: float) -> bool:
         last = self._rows[self._count - 1, _TIME] if self._count else -np.inf
@@ -219,7 +220,8 @@ class MotionWatch:
     def _since(self, duration: float) -> Array:
         """Return the samples (k, 18 + n) of the last so many seconds."""
         rows = self._rows[: self._count]
-        return rows[np.searchsorted(rows[:, _TIME], rows[-1, _TIME] - duration) :]
+        times = rows[:, _TIME]
+        return rows[times.searchsorted(times[-1] - duration) :]
 
     def _explained(self, changes: Array, jacobian: Array) -> Array:
         """Return the model errors (k,) to expect over changes between samples, in m.
@@ -293,8 +295,8 @@ class MotionWatch:
             )
         return Doubt(
             "no-response",
-            f"{text} another way: channels are swapped, the tracker's frame is turned, the sensor "
-            "has slipped, or something pushes the arm; run 'stiffopt commission'",
+            f"{text} in another direction: channels are swapped, the tracker's frame is turned, "
+            "the sensor has slipped, or something pushes the arm; run 'stiffopt commission'",
         )
 
     def _missed(self, rows: Array, by_segments: Array, P: Array) -> _Miss:
@@ -379,7 +381,7 @@ class MotionWatch:
         return Doubt(
             "slip",
             f"the tip seems to have been displaced by {1e3 * distance:.1f} mm without being "
-            "turned, as no push or payload does it: the sensor has slipped, or tracker or base "
+            "turned, which no push or payload does: the sensor has slipped, or tracker or base "
             "have been moved; run 'stiffopt commission'",
         )
 
@@ -426,14 +428,15 @@ class MotionWatch:
         if self._rows[self._count - 1, _TIME] - duration < first:
             return 0.0
         rows = self._since(duration)
-        ends = rows[-1, _TIME] - scale.interval * np.arange(scale.count, -1, -1)
-        marks = rows[np.minimum(np.searchsorted(rows[:, _TIME], ends), len(rows) - 1)]
-        offsets = marks[:, _SEEN] - marks[:, _PREDICTED]
-        drift = offsets[-1] - offsets[0]
-        size = float(np.linalg.norm(drift))
+        whole = rows[-1] - rows[0]
+        drift = whole[_SEEN] - whole[_PREDICTED]
+        size = math.hypot(*drift.tolist())
         least = scale.least_speed * scale.interval + 2 * self._tuning.scatter
         if size < scale.count * least:  # the sum of the parts along it
             return 0.0
+        ends = rows[-1, _TIME] - scale.interval * np.arange(scale.count, -1, -1)
+        marks = rows[np.minimum(rows[:, _TIME].searchsorted(ends), len(rows) - 1)]
+        offsets = marks[:, _SEEN] - marks[:, _PREDICTED]
         along = np.diff(offsets, axis=0) @ drift / max(size, 1e-9)
         explained = self._explained(np.diff(marks, axis=0), jacobian)
         if (along - explained < least).any() or self._is_push(marks[-1] - marks[0], turning):

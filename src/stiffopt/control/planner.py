@@ -17,6 +17,7 @@ import socket
 import subprocess
 import sys
 import time
+import warnings
 from contextlib import suppress
 from dataclasses import replace
 from multiprocessing.connection import Connection
@@ -27,7 +28,8 @@ import numpy as np
 from stiffopt.control.interface import Notice
 from stiffopt.control.planning import Plan, Planning, PlanRequest
 from stiffopt.control.state import Severity
-from stiffopt.errors import StiffoptError
+from stiffopt.control.vibration import BentMode
+from stiffopt.errors import SlowWarning, StiffoptError
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.scene import Scene
 
@@ -226,9 +228,12 @@ class PlannerEnd:
         request = self._sent
         if request is None or answer is None or isinstance(answer, str):
             return None if answer is None else str(answer)
+        if bent := answer.pop("bent"):
+            bent = BentMode(*map(np.array, bent))
         return Plan(
             serial=request.serial,
             pressures=np.array(answer.pop("pressures")),
+            bent=bent,
             offset=request.offset,
             target=request.target,
             adapted=request.adapted,
@@ -254,10 +259,12 @@ class PlanningEnd:
         if isinstance(answer, Plan):
             names = (
                 *("reached", "stiffness", "message", "far", "short", "blocked", "doubt"),
-                *("deviation", "estimate", "approach", "bent"),
+                *("deviation", "estimate", "approach"),
             )
-            own = {name: getattr(answer, name) for name in names}
-            self.connection.send({"pressures": answer.pressures.tolist(), **own})
+            news: dict[str, Any] = {name: getattr(answer, name) for name in names}
+            bent = answer.bent  # the tick receives it, so its arrays are lists as well
+            modes = bent and [each.tolist() for each in (bent.jacobian, bent.linear, bent.plane)]
+            self.connection.send({"pressures": answer.pressures.tolist(), "bent": modes, **news})
         else:
             self.connection.send(answer)
 
@@ -267,6 +274,7 @@ def main(end: PlanningEnd) -> None:
 
     It ends when the other end is closed.
     """
+    warnings.simplefilter("ignore", SlowWarning)  # the loop reports that a plan takes long
     robot, scene = end.connection.recv()
     planning = Planning(robot, scene)
     end.answer(None)

@@ -49,7 +49,8 @@ class Reference:
     ) -> None:
         self._lag = lag
         self._step = _step(period, slew, damping, extra)
-        self.slew_share = slew_share  # share of the slew that the pressures may use
+        # share of the slew that the pressures may use, of each (n,) or all
+        self.slew_share: float | Array = slew_share
         # motion of the tip per pressure (3, n), over the greatest one in a step; 0: no bound
         self.motion_share: Array = np.zeros((3, len(slew)))
         self.rate = 1.0  # a of the four lags, in 1/s
@@ -109,6 +110,10 @@ class VibrationFilter:
     of them. The first mode, with damping ratio zeta, follows the average on a path without residual
     vibration: the average is two steps of half the height, T / 2 apart (zero-vibration shaping), of
     the mean of two values that are T / 4 apart. It is late by 3 / 8 T.
+
+    Attributes
+    ----------
+    averages : the average, and path and speed of the mode (3, m).
     """
 
     def __init__(self, period: float, damping: float, m: int) -> None:
@@ -123,14 +128,24 @@ class VibrationFilter:
         self._past = np.tile(values, (2 * self._kept, 1))
         self._newest = self._kept
         self._omega, self._weights = math.inf, np.array([[1.0], [1.0], [0.0]])
-        self.value = values  # the average
-        self.motion = np.stack([values, np.zeros(len(values))])  # path and speed of the mode
+        self.averages: Array = np.stack([values, values, np.zeros(len(values))])
 
     def shift(self, change: Array) -> None:
         """Add a change (m,) to all values, past ones as well."""
         self._past += change
-        self.value = self.value + change
-        self.motion = self.motion + np.stack([change, np.zeros(len(change))])
+        self.averages = self.averages + np.stack([change, change, np.zeros(len(change))])
+
+    @property
+    def value(self) -> Array:
+        """The average (m,)."""
+        value: Array = self.averages[0]
+        return value
+
+    @property
+    def motion(self) -> Array:
+        """Path and speed of the mode (2, m)."""
+        motion: Array = self.averages[1:]
+        return motion
 
     def advance(self, values: Array, omega: float) -> None:
         """Take in values (m,) with a vibration of `omega`, in rad/s; infinite: no vibration."""
@@ -139,8 +154,7 @@ class VibrationFilter:
         if omega != self._omega:
             self._omega, self._weights = omega, self._shape(omega)
         past = self._past[self._newest : self._newest + self._weights.shape[1]]
-        averaged = self._weights @ past
-        self.value, self.motion = averaged[0], averaged[1:]
+        self.averages = self._weights.dot(past)
 
     def _shape(self, omega: float) -> Array:
         """Return weights (3, k) of average, path and speed, for the newest value first."""
@@ -173,17 +187,17 @@ def _step(period: float, slew: Array, damping: float, extra: int) -> Formula:
     """Return the formula of a step: states (5, n + m), motion (4, n + m), command, chamber (n,).
 
     Inputs: states, the first being the input of the lags; the plan (n + m,); the rate of the lags,
-    in 1/s; omega of the vibration, in rad/s; the regulators' lag, in s; the share of `slew`, the
-    greatest rate of the n pressures, that may be used; the motion of the tip per pressure (3, n),
+    in 1/s; omega of the vibration, in rad/s; the regulators' lag, in s; the shares of `slew`, the
+    greatest rates of the n pressures, that may be used; the motion of the tip per pressure (3, n),
     over the greatest one in a step, of all channels or of one.
     """
     n = len(slew)
     states, plan = ca.SX.sym("states", _LAGS + 1, n + extra), ca.SX.sym("plan", n + extra)
     rate, omega, lag = ca.SX.sym("rate"), ca.SX.sym("omega"), ca.SX.sym("lag")
-    slew_share, motion_share = ca.SX.sym("slew_share"), ca.SX.sym("motion_share", 3, n)
+    slew_share, motion_share = ca.SX.sym("slew_share", n), ca.SX.sym("motion_share", 3, n)
     way = plan.T - states[0, :]
     # all channels take the share of their way that the slowest one can cover in a step
-    steps = ca.mmax(ca.fabs(way[:n]).T / ca.DM(slew * period)) / slew_share
+    steps = ca.mmax(ca.fabs(way[:n]).T / ca.DM(slew * period) / slew_share)
     moved = motion_share @ ca.diag(way[:n])
     squares = ca.vertcat(ca.sum1(moved**2).T, ca.sumsqr(ca.sum2(moved)))
     steps = ca.fmax(steps, ca.sqrt(ca.mmax(squares)))

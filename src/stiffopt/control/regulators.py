@@ -65,23 +65,25 @@ class RegulatorModel:
 
     def begin(self, pressures: Array) -> None:
         """Restart, settled at pressures (n,)."""
-        self.pressures = pressures.copy()  # now, in Pa
-        self.offset = np.zeros_like(pressures)  # b, in Pa: settled pressures relative to commands
-        self.ahead = self.pressures  # a dead time from now; no further command can change them
-        self.healthy = np.stack([pressures, pressures])  # healthy range (2, n), in Pa
-        self._sent = np.tile(pressures, (self._depth, 1))  # commands under way, the oldest first
+        state = np.tile(pressures, (5 + self._depth, 1))
+        state[1] = 0.0
+        self._set(state)
+
+    def _set(self, state: Array) -> None:
+        """Set the state (5 + k, n); its last rows are k commands under way, the oldest first."""
+        self._state = state
+        self.pressures: Array = state[0]  # now, in Pa
+        self.offset: Array = state[1]  # b, in Pa: settled pressures relative to commands
+        self.ahead: Array = state[2]  # a dead time from now; no further command can change them
+        self.healthy: Array = state[3:5]  # healthy range (2, n), in Pa
 
     def advance(self, commanded: Array, reading: Array) -> Array:
         """Take a step with commands (n,) and, at its end, readings (n,); NaN: not measured.
 
         Return the pressures (n,) after it, in Pa.
         """
-        sent = self._sent
-        sent[:-1] = sent[1:]
-        sent[-1] = commanded
-        self.pressures, self.offset, self.ahead, self.healthy = self._step(
-            self.pressures, self.offset, sent, reading, self._share, self.healthy
-        )
+        (state,) = self._step(self._state, commanded, reading, self._share)
+        self._set(state)
         return self.pressures
 
 
@@ -167,16 +169,17 @@ def _share(period: float, lag: Array) -> Array:
 def _step(
     reach: Array, depth: int, slow: tuple[Array, int], period: float, tuning: RegulatorTuning
 ) -> Formula:
-    """Return the formula of a step: pressures, offset, pressures ahead (n,), healthy range (2, n).
+    """Return the formula of a step of the state (5 + k, n), see `RegulatorModel`.
 
-    Inputs: pressures and offset (n,), the commands under way, of which the pressures know the last
-    `depth`, readings (n,), the share (n,) of its way that a pressure goes in a step, and the
-    healthy range (2, n). `slow` are share and depth of the slowest healthy regulators.
+    Inputs: the state, commands and readings (n,), and the share (n,) of its way that a pressure
+    goes in a step. Of the k commands under way the pressures know the last `depth`; `slow` are
+    share and depth of the slowest healthy regulators.
     """
     n, most = len(reach), max(depth, slow[1])
-    share = ca.SX.sym("share", n)
-    x, offset, reading = ca.SX.sym("x", n), ca.SX.sym("offset", n), ca.SX.sym("reading", n)
-    sent, healthy = ca.SX.sym("sent", most, n), ca.SX.sym("healthy", 2, n)
+    state, commanded = ca.SX.sym("state", 5 + most, n), ca.SX.sym("commanded", n)
+    reading, share = ca.SX.sym("reading", n), ca.SX.sym("share", n)
+    x, offset, low, high = (state[row, :].T for row in (0, 1, 3, 4))
+    sent = ca.vertcat(state[6:, :], commanded.T)
 
     def limited(change: Any) -> Any:
         return ca.fmin(ca.fmax(change, -ca.DM(reach)), ca.DM(reach))
@@ -195,12 +198,10 @@ def _step(
     least, greatest = (
         ca.vertcat(*(choose(late[:, k]) for k in range(n))) for choose in (ca.mmin, ca.mmax)
     )
-    low, high = healthy[0, :].T, healthy[1, :].T
     low = ca.fmin(least, low + limited(ca.DM(slow[0]) * (least - low)))
     high = ca.fmax(greatest, high + limited(ca.DM(slow[0]) * (greatest - high)))
-    after = ca.horzcat(low, high).T
-    inputs = [x, offset, sent, reading, share, healthy]
-    return Formula(inputs, [now, offset_after, ahead, after], [sent, healthy, after])
+    after = ca.vertcat(ca.horzcat(now, offset_after, ahead, low, high).T, sent)
+    return Formula([state, commanded, reading, share], [after], [state, after])
 
 
 def _regulation(robot: RobotDescription, control: ControlSettings) -> tuple[Array, float]:

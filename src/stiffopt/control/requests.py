@@ -137,13 +137,13 @@ class Requests:
     def _in_the_rigs_scene(self, task: Task) -> Task:
         """Return a task in the rig's scene; refuse it if the scene lacks the brace's objects."""
         if self._scene is None:
-            raise InputError("brace: the rig file has no scene, so nothing to lean on is known")
+            raise InputError("brace: the rig file has no scene with objects to lean on")
         on_rig = task.model_copy(update={"scene": self._scene})
         assert on_rig.brace is not None
         try:
             on_rig.brace.check(on_rig)
         except BadKeyError as error:
-            raise InputError(f"{dotted(error.loc)}: {error}; that is of the rig's scene") from None
+            raise InputError(f"{dotted(error.loc)}: {error} (in the rig's scene)") from None
         return on_rig
 
     def _limited(self, task: Task) -> Task:

@@ -190,7 +190,7 @@ class Supervisor:
             self.alarms.set(
                 now,
                 "not-vented",
-                f"the supply does not take the command to vent ({error}); it is repeated, and "
+                f"the supply does not accept the command to vent ({error}); it is repeated, and "
                 "the device's own watchdog vents if it has one",
                 Severity.ERROR,
             )
@@ -471,7 +471,7 @@ class Supervisor:
         self._ramp = None
         self._try_to_vent(now)
         if not self.vented:
-            self.fault(now, "device", "the supply does not take the command to vent")
+            self.fault(now, "device", "the supply does not accept the command to vent")
             return
         if self.lifecycle.armed:
             self.lifecycle.change(State.INACTIVE, reason)
@@ -545,7 +545,7 @@ class Supervisor:
         if problems:
             raise CommandError("; ".join(problems))
         if unwanted():
-            raise CommandError("the checks took longer than anybody waited; arm again")
+            raise CommandError("the checks took longer than the client waited; arm again")
         now = self._clock.now()  # checks take time
         self.vented = False
         try:

@@ -8,7 +8,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stiffopt.control.allocation import Allocation
-from stiffopt.control.feedback import GainSchedule, tracking_rows, with_excess, with_offsets
+from stiffopt.control.feedback import (
+    GainSchedule,
+    tracking_rows,
+    with_excess,
+    with_offsets,
+    with_reference,
+)
 from stiffopt.control.motion_error import MotionErrorEstimator
 from stiffopt.control.observer import ArmObserver
 from stiffopt.control.reference import Reference, VibrationFilter
@@ -66,7 +72,7 @@ class TipFeedback:
             self._gains = GainSchedule(period, lag, control.damping, tuning.effort)
             law = with_excess(law, mode.participation)
         self._allocation = Allocation(
-            with_offsets(law),
+            with_reference(with_offsets(law)),
             limits.low,
             limits.high,
             slew * period,
@@ -127,24 +133,23 @@ class TipFeedback:
             Modes of the arm near here, from which the estimator's `excess` is; None: those of the
             straight arm.
         """
-        n, arm = len(goal), self._arm
-        position = tip.pose[:3, 3]
+        arm, position = self._arm, tip.pose[:3, 3]
         self._learn(position, follows)
-        average = self._average(np.concatenate([offset, position]))
+        self._average(np.concatenate([offset, position]))
         self._allocation.limit(*limits)
-        vibration = self._vibration_inputs(reference, bent)
         command, held, residual = self._allocation.solve(
             (
-                tip.pose, tip.jacobian, prescribed, *vibration,
-                reference.path[n:], offset, average, self._motion_error.slope, arm.tip.stiff_axis,
-                reference.motion[1, :n], arm.pressures.lag + arm.pressures.dead_time, most,
+                tip.pose, tip.jacobian, prescribed, *self._vibration_inputs(reference, bent),
+                offset, self._motion_error.slope, arm.tip.stiff_axis,
+                arm.pressures.lag + arm.pressures.dead_time, most,
+                reference.motion, self._averaged.averages,
             ),
             goal,
             arm.pressures.command,
         )  # fmt: skip
         if command is not None:
             reported = residual > self._tuning.unreported_error
-            self.saturated = held if reported else np.zeros(n, dtype=bool)
+            self.saturated = held if reported else np.zeros(len(goal), dtype=bool)
         return command
 
     def _learn(self, position: Array, follows: bool | None) -> None:
@@ -161,26 +166,26 @@ class TipFeedback:
         elif modelled is not None:
             self._motion_error.learn(self._period, modelled.pose[:3, 3], self._arm.tip.offset[:3])
 
-    def _average(self, now: Array) -> Array:
-        """Return offset and position (9,) of the tip, averaged over a vibration."""
+    def _average(self, now: Array) -> None:
+        """Average offset and position (9,) of the tip over a vibration."""
         if self._is_new:
             self._averaged.begin(now)
             self._is_new = False
         self._averaged.advance(now, self._arm.tip.omega)
-        return self._averaged.value
 
     def _vibration_inputs(
         self, reference: Reference, bent: BentMode | None
     ) -> tuple[ArrayLike, ...]:
-        """Return the inputs of `tracking_rows` and `with_excess` for an arm that vibrates."""
+        """Return the inputs of `tracking_rows` and `with_excess` for an arm that vibrates.
+
+        Those that `with_reference` replaces are left out.
+        """
         if self._gains is None:
             return ()
-        estimator, pressures = self._arm.tip, self._arm.pressures
-        motion, n = reference.motion, len(pressures.command)
+        estimator = self._arm.tip
         plane = estimator.soft_plane if bent is None else bent.plane
         return (
             estimator.vibration, plane, estimator.excess, estimator.omega,
-            self._gains.at(estimator.omega), pressures.effective_ahead,
-            self._arm.strained_ahead, reference.chamber, motion[0, :n], motion[1, :n],
-            motion[:2, n : n + 3] - self._averaged.motion[:, :3],
+            self._gains.at(estimator.omega), self._arm.pressures.effective_ahead,
+            self._arm.strained_ahead, reference.chamber,
         )  # fmt: skip

@@ -30,10 +30,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt.control.creep import CreepEstimator
+from stiffopt.control.formula import Formula
+from stiffopt.control.principal import principal_axes
 from stiffopt.control.tuning import CreepTuning, TouchTuning
 from stiffopt.optimise.press import SOFT_SHARE
 from stiffopt.optimise.tip import TipAt
@@ -132,6 +135,7 @@ class TouchEstimator:
         self._presses = False
         # change of the state when a force begins
         self._begins = np.array([1.0, 0.0, 0.0, 0.0, 0.0, -swings, 0.0])
+        self._feeling = _feeling()
         self.begin()
 
     def begin(self) -> None:
@@ -286,11 +290,8 @@ class TouchEstimator:
         if tip.compliance is self._looked_at:
             return
         self._looked_at = tip.compliance
-        R = tip.pose[:3, :3]
-        compliances, axes = np.linalg.eigh(R @ tip.compliance[:3, :3] @ R.T)
-        soft = compliances > SOFT_SHARE * compliances[2]
-        self._softest, axes = float(compliances[2]), axes[:, soft]
-        self._stiffness, self._felt_axes = axes / compliances[soft] @ axes.T, axes @ axes.T
+        self._stiffness, self._felt_axes, softest = self._feeling(tip.pose, tip.compliance)
+        self._softest = float(softest[0])
 
     def _moved(self, pressures: Array, jacobian: Array) -> Array:
         """Return displacements (3, s) of the model's tip by segment since the last sample, in m."""
@@ -441,6 +442,20 @@ class TouchEstimator:
         self._filters = self._filters.keep([0])
         self._filters.means = merged @ self._filters.means
         self._filters.covariances = merged @ self._filters.covariances @ merged.T
+
+
+def _feeling() -> Formula:
+    """Return the formula of how a tip feels a force, in base axes.
+
+    Inputs: pose (4, 4) and compliance (6, 6) of the tip. Outputs: its stiffness (3, 3) in the
+    directions in which it is soft, the projection (3, 3) on these, and its largest compliance.
+    """
+    pose, compliance = ca.SX.sym("pose", 4, 4), ca.SX.sym("compliance", 6, 6)
+    values, axes = principal_axes(compliance[:3, :3])
+    axes, soft = pose[:3, :3] @ axes, values > SOFT_SHARE * values[2]
+    stiff = soft / ca.if_else(soft, values, 1)  # where the tip leans on an object, values may be 0
+    stiffness, felt = (axes @ ca.diag(each) @ axes.T for each in (stiff, soft))
+    return Formula([pose, compliance], [stiffness, felt, values[2]])
 
 
 def _length(way: Array) -> float:

@@ -134,10 +134,11 @@ class FirstMotionTuning:
     """The first motion of an arm that is not known to respond as modelled (`FirstMotion`)."""
 
     slew_share: float = 0.1  # share of the slew that the reference may take
-    # way of the model's tip after which it ends, in m, if the tip has followed with an error of at
-    # most a share of that way
+    # way of the model's tip, and part of a channel in it, after which it ends, in m, if the tip has
+    # followed with an error of at most a share of that way; it begins with a smaller part
     way: float = 8e-3
     error: float = 0.5
+    part: float = 1e-3
     # largest correction by feedback at first, in m; it grows with the reference's way by `error`
     correction: float = 2e-3
 

@@ -17,9 +17,9 @@ from urllib.parse import urlsplit
 from numpy.typing import ArrayLike
 
 from stiffopt.control.state import Event, Snapshot, State
+from stiffopt.daemon.address import local_url
 from stiffopt.daemon.messages import TargetMessage, TaskMessage, TrajectoryMessage
 from stiffopt.daemon.reports import LEASE_HEADER, RobotReport, error_of
-from stiffopt.daemon.secret import bracketed
 from stiffopt.daemon.state_json import record_of
 from stiffopt.errors import (
     CommandError,
@@ -186,7 +186,7 @@ class Client:
                 raise CommandError(f"the arm does not move; it is {state.state}{reason}")
             errors = (state.position_error, state.angle_error)
             if all(map(math.isnan, errors)):
-                raise CommandError("nothing is asked of the tip; set a target first")
+                raise CommandError("the tip has no target; set one first")
             limits = (position_tolerance, angle_tolerance)
             near = not any(e > limit for e, limit in zip(errors, limits, strict=True))
             near_since = min(near_since, now) if near else math.inf
@@ -549,8 +549,7 @@ class ClientStream:
 
 def daemon_url(service: ServiceSettings) -> str:
     """Return the URL of a daemon for clients on its machine, from the rig file's `service`."""
-    host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(service.host, service.host)
-    return f"http://{bracketed(host)}:{service.port}"
+    return local_url(service.host, service.port)
 
 
 def _token(given: str | os.PathLike[str] | None) -> str | None:
@@ -564,7 +563,7 @@ def _token(given: str | os.PathLike[str] | None) -> str | None:
             raise InputError(f"the token's file '{os.fspath(given)}' cannot be read") from None
         token = given
     if not (token.isascii() and token.isprintable()):
-        raise InputError("the token has characters that no token has")
+        raise InputError("the token has characters that a token cannot have")
     return token
 
 

@@ -20,16 +20,16 @@ from stiffopt.control.lifecycle import ARMED
 from stiffopt.control.loop import ControlLoop
 from stiffopt.control.state import Severity, Snapshot, State
 from stiffopt.control.ways import ClearanceWatch
+from stiffopt.daemon.address import bracketed
 from stiffopt.daemon.calls import call_in_thread, ends_within
 from stiffopt.daemon.keeper import Keeper, LogEvents, ServiceManager
-from stiffopt.daemon.secret import Secret, bracketed, check_exposure
+from stiffopt.daemon.secret import Secret, check_exposure
 from stiffopt.errors import CommandError, FileError, InputError, MissingExtraError, StiffoptError
 from stiffopt.files import file_text
 from stiffopt.model.manipulator import load_robot
-from stiffopt.model.robot_files import robot_path
 from stiffopt.optimise.task import Task, load_task
 from stiffopt.paths.motion_file import MotionTable, read_motion
-from stiffopt.rig.config import RigDescription, load_rig_description
+from stiffopt.rig.config import RigDescription, load_rig
 from stiffopt.safety.guard_client import GuardLink
 from stiffopt.safety.realtime import real_time, tidy
 from stiffopt.safety.rigs import guarded_rig
@@ -118,25 +118,26 @@ class Daemon:
         log_folder: str | os.PathLike[str] | None = None,
         json_lines: bool = False,
     ) -> None:
-        self.description = description = load_rig_description(rig)
+        description, robot = load_rig(rig)
+        self.description = description
         if description.rate > _FASTEST:
             raise FileError(
                 rig, f"{description.rate:g} Hz is too fast; at most {_FASTEST:g} Hz", key="rate"
             )
-        self.robot = load_robot(robot_path(description.robot, Path(rig).parent))
+        self.robot = load_robot(robot)
         self.trouble = ""
         self.hung: tuple[str, ...] = ()
         self._folder = os.fspath(log_folder or description.log.folder)
         self._manager = ServiceManager()
-        guarded, self.link = guarded_rig(description, self.robot.description, json_lines=json_lines)
+        guarded, self.link = guarded_rig(description, robot, json_lines=json_lines)
         self._clock = guarded.clock
         period, scene = 1 / description.rate, description.scene
         self._controller = TipController(
-            load_robot(commissioned_robot(description, self.robot.description)),
+            load_robot(commissioned_robot(description, robot)),
             self.link.limits,
             guarded.slew,
             period=period,
-            control=commissioned_control(description, self.robot.description),
+            control=commissioned_control(description, robot),
             safety=description.safety,
             vibrates=_vibrates(description),
             scene=scene,
@@ -224,7 +225,7 @@ class Daemon:
             The guard does not start.
         """
         if self._started:
-            raise InputError("a daemon is started once; make another one")
+            raise InputError("a daemon can be started only once; make another one")
         self._started = True
         try:
             self._log.attach()

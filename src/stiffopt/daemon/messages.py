@@ -139,7 +139,7 @@ class SchemaMessage(_Message):
         if lost:
             places = listed([dotted(place) for place in lost])
             raise InputError(
-                f"{places}: the daemon's messages cannot say this, and it would be lost"
+                f"{places}: the daemon's messages cannot contain this, so it would be lost"
             )
         return _valid(TypeAdapter(cls), message, ())
 

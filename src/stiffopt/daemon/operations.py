@@ -235,7 +235,7 @@ class Operations:
         if lasting:
             outcome = "this is done as soon as it can be"
         elif never:
-            outcome = "it will not do this any more; look at the state, and ask again"
+            outcome = "it will not do this any more; look at the state, and send it again"
         else:
             outcome = "whether it will still do this is not known: look at the state, or vent"
         late = f"the control loop did not answer within {self._patience:g} s"

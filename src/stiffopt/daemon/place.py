@@ -10,8 +10,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from urllib.parse import urlsplit
 
+from stiffopt.daemon.address import is_address
 from stiffopt.daemon.reports import RefusalError
-from stiffopt.daemon.secret import is_address
 
 
 def check_place(
@@ -45,7 +45,7 @@ def check_place(
         scheme, _, place = origin.partition("://")
         if scheme not in ("http", "https") or place.lower() != hosts[0].lower():
             raise RefusalError(
-                403, "origin", f"pages of other sites may not speak to this {server}"
+                403, "origin", f"pages of other sites may not send requests to this {server}"
             )
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -40,12 +41,6 @@ class RecordingLimits:
     retry: float = 10.0
 
 
-def free_bytes(folder: str) -> float:
-    """Return how many bytes an ordinary user may still write in a folder."""
-    disk = os.statvfs(folder)
-    return float(disk.f_bavail * disk.f_frsize)
-
-
 class RunRecording:
     """Records everything that is logged in a context of foxglove.
 
@@ -76,7 +71,7 @@ class RunRecording:
         about: Mapping[str, str],
         *,
         wall: Callable[[], float] = time.time,
-        free: Callable[[str], float] = free_bytes,
+        free: Callable[[str], float] = lambda folder: shutil.disk_usage(folder).free,
         limits: RecordingLimits = RecordingLimits(),
     ) -> None:
         self.path: str | None = None

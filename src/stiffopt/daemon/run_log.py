@@ -143,7 +143,7 @@ def _run_of_contents(path: str | os.PathLike[str], found: McapContents) -> Recor
             path, f"has the format '{about.get('format')}'; this stiffopt reads '{FORMAT}'"
         )
     if not found.of_topic("/pressure"):
-        raise FileError(path, "has no whole message of a run; it was cut short too early")
+        raise FileError(path, "has no complete message of a run; it was truncated too early")
     try:
         return _run(about, found)
     except (KeyError, ValueError, TypeError) as error:

@@ -10,12 +10,11 @@ from __future__ import annotations
 import fcntl
 import os
 import secrets
-import socket
 import stat
 from contextlib import suppress
-from ipaddress import ip_address
 from pathlib import Path
 
+from stiffopt.daemon.address import is_loopback
 from stiffopt.errors import FileError, InputError, os_reason
 from stiffopt.rig.settings import ServiceSettings
 
@@ -50,7 +49,7 @@ def _check_folder(folder: Path) -> None:
     if found.st_mode & stat.S_IWOTH and not found.st_mode & stat.S_ISVTX:
         raise FileError(
             folder,
-            f"is writable for all, so that anyone can exchange files there; take that right away "
+            f"is writable for all, so that anyone can exchange files there; remove that permission "
             f"(chmod o-w), or {_OTHERWISE}",
         )
 
@@ -188,18 +187,6 @@ class Secret:
 # Who can reach the interface, and whether the token is good enough for that
 
 
-def is_loopback(host: str) -> bool:
-    """Return whether only this machine can reach a server on a host.
-
-    A name is on loopback if it has addresses and all of them are.
-    """
-    try:
-        found = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
-    except OSError:
-        return False
-    return bool(found) and all(ip_address(place[0]).is_loopback for *_, place in found)
-
-
 def check_exposure(host: str, token: str, *, given: bool) -> list[tuple[str, str]]:
     """Return the warnings for a control interface on a host: kinds and texts of events.
 
@@ -224,17 +211,3 @@ def check_exposure(host: str, token: str, *, given: bool) -> list[tuple[str, str
         text = f"the token is shorter than {MIN_TOKEN} characters; others here may guess it"
         return [("token", text)]
     return []
-
-
-def bracketed(host: str) -> str:
-    """Return a host as a URL writes it."""
-    return f"[{host}]" if ":" in host else host
-
-
-def is_address(name: str) -> bool:
-    """Return whether a host is an IP address, not a name."""
-    try:
-        ip_address(name)
-    except ValueError:
-        return False
-    return True

@@ -18,9 +18,9 @@ from typing import Any
 
 from starlette.datastructures import Headers
 
+from stiffopt.daemon.address import bound_socket, local_url
 from stiffopt.daemon.messages import MAX_MESSAGE
-from stiffopt.daemon.secret import bracketed
-from stiffopt.errors import InputError, MissingExtraError, ServiceError, os_reason
+from stiffopt.errors import MissingExtraError, ServiceError
 
 try:
     import uvicorn
@@ -69,8 +69,7 @@ class Server:
     @property
     def url(self) -> str:
         """URL for clients on this machine."""
-        host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(self._host, self._host)
-        return f"http://{bracketed(host)}:{self.port}"
+        return local_url(self._host, self.port)
 
     @property
     def alive(self) -> bool:
@@ -88,7 +87,7 @@ class Server:
             The server does not start.
         """
         limiter = getattr(getattr(self._app, "state", None), "limiter", None) or ConnectionLimiter()
-        listening = self._listen()
+        listening = bound_socket(self._host, self.port, _CONNECTIONS)
         self.port = int(listening.getsockname()[1])
         config = uvicorn.Config(
             self._app,
@@ -136,30 +135,6 @@ class Server:
             _log.exception("the control interface has ended")
         finally:
             listening.close()
-
-    def _listen(self) -> socket.socket:
-        try:
-            found = socket.getaddrinfo(
-                self._host, self.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
-            )
-            family, kind, protocol, _, address = found[0]
-            listening = socket.socket(family, kind, protocol)
-        except OSError as error:
-            raise self._cannot(error) from None
-        try:
-            listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            listening.bind(address)
-            listening.listen(_CONNECTIONS)
-        except OSError as error:
-            listening.close()
-            raise self._cannot(error) from None
-        return listening
-
-    def _cannot(self, error: OSError) -> InputError:
-        return InputError(
-            f"cannot listen on {self._host} port {self.port}: {os_reason(error)}; "
-            "give another host or port"
-        )
 
 
 class LimitedConnection:

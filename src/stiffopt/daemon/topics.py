@@ -318,7 +318,4 @@ def target_turn(now: Snapshot) -> Array | None:
         return now.target_quaternion
     if now.target_pointing is None:
         return None
-    x, y, z = (now.target_pointing / np.linalg.norm(now.target_pointing)).tolist()
-    half = np.array([1 + z, -y, x, 0.0])  # turns the z axis there
-    length = float(np.linalg.norm(half))
-    return half / length if length > 1e-9 else np.array([0.0, 1.0, 0.0, 0.0])
+    return lie.quaternion_along(now.target_pointing)

@@ -6,12 +6,7 @@ manages their files. `kinematics_result` and `stiffness_result` compare the data
 `slope` fits stiffnesses. `arm_map` maps a model's stiffness and needs no rig.
 """
 
-from stiffopt.experiments.arm_map import ArmMap, TipMap, map_arm, map_tip
-from stiffopt.experiments.kinematics import (
-    KinematicsSettings,
-    PressureSequence,
-    run_kinematics,
-)
+from stiffopt.experiments.kinematics import KinematicsSettings, run_kinematics
 from stiffopt.experiments.kinematics_result import (
     CoverageResult,
     KinematicsResult,
@@ -22,19 +17,14 @@ from stiffopt.experiments.stiffness import StiffnessSettings, run_stiffness
 from stiffopt.experiments.stiffness_result import StiffnessResult, evaluate_stiffness
 
 __all__ = [
-    "ArmMap",
     "CoverageResult",
     "KinematicsResult",
     "KinematicsSettings",
-    "PressureSequence",
     "StiffnessResult",
     "StiffnessSettings",
-    "TipMap",
     "evaluate_coverage",
     "evaluate_kinematics",
     "evaluate_stiffness",
-    "map_arm",
-    "map_tip",
     "run_kinematics",
     "run_stiffness",
 ]

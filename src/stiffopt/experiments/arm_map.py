@@ -86,12 +86,7 @@ class TipMap:
 
 def first_channels(robot: Manipulator, count: int) -> tuple[int, ...]:
     """Return the first `count` channels of each segment, counted from 1."""
-    found: list[int] = []
-    start = 0
-    for segment in robot.description.segments:
-        found += range(start + 1, start + 1 + min(count, segment.n_channels))
-        start += segment.n_channels
-    return tuple(found)
+    return tuple(k + 1 for own in robot.description.channel_ranges for k in own[:count])
 
 
 def map_arm(

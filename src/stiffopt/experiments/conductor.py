@@ -154,6 +154,10 @@ class Conductor:
                 )
             self.tick(self._target)
 
+    def forget_pressures(self) -> None:
+        """Restart the pressure monitor: what the channels have reached so far no longer counts."""
+        self._monitor.clear()
+
     def tick(self, target: ArrayLike) -> None:
         """Command pressures (n,), in Pa, as the gate's goal, and wait for the next tick.
 
@@ -164,7 +168,7 @@ class Conductor:
         pause = now - self._last
         if pause > self._valid and not self.rig.supply.armed:
             raise DeviceError(
-                f"the experiment stood still for {pause:.3g} s, so that the arm was let down and "
+                f"the experiment stalled for {pause:.3g} s, so the arm was let down and "
                 "vented; go on with --resume"
             )
         self._last = now
@@ -261,10 +265,10 @@ class Conductor:
         if failures:
             raise failures[0]
 
-    def approach(self, target: ArrayLike, rate: ArrayLike = CONDUCTOR.gentle) -> None:
-        """Tick once towards pressures (n,), in Pa, at most at a rate in Pa/s."""
-        limits, target = self.rig.supply.limits, np.asarray(target, dtype=float)
-        reach = np.asarray(rate) * min(max(self.clock.now() - self._last, 0.0), 2 * self._period)
+    def _approach(self, target: Array) -> None:
+        """Tick once towards pressures (n,), in Pa, at most at the gentle rate."""
+        limits = self.rig.supply.limits
+        reach = CONDUCTOR.gentle * min(max(self.clock.now() - self._last, 0.0), 2 * self._period)
         near = np.clip(target, self._commanded - reach, self._commanded + reach)
         outside = (near < limits.low) | (near > limits.high)  # on the way from or to 0
         self.tick(limits.clamp(np.where((target == 0) & outside, 0.0, near)))
@@ -276,7 +280,7 @@ class Conductor:
         span = np.maximum(limits.high, 0.0) - np.minimum(limits.low, 0.0)
         ticks = int(np.max(span / np.minimum(self.rig.slew, CONDUCTOR.gentle)) / self._period)
         for _ in range(CONDUCTOR.ramp_patience * (ticks + 10)):
-            self.approach(target)
+            self._approach(target)
             if np.array_equal(self._commanded, target):
                 return
         raise DeviceError("the commands do not reach their target: the gate limits them")

@@ -132,7 +132,7 @@ def coverage_for(rig: Rig, count: int, settle: float, highest: float | None = No
         )
     poses = spread_pressures(count, limits.low, high)
     return Coverage(
-        base=limits.clamp(np.clip(0.0, limits.low, limits.high)),
+        base=np.clip(0.0, limits.low, limits.high),
         poses=np.array([_shortened(rig, pose) for pose in poses]).reshape(poses.shape),
         speed=np.minimum(effective_slew(rig), CONDUCTOR.gentle),
         settle=settle,

@@ -11,7 +11,7 @@ from typing import Annotated, TypeVar
 
 from pydantic import Field
 
-from stiffopt.errors import FileError, InputError
+from stiffopt.errors import FileError, InputError, os_reason
 from stiffopt.experiments.conductor import Conductor, TrackedFrame
 from stiffopt.files import read_file, save_file
 from stiffopt.logs import LogLayout, LogWriter, McapLogWriter
@@ -42,16 +42,22 @@ class ExperimentSettings(Schema):
     repetitions: Annotated[int, Field(ge=1, le=1000)] = 5
 
 
-def create_folder(path: Path, settings: Schema) -> None:
-    """Create the folder of a new experiment and write its settings there."""
+def empty_folder(path: Path) -> Path:
+    """Make a folder, and return it; it may exist if it is empty."""
     try:
         path.mkdir(parents=True, exist_ok=True)
-        if (path / SETTINGS).exists():
-            raise FileError(path, f"holds an experiment; continue it with --resume {path}")
         if any(path.iterdir()):
             raise FileError(path, "is not empty; give another folder")
     except OSError as error:
-        raise FileError(path, f"cannot be made: {(error.strerror or '').lower()}") from None
+        raise FileError(path, f"cannot be made: {os_reason(error)}") from None
+    return path
+
+
+def create_folder(path: Path, settings: Schema) -> None:
+    """Create the folder of a new experiment and write its settings there."""
+    if (path / SETTINGS).exists():
+        raise FileError(path, f"holds an experiment; continue it with --resume {path}")
+    empty_folder(path)
     save_file(path / SETTINGS, "experiment", settings)
 
 

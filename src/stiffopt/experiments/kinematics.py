@@ -116,7 +116,7 @@ def sequence_for(rig: Rig, settings: KinematicsSettings) -> PressureSequence:
     """Return the sequence for a rig; `InputError` if a pressure is beyond its limits."""
     limits = rig.supply.limits
     check_pressures(rig, settings.pressures, range(limits.n))
-    base = limits.clamp(np.clip(0.0, limits.low, limits.high))
+    base = np.clip(0.0, limits.low, limits.high)
     return PressureSequence.sawtooth(base, settings.pressures, settings.period, effective_slew(rig))
 
 

@@ -104,7 +104,7 @@ def run_poses(
     """
     poses = poses_for(rig, settings)
     limits = rig.supply.limits
-    base = limits.clamp(np.clip(0.0, limits.low, limits.high))
+    base = np.clip(0.0, limits.low, limits.high)
     conductor = Conductor(rig, rate, check)
     conductor.start()
     conductor.ramp(base)

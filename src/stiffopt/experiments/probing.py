@@ -14,9 +14,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from stiffopt.errors import DeviceError, FileError, InputError, os_reason
+from stiffopt.errors import DeviceError, FileError, InputError
 from stiffopt.experiments.conductor import Array, Conductor, TrackedFrame, split_window
-from stiffopt.logs.table import cut_torn_end, read_table
+from stiffopt.logs.table import cut_torn_end, read_table, writing
 from stiffopt.rig.interface import ForceProbe
 
 NAME = "points.csv"
@@ -284,12 +284,8 @@ class PointsFile:
             ]  # fmt: skip
             fields = [f"{value:.9g}" if np.isfinite(value) else "" for value in map(float, values)]
             lines.append(",".join(fields))
-        try:
-            fresh = not self.path.exists() or not self.path.stat().st_size
-            header = [",".join(self._columns)] if fresh else []
-            with open(self.path, "ab") as stream:
-                stream.write("".join(f"{line}\n" for line in [*header, *lines]).encode())
-                stream.flush()
-                os.fsync(stream.fileno())
-        except OSError as error:
-            raise FileError(self.path, f"cannot be written: {os_reason(error)}") from None
+        with writing(self.path), open(self.path, "ab") as stream:
+            header = [] if stream.tell() else [",".join(self._columns)]
+            stream.write("".join(f"{line}\n" for line in [*header, *lines]).encode())
+            stream.flush()
+            os.fsync(stream.fileno())

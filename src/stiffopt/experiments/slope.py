@@ -19,6 +19,7 @@ Array = NDArray[np.float64]
 
 _FEWEST = 3  # points; a line through two has no residual
 _BEND = 3.0  # significance of a curvature, in standard errors, from which a parabola is fitted
+_CONFIDENCE = 0.95  # of the half width of an estimate
 _ALIKE = 0.9  # correlation of a trend with x from which the trend is left out
 
 
@@ -106,19 +107,19 @@ def fit_lines(
     return [line for line in lines if line is not None]
 
 
-def combine(lines: Sequence[LineFit], confidence: float = 0.95) -> SlopeEstimate | None:
+def combine(lines: Sequence[LineFit]) -> SlopeEstimate | None:
     """Combine the slopes of repetitions; None if there are none."""
     if not lines:
         return None
     count = len(lines)
     value = math.fsum(line.slope for line in lines) / count
     within = math.sqrt(math.fsum(line.sigma**2 for line in lines)) / count
-    within_width = within * student_t(confidence, sum(line.freedom for line in lines))
+    within_width = within * student_t(_CONFIDENCE, sum(line.freedom for line in lines))
     if count == 1:
         return SlopeEstimate(value, within, within_width, math.nan, 1)
     spread = math.sqrt(math.fsum((line.slope - value) ** 2 for line in lines) / (count - 1))
     between = spread / math.sqrt(count)
-    width = max(between * student_t(confidence, count - 1), within_width)
+    width = max(between * student_t(_CONFIDENCE, count - 1), within_width)
     return SlopeEstimate(value, max(between, within), width, spread, count)
 
 

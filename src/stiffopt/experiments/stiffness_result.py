@@ -16,6 +16,7 @@ from stiffopt.experiments.stiffness import StiffnessSettings
 from stiffopt.logs import StiffnessTable
 from stiffopt.model.manipulator import Manipulator
 
+_CURVE = 61  # pressures of the model's curves
 _UNKNOWN = SlopeEstimate(math.nan, math.nan, math.nan, math.nan, 0)
 
 
@@ -99,7 +100,7 @@ class StiffnessResult:
 
 
 def evaluate_stiffness(
-    folder: Path, settings: StiffnessSettings, model: Manipulator, curve: int = 61
+    folder: Path, settings: StiffnessSettings, model: Manipulator
 ) -> StiffnessResult:
     """Fit the stiffness of all series in a folder, and compare it with a model.
 
@@ -109,8 +110,6 @@ def evaluate_stiffness(
         Of an experiment, complete or not.
     settings : StiffnessSettings
     model : Manipulator
-    curve : int
-        Number of pressures of the model's curves.
 
     Raises
     ------
@@ -119,7 +118,7 @@ def evaluate_stiffness(
     """
     series = PointsFile(folder, settings.channels).read()
     top = max(settings.pressures)
-    pressures = np.linspace(min(0.0, *settings.pressures), top, curve if top > 0 else 1)
+    pressures = np.linspace(min(0.0, *settings.pressures), top, _CURVE if top > 0 else 1)
     directions = np.array(settings.directions)
     expected = model.stiffness(
         np.stack([settings.pressures_at(p) for p in settings.pressures]), directions

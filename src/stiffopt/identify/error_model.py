@@ -17,7 +17,8 @@ where none can show it.  Both move the tip as far as such pressures would, but e
 directions: a model of bending and elongation may be wrong in either, whatever a single pressure
 does.  Besides, the tip moves at another time than predicted, by a standard deviation t.  What
 differs from one recording session to another, as the zero of the tracker or the state of the
-silicone, is not seen within one; the residual includes 0.5 % of the arm's length for it.
+silicone, is not seen within one; the residual includes 0.5 % of the arm's length for it, but 0.1 %
+where the model has creep, which is the state of the silicone.
 
 s, l, t, the residual and the tail of the errors maximise the probability of the held-back
 errors, with weak priors.  Rows are weighted so that many rows in one region of pressures count
@@ -84,7 +85,9 @@ def error_model(
     _, index, (discrepancy, *_) = best
     gain = ERRORS.untested * discrepancy / recorded_range(pressures)
     _, _, (discrepancy, residual, tail, timing) = _most_probable(folds, index, found, gain)
-    residual = float(np.hypot(residual, ERRORS.session * found.problem.description.length))
+    creeps = any((segment.history or NO_HISTORY).creep for segment in found.robot.segments)
+    session = ERRORS.session_with_creep if creeps else ERRORS.session
+    residual = float(np.hypot(residual, session * found.problem.description.length))
     kept, spacing = representatives(_channels(found), pressures if recorded is None else recorded)
     settled, moving = _unsettled(found)
     return ErrorModel(

@@ -18,7 +18,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from stiffopt.errors import InputError
+from stiffopt.errors import EquilibriumError, InputError
 from stiffopt.identify.problem import CalibrationProblem, Noise, Predicted, Sample
 from stiffopt.identify.settings import FIT
 from stiffopt.model.description import RobotDescription
@@ -99,28 +99,34 @@ def _minimum(
     """Return scaled coordinates (d,) of a minimum near a start, and its cost."""
     from scipy.optimize import least_squares  # a large library; only fits need it
 
+    margin = 1e-9
+    inside = np.clip(start, problem.low + margin, problem.high - margin)
     memory: dict[bytes, tuple[Array, Array]] = {}
 
     def both(x: Array) -> tuple[Array, Array]:
         key = x.tobytes()
         if key not in memory:
             on_evaluation()
-            memory.clear()
-            value, slope = problem.residuals(x)
+            is_start = np.array_equal(x, inside)
+            try:
+                value, slope = problem.residuals(x)
+            except EquilibriumError:
+                if is_start:
+                    raise
+                value, slope = (np.full_like(each, np.nan) for each in problem.residuals(inside))
             # the solver takes back a step to where values fail, so they do where slopes fail
             fails = not (np.isfinite(value).all() and np.isfinite(slope).all())
-            if fails and np.array_equal(x, inside):
+            if fails and is_start:
                 raise InputError(
                     f"the model of robot '{problem.description.name}' has values or slopes that "
                     "are not finite, so that it cannot be fitted; look at its limits of pressure "
                     "and its modulus"
                 )
             value = np.full_like(value, np.nan) if fails else value
+            memory.clear()
             memory[key] = np.concatenate([value, x]), np.vstack([slope, np.eye(problem.size)])
         return memory[key]
 
-    margin = 1e-9
-    inside = np.clip(start, problem.low + margin, problem.high - margin)
     found = least_squares(
         lambda x: both(x)[0],
         inside,

@@ -127,7 +127,7 @@ def prepare(
             available = f"the bodies there are {others}" if others else "there is none but the tip"
             raise FileError(name, f"there is no body {shown(body)}; {available}")
     if len(set(bodies)) < len(tuple(bodies)):
-        raise InputError(f"a body is asked for twice: {', '.join(bodies)}")
+        raise InputError(f"a body is named twice: {', '.join(bodies)}")
     remarks = _check_time(name, log.time)
     _check_lengths(name, log, frame, description.length)
     p, found = _pressures(log, name, columns, pressures)

@@ -247,7 +247,8 @@ class ErrorSettings:
         lengths of the arm; standard deviation per axis on held-back rows, relative to that of the
         fit; degrees of freedom beyond four; error in time, in median time steps of the logs, as
         commands are not known between their rows.
-    session : what differs between recording sessions, per axis, in lengths of the arm.
+    session, session_with_creep : what differs between recording sessions, per axis, in lengths of
+        the arm; for a model with creep only the zero of the tracker, not the state of the silicone.
     unchecked : factor on that of the discrepancy where nothing was held back, as after `--quick`.
     deviations : prior standard deviations of their logarithms.
     per_cell : number of rows that count in a cell of pressures as wide as the reach.
@@ -270,6 +271,7 @@ class ErrorSettings:
     tail: float = 10.0
     timing: float = 0.5
     session: float = 0.005
+    session_with_creep: float = 0.001
     unchecked: float = 4.0
     deviations: tuple[float, float, float, float] = (0.8, 0.4, 0.4, 1.0)
     per_cell: float = 1.0

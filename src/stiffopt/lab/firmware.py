@@ -33,7 +33,7 @@ def firmware_directory() -> Path:
     for place in (package / "firmware", package.parent.parent / "firmware"):
         if (place / "Makefile").is_file():
             return place
-    raise InputError("the firmware's source is not there; install stiffopt anew")
+    raise InputError("the firmware's source is missing; install stiffopt again")
 
 
 def missing_tools() -> str:

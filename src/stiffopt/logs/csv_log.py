@@ -51,13 +51,13 @@ class LogWriter:
         """Find the end of an existing file."""
         text = read_bytes(self.path)
         if text and not text.startswith(header) and not header.startswith(text):
-            raise FileError(self.path, "is there and has other columns; give another name", line=1)
+            raise FileError(self.path, "exists and has other columns; give another name", line=1)
         self.was_torn = cut_torn_end(self.path)
         lines = text[: text.rfind(b"\n") + 1].splitlines()
         if len(lines) > 1:
             fields = lines[-1].split(b",")
             if len(fields) != len(self._formats):
-                raise FileError(self.path, "the last row is not whole; remove it", line=len(lines))
+                raise FileError(self.path, "the last row is incomplete; remove it", line=len(lines))
             try:
                 self.last_time = float(fields[0])
             except ValueError:

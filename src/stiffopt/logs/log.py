@@ -19,6 +19,7 @@ Array = NDArray[np.float64]
 _TIME = "time_s"
 _AXES = ("x", "y", "z")
 _PARTS = ("qw", "qx", "qy", "qz")
+_PRESSURE = re.compile(r"pm?\d+_pa")
 _BODY = re.compile(r"([a-z][a-z0-9]*(?:_[a-z0-9]+)*)_(?:[xyz]_m|q[wxyz])")
 
 
@@ -84,7 +85,7 @@ class LogLayout:
         names = set(columns)
         for name in columns:
             if columns.count(name) > 1:
-                raise FileError(path, f"the column {shown(name)} is there twice", line=1)
+                raise FileError(path, f"the column {shown(name)} appears twice", line=1)
         n = next(k for k in count() if f"p{k + 1}_pa" not in names)
         bodies = {}
         for found in filter(None, map(_BODY.fullmatch, columns)):
@@ -291,7 +292,8 @@ def _pressures(prefix: str, n: int) -> list[str]:
 
 
 def _missing(name: str, unknown: Sequence[str]) -> str:
-    near = difflib.get_close_matches(name, unknown, n=1)
+    misnamed = [each for each in unknown if not _PRESSURE.fullmatch(each)]
+    near = difflib.get_close_matches(name, misnamed, n=1)
     hint = f" (is {shown(near[0])} meant to be that?)" if near else ""
     return f"the column '{name}' is missing{hint}; a log starts with a row of names"
 

@@ -1,5 +1,7 @@
 """Call functions on NumPy arrays, row by row: machine code or the CasADi VM."""
 
+from __future__ import annotations
+
 import ctypes
 import os
 import threading
@@ -28,12 +30,21 @@ class BatchFunction(ABC):
     (k,).  Every function may be called from several threads at once.
     """
 
+    _targets: Sequence[Array]
+    """Memory of one set of arguments; for columns (k,)."""
+    _results: Sequence[Array]
+
     def __init__(self, signature: Signature) -> None:
         self.signature = signature
+        self._lock = threading.Lock()
 
-    @abstractmethod
     def __call__(self, *arguments: Any) -> list[Array]:
         """Return the results, each (r, c), for one set of arguments."""
+        with self._lock:
+            for target, argument in zip(self._targets, arguments, strict=True):
+                target[...] = argument
+            self._evaluate_one()
+            return [result.copy() for result in self._results]
 
     def many(self, *arguments: Array, threads: int | None = None) -> list[Array]:
         """Return the results, each (N, r, c), for N rows, on `threads` threads or all cores.
@@ -58,6 +69,10 @@ class BatchFunction(ABC):
         if count:
             self._evaluate(inputs, strides, outputs, count, threads)
         return outputs
+
+    @abstractmethod
+    def _evaluate_one(self) -> None:
+        """Fill `_results` from `_targets`."""
 
     @abstractmethod
     def _evaluate(
@@ -85,20 +100,14 @@ class CompiledFunction(BatchFunction):
         self._targets = [
             buffer[:, 0] if buffer.shape[1] == 1 else buffer for buffer in self._inputs
         ]
-        self._outputs = [np.zeros(shape) for shape in signature.outputs]
-        self._arrays = _Pointers(self._inputs, [0] * len(self._inputs), self._outputs)
+        self._results = [np.zeros(shape) for shape in signature.outputs]
+        self._arrays = _Pointers(self._inputs, [0] * len(self._inputs), self._results)
         self._work = _Work(signature)
         self._call = (*self._arrays.addresses, 0, 1, *self._work.addresses)
-        self._lock = threading.Lock()
 
-    def __call__(self, *arguments: Any) -> list[Array]:
-        """Return the results, each (r, c), for one set of arguments."""
-        with self._lock:
-            for target, argument in zip(self._targets, arguments, strict=True):
-                target[...] = argument
-            if self._rows(*self._call):
-                raise ArithmeticError("compiled code failed")
-            return [output.copy() for output in self._outputs]
+    def _evaluate_one(self) -> None:
+        if self._rows(*self._call):
+            raise ArithmeticError("compiled code failed")
 
     def _evaluate(
         self,
@@ -129,18 +138,12 @@ class InterpretedFunction(BatchFunction):
     def __init__(self, function: ca.Function) -> None:
         super().__init__(Signature.of(function))
         self._function = function
-        self._single = Buffer(function, 1)
-        self._blocks: dict[int, Buffer] = {}
-        self._lock = threading.Lock()
+        single = Buffer(function, 1)
+        self._targets, self._results = single.targets, single.results
+        self._single, self._blocks = single, dict[int, Buffer]()
 
-    def __call__(self, *arguments: Any) -> list[Array]:
-        """Return the results, each (r, c), for one set of arguments."""
-        single = self._single
-        with self._lock:
-            for target, argument in zip(single.targets, arguments, strict=True):
-                target[...] = argument
-            single.evaluate()
-            return [output.copy() for output in single.results]
+    def _evaluate_one(self) -> None:
+        self._single.evaluate()
 
     def _evaluate(
         self,
@@ -173,19 +176,33 @@ class InterpretedFunction(BatchFunction):
 class Buffer:
     """A CasADi function, mapped over a number of rows, with its own memory.
 
+    Parameters
+    ----------
+    function, rows :
+        The function, and the number of rows.
+    before :
+        A buffer whose results are the first arguments: both share their memory.
+
     Attributes
     ----------
     targets, results : views (rows, r, c) of arguments and results, without the leading axis for one
-        row; arguments that are columns lack the last axis.
+        row; arguments that are columns lack the last axis. Arguments from `before` are left out.
     evaluate : callable
     """
 
-    def __init__(self, function: ca.Function, rows: int) -> None:
+    def __init__(self, function: ca.Function, rows: int, before: Buffer | None = None) -> None:
         mapped = function if rows == 1 else function.map(rows)
         buffer, self.evaluate = mapped.buffer()
         self._keep: list[Any] = [mapped, buffer]
-        self.targets, self.results = [], []
-        for k in range(function.n_in()):
+        self.targets: list[Array] = []
+        self.results: list[Array] = []
+        shared = [] if before is None else before.results
+        for k, result in enumerate(shared):
+            assert function.size_in(k) == result.shape[-2:]  # CasADi would read on
+            if result.size:  # its memory is by columns
+                buffer.set_arg(k, result.swapaxes(-1, -2).reshape(-1).data)
+        self._keep.append(before)
+        for k in range(len(shared), function.n_in()):
             view = self._memory(rows, function.size_in(k), buffer.set_arg, k)
             self.targets.append(view[..., 0] if view.shape[-1] == 1 else view)
         for k in range(function.n_out()):

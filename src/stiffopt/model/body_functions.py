@@ -31,7 +31,7 @@ import numpy as np
 
 from stiffopt import lie
 from stiffopt.model.actuation import Section
-from stiffopt.model.codegen import dense
+from stiffopt.model.codegen import dense, function_of
 from stiffopt.model.compliance import carry_compliance, segment_compliance
 from stiffopt.model.kinematics import segment_jacobian, segment_pose
 from stiffopt.model.layout import Layout, SymbolicArm, symbolic_arm
@@ -125,7 +125,7 @@ def loaded_body_functions(layout: Layout) -> list[ca.Function]:
 
 
 def _function(name: str, inputs: list[ca.SX], outputs: list[ca.SX]) -> ca.Function:
-    return dense(ca.Function(name, inputs, ca.cse([ca.densify(output) for output in outputs])))
+    return dense(function_of(name, inputs, outputs))
 
 
 def _transform(start: ca.SX) -> ca.SX:

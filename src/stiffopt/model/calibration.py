@@ -353,7 +353,7 @@ class Calibration(Schema):
         for index, key in enumerate(keys):
             if key in keys[:index]:
                 raise BadKeyError(
-                    f"parameters.{index}.key", f"{shown(key)} is there twice; expected once"
+                    f"parameters.{index}.key", f"{shown(key)} appears twice; expected once"
                 )
         rows = [len(row) for row in self.correlation]
         if rows != [k] * k:

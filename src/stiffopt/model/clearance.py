@@ -127,9 +127,7 @@ def survey(station: StationOf, ends: Sequence[tuple[float, float, int]]) -> list
     return ranges
 
 
-def nearest_point(
-    station: StationOf, item: MeasuredObject, ranges: Sequence[BodyRange], cutoff: float = inf
-) -> Nearest:
+def nearest_point(station: StationOf, item: MeasuredObject, ranges: Sequence[BodyRange]) -> Nearest:
     """Return the point of a body that is nearest to an object.
 
     Parameters
@@ -138,10 +136,8 @@ def nearest_point(
         The body.
     ranges :
         All of it; for objects other than rings, a part of it is allowed.
-    cutoff :
-        A distance above this, in m, is only known to be above it.
     """
-    search = _Search(station, item, inf if item.is_ring else cutoff)
+    search = _Search(station, item)
     first, *others = ranges
     for each in (search.counted(first), *others):
         search.look_at(each)
@@ -153,8 +149,8 @@ def nearest_point(
 class _Search:
     """Search for the least distance of one object."""
 
-    def __init__(self, station: StationOf, item: MeasuredObject, cutoff: float) -> None:
-        self.station, self.item, self.cutoff = station, item, cutoff
+    def __init__(self, station: StationOf, item: MeasuredObject) -> None:
+        self.station, self.item = station, item
         self.best: Nearest | None = None
         self._slope = 0.0
         self._within: BodyRange | None = None
@@ -186,8 +182,7 @@ class _Search:
 
     @property
     def _to_beat(self) -> float:
-        least = inf if self.best is None else self.best.distance
-        return min(least, self.cutoff) - CLEARANCE_ERROR
+        return inf if self.best is None else self.best.distance - CLEARANCE_ERROR
 
     def _probe(self, point: BodyPoint, stretch: BodyRange) -> Probe:
         values, normals, pieces = self.item.distances(point.position[None])
@@ -248,7 +243,7 @@ class _Search:
     def sharpen(self) -> None:
         """Move the best point to where the slope is zero, so that its normal is accurate too."""
         stretch, best = self._within, self.best
-        if stretch is None or best is None or best.distance >= self.cutoff:
+        if stretch is None or best is None:
             return
         low, high = stretch.points[0].s, stretch.points[-1].s
         step = -_SHARPENED if self._slope > 0 else _SHARPENED

@@ -88,6 +88,11 @@ def dense(function: ca.Function) -> ca.Function:
     return ca.Function(function.name(), inputs, outputs)
 
 
+def function_of(name: str, inputs: list[Any], outputs: list[Any]) -> ca.Function:
+    """Return a function with dense results, whose common subexpressions are evaluated once."""
+    return ca.Function(name, inputs, ca.cse([ca.densify(output) for output in outputs]))
+
+
 def c_code(function: ca.Function) -> str:
     """Return the text of a C file with a dense function ``NAME`` and its ``NAME_rows``."""
     generator = ca.CodeGenerator(f"{function.name()}.c", {"with_header": False})

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from pydantic import (
     BeforeValidator,
     Discriminator,
@@ -357,7 +357,7 @@ class Recordings(Schema):
             if column in self.channels[:index]:
                 raise BadKeyError(
                     f"channels.{index}",
-                    f"column {column} is there twice; expected another for each channel",
+                    f"column {column} appears twice; expected a different one for each channel",
                 )
         return self
 
@@ -444,6 +444,12 @@ class RobotDescription(Schema):
         return sum(segment.n_channels for segment in self.segments)
 
     @property
+    def channel_ranges(self) -> tuple[range, ...]:
+        """Numbers of each segment's channels, counted from 0 along the arm."""
+        ends = [0, *itertools.accumulate(segment.n_channels for segment in self.segments)]
+        return tuple(map(range, ends, ends[1:]))
+
+    @property
     def length(self) -> float:
         """Length at rest with the connectors, in m."""
         return sum(segment.length + segment.connector for segment in self.segments)
@@ -463,6 +469,18 @@ class RobotDescription(Schema):
         """Greatest rate of change of each channel, in Pa/s, or None."""
         return None if self.pressure.slew is None else self._per_channel(self.pressure.slew)
 
+    def slew_limits(self, further: ArrayLike | None = None) -> NDArray[np.float64] | None:
+        """Return the greatest rates of change (n,), in Pa/s, or None if there is no limit.
+
+        They are the smaller of the robot's and further ones, (n,) or one for all.
+        """
+        known = [rates for rates in (self.pressure_slew, further) if rates is not None]
+        if not known:
+            return None
+        rows = [np.broadcast_to(np.asarray(rates, float), self.n_pressures) for rates in known]
+        smallest: NDArray[np.float64] = np.min(rows, axis=0)
+        return smallest
+
     @property
     def channel_areas(self) -> tuple[float, ...]:
         """Area of the chambers that each channel feeds, in m^2: axial force per pressure."""
@@ -480,10 +498,9 @@ class RobotDescription(Schema):
 
     def channel_name(self, index: int) -> str:
         """Return the name of a channel (counted from 0) in messages: ``segment 2 channel 1``."""
-        for number, segment in enumerate(self.segments, start=1):
-            if 0 <= index < segment.n_channels:
-                return f"segment {number} channel {index + 1}"
-            index -= segment.n_channels
+        for number, own in enumerate(self.channel_ranges, start=1):
+            if index in own:
+                return f"segment {number} channel {index - own.start + 1}"
         raise InputError(f"there is no such channel; this robot has {self.n_pressures}")
 
     def check_per_channel(self, key: str, value: object) -> None:
@@ -526,9 +543,9 @@ class RobotDescription(Schema):
 
     def _check_dead_bands(self) -> None:
         """Reject a dead band where a pressure may be negative: it would hardly act there at all."""
-        lowest = iter(self.pressure_min)
-        for index, segment in enumerate(self.segments):
-            low = min(itertools.islice(lowest, segment.n_channels))
+        for index, own in enumerate(self.channel_ranges):
+            segment = self.segments[index]
+            low = min(self.pressure_min[k] for k in own)
             if low < 0 and segment.corrections is not None and segment.corrections.dead_band > 0:
                 raise BadKeyError(
                     f"segments.{index}.corrections.dead_band",
@@ -538,9 +555,9 @@ class RobotDescription(Schema):
 
     def _check_softening(self) -> None:
         """Reject a softening that would leave no modulus at the highest pressures."""
-        highest = iter(self.pressure_max)
-        for index, segment in enumerate(self.segments):
-            most = math.hypot(*itertools.islice(highest, segment.n_channels))
+        for index, own in enumerate(self.channel_ranges):
+            segment = self.segments[index]
+            most = math.hypot(*(self.pressure_max[k] for k in own))
             softening = segment.history.softening if segment.history is not None else 0.0
             if 1 + softening * most <= 0:
                 raise BadKeyError(

@@ -87,8 +87,8 @@ class Manipulator(Arm, ShownInNotebook):
     def tip_jacobian_derivative(self, p: ArrayLike) -> Vector:
         """Return the derivative of `tip_jacobian` by the pressures, (6, n, n), on the last axis.
 
-        With the paper's compensation it does not exist at exactly p = 0 (slip 6 of the model's
-        norm law); there the value is that of the rounded cone.
+        With the paper's compensation it does not exist at exactly p = 0, where the norm of the
+        pressures has a kink; there the value is that of the rounded norm.
         """
         n = self.n_pressures
         flat = self._evaluate(
@@ -307,8 +307,7 @@ class Manipulator(Arm, ShownInNotebook):
         """Return the free arm with the additional stiffness of its history."""
         if self.is_loaded:
             raise InputError(
-                "the stiffness against quick pushes is for the arm without gravity and load, whose "
-                "shape does not depend on it"
+                "the stiffness against quick pushes is for an arm without gravity and load"
             )
         return self.kept("quick", lambda: Manipulator(quick_description(self.description)))
 
@@ -420,7 +419,7 @@ class Manipulator(Arm, ShownInNotebook):
             if self.is_loaded:
                 raise InputError(
                     "method 'elementwise' (eq. 19) is for the arm without gravity and load: its "
-                    "elements know no geometric stiffness; use 'first-order' or 'equilibrium'"
+                    "elements have no geometric stiffness; use 'first-order' or 'equilibrium'"
                 )
             return self._elementwise(p, local, self.length if at is None else at)
         raise InputError(

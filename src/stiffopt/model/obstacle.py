@@ -36,6 +36,7 @@ _RISEN = 1.25  # factor on the arc length at which a straight arm is clear of it
 _FLUSH = 1e-9  # m, allowed height of an object above the plane of the base
 _ABOVE = 1e-4  # m above the base, at which the direction of an object is determined
 _STRAIGHT = 1e-9  # allowed relative lag of the distance behind the height: 0.05 mrad
+_SIDES = 24  # of a drawn surface of revolution
 _TINY = 1e-24  # m^2, added under roots so that gradients exist at zero distance
 
 
@@ -245,12 +246,12 @@ def across(axis: Array) -> tuple[Array, Array]:
     return first, np.cross(axis, first)
 
 
-def revolved(origin: Any, axis: Any, heights: Any, radii: Any, sides: int = 24) -> Array:
-    """Return a surface (3, rows, sides + 1) of revolution, given heights and radii."""
+def revolved(origin: Any, axis: Any, heights: Any, radii: Any) -> Array:
+    """Return a surface (3, rows, _SIDES + 1) of revolution, given heights and radii."""
     axis = np.asarray(axis, dtype=float)
     first, second = across(axis)
-    angle = np.linspace(0.0, 2 * np.pi, sides + 1)
-    ring = np.outer(first, np.cos(angle)) + np.outer(second, np.sin(angle))  # (3, sides + 1)
+    angle = np.linspace(0.0, 2 * np.pi, _SIDES + 1)
+    ring = np.outer(first, np.cos(angle)) + np.outer(second, np.sin(angle))  # (3, _SIDES + 1)
     along = np.multiply.outer(axis, np.asarray(heights, dtype=float))  # (3, rows)
     centres = np.asarray(origin, dtype=float)[:, None] + along
     surface: Array = centres[:, :, None] + np.asarray(radii)[None, :, None] * ring[:, None, :]

@@ -55,7 +55,7 @@ def load_description(
         if robot.calibration is not None and robot.calibration.unfit:
             warnings.warn(
                 f"the robot file {printable(text)} is marked as unfit: its calibration missed its "
-                "own recordings by more than 10 % of the arm's length; calibrate it anew",
+                "own recordings by more than 10 % of the arm's length; calibrate it again",
                 UnfitWarning,
                 stacklevel=2,
             )

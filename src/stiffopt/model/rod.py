@@ -27,6 +27,7 @@ import casadi as ca
 import numpy as np
 
 from stiffopt import lie
+from stiffopt.model.codegen import function_of
 from stiffopt.model.description import RobotDescription
 from stiffopt.model.layout import Layout, symbolic_arm
 from stiffopt.model.shooting import mass_per_length, pieces_of, slopes
@@ -100,8 +101,8 @@ def rod_functions(layout: Layout) -> RodFunctions | None:
         n_slopes += a.numel() * segment.n_channels
         start += segment.n_channels
     inputs = [arm.actuation.pressures, arm.numbers]
-    sections = _function("sections", inputs, [ca.vertcat(*parts), ca.vertcat(*derivatives)])
-    least = _function("margin", inputs, [ca.mmin(arm.actuation.margin)])
+    sections = function_of("sections", inputs, [ca.vertcat(*parts), ca.vertcat(*derivatives)])
+    least = function_of("margin", inputs, [ca.mmin(arm.actuation.margin)])
     return RodFunctions([sections, least, *functions, *_ends()], places, n_parts, n_slopes)
 
 
@@ -118,10 +119,6 @@ def rod_pieces(
         mass = mass_per_length(description.segments[piece.segment])
         pieces.append(RodPiece(*functions.places[piece.segment], piece.steps, step, mass))
     return pieces
-
-
-def _function(name: str, inputs: list[ca.SX], outputs: list[ca.SX]) -> ca.Function:
-    return ca.Function(name, inputs, ca.cse([ca.densify(output) for output in outputs]))
 
 
 def _kind(kind: int, patterns: list[ca.Sparsity], channels: int) -> list[ca.Function]:
@@ -147,10 +144,10 @@ def _kind(kind: int, patterns: list[ca.Sparsity], channels: int) -> list[ca.Func
     by_y, by_n, by_a, by_dy, by_dn = (ca.gradient(h, x) for x in (y, n, a, dy, dn))
     adjoint = [ca.vertcat(by_y, none), by_n, da.T @ by_a, ca.vertcat(by_dy, none), by_dn]
     return [
-        _function(f"slope{kind}", [y, n, f, a], [long]),
-        _function(f"newton{kind}", [y, n, f, a], newton),
-        _function(f"linear{kind}", [y, n, f, a, da], linear),
-        _function(f"adjoint{kind}", [y, n, f, a, da, dy, dn, lam, dlam], adjoint),
+        function_of(f"slope{kind}", [y, n, f, a], [long]),
+        function_of(f"newton{kind}", [y, n, f, a], newton),
+        function_of(f"linear{kind}", [y, n, f, a, da], linear),
+        function_of(f"adjoint{kind}", [y, n, f, a, da, dy, dn, lam, dlam], adjoint),
     ]
 
 
@@ -176,7 +173,7 @@ def _ends() -> list[ca.Function]:
     def at_rest(*values: ca.SX) -> list[ca.SX]:
         return list(ca.substitute(list(values), [delta], here))
 
-    tip = _function(
+    tip = function_of(
         "tip", [q, load, weight],
         at_rest(y, n, ca.jacobian(y, delta), ca.jacobian(n, delta), R),
     )  # fmt: skip
@@ -193,7 +190,7 @@ def _ends() -> list[ca.Function]:
         ca.dot(lam, y) + ca.dot(lam_n, n) + ca.dot(dlam, ca.vertcat(q_dot, change[3:], 0))
         + ca.dot(dlam_n, change[:3]) + ca.dot(left[3:], R @ turn)
     )  # fmt: skip
-    tip_adjoint = _function(
+    tip_adjoint = function_of(
         "tip_adjoint", [q, load, turn, wrench, lam, lam_n, dlam, dlam_n, left],
         at_rest(ca.gradient(total, delta)),
     )  # fmt: skip
@@ -201,12 +198,12 @@ def _ends() -> list[ca.Function]:
     y, n, length = ca.SX.sym("y", 7), ca.SX.sym("n", 3), ca.SX.sym("L")
     reach = length * lie.rotation_from_quaternion(y[:4])[:, 2]
     gain = ca.vertcat(ca.SX.zeros(4), ca.cross(reach, n), 0, reach, 0)
-    rigid = _function("rigid", [y, n, length], [gain, ca.jacobian(gain, y), ca.jacobian(gain, n)])
+    rigid = function_of("rigid", [y, n, length], [gain, ca.jacobian(gain, y), ca.jacobian(gain, n)])
     dy, dn, lam, dlam = (ca.SX.sym("x", size) for size in (7, 3, 8, 12))
     dot = ca.jtimes(gain, y, dy) + ca.jtimes(gain, n, dn)
     h = ca.dot(lam, gain[:8]) + ca.dot(dlam, dot)
     by_y, by_n, by_dy, by_dn = (ca.gradient(h, x) for x in (y, n, dy, dn))
-    rigid_adjoint = _function(
+    rigid_adjoint = function_of(
         "rigid_adjoint", [y, n, length, dy, dn, lam, dlam],
         [ca.vertcat(by_y, 0), by_n, ca.vertcat(by_dy, 0), by_dn],
     )  # fmt: skip

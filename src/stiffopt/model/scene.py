@@ -9,7 +9,6 @@ In code::
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -23,7 +22,7 @@ from pydantic import (
 
 from stiffopt.documents import read_document
 from stiffopt.errors import FileError, InputError, dotted
-from stiffopt.files import SourceFile, from_document, line_of
+from stiffopt.files import SourceFile, folder_of, from_document, line_of
 from stiffopt.model.description import RobotDescription
 from stiffopt.model.obstacle import Obstacle
 from stiffopt.model.obstacles import OBSTACLES
@@ -92,6 +91,11 @@ class SceneObject(_Shapes):
         """The shape that it has."""
         (found,) = self._given().values()
         return found
+
+    @property
+    def may_be_leant_on(self) -> bool:
+        """Whether the arm may touch it."""
+        return self.contact is not None and self.contact.allowed
 
     def _given(self) -> dict[str, Obstacle]:
         shapes = ((key, getattr(self, key)) for key in OBSTACLES)
@@ -204,8 +208,7 @@ def load_scene(path: str | os.PathLike[str]) -> Scene:
 def _from_file(value: Any, info: ValidationInfo) -> Any:
     """Load a scene that is given as a path."""
     if isinstance(value, str | Path):
-        folder = info.context.get("folder") if isinstance(info.context, Mapping) else None
-        return load_scene(Path(folder or "") / value)
+        return load_scene(folder_of(info) / value)
     return value
 
 

@@ -51,7 +51,7 @@ class _Limits:
         if self.is_cancelled:
             raise CancelledError("cancelled before there was an answer")
         if monotonic() > self.deadline:
-            raise OutOfTimeError(f"no answer within the {self.timeout:g} s that it was given")
+            raise OutOfTimeError(f"no answer within the {self.timeout:g} s")
 
 
 _NO_LIMITS, _NO_FLAG = nullcontext(), nullcontext(0)  # for most calls, which have no limits

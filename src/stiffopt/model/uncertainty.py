@@ -8,15 +8,22 @@ propagated to the tip by their Jacobians, to first order; the discrepancy in its
 may move the tip in any direction.  Together they follow a multivariate t-distribution.
 
 Hysteresis depends on how the arm came to its pressures.  Its mean square, about the equilibrium,
-which is what `tip_pose` returns, is that over ways from rest to two pressures drawn from the
-recorded range, and from there; but at most that of effective minus commanded pressures as recorded.
-Silicone remembers its stretch rather than pressures: the tip is about as far from the equilibrium
-where the arm is soft as where it is stiff.  And what a fit calls hysteresis is partly creep, which
-is over where a pose is held.
-Most of these ways leave most play operators at an end of their width, so that the tip is rarely
-near the equilibrium.  Therefore its squared distance, in deviations of the region, is distributed
+which is what `tip_pose` returns, is that over ways from rest to pressures drawn from the recorded
+range, and from there; but at most that of effective minus commanded pressures as recorded.
+Plays lead through two drawn pressures.  Creep goes on while pressures are held: a way stays for
+6 s at each of three drawn ones, and for 1.5 to 6 s at its end.  The tip moves by the slopes half
+the mean of all ways further: at the pressures themselves, a chamber may be in its dead band.
+
+A model without creep knows less of the memory.  Silicone remembers its stretch rather than
+pressures: the tip is about as far from the equilibrium where the arm is soft as where it is stiff.
+And what such a fit calls hysteresis is partly creep, which is over where a pose is held.
+
+Most of these ways leave the arm away from the equilibrium, most play operators at an end of their
+width.  Therefore the squared distance of the tip, in deviations of the region, is distributed
 as 3 F(k, v) with k > 3 degrees of freedom, such that its variance is right (F. E. Satterthwaite, An
 approximate distribution of estimates of variance components, 1946); without hysteresis, k = 3.
+The ways are bounded: where the model has creep, v is larger than that of the other errors, such
+that the mean fourth power of the tail is right.
 """
 
 from __future__ import annotations
@@ -44,6 +51,9 @@ Part = Literal["parameters", "hysteresis", "discrepancy", "residual"]
 
 _LEVEL = 0.95  # probability of the reported regions
 _WAYS = 256  # ways to given pressures
+_VISITS = 3  # pressures that each of them visits
+_STAY = 6.0  # s from one of them to the next
+_AGES = (1.5, 6.0)  # s for which the given pressures have been held, from the middle of the motion
 _HELD = 0.9  # share of these variances that held poses show; the rest was creep and motion
 _STIFFEST = 0.25  # least softness, over that at recorded pressures: a dead band has none
 _SINGULAR = 1e-9  # smallest variance of a direction, over that of all
@@ -75,6 +85,7 @@ class TipUncertainty:
     _source: Uncertainty
     _pressures: Vector
     _shape: float
+    _tail: float
 
     @property
     def covariance(self) -> Vector:
@@ -91,7 +102,7 @@ class TipUncertainty:
         if not 0 < level < 1:
             raise InputError(f"a probability lies between 0 and 1, both excluded; got {level!r}")
         values = np.linalg.eigvalsh(self.covariance)[::-1]
-        factor = squared_radius(level, self._source.degrees_of_freedom, self._shape)
+        factor = squared_radius(level, self._tail, self._shape)
         return np.asarray(np.sqrt(factor * np.maximum(values, 0.0)))
 
     @cached_property
@@ -134,8 +145,8 @@ class PositionErrors:
     position : predicted (N, 3), in base axes and m.
     parameters, hysteresis, discrepancy, residual : mean squares (N, 3, 3) of its error by source,
         as in `TipUncertainty`; hysteresis includes that of the time at which the tip moves.
-    shape : degrees of freedom k (N,) of the error's squared distance; 3 unless the history is
-        unknown.
+    shape, tail : degrees of freedom k and v (N,) of the error's squared distance. Unless the
+        history is unknown, k is 3 and v that of the calibration, which is infinite without a tail.
     """
 
     position: Vector
@@ -144,6 +155,7 @@ class PositionErrors:
     discrepancy: Vector
     residual: Vector
     shape: Vector
+    tail: Vector
 
     @property
     def covariance(self) -> Vector:
@@ -170,8 +182,8 @@ class Uncertainty:
     ) -> None:
         if description.calibration is None:
             raise InputError(
-                f"robot '{description.name}' was not calibrated, so that nothing is known of its "
-                "errors; fit it to recordings with 'stiffopt calibrate'"
+                f"robot '{description.name}' was not calibrated, so its errors are unknown; fit it "
+                "to recordings with 'stiffopt calibrate'"
             )
         self._description = description
         self._channels = [segment.n_channels for segment in description.segments]
@@ -183,12 +195,6 @@ class Uncertainty:
             tip_load,
         )
         self._covariance = self._calibration.covariance
-
-    @property
-    def degrees_of_freedom(self) -> float:
-        """Degrees of freedom of the errors' t-distribution; infinite if it is normal."""
-        errors = self._calibration.errors
-        return np.inf if errors is None else errors.degrees_of_freedom
 
     def at(self, pressures: Vector, *, moving: bool = False) -> TipUncertainty:
         """Return the uncertainty at commanded pressures (n,), held or `moving`; history unknown."""
@@ -205,6 +211,7 @@ class Uncertainty:
             _source=self,
             _pressures=pressures,
             _shape=float(found.shape[0]),
+            _tail=float(found.tail[0]),
         )
 
     def errors(
@@ -228,7 +235,6 @@ class Uncertainty:
         """
         u = pressures if effective is None else effective
         position, per_number, per_pressure = self._slopes.at(u)
-        transposed = np.swapaxes(per_pressure, 1, 2)
         moves = squared_moves(per_pressure, self._discrepancy(u))
         before = self._typical_moves if time is None else fading_mean(time, moves)
         errors = self._calibration.errors
@@ -237,10 +243,15 @@ class Uncertainty:
         if effective is None:
             moved = moving if moving is not None else np.zeros(len(pressures), dtype=bool)
             ways = self._remembered(pressures, per_pressure)
-            hysteresis = per_pressure @ self._hysteresis(ways, moved) @ transposed
+            acting = per_pressure
+            if self._knows_creep:
+                _, _, acting = self._slopes.at(pressures + ways.mean(axis=1) / 2)
+            transposed = np.swapaxes(acting, 1, 2)
+            hysteresis = acting @ self._hysteresis(ways, moved) @ transposed
+            ways = ways @ transposed
             discrepancy *= np.where(moved, 1.0, _HELD)
         else:
-            ways, hysteresis = np.zeros((len(u), 1, u.shape[1])), np.zeros((len(u), 3, 3))
+            ways, hysteresis = np.zeros((len(u), 1, 3)), np.zeros((len(u), 3, 3))
         if rates is not None and errors is not None:
             way = errors.timing * per_pressure @ rates[..., np.newaxis]
             hysteresis = hysteresis + way @ np.swapaxes(way, 1, 2)
@@ -251,14 +262,19 @@ class Uncertainty:
             discrepancy=discrepancy[:, np.newaxis, np.newaxis] * np.eye(3),
             residual=np.broadcast_to(np.eye(3) * residual**2, (len(u), 3, 3)),
             shape=np.full(len(u), 3.0),
+            tail=np.full(len(u), np.inf if errors is None else errors.degrees_of_freedom),
         )
         if effective is not None:
             return found
-        return replace(found, shape=_shape(ways @ transposed, found.covariance))
+        shape, unbounded = _shape(ways, found.covariance)
+        tail = found.tail
+        if self._knows_creep:
+            tail = tail + np.maximum(tail - 4, 0.0) * (1 / np.maximum(unbounded, 1e-3) - 1)
+        return replace(found, shape=shape, tail=tail)
 
     def levels(self, errors: Vector, known: PositionErrors) -> Vector:
         """Return the probability (N,) of the smallest regions that hold errors (N, 3)."""
-        return levels(errors, known.covariance, self.degrees_of_freedom, known.shape)
+        return levels(errors, known.covariance, known.tail, known.shape)
 
     def stiffness_interval(
         self, pressures: Vector, direction: ArrayLike, kind: Kind, boundary: Boundary, frame: Frame
@@ -322,23 +338,21 @@ class Uncertainty:
     def _remembered(self, pressures: Vector, per_pressure: Vector) -> Vector:
         """Return effective minus commanded pressures (N, W, n) in Pa after W ways to (N, n).
 
-        `per_pressure` are the tip's slopes (N, 3, n) there. Silicone remembers its stretch, so the
-        ways leave the tip about as far away at all pressures, though a pressure moves it further
-        where the arm is soft. At the median of the recorded pressures they are those of the plays,
-        and of the creep that is left.
+        `per_pressure` are the tip's slopes (N, 3, n) there. Without creep in the model, the ways
+        leave the tip about as far away at all pressures, though a pressure moves it further where
+        the arm is soft. At the median of the recorded pressures they are those of the plays.
         """
-        errors = self._calibration.errors
         found, crept = self._ways(pressures)
-        if errors is None:
+        if self._calibration.errors is None:
             return found
-        if errors.settled:
-            found += crept * self._creep_left
+        if self._knows_creep:
+            return found + crept * self._creep_left
         softness = self._softness(per_pressure) / self._recorded_softness
         found *= np.sqrt(_HELD / np.maximum(softness, _STIFFEST))[:, np.newaxis]
         return found
 
     def _ways(self, pressures: Vector) -> tuple[Vector, Vector]:
-        """Return what plays leave after W ways to pressures (N, n), and all creep (N, W, n)."""
+        """Return what plays and what creep leave after W ways to pressures (N, n): (N, W, n)."""
         robot, first = self._description, 0
         found = np.zeros((len(pressures), _WAYS, robot.n_pressures))
         crept = np.zeros_like(found)
@@ -348,12 +362,15 @@ class Uncertainty:
             memory = np.array([history.memory_of(c) for c in range(segment.n_channels)])
             for play in history.play:
                 end, held = part_of(x, play.of), np.zeros(1)
-                for visited in (*part_of(self._visited[..., own], play.of), end):
+                for visited in (*part_of(self._visited[-2:, :, own], play.of), end):
                     held = np.clip(held, visited - play.width, visited + play.width)
                 found[..., own] += memory * play.share * part_of(held - end, play.of)
             for creep in history.creep:
-                last = part_of(self._visited[-1][:, own] - x, creep.of)
-                crept[..., own] += memory * creep.share * last
+                slow = np.zeros(1)
+                for visited in part_of(self._visited[..., own], creep.of):
+                    slow = visited + (slow - visited) * np.exp(-_STAY / creep.time)
+                left = np.exp(-self._ages / creep.time)[:, np.newaxis]
+                crept[..., own] += memory * creep.share * left * (slow - part_of(x, creep.of))
             for each in (found, crept):
                 each[..., own] = history.at_fixed_modulus(x, each[..., own])
         errors = self._calibration.errors
@@ -364,9 +381,10 @@ class Uncertainty:
 
     @cached_property
     def _creep_left(self) -> Vector:
-        """Share (n,) of all creep that is left at held pressures, as recorded.
+        """Share (n,) of the ways' creep that was left at held pressures, as recorded; at most 1.
 
-        With it, plays and creep have the mean square of `ErrorModel.settled` at recorded pressures.
+        With it, plays and creep have the mean square of `ErrorModel.settled` at recorded pressures:
+        pressures may have been held for longer than on the ways.
         """
         errors = self._calibration.errors
         assert errors is not None  # a caller's condition
@@ -391,14 +409,28 @@ class Uncertainty:
         return np.asarray(np.median(self._softness(per_pressure), axis=0))
 
     @cached_property
+    def _knows_creep(self) -> bool:
+        """Whether the model has creep, and pressures were held in the recordings."""
+        errors = self._calibration.errors
+        if errors is None or not errors.settled:
+            return False
+        return any((segment.history or NO_HISTORY).creep for segment in self._description.segments)
+
+    @cached_property
+    def _ages(self) -> Vector:
+        """Times (W,) in s for which pressures are held at the ends of the ways."""
+        strata = (np.arange(_WAYS) + 0.5) / _WAYS
+        return np.asarray(np.interp(np.random.default_rng(1).permuted(strata), (0, 1), _AGES))
+
+    @cached_property
     def _visited(self) -> Vector:
-        """Pressures (2, W, n) in Pa that the ways visit in turn."""
+        """Pressures (_VISITS, W, n) in Pa that the ways visit in turn."""
         known, robot = self._calibration, self._description
         low, high = (
             known.pressure_min or robot.pressure_min,
             known.pressure_max or robot.pressure_max,
         )
-        strata = np.tile((np.arange(_WAYS) + 0.5) / _WAYS, (2, robot.n_pressures, 1))
+        strata = np.tile((np.arange(_WAYS) + 0.5) / _WAYS, (_VISITS, robot.n_pressures, 1))
         shares = np.random.default_rng(0).permuted(strata, axis=2)  # a Latin hypercube
         return np.asarray(low + np.swapaxes(shares, 1, 2) * np.subtract(high, low))
 
@@ -458,11 +490,12 @@ def _skew(vectors: Vector) -> Vector:
     return np.stack(rows, axis=-2)
 
 
-def _shape(moves: Vector, covariance: Vector) -> Vector:
+def _shape(moves: Vector, covariance: Vector) -> tuple[Vector, Vector]:
     """Return k (N,) for which 3 chi^2(k) / k has the variance of the squared distances of errors.
 
     An error is one of the moves (N, W, 3), equally likely, and an independent normal error; both
-    together have the mean squares `covariance` (N, 3, 3).
+    together have the mean squares `covariance` (N, 3, 3). Return also the share (N,) of the mean
+    fourth power of a normal error that the latter contributes: a tail of it counts by that.
     """
     least = _SINGULAR * np.trace(covariance, axis1=1, axis2=2) + np.finfo(float).tiny
     squared, axes = np.linalg.eigh(covariance)
@@ -472,7 +505,8 @@ def _shape(moves: Vector, covariance: Vector) -> Vector:
     bounded = np.swapaxes(moves, 1, 2) @ moves / moves.shape[1]
     rest = np.eye(3) - bounded
     variance = squares.var(axis=1) + np.einsum("nij,nji->n", 4 * bounded + 2 * rest, rest)
-    return np.asarray(18 / variance)
+    trace, square = np.einsum("nii->n", rest), np.einsum("nij,nji->n", rest, rest)
+    return np.asarray(18 / variance), np.asarray((trace**2 + 2 * square) / 15)
 
 
 def squared_radius(level: float, degrees_of_freedom: float, shape: float = 3.0) -> float:
@@ -491,7 +525,10 @@ def squared_radius(level: float, degrees_of_freedom: float, shape: float = 3.0) 
 
 
 def levels(
-    errors: Vector, covariance: Vector, degrees_of_freedom: float, shape: float | Vector = 3.0
+    errors: Vector,
+    covariance: Vector,
+    degrees_of_freedom: float | Vector,
+    shape: float | Vector = 3.0,
 ) -> Vector:
     """Return the probability (N,) of the smallest regions that hold errors (N, 3).
 
@@ -503,6 +540,6 @@ def levels(
     squares = np.einsum(
         "ni,ni->n", errors, np.linalg.solve(covariance, errors[..., np.newaxis])[..., 0]
     )
-    if np.isinf(v):
+    if np.isinf(v).all():
         return np.asarray(chdtr(shape, squares * shape / 3))
     return np.asarray(fdtr(shape, v, squares * v / (3 * (v - 2))))

@@ -72,8 +72,7 @@ class Brace(Schema):
                 raise BadKeyError(
                     key, f"there is no object '{name}' in the scene; it has {quoted(known)}"
                 )
-            contact = known[name].contact
-            if contact is None or not contact.allowed:
+            if not known[name].may_be_leant_on:
                 raise BadKeyError(
                     key,
                     f"'{name}' may not be touched; its object needs 'contact: {{allowed: true}}'",

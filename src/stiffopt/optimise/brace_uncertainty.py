@@ -104,8 +104,6 @@ class BraceUncertainty:
         assert task.scene is not None
         assert task.brace is not None
         robot = Manipulator(varied(self._robot.description, [parameter], [coordinate]))
-        load, scene = task.tip_load, leant_on(task.scene, task.brace)
-        if load is not None:
-            robot = robot.with_load(load.force, load.moment, load.frame)
+        robot, scene = task.loaded(robot), leant_on(task.scene, task.brace)
         eq = robot.contact_equilibrium(self._eq.pressures, scene, approach=task.brace.approach)
         return eq if eq.contacts else self._eq

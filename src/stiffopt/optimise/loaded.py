@@ -3,11 +3,10 @@
 The compiled solver finds the tip by the integrator in C, see `stiffopt.model.loaded_arm`.
 """
 
-from typing import Any
-
 import casadi as ca
 
 from stiffopt import lie
+from stiffopt.model.codegen import function_of
 from stiffopt.model.layout import Layout, symbolic_arm
 from stiffopt.model.shape import PointOfArm
 from stiffopt.optimise.program import Program
@@ -79,17 +78,15 @@ def tip_functions(program: Program, layout: Layout) -> list[ca.Function]:
     residuals, _, terms, _, floors, _ = program.point(tip, parameters)
     terms = ca.vertcat(*terms.elements(), *(floors.elements() if program.n_floors else ()))
 
-    def function(name: str, outputs: list[Any]) -> ca.Function:
-        return ca.Function(name, inputs, ca.cse([ca.densify(output) for output in outputs]))
-
     return [
-        function("residuals", [residuals, tip.by_twist(residuals)]),
-        function(
+        function_of("residuals", inputs, [residuals, tip.by_twist(residuals)]),
+        function_of(
             "terms",
+            inputs,
             [
                 terms, tip.by_twist(terms),
                 ca.jacobian(terms, ca.vec(tip.base_compliance)), ca.jacobian(terms, tip.pressures),
             ],
         ),
-        function("judge", program.judge(tip, parameters)),
+        function_of("judge", inputs, program.judge(tip, parameters)),
     ]  # fmt: skip

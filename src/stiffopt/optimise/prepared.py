@@ -39,8 +39,7 @@ class Prepared:
     """
 
     def __init__(self, robot: Manipulator, task: Task, seed: int) -> None:
-        load = task.tip_load
-        self.robot = robot.with_load(load.force, load.moment, load.frame) if load else robot
+        self.robot = task.loaded(robot)
         task.check_scene(robot.description)
         self.lower, self.upper = task.pressure_bounds(robot.description)
         self._program = Program.of(task, robot.description)

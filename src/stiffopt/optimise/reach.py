@@ -73,9 +73,7 @@ def can_reach(problem: PressureProblem, candidates: list[Vector]) -> bool:
     return False
 
 
-def reach_all(
-    problem: PressureProblem, x: Vector, most_iterations: int = REACH.iterations_of_many
-) -> tuple[Vector, Vector]:
+def reach_all(problem: PressureProblem, x: Vector) -> tuple[Vector, Vector]:
     """Bring pressures (N, n) of an arm without loads to the pose, all at once.
 
     Returns the final pressures, and the largest ratio (N,) of a residual to its radius: at most one
@@ -92,7 +90,7 @@ def reach_all(
     before = _misfits(residual / scale)
     damping = np.full(len(x), REACH.damping)
     going = np.flatnonzero((ratio > 1) & np.isfinite(before))
-    for _ in range(most_iterations):
+    for _ in range(REACH.iterations_of_many):
         checkpoint()
         if not len(going):
             break

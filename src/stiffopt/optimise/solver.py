@@ -98,13 +98,10 @@ class PressureSolver:
             once for a kind of task (formulas, machine code) is always completed.
         cancel : threading.Event or callable, optional
             Gives up in the same way as soon as the event is set or the callable returns true.  It
-            is polled every 10 ms, maybe from another thread.
+            is polled every 10 ms, possibly from another thread.
         """
-        if target is not None and not isinstance(target, Target):
-            raise InputError(f"target must be a Target; got {shown(target)}")
         watch = Stopwatch()
-        start = self._checked(guess)
-        task = self.task if target is None else self.task.model_copy(update={"target": target})
+        task, start = self._aimed_at(target), self._checked(guess)
         with giving_up(timeout, cancel):
             solution = self._found(task, start)
         solution.timings.update(watch.timings())
@@ -181,9 +178,7 @@ class PressureSolver:
         OutOfTimeError, CancelledError
             If `timeout` or `cancel` (see `solve`) ended the search before it was decided.
         """
-        if target is not None and not isinstance(target, Target):
-            raise InputError(f"target must be a Target; got {shown(target)}")
-        task = self.task if target is None else self.task.model_copy(update={"target": target})
+        task = self._aimed_at(target)
         with giving_up(timeout, cancel):
             fast = self._search.fast(task.unbraced, None)
             if fast is not None:
@@ -238,8 +233,7 @@ class PressureSolver:
             None if that search has no machine code, or finds no answer that holds.  `solve` would
             go on with the general method, which may take minutes for an arm under gravity.
         """
-        task = self.task if target is None else self.task.model_copy(update={"target": target})
-        return self._search.solve(task, self._checked(guess), limits)
+        return self._search.solve(self._aimed_at(target), self._checked(guess), limits)
 
     def __repr__(self) -> str:
         return f"PressureSolver({self._given!r}, {self.task!r})"
@@ -259,6 +253,14 @@ class PressureSolver:
     def __reduce__(self) -> tuple[object, ...]:
         """Support pickling: keep the arm and the task, and prepare the rest again."""
         return partial(PressureSolver, seed=self.seed), (self._given, self.task)
+
+    def _aimed_at(self, target: Target | None) -> Task:
+        """Return the task with another target, if one is given."""
+        if target is None:
+            return self.task
+        if not isinstance(target, Target):
+            raise InputError(f"target must be a Target; got {shown(target)}")
+        return self.task.model_copy(update={"target": target})
 
     # -- warm calls -------------------------------------------------------------------------
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Annotated, Any, cast
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +39,9 @@ from stiffopt.optimise.press import Press
 from stiffopt.optimise.target import Target
 from stiffopt.schema import BadKeyError, Items, Schema, Vector
 from stiffopt.units import Force, Moment, Pressure, read_from_file, within
+
+if TYPE_CHECKING:
+    from stiffopt.model.manipulator import Manipulator
 
 
 class Load(Schema):
@@ -251,6 +254,11 @@ class Task(ForRobot):
             return self.load
         reaction = tuple(-press.force * part for part in press.direction)
         return Load(force=cast("tuple[float, float, float]", reaction), frame=press.frame)
+
+    def loaded(self, robot: Manipulator) -> Manipulator:
+        """Return an arm with that load."""
+        load = self.tip_load
+        return robot.with_load(load.force, load.moment, load.frame) if load else robot
 
     def __repr__(self) -> str:
         parts = [] if self.robot is None else [self.robot]

@@ -93,7 +93,7 @@ def plan_motion(
         Required of the body, in m; by default that of the scene.  For a calibrated robot, the
         uncertainty of the tip is added (`Manipulator.tip_uncertainty`).
     slew : float or (n,), optional
-        Largest rates of change in Pa/s, besides the robot's own; one of the two must be known.
+        Largest rates of change in Pa/s, in addition to the robot's; one of the two must be known.
     load : Load, optional
         At the tip all the way; replaces that of the tasks.
     seed : int
@@ -120,8 +120,8 @@ def plan_motion(
     if any(isinstance(each, Task) and each.brace is not None for each in (start, *goals)):
         if not (len(goals) == 1 and isinstance(goals[0], Task) and goals[0].brace is not None):
             raise InputError(
-                "a task with 'brace' can be the only goal of a motion, and not its start: played "
-                "backwards, the motion there lets go"
+                "a task with 'brace' can be the only goal of a motion, and not its start; to "
+                "release the contact, play the motion into it backwards"
             )
         task = goals[0] if scene is None else goals[0].model_copy(update={"scene": scene})
         options: dict[str, Any] = {"clearance": clearance, "load": load, "seed": seed}
@@ -164,8 +164,8 @@ def _with_margin(request: MotionRequest, timings: dict[str, float]) -> tuple[_Pl
         request = replace(request, margin=_GROWTH * left_open)
     unit = display_units().length
     raise Unsolved(
-        "no way was found on which the body keeps clear by as much as the calibration leaves open "
-        f"there; on the last one that is {unit.text(left_open, '.3g')}"
+        "no way was found on which the clearance exceeds the uncertainty of the calibration; on "
+        f"the last one that is {unit.text(left_open, '.3g')}"
     )
 
 
@@ -211,7 +211,7 @@ def _leaning(
         for on, force in end.pressed()
     )
     message = f"from rest on into contact: at the end it leans on {leant}; played backwards the "
-    message += "motion lets go"
+    message += "motion releases the contact"
     if not leant:
         message = "from rest, where the arm lies on an object, to a posture that is clear of it"
     return replace(
@@ -362,7 +362,7 @@ class _Planner:
             text += f", where {unit.text(request.required, '.3g')} of clearance are required"
         if request.margin:
             kept = unit.text(request.margin, ".3g")
-            text += f", {kept} of them for what the calibration leaves open"
+            text += f", {kept} of them for the uncertainty of the calibration"
         return text
 
     # -- ways -------------------------------------------------------------------------------
@@ -465,10 +465,10 @@ class _Planner:
             return reached
         margin, unit = self.request.margin, display_units().length
         counted = (
-            "this counts no error of the model, as the robot is not calibrated"
+            "this includes no error of the model, as the robot is not calibrated"
             if margin is None
-            else f"{unit.text(margin, '.3g')} of it are kept for what the calibration leaves open "
-            "(95 %)"
+            else f"{unit.text(margin, '.3g')} of it are kept for the uncertainty of the "
+            "calibration (95 %)"
         )
         least = unit.text(clearance.min(), ".3g")
         kept = f"the body is at least {least} clear of the scene; {counted}"

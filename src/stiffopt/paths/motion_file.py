@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from stiffopt.documents import read_document
 from stiffopt.errors import FileError, InputError
-from stiffopt.logs.table import read_table
+from stiffopt.logs.table import read_bytes, read_table
 from stiffopt.model.description import RobotDescription
 from stiffopt.paths.solution import LEANS
 from stiffopt.paths.trajectory import Trajectory, trajectory_through
@@ -22,6 +22,9 @@ RESULT_FORMAT = "stiffopt-path-result/1"
 
 LEANING = "leaning"
 """Column or key that says at which points the arm is in contact."""
+
+POSITION_ERROR = "position_error_m"
+"""A column that no log has; it identifies a solution."""
 
 Vector = NDArray[np.float64]
 
@@ -62,6 +65,11 @@ class MotionTable:
             return trajectory_through(self.times, self.pressures, self.tips, ranges, begin)
         except InputError as error:
             raise FileError(self.file, f"cannot be played: {error}") from None
+
+
+def is_motion_csv(file: str | os.PathLike[str]) -> bool:
+    """Return whether a file is the CSV of a solution, rather than a log."""
+    return POSITION_ERROR.encode() in read_bytes(file).partition(b"\n")[0].split(b",")
 
 
 def read_motion(file: str | os.PathLike[str], description: RobotDescription) -> MotionTable:

@@ -14,7 +14,6 @@ from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.scene import Scene
 from stiffopt.optimise.task import Load, Task
 from stiffopt.paths.configurations import End, checked_pressures, several
-from stiffopt.paths.rates import slew_limits
 from stiffopt.paths.solution import PathSolution, Status
 
 Vector = NDArray[np.float64]
@@ -146,7 +145,7 @@ def _rates(robot: Manipulator, slew: float | ArrayLike | None) -> Vector:
                 f"slew must be one rate above 0 in Pa/s or {robot.n_pressures} of them; "
                 f"got {shown(slew)}"
             )
-    rates = slew_limits(robot.description, None if own is None else tuple(own.tolist()))
+    rates = robot.description.slew_limits(own)
     if rates is None:
         raise InputError(
             "a motion needs to know the rates of the pressures; give slew, or pressure.slew in "

@@ -1,29 +1,11 @@
-"""Limits on the rates of pressures, and the step sizes and times that follow from them."""
+"""The step sizes and times that follow from the limits on the rates of pressures."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from stiffopt.model.description import RobotDescription
-
 Vector = NDArray[np.float64]
-
-
-def slew_limits(
-    description: RobotDescription, path_slew: float | tuple[float, ...] | None = None
-) -> Vector | None:
-    """Return the largest rates (n,) of a robot's channels, in Pa/s.
-
-    They are the smaller of the robot's and those of a path, (n,) or one for all; None if neither
-    gives any.
-    """
-    known = [rates for rates in (description.pressure_slew, path_slew) if rates is not None]
-    if not known:
-        return None
-    rows = [np.broadcast_to(np.asarray(rates, float), description.n_pressures) for rates in known]
-    smallest: Vector = np.min(rows, axis=0)
-    return smallest
 
 
 def least_times(pressures: ArrayLike, slew: ArrayLike) -> Vector:

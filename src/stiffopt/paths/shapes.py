@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import cached_property
 from pathlib import Path as FilePath
 from typing import Annotated, NamedTuple
@@ -21,6 +21,7 @@ from pydantic import (
 
 from stiffopt.directions import Direction, unit_quaternion
 from stiffopt.errors import FileError, InputError
+from stiffopt.files import folder_of
 from stiffopt.logs.table import read_table
 from stiffopt.model.obstacle import Point, Radius
 from stiffopt.optimise.target import Target
@@ -239,8 +240,7 @@ class PathShape(Schema):
     @field_validator("csv", mode="after")
     @classmethod
     def _from_its_folder(cls, file: FilePath | None, info: ValidationInfo) -> FilePath | None:
-        folder = info.context.get("folder") if isinstance(info.context, Mapping) else None
-        return file if file is None or folder is None else FilePath(folder) / file
+        return None if file is None else folder_of(info) / file
 
     @field_serializer("csv", when_used="json")
     def _write_file(self, file: FilePath | None) -> str | None:
@@ -291,7 +291,7 @@ def _check_columns(file: FilePath, columns: tuple[str, ...]) -> None:
     wanted = _COLUMNS[1:4] + (_COLUMNS[4:] if any(c in columns for c in _COLUMNS[4:]) else ())
     wrong: list[tuple[Callable[[str], bool], tuple[str, ...], str]] = [
         (lambda name: name not in _COLUMNS, columns, "is unknown"),
-        (lambda name: columns.count(name) > 1, columns, "is there twice"),
+        (lambda name: columns.count(name) > 1, columns, "appears twice"),
         (lambda name: name not in columns, wanted, "is missing"),
     ]
     for is_wrong, names, what in wrong:

@@ -17,7 +17,7 @@ from stiffopt.paths.attempts import RouteAttempts
 from stiffopt.paths.candidates import candidates
 from stiffopt.paths.path import Path
 from stiffopt.paths.points import PathCandidate, PathTasks
-from stiffopt.paths.rates import least_times, slew_limits, step_limits
+from stiffopt.paths.rates import least_times, step_limits
 from stiffopt.paths.settings import RATES
 from stiffopt.paths.solution import PathSolution
 
@@ -77,7 +77,7 @@ class _PathSolver:
             for target, goal in zip(self._points.targets, self._points.goals, strict=True)
         ]
         self._ends = path.end_pressures(robot.description)
-        self._slew = slew_limits(robot.description, path.pressure.slew)
+        self._slew = robot.description.slew_limits(path.pressure.slew)
         self._over = "mean" if path.stiffness is None else path.stiffness.over
         self._answers = PathAnswers(robot, path, self._points, self._slew)
         self._unreachable: tuple[int, str] | None = None  # the first point, and why
@@ -186,10 +186,11 @@ class _PathSolver:
         if times is None:
             times = self._fastest(pressures)
         solution = self._answers.judged(tasks, pressures, times, attempts.alone, self._unreachable)
-        branches = max(map(len, layers))
+        branches, crossings = max(map(len, layers)), route.crossings
         confidence = (
-            f"{starts} starts found at most {branches} local optima at a point; "
-            f"the best sequence crosses between branches at full rate {route.crossings} times"
+            f"{starts} starts found at most {branches} local "
+            f"{'optimum' if branches == 1 else 'optima'} at a point; the best sequence crosses "
+            f"between branches at full rate {crossings} time{'' if crossings == 1 else 's'}"
         )
         solution = replace(solution, confidence=confidence)
         if stuck is not None:

@@ -70,7 +70,7 @@ def _check_compensation(given: Compensation, index: int) -> None:
     for name, value in plain.items():
         if getattr(given, name) != value:
             raise InputError(
-                f"the simulated arm knows no segments[{index}].compensation.{name}; simulate a "
+                f"the simulated arm has no segments[{index}].compensation.{name}; simulate a "
                 "robot without it, which the optimiser's model may still have"
             )
 

@@ -301,7 +301,7 @@ def plant_of(description: Any) -> PlantSettings:
     plant, scene = description.plant, description.scene
     plant = plant if isinstance(plant, PlantSettings) else PlantSettings()
     if plant.scene is None and scene is not None:
-        met = [item for item in scene.objects if item.contact and item.contact.allowed]
+        met = [item for item in scene.objects if item.may_be_leant_on]
         if met:
             scene = check_touchable(scene.model_copy(update={"objects": tuple(met)}))
             plant = plant.model_copy(update={"scene": scene})

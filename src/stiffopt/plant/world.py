@@ -260,7 +260,7 @@ class World:
             There is no such device, fault or channel, or the rig file does not allow faults.
         """
         if not self.plant.settings.faults:
-            raise InputError("faults are not enabled; say 'faults: true' in the rig file's plant")
+            raise InputError("faults are not enabled; set 'faults: true' in the rig file's plant")
         if fault not in self.known_faults.get(device, ()):
             faults = self.known_faults.items()
             known = "; ".join(f"{name}: {', '.join(names)}" for name, names in faults)

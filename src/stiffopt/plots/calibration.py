@@ -174,22 +174,19 @@ def plot_errors_over_pressure(
     figure, panels = _rows(
         robot.n_segments, 2.5, columns=last + 1, head=head, between=0.08, sharey=True
     )
-    begin, are_moved = 0, False
-    for s, segment in enumerate(robot.segments):
-        end = begin + segment.n_channels
-        for channel in range(begin, end):
-            axes = panels[s, channel - begin]
+    are_moved = False
+    for s, own in enumerate(robot.channel_ranges):
+        for axes, channel in zip(panels[s], own, strict=False):
             pressures = [each.pressures[:, channel] for each in shown]
             limits = (seen.pressure_min[channel], seen.pressure_max[channel]) if seen else None
             are_moved |= _draw_clouds(axes, shown, pressures, limits)
             axes.set_xlabel(f"{robot.channel_name(channel)} ({pressure})")
-        for axes in panels[s, end - begin : last]:
+        for axes in panels[s, len(own) : last]:
             axes.set_visible(False)
-        norms = [np.linalg.norm(each.pressures[:, begin:end], axis=1) for each in shown]
+        norms = [np.linalg.norm(each.pressures[:, own], axis=1) for each in shown]
         limits = (0.0, seen.pressure_norm[s]) if seen else None
         are_moved |= _draw_clouds(panels[s, last], shown, norms, limits)
         panels[s, last].set_xlabel(f"norm of segment {s + 1} ({pressure})")
-        begin = end
     for axes in panels[:, 0]:
         axes.set_ylabel(f"error ({length})")
     highest = max((float(np.nanmax(each.distance, initial=0.0)) for each in shown), default=1.0)

@@ -397,8 +397,7 @@ def draw_pressures_along(
         raise InputError(f"segment: the arm has segments 1 to {len(segments)}; got {segment}")
     unit = display_units().pressure
     low, high = map(unit.of, limits or (solution.robot.pressure_min, solution.robot.pressure_max))
-    before = sum(each.n_channels for each in segments[: segment - 1])
-    channels = slice(before, before + segments[segment - 1].n_channels)
+    channels = solution.robot.description.channel_ranges[segment - 1]
     values, fast = unit.of(solution.pressures[:, channels]), _fast_steps(solution)[:, channels]
     for channel in range(values.shape[1]):
         axes.plot(

@@ -250,29 +250,21 @@ def draw_pareto(
 
 def _places(robot: Manipulator) -> Any:
     """Return the positions of the bars, with a gap between segments."""
-    places, place = [], 0.0
-    for segment in robot.description.segments:
-        for _ in range(segment.n_channels):
-            places.append(place)
-            place += 1.0
-        place += 0.6
-    return np.array(places)
+    ranges = enumerate(robot.description.channel_ranges)
+    return np.array([k + 0.6 * segment for segment, own in ranges for k in own])
 
 
 def _label_channels(axes: Any, robot: Manipulator, places: Any) -> None:
-    counts = [segment.n_channels for segment in robot.description.segments]
-    axes.set_xticks(places, [str(k + 1) for n in counts for k in range(n)])
+    ranges = robot.description.channel_ranges
+    axes.set_xticks(places, [str(k + 1) for own in ranges for k in range(len(own))])
     axes.tick_params(axis="x", length=0)
     axes.set_xlabel("channel")
-    start = 0
-    for number, count in enumerate(counts):
-        middle = places[start : start + count].mean()
+    for number, own in enumerate(ranges):
         axes.text(
-            middle, 1.0, f"segment {number + 1}", transform=axes.get_xaxis_transform(),
+            places[own].mean(), 1.0, f"segment {number + 1}", transform=axes.get_xaxis_transform(),
             ha="center", va="top", fontsize=10, weight="bold",
             color=style.segment_text_colour(number),
         )  # fmt: skip
-        start += count
 
 
 def _pressure_legend(axes: Any, any_active: bool) -> None:
@@ -324,7 +316,7 @@ def draw_solution(
         The solution has no pressures, or the view is invalid.
     """
     _require_pressures(solution)
-    arm = _loaded(robot, solution.task)
+    arm = solution.task.loaded(robot)
     drawing = _Drawing(axes, arm, solution)
     drawing.draw_base()
     leaning = solution.equilibrium
@@ -369,7 +361,7 @@ def draw_task(axes: Any, robot: Manipulator, task: Task, *, view: View | None = 
     InputError
         The view is invalid.
     """
-    arm = _loaded(robot, task)
+    arm = task.loaded(robot)
     start = arm.pressure_min
     drawing = _Drawing(axes, arm, PressureSolution("failed", "", task, start, arm.tip_pose(start)))
     drawing.draw_base()
@@ -381,11 +373,6 @@ def draw_task(axes: Any, robot: Manipulator, task: Task, *, view: View | None = 
     if task.scene is not None:
         drawing.draw_objects(task.scene)
     return drawing.finish(view)
-
-
-def _loaded(robot: Manipulator, task: Task) -> Manipulator:
-    load = task.tip_load
-    return robot.with_load(load.force, load.moment, load.frame) if load else robot
 
 
 def _require_pressures(solution: PressureSolution) -> None:

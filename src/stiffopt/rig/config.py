@@ -170,7 +170,12 @@ class RigDescription(Schema):
 
 
 def load_rig_description(path: str | os.PathLike[str]) -> RigDescription:
-    """Read a rig file and check it against its robot.
+    """Read a rig file and check it against its robot; see `load_rig`."""
+    return load_rig(path)[0]
+
+
+def load_rig(path: str | os.PathLike[str]) -> tuple[RigDescription, RobotDescription]:
+    """Read a rig file and the file of its robot; check that they fit.
 
     Raises
     ------
@@ -191,11 +196,11 @@ def load_rig_description(path: str | os.PathLike[str]) -> RigDescription:
         ) from None
     except InputError as error:
         raise FileError(path, str(error), line=line_of(path, "robot"), key="robot") from None
-    if description.commissioning.record is not None:
-        return description
-    record = str(Path(path).absolute().with_suffix(".commissioning.yaml"))
-    settings = description.commissioning.model_copy(update={"record": record})
-    return description.model_copy(update={"commissioning": settings})
+    if description.commissioning.record is None:
+        record = str(Path(path).absolute().with_suffix(".commissioning.yaml"))
+        settings = description.commissioning.model_copy(update={"record": record})
+        description = description.model_copy(update={"commissioning": settings})
+    return description, robot
 
 
 def _check_against(description: RigDescription, robot: RobotDescription) -> None:
@@ -285,12 +290,7 @@ def limits_of(description: RigDescription, robot: RobotDescription) -> PressureL
 
 def slew_of(description: RigDescription, robot: RobotDescription) -> NDArray[np.float64] | None:
     """Return the greatest rates of change (n,), in Pa/s, or None if there is no limit."""
-    rates = [r for r in (robot.pressure_slew, description.safety.max_slew) if r is not None]
-    if not rates:
-        return None
-    broadcast = [np.broadcast_to(rate, robot.n_pressures).astype(float) for rate in rates]
-    slew: NDArray[np.float64] = np.minimum.reduce(broadcast)
-    return slew
+    return robot.slew_limits(description.safety.max_slew)
 
 
 def registration_of(tracker: TrackerSettings, robot: RobotDescription) -> Registration:

@@ -175,7 +175,7 @@ class Rig(Opened):
         """
         if valid_for is not None:
             if isinstance(pressures, PressureCommand):
-                raise CommandError("a PressureCommand says itself for how long it is valid")
+                raise CommandError("a PressureCommand contains its own time of validity")
             pressures = PressureCommand(pressures, self.clock.now(), valid_for)
         self.supply.command(pressures)
 

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, ValidationInfo, model_validator
 
+from stiffopt.files import folder_of
 from stiffopt.model.description import PerChannelPressure, PerChannelRate
 from stiffopt.schema import BadKeyError, Schema
 from stiffopt.units import Duration, Force, Frequency, Length, Ratio, Speed
@@ -20,8 +19,7 @@ def _none(value: Any) -> Any:
 
 def _beside(value: Any, info: ValidationInfo) -> Any:
     """Make a path in a file independent of the working directory."""
-    folder = info.context.get("folder") if isinstance(info.context, Mapping) else None
-    return str(Path(folder) / value) if folder is not None and isinstance(value, str) else value
+    return str(folder_of(info) / value) if isinstance(value, str) else value
 
 
 _Port = Annotated[int, Field(ge=0, le=65535, strict=True)]
@@ -89,8 +87,8 @@ class Safety(Schema):
         if self.hold_timeout is None and self.unlimited_hold != "accepted":
             raise BadKeyError(
                 "hold_timeout",
-                "without one, pressures may be held for ever on an arm that is not understood; "
-                "give a time, or say 'unlimited_hold: accepted' as well",
+                "without one, pressures may be held for ever on an arm whose motion is not "
+                "explained; give a time, or add 'unlimited_hold: accepted'",
             )
         return self
 

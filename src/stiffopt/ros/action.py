@@ -148,7 +148,7 @@ class FollowAction:
                 for part in ("path", "component_path", "goal", "component_goal")
             ):
                 raise InputError(
-                    "tolerances, and joints of several degrees of freedom, are not known here"
+                    "tolerances, and joints of several degrees of freedom, are not supported"
                 )
             found.append(self._read(wanted.trajectory))
             self._client.follow_trajectory(found[0])

@@ -130,7 +130,7 @@ class HostedDevices:
                 return self.world.pressures.tolist()
         if self._probe is not None and word.startswith("probe-"):
             return self._use_probe(self._probe, word, about)
-        raise DeviceError(f"a simulated rig knows nothing of '{word}'")
+        raise DeviceError(f"a simulated rig has no '{word}'")
 
     def _use_probe(self, probe: ForceProbe, word: str, about: dict[str, Any]) -> Any:
         """Carry out a request of a `ForwardedProbe`; a move only starts here."""

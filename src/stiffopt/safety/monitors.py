@@ -172,8 +172,8 @@ class PressureMonitor:
             return Trouble(
                 "leak",
                 f"channel {channel + 1} reads {_bar(p[channel])}, though "
-                f"{_bar(self._commanded[channel])} was commanded: it leaks, or its regulator has "
-                "no more pressure; it is vented with all others",
+                f"{_bar(self._commanded[channel])} was commanded: it leaks, its regulator has no "
+                "more pressure, or its gauge is another channel's; it is vented with all others",
             )
         return None
 

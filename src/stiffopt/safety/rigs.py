@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import os
-from pathlib import Path
 
-from stiffopt.errors import InputError
 from stiffopt.model.description import RobotDescription
-from stiffopt.model.robot_files import load_description
 from stiffopt.rig.assembly import make_rig
-from stiffopt.rig.config import RigDescription, limits_of, load_rig_description, slew_of
+from stiffopt.rig.config import RigDescription, limits_of, load_rig, slew_of
 from stiffopt.rig.interface import (
     Clock,
     ForceProbe,
@@ -46,9 +43,7 @@ def open_rig(path: str | os.PathLike[str], *, real_time: bool = False) -> Rig:
     MissingExtraError
         The rig is simulated and numba is not installed.
     """
-    description = load_rig_description(path)
-    robot = load_description(description.robot, base=Path(path).parent)
-    return rig_for_programs(description, robot, real_time=real_time)
+    return rig_for_programs(*load_rig(path), real_time=real_time)
 
 
 def rig_for_programs(
@@ -87,10 +82,7 @@ def gated_rig(rig: Rig, safety: Safety, period: float) -> Rig:
 
 
 def guarded_rig(
-    rig: str | os.PathLike[str] | RigDescription,
-    robot: RobotDescription | None = None,
-    *,
-    json_lines: bool = False,
+    description: RigDescription, robot: RobotDescription, *, json_lines: bool = False
 ) -> tuple[Rig, GuardLink]:
     """Return a rig in real time whose supply a guard process owns, and the link to the guard.
 
@@ -99,29 +91,18 @@ def guarded_rig(
 
     Parameters
     ----------
-    rig :
-        A rig file, or its content.
-    robot :
-        Robot of the rig; required with the content of a rig file.
+    description, robot :
+        Content of a rig file, and its robot.
     json_lines :
         Whether the guard writes JSON lines on stderr.
 
     Raises
     ------
-    FileError
-        A file is wrong.
     InputError
-        The robot is missing.
+        A setting does not fit the robot.
     MissingExtraError
         A library is not installed.
     """
-    if isinstance(rig, RigDescription):
-        if robot is None:
-            raise InputError("expected the robot of the rig too")
-        description = rig
-    else:
-        description = load_rig_description(rig)
-        robot = robot or load_description(description.robot, base=Path(rig).parent)
     limits, slew = limits_of(description, robot), slew_of(description, robot)
     clock: Clock = SystemClock()
     tracker: PoseTracker | None

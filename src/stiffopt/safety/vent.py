@@ -9,9 +9,8 @@ from contextlib import suppress
 from pathlib import Path
 
 from stiffopt.errors import DeviceError
-from stiffopt.model.robot_files import load_description
 from stiffopt.rig.assembly import make_rig
-from stiffopt.rig.config import RigDescription, load_rig_description
+from stiffopt.rig.config import RigDescription, load_rig
 from stiffopt.rig.interface import PressureSupply
 from stiffopt.safety.hosted import simulated_endpoint
 from stiffopt.safety.rescue import vent_directly
@@ -38,10 +37,9 @@ def vent_rig(path: str | os.PathLike[str]) -> str:
     DeviceError
         It is not certain that the supply is vented.
     """
-    description = load_rig_description(path)
+    description, robot = load_rig(path)
     if description.supply.simulated:
         return _vent_simulated(description)
-    robot = load_description(description.robot, base=Path(path).parent)
     supply = make_rig(description.model_copy(update={"tracker": None, "probe": None}), robot).supply
     if not isinstance(supply, PressureSupply):
         raise DeviceError("this rig's supply cannot be reached directly")

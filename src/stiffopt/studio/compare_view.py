@@ -44,7 +44,7 @@ class CompareView:
     def show(self) -> None:
         """Compare the kept solutions with the present one."""
         if self._bench.kept:
-            self._table.content = texts.compared_html(self._bench, KEPT)
+            self._table.content = texts.compared_html(self._bench)
 
     def _keep(self, _: Any) -> None:
         bench = self._bench
@@ -56,14 +56,14 @@ class CompareView:
             )  # fmt: skip
             arm.show(answer.robot, answer.pressures)
             self._kept.append(arm)
-        self._table.content = texts.compared_html(bench, KEPT)
+        self._table.content = texts.compared_html(bench)
 
     def _clear(self, _: Any) -> None:
         self._bench.kept.clear()
         for arm in self._kept:
             arm.remove()
         self._kept.clear()
-        self._table.content = texts.compared_html(self._bench, KEPT)
+        self._table.content = texts.compared_html(self._bench)
 
 
 class CopyView:

@@ -71,10 +71,8 @@ class Design:
         """Return a robot with a first task: hold its tip where it bends a little, stiff along x."""
         robot = load_robot(description)
         low, high = robot.pressure_min, robot.pressure_max
-        pressures, channel = low.copy(), 0
-        for segment in description.segments:
-            pressures[channel] += _BENT * (high - low)[channel]
-            channel += segment.n_channels
+        pressures, first = low.copy(), [own[0] for own in description.channel_ranges]
+        pressures[first] += _BENT * (high - low)[first]
         position = robot.tip_pose(np.clip(pressures, low, high))[:3, 3]
         task = Task(
             target=Target(position=tuple(position.round(4).tolist())),

@@ -70,9 +70,7 @@ class Leaning:
             The arm slips off, snaps through or buckles on the way.
         """
         scene = design.task.scene
-        if scene is None or not any(
-            each.contact and each.contact.allowed for each in scene.objects
-        ):
+        if scene is None or not any(each.may_be_leant_on for each in scene.objects):
             raise InputError(
                 "there is nothing to lean on; choose an object and tick 'may be leant on'"
             )

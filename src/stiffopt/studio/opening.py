@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path as FilePath
 from typing import Any
 
-from stiffopt.daemon.secret import is_loopback
+from stiffopt.daemon.address import is_loopback
 from stiffopt.errors import InputError
 from stiffopt.studio.cloud import check_map
 from stiffopt.studio.page import StudioPage

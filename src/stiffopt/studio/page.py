@@ -18,7 +18,6 @@ import hmac
 import http
 import io
 import secrets
-import socket
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stdout
@@ -27,10 +26,10 @@ from http.cookies import CookieError, SimpleCookie
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
+from stiffopt.daemon.address import bound_socket, local_url, own_host
 from stiffopt.daemon.place import check_place
 from stiffopt.daemon.reports import RefusalError
-from stiffopt.daemon.secret import bracketed
-from stiffopt.errors import InputError, MissingExtraError, ServiceError, os_reason
+from stiffopt.errors import MissingExtraError, ServiceError
 
 try:
     import viser
@@ -134,9 +133,12 @@ class StudioPage:
 
     def __init__(self, host: str = "127.0.0.1", port: int = 0, label: str = "stiffopt") -> None:
         self.host, self._check = host, KeyCheck((host,))
-        port = _free_port(host, port)
+        with bound_socket(host, port) as free:  # viser would take the next one
+            port = int(free.getsockname()[1])
         with _starting, redirect_stdout(io.StringIO()), _checked(self._check):
             self.server = _PrivateServer(host=host, port=port, label=label, verbose=False)
+        self.server.gui.configure_theme(show_logo=False, show_share_button=False)
+        self.server.gui.main_panel.set_width(400)
         self.port = self.server.get_port()
         if not self._refuses_strangers():
             self.close()
@@ -148,8 +150,7 @@ class StudioPage:
     @property
     def url(self) -> str:
         """The address with the key."""
-        host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(self.host, self.host)
-        return f"http://{bracketed(host)}:{self.port}/?key={self._check.key}"
+        return f"{local_url(self.host, self.port)}/?key={self._check.key}"
 
     def close(self) -> None:
         """End all connections and stop listening."""
@@ -158,7 +159,6 @@ class StudioPage:
 
     def _refuses_strangers(self) -> bool:
         """Whether the page and its WebSocket are refused without the key."""
-        host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(self.host, self.host)
         upgrade = {
             "Connection": "Upgrade",
             "Upgrade": "websocket",
@@ -166,7 +166,7 @@ class StudioPage:
             "Sec-WebSocket-Key": "c3RpZmZvcHQgc3R1ZGlvIQ==",
         }
         for headers in ({}, upgrade):
-            connection = HTTPConnection(host, self.port, timeout=_TRY)
+            connection = HTTPConnection(own_host(self.host), self.port, timeout=_TRY)
             try:
                 connection.request("GET", "/", headers=headers)
                 if connection.getresponse().status != http.HTTPStatus.FORBIDDEN:
@@ -198,18 +198,3 @@ def _checked(check: KeyCheck) -> Iterator[None]:
         yield
     finally:
         asyncio_server.serve = serve  # type: ignore[misc]
-
-
-def _free_port(host: str, port: int) -> int:
-    """Return the port, or a free one for 0; raise if it is in use (viser would take the next)."""
-    try:
-        found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
-        family, kind, protocol, _, address = found[0]
-        with socket.socket(family, kind, protocol) as probe:
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            probe.bind(address)
-            return int(probe.getsockname()[1])
-    except OSError as error:
-        raise InputError(
-            f"cannot listen on {host} port {port}: {os_reason(error)}; give another host or port"
-        ) from None

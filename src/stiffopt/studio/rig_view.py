@@ -66,8 +66,6 @@ class RigView:
     def _add_panel(self) -> None:
         gui, watch = self.server.gui, self.watch
         if self._preview is None:
-            gui.configure_theme(show_logo=False, show_share_button=False)
-            gui.main_panel.set_width(400)
             self._words = gui.add_html("")
             return
         panel = gui.add_panel()

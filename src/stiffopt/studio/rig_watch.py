@@ -25,9 +25,9 @@ from stiffopt.daemon.client import Client, daemon_url
 from stiffopt.errors import CommandError, InputError, StiffoptError
 from stiffopt.model.contact.equilibrium import ContactEquilibrium
 from stiffopt.model.manipulator import Manipulator
-from stiffopt.model.robot_files import load_description, robot_path
+from stiffopt.model.robot_files import robot_path
 from stiffopt.optimise.task import PressureRange
-from stiffopt.rig.config import limits_of, load_rig_description
+from stiffopt.rig.config import limits_of, load_rig
 from stiffopt.safety.vent import vent_rig
 from stiffopt.studio.design import Design
 from stiffopt.studio.workbench import Workbench
@@ -68,11 +68,10 @@ class RigWatch:
         token: str | os.PathLike[str] | None = None,
         is_watched: Callable[[], bool] = lambda: True,
     ) -> None:
-        rig = load_rig_description(file)
+        rig, robot = load_rig(file)
         if not rig.service.port:
             raise InputError(f"{file}: service.port is 0, so its daemon has no known address")
         self._file, self._is_watched = file, is_watched
-        robot = load_description(rig.robot, base=Path(file).parent)
         design = Design.of_description(robot, robot_path(rig.robot, Path(file).parent))
         self.design = design.with_task(
             scene=rig.scene, pressure=PressureRange(max=tuple(limits_of(rig, robot).high.tolist()))

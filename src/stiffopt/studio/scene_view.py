@@ -189,7 +189,7 @@ class SceneView:
         if item is None or self.is_held:
             return
         place(self._handle, objects.place_of(item.shape))
-        self._allowed.value = item.contact is not None and item.contact.allowed
+        self._allowed.value = item.may_be_leant_on
         size = objects.size_of(item.shape)
         if size is not None:
             show_on_slider(self._size, self._unit, size)

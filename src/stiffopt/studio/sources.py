@@ -16,6 +16,7 @@ from stiffopt.model.manipulator import load_robot
 from stiffopt.model.robot_files import builtin_robots, load_description
 from stiffopt.model.scene import load_scene
 from stiffopt.optimise.task import load_task
+from stiffopt.paths.motion_file import is_motion_csv
 from stiffopt.paths.path import load_path
 from stiffopt.paths.solver import solve_path
 from stiffopt.studio.design import Design
@@ -24,7 +25,6 @@ from stiffopt.studio.timeline import Timeline
 ROBOT = "stiff-flop-2"
 """The default robot."""
 _KINDS = ("robot", "task", "scene", "path", "rig")
-_MOTION = "position_error_m"  # a column that logs do not have
 
 
 def kind_of(file: str) -> str:
@@ -44,7 +44,7 @@ def kind_of(file: str) -> str:
     if kind not in _KINDS:
         known = ", ".join(_KINDS)
         raise FileError(
-            file, f"is nothing that the studio shows; expected a file of a {known} or recording"
+            file, f"cannot be shown in the studio; expected a file of a {known} or recording"
         )
     return kind
 
@@ -68,7 +68,7 @@ def timeline_of(file: str, robot: str | None = None) -> Timeline:
         return Timeline.of_path(path, solve_path(load_robot(path.resolve_robot()), path))
     if FilePath(file).suffix.lower() == ".csv":
         description = load_description(robot or ROBOT)
-        if _is_motion(file):
+        if is_motion_csv(file):
             return Timeline.of_motion(file, description)
         return Timeline.of_log(file, read_log(file), description)
     if LOG_METADATA in read_mcap(file).metadata:
@@ -85,11 +85,3 @@ def _robot_of(text: str) -> RobotDescription:
         path = FilePath(folder) / "robot.yaml"
         write_whole(path, text.encode())
         return load_description(path)
-
-
-def _is_motion(file: str) -> bool:
-    try:
-        with open(file, encoding="utf-8", errors="replace") as stream:
-            return _MOTION in stream.readline().split(",")
-    except OSError as error:
-        raise FileError(file, f"cannot be read: {error.strerror}") from None

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from stiffopt import lie
 from stiffopt.errors import StiffoptError
 from stiffopt.model.stopping import Cancel
 from stiffopt.plots import style
@@ -103,8 +104,6 @@ class TaskView:
 
     def _add_panel(self, found: WorkspaceMap | None, *, is_preview: bool) -> None:
         gui, design = self.server.gui, self.bench.design
-        gui.configure_theme(show_logo=False, show_share_button=False)
-        gui.main_panel.set_width(400)
         if is_preview:
             gui.add_html(texts.note_html(_PREVIEW))
         self._words = gui.add_html("")
@@ -232,7 +231,7 @@ class TaskView:
         if target.orientation is not None:
             turn(self._target, target.orientation)
         elif target.pointing is not None:
-            turn(self._target, _pointing_quaternion(np.array(target.pointing)))
+            turn(self._target, lie.quaternion_along(target.pointing))
         elif self._target.disable_rotations is False:
             turn(self._target, (1.0, 0.0, 0.0, 0.0))
         self._target.disable_rotations = design.angular == "any"
@@ -267,10 +266,3 @@ class TaskView:
             pose[2, 3] = self._length
             return pose
         return np.asarray(answer.solution.tip_pose)
-
-
-def _pointing_quaternion(direction: Vector) -> Vector:
-    """Return the smallest rotation (w first) from the z axis to a unit vector."""
-    half = np.array([1.0 + direction[2], -direction[1], direction[0], 0.0])
-    length = np.linalg.norm(half)
-    return np.array([0.0, 1.0, 0.0, 0.0]) if length < 1e-9 else half / length

@@ -22,6 +22,7 @@ from stiffopt.optimise.solution import PressureSolution
 from stiffopt.plots import style
 from stiffopt.plots.wording import direction_text, gain_text, stiffness_text
 from stiffopt.studio.design import Design
+from stiffopt.studio.drawing import KEPT
 from stiffopt.studio.leaning import contact_rows, leaning_rows
 from stiffopt.studio.rig_watch import RigWatch
 from stiffopt.studio.timeline import Timeline
@@ -116,14 +117,13 @@ def _rows(answer: StudioAnswer) -> Iterable[tuple[str, str]]:
 
 def _limits_text(answer: StudioAnswer) -> str:
     """Describe which channels are at which limits, by segment."""
-    parts, begin = [], 0
-    for number, segment in enumerate(answer.robot.description.segments, start=1):
+    parts = []
+    for number, own in enumerate(answer.robot.description.channel_ranges, start=1):
         for side, name in ((-1, "min"), (1, "max")):
-            mine = answer.at_limit[begin : begin + segment.n_channels] == side
-            if mine.any():
-                channels = ", ".join(str(k + 1) for k in np.flatnonzero(mine))
+            mine = np.flatnonzero(answer.at_limit[own] == side)
+            if len(mine):
+                channels = ", ".join(str(k + 1) for k in mine)
                 parts.append(f"segment {number}: {channels} at {name}")
-        begin += segment.n_channels
     return "; ".join(parts)
 
 
@@ -174,24 +174,24 @@ def pressures_html(
     """
     p, low, high = (np.asarray(each, dtype=float) for each in (pressures, low, high))
     top, bottom = max(high.max(), p.max()), min(low.min(), 0.0)
-    rows, index, unit = [], 0, display_units().pressure
+    rows, unit = [], display_units().pressure
 
     def share(value: float) -> str:
         return f"{np.clip(100 * (value - bottom) / (top - bottom), 0, 100):.1f}%"
 
-    for number, segment in enumerate(description.segments):
+    for number, own in enumerate(description.channel_ranges):
         rows.append(
             f"<div style='color:{style.segment_text_colour(number)};font-weight:600;"
             f"margin-top:4px'>segment {number + 1}</div>"
         )
-        for channel in range(segment.n_channels):
+        for channel, index in enumerate(own, start=1):
             colour = style.AT_LIMIT if at_limit[index] else style.WITHIN_LIMITS
             tick = ""
             if marks is not None:
                 tick = _line(share(float(np.asarray(marks)[index])), "#222", 2)
             rows.append(
                 "<div style='display:flex;align-items:center;gap:6px;height:15px'>"
-                f"<span style='width:1em'>{channel + 1}</span>"
+                f"<span style='width:1em'>{channel}</span>"
                 f"<span style='position:relative;flex:1;height:10px;background:{style.RANGE}'>"
                 f"<span style='position:absolute;left:0;top:0;bottom:0;"
                 f"width:{share(p[index])};background:{colour}'></span>"
@@ -199,7 +199,6 @@ def pressures_html(
                 f"<span style='width:4.6em;text-align:right'>{unit.text(p[index], '.2f')}</span>"
                 "</div>"
             )
-            index += 1
     legend = f"orange: at a limit{'' if marks is None else f' &middot; black mark: {mark}'}"
     return (
         f"<div style='font-size:0.8em'>{''.join(rows)}"
@@ -222,10 +221,10 @@ def note_html(text: str) -> str:
 # -- answers side by side -------------------------------------------------------------------------
 
 
-def compared_html(bench: Workbench, colours: Sequence[str]) -> str:
+def compared_html(bench: Workbench) -> str:
     """Return a table of the present and the kept solutions, each with its colour."""
     now = [] if bench.answer is None else [(style.DARK, "now", bench.answer)]
-    kept = [(colours[k % len(colours)], str(k + 1), answer) for k, answer in enumerate(bench.kept)]
+    kept = [(KEPT[k % len(KEPT)], str(k + 1), answer) for k, answer in enumerate(bench.kept)]
     if not kept:
         return _padded("<div style='font-size:0.85em'>Keep an answer to compare others.</div>")
     units = display_units()

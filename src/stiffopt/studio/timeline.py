@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path as FilePath
 from typing import NamedTuple
 
@@ -27,6 +27,7 @@ from stiffopt.plots.wording import stiffness_text
 Vector = NDArray[np.float64]
 
 _SHOWN = 400  # points of a chart
+_EVENTS = 4  # shown at a time
 
 
 class TimelineChart(NamedTuple):
@@ -85,7 +86,7 @@ class Timeline:
     headline: str = ""
     asked: Vector | None = None
     seen: Vector | None = None
-    events: tuple[tuple[float, str], ...] = field(default=())
+    events: tuple[tuple[float, str], ...] = ()
     scene: Scene | None = None
 
     @property
@@ -106,9 +107,9 @@ class Timeline:
             seen = self.seen[known[-1]] if len(known) else None
         return TimelineMoment(index, pressures, seen)
 
-    def events_until(self, time: float, count: int = 4) -> tuple[tuple[float, str], ...]:
+    def events_until(self, time: float) -> tuple[tuple[float, str], ...]:
         """Return the last events until a time, the newest first."""
-        return tuple([event for event in self.events if event[0] <= time][-count:][::-1])
+        return tuple([event for event in self.events if event[0] <= time][: -_EVENTS - 1 : -1])
 
     def shown_rows(self) -> NDArray[np.int_]:
         """Return the rows that a chart shows: all, or some hundreds of them."""
@@ -227,13 +228,13 @@ def _check_rows(file: str | os.PathLike[str], times: Vector, pressures: Vector) 
 
 def _pressure_charts(description: RobotDescription, pressures: Vector) -> tuple[TimelineChart, ...]:
     """Return a chart of the pressures of each segment."""
-    charts, begin, unit = [], 0, display_units().pressure
-    for number, segment in enumerate(description.segments):
-        mine = slice(begin, begin + segment.n_channels)
-        names = tuple(f"channel {k + 1}" for k in range(segment.n_channels))
-        title = f"segment {number + 1}: pressure ({unit})"
-        charts.append(
-            TimelineChart(title, names, unit.of(pressures[:, mine]), shows_pressures=True)
+    unit = display_units().pressure
+    return tuple(
+        TimelineChart(
+            f"segment {number}: pressure ({unit})",
+            tuple(f"channel {k + 1}" for k in range(len(own))),
+            unit.of(pressures[:, own]),
+            shows_pressures=True,
         )
-        begin += segment.n_channels
-    return tuple(charts)
+        for number, own in enumerate(description.channel_ranges, start=1)
+    )

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from stiffopt.plots import style
-from stiffopt.plots.shapes import surface_mesh
 from stiffopt.studio import texts
 from stiffopt.studio.drawing import ArmTube, add_surroundings, place, rgb
+from stiffopt.studio.scene_view import draw_object
 from stiffopt.studio.timeline import Timeline, TimelineChart
 
 _FRAME = 0.05  # s, period of the animation
@@ -52,21 +52,17 @@ class TimelineView:
         return float(self._slider.value)
 
     def _add_scene(self) -> None:
-        scene, timeline = self.server.scene, self.timeline
+        timeline = self.timeline
         tips = timeline.robot.tip_pose(timeline.pressures[timeline.shown_rows()])[:, :3, 3]
         self._add_line("/tips", tips, style.DARK)
         if timeline.asked is not None:
             self._add_line("/asked", timeline.asked, style.TARGET)
-        self._seen = scene.add_icosphere(
+        self._seen = self.server.scene.add_icosphere(
             "/seen", radius=0.02 * self._length, color=rgb(style.MEASURED), visible=False
         )
         if timeline.scene is not None:
             for number, item in enumerate(timeline.scene.objects):
-                vertices, faces = surface_mesh(item.shape, self._length)
-                scene.add_mesh_simple(
-                    f"/scene/{number}", vertices, faces, color=rgb(style.OBSTACLE), opacity=0.5,
-                    side="double", cast_shadow=False,
-                )  # fmt: skip
+                draw_object(self.server, item, number, self._length)
 
     def _add_line(self, name: str, points: Any, colour: str) -> None:
         pairs = np.stack([points[:-1], points[1:]], axis=1).astype(np.float32)
@@ -76,8 +72,6 @@ class TimelineView:
 
     def _add_panel(self) -> None:
         gui, timeline = self.server.gui, self.timeline
-        gui.configure_theme(show_logo=False, show_share_button=False)
-        gui.main_panel.set_width(400)
         self._words = gui.add_html("")
         self._button = gui.add_button("play")
         self._button.on_click(self._pressed)

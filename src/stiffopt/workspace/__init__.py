@@ -8,6 +8,5 @@ only when needed.
 
 from stiffopt.workspace.map import Extreme, WorkspaceMap
 from stiffopt.workspace.mapping import map_workspace, open_workspace_map
-from stiffopt.workspace.plan import MapPlan
 
-__all__ = ["Extreme", "MapPlan", "WorkspaceMap", "map_workspace", "open_workspace_map"]
+__all__ = ["Extreme", "WorkspaceMap", "map_workspace", "open_workspace_map"]

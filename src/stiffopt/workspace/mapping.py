@@ -146,7 +146,7 @@ def open_workspace_map(path: str | os.PathLike[str]) -> WorkspaceMap:
     require_package("zarr", "map")
     store = MapStore(path)
     if not store.is_complete:
-        raise FileError(path, "is not complete; run what made it again, and it goes on")
+        raise FileError(path, "is not complete; run the command that made it again to continue")
     return _as_map(_plan_of(store), store.read(), store.path, evaluated=0)
 
 

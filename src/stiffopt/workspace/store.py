@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from stiffopt.errors import FileError, os_reason, require_package, shown
 from stiffopt.workspace.map import FILL, WorkspaceMap
-from stiffopt.workspace.table import CellTable, MapPart, cell_keys
+from stiffopt.workspace.table import CellTable, MapPart, cell_keys, merged
 
 FORMAT = "stiffopt-map/1"
 _METADATA = "zarr.json"
@@ -140,7 +140,7 @@ class MapStore:
             return None
         except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile):
             raise FileError(
-                path, "is damaged, so the map cannot be resumed; begin anew with --overwrite"
+                path, "is damaged, so the map cannot be resumed; start again with --overwrite"
             ) from None
 
     # -- complete maps ----------------------------------------------------------------------
@@ -183,7 +183,8 @@ class MapStore:
             lost = int(self.attributes["samples_without_equilibrium"])
         except Exception as error:  # a damaged file may raise anything in zarr's decoders
             raise FileError(
-                self.path, f"is damaged: {type(error).__name__}: {error}; begin anew (--overwrite)"
+                self.path,
+                f"is damaged: {type(error).__name__}: {error}; start again with --overwrite",
             ) from None
         return MapPart(0, lost, low, high, table)
 
@@ -254,9 +255,7 @@ def read_table(path: Path, first: NDArray[np.int64]) -> CellTable:
         inside: Any = (..., *where)
         key = cell_keys(np.stack(where, axis=1) + first + np.array([start, 0, 0]))
         parts.append(CellTable(key, **{name: box[inside] for name, box in slab.items()}))
-    names = list(parts[0].arrays)
-    # slabs are in order along x, so keys ascend
-    return CellTable(*(np.concatenate([getattr(p, n) for p in parts], axis=-1) for n in names))
+    return merged(parts)
 
 
 # metadata ----------------------------------------------------------------------------------------

@@ -166,14 +166,14 @@ class Cluster(AbstractContextManager["Cluster"]):
         except StiffoptError:
             raise
         except TimeoutError as error:  # it was done, so nothing but its transfer can take long
-            raise ResultLostError("the cluster has lost a result that was done") from error
+            raise ResultLostError("the cluster has lost a finished result") from error
         except (Exception, CancelledError) as error:
             raise ClusterError(
                 f"the cluster failed: {type(error).__name__}: {str(error) or 'no reason given'}"
             ) from error
         if token != self._token:
             raise ClusterError(
-                "the cluster's workers understand the map otherwise than this process does; "
+                "the cluster's workers interpret the map differently from this process; "
                 "install the same version of stiffopt everywhere"
             )
         self._seen = monotonic()

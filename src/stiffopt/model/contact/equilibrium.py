@@ -280,7 +280,7 @@ class ContactEquilibrium:
     def friction(self) -> FrictionBounds:
         """Bounds on how far friction can change this equilibrium, to first order.
 
-        They hold for every approach. At each touched point acts a tangential force of at most the
+        They hold for every approach. At each touched point a tangential force acts, of at most the
         coefficient of friction times the normal force, in the direction in which it changes tip and
         forces most. The contacts stay closed.
         """
@@ -442,7 +442,7 @@ class ContactEquilibrium:
     def foretold_loss(self, direction: ArrayLike, contacts: Grip = "sliding") -> float:
         """Return the push in N of `lift_off` to first order in the push; infinite if there is none.
 
-        It takes a small part of the time, and knows no contacts that the push adds.  Parameters are
+        It takes a small part of the time, and ignores contacts that the push adds.  Parameters are
         those of `lift_off`.
         """
         d = np.asarray(checked_measure(direction, "translation", "free", "base").direction)
@@ -537,12 +537,5 @@ def contact_problem(arm: Manipulator, scene: Scene, spacing: float = SPACINGS[0]
 def _problem(rod: Rod, key: SceneKey, spacing: float) -> ContactProblem:
     measured = measured_scene(key.scene, rod.arm.description)
     pairs = zip(key.scene.objects, measured.items, strict=True)
-    return ContactProblem(
-        rod,
-        tuple(
-            ContactSurface(item, known.begin)
-            for item, known in pairs
-            if item.contact is not None and item.contact.allowed
-        ),
-        spacing,
-    )
+    surfaces = (ContactSurface(item, near.begin) for item, near in pairs if item.may_be_leant_on)
+    return ContactProblem(rod, tuple(surfaces), spacing)

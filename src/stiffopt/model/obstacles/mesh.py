@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ from pydantic import ValidationInfo, field_serializer, field_validator, model_va
 from stiffopt import lie
 from stiffopt.directions import Quaternion
 from stiffopt.errors import InputError
+from stiffopt.files import folder_of
 from stiffopt.model.description import RobotDescription
 from stiffopt.model.distance_grid import (
     DistanceGrid,
@@ -59,8 +59,7 @@ class Mesh(Obstacle):
     @field_validator("file", mode="after")
     @classmethod
     def _from_its_folder(cls, file: Path, info: ValidationInfo) -> Path:
-        folder = info.context.get("folder") if isinstance(info.context, Mapping) else None
-        return file if folder is None else Path(folder) / file
+        return folder_of(info) / file
 
     @field_serializer("file", when_used="json")
     def _write_file(self, file: Path) -> str:

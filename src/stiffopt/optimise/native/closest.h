@@ -32,7 +32,8 @@ static void closest_optima(Program *P, const double *last, const Ranked *nearest
     int64_t nothing_new = 0, descents = 0;
     NEW_POINT(p, s);
     for (int64_t i = 0; closest_start(P, i, last, nearest, count, &p); i++) {
-        if (stopped(P) || descents >= set->most_descents || nothing_new >= set->agreeing) break;
+        if (stopped(P) || descents >= set->compiled_descents) break;
+        if (nothing_new >= set->compiled_agreeing) break;
         found->tried++;
         if (!reach(P, &p, s->reach.iterations) || !evaluate(P, &p, 1)) continue;
         Descent now = descend(P, &p, known);
@@ -70,8 +71,8 @@ static int closest(Program *P, const double *from, double *x, double *slope, Fou
     const double *tolerances = P->radius;
     own.terms = 1, own.floors = 0, own.precision = set->precision, own.same_optimum = set->same;
     int64_t n = own.n, balls = own.balls, stages = 0, good = 0;
-    double radius[balls], optima[set->most_descents * n];
-    Descent ends[set->most_descents];
+    double radius[balls], optima[set->compiled_descents * n];
+    Descent ends[set->compiled_descents];
     Effort effort;
     Ranked nearest[2 * own.most_effort.screened];
     int64_t count = nearest_samples(P, nearest, &effort);

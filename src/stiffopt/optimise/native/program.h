@@ -30,7 +30,7 @@ typedef struct {
 } Effort;
 
 typedef struct {
-    int64_t general_descents, general_agreeing, most_descents, agreeing, samples;
+    int64_t most_descents, agreeing, compiled_descents, compiled_agreeing, samples;
     double same, precision;
 } ClosestSettings;
 

@@ -572,7 +572,7 @@ class ModbusLine:
             echo = answer.address if function.startswith("write") and code < 0x80 else None
             if code & 0x7F != _CODES[function] or (echo is not None and echo != args[0]):
                 self.disconnect()  # the answer may be to an earlier request, unnoticed by pymodbus
-                raise DeviceError(f"{self.address} answers something else: {what}")
+                raise DeviceError(f"{self.address} sent an unexpected answer: {what}")
         if code >= 0x80:
             reason = _EXCEPTIONS.get(answer.exception_code, "it does not say why")
             message = f"{self.address} refuses: {what}; exception {answer.exception_code}, {reason}"

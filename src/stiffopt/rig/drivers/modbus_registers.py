@@ -258,7 +258,8 @@ class PressureRegister:
             count = self._next(count, 1 if (said < lowest) == self.scale.rises else -1)
             if pressure != 0 and not lowest <= self.scale.to_pressure(count) <= highest:
                 raise InputError(
-                    f"its register can say nothing from {lowest * 1e-5:g} to {highest * 1e-5:g} bar"
+                    f"its register cannot represent any pressure from {lowest * 1e-5:g} to "
+                    f"{highest * 1e-5:g} bar"
                 )
         return self.registers(count)
 

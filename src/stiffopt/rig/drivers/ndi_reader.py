@@ -86,7 +86,10 @@ def known_ports() -> str:
     from serial.tools import list_ports
 
     names = sorted(port.device for port in list_ports.comports())
-    return f"the ports here are {', '.join(names)}" if names else "this computer has none now"
+    if not names:
+        return "this computer has none now"
+    are = "port here is" if len(names) == 1 else "ports here are"
+    return f"the {are} {', '.join(names)}"
 
 
 def find_port() -> str:
@@ -99,7 +102,7 @@ def find_port() -> str:
         if port.vid == NDI_VENDOR or (port.vid, port.pid) in NDI_IDS
     ]
     if not ports:
-        raise LostError(f"no USB port says that it is NDI's; {known_ports()}")
+        raise LostError(f"no USB port identifies itself as NDI's; {known_ports()}")
     if len(ports) > 1:
         raise LostError(f"there are several NDI devices, at {', '.join(ports)}; name one")
     return str(ports[0])

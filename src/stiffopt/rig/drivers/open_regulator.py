@@ -250,7 +250,7 @@ class OpenRegulatorSupply(PressureSupply):
         payload = struct.pack(f"<IH{len(counts)}h", time, validity, *counts)
         status = self._keep(self._line.status(SET, payload))
         if status.set_points != counts:
-            raise DeviceError(f"{self._line} holds other set-points than it was told")
+            raise DeviceError(f"{self._line} holds other set-points than it received")
         self._held_counts = counts
         return status
 

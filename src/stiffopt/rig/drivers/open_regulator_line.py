@@ -140,19 +140,6 @@ def body_of(frame: bytes) -> bytes | None:
     return None
 
 
-class BoardRefusedError(DeviceError):
-    """The board has refused the request.
-
-    Attributes
-    ----------
-    code : see docs/open-regulator.md.
-    """
-
-    def __init__(self, message: str, code: int) -> None:
-        super().__init__(message)
-        self.code = code
-
-
 class BoardLine:
     """Sends requests to a board and returns its answers; nothing is sent twice.
 
@@ -205,10 +192,8 @@ class BoardLine:
 
         Raises
         ------
-        BoardRefusedError
-            The board refuses.
         DeviceError
-            It does not answer, or answers wrongly.
+            The board refuses, does not answer, or answers wrongly.
         """
         body = self._exchange(kind, payload, self.board, self.timeout)
         if body[0] != VERSION:
@@ -217,13 +202,13 @@ class BoardLine:
             raise self._refusal(kind, body[4:])
         return body[4:]
 
-    def _refusal(self, kind: int, payload: bytes) -> BoardRefusedError:
+    def _refusal(self, kind: int, payload: bytes) -> DeviceError:
         code, _, cause, channel, fault, faulty = payload[:6]
         if code == IS_VENTED:
             told = f"it has vented: {in_words(cause, channel)}"
         else:
             told = _ERRORS.get(code, f"error {code}").format(fault=in_words(fault, faulty))
-        return BoardRefusedError(f"{self} does not {_NAMES[kind]}: {told}", code)
+        return DeviceError(f"{self} does not {_NAMES[kind]}: {told}")
 
     def _exchange(self, kind: int, payload: bytes, board: int, timeout: float) -> bytes:
         with self._lock:
@@ -256,7 +241,7 @@ class BoardLine:
             self._doubtful = False
         elif self._serial.in_waiting:
             raise DeviceError(
-                f"{self} says what nobody has asked for: is there a second board or a second "
+                f"{self} sent an unrequested message: is there a second board or a second "
                 "program on this line?"
             )
         return self._serial
@@ -277,7 +262,7 @@ class BoardLine:
         if body is None:
             raise DeviceError(f"{self} was not understood when asked to {_NAMES[kind]}: noise")
         if body[2] != self._sequence or body[3] not in (kind | REPLY, ERROR_REPLY):
-            raise DeviceError(f"{self} answers something else than what it was asked")
+            raise DeviceError(f"{self} sent an answer to another request")
         return body
 
 

@@ -142,7 +142,8 @@ class ZaberProbeSettings(ProbeSettings):
         if self.max_force > self.force.largest:
             raise BadKeyError(
                 "max_force",
-                f"the sensor saturates at {self.force.largest:.3g} N, so that nobody would notice",
+                f"the sensor saturates at {self.force.largest:.3g} N, so a larger force would go "
+                "unnoticed",
             )
         return self
 
