@@ -103,7 +103,7 @@ $(BENCH)/.installed: $(VENV)/.created pyproject.toml
 	@echo "Installing what the benchmarks compare with into $(BENCH) ..."
 	@[ -x $(BENCH)/bin/python ] || $(BIN)/python -m venv $(BENCH)
 	@pip="$(BENCH)/bin/python -m pip --quiet --quiet --disable-pip-version-check"; \
-	$$pip install --editable '.[plot,bench]' || \
-	  { $$pip install --editable '.[plot]' && for peer in $(PEERS); do \
+	$$pip install --editable '.[plan,plot,bench]' || \
+	  { $$pip install --editable '.[plan,plot]' && for peer in $(PEERS); do \
 	    $$pip install $$peer || echo "$$peer cannot be installed and is left out."; done; }
 	@touch $@
