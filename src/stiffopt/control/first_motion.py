@@ -4,7 +4,7 @@ On a rig that nobody has commissioned, channels may be swapped or the tracker's 
 watch of the motion (`MotionWatch`) finds that after a few millimetres, but until the chambers obey
 its hold, a fast arm moves much farther than that. Meanwhile feedback corrects no more than an error
 of the model explains: with swapped channels it drives the tip away, the faster the farther it is.
-A channel that has had no part in the first motion is slow when it has one: what it does is unknown.
+A channel without a part in the first motion is slow when it first has one: its effect is unknown.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class FirstMotion:
 
     @property
     def is_over(self) -> bool:
-        """Whether all channels are known to do what the model says."""
+        """Whether the tip has followed the model with every channel."""
         return bool(self._responds.all())
 
     def take(self, modelled: Array, seen: Array, parts: Array) -> None:

@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 
 
 def are_within(bound: float, values: Array) -> bool:
-    """Whether the size of each value (k,) is at most `bound`; that of NaN is not.
+    """Return whether all values (k,) lie between -`bound` and `bound`; False if one is NaN.
 
     For a few values this is quicker than NumPy.
     """

@@ -94,7 +94,7 @@ class SceneObject(_Shapes):
 
     @property
     def may_be_leant_on(self) -> bool:
-        """Whether the arm may touch it."""
+        """Whether the scene allows the arm to touch this object."""
         return self.contact is not None and self.contact.allowed
 
     def _given(self) -> dict[str, Obstacle]:

@@ -410,7 +410,7 @@ class Uncertainty:
 
     @cached_property
     def _knows_creep(self) -> bool:
-        """Whether the model has creep, and pressures were held in the recordings."""
+        """Whether the model describes creep and the recordings contain held pressures."""
         errors = self._calibration.errors
         if errors is None or not errors.settled:
             return False
