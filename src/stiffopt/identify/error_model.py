@@ -85,8 +85,7 @@ def error_model(
     _, index, (discrepancy, *_) = best
     gain = ERRORS.untested * discrepancy / recorded_range(pressures)
     _, _, (discrepancy, residual, tail, timing) = _most_probable(folds, index, found, gain)
-    creeps = any((segment.history or NO_HISTORY).creep for segment in found.robot.segments)
-    session = ERRORS.session_with_creep if creeps else ERRORS.session
+    session = ERRORS.session_with_creep if found.robot.creeps else ERRORS.session
     residual = float(np.hypot(residual, session * found.problem.description.length))
     kept, spacing = representatives(_channels(found), pressures if recorded is None else recorded)
     settled, moving = _unsettled(found)

@@ -450,6 +450,11 @@ class RobotDescription(Schema):
         return tuple(map(range, ends, ends[1:]))
 
     @property
+    def creeps(self) -> bool:
+        """Whether the history of any segment contains creep."""
+        return any(segment.history and segment.history.creep for segment in self.segments)
+
+    @property
     def length(self) -> float:
         """Length at rest with the connectors, in m."""
         return sum(segment.length + segment.connector for segment in self.segments)

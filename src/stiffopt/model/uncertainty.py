@@ -412,9 +412,7 @@ class Uncertainty:
     def _knows_creep(self) -> bool:
         """Whether the model describes creep and the recordings contain held pressures."""
         errors = self._calibration.errors
-        if errors is None or not errors.settled:
-            return False
-        return any((segment.history or NO_HISTORY).creep for segment in self._description.segments)
+        return errors is not None and bool(errors.settled) and self._description.creeps
 
     @cached_property
     def _ages(self) -> Vector:
