@@ -365,7 +365,7 @@ def test_a_distance_is_that_of_the_tip_while_it_is_held_on_its_way() -> None:
     bench.controller.set_task(bench.task(position=position))
     bench.run(0.15)
     (before,) = bench.controller.notices()
-    assert before.text.endswith("by the model")
+    assert before.text.endswith("by the model; the tip is on its way")
     away = bench.run(1.0, position, steer=False)[-1]  # the pressures are held
     (said,) = (notice.text for notice in bench.controller.notices())
     told, modelled = (
