@@ -8,7 +8,7 @@ look for what no push, payload or model error explains:
   bending by d turns an arm: by about 3 d / (2 length), or at least two thirds of that; if d has
   changed along the motion of s, the arm is weaker or softer than modelled. A change that has begun
   with such a turn is a push. It may excite higher modes, in which the tip turns otherwise, so the
-  test pauses;
+  test pauses. A tip at rest is judged sooner, by y - s and its own turn, vibration included;
 * drift: y - s keeps moving, faster than the model's error can change while s moves;
 * swing: y - r oscillates, and does not decay.
 
