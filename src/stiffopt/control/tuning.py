@@ -381,6 +381,7 @@ class MotionTuning:
     largest_push: float = 8e-3
     slip_of_large: float = 0.25
     slips: int = 4  # successive samples that show a slip
+    jump_window: float = 0.25  # in which a slip at rest is looked for, vibration included, in s
     # decrease of the missing share of the turn in these samples with which it is a push, whose
     # higher modes turned the tip otherwise at first
     catches_up: float = 0.1
