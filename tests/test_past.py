@@ -10,7 +10,8 @@ import pytest
 from numpy.typing import NDArray
 
 from stiffopt.identify import past
-from stiffopt.identify.past import Effective, Past, Start
+from stiffopt.identify.past import Effective, Past, Start, pause_between
+from stiffopt.identify.settings import FIT
 from stiffopt.model.history import Creep, History, Memory, Part, Play
 
 Array = NDArray[np.float64]
@@ -245,16 +246,23 @@ def test_the_state_is_carried_from_log_to_log() -> None:
     time, pressures = course(400, seed=5)
     cut = 170
     first = run(FULL, time[:cut], pressures[:cut])
-    # a minute of rest between them, in steps that a memory takes too
-    pause = time[cut - 1] + 60.0
+    pause = time[cut - 1] + 30.0  # the knot until which the last pressures are held
     again = pause + (time[cut:] - time[cut - 1])
-    second = run(FULL, again, pressures[cut:], first.end)
+    begun = Past(FULL, 3).rested(first.end, pause_between(time[:cut], again), FULL)
+    second = run(FULL, again, pressures[cut:], begun)
     once = np.concatenate([time[:cut], [pause], again])
     all_pressures = np.vstack([pressures[:cut], pressures[cut - 1], pressures[cut:]])
     together = run(FULL, once, all_pressures).pressures
     assert second.pressures == pytest.approx(together[cut + 1 :], abs=150.0)
     forgotten = run(FULL, again, pressures[cut:]).pressures
     assert np.abs(forgotten - together[cut + 1 :])[:20].max() > 400.0
+
+
+def test_logs_whose_clocks_begin_anew_are_a_minute_apart() -> None:
+    earlier = np.array([5.0, 6.0, 7.0])
+    assert pause_between(earlier, earlier + 4.5) == pytest.approx(2.5)
+    assert pause_between(earlier, earlier) == FIT.between_logs == 60.0
+    assert pause_between(earlier, earlier + 2.0) == FIT.between_logs
 
 
 @pytest.mark.parametrize("name", ["lag", "lag_falling", "dead_time", "side"])
@@ -271,7 +279,7 @@ def test_derivatives_go_on_in_the_next_log(name: str) -> None:
         one = pressures if name != "side" else small[::-1]
         start = Start.settled(history, one[0], sides, EVERYWHERE)
         first = run(history, time, one, start)
-        return run(history, time, small, first.end)
+        return run(history, time, small, Past(history, 3).rested(first.end, 60.0, history))
 
     found = at(0.0)
     per = found.per_side.sum(axis=2) if name == "side" else found.per_number[name]

@@ -93,7 +93,7 @@ class Effective:
     per_number : their derivatives (M, c) by each number of the history, by its key: ``lag``,
         ``lag_falling``, ``dead_time``, ``memory[0]``, ``play[0].share``, ``creep[0].share``, ...
     per_side : their derivatives (M, c, c) by the initial sides of the channels.
-    end : state in which the next log of the sequence begins.
+    end : state after the last row.
     """
 
     pressures: Array
@@ -193,18 +193,17 @@ class Past:
         for j in range(len(history.parts)):
             name = f"play[{j}]" if j < plays else f"creep[{j - plays}]"
             per_number[f"{name}.share"] = times(by_slow, held(states, j) * memory)
-        end = self._rested(self._start(state, pressures[-1]), history)
+        end = self._start(state, pressures[-1])
         sides = np.stack([memory * slow(each) for each in by_side], axis=2)
         if len(by_side) < c:  # the side of a channel moves no other's plays
             sides = sides * np.eye(c)
         u = x + history.at_fixed_modulus(x, slowly)
         return Effective(u, per_number, by_slow @ sides, end)
 
-    def _rested(self, end: Start, history: History) -> Start:
-        """Return the state `FIT.between_logs` later, at the last pressures."""
-        same, pause = end.before[np.newaxis], np.array([FIT.between_logs])
-        lags = (history.lag, history.lag_falling)
-        (state,) = self._run(history)(_carried(end), same, same, pause, lags)
+    def rested(self, end: Start, pause: float, history: History) -> Start:
+        """Return the state a `pause` in s after the end of a log, at its last pressures."""
+        same, lags = end.before[np.newaxis], (history.lag, history.lag_falling)
+        (state,) = self._run(history)(_carried(end), same, same, np.array([pause]), lags)
         return self._start(state, end.before)
 
     def _start(self, state: Array, before: Array) -> Start:
@@ -217,6 +216,15 @@ class Past:
         if kind not in self._runs:
             self._runs[kind] = _HistoryRun(self.history, self._channels, *kind)
         return self._runs[kind]
+
+
+def pause_between(earlier: Array, later: Array) -> float:
+    """Return the time between two logs of a sequence, in s, from the times (N,) of their rows.
+
+    Unless the later log's clock continues the earlier one's, that is `FIT.between_logs`.
+    """
+    apart = float(later[0] - earlier[-1])
+    return apart if apart > 0 else FIT.between_logs
 
 
 def _sides(history: History, channels: int) -> int:

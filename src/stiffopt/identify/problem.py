@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt.identify.discrepancy import Systematic, smooth_functions
-from stiffopt.identify.past import Past, Start
+from stiffopt.identify.past import Past, Start, pause_between
 from stiffopt.identify.recording import Recording
 from stiffopt.identify.sensing import Readings, readings
 from stiffopt.identify.settings import FIT
@@ -426,7 +426,8 @@ class CalibrationProblem:
                 pressures = sample.recording.pressures[:, channels]
                 before = sample.recording.before[channels]
                 if sample.begin == "previous" and end is not None:
-                    start = end
+                    pause = pause_between(self.samples[i - 1].recording.time, sample.recording.time)
+                    start = past.rested(end, pause, history)
                 elif sample.begin == "unknown" and sides[i].stop > sides[i].start:
                     owner = sides[i]
                     own = coordinates[owner][channels]
