@@ -30,7 +30,6 @@ from stiffopt.safety.monitors import PressureMonitor
 
 FASTEST = 500.0
 """Highest rate of the loop, in Hz."""
-_NO_TRACKER = "this rig has none, and the loop cannot steer without; add one"
 _NO_SLEW = (
     "there is no limit to how fast pressures may rise; set safety.max_slew in the rig file, or "
     "pressure.slew in the robot file"
@@ -49,10 +48,11 @@ _UNUSUAL = 0.05
 
 
 def check_description(settings: RigDescription, robot: RobotDescription) -> Iterator[MisfitError]:
-    """Yield why the loop could never arm or steer the rig of a file, whatever its devices say."""
+    """Yield why the loop could never arm the rig of a file, whatever its devices say.
+
+    A rig without a tracker is for scripts, and no mistake.
+    """
     safety, supply, period = settings.safety, settings.supply, 1 / settings.rate
-    if settings.tracker is None:
-        yield MisfitError(_NO_TRACKER, "tracker")
     if slew_of(settings, robot) is None:
         yield MisfitError(_NO_SLEW, "safety", "max_slew")
     if not supply.simulated:
@@ -83,7 +83,7 @@ def check_rig(rig: Rig, outlet: Outlet, controller: Controller) -> Iterator[str]
     """Yield the problems of a rig's configuration; each begins with the name of its check."""
     robot, limits = rig.robot, outlet.limits
     if rig.tracker is None:
-        yield f"tracker: {_NO_TRACKER}"
+        yield "tracker: this rig has none, and the loop cannot steer without; add one"
     if not robot.n_pressures == limits.n == rig.supply.n:
         yield (
             f"channels: the robot '{robot.name}' has {robot.n_pressures}, the supply "
