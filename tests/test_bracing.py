@@ -315,23 +315,25 @@ def test_uncertainty_ends_with_its_push_and_comes_again_with_the_next(approach):
         said = course.notices()
         assert [each.kind for each in said if not each.standing][-1] == "brace-uncertain"
         assert standing(course) == ["brace-uncertain"]
-        assert samples(course, approach, np.zeros(3), 80) is None
+        assert samples(course, approach, np.zeros(3), 100) is None
         assert course.contacts == "held"
         assert standing(course) == []
 
 
 def test_a_push_about_the_limit_does_not_make_the_alarm_flicker(approach):
-    """Contacts are certain again only when a quarter more of the deviation is left."""
+    """Contacts are certain again only after two seconds of certainty."""
     course, lifts = held(approach), lift_off(approach)
     samples(course, approach, np.zeros(3), 40)
     share = 0.0
     while course.contacts == "held":
         share += 0.01
         samples(course, approach, pushed(approach, share * lifts), 10)
-    for change in (-0.02, 0.02, -0.02, 0.02):
-        samples(course, approach, pushed(approach, (share + change) * lifts), 20)
+    course.notices()
+    for change in (-0.1, 0.02, -0.1, 0.02):
+        samples(course, approach, pushed(approach, (share + change) * lifts), 60)
         assert course.contacts == "uncertain"
-    samples(course, approach, pushed(approach, (share - 0.15) * lifts), 20)
+    assert [notice.standing for notice in course.notices()] == [True]
+    samples(course, approach, pushed(approach, (share - 0.1) * lifts), 100)
     assert course.contacts == "held"
 
 

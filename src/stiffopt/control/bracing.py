@@ -106,6 +106,7 @@ class Bracing:
         self._slips = False  # a contact that may slide slips under the present push; reported
         self._doubt = ""  # why contacts are uncertain
         self._doubted = 0.0  # for how long, in s
+        self._certain = 0.0  # how long they have been certain, in s
         self._why = ""
         self._notices: list[Notice] = []
 
@@ -283,7 +284,8 @@ class Bracing:
             weakest = int(before.argmin())
             self.force, self.margin = float(before[weakest]), math.nan
             self.deviation = float(self._rest_deviations(before)[weakest])
-            self._slips, self._doubt, self._doubted = False, "", 0.0
+            self._slips = False
+            self._weigh("", elapsed)
             return
         self._pushed += elapsed
         if sticks and not self._doubt:  # what stays is creep in the end
@@ -436,24 +438,29 @@ class Bracing:
         if (forces + reach < 0).any():
             self.release(why=f"{self._named(int((forces + reach).argmin()))} lifts off {words}")
             return
-        more = t.again if self._doubt else 1.0  # contacts are certain again a little later
         slid = self._friction.slid(self.push, before)
-        slips, doubt = bool((slid > t.slid / more).any()), ""
+        slips, doubt = bool((slid > t.slid).any()), ""
         if slips and self._sticks:
             own = self.approach.hold.sticking.own[int(slid.argmax())]
             doubt = f"{self._named(own)} may slide {words}"
-        elif forces[weakest] < more * reach[weakest]:
+        elif forces[weakest] < reach[weakest]:
             most, whole = 1e3 * (forces + reach)[weakest], 1e3 * before[weakest]
             text = f"{self._named(weakest)} may have lifted off: it has 0 to {most:.0f} mN"
             doubt = f"{text} {words}, and {whole:.0f} mN without"
-        if doubt and not self._doubt:
-            self._notify("brace-uncertain", doubt, Severity.WARNING)
         if slips and not self._sticks and not self._slips:
             text = f"{self._named(weakest)} slips {words}"
             self._notify("brace-slips", text, Severity.WARNING)
         self._slips = self._slips or slips
-        self._doubt = doubt and (self._doubt or doubt)
-        self._doubted = self._doubted + elapsed if doubt else 0.0
+        self._weigh(doubt, elapsed)
+
+    def _weigh(self, doubt: str, elapsed: float) -> None:
+        """Take in why the contacts are uncertain at a sample; an empty text if they are not."""
+        t = self._tuning
+        if doubt and not self._doubt:
+            self._notify("brace-uncertain", doubt, Severity.WARNING)
+        self._certain = 0.0 if doubt else self._certain + elapsed
+        self._doubt = (self._doubt or doubt) if self._certain < t.again else ""
+        self._doubted = self._doubted + elapsed if self._doubt else 0.0
         if self._doubted > t.longest_push:
             self.release(why=f"for {t.longest_push:.0f} s it has not been certain: {self._doubt}")
 

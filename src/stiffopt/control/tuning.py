@@ -600,10 +600,10 @@ class BracingTuning:
     aside: float = 0.3
     push_creeps: float = 30.0
     # a contact is held or lost if its force is above or below zero by so many standard deviations,
-    # as many as the margin of a task has (`BRACE.sure`); factor on that, and on the least slide
-    # that is foretold, at which it is certain again
+    # as many as the margin of a task has (`BRACE.sure`); time for which it has to be certain until
+    # it is not reported as uncertain any more, in s
     certain: float = 2.0
-    again: float = 1.25
+    again: float = 2.0
     # least standard deviation of a contact's force without a push, as a share of it, and of its
     # change by a push, as a share of that
     least_deviation: float = 0.2
