@@ -251,8 +251,8 @@ def test_a_tip_that_goes_along_an_arc_is_no_push_along_the_arm(approach):
     assert abs(course.push[2]) < math.sqrt(course.covariance[2, 2])
 
 
-def test_a_push_is_not_taken_for_a_larger_one_where_the_arm_is_stiff(approach):
-    """Its deviation in directions in which the tip hardly moves is that of the push itself."""
+def test_a_push_along_which_the_tip_does_not_move_may_be_any(approach):
+    """Its deviation there is that of all pushes, and by hand where the tip moves by 0.1 m/N."""
     course, tip = held(approach), approach.tips[-1]
     pose = tip.pose.copy()
     pose[:3, :3] = np.eye(3)
@@ -260,9 +260,7 @@ def test_a_push_is_not_taken_for_a_larger_one_where_the_arm_is_stiff(approach):
     for off in (*[np.zeros(3)] * 40, *[np.array([3e-3, 0.0, 0.0])] * 40):
         course.look(0.025, pose[:3, 3] + off, still, approach.pressures[-1])
     assert course.push == pytest.approx([0.03, 0.0, 0.0], abs=1e-3)
-    assert np.sqrt(np.diag(course.covariance)) == pytest.approx(
-        [2e-4 / 0.1, 0.03 / math.sqrt(3), 0.03 / math.sqrt(3)], rel=0.05
-    )
+    assert np.sqrt(np.diag(course.covariance)) == pytest.approx([2e-4 / 0.1, 0.1, 0.1], rel=0.05)
 
 
 @pytest.mark.parametrize(

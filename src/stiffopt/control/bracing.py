@@ -291,7 +291,6 @@ class Bracing:
         if sticks and not self._doubt:  # what stays is creep in the end
             self._error = self._error + min(elapsed / t.push_creeps, 1.0) * raw
         self.push, self.displacement = push, off
-        usual = min(1.0, float(push @ push / np.trace(usual))) * usual  # it is no larger elsewhere
         gain = np.linalg.solve(C @ usual @ C.T + noise, C @ usual)
         self.covariance[:] = usual - usual @ C.T @ gain
         self._judge(before, elapsed)
