@@ -11,8 +11,16 @@ sigma of y - s - b and f of pushes,
 
     F = C (C C + (sigma / f)^2)^-1 (y - s - b).
 
-The contacts count as held as long as the model's contacts hold under this push, and, where they
-are to stick, as long as the tip does not show that they slide (`SlideEstimator`).
+The tip goes along an arc, so sigma grows with the square of what it is moved by.
+
+With the model's normal forces N0 before the push, and their derivatives G by it, those under the
+push are N = N0 + G F. What is wrong with N0, F and the model's response has the deviation s. Then
+
+- the contacts are *held* while N > 2 s;
+- they are *uncertain* otherwise, or if contacts that are to stick would slide under the push. This
+  is reported, and the arm goes on holding;
+- a contact is *lost* if N < -2 s, if the tip shows that it slides (`SlideEstimator`) or is where a
+  free arm has it, or after a minute of uncertainty. Then the arm lets go.
 """
 
 from __future__ import annotations
@@ -63,7 +71,8 @@ class Bracing:
     phase : the present phase.
     is_steered : whether the pressures follow this course; if not, they are held or let down.
     next : task to pursue after the release; None: the arm stays at rest.
-    force : smallest normal force of the contacts, as estimated, in N; NaN without contact.
+    force : normal force of the least certain contact, as estimated, in N; NaN without contact.
+    deviation : standard deviation of that force, in N.
     margin : further push at the tip that would break a contact, in N; NaN while nothing pushes.
     push : estimated push at the tip (3,), base axes, in N; zero while none is felt.
     displacement : of the tip by the push (3,), in m.
@@ -74,7 +83,7 @@ class Bracing:
         self.task, self._tuning = task, tuning
         self.phase, self.is_steered = BracePhase.PLANNING, True
         self.next: Task | None = None
-        self.force = self.margin = math.nan
+        self.force = self.deviation = self.margin = math.nan
         self.push, self.displacement = np.zeros(3), np.zeros(3)
         self.covariance: Array = tuning.usual_push**2 * np.eye(3)
         self._error: Array | None = None  # b (3,)
@@ -94,8 +103,10 @@ class Bracing:
         self._free = 0  # successive samples at which the tip is nearer to a free arm's
         self._is_off = False  # the tip is known to stay off its target
         self._nearest = (math.inf, 0.0)  # distance of the tip from it, in m, and when it fell to it
-        self._warned: set[str] = set()  # kinds of warnings about the present push
-        self._share = 1.0  # of the weakest contact's force that a push leaves, averaged
+        self._slips = False  # a contact that may slide slips under the present push; reported
+        self._doubt = ""  # why contacts are uncertain
+        self._doubted = 0.0  # for how long, in s
+        self._certain = 0.0  # how long they have been certain, in s
         self._why = ""
         self._notices: list[Notice] = []
 
@@ -107,6 +118,13 @@ class Bracing:
     def leans(self) -> bool:
         """Whether the arm is in contact, approaches it, or lets go."""
         return self.phase in (BracePhase.APPROACHING, BracePhase.HELD, BracePhase.RELEASING)
+
+    @property
+    def contacts(self) -> str:
+        """Whether the contacts are `held`, `uncertain` or `lost`; empty if there are none."""
+        if self.phase is BracePhase.HELD:
+            return "uncertain" if self._doubt else "held"
+        return "lost" if self._why else ""
 
     @property
     def pressures(self) -> Array:
@@ -133,7 +151,7 @@ class Bracing:
         self.next = then or self.next
         if self.phase in (BracePhase.APPROACHING, BracePhase.HELD):
             self.phase, self._why, self._pace = BracePhase.RELEASING, why, 0.0
-            self.force = self.margin = math.nan
+            self.force = self.deviation = self.margin = math.nan
             self.push = self.displacement = np.zeros(3)
             text = "goes back on the way that it came"
             if why:
@@ -255,23 +273,26 @@ class Bracing:
             C = C + friction.tip[:3] @ self.approach.hold.sticking.per_push
             if not settles and self._has_slid(elapsed, seen, quaternion, pressures):
                 return
-        usual = self._usual(R)
-        push = usual @ C.T @ np.linalg.solve(C @ usual @ C.T + t.deviation**2 * np.eye(3), off)
+        usual, noise = self._usual(R), self._noise(off)
+        push = usual @ C.T @ np.linalg.solve(C @ usual @ C.T + noise, off)
         feels = self._feels(off, push, before)
-        if settles or not feels or self._pushed > t.longest_push:
+        if settles or not feels or (self._pushed > t.longest_push and not self._doubt):
             time = t.settling_time if settles else t.error_time
             self._error = self._error + min(elapsed / time, 1.0) * raw
             self._pushed = self._pushed * float(feels)
             self.push = self.displacement = np.zeros(3)
-            self.force, self.margin = float(before.min()), math.nan
-            self._share = 1.0
-            self._warned.clear()
+            weakest = int(before.argmin())
+            self.force, self.margin = float(before[weakest]), math.nan
+            self.deviation = float(self._rest_deviations(before)[weakest])
+            self._slips = False
+            self._weigh("", elapsed)
             return
         self._pushed += elapsed
-        if sticks:  # what stays is creep in the end
+        if sticks and not self._doubt:  # what stays is creep in the end
             self._error = self._error + min(elapsed / t.push_creeps, 1.0) * raw
         self.push, self.displacement = push, off
-        self.covariance[:] = np.linalg.inv(C.T @ C / t.deviation**2 + np.linalg.inv(usual))
+        gain = np.linalg.solve(C @ usual @ C.T + noise, C @ usual)
+        self.covariance[:] = usual - usual @ C.T @ gain
         self._judge(before, elapsed)
 
     def _has_slid(
@@ -296,8 +317,8 @@ class Bracing:
         if self._slid < t.samples:
             return False
         most = int(np.where(slid, sizes, 0.0).argmax())
-        where = approach.contacts[approach.hold.sticking.own[most]].object
-        self.release(why=f"the contact on '{where}' has slid by {1e3 * sizes[most]:.1f} mm")
+        where = self._named(approach.hold.sticking.own[most])
+        self.release(why=f"{where} has slid by {1e3 * sizes[most]:.1f} mm")
         return True
 
     def _feels(self, off: Array, push: Array, before: Array) -> bool:
@@ -313,6 +334,18 @@ class Bracing:
             force = float(np.linalg.norm(push))
             uses = max(uses, force / max(self._friction.left(push / force, before), 1e-6))
         return size > t.felt or (size > t.least_felt and uses > t.felt_share)
+
+    def _noise(self, off: Array) -> Array:
+        """Return the covariance (3, 3) of a displacement (3,) of the tip that no push explains.
+
+        A tip that is moved by y goes along an arc, so that its place is off the linear response by
+        y^2 / (2 length).
+        """
+        assert self.approach is not None
+        length = float(np.linalg.norm(self.approach.free_tips[0]))
+        bent = float(off @ off) / (2 * length)
+        found: Array = (self._tuning.deviation**2 + bent**2) * np.eye(3)
+        return found
 
     def _usual(self, rotation: Array) -> Array:
         """Return the covariance (3, 3) of pushes before the tip is seen, in N^2; base axes.
@@ -362,44 +395,77 @@ class Bracing:
         found: Array = float(np.clip(share, -1.0, 1.0)) * self._corrected
         return found
 
-    def _judge(self, before: Array, elapsed: float) -> None:
-        """Judge whether the contacts hold the estimated push; `before`: normal forces (k,).
+    def _rest_deviations(self, before: Array) -> Array:
+        """Return the standard deviations (k,) of normal forces without a push, in N.
 
-        Silicone is stiffer to a quick push, so while one grows, less is left than estimated.
+        `before`: these forces (k,). A robot that is not calibrated has none of its own.
         """
+        assert self.approach is not None
+        least, own = self._tuning.least_deviation * before, self.approach.hold.deviations
+        found: Array = np.maximum(own, least)
+        return found
+
+    def _deviations(self, before: Array, change: Array) -> Array:
+        """Return the standard deviations (k,) of the normal forces under the push, in N.
+
+        They come from the forces without it, from the push, which the tip hardly shows where it is
+        stiff, and from the response of the model. `before`: forces (k,) without the push; `change`:
+        by it (k,).
+        """
+        assert self.approach is not None
+        G, response = self._per_push, self._tuning.response * change
+        pushed = np.einsum("ki,ij,kj->k", G, self.covariance, G)
+        found: Array = np.sqrt(self._rest_deviations(before) ** 2 + pushed + response**2)
+        return found
+
+    def _judge(self, before: Array, elapsed: float) -> None:
+        """Judge whether the contacts hold the estimated push; `before`: normal forces (k,)."""
         assert self.approach is not None
         assert self._friction is not None
         t, size = self._tuning, float(np.linalg.norm(self.push))
         change = self._per_push @ self.push
-        forces = before + change
-        weakest = int(forces.argmin())
+        forces, deviations = before + change, self._deviations(before, change)
+        reach = t.certain * deviations
+        weakest = int((forces - reach).argmin())
+        self.force, self.deviation = float(forces[weakest]), float(deviations[weakest])
         falls = change < 0
         left = size * float(np.min(before[falls] / -change[falls], initial=math.inf))
         if self._sticks:
             left = min(left, self._friction.left(self.push / size, before))
-        slips = float(self._friction.slid(self.push, before).max(initial=0.0)) > t.slid
-        self.force = float(forces[weakest])
         self.margin = max(left - size, 0.0)
-        share = self.force / max(float(before[weakest]), 1e-6)
-        self._share += min(elapsed / t.grown_time, 1.0) * (share - self._share)
-        none = t.lost_share + min(max(self._share - share, 0.0), t.grown_share)
-        how = "lifts off" if share <= none else "slips" if self._sticks and slips else ""
-        where = f"on '{self.approach.contacts[weakest].object}'"
         words = f"under a push of {1e3 * size:.0f} mN"
-        if how:
-            self.release(why=f"the contact {where} {how} {words}")
+        if (forces + reach < 0).any():
+            self.release(why=f"{self._named(int((forces + reach).argmin()))} lifts off {words}")
             return
-        if slips:
-            self._warn("brace-slips", f"the contact {where} slips {words}")
-        if share < t.weak_share:
-            left_over = f"{1e3 * max(self.force, 0.0):.0f} of {1e3 * before[weakest]:.0f} mN"
-            self._warn("brace-weak", f"the contact {where} may lift off: {left_over} left {words}")
+        slid = self._friction.slid(self.push, before)
+        slips, doubt = bool((slid > t.slid).any()), ""
+        if slips and self._sticks:
+            own = self.approach.hold.sticking.own[int(slid.argmax())]
+            doubt = f"{self._named(own)} may slide {words}"
+        elif forces[weakest] < reach[weakest]:
+            most, whole = 1e3 * (forces + reach)[weakest], 1e3 * before[weakest]
+            text = f"{self._named(weakest)} may have lifted off: it has 0 to {most:.0f} mN"
+            doubt = f"{text} {words}, and {whole:.0f} mN without"
+        if slips and not self._sticks and not self._slips:
+            text = f"{self._named(weakest)} slips {words}"
+            self._notify("brace-slips", text, Severity.WARNING)
+        self._slips = self._slips or slips
+        self._weigh(doubt, elapsed)
 
-    def _warn(self, kind: str, text: str) -> None:
-        """Warn of a kind once during a push."""
-        if kind not in self._warned:
-            self._warned.add(kind)
-            self._notify(kind, text, Severity.WARNING)
+    def _weigh(self, doubt: str, elapsed: float) -> None:
+        """Take in why the contacts are uncertain at a sample; an empty text if they are not."""
+        t = self._tuning
+        if doubt and not self._doubt:
+            self._notify("brace-uncertain", doubt, Severity.WARNING)
+        self._certain = 0.0 if doubt else self._certain + elapsed
+        self._doubt = (self._doubt or doubt) if self._certain < t.again else ""
+        self._doubted = self._doubted + elapsed if self._doubt else 0.0
+        if self._doubted > t.longest_push:
+            self.release(why=f"for {t.longest_push:.0f} s it has not been certain: {self._doubt}")
+
+    def _named(self, contact: int) -> str:
+        assert self.approach is not None
+        return f"the contact on '{self.approach.contacts[contact].object}'"
 
     def _notify(self, kind: str, text: str, severity: Severity = Severity.INFO) -> None:
         self._notices.append(Notice(kind, text, severity))
@@ -480,4 +546,6 @@ class Bracing:
         found, self._notices = tuple(self._notices), []
         if self._why and self.phase in (BracePhase.RELEASING, BracePhase.RELEASED):
             found = (*found, Notice("brace-lost", self._why, Severity.ERROR, standing=True))
+        elif self.contacts == "uncertain":
+            found = (*found, Notice("brace-uncertain", self._doubt, standing=True))
         return found
