@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import cache
 from itertools import pairwise
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -28,7 +29,7 @@ from stiffopt.model.description import RobotDescription, Tolerances
 from stiffopt.model.history import Creep, History, Play
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.parameters import Parameter, with_values
-from stiffopt.model.robot_files import load_description
+from stiffopt.model.robot_files import load_description, save_robot
 
 Array = NDArray[np.float64]
 
@@ -142,7 +143,7 @@ def test_play_of_elongation_is_found_and_chosen() -> None:
 
 @pytest.mark.parametrize("remembers", ["pressure", "strain"])
 def test_what_an_arm_remembers_is_found(
-    remembers: Literal["pressure", "strain"], monkeypatch: pytest.MonkeyPatch
+    remembers: Literal["pressure", "strain"], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr(calibration, "other_laws", lambda description: [])
     parts = ("pressure", "opposite") if remembers == "strain" else ("pressure",)
@@ -160,6 +161,8 @@ def test_what_an_arm_remembers_is_found(
     found = result.robot.segments[0].history
     assert found is not None
     assert found.remembers == remembers
+    save_robot(tmp_path / "arm.yaml", result.robot)
+    assert load_description(tmp_path / "arm.yaml").segments[0].history == found
     assert validate(result.robot, [second])[0].errors.mean < 0.8e-3
 
 
