@@ -217,11 +217,22 @@ def after_ways(robot: RobotDescription, p: Array, count: int) -> Array:
     return np.array(found)
 
 
-@pytest.mark.parametrize("of", ["pressure", "elongation", "bending"])
+@pytest.mark.parametrize(
+    ("of", "softening"),
+    [
+        ("pressure", 0.0),
+        ("elongation", 0.0),
+        ("bending", 0.0),
+        ("opposite", 0.0),
+        ("opposite", -2e-6),
+    ],
+)
 @pytest.mark.parametrize("p", [P, np.array([0.02e5, 0.0, 0.6e5]), np.array([1.5e5, 0.0, 0.3e5])])
-def test_hysteresis_moves_the_tip_as_former_pressures_do(p: Array, of: Part) -> None:
+def test_hysteresis_moves_the_tip_as_former_pressures_do(
+    p: Array, of: Part, softening: float
+) -> None:
     plays = [Play(width=w, share=0.02, of=of) for w in (3e3, 12e3, 40e3)]
-    history = History(memory=(0.5, 1.0, 1.5), play=plays)
+    history = History(memory=(0.5, 1.0, 1.5), softening=softening, remembers="strain", play=plays)
     robot = calibrated(history=history, parameters=(), correlation=())
     arm = Manipulator(robot)
     found = arm.tip_uncertainty(p)

@@ -123,7 +123,7 @@ def _check_with_robot(wanted: Any) -> None:
 
 
 def _check_rig(path: str) -> None:
-    from stiffopt.control.arming import check_description
+    from stiffopt.daemon.armable import check_description
     from stiffopt.rig.config import load_rig
 
     mistakes = [

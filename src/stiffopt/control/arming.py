@@ -1,4 +1,4 @@
-"""Checks of the rig before it is armed: its file, configuration, vented arm and commissioning."""
+"""Checks of the rig before it is armed: its configuration, its vented arm, its commissioning."""
 
 from __future__ import annotations
 
@@ -19,21 +19,17 @@ from stiffopt.commissioning.record import (
 from stiffopt.control.gauge_watch import GaugeWatch
 from stiffopt.control.interface import Controller
 from stiffopt.control.tracker_watch import Sight, TrackerWatch
-from stiffopt.errors import CommandError, InputError
-from stiffopt.model.description import RobotDescription
-from stiffopt.rig.config import RigDescription, limits_of, slew_of
-from stiffopt.rig.device import MisfitError
+from stiffopt.errors import InputError
 from stiffopt.rig.interface import PressureReading, Rig, SupplySettings
 from stiffopt.rig.settings import CommissioningSettings
-from stiffopt.safety.gate import Outlet, check_protection
+from stiffopt.safety.gate import Outlet
 from stiffopt.safety.monitors import PressureMonitor
 
-FASTEST = 500.0
-"""Highest rate of the loop, in Hz."""
-_NO_SLEW = (
+NO_SLEW = (
     "there is no limit to how fast pressures may rise; set safety.max_slew in the rig file, or "
     "pressure.slew in the robot file"
 )
+"""Why a rig without a limit of slew is not armed."""
 _BUSY = 1.0  # load of a processor above which programs wait
 
 # limits of how a vented arm may differ from when it was commissioned
@@ -45,38 +41,6 @@ _MAX_GAUGE_CHANGE = 0.3  # share of `Safety.max_pressure_error`
 # offset of a vented tip from the model's, as a share of the arm's length, that is told without a
 # record: tolerances of the base, 2 mm and 2 degrees, make it 0.046
 _UNUSUAL = 0.05
-
-
-def check_description(settings: RigDescription, robot: RobotDescription) -> Iterator[MisfitError]:
-    """Yield why the loop could never arm the rig of a file, whatever its devices say.
-
-    A rig without a tracker is for scripts, and no mistake.
-    """
-    safety, supply, period = settings.safety, settings.supply, 1 / settings.rate
-    if slew_of(settings, robot) is None:
-        yield MisfitError(_NO_SLEW, "safety", "max_slew")
-    if not supply.simulated:
-        try:
-            check_protection(supply.device(limits_of(settings, robot)), safety)
-        except (CommandError, InputError) as error:
-            yield MisfitError(str(error), "supply")
-    if settings.rate > FASTEST:
-        yield MisfitError(f"{settings.rate:g} Hz is too fast; at most {FASTEST:g} Hz", "rate")
-    between = f"the {1e3 * period:g} ms between two commands at a rate of {settings.rate:g} Hz"
-    for key, effect in (
-        ("guard_timeout", "the guard would vent every time"),
-        ("command_timeout", "each command would expire before the next"),
-    ):
-        if (timeout := getattr(safety, key)) <= period:
-            reason = f"{1e3 * timeout:g} ms is not longer than {between}: {effect}"
-            yield MisfitError(reason, "safety", key)
-    frames = getattr(settings.tracker, "rate", None)
-    if frames is not None and 1 / frames > safety.tracker_timeout:
-        yield MisfitError(
-            f"{1e3 * safety.tracker_timeout:g} ms is shorter than the {1e3 / frames:g} ms between "
-            "two frames of the tracker: the tip would never count as seen",
-            *("safety", "tracker_timeout"),
-        )
 
 
 def check_rig(rig: Rig, outlet: Outlet, controller: Controller) -> Iterator[str]:
@@ -104,7 +68,7 @@ def check_rig(rig: Rig, outlet: Outlet, controller: Controller) -> Iterator[str]
     if (limits.low < np.array(robot.pressure_min) - slack).any():
         yield "limits: the supply may go below the robot's pressure.min; take this arm's robot file"
     if not (np.isfinite(rig.slew) & (rig.slew > 0)).all():
-        yield f"slew: {_NO_SLEW}"
+        yield f"slew: {NO_SLEW}"
     try:
         controller.check()
     except InputError as error:

@@ -15,13 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt.commissioning.record import commissioned_control, commissioned_robot, is_commissioned
-from stiffopt.control.arming import FASTEST
 from stiffopt.control.controller import TipController
 from stiffopt.control.lifecycle import ARMED
 from stiffopt.control.loop import ControlLoop
 from stiffopt.control.state import Severity, Snapshot, State
 from stiffopt.control.ways import ClearanceWatch
 from stiffopt.daemon.address import bracketed
+from stiffopt.daemon.armable import FASTEST
 from stiffopt.daemon.calls import call_in_thread, ends_within
 from stiffopt.daemon.keeper import Keeper, LogEvents, ServiceManager
 from stiffopt.daemon.secret import Secret, check_exposure

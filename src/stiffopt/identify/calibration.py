@@ -155,7 +155,7 @@ def calibrate(
     for key in settings.fixed:
         Parameter(key).value(description)  # raises if there is no such number
     laws = other_laws(description) if settings.strain_law == "auto" else []
-    teller = _Teller(progress, len(structures) + len(laws))
+    teller = _Teller(progress, len(structures) + len(laws) + 1)
     candidates: list[Candidate] = []
     try:
         with giving_up(timeout, cancel):
@@ -199,7 +199,8 @@ def _chosen(
 ) -> Candidate:
     """Fit structures, then the best one under other strain laws; return the best candidate.
 
-    Every fitted candidate is appended to `candidates`.
+    A model with creep is then tried with a memory of strain, unless the settings name both model
+    and law; it is chosen if it predicts better. Every fitted candidate is appended to `candidates`.
     """
     description, recordings = setup.description, setup.recordings
     first = near = _screened(setup, teller)
@@ -227,6 +228,10 @@ def _chosen(
             others.append(_candidate(setup, structure, (near,), teller))
             candidates.append(others[-1])
         chosen = best(others)
+    if chosen.structure.creep and "auto" in (setup.settings.structure, setup.settings.strain_law):
+        near = chosen.fit.problem.named(chosen.fit.x)
+        candidates.append(_candidate(setup, chosen.structure.of_strain(), (near,), teller))
+        chosen = min(chosen, candidates[-1], key=lambda each: each.score)
     return chosen
 
 

@@ -376,19 +376,21 @@ class Uncertainty:
             own = slice(first, first := first + segment.n_channels)
             history, x = segment.history or NO_HISTORY, pressures[:, np.newaxis, own]
             memory = np.array([history.memory_of(c) for c in range(segment.n_channels)])
+            ways, here = history.followed(self._visited[..., own]), history.followed(x)
             for play in history.play:
-                end, held = part_of(x, play.of), np.zeros(1)
-                for visited in (*part_of(self._visited[-2:, :, own], play.of), end):
+                end, held = part_of(here, play.of), np.zeros(1)
+                for visited in (*part_of(ways[-2:], play.of), end):
                     held = np.clip(held, visited - play.width, visited + play.width)
                 found[..., own] += memory * play.share * part_of(held - end, play.of)
             for creep in history.creep:
                 slow = np.zeros(1)
-                for visited in part_of(self._visited[..., own], creep.of):
+                for visited in part_of(ways, creep.of):
                     slow = visited + (slow - visited) * np.exp(-_STAY / creep.time)
                 left = np.exp(-self._ages / creep.time)[:, np.newaxis]
-                crept[..., own] += memory * creep.share * left * (slow - part_of(x, creep.of))
+                slow = part_of(slow - part_of(here, creep.of), creep.of)
+                crept[..., own] += memory * creep.share * left * slow
             for each in (found, crept):
-                each[..., own] = history.at_fixed_modulus(x, each[..., own])
+                each[..., own] = history.with_memory(here, each[..., own]) - x
         errors = self._calibration.errors
         if errors is not None and errors.settled:
             size = np.sqrt(np.mean(found**2, axis=1, keepdims=True))
