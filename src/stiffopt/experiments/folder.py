@@ -109,8 +109,8 @@ def recorded(
     """Context in which all frames are recorded, as CSV and MCAP.
 
     The files' names contain ``.part`` until the context ends without an exception. All logs of a
-    conductor have one clock, so that the pauses between them are known. Each begins at a whole
-    second of it; the pause before is up to a second shorter than that.
+    conductor have one clock, so that the pauses between them are known, to a second: each begins at
+    a whole second of it.
 
     Parameters
     ----------
@@ -137,7 +137,10 @@ def recorded(
     mcap, csv = (folder / f"{name}.part.{ending}" for ending in ("mcap", "csv"))
     for part in (mcap, csv):
         part.unlink(missing_ok=True)  # left by an interrupted run
-    with LogWriter(csv, layout) as to_csv, McapLogWriter(mcap, layout, about) as to_mcap:
+    with (
+        LogWriter(csv, layout) as to_csv,
+        McapLogWriter(mcap, layout, about, begin - zero) as to_mcap,
+    ):
 
         def keep(row: TrackedFrame) -> None:
             if 0 <= row.time - begin <= longest:
@@ -181,10 +184,10 @@ class RawRecording:
             part += 1
             mcap = folder / f"{name}_{part}.mcap"
         about = {"experiment": "stiffness", "repetition": str(repetition), "rig": rig}
-        self._mcap = McapLogWriter(mcap, layout, about)
         last = self._csv.last_time
         now = conductor.clock.now()
         begin = now if last is None else now - last - _PAUSE
+        self._mcap = McapLogWriter(mcap, layout, about, now - begin)
 
         def keep(row: TrackedFrame) -> None:
             if row.time >= now:

@@ -8,10 +8,12 @@ gives the reading (`stiffopt.identify.sensing`).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import islice
 from typing import Literal, cast
 
 import casadi as ca
@@ -493,11 +495,12 @@ def _excess(robot: RobotDescription) -> ca.SX:
         corrections = segment.corrections
         assert compensation is not None
         assert corrections is not None
-        shares = ca.fmax(*history.shares)
+        most = list(islice(limits, segment.n_channels))
+        shares = ca.fmax(*history.shares) / history.left(math.hypot(*most))
         acting = []
         for c in range(segment.n_channels):
             memory.append((history.memory_of(c) * shares - FIT.most_memory) / FIT.memory_slack)
-            acting.append(corrections.gain[c] * next(limits) + ca.fabs(corrections.offset[c]))
+            acting.append(corrections.gain[c] * most[c] + ca.fabs(corrections.offset[c]))
         change = compensation.modulus_per_pressure * ca.norm_2(ca.vertcat(*acting))
         change = change / segment.material.youngs_modulus  # largest relative change of the modulus
         if compensation.modulus_law == "linear":

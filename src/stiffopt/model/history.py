@@ -134,7 +134,7 @@ class History(Schema):
 
     @model_validator(mode="after")
     def _check(self) -> History:
-        total = max(self.shares) * max(self.memory, default=1.0)
+        total = self.memory_at(0.0)
         if total >= 1:
             raise BadKeyError(
                 "play" if self.play else "creep",
@@ -156,6 +156,22 @@ class History(Schema):
         )
         return of_elongation, of_bending
 
+    def memory_at(self, norm: float) -> float:
+        """Return the largest share of a small change of pressures, of a norm in Pa, that is slow.
+
+        With a memory of strain it grows as the modulus falls: the stress that is remembered
+        stretches a softer arm further.
+        """
+        share = max(self.shares) * max(self.memory, default=1.0)
+        return share / self.left(norm)
+
+    def left(self, norm: float) -> float:
+        """Return the share of the modulus that is left at a norm of pressures, in Pa.
+
+        1 with a memory of pressure.
+        """
+        return 1 + self.softening * norm if self.remembers == "strain" else 1.0
+
     @property
     def largest_memory(self) -> float:
         """Largest effect of hysteresis on the shape, as a pressure at the modulus of rest, in Pa.
@@ -173,11 +189,25 @@ class History(Schema):
         Play and creep delay the rest.  What resists pressure also resists a push, so a quick small
         push meets an arm that is 1 / quick_share times as stiff as in equilibrium. This is a mean
         over the axis and the two directions across, where these differ; with a memory of strain, it
-        is the share at low pressures.
+        is the share at low pressures (`quick_softening`).
         """
         memory = sum(self.memory) / len(self.memory) if self.memory else 1.0
         of_elongation, of_bending = self.shares
         return 1 - memory * (of_elongation + 2 * of_bending) / 3
+
+    def quick_softening(self, softening: float, most: float) -> float:
+        """Return the share of softening, from 0 to 1, against a quick push.
+
+        With a memory of strain a push at pressures of norm p meets 1 / (1 - S / (1 + c p)) times
+        the stiffness of equilibrium, where 1 - S is `quick_share`. The stiffness is taken as linear
+        in p, and right at zero and at the norm `most`, in Pa. `softening`: that in equilibrium.
+        """
+        left, c = self.left(most), self.softening
+        if left == 1:
+            return softening
+        share = self.quick_share
+        of_rest = (1 + softening * c * most) * share / (1 - (1 - share) / left)
+        return min(max((of_rest - 1) / (c * most), 0.0), 1.0)
 
     def remembered_shares(self, n_channels: int) -> Array:
         """Return the shares (c,) of the channels' pressures that act through play and creep."""
