@@ -197,6 +197,7 @@ class MotionWatch:
         self.doubt = self._no_response(jacobian, tip.pose[:3, 2])
         if turned is None:
             self._known_from = math.inf
+            self._jumps.clear()
         elif 3 * deviation < self._min_motion / 2:  # the least displacement that is a slip
             self._known_from = min(self._known_from, time)
         if self._known_from <= time:
