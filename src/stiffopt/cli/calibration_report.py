@@ -377,7 +377,8 @@ def models_compared(result: CalibrationResult) -> TextTable:
         "Models, by their error in what was held back",
         ("model", f"mean {display_units().length}", "worst", "in"),
         tuple(rows),
-        "the simplest of those that predict about as well as the best is chosen",
+        "the simplest of those that predict about as well as the best is chosen; "
+        "docs/calibration.md describes them",
         words=("in",),
     )
 

@@ -231,7 +231,7 @@ def late_ticks(lateness: float, guard_timeout: float, load: float = 0.0) -> str:
     if lateness < half:
         what = f"{load:.1f} processes want each processor of this computer"
     advice = (
-        "give the computer less to do, or this program the real-time rights that it lacks "
+        "give the computer less to do, or this program real-time rights that it lacks, if any "
         "('stiffopt run' lists them when it starts)"
     )
     patience = max(0.1, math.ceil(20 * 2.5 * lateness) / 20)
