@@ -374,11 +374,10 @@ def models_compared(result: CalibrationResult) -> TextTable:
             )
         )
     return TextTable(
-        "Models, by their error in what was held back",
+        "Models (docs/calibration.md), by their error in what was held back",
         ("model", f"mean {display_units().length}", "worst", "in"),
         tuple(rows),
-        "the simplest of those that predict about as well as the best is chosen; "
-        "docs/calibration.md describes them",
+        "the simplest of those that predict about as well as the best is chosen",
         words=("in",),
     )
 
