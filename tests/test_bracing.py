@@ -344,6 +344,123 @@ def test_contacts_that_stay_uncertain_for_a_minute_are_let_go(approach):
     assert "for 60 s it has not been certain: the contact on 'post' may have lifted off" in text
 
 
+def ramp(course: Bracing, approach: BraceApproach, start: Any, end: Any, count: int) -> int:
+    """Look at samples of a push that grows; how many it took until it is not `held` any more."""
+    for number in range(count):
+        push = start + (end - start) * number / count
+        samples(course, approach, pushed(approach, push), 1)
+        if course.contacts != "held":
+            return number
+    return count
+
+
+def test_a_push_that_lasts_for_minutes_is_not_forgotten(approach):
+    """Half of what lifts the contact off becomes the model's error, but the force is less known."""
+    course, lifts = held(approach), lift_off(approach)
+    samples(course, approach, np.zeros(3), 40)
+    assert ramp(course, approach, 0 * lifts, 0.5 * lifts, 80) == 80
+    assert samples(course, approach, pushed(approach, 0.5 * lifts), 4800) is None
+    whole = approach.hold.forces[0]
+    assert not course.push.any()
+    assert course.force - 2 * course.deviation < 0.5 * whole
+    assert ramp(course, approach, 0.5 * lifts, lifts, 80) < 80
+    assert course.contacts == "uncertain"
+    assert samples(course, approach, pushed(approach, lifts), 40) is None
+    assert course.force < 2 * course.deviation
+    assert samples(course, approach, pushed(approach, lifts), 2500) is not None
+
+
+@pytest.mark.parametrize("seconds", [300, 900])
+def test_a_push_too_slow_to_be_felt_makes_contacts_uncertain(approach, seconds):
+    course, lifts = held(approach), lift_off(approach)
+    samples(course, approach, np.zeros(3), 40)
+    count = 40 * seconds
+    told = ramp(course, approach, 0 * lifts, 1.5 * lifts, count)
+    assert 0.3 < 1.5 * told / count < 0.8
+    assert not course.push.any()
+    (alarm,) = [notice for notice in course.notices() if notice.standing]
+    assert "since the tip has moved away as by a slow push" in alarm.text
+    off = pushed(approach, 1.5 * told / count * lifts)
+    assert samples(course, approach, off, 2600) == pytest.approx(60.0, abs=2.0)
+
+
+@pytest.mark.parametrize("way", [1.0, -1.0])
+def test_creep_of_a_hold_is_no_push(approach, way):
+    """It moves the tip by 1 % of what the pressures do, per e-fold, either way along the push."""
+    course, tip = held(approach), approach.tips[-1]
+    moves = float(np.linalg.norm(tip.jacobian[:3] @ approach.pressures[-1]))
+    off = pushed(approach, way * lift_off(approach))
+    off *= 0.01 * moves / np.linalg.norm(off)
+    for number in range(1200):
+        assert samples(course, approach, off * math.log(1 + number * 0.025 / 3), 1) is None
+        assert course.contacts == "held"
+    assert course.deviation == pytest.approx(0.2 * approach.hold.forces[0], rel=0.01)
+
+
+def test_a_force_that_is_badly_known_at_rest_is_stated_with_its_deviation(approach):
+    own = 0.7 * approach.hold.forces
+    unsure = replace(approach, hold=approach.hold._replace(deviations=own))
+    course = held(unsure)
+    samples(course, unsure, np.zeros(3), 120)
+    assert course.contacts == "held"
+    assert course.deviation == pytest.approx(own[0])
+
+
+def test_the_arm_does_not_let_go_of_contacts_that_are_certain_again(approach):
+    """The push ends shortly before a minute of doubt is over."""
+    course, lifts = held(approach), lift_off(approach)
+    samples(course, approach, np.zeros(3), 40)
+    assert samples(course, approach, pushed(approach, 0.8 * lifts), 2344) is None
+    assert samples(course, approach, np.zeros(3), 200) is None
+    assert course.contacts == "held"
+
+
+def test_the_doubt_of_a_second_contact_is_told_and_the_alarm_follows(approach):
+    """A push along x would lift off the post, and a tenth of it along y a rib."""
+    hold, lifts = approach.hold, lift_off(approach)
+    rate = float(hold.per_push[0, 0])
+    both = replace(
+        approach,
+        contacts=(approach.contacts[0], approach.contacts[0]._replace(object="rib")),
+        hold=hold._replace(
+            forces=np.repeat(hold.forces, 2),
+            deviations=np.zeros(2),
+            per_pressure=np.repeat(hold.per_pressure, 2, axis=0),
+            per_push=np.array([[rate, 0.0, 0.0], [0.0, 10 * rate, 0.0]]),
+        ),
+    )
+    course, other = held(both), 0.11 * lifts[[1, 0, 2]]
+    samples(course, both, np.zeros(3), 40)
+    samples(course, both, pushed(both, 0.9 * lifts), 80)
+    samples(course, both, pushed(both, other), 20)
+    said = course.notices()
+    events = [each.text for each in said if each.kind == "brace-uncertain" and not each.standing]
+    assert [("'post'" in text, "'rib'" in text) for text in events] == [(1, 0), (0, 1)]
+    assert "'post'" in said[-1].text
+    assert "'rib'" in said[-1].text
+    samples(course, both, pushed(both, other), 100)
+    (alarm,) = course.notices()
+    assert alarm.text == events[1]
+
+
+def test_a_slip_that_comes_and_goes_is_reported_once(approach):
+    course, lifts = held(approach), lift_off(approach)
+    samples(course, approach, np.zeros(3), 40)
+    for _ in range(5):
+        samples(course, approach, pushed(approach, 0.4 * lifts), 30)
+        samples(course, approach, np.zeros(3), 40)
+    told = [notice.kind for notice in course.notices()]
+    assert told == ["braced", "brace-slips"]
+
+
+def test_a_sample_that_is_not_finite_does_not_count(approach):
+    course, lifts = held(approach), lift_off(approach)
+    samples(course, approach, np.zeros(3), 40)
+    samples(course, approach, np.full(3, math.nan), 1)
+    assert course.force == pytest.approx(approach.hold.forces[0])
+    assert samples(course, approach, pushed(approach, 2.5 * lifts), 40) is not None
+
+
 def stiff(approach: BraceApproach, moved: float) -> tuple[BraceApproach, Any]:
     """The same approach with a tip that moves by so much until it lifts off, and that push."""
     lifts, tip = lift_off(approach), approach.tips[-1]

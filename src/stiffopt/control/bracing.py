@@ -14,19 +14,24 @@ sigma of y - s - b and f of pushes,
 The tip goes along an arc, so sigma grows with the square of what it is moved by.
 
 With the model's normal forces N0 before the push, and their derivatives G by it, those under the
-push are N = N0 + G F. What is wrong with N0, F and the model's response has the deviation s. Then
+push are N = N0 + G F. What is wrong with N0, F and the model's response has the deviation s. Part
+of s is the force that a push would take away which moves the tip as b has, beyond creep, since the
+arm settled. Nobody knows whether that is a push. Then
 
-- the contacts are *held* while N > 2 s;
+- the contacts are *held* while N > 2 s, or while no push is felt and b has not drifted. A force
+  that is badly known at rest is stated with its deviation, and is no reason to let go;
 - they are *uncertain* otherwise, or if contacts that are to stick would slide under the push. This
   is reported, and the arm goes on holding;
-- a contact is *lost* if N < -2 s, if the tip shows that it slides (`SlideEstimator`) or is where a
-  free arm has it, or after a minute of uncertainty. Then the arm lets go.
+- a contact is *lost* if N < -2 s under a push that is felt, with s without that part. It also is if
+  the tip shows that it slides (`SlideEstimator`) or is where a free arm has it, or after a minute
+  of uncertainty. Then the arm lets go.
 """
 
 from __future__ import annotations
 
 import math
 from enum import StrEnum
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,6 +50,9 @@ from stiffopt.paths.leaning import BraceApproach
 Array = NDArray[np.float64]
 
 
+_UNCERTAIN, _SLIPS = "brace-uncertain", "brace-slips"
+
+
 class BracePhase(StrEnum):
     """The phase of a brace."""
 
@@ -54,6 +62,21 @@ class BracePhase(StrEnum):
     HELD = "held"
     RELEASING = "releasing"
     RELEASED = "released"
+
+
+class Concern(NamedTuple):
+    """What is reported of a contact.
+
+    Attributes
+    ----------
+    kind : `brace-uncertain` or `brace-slips`.
+    contact : its index.
+    cause : `slide` or `lift` under a push, or `drift` of b.
+    """
+
+    kind: str
+    contact: int
+    cause: str
 
 
 class Bracing:
@@ -87,6 +110,7 @@ class Bracing:
         self.push, self.displacement = np.zeros(3), np.zeros(3)
         self.covariance: Array = tuning.usual_push**2 * np.eye(3)
         self._error: Array | None = None  # b (3,)
+        self._settled: Array = np.zeros(3)  # b when the arm had settled
         self._corrected: Array = np.zeros(3)  # of late, by the model; friction may withhold it
         self._residual: Array = np.zeros(3)  # y - s, smoothed over vibrations
         self._held = self._pushed = 0.0  # durations, in s
@@ -103,10 +127,9 @@ class Bracing:
         self._free = 0  # successive samples at which the tip is nearer to a free arm's
         self._is_off = False  # the tip is known to stay off its target
         self._nearest = (math.inf, 0.0)  # distance of the tip from it, in m, and when it fell to it
-        self._slips = False  # a contact that may slide slips under the present push; reported
-        self._doubt = ""  # why contacts are uncertain
-        self._doubted = 0.0  # for how long, in s
-        self._certain = 0.0  # how long they have been certain, in s
+        self._concerns: dict[Concern, str] = {}  # what is reported, with its text
+        self._calm: dict[Concern, float] = {}  # how long it has not been seen, in s
+        self._doubted = 0.0  # for how long contacts have been uncertain, in s
         self._why = ""
         self._notices: list[Notice] = []
 
@@ -125,6 +148,12 @@ class Bracing:
         if self.phase is BracePhase.HELD:
             return "uncertain" if self._doubt else "held"
         return "lost" if self._why else ""
+
+    @property
+    def _doubt(self) -> str:
+        """Why contacts are uncertain; empty if they are not."""
+        texts = [text for each, text in self._concerns.items() if each.kind == _UNCERTAIN]
+        return "; also ".join(texts)
 
     @property
     def pressures(self) -> Array:
@@ -213,6 +242,7 @@ class Bracing:
         """Check at a sample of the tracker whether the contacts hold.
 
         If the tip is nearer to its place on a free arm, the contact is lost, whatever pushes it.
+        Numbers that are not finite do not count.
 
         Parameters
         ----------
@@ -230,6 +260,10 @@ class Bracing:
         t, held, friction = self._tuning, self.phase is BracePhase.HELD, self._friction
         if self.approach is None or friction is None:
             return
+        if not np.isfinite(seen).all():
+            return
+        if quaternion is not None and not np.isfinite(quaternion).all():
+            quaternion = None
         if not (held or self.phase is BracePhase.APPROACHING):
             return
         off_plan = t.off_plan if self.is_steered else t.let_down
@@ -273,27 +307,48 @@ class Bracing:
             C = C + friction.tip[:3] @ self.approach.hold.sticking.per_push
             if not settles and self._has_slid(elapsed, seen, quaternion, pressures):
                 return
-        usual, noise = self._usual(R), self._noise(off)
-        push = usual @ C.T @ np.linalg.solve(C @ usual @ C.T + noise, off)
+        push, covariance = self._push(C, R, off)
         feels = self._feels(off, push, before)
         if settles or not feels or (self._pushed > t.longest_push and not self._doubt):
             time = t.settling_time if settles else t.error_time
             self._error = self._error + min(elapsed / time, 1.0) * raw
+            if settles:
+                self._settled = self._error
             self._pushed = self._pushed * float(feels)
             self.push = self.displacement = np.zeros(3)
-            weakest = int(before.argmin())
-            self.force, self.margin = float(before[weakest]), math.nan
-            self.deviation = float(self._rest_deviations(before)[weakest])
-            self._slips = False
-            self._weigh("", elapsed)
+            self._rest(before, self._drift(C, R, tip, pressures), elapsed)
             return
         self._pushed += elapsed
         if sticks and not self._doubt:  # what stays is creep in the end
             self._error = self._error + min(elapsed / t.push_creeps, 1.0) * raw
         self.push, self.displacement = push, off
-        gain = np.linalg.solve(C @ usual @ C.T + noise, C @ usual)
-        self.covariance[:] = usual - usual @ C.T @ gain
-        self._judge(before, elapsed)
+        self.covariance[:] = covariance
+        self._judge(before, self._drift(C, R, tip, pressures), elapsed)
+
+    def _push(self, C: Array, rotation: Array, off: Array) -> tuple[Array, Array]:
+        """Return the most likely push (3,) that moves the tip by `off` (3,), and its covariance.
+
+        `C`: compliance (3, 3) of the tip, base axes.
+        """
+        usual = self._usual(rotation)
+        gain = np.linalg.solve(C @ usual @ C.T + self._noise(off), C @ usual).T
+        return gain @ off, usual - gain @ C @ usual
+
+    def _drift(self, C: Array, rotation: Array, tip: TipAt, pressures: Array) -> Array:
+        """Return the forces (k,) that contacts may have lost since settling, unknown to anybody.
+
+        A push that lasts becomes part of b. So does creep, which moves the tip as if the pressures
+        grew, and this part does not count. See `_push` for `C`.
+        """
+        t = self._tuning
+        assert self._error is not None
+        change, began = self._error - self._settled, t.creep_time + self._settling
+        folds = math.log(max((t.creep_time + self._held) / began, 1.0))
+        creep = t.most_creep * folds * float(np.linalg.norm(tip.jacobian[:3] @ pressures))
+        size = float(np.linalg.norm(change))
+        change = max(0.0, 1 - creep / max(size, 1e-12)) * change
+        found: Array = np.maximum(-(self._per_push @ self._push(C, rotation, change)[0]), 0.0)
+        return found
 
     def _has_slid(
         self, elapsed: float, seen: Array, quaternion: Array | None, pressures: Array
@@ -418,13 +473,32 @@ class Bracing:
         found: Array = np.sqrt(self._rest_deviations(before) ** 2 + pushed + response**2)
         return found
 
-    def _judge(self, before: Array, elapsed: float) -> None:
-        """Judge whether the contacts hold the estimated push; `before`: normal forces (k,)."""
+    def _rest(self, before: Array, drift: Array, elapsed: float) -> None:
+        """Judge whether the contacts hold while no push is felt; see `_judge`."""
+        t = self._tuning
+        own = self._rest_deviations(before)
+        deviations = np.hypot(own, drift)
+        left = before - t.certain * deviations
+        weakest = int(left.argmin())
+        self.force, self.deviation = float(before[weakest]), float(deviations[weakest])
+        self.margin, found = math.nan, {}
+        for each in map(int, np.flatnonzero((left < 0) & (drift > t.felt_share * before))):
+            text = self._lifted(each, float(before[each] + t.certain * own[each]))
+            why = "since the tip has moved away as by a slow push"
+            found[Concern(_UNCERTAIN, each, "drift")] = f"{text}, {why}"
+        self._weigh(found, elapsed)
+
+    def _judge(self, before: Array, drift: Array, elapsed: float) -> None:
+        """Judge whether the contacts hold the estimated push.
+
+        `before`: normal forces (k,) without it; `drift`: what they may have lost (k,).
+        """
         assert self.approach is not None
         assert self._friction is not None
         t, size = self._tuning, float(np.linalg.norm(self.push))
         change = self._per_push @ self.push
-        forces, deviations = before + change, self._deviations(before, change)
+        forces, own = before + change, self._deviations(before, change)
+        most, deviations = forces + t.certain * own, np.hypot(own, drift)
         reach = t.certain * deviations
         weakest = int((forces - reach).argmin())
         self.force, self.deviation = float(forces[weakest]), float(deviations[weakest])
@@ -434,34 +508,45 @@ class Bracing:
             left = min(left, self._friction.left(self.push / size, before))
         self.margin = max(left - size, 0.0)
         words = f"under a push of {1e3 * size:.0f} mN"
-        if (forces + reach < 0).any():
-            self.release(why=f"{self._named(int((forces + reach).argmin()))} lifts off {words}")
+        if (most < 0).any():
+            self.release(why=f"{self._named(int(most.argmin()))} lifts off {words}")
             return
-        slid = self._friction.slid(self.push, before)
-        slips, doubt = bool((slid > t.slid).any()), ""
-        if slips and self._sticks:
-            own = self.approach.hold.sticking.own[int(slid.argmax())]
-            doubt = f"{self._named(own)} may slide {words}"
-        elif forces[weakest] < reach[weakest]:
-            most, whole = 1e3 * (forces + reach)[weakest], 1e3 * before[weakest]
-            text = f"{self._named(weakest)} may have lifted off: it has 0 to {most:.0f} mN"
-            doubt = f"{text} {words}, and {whole:.0f} mN without"
-        if slips and not self._sticks and not self._slips:
-            text = f"{self._named(weakest)} slips {words}"
-            self._notify("brace-slips", text, Severity.WARNING)
-        self._slips = self._slips or slips
-        self._weigh(doubt, elapsed)
+        slid, found = self._friction.slid(self.push, before), {}
+        kind, how = (_UNCERTAIN, "may slide") if self._sticks else (_SLIPS, "slips")
+        for i in np.flatnonzero(slid > t.slid):
+            each = self.approach.hold.sticking.own[int(i)]
+            found[Concern(kind, each, "slide")] = f"{self._named(each)} {how} {words}"
+        for each in map(int, np.flatnonzero(forces < reach)):
+            text, whole = self._lifted(each, float(most[each])), 1e3 * before[each]
+            text = f"{text} {words}, and {whole:.0f} mN without"
+            found[Concern(_UNCERTAIN, each, "lift")] = text
+        self._weigh(found, elapsed)
 
-    def _weigh(self, doubt: str, elapsed: float) -> None:
-        """Take in why the contacts are uncertain at a sample; an empty text if they are not."""
+    def _weigh(self, found: dict[Concern, str], elapsed: float) -> None:
+        """Take in what is of concern at a sample.
+
+        It is reported when it comes, and until it has not been seen for `again`. The arm lets go
+        only at a sample that is itself doubtful.
+        """
         t = self._tuning
-        if doubt and not self._doubt:
-            self._notify("brace-uncertain", doubt, Severity.WARNING)
-        self._certain = 0.0 if doubt else self._certain + elapsed
-        self._doubt = (self._doubt or doubt) if self._certain < t.again else ""
-        self._doubted = self._doubted + elapsed if self._doubt else 0.0
-        if self._doubted > t.longest_push:
-            self.release(why=f"for {t.longest_push:.0f} s it has not been certain: {self._doubt}")
+        for each, text in found.items():
+            if each not in self._concerns:
+                self._notify(each.kind, text, Severity.WARNING)
+                self._concerns[each] = text
+        for each in list(self._concerns):
+            self._calm[each] = 0.0 if each in found else self._calm[each] + elapsed
+            if self._calm[each] >= t.again:
+                del self._concerns[each]
+        if not self._doubt:
+            self._doubted = 0.0
+        if any(each.kind == _UNCERTAIN for each in found):
+            self._doubted += elapsed
+            if self._doubted > t.longest_push:
+                time = f"{t.longest_push:.0f} s"
+                self.release(why=f"for {time} it has not been certain: {self._doubt}")
+
+    def _lifted(self, contact: int, most: float) -> str:
+        return f"{self._named(contact)} may have lifted off: it has 0 to {1e3 * most:.0f} mN"
 
     def _named(self, contact: int) -> str:
         assert self.approach is not None
@@ -547,5 +632,5 @@ class Bracing:
         if self._why and self.phase in (BracePhase.RELEASING, BracePhase.RELEASED):
             found = (*found, Notice("brace-lost", self._why, Severity.ERROR, standing=True))
         elif self.contacts == "uncertain":
-            found = (*found, Notice("brace-uncertain", self._doubt, standing=True))
+            found = (*found, Notice(_UNCERTAIN, self._doubt, standing=True))
         return found
