@@ -341,7 +341,7 @@ def test_contacts_that_stay_uncertain_for_a_minute_are_let_go(approach):
     after = samples(course, approach, pushed(approach, 0.8 * lifts), 3000)
     assert after == pytest.approx(60.0, abs=1.0)
     text = course.notices()[-1].text
-    assert "for 60 s it has not been certain: the contact on 'post' may have lifted off" in text
+    assert "for 60 s it was uncertain: the contact on 'post' may have lifted off" in text
 
 
 def ramp(course: Bracing, approach: BraceApproach, start: Any, end: Any, count: int) -> int:

@@ -518,7 +518,7 @@ class Bracing:
             found[Concern(kind, each, "slide")] = f"{self._named(each)} {how} {words}"
         for each in map(int, np.flatnonzero(forces < reach)):
             text, whole = self._lifted(each, float(most[each])), 1e3 * before[each]
-            text = f"{text} {words}, and {whole:.0f} mN without"
+            text = f"{text} {words}; without it, {whole:.0f} mN"
             found[Concern(_UNCERTAIN, each, "lift")] = text
         self._weigh(found, elapsed)
 
@@ -543,7 +543,7 @@ class Bracing:
             self._doubted += elapsed
             if self._doubted > t.longest_push:
                 time = f"{t.longest_push:.0f} s"
-                self.release(why=f"for {time} it has not been certain: {self._doubt}")
+                self.release(why=f"for {time} it was uncertain: {self._doubt}")
 
     def _lifted(self, contact: int, most: float) -> str:
         return f"{self._named(contact)} may have lifted off: it has 0 to {1e3 * most:.0f} mN"
