@@ -272,7 +272,7 @@ class History(Schema):
         return self.with_memory(x, memory * slow)
 
     def followed(self, pressures: Any) -> Any:
-        """Return what the operators follow at pressures p (..., c): p, or v = p / (1 + c |p|)."""
+        """Return what the operators follow at pressures p (..., c): p, or ``p / (1 + c |p|)``."""
         if self.remembers == "pressure" or not self.softening:
             return pressures
         return pressures / (1 + self.softening * _norm(pressures))
