@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -331,16 +331,22 @@ def test_creep_is_left_as_far_as_was_recorded(size: float) -> None:
         np.testing.assert_allclose(found, expected, atol=0.05 * expected.max())
 
 
-@pytest.mark.parametrize("creep", [CREEP.creep, ()])
-def test_with_creep_a_known_memory_is_wrong_by_a_tenth(creep: tuple[Creep, ...]) -> None:
-    history = History(lag=0.2, dead_time=0.05, play=(Play(width=3e3, share=0.02),), creep=creep)
+@pytest.mark.parametrize(
+    ("creep", "remembers", "share"),
+    [(CREEP.creep, "pressure", 0.1), (CREEP.creep, "strain", 0.05), ((), "pressure", 0.0)],
+)
+def test_with_creep_a_known_memory_is_wrong_by_a_share(
+    creep: tuple[Creep, ...], remembers: Literal["pressure", "strain"], share: float
+) -> None:
+    play = (Play(width=3e3, share=0.02),)
+    history = History(lag=0.2, dead_time=0.05, play=play, creep=creep, remembers=remembers)
     robot = calibrated(history=history)
     rates, remembered = np.array([1e4, -2e4, 0.0]), np.array([3e3, 1e3, -2e3])
     u = P - 0.25 * rates + remembered
     known = Uncertainty(robot).errors(P[None], effective=u[None], rates=rates[None])
     arm = Manipulator(robot)
     way = arm.tip_pose(u)[:3, :3] @ arm.tip_jacobian(u)[:3] @ remembered
-    expected = (0.1 * np.linalg.norm(way)) ** 2 / 3 * bool(creep)
+    expected = (share * np.linalg.norm(way)) ** 2 / 3
     np.testing.assert_allclose(known.hysteresis[0], expected * np.eye(3), rtol=1e-6, atol=1e-15)
 
 

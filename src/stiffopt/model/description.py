@@ -455,6 +455,12 @@ class RobotDescription(Schema):
         return any(segment.history and segment.history.creep for segment in self.segments)
 
     @property
+    def remembers_strain(self) -> bool:
+        """Whether the history of any segment is of strain instead of pressure."""
+        histories = (segment.history or NO_HISTORY for segment in self.segments)
+        return any(each.remembers == "strain" for each in histories)
+
+    @property
     def length(self) -> float:
         """Length at rest with the connectors, in m."""
         return sum(segment.length + segment.connector for segment in self.segments)

@@ -15,7 +15,7 @@ Plays lead through two drawn pressures.  Creep goes on while pressures are held:
 the mean of all ways further: at the pressures themselves, a chamber may be in its dead band.
 
 With creep in the model, what it remembers moves the tip by a tenth more or less than it says, in
-any direction; so it does where the history is known.
+any direction; so it does where the history is known, by a twentieth if strain is remembered.
 
 A model without creep knows less of the memory.  Silicone remembers its stretch rather than
 pressures: the tip is about as far from the equilibrium where the arm is soft as where it is stiff.
@@ -59,6 +59,7 @@ _STAY = 6.0  # s from one of them to the next
 _AGES = (1.5, 6.0)  # s for which the given pressures have been held, from the middle of the motion
 _HELD = 0.9  # share of these variances that held poses show; the rest was creep and motion
 _MISREMEMBERED = 0.1  # error of what a model with creep remembers, over how far it moves the tip
+_MISREMEMBERED_STRAIN = 0.05  # the same where the history is known and strain is remembered
 _STIFFEST = 0.25  # least softness, over that at recorded pressures: a dead band has none
 _SINGULAR = 1e-9  # smallest variance of a direction, over that of all
 NORMAL_QUANTILE = 1.959963984540054  # of 97.5 %, for two-sided intervals of 95 %
@@ -260,7 +261,9 @@ class Uncertainty:
             ways = (effective - pressures + late)[:, np.newaxis] @ np.swapaxes(per_pressure, 1, 2)
             hysteresis = np.zeros((len(u), 3, 3))
         if self._description.creeps:
-            missed = _MISREMEMBERED**2 * (ways**2).sum(axis=2).mean(axis=1) / 3
+            known = effective is not None and self._description.remembers_strain
+            share = _MISREMEMBERED_STRAIN if known else _MISREMEMBERED
+            missed = share**2 * (ways**2).sum(axis=2).mean(axis=1) / 3
             hysteresis = hysteresis + missed[:, np.newaxis, np.newaxis] * np.eye(3)
         if rates is not None and errors is not None:
             way = errors.timing * per_pressure @ rates[..., np.newaxis]
