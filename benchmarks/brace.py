@@ -37,7 +37,7 @@ MAX_FORCE, MARGIN, TOLERANCE = 0.3, 0.02, 1e-4
 _STEP = 30.0  # Pa, of differences
 
 
-def draw(seed: int, name: str = ROBOT) -> dict[str, Any]:
+def draw(seed: int, name: str = ROBOT, friction: float = 0.0) -> dict[str, Any]:
     """A random task of a robot, whose object is clear of the arm at rest."""
     rng = np.random.default_rng([22, seed])
     robot = stiffopt.load_robot(name)
@@ -49,6 +49,7 @@ def draw(seed: int, name: str = ROBOT) -> dict[str, Any]:
             continue
         kind = rng.choice(["post", "ball", "wall"], p=[0.5, 0.2, 0.3])
         item = _object(rng, str(kind), T[round(rng.uniform(0.35, 0.9) * 60) - 1])
+        item["contact"]["friction"] = friction
         scene = stiffopt.Scene(objects=[stiffopt.SceneObject(**item)])
         if robot.clearance(np.zeros(6), scene) > 1e-3:
             break
@@ -81,12 +82,13 @@ def _object(rng: np.random.Generator, kind: str, pose: Any) -> dict[str, Any]:
 def task_of(case: dict[str, Any]) -> stiffopt.Task:
     """The task of a case."""
     scene = stiffopt.Scene(objects=[stiffopt.SceneObject(**case["object"])])
+    grip = "sticking" if case["object"]["contact"].get("friction") else "sliding"
     return stiffopt.Task(
         robot=case.get("robot", ROBOT),
         target=stiffopt.Target(position=case["target"], tolerance={"position": TOLERANCE}),
         stiffness={"maximise": {"direction": case["direction"]}},
         scene=scene,
-        brace={"objects": ["it"], "margin": MARGIN},
+        brace={"objects": ["it"], "margin": MARGIN, "contacts": grip},
     )
 
 
@@ -249,12 +251,14 @@ class Reference:
         return np.array([*eq.tip_pose[:3, 3], eq.stiffness(self.d), *rest])
 
 
-def run(seeds: range, starts: int, folder: Path, name: str) -> Iterator[dict[str, Any]]:
+def run(
+    seeds: range, starts: int, folder: Path, name: str, friction: float
+) -> Iterator[dict[str, Any]]:
     """All cases; the reference from the folder where it is there, the answer always anew."""
     folder.mkdir(parents=True, exist_ok=True)
     for seed in seeds:
         file = folder / f"{seed}.json"
-        case = json.loads(file.read_text()) if file.exists() else draw(seed, name)
+        case = json.loads(file.read_text()) if file.exists() else draw(seed, name, friction)
         case["answer"] = answered(case)
         if starts and case.get("reference", {}).get("asked") != starts:
             reference = Reference(stiffopt.load_robot(name), task_of(case))
@@ -323,13 +327,18 @@ def main() -> None:
     parser.add_argument("--cases", type=int, default=50)
     parser.add_argument("--first", type=int, default=0, metavar="SEED")
     parser.add_argument("--starts", type=int, default=200, help="of the reference; 0: none")
+    parser.add_argument(
+        "--friction", type=float, default=0.0,
+        help="of the objects; above 0 contacts are to stick, which the reference ignores",
+    )  # fmt: skip
     parser.add_argument("--out", type=Path, default=Path("out/brace"))
     parser.add_argument("--keep", type=Path, help="write the report here too")
     arguments = parser.parse_args()
     warnings.simplefilter("ignore")
     cases = []
     seeds = range(arguments.first, arguments.first + arguments.cases)
-    for case in run(seeds, arguments.starts, arguments.out, arguments.robot):
+    chosen = arguments.starts, arguments.out, arguments.robot, arguments.friction
+    for case in run(seeds, *chosen):
         cases.append(case)
         answer = case["answer"]
         print(

@@ -6,13 +6,13 @@ Arms, calibrated files and tasks are those of `brace_rig.py`, with other seeds f
 controller gets the calibrated file; it goes into contact and holds for 20 s. From there, each in a
 copy of the process:
 
-- Pushes at the tip grow from zero until a loss is reported, by `--grows` of the foretold loss in a
+- Pushes at the tip grow from zero until a loss is certain, by `--grows` of the foretold loss in a
   second, along the direction in which the contact should lift off first. With `--slips`, `contacts`
   are `sticking`, and pushes are along or against the direction whose stiffness counts, in which it
   should slip first.
 - A push in the same direction stays at 0.7 of the push that loses the contact, for 20 s.
 
-Once a loss is reported the arm lets go by itself; otherwise a task at rest makes it.
+Once a loss is certain the arm lets go by itself; otherwise a task at rest makes it.
 
 The contact is lost by a lift-off where the plant's force becomes zero; by a slip where the point of
 the body that touches has slid by 0.1 mm since the push began, and again by 0.3 and 0.5 mm: a
@@ -20,12 +20,15 @@ measured tip cannot show 0.1 mm (`docs/contact.md`), and in a push that stays, c
 a contact by as much. If the loss is reported before, a copy of the plant that does not let go tells
 when it would have come: the delay is then negative.
 
-Metrics: this delay; the slide that is told within 0.3 s, which is the slide 0.3 s before the report
-(`slip_bound.py` has how small it can be); the delay of the warning that the contact may be lost
-(`brace-weak`, `brace-slips`); losses reported without one, during the hold or the push at 0.7; the
-estimated contact force (`brace_force`) against that of the plant; what the contacts were pressed
-with at most; and whether the arm ends at rest, clear of the object. A slip that is reported during
-the push at 0.7 is a false one only if the contact has not slid by then.
+A loss is reported in two steps: that it may have come (`brace-uncertain`), and that it is certain
+(`brace-lost`), when the arm lets go.
+
+Metrics: the delays of both; the slide that is told within 0.3 s, which is the slide 0.3 s before
+the first report (`slip_bound.py` has how small it can be); both reports without a loss, during the
+hold or the push at 0.7; the error of the estimated contact force over its stated deviation at the
+loss and under the push at 0.7; what the contacts were pressed with at most; and whether the arm
+ends at rest, clear of the object. A slip that is reported during the push at 0.7 is a false one
+only if the contact has not slid by then.
 """
 
 from __future__ import annotations
@@ -246,13 +249,16 @@ def leant(
     if loop.status.brace != "held":
         return row | {"refused": loop.status.brace, "told": [each[1:] for each in loop.told]}
     on_way, loop.most = loop.most, 0.0
+    begin = loop.rig.clock.now()
     loop.go(HOLD, lambda: loop.status.brace != "held")
     row |= {
         "estimated": loop.status.brace_force, "force": loop.force,
+        "deviation": loop.status.brace_force_deviation,
         "error": loop.status.position_error, "most": loop.most, "most_on_way": on_way,
         "max": found.contacts[0].max_force, "foretold": first.loss.force,
     }  # fmt: skip
     row["false"] = loop.status.brace != "held"
+    row["doubted"] = loop.told_since(begin, "brace-uncertain") is not None
     return Held(loop, task, found, first, row)
 
 
@@ -301,38 +307,43 @@ def in_copy(work: Callable[[], dict[str, Any]]) -> dict[str, Any]:
     return found
 
 
+def score(loop: Loop) -> float:
+    """The error of the estimated contact force over its standard deviation."""
+    status = loop.status
+    return float((status.brace_force - loop.force) / status.brace_force_deviation)
+
+
 def push_off(loop: Loop, first: Any, normal: Any, *, grows: float, slips: bool) -> dict[str, Any]:
-    """What a push gives that grows until a loss is reported."""
+    """What a push gives that grows until a loss is certain."""
     rate = grows * first.loss.force * np.array(first.direction)
     longest, plant, begin = LONGEST / grows, loop.rig.world.plant, loop.rig.clock.now()
-    slide, losses, errors = Slide(plant, normal), Losses(slips=slips), []
-    times_slid = [(0.0, 0.0)]
+    slide, losses = Slide(plant, normal), Losses(slips=slips)
+    times_slid, scores = [(0.0, 0.0)], [0.0]
 
     def is_told() -> bool:
         slid, now = slide.update(plant), loop.rig.clock.now() - begin
         times_slid.append((now, slid))
         if not losses.times:
-            errors.append(loop.status.brace_force - loop.force)
+            scores[0] = score(loop)
         losses.take(now, loop.force, slid)
         return bool(loop.status.brace != "held")
 
     told = loop.go(longest, is_told, lambda after: rate * after)
-    is_reported = loop.status.brace != "held"
+    is_lost, doubted = loop.status.brace != "held", loop.told_since(begin, "brace-uncertain")
+    first = told if doubted is None else doubted
     copied, pressures = copy.deepcopy((plant, slide)), loop.rig.supply.read().pressures
     losses.foresee(*copied, pressures, lambda after: rate * after, told, longest)
-    warned = loop.told_since(begin, "brace-slips" if slips else "brace-weak")
-    times = losses.times
+    times, is_reported = losses.times, is_lost or doubted is not None
     row = {
-        "grows": grows, "reported": is_reported, "lost": times,
-        "error_force": float(np.nanmean(np.abs(errors))),
-        "slide": float(np.interp(told - WITHIN, *np.array(times_slid).T)),
+        "grows": grows, "reported": is_reported, "lost": times, "score": scores[0],
+        "slide": float(np.interp(first - WITHIN, *np.array(times_slid).T)),
         "push": float(np.linalg.norm(rate)) * (times[0] if times else longest),
     }  # fmt: skip
     if times and is_reported:
         row |= {
-            "late": [told - each for each in times],
-            "at_share": told / times[0],
-            "warned": None if warned is None else warned - times[0],
+            "late": [first - each for each in times],
+            "at_share": first / times[0],
+            "certain": told - times[0] if is_lost else None,
         }
     loop.go(FADES, push=lambda after: max(0.0, 1 - after / FADES) * told * rate)
     plant.set_load(None)
@@ -348,10 +359,13 @@ def keep_pushing(loop: Loop, first: Any, normal: Any, *, slips: bool) -> dict[st
     losses.foresee(*copied, pressures, lambda after: rate * after, 0.0, LONGEST * RAMP)
     if not losses.times:
         return {}
-    most, slid = KEPT * losses.times[0] * rate, [0.0]
+    most, slid, begin = KEPT * losses.times[0] * rate, [0.0], loop.rig.clock.now()
+    scores: list[float] = []
 
     def is_told() -> bool:
         slid[0] = slide.update(plant)
+        if loop.status.brace == "held" and loop.rig.clock.now() > begin + RAMP:
+            scores.append(score(loop))
         return bool(loop.status.brace != "held")
 
     loop.go(RAMP + HOLD, is_told, lambda after: min(after / RAMP, 1.0) * most)
@@ -359,6 +373,8 @@ def keep_pushing(loop: Loop, first: Any, normal: Any, *, slips: bool) -> dict[st
     row = {
         "kept": kept,
         "slid": slid[0],
+        "doubted_pushed": loop.told_since(begin, "brace-uncertain") is not None,
+        "score": float(np.mean(scores)) if scores else None,
         "estimated_pushed": loop.status.brace_force,
         "force_pushed": loop.force,
     }
@@ -400,13 +416,19 @@ def main() -> None:
 def report(rows: list[dict[str, Any]], *, slips: bool) -> None:
     """Print the tables."""
     good = [row for row in rows if "force" in row]
-    head = ["arm", "force promised, estimated, met, mN", "push foretold, lost at, mN", "late, s"]
+    head = [
+        "arm", "force promised, estimated, its deviation, met, mN", "push foretold, lost at, mN",
+        "first report, s", "certain, s",
+    ]  # fmt: skip
     lines = [
         [
             f"{row['arm']}",
-            ", ".join(f"{1e3 * row[key]:.0f}" for key in ("promised", "estimated", "force")),
+            ", ".join(
+                f"{1e3 * row[key]:.0f}" for key in ("promised", "estimated", "deviation", "force")
+            ),
             f"{1e3 * row['foretold']:.0f}, {1e3 * row['push']:.0f}",
             ", ".join(f"{each:.2f}" for each in row.get("late", [])) or "not reported",
+            "never" if row.get("certain") is None else f"{row['certain']:.2f}",
         ]
         for row in good
         if row.get("lost")
@@ -434,8 +456,15 @@ def report(rows: list[dict[str, Any]], *, slips: bool) -> None:
         lines.append([slid, f"{grows}", f"{len(lost)}", *cells, f"{by}", f"{within}", f"{missing}"])
     print("\n".join(table(head, lines)))
     kept = [row["kept"] for row in good if "kept" in row]
-    print(f"lost while nothing pushed: {sum(row['false'] for row in good)} of {len(good)}")
+    for what, key in (("lost", "false"), ("uncertain", "doubted")):
+        print(f"{what} while nothing pushed: {sum(row[key] for row in good)} of {len(good)}")
     print(f"pushed with {KEPT} of the loss for {HOLD:.0f} s, and held: {sum(kept)} of {len(kept)}")
+    doubted = sum(row.get("doubted_pushed", False) for row in good)
+    print(f"  uncertain: {doubted}")
+    scores = np.abs([row["score"] for row in good if row.get("score") is not None])
+    if len(scores) and not slips:
+        within = ", ".join(f"{(scores < most).mean():.0%} within {most}" for most in (1, 2))
+        print(f"force off, over its deviation: {np.sqrt((scores**2).mean()):.2f} (RMS), {within}")
     if slips:
         slid = sum(row["slid"] > SLIDES[0] and not row["kept"] for row in good if "kept" in row)
         print(f"  not held, and had slid by {1e3 * SLIDES[0]} mm when it was reported: {slid}")

@@ -4,6 +4,7 @@ import os
 import platform
 import shutil
 import subprocess
+from datetime import date
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -17,6 +18,7 @@ def environment() -> dict[str, str]:
     """What a reader needs to compare with another machine."""
     here = str(Path(__file__).parent)
     found = {
+        "date": date.today().isoformat(),
         "processor": _processor(),
         "cores": str(_cores()),
         "system": f"{platform.system()} {platform.release()} {platform.machine()}",

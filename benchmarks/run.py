@@ -109,7 +109,7 @@ def keep(out: Path) -> None:
 
 def _code(build: Section) -> dict[str, int]:
     found = {
-        f"{segments} segments": int(record["empty"]["code_bytes"])
+        f"{segments} segments": int(record["waiting"]["code_bytes"])
         for segments, record in build.data.items()
     }
     return {name: size for name, size in found.items() if size}

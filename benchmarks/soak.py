@@ -9,7 +9,8 @@ device; then the loop is reset and armed again. One line is written for every te
 errors, faults, their consequences, and the memory of the process. A stopped run resumes where its
 file ends, with a new arm. The exit code is 1 if any of these occurred:
 
-* a channel commanded above its limit, or a state `fault` under pressure;
+* a channel commanded above its limit, a state `fault` under pressure, or an arm that is let down
+  without a fault;
 * a fault of a device that should be detected and was not, or the other way round;
 * an error of the tip, at rest and without a fault, that grew from the first to the last quarter;
 * memory that grew likewise.
@@ -138,8 +139,8 @@ class Soak:
             alarmed = alarmed or bool(snapshot.alarms)
             if (snapshot.commanded > self.high * (1 + 1e-9)).any():
                 wrong.append(f"commanded above the limit at {now:.2f} s")
-            if snapshot.state is State.FAULT and fault is None:
-                wrong.append(f"fault without a cause at {now:.2f} s: {snapshot.reason}")
+            if snapshot.state in {State.FAULT, State.INACTIVE} and fault is None:
+                wrong.append(f"{snapshot.state} without a cause at {now:.2f} s: {snapshot.reason}")
                 self.ready()
                 disturbed = True
             if fault is not None and now >= fault_ends:

@@ -338,6 +338,13 @@ def test_refusals(tmp_path, old, new, message):
     assert message in str(caught.value)
 
 
+def test_nothing_sticks_to_an_object_without_friction(tmp_path):
+    text = TASK.replace("20 mN}", "20 mN, contacts: sticking}")
+    assert stiffopt.load_task(written(tmp_path, text)).brace.contacts == "sticking"
+    with pytest.raises(InputError, match=r"brace\.contacts: nothing sticks to 'post'"):
+        stiffopt.load_task(written(tmp_path, text.replace(", friction: 0.2", "")))
+
+
 def test_a_brace_needs_a_scene(tmp_path):
     with pytest.raises(InputError, match="brace: needs a scene"):
         stiffopt.load_task(written(tmp_path, TASK[: TASK.index("scene:")]))

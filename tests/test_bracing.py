@@ -29,6 +29,7 @@ from stiffopt.optimise import braced
 from stiffopt.optimise.settings import BRACE, Effort
 from stiffopt.optimise.solution import PressureSolution
 from stiffopt.optimise.solver import PressureSolver
+from stiffopt.optimise.tip import TipAt
 from stiffopt.paths.configurations import Unsolved
 from stiffopt.paths.leaning import FORCE_RATE, GRADUAL, SPEED, BraceApproach, approach_to, gradual
 from stiffopt.paths.motion_file import read_motion
@@ -200,45 +201,269 @@ def test_the_way_begins_and_ends_gradually(approach):
 def test_a_push_that_grows_slowly_is_felt(approach):
     course = held(approach)
     samples(course, approach, np.zeros(3), 40)
-    hold, way = approach.hold, np.array([1.0, 0.0, 0.0])
-    lifts = float(-hold.forces[0] / (hold.per_push @ way)[0])
-    most = 0.7 * lifts * way
+    most = 0.7 * lift_off(approach)
     rate = 2.5e-4 / np.linalg.norm(pushed(approach, most))  # 0.25 mm/s
     for number in range(int(1 / (0.025 * rate))):
         assert samples(course, approach, 0.025 * number * rate * pushed(approach, most), 1) is None
     assert np.linalg.norm(course.push - most) < 0.5 * np.linalg.norm(most)
-    assert course.force < 0.7 * hold.forces[0]
+    assert course.force < 0.7 * approach.hold.forces[0]
 
 
-def test_a_lift_off_is_told_within_300_ms_and_less_is_not(approach):
-    hold = approach.hold
-    way = np.array([1.0, 0.0, 0.0])
-    lifts = float(-hold.forces[0] / (hold.per_push @ way)[0])
+def lift_off(approach: BraceApproach) -> Any:
+    """The push along x that lifts the contact off, in N."""
+    lifts = float(-approach.hold.forces[0] / approach.hold.per_push[0, 0])
     assert lifts > 0
-    course = held(approach)
+    return lifts * np.array([1.0, 0.0, 0.0])
+
+
+def standing(course: Bracing) -> list[str]:
+    """Kinds of the alarms that stand."""
+    return [notice.kind for notice in course.notices() if notice.standing]
+
+
+def test_the_deviation_of_a_force_is_that_of_what_it_comes_from(approach):
+    """By hand: 30 mN before; 1.0 and 0.5 times 10 mN of push; a tenth of a change of 50 mN."""
+    hold = approach.hold._replace(
+        forces=np.array([0.1]), deviations=np.array([0.03]), per_push=np.array([[-1.0, 0.5, 0.0]])
+    )
+    course = held(replace(approach, hold=hold))
+    course.covariance = 0.01**2 * np.eye(3)
+    (found,) = course._deviations(hold.forces, np.array([-0.05]))
+    assert found == pytest.approx(math.sqrt(0.03**2 + 1.25 * 0.01**2 + 0.005**2))
+    course._tuning = replace(course._tuning, least_deviation=0.5)
+    (found,) = course._deviations(hold.forces, np.array([0.0]))
+    assert found == pytest.approx(math.sqrt(0.05**2 + 1.25 * 0.01**2))
+
+
+def test_a_tip_that_goes_along_an_arc_is_no_push_along_the_arm(approach):
+    """A push across moves it by 30 mm, and 3 mm along the arm, which is stiff."""
+    course, tip, p = held(approach), approach.tips[-1], approach.pressures[-1]
+    length = ROBOT.tip_pose(np.zeros(6))[2, 3]
+    along = -(0.03**2) / (2 * length)
+    pose = tip.pose.copy()
+    pose[:3, :3] = np.eye(3)
+    bent = TipAt(pose, tip.jacobian, np.diag([0.25, 0.25, 4e-3, 1.0, 1.0, 1.0]))
+    for off in (*[np.zeros(3)] * 40, *[np.array([0.0, 0.03, along])] * 40):
+        course.look(0.025, pose[:3, 3] + off, bent, p)
+    across, apparent = course.push[1], abs(along) / 4e-3
+    assert across == pytest.approx(0.12, rel=0.05)
+    assert abs(course.push[2]) < 0.03 < 0.6 < apparent
+    assert abs(course.push[2]) < math.sqrt(course.covariance[2, 2])
+
+
+def test_a_push_along_which_the_tip_does_not_move_may_be_any(approach):
+    """Its deviation there is that of all pushes, and by hand where the tip moves by 0.1 m/N."""
+    course, tip = held(approach), approach.tips[-1]
+    pose = tip.pose.copy()
+    pose[:3, :3] = np.eye(3)
+    still = TipAt(pose, tip.jacobian, np.diag([0.1, 1e-6, 1e-6, 1.0, 1.0, 1.0]))
+    for off in (*[np.zeros(3)] * 40, *[np.array([3e-3, 0.0, 0.0])] * 40):
+        course.look(0.025, pose[:3, 3] + off, still, approach.pressures[-1])
+    assert course.push == pytest.approx([0.03, 0.0, 0.0], abs=1e-3)
+    assert np.sqrt(np.diag(course.covariance)) == pytest.approx([2e-4 / 0.1, 0.1, 0.1], rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("share", "contacts"), [(0.3, "held"), (0.8, "uncertain"), (1.2, "uncertain"), (2.0, "lost")]
+)
+def test_contacts_are_held_uncertain_or_lost_by_the_force_and_its_deviation(
+    approach, share, contacts
+):
+    course, lifts = held(approach), lift_off(approach)
     samples(course, approach, np.zeros(3), 40)
-    assert samples(course, approach, pushed(approach, 0.5 * lifts * way), 40) is None
-    assert "brace-weak" not in [notice.kind for notice in course.notices()]
-    assert samples(course, approach, pushed(approach, 0.7 * lifts * way), 40) is None
-    (weak,) = [notice for notice in course.notices() if notice.kind == "brace-weak"]
-    assert "the contact on 'post' may lift off: " in weak.text
-    assert course.force == pytest.approx(0.3 * hold.forces[0], rel=0.15)
-    assert course.margin == pytest.approx(0.3 * lifts, rel=0.15)
-    assert np.linalg.norm(course.push - 0.7 * lifts * way) < 0.15 * lifts
-    after = samples(course, approach, pushed(approach, 1.3 * lifts * way), 40)
+    assert course.deviation == pytest.approx(0.2 * approach.hold.forces[0], rel=0.01)
+    after = samples(course, approach, pushed(approach, share * lifts), 80)
+    assert course.contacts == contacts
+    kinds = [notice.kind for notice in course.notices()]
+    expected = {"held": [], "uncertain": ["brace-uncertain"] * 2, "lost": ["brace-lost"] * 2}
+    assert [kind for kind in kinds[1:] if kind != "brace-slips"][-2:] == expected[contacts]
+    assert (after is not None) == (contacts == "lost")
+    if contacts != "lost":
+        left = (1 - share) * approach.hold.forces[0]
+        assert course.force == pytest.approx(left, abs=0.05 * approach.hold.forces[0])
+        assert (course.force > 2 * course.deviation) == (contacts == "held")
+        assert np.linalg.norm(course.push - share * lifts) < 0.2 * np.linalg.norm(lifts)
+
+
+def test_a_lift_off_is_told_within_300_ms_and_the_arm_lets_go_when_it_is_certain(approach):
+    """A push grows by a tenth of what lifts the contact off in a second, and then jumps."""
+    course, lifts = held(approach), lift_off(approach)
+    samples(course, approach, np.zeros(3), 40)
+    said = course.notices()
+    for number in range(round(10.3 / 0.025)):
+        assert samples(course, approach, pushed(approach, number * 2.5e-3 * lifts), 1) is None
+        said += course.notices()
+    (told,) = [each for each in said if each.kind == "brace-uncertain" and not each.standing]
+    assert "the contact on 'post' may have lifted off: it has 0 to " in told.text
+    assert course.contacts == "uncertain"
+    after = samples(course, approach, pushed(approach, 2.5 * lifts), 40)
     assert after is not None
     assert after <= 0.3
-    (told,) = [notice for notice in course.notices() if notice.kind == "brace-lost" and
-               not notice.standing]  # fmt: skip
-    assert "the contact on 'post' lifts off under a push of" in told.text
-    (standing,) = [notice for notice in course.notices() if notice.standing]
-    assert standing.kind == "brace-lost"
+    lost = [each for each in course.notices() if each.kind == "brace-lost"]
+    assert "the contact on 'post' lifts off under a push of" in lost[0].text
+    assert [each.standing for each in lost] == [False, True]
+    assert course.contacts == "lost"
+
+
+def test_uncertainty_ends_with_its_push_and_comes_again_with_the_next(approach):
+    course, lifts = held(approach), lift_off(approach)
+    samples(course, approach, np.zeros(3), 40)
+    for _ in range(2):
+        assert samples(course, approach, pushed(approach, 0.9 * lifts), 40) is None
+        said = course.notices()
+        assert [each.kind for each in said if not each.standing][-1] == "brace-uncertain"
+        assert standing(course) == ["brace-uncertain"]
+        assert samples(course, approach, np.zeros(3), 100) is None
+        assert course.contacts == "held"
+        assert standing(course) == []
+
+
+def test_a_push_about_the_limit_does_not_make_the_alarm_flicker(approach):
+    """Contacts are certain again only after two seconds of certainty."""
+    course, lifts = held(approach), lift_off(approach)
+    samples(course, approach, np.zeros(3), 40)
+    share = 0.0
+    while course.contacts == "held":
+        share += 0.01
+        samples(course, approach, pushed(approach, share * lifts), 10)
+    course.notices()
+    for change in (-0.1, 0.02, -0.1, 0.02):
+        samples(course, approach, pushed(approach, (share + change) * lifts), 60)
+        assert course.contacts == "uncertain"
+    assert [notice.standing for notice in course.notices()] == [True]
+    samples(course, approach, pushed(approach, (share - 0.1) * lifts), 100)
+    assert course.contacts == "held"
+
+
+def test_contacts_that_stay_uncertain_for_a_minute_are_let_go(approach):
+    course, lifts = held(approach), lift_off(approach)
+    samples(course, approach, np.zeros(3), 40)
+    after = samples(course, approach, pushed(approach, 0.8 * lifts), 3000)
+    assert after == pytest.approx(60.0, abs=1.0)
+    text = course.notices()[-1].text
+    assert "for 60 s it was uncertain: the contact on 'post' may have lifted off" in text
+
+
+def ramp(course: Bracing, approach: BraceApproach, start: Any, end: Any, count: int) -> int:
+    """Look at samples of a push that grows; how many it took until it is not `held` any more."""
+    for number in range(count):
+        push = start + (end - start) * number / count
+        samples(course, approach, pushed(approach, push), 1)
+        if course.contacts != "held":
+            return number
+    return count
+
+
+def test_a_push_that_lasts_for_minutes_is_not_forgotten(approach):
+    """Half of what lifts the contact off becomes the model's error, but the force is less known."""
+    course, lifts = held(approach), lift_off(approach)
+    samples(course, approach, np.zeros(3), 40)
+    assert ramp(course, approach, 0 * lifts, 0.5 * lifts, 80) == 80
+    assert samples(course, approach, pushed(approach, 0.5 * lifts), 4800) is None
+    whole = approach.hold.forces[0]
+    assert not course.push.any()
+    assert course.force - 2 * course.deviation < 0.5 * whole
+    assert ramp(course, approach, 0.5 * lifts, lifts, 80) < 80
+    assert course.contacts == "uncertain"
+    assert samples(course, approach, pushed(approach, lifts), 40) is None
+    assert course.force < 2 * course.deviation
+    assert samples(course, approach, pushed(approach, lifts), 2500) is not None
+
+
+@pytest.mark.parametrize("seconds", [300, 900])
+def test_a_push_too_slow_to_be_felt_makes_contacts_uncertain(approach, seconds):
+    course, lifts = held(approach), lift_off(approach)
+    samples(course, approach, np.zeros(3), 40)
+    count = 40 * seconds
+    told = ramp(course, approach, 0 * lifts, 1.5 * lifts, count)
+    assert 0.3 < 1.5 * told / count < 0.8
+    assert not course.push.any()
+    (alarm,) = [notice for notice in course.notices() if notice.standing]
+    assert "since the tip has moved away as by a slow push" in alarm.text
+    off = pushed(approach, 1.5 * told / count * lifts)
+    assert samples(course, approach, off, 2600) == pytest.approx(60.0, abs=2.0)
+
+
+@pytest.mark.parametrize("way", [1.0, -1.0])
+def test_creep_of_a_hold_is_no_push(approach, way):
+    """It moves the tip by 1 % of what the pressures do, per e-fold, either way along the push."""
+    course, tip = held(approach), approach.tips[-1]
+    moves = float(np.linalg.norm(tip.jacobian[:3] @ approach.pressures[-1]))
+    off = pushed(approach, way * lift_off(approach))
+    off *= 0.01 * moves / np.linalg.norm(off)
+    for number in range(1200):
+        assert samples(course, approach, off * math.log(1 + number * 0.025 / 3), 1) is None
+        assert course.contacts == "held"
+    assert course.deviation == pytest.approx(0.2 * approach.hold.forces[0], rel=0.01)
+
+
+def test_a_force_that_is_badly_known_at_rest_is_stated_with_its_deviation(approach):
+    own = 0.7 * approach.hold.forces
+    unsure = replace(approach, hold=approach.hold._replace(deviations=own))
+    course = held(unsure)
+    samples(course, unsure, np.zeros(3), 120)
+    assert course.contacts == "held"
+    assert course.deviation == pytest.approx(own[0])
+
+
+def test_the_arm_does_not_let_go_of_contacts_that_are_certain_again(approach):
+    """The push ends shortly before a minute of doubt is over."""
+    course, lifts = held(approach), lift_off(approach)
+    samples(course, approach, np.zeros(3), 40)
+    assert samples(course, approach, pushed(approach, 0.8 * lifts), 2344) is None
+    assert samples(course, approach, np.zeros(3), 200) is None
+    assert course.contacts == "held"
+
+
+def test_the_doubt_of_a_second_contact_is_told_and_the_alarm_follows(approach):
+    """A push along x would lift off the post, and a tenth of it along y a rib."""
+    hold, lifts = approach.hold, lift_off(approach)
+    rate = float(hold.per_push[0, 0])
+    both = replace(
+        approach,
+        contacts=(approach.contacts[0], approach.contacts[0]._replace(object="rib")),
+        hold=hold._replace(
+            forces=np.repeat(hold.forces, 2),
+            deviations=np.zeros(2),
+            per_pressure=np.repeat(hold.per_pressure, 2, axis=0),
+            per_push=np.array([[rate, 0.0, 0.0], [0.0, 10 * rate, 0.0]]),
+        ),
+    )
+    course, other = held(both), 0.11 * lifts[[1, 0, 2]]
+    samples(course, both, np.zeros(3), 40)
+    samples(course, both, pushed(both, 0.9 * lifts), 80)
+    samples(course, both, pushed(both, other), 20)
+    said = course.notices()
+    events = [each.text for each in said if each.kind == "brace-uncertain" and not each.standing]
+    assert [("'post'" in text, "'rib'" in text) for text in events] == [(1, 0), (0, 1)]
+    assert "'post'" in said[-1].text
+    assert "'rib'" in said[-1].text
+    samples(course, both, pushed(both, other), 100)
+    (alarm,) = course.notices()
+    assert alarm.text == events[1]
+
+
+def test_a_slip_that_comes_and_goes_is_reported_once(approach):
+    course, lifts = held(approach), lift_off(approach)
+    samples(course, approach, np.zeros(3), 40)
+    for _ in range(5):
+        samples(course, approach, pushed(approach, 0.4 * lifts), 30)
+        samples(course, approach, np.zeros(3), 40)
+    told = [notice.kind for notice in course.notices()]
+    assert told == ["braced", "brace-slips"]
+
+
+def test_a_sample_that_is_not_finite_does_not_count(approach):
+    course, lifts = held(approach), lift_off(approach)
+    samples(course, approach, np.zeros(3), 40)
+    samples(course, approach, np.full(3, math.nan), 1)
+    assert course.force == pytest.approx(approach.hold.forces[0])
+    assert samples(course, approach, pushed(approach, 2.5 * lifts), 40) is not None
 
 
 def stiff(approach: BraceApproach, moved: float) -> tuple[BraceApproach, Any]:
     """The same approach with a tip that moves by so much until it lifts off, and that push."""
-    hold, way, tip = approach.hold, np.array([1.0, 0.0, 0.0]), approach.tips[-1]
-    lifts = float(-hold.forces[0] / (hold.per_push @ way)[0]) * way
+    lifts, tip = lift_off(approach), approach.tips[-1]
     compliance = tip.compliance * moved / np.linalg.norm(pushed(approach, lifts))
     tips = (*approach.tips[:-1], tip._replace(compliance=compliance))
     return replace(approach, tips=tips), lifts
@@ -250,38 +475,24 @@ def test_a_slow_push_that_hardly_moves_a_stiff_arm_is_told_in_time(approach):
     course = held(very_stiff)
     samples(course, very_stiff, np.zeros(3), 40)
     for number in range(1, 300):
-        off = pushed(very_stiff, number * 0.025 / 5.0 * lifts)
-        if samples(course, very_stiff, off, 1) is not None:
+        samples(course, very_stiff, pushed(very_stiff, number * 0.025 / 5.0 * lifts), 1)
+        if course.contacts == "uncertain":
             break
-    assert 0.7 * 5.0 < number * 0.025 < 5.0 + 0.3
-    assert "lifts off" in course.notices()[-1].text
+    assert 0.3 * 5.0 < number * 0.025 < 5.0 + 0.3
 
 
 def test_a_push_below_the_loss_is_held_and_becomes_the_models_error_in_the_end(approach):
     very_stiff, lifts = stiff(approach, 8e-4)
     course = held(very_stiff)
     samples(course, very_stiff, np.zeros(3), 40)
-    off = pushed(very_stiff, 0.6 * lifts)
+    off = pushed(very_stiff, 0.35 * lifts)
     assert samples(course, very_stiff, off, 800) is None
-    assert course.force == pytest.approx(0.4 * approach.hold.forces[0], rel=0.2)
+    assert course.force == pytest.approx(0.65 * approach.hold.forces[0], rel=0.2)
     assert samples(course, very_stiff, off, 2400) is None
     for _ in range(20):
         assert samples(course, very_stiff, off, 1) is None
         assert not course.push.any()
     assert course.force == pytest.approx(approach.hold.forces[0])
-
-
-@pytest.mark.parametrize("quick", [True, False])
-def test_less_is_left_while_a_push_grows_than_when_it_stays(approach, quick):
-    """A quick push to 0.8 of the loss counts as one, a slow one that then stays does not."""
-    way = np.array([1.0, 0.0, 0.0])
-    lifts = float(-approach.hold.forces[0] / (approach.hold.per_push @ way)[0]) * way
-    course = held(approach)
-    samples(course, approach, np.zeros(3), 40)
-    steps = 10 if quick else 400
-    shares = [*np.linspace(0, 0.65, 40), *[0.65] * 80, *np.linspace(0.65, 0.8, steps), *[0.8] * 400]
-    lost = [samples(course, approach, pushed(approach, each * lifts), 1) for each in shares]
-    assert any(lost) == quick
 
 
 def test_contacts_are_judged_at_pressures_that_the_silicone_keeps_off_the_plan(approach):
@@ -297,7 +508,7 @@ def test_contacts_are_judged_at_pressures_that_the_silicone_keeps_off_the_plan(a
 
 
 @pytest.mark.parametrize("contacts", ["sliding", "sticking"])
-def test_a_slip_is_told_and_lets_go_where_contacts_are_to_stick(approach, contacts):
+def test_a_slip_by_the_push_alone_is_told_and_does_not_let_go(approach, contacts):
     friction = Friction(approach.hold, approach.pressures[-1])
     slips = friction.left(np.array([1.0, 0, 0]), approach.hold.forces)
     course = held(approach, contacts=contacts)
@@ -306,15 +517,18 @@ def test_a_slip_is_told_and_lets_go_where_contacts_are_to_stick(approach, contac
     moved = pushed(approach, push)
     if contacts == "sticking":
         moved += friction.tip[:3] @ approach.hold.sticking.per_push @ push
-    after = samples(course, approach, moved, 40)
-    kinds = [notice.kind for notice in course.notices()]
+    assert samples(course, approach, moved, 12) is None
+    said = course.notices()
+    (told,) = [each for each in said if "sli" in each.text and not each.standing]
     if contacts == "sliding":
-        assert after is None
-        assert kinds.count("brace-slips") == 1
+        assert told.kind == "brace-slips"
+        assert course.contacts == "held"
     else:
-        assert after is not None
-        assert after <= 0.3
-        assert "brace-lost" in kinds
+        assert told.kind == "brace-uncertain"
+        assert "the contact on 'post' may slide under a push of" in told.text
+        assert course.contacts == "uncertain"
+        assert samples(course, approach, moved, 400) is None
+        assert course.contacts == "uncertain", "the push does not become creep meanwhile"
 
 
 def moved_tip(approach: BraceApproach, push: Any, slides: Any, error: Any) -> tuple[Any, Any]:
@@ -514,6 +728,8 @@ def test_the_loop_leans_holds_tells_a_lift_off_and_lets_go(solution, approach, m
     assert loop.status.position_error < 0.7 * missed
     assert loop.force == pytest.approx(approach.hold.forces[0], rel=0.15)
     assert loop.status.brace_force == pytest.approx(loop.force, rel=0.15)
+    assert loop.status.brace_force_deviation == pytest.approx(0.2 * loop.status.brace_force)
+    assert loop.status.brace_contacts == "held"
     assert not loop.status.touches
     plant = loop.rig.world.plant
     for push in (0.05, 0.09):
@@ -521,13 +737,21 @@ def test_the_loop_leans_holds_tells_a_lift_off_and_lets_go(solution, approach, m
         loop.wait(0.5)
         assert loop.status.wrench[0] == pytest.approx(push, rel=0.25)
         assert loop.status.brace_force == pytest.approx(loop.force, abs=0.03)
-    for push in np.linspace(0.09, 0.3, 40):  # too slow for a tip that seems to jump
+    pushes = iter(np.linspace(0.09, 0.6, 100))
+    for push in pushes:
         plant.set_load(PlantLoad(force=(push, 0, 0)))
         loop.wait(0.05)
-        if loop.force == 0 or loop.status.brace == "releasing":
+        if loop.force == 0:
             break
-    assert loop.until(lambda s: s.brace == "releasing", 1.0) <= 0.3
-    assert "brace-lost" in loop.told
+    loop.until(lambda s: s.brace_contacts != "held", 0.3)
+    assert "brace-uncertain" in loop.told
+    for push in pushes:
+        plant.set_load(PlantLoad(force=(push, 0, 0)))
+        loop.wait(0.05)
+        if loop.status.brace == "releasing":
+            break
+    assert loop.status.brace_contacts == "lost"
+    assert loop.told[-1] == "brace-lost"
     plant.set_load(None)
     loop.until(lambda s: s.brace == "released", 20.0)
     assert loop.force == 0

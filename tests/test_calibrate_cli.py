@@ -10,15 +10,18 @@ from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import replace
 from io import StringIO
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 import stiffopt
 from recordings import UCL, needs_ucl
 from stiffopt.cli import calibrate_run, exits
 from stiffopt.cli.calibrate_run import fixed_keys, log_names
+from stiffopt.cli.calibration_report import models_compared
 from stiffopt.cli.main import main
 from stiffopt.errors import CancelledError, FileError, InputError
 from stiffopt.files import save_file
@@ -706,3 +709,14 @@ tolerances: {base_turn: 180 deg, youngs_modulus: 70 %, area: 150 %, length: 5 %}
     assert list(logs) == [morning.name, slow.name]
     assert logs[slow.name]["position_error_mm"]["mean"] < 1.3
     assert logs[morning.name]["position_error_mm"]["mean"] < 1.8
+
+
+def test_each_compared_model_is_one_line_of_80_columns() -> None:
+    folds = {"kinematics_poses_2.csv": SimpleNamespace(mean=13.2e-3)}
+    models = [SimpleNamespace(structure=each, score=4e-3, folds=folds) for each in STRUCTURES]
+    result = SimpleNamespace(structure=STRUCTURES[-1], candidates=models)
+    page = StringIO()
+    Console(width=80, file=page).print(models_compared(result).renderable())
+    lines = page.getvalue().splitlines()
+    assert len(lines) == 3 + len(STRUCTURES)
+    assert f"{STRUCTURES[-1].name}  <- chosen" in lines[-2]

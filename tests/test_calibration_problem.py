@@ -14,6 +14,7 @@ from stiffopt import lie
 from stiffopt.identify.past import Past, Start
 from stiffopt.identify.problem import Begin, CalibrationProblem, Noise, Sample, TrackedPoint
 from stiffopt.identify.recording import Recording, Track
+from stiffopt.identify.settings import FIT
 from stiffopt.identify.structures import STRUCTURES, ModelStructure
 from stiffopt.identify.unknowns import (
     Unknowns,
@@ -224,6 +225,25 @@ def test_effective_pressures_are_those_of_the_robots_history() -> None:
         )
         own = slice(problem.starts[i], problem.starts[i + 1])
         assert found[own] == pytest.approx(expected.pressures, rel=1e-6)
+
+
+def test_logs_of_one_clock_are_as_far_apart_as_it_says() -> None:
+    problem = problem_of(CASES["two segments in sequence"])
+    x, (first, second, third) = somewhere(problem), problem.samples
+
+    def effective(pause: float) -> Array:
+        begin = first.recording.time[-1] + pause
+        time = second.recording.time - second.recording.time[0] + begin
+        later = replace(second, recording=replace(second.recording, time=time))
+        moved = CalibrationProblem(
+            problem.description, problem.unknowns, [first, later, third], problem.points,
+            problem.base_in_tracker, problem.noise,
+        )  # fmt: skip
+        return moved.predict(x).effective[problem.starts[1] : problem.starts[2]]
+
+    own = problem.predict(x).effective[problem.starts[1] : problem.starts[2]]
+    assert effective(FIT.between_logs) == pytest.approx(own, abs=1e-3)
+    assert np.abs(effective(0.5) - own).max() > 10.0
 
 
 def test_residuals_are_weighted_errors_over_the_noise() -> None:

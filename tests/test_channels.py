@@ -104,6 +104,13 @@ def test_a_small_leak_is_told_within_a_second(leak: float) -> None:
     assert line.kinds == []
 
 
+def test_a_leak_that_is_there_before_the_motion_is_told_within_a_second() -> None:
+    line = Line()
+    line.leak[1] = 1.0  # 6 % of the pressure, which ends just above what raises the alarm
+    line.to(0.0, 0.66 * BAR, 0.0, seconds=1.0)
+    assert line.kinds == ["shortfall"]
+
+
 def test_a_channel_that_always_differs_is_usual() -> None:
     line = Line()
     line.leak[1] = 0.35  # 2.1 % of the pressure, as a wrong gain
@@ -365,7 +372,7 @@ def test_a_distance_is_that_of_the_tip_while_it_is_held_on_its_way() -> None:
     bench.controller.set_task(bench.task(position=position))
     bench.run(0.15)
     (before,) = bench.controller.notices()
-    assert before.text.endswith("by the model")
+    assert before.text.endswith("by the model; the tip is on its way")
     away = bench.run(1.0, position, steer=False)[-1]  # the pressures are held
     (said,) = (notice.text for notice in bench.controller.notices())
     told, modelled = (

@@ -45,6 +45,24 @@ def test_memory_of_an_arm_that_softens_acts_at_its_modulus() -> None:
     assert other.segments[0].history.softening == 0
 
 
+def test_memory_of_strain_has_operators_of_opposite_fibres() -> None:
+    structure = BY_NAME["creep"].of_strain()
+    arm = structure.applied(ONE, 1e5)
+    history = arm.segments[0].history
+    assert history is not None
+    assert history.remembers == "strain"
+    parts = [
+        [play.width for play in history.play if play.of == of] for of in ("pressure", "opposite")
+    ]
+    assert parts[0] == parts[1] != []
+    for each in (structure, BY_NAME["creep"]):
+        assert each.applied(arm, 1e5) == arm  # what it has, it keeps
+    creep = BY_NAME["creep"].applied(ONE, 1e5).segments[0].history
+    assert creep is not None
+    assert creep.remembers == "pressure"
+    assert all(play.of == "pressure" for play in creep.play)
+
+
 @dataclass(frozen=True)
 class Nothing:
     """Stands for a fit that nobody asks."""

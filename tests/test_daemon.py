@@ -27,7 +27,7 @@ import pytest
 from conftest import use_compiler
 from examples import blocks
 from fake_loop import FakeLoop, ManualClock
-from running import ONE, TWO, patient_rig, wait_for
+from running import patient_rig, wait_for
 from stiffopt.control.lifecycle import EventBuffer
 from stiffopt.control.state import Severity, Snapshot, State
 from stiffopt.daemon import daemon as daemon_module
@@ -186,15 +186,6 @@ def test_another_guard_replaces_one_that_was_killed(daemon: tuple[Daemon, Client
     armed(client)
     assert client.state().state is State.ACTIVE
     client.disarm()
-
-
-def test_a_task_is_for_this_arm(daemon: tuple[Daemon, Client], tmp_path: Path) -> None:
-    made, _ = daemon
-    (tmp_path / "one.yaml").write_text(ONE)
-    (tmp_path / "two.yaml").write_text(TWO)
-    assert made.read_task(tmp_path / "one.yaml").target.position is not None
-    with pytest.raises(FileError, match="this rig has 'stiff-flop-1'"):
-        made.read_task(tmp_path / "two.yaml")
 
 
 def test_a_crowd_that_connects_and_says_nothing_does_not_touch_control(

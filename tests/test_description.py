@@ -186,6 +186,12 @@ MISTAKES = [
     ("connector: 5 mm", "connector: -1 mm", 14, "connector: must be at least 0"),
     ("connector: 5 mm", "strain_law: neo", 14, "'neo' is not one of 'paper', 'rest-length'"),
     ("connector: 5 mm", "history: {softening: -0.2}", 14, "-0.2 per Pa leaves no modulus"),
+    (
+        "connector: 5 mm",
+        "history: {softening: -3e-6, remembers: strain, creep: [{time: 9 s, share: 0.6}]}",
+        14,
+        "at the highest pressures they add up to",
+    ),
     ("tip_mass: 20 g", "tip_mass: -20 g", 15, "tip_mass: must be at least 0, not '-20 g'"),
     ("9.81 m/s^2]", "9.81 m/s^2, 0 m/s^2]", 16, "gravity: expected 3 items, not 4"),
     ("9.81 m/s^2]", "9.81 N]", 16, "gravity[2]: '9.81 N': 'N' is not a unit of acceleration"),

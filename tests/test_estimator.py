@@ -554,6 +554,7 @@ def test_offset_of_the_orientation_is_found_and_its_sign_does_not_matter():
             estimator.take([sample(k * PERIOD, truth.position, q)])
         assert estimator.estimate.rotation == pytest.approx(off, abs=1e-3)
         assert estimator.estimate.turn == pytest.approx([0.05, -0.08, 0.03], abs=1e-3)
+        assert estimator.turned == pytest.approx([0.05, -0.08, 0.03], abs=1e-9)
         answers.append(state(estimator))
     assert answers[1] == pytest.approx(answers[0], abs=1e-12)
     assert answers[2] == pytest.approx(answers[0], abs=1e-12)

@@ -41,9 +41,13 @@ def test_a_recording_holds_what_was_so_at_each_frame(tmp_path: Path) -> None:
     rig = fake_rig(slew=3e5)
     with rig:
         assert run_kinematics(rig, tmp_path, short(), rate=100.0) == []
-    for repetition in (1, 2):
-        log = read_log(tmp_path / f"kinematics_{repetition}.csv")
+    ended = 0.0
+    for repetition, log in enumerate(read_recordings(tmp_path, short()), start=1):
+        written = read_log(tmp_path / f"kinematics_{repetition}.csv").time
+        assert 0 < written[0] - ended < 5  # one clock: the arm rests between them
+        ended = written[-1]
         other = read_mcap_log(tmp_path / f"kinematics_{repetition}.mcap")
+        np.testing.assert_allclose(other.time, written, atol=2e-6)
         np.testing.assert_allclose(other.tip_position, log.tip_position, atol=1e-7)
         assert log.time[0] < 0.03
         assert log.time[-1] > 3.1
@@ -57,6 +61,7 @@ def test_a_recording_holds_what_was_so_at_each_frame(tmp_path: Path) -> None:
         ramp = np.interp(log.time, np.arange(7) * 0.5, [0, 0.5e5, 0, 0, 0, 0, 0])
         np.testing.assert_allclose(log.commanded[:, 0], ramp, atol=1100)
         np.testing.assert_allclose(log.commanded.max(axis=0), 0.5e5, rtol=0.02)
+    assert repetition == 2
     assert not list(tmp_path.glob("*.part.*"))
 
 

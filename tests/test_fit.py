@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import cache
 from itertools import pairwise
-from typing import Any
+from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 from made_logs import course, made_log, reddened
 from stiffopt import lie
 from stiffopt.errors import EquilibriumError, InputError
+from stiffopt.identify import calibration
 from stiffopt.identify.calibration import CalibrationResult, calibrate
 from stiffopt.identify.discrepancy import smooth_functions
 from stiffopt.identify.fit import Fit, _reweighted, fit
@@ -27,7 +29,7 @@ from stiffopt.model.description import RobotDescription, Tolerances
 from stiffopt.model.history import Creep, History, Play
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.parameters import Parameter, with_values
-from stiffopt.model.robot_files import load_description
+from stiffopt.model.robot_files import load_description, save_robot
 
 Array = NDArray[np.float64]
 
@@ -137,6 +139,31 @@ def test_play_of_elongation_is_found_and_chosen() -> None:
     assert errors[1] < 0.5 * errors[0]
     (found,) = (p for p in result.robot.segments[0].history.play if p.of == "elongation")
     assert found.share == pytest.approx(0.4, abs=0.1)
+
+
+@pytest.mark.parametrize("remembers", ["pressure", "strain"])
+def test_what_an_arm_remembers_is_found(
+    remembers: Literal["pressure", "strain"], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(calibration, "other_laws", lambda description: [])
+    parts = ("pressure", "opposite") if remembers == "strain" else ("pressure",)
+    plays = [Play(width=20 * KPA, share=0.3 / len(parts), of=of) for of in parts]
+    creep = (Creep(time=20.0, share=0.1),)
+    history = History(lag=0.5, softening=-0.2 / 1e5, remembers=remembers, play=plays, creep=creep)
+    robot = with_history(true_robot("static"), history)
+    first, second = (
+        ("log.csv", made_log(robot, *course(3, 60.0, seed, rate=5.0), base=BASE, noise=3e-4))
+        for seed in (1, 2)
+    )
+    few = settings("creep", strain_law="auto", holds_back=True, rows=150, start_rows=50, rounds=1)
+    result = calibrate(ONE, [first], settings=few)
+    assert [each.structure.name for each in result.candidates] == ["creep", "creep, strain"]
+    found = result.robot.segments[0].history
+    assert found is not None
+    assert found.remembers == remembers
+    save_robot(tmp_path / "arm.yaml", result.robot)
+    assert load_description(tmp_path / "arm.yaml").segments[0].history == found
+    assert validate(result.robot, [second])[0].errors.mean < 0.8e-3
 
 
 def test_registration_is_found_with_orientations() -> None:

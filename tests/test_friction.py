@@ -39,7 +39,9 @@ def friction_at(*names: str, friction: float = MU) -> Friction:
         (eq.shifted(push=each).normal_forces - eq.shifted(push=-each).normal_forces) / (2 * step)
         for each in step * np.eye(3)
     ]
-    hold = Hold(eq.normal_forces, eq.force_gradients, np.array(forces).T, eq.sticking)
+    hold = Hold(
+        eq.normal_forces, np.zeros(len(names)), eq.force_gradients, np.array(forces).T, eq.sticking
+    )
     return Friction(hold, PRESSURES)
 
 
@@ -72,7 +74,7 @@ def test_contacts_at_almost_the_same_station_stay_within_their_cones():
     assert np.linalg.eigvalsh(sticking.per_slide) == pytest.approx(
         [*stiffness[1:] / (1 + 1e-4 * stiffness[1:]), 1e4], rel=0.05
     )
-    hold = Hold(eq.normal_forces, eq.force_gradients, np.zeros((2, 3)), sticking)
+    hold = Hold(eq.normal_forces, np.zeros(2), eq.force_gradients, np.zeros((2, 3)), sticking)
     friction = Friction(hold, pressures)
     for share in np.linspace(0.0, 1.0, 60):
         friction.follow(share * pressures, 0.2, 1e-4)

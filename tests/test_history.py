@@ -19,7 +19,7 @@ from conftest import is_long
 from independent import FLOP
 from stiffopt.errors import InputError
 from stiffopt.model.description import Segment
-from stiffopt.model.history import NO_HISTORY, Creep, History, Memory, Part, Play
+from stiffopt.model.history import NO_HISTORY, Creep, History, Memory, Part, Play, part_of
 
 Vector = NDArray[np.float64]
 
@@ -371,6 +371,27 @@ def test_deflated_chambers_stay_stretched() -> None:
     assert found == pytest.approx(np.array([[85.0, 85, 85], [95, 5, 5], [5, 5, 5]]))
 
 
+def test_fibres_opposite_to_each_channel() -> None:
+    """A unit of stress there is a unit of force, with the moment of the other side."""
+    for count in (3, 4, 6):
+        angles = 2 * np.pi * np.arange(count) / count
+        places = np.column_stack([np.cos(angles), np.sin(angles)])
+        opposite = part_of(np.eye(count), "opposite")
+        assert opposite.sum(axis=1) == pytest.approx(1)
+        assert opposite @ places == pytest.approx(-places)
+        assert opposite @ opposite == pytest.approx(np.eye(count))
+    two = PATH[:, :2]  # each opposite to the other
+    expected = of_segment(of_part("pressure"), two)
+    assert of_segment(of_part("opposite"), two) == pytest.approx(expected)
+    history = of_part("opposite", lag=0.3)
+    assert (
+        np.abs(of_segment(history, PATH) - PATH).max() < history.largest_memory + 100 * KPA * 0.45
+    )
+    memory = Memory([history] * 3, range(3))
+    memory.settle(PATH[0])
+    assert memory.effective == pytest.approx(PATH[0])
+
+
 def test_parts_may_be_cut_into_any_steps_and_settle_in_the_middle() -> None:
     histories = [of_part(of, lag=0.3, dead_time=0.37) for of in ("elongation", "bending")]
     path, places = np.hstack([PATH[:8], PATH[8:16]]), [0, 1, 2, 0, 1, 2]
@@ -422,15 +443,52 @@ def test_what_is_remembered_is_a_stress_at_the_present_modulus(x: list[float]) -
     def strain(p: Vector, modulus_at: Vector) -> Vector:
         return np.asarray(p / (1 + c * np.linalg.norm(modulus_at)))
 
-    acting = history.at_fixed_modulus(now, remembered)
+    acting = history.with_memory(now, remembered) - now
     expected = strain(now + remembered, now) - strain(now, now)
     found = strain(now + acting, now + acting) - strain(now, now)
     assert found == pytest.approx(expected, rel=1e-3)
     assert (acting != pytest.approx(remembered, rel=0.01)) == bool(now.any())
     none = history.model_copy(update={"softening": 0.0})
-    assert none.at_fixed_modulus(now, remembered) == pytest.approx(remembered)
-    symbolic = history.at_fixed_modulus(ca.SX(now), ca.SX(remembered))
-    assert ca.evalf(symbolic).full() == pytest.approx(acting)
+    assert none.with_memory(now, remembered) - now == pytest.approx(remembered)
+    symbolic = history.with_memory(ca.SX(now), ca.SX(remembered))
+    assert ca.evalf(symbolic).full() - now == pytest.approx(acting)
+
+
+@pytest.mark.parametrize("of", ["pressure", "opposite"])
+def test_operators_may_act_on_the_strain(of: Part) -> None:
+    """They do to v = p / (1 + c |p|) what others do to p; their stress meets the modulus at p."""
+    c = -2e-6
+    plain = of_part(of, lag=0.3)
+    history = plain.model_copy(update={"softening": c, "remembers": "strain"})
+    modulus = 1 + c * np.linalg.norm(PATH, axis=1, keepdims=True)
+    memory = Memory([history] * 3, range(3))
+    memory.settle(PATH[-1])
+    assert memory.effective == pytest.approx(PATH[-1])
+    without_lag = plain.model_copy(update={"lag": 0.0})
+    held = of_segment(without_lag, PATH / modulus) - PATH / modulus
+    u = of_segment(history.model_copy(update={"lag": 0.0}), PATH)
+    strain = u / (1 + c * np.linalg.norm(u, axis=1, keepdims=True))
+    assert strain == pytest.approx(PATH / modulus + held / modulus)
+    for p in PATH[:8]:
+        end = memory.advance(1.0, p)
+    cut = Memory([history] * 3, range(3))
+    cut.settle(PATH[-1])
+    for p in np.repeat(PATH[:8], 5, axis=0):
+        cut.advance(0.2, p)
+    assert cut.effective == pytest.approx(end)
+
+
+def test_a_history_is_of_pressures_unless_it_says_so() -> None:
+    keys = {"softening": -2e-6, "play": [{"width": "10 kPa", "share": 0.2}]}
+    old = History.model_validate(keys)
+    assert old.remembers == "pressure"
+    same = History.model_validate(keys | {"remembers": "pressure"})
+    assert (of_segment(old, PATH) == of_segment(same, PATH)).all()
+    other = History.model_validate(keys | {"remembers": "strain"})
+    assert np.abs(of_segment(other, PATH) - of_segment(old, PATH)).max() > 1 * KPA
+    assert History.model_validate(other.model_dump()) == other
+    with pytest.raises(InputError, match="'pressure' or 'strain'"):
+        History(remembers="stress")  # type: ignore[arg-type]
 
 
 def test_what_a_memory_refuses() -> None:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from conftest import use_compiler
 from simulated_loop import TASK, Lab
 from stiffopt.control.arming import late_ticks
 from stiffopt.control.interface import Notice
@@ -237,6 +239,16 @@ def test_a_way_down_that_would_take_too_long_to_find_is_straight_and_says_so() -
     taken, warning = watch.way_down(BENT)
     assert len(taken) == 2
     assert "was not looked at" in warning
+
+
+def test_after_preparing_without_kept_code_the_way_down_is_looked_at(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All code is there then: none is still made in the background."""
+    use_compiler(monkeypatch, tmp_path)
+    watch = ClearanceWatch(load_robot("stiff-flop-2"), _scene(0.5, 0.5, 0.5))
+    watch.prepare()
+    assert watch.way_down(BENT)[1] == ""
 
 
 def test_arming_says_what_to_change_on_a_computer_that_is_late() -> None:

@@ -45,6 +45,46 @@ def test_a_first_file_is_right_and_says_what_comes_next(kind: str) -> None:
     assert (found.exit_code, found.stdout) == (0, f"{name}: a {kind} file without mistakes\n")
 
 
+UNARMED = """format: stiffopt-rig/1
+robot: arm.yaml
+rate: 10 Hz
+supply:
+  driver: modbus
+  tcp: {host: localhost}
+  scale: {counts: [0, 32767], pressure: [0 bar, 10 bar]}
+  channels: [{setpoint: 1}, {setpoint: 2}, {setpoint: 3}]
+tracker: {driver: aurora, rate: 10 Hz}
+safety: {guard_timeout: 100 ms, command_timeout: 50 ms, tracker_timeout: 90 ms}
+"""
+
+
+def test_a_rig_that_could_never_be_armed_is_a_mistake() -> None:
+    robot = (ROOT / "src/stiffopt/robots/stiff-flop-1.yaml").read_text(encoding="utf-8")
+    Path("arm.yaml").write_text(re.sub(r", slew: [^}]*", "", robot), encoding="utf-8")
+    Path("rig.yaml").write_text(UNARMED, encoding="utf-8")
+    found = run("check", "rig.yaml")
+    assert found.exit_code == 2
+    expected = [
+        "rig.yaml: safety.max_slew: there is no limit",
+        "rig.yaml:4: supply: this supply has neither a watchdog nor a dump valve",
+        "rig.yaml:10: safety.guard_timeout: 100 ms is not longer than the 100 ms between two comm",
+        "rig.yaml:10: safety.command_timeout: 50 ms is not longer",
+        "rig.yaml:10: safety.tracker_timeout: 90 ms is shorter than the 100 ms between two frames",
+    ]
+    lines = found.stdout.splitlines()
+    assert len(lines) == len(expected)
+    assert all(line.startswith(text) for line, text in zip(lines, expected, strict=True)), lines
+    mended = UNARMED.replace("10 Hz", "40 Hz").replace("safety: {", "safety: {max_slew: 1 bar/s, ")
+    mended = mended.replace("scale:", "dump_valve: {coil: 0}\n  scale:")
+    Path("rig.yaml").write_text(mended, encoding="utf-8")
+    assert run("check", "--quiet", "rig.yaml").stdout == ""
+    for_scripts = re.sub("tracker: .*\n", "", mended)
+    Path("rig.yaml").write_text(for_scripts, encoding="utf-8")
+    assert run("check", "--quiet", "rig.yaml").stdout == ""
+    Path("rig.yaml").write_text(for_scripts.replace("40 Hz", "600 Hz"), encoding="utf-8")
+    assert "rate: 600 Hz is too fast" in run("check", "rig.yaml").stdout
+
+
 def test_first_files_lead_to_an_answer() -> None:
     """The way of a new user: one's own arm, a task, a path, a scene, a rig."""
     assert run("init", "robot", "arm.yaml", "--segments", "2", "--length", "60 mm").exit_code == 0

@@ -126,6 +126,8 @@ def test_bad_input_is_one_sentence(
             assert not told.out
     assert main(["log", "plot", str(other)]) == 2
     assert "experiment" in capsys.readouterr().err
+    assert main(["log", "plot", str(tmp_path / "no" / "run.mcap")]) == 2
+    assert "no such file" in capsys.readouterr().err
     assert main(["log", "plot", str(run_file), "--out", str(tmp_path / "x.doc")]) == 2
     assert ".png" in capsys.readouterr().err
     assert main(["log", "export", str(run_file), "--out", str(tmp_path / "no" / "x.csv")]) == 2

@@ -339,7 +339,7 @@ EVERYTHING: list[Schema] = [
                 objects=[
                     SceneObject(
                         name="post", sphere={"centre": (0.1, 0.0, 0.1), "radius": 0.01},
-                        contact=AllowedContact(allowed=True),
+                        contact=AllowedContact(allowed=True, friction=0.3),
                     )
                 ]
             ),

@@ -65,7 +65,7 @@ def test_what_is_no_motion_is_refused(solution: PathSolution, tmp_path: Path) ->
     assert "no such file" in refused(tmp_path / "none.csv")
     text = result.read_text()
     assert "is not solved" in refused(result, text.replace("solved", "unreachable", 1))
-    assert "is no motion" in refused(result, text.replace("path-result", "result"))
+    assert "is not a motion" in refused(result, text.replace("path-result", "result"))
     assert "no whole result" in refused(result, text.replace("0.5 s", "soon"))
     lines = table.read_text().splitlines()
     assert "too few points" in refused(table, "\n".join(lines[:2]) + "\n")

@@ -37,10 +37,10 @@ def take(
     deviation: float = 0,
 ) -> None:
     """Have a sample watched, at the least pressures that make the model move as predicted."""
-    pressures, turns = np.linalg.pinv(J) @ predicted, offset is not NONE
+    pressures, turned = np.linalg.pinv(J) @ predicted, None if offset is NONE else offset[3:]
     watch.take(
         time, seen, predicted, offset, pressures, TIP,
-        turns=turns, swings=(swing, swing / 2), deviation=deviation,
+        turned=turned, swings=(swing, swing / 2), deviation=deviation,
     )  # fmt: skip
 
 
@@ -345,7 +345,8 @@ def test_an_offset_that_the_estimator_does_not_know_yet_is_no_slip(
         found = (time > 0.25) * 0.008 * X  # at first it counts as a vibration
         deviation = 1e-4 if time > known_after else 2e-3
         watch.intend(time, np.zeros(3))
-        take(watch, time, found, np.zeros(3), np.concatenate([found, np.zeros(3)]), 0, deviation)
+        offset = np.concatenate([found, np.zeros(3)])
+        take(watch, time, 0.008 * X, np.zeros(3), offset, 0, deviation)
     assert (watch.doubt is not None) is is_doubted
 
 
@@ -363,6 +364,40 @@ def test_an_arm_that_moves_less_or_farther_than_modelled_is_no_slipped_sensor(
     assert watch.doubt.kind == "weak"
     assert f"{response:.2f} times as far" in watch.doubt.text
     assert words in watch.doubt.text
+
+
+@pytest.mark.parametrize(
+    ("turned", "swings_at", "is_doubted"), [(0.0, 1.0, True), (0.6, 1.0, False), (0.0, 0.7, False)]
+)
+def test_a_sensor_that_shakes_is_doubted_before_it_has_swung_once(
+    turned: float, swings_at: float, is_doubted: bool
+) -> None:
+    """The estimator takes all of it for a vibration. One that goes on is judged by its swings."""
+    watch, way = MotionWatch(ROBOT.description, MotionTuning()), TIP.pose[:3, :3] @ X
+    turn = turned * turn_of_a_push(TIP) @ way
+    for time in np.arange(0.0, 1.3, FRAME):
+        shaken = 0.01 * np.sin(2 * np.pi * 3 * (time - 1)) * (time > 1)
+        watch.intend(time, np.zeros(3))
+        watch.take(
+            time, shaken * way, np.zeros(3), NONE, np.zeros(6), TIP,
+            turned=shaken * turn, swings=(0.0, 0.01 * (time > swings_at)),
+        )  # fmt: skip
+        if watch.doubt is not None:
+            break
+    assert (watch.doubt is not None) is is_doubted
+    if is_doubted:
+        assert watch.doubt.kind == "slip"
+        assert time < 1.15
+
+
+def test_a_payload_that_lengthens_a_bent_arm_turns_it_more_than_its_soft_directions_tell() -> None:
+    robot, bent = load_robot("stiff-flop-2-hanging"), np.array([1.2e5, 0.0, 0.0, 0.0, 1.2e5, 0.0])
+    tip = TipModel(robot).at(bent)
+    loaded = robot.loaded_tip_pose(bent, [0.0, 0.0, 0.1, 0.0, 0.0, 0.0])
+    moved, turn = loaded[:3, 3] - tip.pose[:3, 3], lie.log(loaded @ np.linalg.inv(tip.pose))[3:]
+    whole = turn_of_a_push(tip, along_stiff_axis=True) @ moved
+    assert np.linalg.norm(whole - turn) < 0.3 * np.linalg.norm(turn)
+    assert np.linalg.norm(turn_of_a_push(tip) @ moved - turn) > 0.5 * np.linalg.norm(turn)
 
 
 def slowly(t: float) -> float:
@@ -384,7 +419,7 @@ def test_a_drift_that_turns_nothing_is_doubted_though_the_posture_follows_it() -
         offset = np.concatenate([drift * Y, [0.0, 0.0, 1e-9]])
         pressures = np.linalg.pinv(J) @ -offset[:3] + way * 0.8 * drift
         watch.intend(time, np.zeros(3))
-        watch.take(time, np.zeros(3), -offset[:3], offset, pressures, TIP, turns=True)
+        watch.take(time, np.zeros(3), -offset[:3], offset, pressures, TIP, turned=offset[3:])
         if watch.doubt is not None:
             break
     assert watch.doubt is not None
@@ -436,5 +471,5 @@ def test_segments_that_move_the_tip_against_each_other_may_miss_by_more() -> Non
         share = moved(time)
         watch.intend(time, 0.008 * share * X)
         seen = share * (0.008 * X + 0.008 * Y - 0.006 * X)
-        watch.take(time, seen, 0.008 * share * X, NONE, share * way, TIP, turns=False)
+        watch.take(time, seen, 0.008 * share * X, NONE, share * way, TIP, turned=None)
     assert watch.doubt is None

@@ -7,6 +7,7 @@ import fcntl
 import itertools
 import os
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -218,6 +219,21 @@ def test_a_mismatch_is_what_it_says():
     T = settled(Arm((PLAIN,)).under((3, 0, 9), 0.01), p, mismatch=mismatch)
     assert T[:3, 3] == pytest.approx(expected[:3, 3], abs=2e-5)
     assert T[:3, :3] == pytest.approx(expected[:3, :3], abs=1e-3)
+
+
+def test_another_installation_or_a_new_one_compiles_its_own(monkeypatch, tmp_path):
+    """Numba does not use the code of other files, so its folder says that it is empty."""
+    found = [jit._folder.__wrapped__()]
+    source = Path(jit.__file__).with_name("rod.py").read_bytes()
+    for name in ("one", "two"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "rod.py").write_bytes(source + b"# @jit")
+        monkeypatch.setattr(jit, "__file__", str(tmp_path / name / "jit.py"))
+        found.append(jit._folder.__wrapped__())
+    os.utime(tmp_path / "two" / "rod.py", (1e9, 1e9))
+    found.append(jit._folder.__wrapped__())
+    assert len(set(found)) == len(found)
+    assert jit._folder.__wrapped__() == found[-1]
 
 
 @pytest.mark.filterwarnings("ignore::stiffopt.errors.SlowWarning")

@@ -45,8 +45,8 @@ def test_a_line_estimates_what_is_left(clock: Clock, capsys: pytest.CaptureFixtu
         bar.report(2, None, "")
     out, err = capsys.readouterr()
     assert err.splitlines() == [
-        r"fitting\tall: 25%, 10 s gone, about 30 s to go",
-        "30 s gone",
+        r"fitting\tall: 25%, 10 s so far, about 30 s left",
+        "30 s so far",
     ]
     assert out == ""
 

@@ -39,6 +39,20 @@ def test_one_segment_is_stiffer_by_what_its_memory_holds(history: History, share
         assert arm.stiffness(P, direction, quick=True) == pytest.approx(slow / share, rel=1e-12)
 
 
+def test_a_memory_of_strain_holds_more_where_the_arm_is_soft() -> None:
+    given = load_description("stiff-flop-1")
+    (segment,) = given.segments
+    assert segment.compensation is not None
+    slope = segment.compensation.modulus_per_pressure / segment.material.youngs_modulus
+    history = SLOW.model_copy(update={"softening": slope, "remembers": "strain"})
+    arm, most = load_robot(robot("stiff-flop-1", history)), np.array(given.pressure_max)
+    for share, tolerance in ((0.0, 1e-6), (0.5, 0.10), (1.0, 1e-6)):
+        left = 1 + slope * float(np.linalg.norm(share * most))
+        expected = arm.stiffness(share * most, X) / (1 - 0.3 / left)
+        quick = arm.stiffness(share * most, X, quick=True)
+        assert quick == pytest.approx(expected, rel=tolerance)
+
+
 def test_the_quick_share_is_what_a_small_quick_change_of_pressure_does() -> None:
     """On an arm long at a pressure, in the middle of its plays."""
     memory = Memory([SLOW.model_copy(update={"lag": 0.0})])

@@ -92,7 +92,10 @@ def test_what_cannot_be_run_is_refused(
     assert "above 0 s" in refused(capsys, rig, "--duration", "0 s")
     assert "--duration" in refused(capsys, rig, "--duration", "soon")
     assert "not both" in refused(capsys, rig, "--plain", "--json-lines")
-    assert "no such file" in refused(capsys, rig, *alone, str(tmp_path / "none.yaml"))
+    # before anything starts: no line of a state
+    assert main(["run", rig, *alone, str(tmp_path / "none.yaml")]) == 2
+    told = capsys.readouterr()
+    assert (told.out, "no such file" in told.err) == ("", True)
     other = refused(capsys, rig, *alone, str(tmp_path / "two.yaml"))
     assert "robot 'stiff-flop-2-hanging'; this rig has 'stiff-flop-1'" in other
     monkeypatch.setenv("NOTIFY_SOCKET", "/nowhere")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -217,11 +217,22 @@ def after_ways(robot: RobotDescription, p: Array, count: int) -> Array:
     return np.array(found)
 
 
-@pytest.mark.parametrize("of", ["pressure", "elongation", "bending"])
+@pytest.mark.parametrize(
+    ("of", "softening"),
+    [
+        ("pressure", 0.0),
+        ("elongation", 0.0),
+        ("bending", 0.0),
+        ("opposite", 0.0),
+        ("opposite", -2e-6),
+    ],
+)
 @pytest.mark.parametrize("p", [P, np.array([0.02e5, 0.0, 0.6e5]), np.array([1.5e5, 0.0, 0.3e5])])
-def test_hysteresis_moves_the_tip_as_former_pressures_do(p: Array, of: Part) -> None:
+def test_hysteresis_moves_the_tip_as_former_pressures_do(
+    p: Array, of: Part, softening: float
+) -> None:
     plays = [Play(width=w, share=0.02, of=of) for w in (3e3, 12e3, 40e3)]
-    history = History(memory=(0.5, 1.0, 1.5), play=plays)
+    history = History(memory=(0.5, 1.0, 1.5), softening=softening, remembers="strain", play=plays)
     robot = calibrated(history=history, parameters=(), correlation=())
     arm = Manipulator(robot)
     found = arm.tip_uncertainty(p)
@@ -318,6 +329,25 @@ def test_creep_is_left_as_far_as_was_recorded(size: float) -> None:
         expected = slope @ (moves.T @ moves / len(moves)) @ slope.T
         found = arm.tip_uncertainty(p).hysteresis
         np.testing.assert_allclose(found, expected, atol=0.05 * expected.max())
+
+
+@pytest.mark.parametrize(
+    ("creep", "remembers", "share"),
+    [(CREEP.creep, "pressure", 0.1), (CREEP.creep, "strain", 0.05), ((), "pressure", 0.0)],
+)
+def test_with_creep_a_known_memory_is_wrong_by_a_share(
+    creep: tuple[Creep, ...], remembers: Literal["pressure", "strain"], share: float
+) -> None:
+    play = (Play(width=3e3, share=0.02),)
+    history = History(lag=0.2, dead_time=0.05, play=play, creep=creep, remembers=remembers)
+    robot = calibrated(history=history)
+    rates, remembered = np.array([1e4, -2e4, 0.0]), np.array([3e3, 1e3, -2e3])
+    u = P - 0.25 * rates + remembered
+    known = Uncertainty(robot).errors(P[None], effective=u[None], rates=rates[None])
+    arm = Manipulator(robot)
+    way = arm.tip_pose(u)[:3, :3] @ arm.tip_jacobian(u)[:3] @ remembered
+    expected = (share * np.linalg.norm(way)) ** 2 / 3
+    np.testing.assert_allclose(known.hysteresis[0], expected * np.eye(3), rtol=1e-6, atol=1e-15)
 
 
 @pytest.mark.parametrize("residual", [3e-4, 1e-3, 5e-3])

@@ -59,8 +59,9 @@ Sequence = Annotated[
     bool,
     typer.Option(
         "--sequence",
-        help="The logs were recorded without a break: each begins in the state in which the "
-        "previous one ended. Without it, each log's initial state is estimated.",
+        help="The logs follow each other: each begins in the state that the previous one led to, "
+        "after the pause by their times, or a minute if these begin anew. Without it, each log's "
+        "initial state is estimated.",
     ),
 ]
 Rezero = Annotated[

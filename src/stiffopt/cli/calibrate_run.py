@@ -372,10 +372,13 @@ def _check_channels(path: str, log: Log, robot: RobotDescription) -> None:
             )
     elif log.n != robot.n_pressures:
         example = ",".join(str(c + 1) for c in range(robot.n_pressures))
+        remedy = f"give the column of each channel with --channels {example}"
+        if log.n < robot.n_pressures:
+            remedy = "is this another robot's log?"
         raise FileError(
             path,
             f"has {log.n} pressures, the robot '{robot.name}' has {robot.n_pressures} channels; "
-            f"give the column of each channel with --channels {example}",
+            f"{remedy}",
         )
 
 

@@ -368,17 +368,17 @@ def models_compared(result: CalibrationResult) -> TextTable:
         rows.append(
             (
                 each.structure.name + mark,
-                each.structure.words,
                 _length(each.score),
-                f"{_length(each.folds[worst].mean)} ({worst})",
+                _length(each.folds[worst].mean),
+                worst,
             )
         )
     return TextTable(
-        "Models, by their error in what was held back",
-        ("model", "it has", f"mean {display_units().length}", "worst"),
+        "Models (docs/calibration.md), by their error in what was held back",
+        ("model", f"mean {display_units().length}", "worst", "in"),
         tuple(rows),
         "the simplest of those that predict about as well as the best is chosen",
-        words=("it has", "worst"),
+        words=("in",),
     )
 
 

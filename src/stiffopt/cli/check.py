@@ -11,7 +11,8 @@ CHECK_HELP = """\
 Check files without using them: all mistakes at once, one per line, with file, line and key.
 
 Robot, task, path, scene and rig files are checked together with the files that they name; logs
-(.csv, .mcap) are read. Nothing is solved and no device is touched.
+(.csv, .mcap) are read. It is a mistake if a rig with a tracker could never be armed by 'stiffopt
+run'. Nothing is solved and no device is touched.
 """
 
 CHECK_EPILOG = """\

@@ -13,8 +13,8 @@ from typing import Any
 from stiffopt.cli.console import write_json, write_line
 from stiffopt.cli.exits import BAD_INPUT, SOLVED
 from stiffopt.documents import read_document
-from stiffopt.errors import FileError, InputError, StiffoptError, shown
-from stiffopt.files import format_of
+from stiffopt.errors import FileError, InputError, StiffoptError, dotted, shown
+from stiffopt.files import format_of, line_of
 
 _FORMAT = re.compile(r"stiffopt-([a-z]+)/\d+")
 
@@ -123,9 +123,16 @@ def _check_with_robot(wanted: Any) -> None:
 
 
 def _check_rig(path: str) -> None:
-    from stiffopt.rig.config import load_rig_description
+    from stiffopt.daemon.armable import check_description
+    from stiffopt.rig.config import load_rig
 
-    load_rig_description(path)
+    mistakes = [
+        FileError(path, str(error), line=line_of(path, *error.place), key=dotted(error.place))
+        for error in check_description(*load_rig(path))
+    ]
+    if mistakes:
+        mistakes[0].others = tuple(mistakes[1:])
+        raise mistakes[0]
 
 
 def _check_experiment(path: str) -> None:

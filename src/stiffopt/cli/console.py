@@ -189,16 +189,16 @@ class _ProgressLines:
 
     def report(self, done: float, total: float | None, text: str) -> None:
         """Print a line if one is due."""
-        gone = self._clock() - self._begin
-        if gone < self._next:
+        spent = self._clock() - self._begin
+        if spent < self._next:
             return
-        self._next = gone + min(max(gone, _FIRST_LINE), _LONGEST_SILENCE)
+        self._next = spent + min(max(spent, _FIRST_LINE), _LONGEST_SILENCE)
         share = done / total if total else 0.0
         line = f"{printable(text)}: " if text else ""
         if share > 0.0:
-            line += f"{share:.0%}, {gone:.0f} s gone, about {gone * (1 / share - 1):.0f} s to go"
+            line += f"{share:.0%}, {spent:.0f} s so far, about {spent * (1 / share - 1):.0f} s left"
         else:
-            line += f"{gone:.0f} s gone"
+            line += f"{spent:.0f} s so far"
         print(line, file=sys.stderr, flush=True)
 
 
@@ -221,7 +221,7 @@ def _progress(*, is_counted: bool) -> Progress:
     ]
     if is_counted:
         columns[2:2] = [BarColumn(bar_width=24), TaskProgressColumn()]
-        columns += [TextColumn("gone,"), TimeRemainingColumn(), TextColumn("to go")]
+        columns += [TextColumn("so far,"), TimeRemainingColumn(), TextColumn("left")]
     return Progress(
         *columns,
         console=console_on(stderr=True),

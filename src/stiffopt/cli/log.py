@@ -146,8 +146,8 @@ def plot(
         from stiffopt.plots.run import error_lines, plot_run
 
         path = str(Path(run).with_suffix(".png")) if out is None else out
-        check_picture(path)
         recorded = read_run(run)
+        check_picture(path)
         if not recorded.complete and not quiet:
             report_note(f"{run} was truncated or damaged; its complete part was drawn")
         save_figure(plot_run(recorded), path)

@@ -23,11 +23,14 @@ from stiffopt.cli.quantities import quantity
 from stiffopt.cli.run_display import Lines, LiveStatus, write_at_once
 from stiffopt.control.state import State
 from stiffopt.daemon.calls import call_in_thread, ends_within
-from stiffopt.errors import InputError, StiffoptError
-from stiffopt.rig.config import load_rig_description
+from stiffopt.errors import FileError, InputError, StiffoptError
+from stiffopt.rig.config import load_rig
 
 if TYPE_CHECKING:
     from stiffopt.daemon.daemon import Daemon
+    from stiffopt.model.description import RobotDescription
+    from stiffopt.optimise.task import Task
+    from stiffopt.paths.motion_file import MotionTable
 
 _CHECK = 0.2  # s, period of checks whether the end has begun
 _LOOK = 0.05  # s, period of checks whether it is over
@@ -73,8 +76,10 @@ def run(
     seconds = float("inf") if duration is None else quantity("--duration", duration, "s", "time")
     if not seconds > 0:
         raise InputError("--duration: expected a time above 0 s")
-    load_rig_description(rig)  # reports its mistakes before anything else is loaded
+    robot = load_rig(rig)[1]  # reports its mistakes before anything else is loaded
     with _Signals().handled() as signals:
+        wanted = None if task is None else _read_task(task, robot)
+        motion = None if play is None else _read_motion(play, robot)
         from stiffopt.daemon.daemon import TIMES, Daemon
 
         daemon = Daemon(rig, service=service, log_folder=log_folder, json_lines=style == "json")
@@ -83,7 +88,7 @@ def run(
         longest = daemon.description.safety.ramp_time + TIMES.stop
         with Backstop(longest, watch.is_ending), showing_slow_warnings(watch.say_slow):
             state, refused = _steered(
-                daemon, watch, task, play, arm=arm, seconds=seconds, unattended=not service
+                daemon, watch, wanted, motion, arm=arm, seconds=seconds, unattended=not service
             )
             code = _verdict(daemon, watch, state, refused)
             if not screen.finish(_LAST_OUTPUT) or daemon.hung:
@@ -93,11 +98,30 @@ def run(
     return code
 
 
+def _read_task(path: str, robot: RobotDescription) -> Task:
+    """Read a task file; raise `FileError` if it is wrong or for another robot."""
+    from stiffopt.optimise.task import load_task
+
+    task = load_task(path)
+    asked = task.resolve_robot().name
+    if asked != robot.name:
+        reason = f"is for the robot '{asked}'; this rig has '{robot.name}'"
+        raise FileError(path, reason, key="robot")
+    return task
+
+
+def _read_motion(path: str, robot: RobotDescription) -> MotionTable:
+    """Read a motion; raise `FileError` if it is wrong or for another robot."""
+    from stiffopt.paths.motion_file import read_motion
+
+    return read_motion(path, robot)
+
+
 def _steered(
     daemon: Daemon,
     watch: _Watch,
-    task_file: str | None,
-    motion_file: str | None,
+    task: Task | None,
+    motion: MotionTable | None,
     *,
     arm: bool,
     seconds: float,
@@ -107,8 +131,6 @@ def _steered(
     refused = ""
     try:
         with watch.signals.interrupting():
-            task = None if task_file is None else daemon.read_task(task_file)
-            motion = None if motion_file is None else daemon.read_motion(motion_file)
             name = daemon.description.name
             watch.say("starting", f"connecting to {name}; a first start compiles the model")
             daemon.start()

@@ -25,6 +25,11 @@ from stiffopt.rig.settings import CommissioningSettings
 from stiffopt.safety.gate import Outlet
 from stiffopt.safety.monitors import PressureMonitor
 
+NO_SLEW = (
+    "there is no limit to how fast pressures may rise; set safety.max_slew in the rig file, or "
+    "pressure.slew in the robot file"
+)
+"""Why a rig without a limit of slew is not armed."""
 _BUSY = 1.0  # load of a processor above which programs wait
 
 # limits of how a vented arm may differ from when it was commissioned
@@ -63,10 +68,7 @@ def check_rig(rig: Rig, outlet: Outlet, controller: Controller) -> Iterator[str]
     if (limits.low < np.array(robot.pressure_min) - slack).any():
         yield "limits: the supply may go below the robot's pressure.min; take this arm's robot file"
     if not (np.isfinite(rig.slew) & (rig.slew > 0)).all():
-        yield (
-            "slew: there is no limit to how fast pressures may rise; set safety.max_slew in the "
-            "rig file, or pressure.slew in the robot file"
-        )
+        yield f"slew: {NO_SLEW}"
     try:
         controller.check()
     except InputError as error:
@@ -229,7 +231,7 @@ def late_ticks(lateness: float, guard_timeout: float, load: float = 0.0) -> str:
     if lateness < half:
         what = f"{load:.1f} processes want each processor of this computer"
     advice = (
-        "give the computer less to do, or this program the real-time rights that it lacks "
+        "give the computer less to do, or this program real-time rights that it lacks, if any "
         "('stiffopt run' lists them when it starts)"
     )
     patience = max(0.1, math.ceil(20 * 2.5 * lateness) / 20)

@@ -11,14 +11,27 @@ sigma of y - s - b and f of pushes,
 
     F = C (C C + (sigma / f)^2)^-1 (y - s - b).
 
-The contacts count as held as long as the model's contacts hold under this push, and, where they
-are to stick, as long as the tip does not show that they slide (`SlideEstimator`).
+The tip goes along an arc, so sigma grows with the square of what it is moved by.
+
+With the model's normal forces N0 before the push, and their derivatives G by it, those under the
+push are N = N0 + G F. What is wrong with N0, F and the model's response has the deviation s. Part
+of s is the force that a push would take away which moves the tip as b has, beyond creep, since the
+arm settled. Nobody knows whether that is a push. Then
+
+- the contacts are *held* while N > 2 s, or while no push is felt and b has not drifted. A force
+  that is badly known at rest is stated with its deviation, and is no reason to let go;
+- they are *uncertain* otherwise, or if contacts that are to stick would slide under the push. This
+  is reported, and the arm goes on holding;
+- a contact is *lost* if N < -2 s under a push that is felt, with s without that part. It also is if
+  the tip shows that it slides (`SlideEstimator`) or is where a free arm has it, or after a minute
+  of uncertainty. Then the arm lets go.
 """
 
 from __future__ import annotations
 
 import math
 from enum import StrEnum
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +50,9 @@ from stiffopt.paths.leaning import BraceApproach
 Array = NDArray[np.float64]
 
 
+_UNCERTAIN, _SLIPS = "brace-uncertain", "brace-slips"
+
+
 class BracePhase(StrEnum):
     """The phase of a brace."""
 
@@ -46,6 +62,21 @@ class BracePhase(StrEnum):
     HELD = "held"
     RELEASING = "releasing"
     RELEASED = "released"
+
+
+class Concern(NamedTuple):
+    """What is reported of a contact.
+
+    Attributes
+    ----------
+    kind : `brace-uncertain` or `brace-slips`.
+    contact : its index.
+    cause : `slide` or `lift` under a push, or `drift` of b.
+    """
+
+    kind: str
+    contact: int
+    cause: str
 
 
 class Bracing:
@@ -63,7 +94,8 @@ class Bracing:
     phase : the present phase.
     is_steered : whether the pressures follow this course; if not, they are held or let down.
     next : task to pursue after the release; None: the arm stays at rest.
-    force : smallest normal force of the contacts, as estimated, in N; NaN without contact.
+    force : normal force of the least certain contact, as estimated, in N; NaN without contact.
+    deviation : standard deviation of that force, in N.
     margin : further push at the tip that would break a contact, in N; NaN while nothing pushes.
     push : estimated push at the tip (3,), base axes, in N; zero while none is felt.
     displacement : of the tip by the push (3,), in m.
@@ -74,10 +106,11 @@ class Bracing:
         self.task, self._tuning = task, tuning
         self.phase, self.is_steered = BracePhase.PLANNING, True
         self.next: Task | None = None
-        self.force = self.margin = math.nan
+        self.force = self.deviation = self.margin = math.nan
         self.push, self.displacement = np.zeros(3), np.zeros(3)
         self.covariance: Array = tuning.usual_push**2 * np.eye(3)
         self._error: Array | None = None  # b (3,)
+        self._settled: Array = np.zeros(3)  # b when the arm had settled
         self._corrected: Array = np.zeros(3)  # of late, by the model; friction may withhold it
         self._residual: Array = np.zeros(3)  # y - s, smoothed over vibrations
         self._held = self._pushed = 0.0  # durations, in s
@@ -94,8 +127,9 @@ class Bracing:
         self._free = 0  # successive samples at which the tip is nearer to a free arm's
         self._is_off = False  # the tip is known to stay off its target
         self._nearest = (math.inf, 0.0)  # distance of the tip from it, in m, and when it fell to it
-        self._warned: set[str] = set()  # kinds of warnings about the present push
-        self._share = 1.0  # of the weakest contact's force that a push leaves, averaged
+        self._concerns: dict[Concern, str] = {}  # what is reported, with its text
+        self._calm: dict[Concern, float] = {}  # how long it has not been seen, in s
+        self._doubted = 0.0  # for how long contacts have been uncertain, in s
         self._why = ""
         self._notices: list[Notice] = []
 
@@ -107,6 +141,19 @@ class Bracing:
     def leans(self) -> bool:
         """Whether the arm is in contact, approaches it, or lets go."""
         return self.phase in (BracePhase.APPROACHING, BracePhase.HELD, BracePhase.RELEASING)
+
+    @property
+    def contacts(self) -> str:
+        """Whether the contacts are `held`, `uncertain` or `lost`; empty if there are none."""
+        if self.phase is BracePhase.HELD:
+            return "uncertain" if self._doubt else "held"
+        return "lost" if self._why else ""
+
+    @property
+    def _doubt(self) -> str:
+        """Why contacts are uncertain; empty if they are not."""
+        texts = [text for each, text in self._concerns.items() if each.kind == _UNCERTAIN]
+        return "; also ".join(texts)
 
     @property
     def pressures(self) -> Array:
@@ -133,7 +180,7 @@ class Bracing:
         self.next = then or self.next
         if self.phase in (BracePhase.APPROACHING, BracePhase.HELD):
             self.phase, self._why, self._pace = BracePhase.RELEASING, why, 0.0
-            self.force = self.margin = math.nan
+            self.force = self.deviation = self.margin = math.nan
             self.push = self.displacement = np.zeros(3)
             text = "goes back on the way that it came"
             if why:
@@ -195,6 +242,7 @@ class Bracing:
         """Check at a sample of the tracker whether the contacts hold.
 
         If the tip is nearer to its place on a free arm, the contact is lost, whatever pushes it.
+        Numbers that are not finite do not count.
 
         Parameters
         ----------
@@ -212,6 +260,10 @@ class Bracing:
         t, held, friction = self._tuning, self.phase is BracePhase.HELD, self._friction
         if self.approach is None or friction is None:
             return
+        if not np.isfinite(seen).all():
+            return
+        if quaternion is not None and not np.isfinite(quaternion).all():
+            quaternion = None
         if not (held or self.phase is BracePhase.APPROACHING):
             return
         off_plan = t.off_plan if self.is_steered else t.let_down
@@ -255,24 +307,48 @@ class Bracing:
             C = C + friction.tip[:3] @ self.approach.hold.sticking.per_push
             if not settles and self._has_slid(elapsed, seen, quaternion, pressures):
                 return
-        usual = self._usual(R)
-        push = usual @ C.T @ np.linalg.solve(C @ usual @ C.T + t.deviation**2 * np.eye(3), off)
+        push, covariance = self._push(C, R, off)
         feels = self._feels(off, push, before)
-        if settles or not feels or self._pushed > t.longest_push:
+        if settles or not feels or (self._pushed > t.longest_push and not self._doubt):
             time = t.settling_time if settles else t.error_time
             self._error = self._error + min(elapsed / time, 1.0) * raw
+            if settles:
+                self._settled = self._error
             self._pushed = self._pushed * float(feels)
             self.push = self.displacement = np.zeros(3)
-            self.force, self.margin = float(before.min()), math.nan
-            self._share = 1.0
-            self._warned.clear()
+            self._rest(before, self._drift(C, R, tip, pressures), elapsed)
             return
         self._pushed += elapsed
-        if sticks:  # what stays is creep in the end
+        if sticks and not self._doubt:  # what stays is creep in the end
             self._error = self._error + min(elapsed / t.push_creeps, 1.0) * raw
         self.push, self.displacement = push, off
-        self.covariance[:] = np.linalg.inv(C.T @ C / t.deviation**2 + np.linalg.inv(usual))
-        self._judge(before, elapsed)
+        self.covariance[:] = covariance
+        self._judge(before, self._drift(C, R, tip, pressures), elapsed)
+
+    def _push(self, C: Array, rotation: Array, off: Array) -> tuple[Array, Array]:
+        """Return the most likely push (3,) that moves the tip by `off` (3,), and its covariance.
+
+        `C`: compliance (3, 3) of the tip, base axes.
+        """
+        usual = self._usual(rotation)
+        gain = np.linalg.solve(C @ usual @ C.T + self._noise(off), C @ usual).T
+        return gain @ off, usual - gain @ C @ usual
+
+    def _drift(self, C: Array, rotation: Array, tip: TipAt, pressures: Array) -> Array:
+        """Return the forces (k,) that contacts may have lost since settling, unknown to anybody.
+
+        A push that lasts becomes part of b. So does creep, which moves the tip as if the pressures
+        grew, and this part does not count. See `_push` for `C`.
+        """
+        t = self._tuning
+        assert self._error is not None
+        change, began = self._error - self._settled, t.creep_time + self._settling
+        folds = math.log(max((t.creep_time + self._held) / began, 1.0))
+        creep = t.most_creep * folds * float(np.linalg.norm(tip.jacobian[:3] @ pressures))
+        size = float(np.linalg.norm(change))
+        change = max(0.0, 1 - creep / max(size, 1e-12)) * change
+        found: Array = np.maximum(-(self._per_push @ self._push(C, rotation, change)[0]), 0.0)
+        return found
 
     def _has_slid(
         self, elapsed: float, seen: Array, quaternion: Array | None, pressures: Array
@@ -296,8 +372,8 @@ class Bracing:
         if self._slid < t.samples:
             return False
         most = int(np.where(slid, sizes, 0.0).argmax())
-        where = approach.contacts[approach.hold.sticking.own[most]].object
-        self.release(why=f"the contact on '{where}' has slid by {1e3 * sizes[most]:.1f} mm")
+        where = self._named(approach.hold.sticking.own[most])
+        self.release(why=f"{where} has slid by {1e3 * sizes[most]:.1f} mm")
         return True
 
     def _feels(self, off: Array, push: Array, before: Array) -> bool:
@@ -313,6 +389,18 @@ class Bracing:
             force = float(np.linalg.norm(push))
             uses = max(uses, force / max(self._friction.left(push / force, before), 1e-6))
         return size > t.felt or (size > t.least_felt and uses > t.felt_share)
+
+    def _noise(self, off: Array) -> Array:
+        """Return the covariance (3, 3) of a displacement (3,) of the tip that no push explains.
+
+        A tip that is moved by y goes along an arc, so that its place is off the linear response by
+        y^2 / (2 length).
+        """
+        assert self.approach is not None
+        length = float(np.linalg.norm(self.approach.free_tips[0]))
+        bent = float(off @ off) / (2 * length)
+        found: Array = (self._tuning.deviation**2 + bent**2) * np.eye(3)
+        return found
 
     def _usual(self, rotation: Array) -> Array:
         """Return the covariance (3, 3) of pushes before the tip is seen, in N^2; base axes.
@@ -362,44 +450,107 @@ class Bracing:
         found: Array = float(np.clip(share, -1.0, 1.0)) * self._corrected
         return found
 
-    def _judge(self, before: Array, elapsed: float) -> None:
-        """Judge whether the contacts hold the estimated push; `before`: normal forces (k,).
+    def _rest_deviations(self, before: Array) -> Array:
+        """Return the standard deviations (k,) of normal forces without a push, in N.
 
-        Silicone is stiffer to a quick push, so while one grows, less is left than estimated.
+        `before`: these forces (k,). A robot that is not calibrated has none of its own.
+        """
+        assert self.approach is not None
+        least, own = self._tuning.least_deviation * before, self.approach.hold.deviations
+        found: Array = np.maximum(own, least)
+        return found
+
+    def _deviations(self, before: Array, change: Array) -> Array:
+        """Return the standard deviations (k,) of the normal forces under the push, in N.
+
+        They come from the forces without it, from the push, which the tip hardly shows where it is
+        stiff, and from the response of the model. `before`: forces (k,) without the push; `change`:
+        by it (k,).
+        """
+        assert self.approach is not None
+        G, response = self._per_push, self._tuning.response * change
+        pushed = np.einsum("ki,ij,kj->k", G, self.covariance, G)
+        found: Array = np.sqrt(self._rest_deviations(before) ** 2 + pushed + response**2)
+        return found
+
+    def _rest(self, before: Array, drift: Array, elapsed: float) -> None:
+        """Judge whether the contacts hold while no push is felt; see `_judge`."""
+        t = self._tuning
+        own = self._rest_deviations(before)
+        deviations = np.hypot(own, drift)
+        left = before - t.certain * deviations
+        weakest = int(left.argmin())
+        self.force, self.deviation = float(before[weakest]), float(deviations[weakest])
+        self.margin, found = math.nan, {}
+        for each in map(int, np.flatnonzero((left < 0) & (drift > t.felt_share * before))):
+            text = self._lifted(each, float(before[each] + t.certain * own[each]))
+            why = "since the tip has moved away as by a slow push"
+            found[Concern(_UNCERTAIN, each, "drift")] = f"{text}, {why}"
+        self._weigh(found, elapsed)
+
+    def _judge(self, before: Array, drift: Array, elapsed: float) -> None:
+        """Judge whether the contacts hold the estimated push.
+
+        `before`: normal forces (k,) without it; `drift`: what they may have lost (k,).
         """
         assert self.approach is not None
         assert self._friction is not None
         t, size = self._tuning, float(np.linalg.norm(self.push))
         change = self._per_push @ self.push
-        forces = before + change
-        weakest = int(forces.argmin())
+        forces, own = before + change, self._deviations(before, change)
+        most, deviations = forces + t.certain * own, np.hypot(own, drift)
+        reach = t.certain * deviations
+        weakest = int((forces - reach).argmin())
+        self.force, self.deviation = float(forces[weakest]), float(deviations[weakest])
         falls = change < 0
         left = size * float(np.min(before[falls] / -change[falls], initial=math.inf))
         if self._sticks:
             left = min(left, self._friction.left(self.push / size, before))
-        slips = float(self._friction.slid(self.push, before).max(initial=0.0)) > t.slid
-        self.force = float(forces[weakest])
         self.margin = max(left - size, 0.0)
-        share = self.force / max(float(before[weakest]), 1e-6)
-        self._share += min(elapsed / t.grown_time, 1.0) * (share - self._share)
-        none = t.lost_share + min(max(self._share - share, 0.0), t.grown_share)
-        how = "lifts off" if share <= none else "slips" if self._sticks and slips else ""
-        where = f"on '{self.approach.contacts[weakest].object}'"
         words = f"under a push of {1e3 * size:.0f} mN"
-        if how:
-            self.release(why=f"the contact {where} {how} {words}")
+        if (most < 0).any():
+            self.release(why=f"{self._named(int(most.argmin()))} lifts off {words}")
             return
-        if slips:
-            self._warn("brace-slips", f"the contact {where} slips {words}")
-        if share < t.weak_share:
-            left_over = f"{1e3 * max(self.force, 0.0):.0f} of {1e3 * before[weakest]:.0f} mN"
-            self._warn("brace-weak", f"the contact {where} may lift off: {left_over} left {words}")
+        slid, found = self._friction.slid(self.push, before), {}
+        kind, how = (_UNCERTAIN, "may slide") if self._sticks else (_SLIPS, "slips")
+        for i in np.flatnonzero(slid > t.slid):
+            each = self.approach.hold.sticking.own[int(i)]
+            found[Concern(kind, each, "slide")] = f"{self._named(each)} {how} {words}"
+        for each in map(int, np.flatnonzero(forces < reach)):
+            text, whole = self._lifted(each, float(most[each])), 1e3 * before[each]
+            text = f"{text} {words}; without it, {whole:.0f} mN"
+            found[Concern(_UNCERTAIN, each, "lift")] = text
+        self._weigh(found, elapsed)
 
-    def _warn(self, kind: str, text: str) -> None:
-        """Warn of a kind once during a push."""
-        if kind not in self._warned:
-            self._warned.add(kind)
-            self._notify(kind, text, Severity.WARNING)
+    def _weigh(self, found: dict[Concern, str], elapsed: float) -> None:
+        """Take in what is of concern at a sample.
+
+        It is reported when it comes, and until it has not been seen for `again`. The arm lets go
+        only at a sample that is itself doubtful.
+        """
+        t = self._tuning
+        for each, text in found.items():
+            if each not in self._concerns:
+                self._notify(each.kind, text, Severity.WARNING)
+                self._concerns[each] = text
+        for each in list(self._concerns):
+            self._calm[each] = 0.0 if each in found else self._calm[each] + elapsed
+            if self._calm[each] >= t.again:
+                del self._concerns[each]
+        if not self._doubt:
+            self._doubted = 0.0
+        if any(each.kind == _UNCERTAIN for each in found):
+            self._doubted += elapsed
+            if self._doubted > t.longest_push:
+                time = f"{t.longest_push:.0f} s"
+                self.release(why=f"for {time} it was uncertain: {self._doubt}")
+
+    def _lifted(self, contact: int, most: float) -> str:
+        return f"{self._named(contact)} may have lifted off: it has 0 to {1e3 * most:.0f} mN"
+
+    def _named(self, contact: int) -> str:
+        assert self.approach is not None
+        return f"the contact on '{self.approach.contacts[contact].object}'"
 
     def _notify(self, kind: str, text: str, severity: Severity = Severity.INFO) -> None:
         self._notices.append(Notice(kind, text, severity))
@@ -480,4 +631,6 @@ class Bracing:
         found, self._notices = tuple(self._notices), []
         if self._why and self.phase in (BracePhase.RELEASING, BracePhase.RELEASED):
             found = (*found, Notice("brace-lost", self._why, Severity.ERROR, standing=True))
+        elif self.contacts == "uncertain":
+            found = (*found, Notice(_UNCERTAIN, self._doubt, standing=True))
         return found

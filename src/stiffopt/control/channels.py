@@ -68,6 +68,7 @@ class Channels:
         self._limits, self._tuning = limits, tuning
         self._min_allowed = np.full(limits.n, tuning.max_compensation)
         self._max_allowed = np.maximum(self._min_allowed, tuning.make_up_share * tolerance)
+        self._alarm_above = tuning.alarm_share * self._max_allowed
         self._probe = tuning.probe_share * tolerance
         self._let_down = tuning.let_down_share * slew
         self._empty = np.clip(0.0, limits.low, limits.high)
@@ -87,7 +88,10 @@ class Channels:
         self._allowed: Array = self._min_allowed.copy()  # shortfall to compensate, in Pa
         self._held: Array = np.zeros(n)  # pressure of a limited or stuck channel, in Pa
         self._found: Array = np.zeros(n)  # the same when it was found, in Pa
-        self._durations: Array = np.zeros((2, n))  # durations of being short, and too high, in s
+        # durations of being short by more than is made up for, too high, and short enough for an
+        # alarm, in s
+        self._durations: Array = np.zeros((3, n))
+        self._fed: Flags = np.zeros(n, dtype=bool)  # whether there is that alarm
         # last readings that followed, NaN once they have moved; these without the regulators'
         # offset; and these, in Pa (3, n)
         self._followed: Array = np.zeros((3, n))
@@ -200,11 +204,13 @@ class Channels:
         `ignores` (2, n) are readings that keep still, and those that should have fallen.
         """
         follows, patience = self._tuning.follows, self._tuning.patience
-        wrong = np.stack([short > self._max_allowed, self.limited & (-short > follows)])
+        too_high = self.limited & (-short > follows)
+        wrong = np.stack([short > self._max_allowed, too_high, short > self._alarm_above])
         self._durations = np.clip(
             self._durations + np.where(wrong, elapsed, -elapsed), 0.0, patience
         )
-        lasting = (self._durations >= patience) | ignores
+        self._fed = (self._durations[2] >= patience) | (self._fed & (self._durations[2] > 0))
+        lasting = (self._durations[:2] >= patience) | ignores
         moved = self._smoothed - self._found
         again = np.where(self.stuck, np.abs(moved) > follows, (moved > follows) & (short < follows))
         before = self.limited
@@ -285,8 +291,7 @@ class Channels:
                 "rig file"
             )
             yield Notice("slow-channel", text, Severity.WARNING, standing=True)
-        fed = self._allowed > self._tuning.alarm_share * self._max_allowed
-        off = ~self.lost & (fed | self._rest.changed)
+        off = ~self.lost & (self._fed | self._rest.changed)
         if off.any():
             each = ", ".join(
                 f"channel {c + 1} by {abs(self.shortfall[c]) * 1e-5:.2f} bar "

@@ -142,6 +142,7 @@ class TipEstimator:
         self._ticks = 0
         self.sample: PoseSample | None = None  # the latest that was used
         self.predicted: Array = np.zeros(3)  # position at its capture without the offset
+        self.turned: Array = np.zeros(3)  # rotation vector from the orientation predicted likewise
         # amplitudes of the driven and the free vibration at that time, in m
         self.swings = (0.0, 0.0)
         self._first: PoseSample | None = None
@@ -356,7 +357,7 @@ class TipEstimator:
         has_orientation = sample.quaternion is not None
         (
             self._free, self.offset, self._covariance, self._variances, self._offset_slope,
-            self.detuning, self.predicted, swings,
+            self.detuning, self.predicted, swings, self.turned,
         ) = self._correct(
             past.motion, past.rotation, self._past[-1].motion, self._free, self.offset,
             self.soft_plane, self._lean, self._covariance, self._variances,
@@ -492,6 +493,9 @@ def _correction(tuning: EstimatorTuning, vibrates: bool) -> Formula:
     expected = _rotation(turn + lean @ vibration[0, :].T) @ rotation
     between = lie.rotation_from_quaternion(quaternion) @ expected.T
     angle = lie.rotation_vector_from_quaternion(lie.quaternion_from_rotation(between))
+    predicted = _rotation(lean @ driven[0, :].T) @ rotation
+    between = lie.rotation_from_quaternion(quaternion) @ predicted.T
+    turned = lie.rotation_vector_from_quaternion(lie.quaternion_from_rotation(between))
     angular_gain = has_orientation * angular / (angular + t.angular_noise**2)
     inputs = [
         motion, rotation, motion_now, free_motion, pose_offset, soft_plane, lean, covariance,
@@ -505,7 +509,7 @@ def _correction(tuning: EstimatorTuning, vibrates: bool) -> Formula:
     outputs = [
         ca.vertcat(free_after, free_slope_after),
         ca.vertcat(offset_after, turn + angular_gain * angle), P - gain @ PH.T, variances_after,
-        offset_slope_after, detuning_after, static + driven[0, :].T, ca.vertcat(*swings),
+        offset_slope_after, detuning_after, static + driven[0, :].T, ca.vertcat(*swings), turned,
     ]  # fmt: skip
     return Formula(inputs, outputs)
 

@@ -135,4 +135,5 @@ class Alarms:
             gone = self._standing.pop(kind, None)
             self.now = tuple(self._standing.values())
         if gone is not None:
-            self._events.add(time, f"{kind}-over", f"no longer: {gone.text}")
+            what, _, _ = gone.text.partition(";")
+            self._events.add(time, f"{kind}-over", f"no longer: {what}")

@@ -8,7 +8,7 @@ look for what no push, payload or model error explains:
   bending by d turns an arm: by about 3 d / (2 length), or at least two thirds of that; if d has
   changed along the motion of s, the arm is weaker or softer than modelled. A change that has begun
   with such a turn is a push. It may excite higher modes, in which the tip turns otherwise, so the
-  test pauses;
+  test pauses. A tip at rest is judged sooner, by y - s and its own turn, vibration included;
 * drift: y - s keeps moving, faster than the model's error can change while s moves;
 * swing: y - r oscillates, and does not decay.
 
@@ -37,8 +37,8 @@ from stiffopt.optimise.tip import TipAt
 Array = NDArray[np.float64]
 
 _TIME, _SEEN, _PREDICTED, _INTENDED = 0, slice(1, 4), slice(4, 7), slice(7, 10)  # columns of a row
-_OFFSET, _TURN, _DRIVEN, _FREE = slice(10, 13), slice(13, 16), 16, 17
-_PRESSURES = slice(18, None)
+_OFFSET, _TURN, _TURNED = slice(10, 13), slice(13, 16), slice(16, 19)
+_DRIVEN, _FREE, _PRESSURES = 19, 20, slice(21, None)
 
 
 @dataclass(frozen=True)
@@ -97,8 +97,9 @@ class MotionWatch:
     def begin(self) -> None:
         """Restart."""
         self._count = self._misses = 0
-        # shares of the turn of a push that are missing in the latest samples
+        # shares of the turn of a push that are missing in the latest samples, by both tests of it
         self._slips: deque[float] = deque(maxlen=self._tuning.slips)
+        self._jumps: deque[float] = deque(maxlen=self._tuning.slips)
         self._bends_until = -math.inf  # end of the pause after a push, in s
         self._known_from = math.inf  # time from which the estimator knows the tip's offset, in s
         self._path = 0.0  # length of the way of r, in m
@@ -117,6 +118,7 @@ class MotionWatch:
         self._unproven.clear()
         self._misses = 0
         self._slips.clear()
+        self._jumps.clear()
         self.pace = 1.0
         self._swings = [_Swings(self._tuning) for _ in range(3)]
         self.forgive()
@@ -132,6 +134,7 @@ class MotionWatch:
         rows[:, _PREDICTED] -= change[:3]
         rows[:, _OFFSET] += change[:3]
         rows[:, _TURN] += change[3:]
+        rows[:, _TURNED] += change[3:]
 
     def intend(self, now: float, position: Array) -> None:
         """Note the tip position (3,) that the reference intends; in each tick of control."""
@@ -146,7 +149,7 @@ class MotionWatch:
         pressures: Array,
         tip: TipAt,
         *,
-        turns: bool,
+        turned: Array | None,
         swings: tuple[float, float] = (0.0, 0.0),
         deviation: float = 0.0,
     ) -> None:
@@ -164,8 +167,9 @@ class MotionWatch:
             Effective pressures (n,), in Pa.
         tip :
             The model's tip at these pressures.
-        turns :
-            Whether the tracker measures orientations.
+        turned :
+            Rotation vector (3,) from the predicted orientation to that in the sample, in rad; None:
+            not measured.
         swings :
             Amplitudes of the vibration that the pressures drive, and of the free one, in m.
         deviation :
@@ -179,7 +183,8 @@ class MotionWatch:
         if self._count == len(self._rows):
             self._rows[: self._kept] = self._rows[-self._kept :]
             self._count = self._kept
-        row = (time, *seen, *predicted, *intended, *offset, *swings, *pressures)
+        turn = np.zeros(3) if turned is None else turned
+        row = (time, *seen, *predicted, *intended, *offset, *turn, *swings, *pressures)
         self._rows[self._count] = row
         self._count += 1
         if self._is_pushed():
@@ -190,13 +195,17 @@ class MotionWatch:
             axis.take(_Turn(time, error, self._path))
         jacobian = tip.pose[:3, :3] @ tip.jacobian[:3]
         self.doubt = self._no_response(jacobian, tip.pose[:3, 2])
-        if not turns:
+        if turned is None:
             self._known_from = math.inf
+            self._jumps.clear()
         elif 3 * deviation < self._min_motion / 2:  # the least displacement that is a slip
             self._known_from = min(self._known_from, time)
         if self._known_from <= time:
             self.doubt = self.doubt or self._slip(jacobian, tip)
-        self.doubt = self.doubt or self._drift(jacobian, tip if turns else None) or self._swing()
+        turning = None if turned is None else tip
+        if turning is not None:
+            self.doubt = self.doubt or self._jump(jacobian, turning)
+        self.doubt = self.doubt or self._drift(jacobian, turning) or self._swing()
 
     def _is_pushed(self) -> bool:
         """Return whether something has just displaced the tip while the reference rested."""
@@ -204,8 +213,12 @@ class MotionWatch:
         before = self._since(tuning.push_time)[0, _OFFSET]
         if not math.dist(before.tolist(), now.tolist()) > tuning.push:
             return False
-        intended = self._since(tuning.slip_window)[:, _INTENDED]
-        return not np.ptp(intended, axis=0).max() > tuning.noise
+        return self._rests(tuning.slip_window)
+
+    def _rests(self, duration: float) -> bool:
+        """Return whether the reference has rested for so many seconds."""
+        intended = self._since(duration)[:, _INTENDED]
+        return not np.ptp(intended, axis=0).max() > self._tuning.noise
 
     def _is_early(self, time: float) -> bool:
         last = self._rows[self._count - 1, _TIME] if self._count else -np.inf
@@ -218,7 +231,7 @@ class MotionWatch:
         return None
 
     def _since(self, duration: float) -> Array:
-        """Return the samples (k, 18 + n) of the last so many seconds."""
+        """Return the samples (k, 21 + n) of the last so many seconds."""
         rows = self._rows[: self._count]
         times = rows[:, _TIME]
         return rows[times.searchsorted(times[-1] - duration) :]
@@ -226,7 +239,7 @@ class MotionWatch:
     def _explained(self, changes: Array, jacobian: Array) -> Array:
         """Return the model errors (k,) to expect over changes between samples, in m.
 
-        `changes` (k, 18 + n) are differences of samples; the Jacobian (3, n) is of the tip's
+        `changes` (k, 21 + n) are differences of samples; the Jacobian (3, n) is of the tip's
         position, base axes.
         """
         own: Array = self._tuning.model_error * self._by_segments(changes, jacobian).sum(axis=1)
@@ -368,7 +381,7 @@ class MotionWatch:
             self._slips.clear()
             return None
         self._slips.append(missing / size)
-        if len(self._slips) < tuning.slips or self._slips[0] - self._slips[-1] > tuning.catches_up:
+        if not self._lasts(self._slips):
             return None
         if share := self._share(moved, way[_PREDICTED]):
             return Doubt(
@@ -378,6 +391,41 @@ class MotionWatch:
                 "pressures that the gauges read, or channels are swapped; run 'stiffopt "
                 "commission'",
             )
+        return self._slipped(distance)
+
+    def _lasts(self, missing: deque[float]) -> bool:
+        """Whether the turn of a push has been missing for long enough, by shares of it."""
+        tuning = self._tuning
+        return len(missing) == tuning.slips and missing[0] - missing[-1] <= tuning.catches_up
+
+    def _jump(self, jacobian: Array, tip: TipAt) -> Doubt | None:
+        """Test whether the tip, at rest until now, moves without the turn of a push.
+
+        The vibration that a push excites turns the tip as the push does. So what is measured is
+        compared, and no estimate must separate the two. As the tip swings on, higher modes and
+        large turns make it differ.
+        """
+        tuning, rows = self._tuning, self._since(self._tuning.jump_window)
+        ways, least = rows[-1] - rows, self._min_motion / 2 + 6 * tuning.scatter
+        moved = ways[:, _SEEN] - ways[:, _PREDICTED]
+        distances = np.sqrt((moved**2).sum(axis=1))
+        worst = int(np.argmax(distances))
+        distance, wrong = float(distances[worst]), False
+        if distance > least and rows[worst, _FREE] < least / 2 and self._rests(tuning.jump_window):
+            own = float(self._explained(np.diff(rows[worst:], axis=0), jacobian).sum())
+            bent = turn_of_a_push(tip, along_stiff_axis=True) @ moved[worst]
+            missing = self._missed_turn(bent, ways[worst, _TURNED])
+            size, least_turn = float(np.linalg.norm(bent)), tuning.least_turn
+            most = max(tuning.slip, own / distance) * size
+            wrong = size > least_turn and missing > max(most, least_turn)
+        if not wrong:
+            self._jumps.clear()
+            return None
+        self._jumps.append(missing / size)
+        return self._slipped(distance) if self._lasts(self._jumps) else None
+
+    @staticmethod
+    def _slipped(distance: float) -> Doubt:
         return Doubt(
             "slip",
             f"the tip seems to have been displaced by {1e3 * distance:.1f} mm without being "

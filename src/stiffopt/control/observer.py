@@ -19,6 +19,7 @@ from stiffopt.control.motion_watch import MotionWatch
 from stiffopt.control.pressing import Pressing
 from stiffopt.control.regulators import PressureEstimator
 from stiffopt.control.replanning import AnyCourse
+from stiffopt.control.tip_errors import turn_of_a_push
 from stiffopt.control.touch import TouchEstimator
 from stiffopt.control.tuning import ControlTuning
 from stiffopt.control.vibration import BendingMode
@@ -219,12 +220,14 @@ class ArmObserver:
         self.touch.take(sample.time, sample.position - predicted, effective, tip, self.tip.omega)
         if isinstance(course, Pressing) and course.is_blocked:
             return  # an object of unknown force holds the tip: its motion is not the model's
+        turned = self.tip.turned if self.tip.turn_known else None
         if presses:
             pushed = self.touch.felt.displacement
+            if turned is not None:
+                turned = turned - turn_of_a_push(tip, along_stiff_axis=True) @ pushed
         self.watch.take(
-            sample.time, sample.position - pushed, predicted, self.tip.offset,
-            effective, tip, turns=self.tip.turn_known, swings=self.tip.swings,
-            deviation=self.tip.deviation,
+            sample.time, sample.position - pushed, predicted, self.tip.offset, effective, tip,
+            turned=turned, swings=self.tip.swings, deviation=self.tip.deviation,
         )  # fmt: skip
 
     def lean_on(self, leaning: LeaningTip | None) -> Array:

@@ -298,7 +298,7 @@ class Replanner:
         notices, plan = self._planner.notices(), self.plan
         is_final = plan is not None and plan.serial == self._serial and self._detour is None
         if plan is not None and is_final and not plan.reached:
-            message, task = f"{plan.message} by the model", self.pursuit.task
+            message, task = f"{plan.message} by the model; the tip is on its way", self.pursuit.task
             if away is not None and task is not None:
                 message = nearest_words(*away, task.target.tolerance, "the tip")
             text = "the target cannot be reached"

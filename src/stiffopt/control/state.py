@@ -273,8 +273,15 @@ class ControllerStatus:
             "`released`; empty without one"
         ),
     ] = ""
+    brace_contacts: Annotated[
+        str,
+        _tip("whether its contacts are `held`, `uncertain` or `lost`; empty before and without"),
+    ] = ""
     brace_force: Annotated[
-        float, _tip("smallest force of its contacts along their normals", "N", decimals=5)
+        float, _tip("normal force of its least certain contact, as estimated", "N", decimals=5)
+    ] = math.nan
+    brace_force_deviation: Annotated[
+        float, _tip("standard deviation of that force", "N", decimals=5)
     ] = math.nan
     brace_margin: Annotated[
         float, _tip("further push, as it is felt, by which a contact is lost", "N", decimals=5)

@@ -28,6 +28,8 @@ Array = NDArray[np.float64]
 _INEQUALITY_WEIGHT = 30.0
 """Weight of an inequality in least squares; it may be violated by a thousandth of the error."""
 
+_ERROR_PER_FORCE = 0.01  # error of the model's tip, over the force of a usual push, in m/N
+
 
 class TipErrors:
     """Position and angle errors of a tip, and their derivatives by the pressures."""
@@ -135,15 +137,20 @@ def stiffness_function(task: Task) -> Callable[[Array, Array], float] | None:
     return stiffness
 
 
-def turn_of_a_push(tip: TipAt) -> Array:
+def turn_of_a_push(tip: TipAt, *, along_stiff_axis: bool = False) -> Array:
     """Return the turn of the tip (3, 3) per displacement by a force at it, base axes, in rad/m.
 
-    It covers the tip's two softest directions; a displacement along the third turns nothing.
+    It covers the tip's two softest directions; a displacement along the third turns nothing, as it
+    is mostly an error of the model, not a force. `along_stiff_axis` counts it as a force as far as
+    the compliance c of that axis is more than that of an error of 1 mm by 0.1 N: with the weight
+    ``c / (c^2 + (1 mm / 0.1 N)^2)`` instead of ``1 / c``.
     """
     rotation = tip.pose[:3, :3]
     compliances, axes = np.linalg.eigh(tip.compliance[:3, :3])
-    soft = axes[:, 1:]
-    turn: Array = tip.compliance[3:, :3] @ soft / compliances[1:] @ soft.T
+    stiff, *soft = compliances
+    along = stiff / (stiff**2 + _ERROR_PER_FORCE**2) if along_stiff_axis else 0.0
+    stiffnesses = np.array([along, *(1 / c for c in soft)])
+    turn: Array = tip.compliance[3:, :3] @ axes * stiffnesses @ axes.T
     return rotation @ turn @ rotation.T
 
 

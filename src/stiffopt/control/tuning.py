@@ -381,6 +381,7 @@ class MotionTuning:
     largest_push: float = 8e-3
     slip_of_large: float = 0.25
     slips: int = 4  # successive samples that show a slip
+    jump_window: float = 0.25  # in which a slip at rest is looked for, vibration included, in s
     # decrease of the missing share of the turn in these samples with which it is a push, whose
     # higher modes turned the tip otherwise at first
     catches_up: float = 0.1
@@ -588,9 +589,13 @@ class BracingTuning:
     creep: float = 0.01
     creep_time: float = 3.0
     slid: float = 1e-4
+    # creep since the arm settled that is not taken for a slow push: share by which pressures seem
+    # to grow, per e-fold
+    most_creep: float = 0.02
     # time for which friction at the contacts may withhold a correction of the tip, in s
     withheld_time: float = 5.0
-    longest_push: float = 60.0  # after which a push becomes the model's error too, in s
+    # time after which a push becomes the model's error too, and uncertain contacts let go, in s
+    longest_push: float = 60.0
     # deviation of that displacement, in m, and of pushes, in N
     deviation: float = 2e-4
     usual_push: float = 0.1
@@ -598,12 +603,15 @@ class BracingTuning:
     # and the time constant with which what a push displaces becomes creep, in s
     aside: float = 0.3
     push_creeps: float = 30.0
-    # of its force, below which the estimate cannot tell it from none; what may be added to that for
-    # what a growing push has taken of late, and how long that is, in s
-    lost_share: float = 0.15
-    grown_share: float = 0.1
-    grown_time: float = 1.0
-    weak_share: float = 0.4  # of its force, below which a contact that a push relieves may lift off
+    # a contact is held or lost if its force is above or below zero by so many standard deviations,
+    # as many as the margin of a task has (`BRACE.sure`); time for which it has to be certain until
+    # it is not reported as uncertain any more, in s
+    certain: float = 2.0
+    again: float = 2.0
+    # least standard deviation of a contact's force without a push, as a share of it, and of its
+    # change by a push, as a share of that
+    least_deviation: float = 0.2
+    response: float = 0.1
     # time constants with which the tip goes to its target, at first and once it has settled, in s
     first_time: float = 2.0
     time: float = 3.0

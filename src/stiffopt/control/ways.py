@@ -6,7 +6,6 @@ pressures; an arm that differs from its model is nearer or farther by that diffe
 
 from __future__ import annotations
 
-import math
 import time
 from itertools import pairwise
 
@@ -30,6 +29,7 @@ _STATIONS = 13  # along the body, whose ways are measured
 _SAMPLES = 64  # pressures at which the body's speed is measured
 _SPEED_FACTOR = 1.5  # safety factor on that speed
 _STATES_DOWN = 5  # states on each piece of a way down
+_TIMED = 5  # measurements of the cost; the least counts, as other programs interrupt
 _MAX_COST = 5e-3  # s, of choosing a way down, for which a tick has to wait
 
 
@@ -104,6 +104,7 @@ class ClearanceWatch:
         robot = self._robot
         with compiling_at_once():
             robot._body.machine_code(COMPILED_FREE_FROM)
+            robot.clearance(robot.pressure_min, self._scene)  # the distances to the scene too
         low, high = robot.pressure_min, robot.pressure_max
         samples = np.random.default_rng(0).uniform(low, high, (_SAMPLES, len(low)))
         at = np.linspace(0.0, robot.length, _STATIONS)
@@ -115,15 +116,16 @@ class ClearanceWatch:
         """Restart: forget where the body is."""
         self._at = np.zeros(self._robot.n_pressures)
         self._clearance = -np.inf
-        if math.isfinite(self._cost):
-            self._measure_cost()  # code compiled in the background since then is faster
 
     def _measure_cost(self) -> None:
         robot = self._robot
         states = np.linspace(robot.pressure_min, robot.pressure_max, _STATES_DOWN)
-        begin = time.perf_counter()
-        robot.clearance(states, self._scene)
-        self._cost = (time.perf_counter() - begin) / _STATES_DOWN
+        times = []
+        for _ in range(_TIMED):
+            begin = time.perf_counter()
+            robot.clearance(states, self._scene)
+            times.append(time.perf_counter() - begin)
+        self._cost = min(times) / _STATES_DOWN
 
     def too_near(self, pressures: Array) -> str:
         """Return why the body must not go to effective pressures (n,), in Pa; empty if it may.

@@ -21,14 +21,15 @@ from stiffopt.control.loop import ControlLoop
 from stiffopt.control.state import Severity, Snapshot, State
 from stiffopt.control.ways import ClearanceWatch
 from stiffopt.daemon.address import bracketed
+from stiffopt.daemon.armable import FASTEST
 from stiffopt.daemon.calls import call_in_thread, ends_within
 from stiffopt.daemon.keeper import Keeper, LogEvents, ServiceManager
 from stiffopt.daemon.secret import Secret, check_exposure
 from stiffopt.errors import CommandError, FileError, InputError, MissingExtraError, StiffoptError
 from stiffopt.files import file_text
 from stiffopt.model.manipulator import load_robot
-from stiffopt.optimise.task import Task, load_task
-from stiffopt.paths.motion_file import MotionTable, read_motion
+from stiffopt.optimise.task import Task
+from stiffopt.paths.motion_file import MotionTable
 from stiffopt.rig.config import RigDescription, load_rig
 from stiffopt.safety.guard_client import GuardLink
 from stiffopt.safety.realtime import real_time, tidy
@@ -40,8 +41,6 @@ if TYPE_CHECKING:
 
 
 Array = NDArray[np.float64]
-
-_FASTEST = 500.0  # Hz
 
 
 @dataclass(frozen=True)
@@ -120,9 +119,9 @@ class Daemon:
     ) -> None:
         description, robot = load_rig(rig)
         self.description = description
-        if description.rate > _FASTEST:
+        if description.rate > FASTEST:
             raise FileError(
-                rig, f"{description.rate:g} Hz is too fast; at most {_FASTEST:g} Hz", key="rate"
+                rig, f"{description.rate:g} Hz is too fast; at most {FASTEST:g} Hz", key="rate"
             )
         self.robot = load_robot(robot)
         self.trouble = ""
@@ -243,20 +242,6 @@ class Daemon:
             self.stop()
             raise
         self._manager.ready()
-
-    def read_task(self, path: str | os.PathLike[str]) -> Task:
-        """Read a task file; raise `FileError` if it is wrong or for another robot."""
-        task = load_task(path)
-        asked, there = task.resolve_robot().name, self.robot.description.name
-        if asked != there:
-            raise FileError(
-                path, f"is for the robot '{asked}'; this rig has '{there}'", key="robot"
-            )
-        return task
-
-    def read_motion(self, path: str | os.PathLike[str]) -> MotionTable:
-        """Read a motion of this rig's robot; raise `FileError` if it is wrong."""
-        return read_motion(path, self.robot.description)
 
     def arm(self, task: Task | None = None, motion: MotionTable | None = None) -> None:
         """Arm as soon as the tracker has seen the vented arm for long enough.

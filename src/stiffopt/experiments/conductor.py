@@ -119,6 +119,7 @@ class Conductor:
         self.sink: Callable[[TrackedFrame], None] | None = None  # called with every new frame
         self.watch: Callable[[TickRecord], None] | None = None  # called in every tick; may raise
         self.probing = False  # whether the probe is read in each tick
+        self.origin: float | None = None  # time 0 of the logs, set by the first one
         self._period = 1.0 / rate
         self._check = check
         safety = Safety() if rig.settings is None else rig.settings.safety

@@ -161,6 +161,6 @@ def round_count(poses: int) -> int:
 def round_name(number: int) -> str:
     """Return the name of a round's recording, without ending; rounds count from 1.
 
-    Sorted by name, rounds follow the paper's sequence, in the order of recording.
+    Sorted by name, rounds follow the paper's sequence, up to the ninth in the order of recording.
     """
     return f"kinematics_poses_{number}"

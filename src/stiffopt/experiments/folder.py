@@ -108,7 +108,9 @@ def recorded(
 ) -> Iterator[float]:
     """Context in which all frames are recorded, as CSV and MCAP.
 
-    The files' names contain ``.part`` until the context ends without an exception.
+    The files' names contain ``.part`` until the context ends without an exception. All logs of a
+    conductor have one clock, so that the pauses between them are known, to a second: each begins at
+    a whole second of it.
 
     Parameters
     ----------
@@ -124,20 +126,26 @@ def recorded(
     Yields
     ------
     float
-        Time 0 of the recording, on the rig's clock, in s.
+        Beginning of the recording, on the rig's clock, in s.
     """
     turns = any(row.quaternion is not None for row in conductor.rows)
     layout = LogLayout(n=conductor.n, measured=True, tip_quaternion=turns)
     begin = conductor.clock.now()
+    if conductor.origin is None:
+        conductor.origin = begin
+    zero = begin - math.ceil(begin - conductor.origin)
     mcap, csv = (folder / f"{name}.part.{ending}" for ending in ("mcap", "csv"))
     for part in (mcap, csv):
         part.unlink(missing_ok=True)  # left by an interrupted run
-    with LogWriter(csv, layout) as to_csv, McapLogWriter(mcap, layout, about) as to_mcap:
+    with (
+        LogWriter(csv, layout) as to_csv,
+        McapLogWriter(mcap, layout, about, begin - zero) as to_mcap,
+    ):
 
         def keep(row: TrackedFrame) -> None:
             if 0 <= row.time - begin <= longest:
-                to_csv.append(row.logged(begin))
-                to_mcap.append(row.logged(begin))
+                to_csv.append(row.logged(zero))
+                to_mcap.append(row.logged(zero))
 
         conductor.sink = keep
         try:
@@ -176,10 +184,10 @@ class RawRecording:
             part += 1
             mcap = folder / f"{name}_{part}.mcap"
         about = {"experiment": "stiffness", "repetition": str(repetition), "rig": rig}
-        self._mcap = McapLogWriter(mcap, layout, about)
         last = self._csv.last_time
         now = conductor.clock.now()
         begin = now if last is None else now - last - _PAUSE
+        self._mcap = McapLogWriter(mcap, layout, about, now - begin)
 
         def keep(row: TrackedFrame) -> None:
             if row.time >= now:

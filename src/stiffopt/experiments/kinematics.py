@@ -220,8 +220,9 @@ def run_kinematics(
         done += coverage.duration(number)
     if restless:
         notes.append(
-            f"in {restless} combined poses the arm was not at rest within {settings.settle:g} s "
-            "(--settle)"
+            f"in {restless} of {settings.poses} combined poses the tip still moved after "
+            f"{settings.settle:g} s: soft arms creep, and 'stiffopt calibrate' fits that. A longer "
+            "--settle shows more of it"
         )
     return notes
 

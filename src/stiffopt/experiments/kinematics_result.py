@@ -6,9 +6,10 @@ poses; `doubts` finds suspicious properties of the recordings.
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -99,9 +100,10 @@ class KinematicsResult(DistanceStatistics):
 
 
 def read_recordings(folder: Path, settings: KinematicsSettings) -> list[Log]:
-    """Return the complete recordings of the paper's sequence in a folder."""
+    """Return the complete recordings of the paper's sequence in a folder, each from 0 s on."""
     paths = [folder / f"{recording_name(k + 1)}.csv" for k in range(settings.repetitions)]
-    return [read_log(path) for path in paths if path.exists()]
+    logs = [read_log(path) for path in paths if path.exists()]
+    return [replace(log, time=log.time - math.floor(log.time[0])) for log in logs]
 
 
 def evaluate_kinematics(logs: Sequence[Log], model: Manipulator) -> KinematicsResult:

@@ -53,6 +53,7 @@ from stiffopt.logs import StiffnessTable
 from stiffopt.model.actuation import StrainLaw
 from stiffopt.model.calibration import Calibration, ErrorModel, FittedParameter
 from stiffopt.model.description import Recordings, RobotDescription
+from stiffopt.model.history import NO_HISTORY
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.parameters import Parameter, with_values
 from stiffopt.model.stopping import Cancel, checkpoint, giving_up
@@ -155,7 +156,7 @@ def calibrate(
     for key in settings.fixed:
         Parameter(key).value(description)  # raises if there is no such number
     laws = other_laws(description) if settings.strain_law == "auto" else []
-    teller = _Teller(progress, len(structures) + len(laws))
+    teller = _Teller(progress, len(structures) + len(laws) + 1)
     candidates: list[Candidate] = []
     try:
         with giving_up(timeout, cancel):
@@ -199,7 +200,9 @@ def _chosen(
 ) -> Candidate:
     """Fit structures, then the best one under other strain laws; return the best candidate.
 
-    Every fitted candidate is appended to `candidates`.
+    A model with creep of an arm that softens is then tried with a memory of strain, unless the
+    settings name both model and law; it is chosen if it predicts better. Every fitted candidate is
+    appended to `candidates`.
     """
     description, recordings = setup.description, setup.recordings
     first = near = _screened(setup, teller)
@@ -227,7 +230,22 @@ def _chosen(
             others.append(_candidate(setup, structure, (near,), teller))
             candidates.append(others[-1])
         chosen = best(others)
+    named = "auto" not in (setup.settings.structure, setup.settings.strain_law)
+    if not named and _may_remember_strain(setup, chosen.fit.problem.description):
+        near = chosen.fit.problem.named(chosen.fit.x)
+        candidates.append(_candidate(setup, chosen.structure.of_strain(), (near,), teller))
+        chosen = min(chosen, candidates[-1], key=lambda each: each.score)
     return chosen
+
+
+def _may_remember_strain(setup: Setup, robot: RobotDescription) -> bool:
+    """Whether to try a memory of strain: without softening, it is one of pressure.
+
+    A table of stiffness is compared with quick pushes. If strain is remembered, what they meet
+    depends on the pressures, which the fit does not follow.
+    """
+    histories = [segment.history or NO_HISTORY for segment in robot.segments]
+    return robot.creeps and not setup.tables and any(each.softening for each in histories)
 
 
 def _candidate(

@@ -71,7 +71,8 @@ class Start:
         changes = np.eye(count) if _sides(history, count) > 1 else np.ones((1, count))
         states = history.settled(pressures, np.zeros(count))
         per_side = np.zeros((len(changes), *states.shape))
-        low, high = np.minimum(visited.min(axis=0), 0), np.maximum(visited.max(axis=0), 0)
+        ways = history.followed(visited)
+        low, high = np.minimum(ways.min(axis=0), 0), np.maximum(ways.max(axis=0), 0)
         for j, play in enumerate(history.play, start=1):
             projection, x, w = part_of(np.eye(count), play.of), states[j], play.width
             up, down = np.maximum(projection, 0), np.minimum(projection, 0)
@@ -93,7 +94,7 @@ class Effective:
     per_number : their derivatives (M, c) by each number of the history, by its key: ``lag``,
         ``lag_falling``, ``dead_time``, ``memory[0]``, ``play[0].share``, ``creep[0].share``, ...
     per_side : their derivatives (M, c, c) by the initial sides of the channels.
-    end : state in which the next log of the sequence begins.
+    end : state after the last row.
     """
 
     pressures: Array
@@ -131,21 +132,22 @@ class Past:
         time : (N,)
             In s, increasing.
         pressures : (N, c)
-            Commanded, in Pa; linear between rows.
+            Commanded, in Pa; what the operators follow is linear between rows.
         wanted : (M,)
             Rows whose effective pressures are returned, increasing.
         start : state before the first row.
         history : the values to use; its operators must be those of this object.
         """
         first = time[0] - (np.median(np.diff(time)) if len(time) > 1 else 1.0)
-        knots, values = np.concatenate([[first], time]), np.vstack([start.before, pressures])
+        knots = np.concatenate([[first], time])
+        values = history.followed(np.vstack([start.before, pressures]))
         run, lags = self._run(history), (history.lag, history.lag_falling)
         at = time[wanted] - history.dead_time
         places = np.maximum(np.searchsorted(knots, at) - 1, 0)  # of the last knots before
         state = _carried(start)
         kept = np.empty((len(wanted), *state.shape))
         for block in run.blocks(len(time)):
-            found = run(state, values[:-1][block], pressures[block], np.diff(knots)[block], lags)
+            found = run(state, values[:-1][block], values[1:][block], np.diff(knots)[block], lags)
             along = np.concatenate([state[np.newaxis], found])
             inside = (places >= block.start) & (places < block.stop)
             kept[inside] = along[places[inside] - block.start + (history.dead_time == 0)]
@@ -157,7 +159,7 @@ class Past:
             late = at > first
             steps = (at - knots[places])[late]
             kept[late] = run.aside(kept[late], values[places][late], command[late], steps, lags)
-            slope[~late], command[~late] = 0.0, start.before
+            slope[~late], command[~late] = 0.0, values[0]
         memory = np.array([history.memory_of(channel) for channel in range(self._channels)])
         c = self._channels
         states, by_lag, by_falling, *by_side = (
@@ -166,21 +168,22 @@ class Past:
         rates = _rates(history, states, command, slope, falls)
 
         def held(states: Array, j: int) -> Array:
-            return np.asarray(part_of(states[:, 1 + j] - states[:, 0], history.parts[j].of))
+            of = history.parts[j].of
+            return np.asarray(part_of(states[:, 1 + j] - part_of(states[:, 0], of), of))
 
         def slow(states: Array) -> Array:
             parts = enumerate(history.parts)
             return sum((p.share * held(states, j) for j, p in parts), np.zeros_like(states[:, 0]))
 
         x, slowly = states[:, 0], memory * slow(states)
-        by_x, by_slow = history.slopes_at_fixed_modulus(x, slowly)
+        by_x, by_slow = history.slopes_with_memory(x, slowly)
 
         def times(matrices: Array, vectors: Array) -> Array:
             return np.asarray((matrices @ vectors[..., np.newaxis])[..., 0])
 
         def mixed(slopes: Array) -> Array:
             own = slopes[:, 0]
-            return np.asarray(own + times(by_x, own) + times(by_slow, memory * slow(slopes)))
+            return np.asarray(times(by_x, own) + times(by_slow, memory * slow(slopes)))
 
         per_number = {
             "lag": mixed(by_lag),
@@ -193,18 +196,17 @@ class Past:
         for j in range(len(history.parts)):
             name = f"play[{j}]" if j < plays else f"creep[{j - plays}]"
             per_number[f"{name}.share"] = times(by_slow, held(states, j) * memory)
-        end = self._rested(self._start(state, pressures[-1]), history)
+        end = self._start(state, pressures[-1])
         sides = np.stack([memory * slow(each) for each in by_side], axis=2)
         if len(by_side) < c:  # the side of a channel moves no other's plays
             sides = sides * np.eye(c)
-        u = x + history.at_fixed_modulus(x, slowly)
+        u = history.with_memory(x, slowly)
         return Effective(u, per_number, by_slow @ sides, end)
 
-    def _rested(self, end: Start, history: History) -> Start:
-        """Return the state `FIT.between_logs` later, at the last pressures."""
-        same, pause = end.before[np.newaxis], np.array([FIT.between_logs])
-        lags = (history.lag, history.lag_falling)
-        (state,) = self._run(history)(_carried(end), same, same, pause, lags)
+    def rested(self, end: Start, pause: float, history: History) -> Start:
+        """Return the state a `pause` in s after the end of a log, at its last pressures."""
+        same, lags = history.followed(end.before[np.newaxis]), (history.lag, history.lag_falling)
+        (state,) = self._run(history)(_carried(end), same, same, np.array([pause]), lags)
         return self._start(state, end.before)
 
     def _start(self, state: Array, before: Array) -> Start:
@@ -217,6 +219,15 @@ class Past:
         if kind not in self._runs:
             self._runs[kind] = _HistoryRun(self.history, self._channels, *kind)
         return self._runs[kind]
+
+
+def pause_between(earlier: Array, later: Array) -> float:
+    """Return the time between two logs of a sequence, in s, from the times (N,) of their rows.
+
+    Unless the later log's clock continues the earlier one's, that is `FIT.between_logs`.
+    """
+    apart = float(later[0] - earlier[-1])
+    return apart if apart > 0 else FIT.between_logs
 
 
 def _sides(history: History, channels: int) -> int:

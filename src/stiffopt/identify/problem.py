@@ -8,10 +8,12 @@ gives the reading (`stiffopt.identify.sensing`).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import islice
 from typing import Literal, cast
 
 import casadi as ca
@@ -19,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt.identify.discrepancy import Systematic, smooth_functions
-from stiffopt.identify.past import Past, Start
+from stiffopt.identify.past import Past, Start, pause_between
 from stiffopt.identify.recording import Recording
 from stiffopt.identify.sensing import Readings, readings
 from stiffopt.identify.settings import FIT
@@ -426,7 +428,8 @@ class CalibrationProblem:
                 pressures = sample.recording.pressures[:, channels]
                 before = sample.recording.before[channels]
                 if sample.begin == "previous" and end is not None:
-                    start = end
+                    pause = pause_between(self.samples[i - 1].recording.time, sample.recording.time)
+                    start = past.rested(end, pause, history)
                 elif sample.begin == "unknown" and sides[i].stop > sides[i].start:
                     owner = sides[i]
                     own = coordinates[owner][channels]
@@ -492,11 +495,12 @@ def _excess(robot: RobotDescription) -> ca.SX:
         corrections = segment.corrections
         assert compensation is not None
         assert corrections is not None
-        shares = ca.fmax(*history.shares)
+        most = list(islice(limits, segment.n_channels))
+        shares = ca.fmax(*history.shares) / history.left(math.hypot(*most))
         acting = []
         for c in range(segment.n_channels):
             memory.append((history.memory_of(c) * shares - FIT.most_memory) / FIT.memory_slack)
-            acting.append(corrections.gain[c] * next(limits) + ca.fabs(corrections.offset[c]))
+            acting.append(corrections.gain[c] * most[c] + ca.fabs(corrections.offset[c]))
         change = compensation.modulus_per_pressure * ca.norm_2(ca.vertcat(*acting))
         change = change / segment.material.youngs_modulus  # largest relative change of the modulus
         if compensation.modulus_law == "linear":

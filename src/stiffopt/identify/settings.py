@@ -173,7 +173,8 @@ class FitSettings:
         may raise it (at 1, more pressure bends the arm less) and lower it; and the excess of any of
         these that counts as one deviation.
     side : prior deviation of a channel's initial state of hysteresis, from -1 to 1.
-    between_logs : assumed time at the last pressures between two logs of a sequence, in s.
+    between_logs : assumed time at the last pressures between two logs of a sequence, in s, where
+        each has its own clock.
     systematic : deviation of the errors that rows at nearby pressures share, in lengths of the arm.
     near : correlation length of these errors, as a share of the highest recorded pressure.
     centres_apart, most_centres : spacing of their centres, in correlation lengths, and largest
@@ -422,8 +423,8 @@ class CalibrationSettings(Schema):
         simplest of those that predict held-back logs (with few logs, held-back parts) best.
     strain_law : ``auto`` for the robot file's, unless another law of `stiffopt.model.laws` predicts
         held-back data clearly better; or ``keep``.
-    sequence : whether the logs were recorded without a break, so that each begins in the state in
-        which the previous one ended.
+    sequence : whether the logs follow each other, so that each begins in the state that the
+        previous one led to; after the pause by their times, or a minute if these begin anew.
     rezero : whether each log has its own zero of positions.
     pressures : which of the recorded pressures drive the model.
     fixed : keys of parameters that are not fitted.

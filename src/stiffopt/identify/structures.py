@@ -6,7 +6,7 @@ Models are compared by their errors in logs, or parts of logs, to which they wer
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,6 +38,7 @@ class ModelStructure:
     lag, falling, play, elongation, memory, creep : which parts the history has. A lag comes with a
         dead time if the logs are sampled finely enough to distinguish them; `elongation` is play
         that acts on the mean pressure alone.
+    strain : whether lag, play and creep follow strains, and play also that of opposite fibres.
     strain_law : of all segments; empty for that of the robot file.
     as_given : whether to take the history from the robot file.
     after : names of simpler models; this one is tried only if one of them is the best so far.
@@ -52,6 +53,7 @@ class ModelStructure:
     elongation: bool = False
     memory: bool = False
     creep: bool = False
+    strain: bool = False
     strain_law: str = ""
     as_given: bool = False
     after: tuple[str, ...] = ()
@@ -69,6 +71,11 @@ class ModelStructure:
         """
         segments = tuple(self._segment(segment, seen, fine) for segment in description.segments)
         return description.model_copy(update={"segments": segments, "calibration": None})
+
+    def of_strain(self) -> ModelStructure:
+        """Return the same structure with a memory of strain."""
+        name, words = f"{self.name}, strain", f"{self.words}; a memory of the fibres' strain"
+        return replace(self, name=name, words=words, strain=True)
 
     def is_possible(self, description: RobotDescription) -> bool:
         """Whether the robot can have this structure: a dead band needs pressures above zero."""
@@ -113,11 +120,15 @@ class ModelStructure:
         if self.elongation and all(play.of == "pressure" for play in plays):
             width = START.elongation_width * seen
             plays += (Play(width=width, share=START.play_share, of="elongation"),)
+        if self.strain and all(play.of != "opposite" for play in plays):
+            own = (play for play in plays if play.of == "pressure")
+            plays += tuple(play.model_copy(update={"of": "opposite"}) for play in own)
         creeps = given.creep or tuple(
             Creep(time=time, share=START.creep_share) for time in START.creep_times
         )
         return History(
             softening=_softening(segment) if self.creep else 0.0,  # else play stands for creep
+            remembers="strain" if self.strain else given.remembers,
             dead_time=(given.dead_time or START.dead_time) if self.lag and fine else 0.0,
             lag=(given.lag or START.lag) if self.lag else 0.0,
             lag_falling=(given.lag_falling or given.lag or START.lag) if self.falling else 0.0,

@@ -41,6 +41,8 @@ class McapLogWriter:
         The file, whose folder must exist, and its columns.
     about :
         Metadata to keep in the file.
+    now :
+        Present time of the log, in s.
 
     Raises
     ------
@@ -55,13 +57,14 @@ class McapLogWriter:
         path: str | os.PathLike[str],
         layout: LogLayout,
         about: Mapping[str, str] | None = None,
+        now: float = 0.0,
     ) -> None:
         require_package("foxglove-sdk", "log", "foxglove")
         from foxglove import Channel, Context
 
         self.path = os.fspath(path)
         self.layout = layout
-        self._start = time.time_ns()  # date of the log, for viewers
+        self._start = time.time_ns() - round(1e9 * now)  # date of time 0, for viewers
         self._last_time: float | None = None
         self._topics = _topics(layout)
         context = Context()

@@ -29,7 +29,7 @@ from pydantic import (
 
 from stiffopt.errors import InputError, shown
 from stiffopt.model.calibration import Calibration, ErrorModel
-from stiffopt.model.history import History
+from stiffopt.model.history import NO_HISTORY, History
 from stiffopt.registration import Placement, Registration
 from stiffopt.schema import BadKeyError, Items, Schema, Vector, explain
 from stiffopt.units import (
@@ -455,6 +455,12 @@ class RobotDescription(Schema):
         return any(segment.history and segment.history.creep for segment in self.segments)
 
     @property
+    def remembers_strain(self) -> bool:
+        """Whether the history of any segment is of strain instead of pressure."""
+        histories = (segment.history or NO_HISTORY for segment in self.segments)
+        return any(each.remembers == "strain" for each in histories)
+
+    @property
     def length(self) -> float:
         """Length at rest with the connectors, in m."""
         return sum(segment.length + segment.connector for segment in self.segments)
@@ -563,12 +569,20 @@ class RobotDescription(Schema):
         for index, own in enumerate(self.channel_ranges):
             segment = self.segments[index]
             most = math.hypot(*(self.pressure_max[k] for k in own))
-            softening = segment.history.softening if segment.history is not None else 0.0
+            history = segment.history or NO_HISTORY
+            softening = history.softening
             if 1 + softening * most <= 0:
                 raise BadKeyError(
                     f"segments.{index}.history.softening",
                     f"{softening:g} per Pa leaves no modulus at the highest pressures, with a "
                     f"norm of {most * 1e-5:g} bar; expected between {-1 / most:.3g} and 0",
+                )
+            if history.remembers == "strain" and history.memory_at(most) >= 1:
+                raise BadKeyError(
+                    f"segments.{index}.history.remembers",
+                    "with a memory of strain, shares of play and creep grow as the arm softens: "
+                    f"at the highest pressures they add up to {history.memory_at(most):.3g}; "
+                    "expected less than 1",
                 )
 
     def _check_recordings(self) -> None:

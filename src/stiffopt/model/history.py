@@ -17,7 +17,11 @@ chambers stay stretched after they were deflated.  A segment's elongation depend
 pressures, and its bending on their deviations from it.  So an operator may act on one of these
 parts instead of on each channel.  With the projection A on that part (elongation: 1/c everywhere
 for c channels; bending: identity minus that), y_j and z_k follow ``A x``, and the operator adds
-``share A (y_j - x)``, which does not affect or depend on the other part.
+``share A (y_j - A x)``, which does not affect or depend on the other part.
+
+Fibres opposite to a chamber stretch with the mean of all pressures, and shorten as their chamber
+bends the segment away from them.  What they remember acts likewise, so operators of these fibres
+have A = 2/c - identity.
 
 Silicone that pressure makes softer, with a modulus of ``E (1 + c |x|)`` for the pressures x of a
 segment, stretches further with each pressure: by the stress, and by the softening.  What it
@@ -25,6 +29,13 @@ remembers is a stress, which does not soften it.  So along x, where softening ma
 ``1 / (1 + c |x|)`` times as much as at the same modulus, s counts less, ::
 
     u = x + s + c x (x . s) / |x|.
+
+Such silicone also stretches further than its pressures rise, by as much as it softens.  Operators
+may remember that strain instead: x is then the lagged ``v(p) = p / (1 + c |p|)``, which y_j and z_k
+follow as above, all as pressures at the modulus of rest.  The stress s stretches a softer arm more,
+and u is the pressure with the strain that results, ::
+
+    v(u) = x + (1 - c |x|) s,    where 1 - c |x| = 1 / (1 + c |p|) for x = v(p).
 
 Settled, and in the middle between loading and unloading, ``u = p``: a history does not change the
 equilibrium, which the strain law describes.  After a long monotone change of all pressures u
@@ -52,8 +63,9 @@ from stiffopt.units import Duration, Number, Pressure, Ratio
 
 Array = NDArray[np.float64]
 
-Part = Literal["pressure", "elongation", "bending"]
-"""What an operator acts on: each channel's pressure, their mean, or deviations from the mean."""
+Part = Literal["pressure", "elongation", "bending", "opposite"]
+"""What an operator acts on: each channel's pressure, their mean, deviations from the mean, or the
+fibres opposite to each channel, twice the mean minus its pressure."""
 
 _Share = Annotated[Ratio, Field(ge=0, lt=1)]
 
@@ -95,8 +107,7 @@ class Creep(Schema):
 class History(Schema):
     """How the shape of a segment follows the pressures of its channels, all in the same way.
 
-    Operators of pressure act on each channel alone, those of elongation and bending on all channels
-    of the segment.
+    Operators of pressure act on each channel alone, the others on all channels of the segment.
 
     Attributes
     ----------
@@ -106,6 +117,8 @@ class History(Schema):
         they fill; 0: the same.
     memory : factor on the shares of play and creep for each channel; one for all if empty.
     softening : c, relative change of the modulus per norm of the segment's pressures, in 1/Pa.
+    remembers : what lag, play and creep follow: pressures, or the strain that pressures have at the
+        modulus that `softening` leaves.
     play : hysteresis.
     creep : slow effects.
     """
@@ -115,12 +128,13 @@ class History(Schema):
     lag_falling: Annotated[Duration, Field(ge=0)] = 0.0
     memory: Items[Annotated[Ratio, Field(ge=0)]] = ()
     softening: Annotated[Number, Field(le=0)] = 0.0
+    remembers: Literal["pressure", "strain"] = "pressure"
     play: Items[Play] = ()
     creep: Items[Creep] = ()
 
     @model_validator(mode="after")
     def _check(self) -> History:
-        total = max(self.shares) * max(self.memory, default=1.0)
+        total = self.memory_at(0.0)
         if total >= 1:
             raise BadKeyError(
                 "play" if self.play else "creep",
@@ -142,14 +156,31 @@ class History(Schema):
         )
         return of_elongation, of_bending
 
+    def memory_at(self, norm: float) -> float:
+        """Return the largest share of a small change of pressures, of a norm in Pa, that is slow.
+
+        With a memory of strain it grows as the modulus falls: the stress that is remembered
+        stretches a softer arm further.
+        """
+        share = max(self.shares) * max(self.memory, default=1.0)
+        return share / self.left(norm)
+
+    def left(self, norm: float) -> float:
+        """Return the share of the modulus that is left at a norm of pressures, in Pa.
+
+        1 with a memory of pressure.
+        """
+        return 1 + self.softening * norm if self.remembers == "strain" else 1.0
+
     @property
     def largest_memory(self) -> float:
-        """Largest effect of hysteresis on the shape, as a pressure, in Pa.
+        """Largest effect of hysteresis on the shape, as a pressure at the modulus of rest, in Pa.
 
         For a channel with another `memory` it is multiplied by that.
         """
-        # |A v| <= 2 (1 - 1/c) max |v| for the projection A on bending
-        return sum(part.share * part.width * (1 + (part.of == "bending")) for part in self.play)
+        # |A v| <= k max |v| with k = 2 (1 - 1/c) for bending, 3 - 4/c for opposite fibres
+        most = {"bending": 2, "opposite": 3}
+        return sum(part.share * part.width * most.get(part.of, 1) for part in self.play)
 
     @property
     def quick_share(self) -> float:
@@ -157,11 +188,26 @@ class History(Schema):
 
         Play and creep delay the rest.  What resists pressure also resists a push, so a quick small
         push meets an arm that is 1 / quick_share times as stiff as in equilibrium. This is a mean
-        over the axis and the two directions across, where these differ.
+        over the axis and the two directions across, where these differ; with a memory of strain, it
+        is the share at low pressures (`quick_softening`).
         """
         memory = sum(self.memory) / len(self.memory) if self.memory else 1.0
         of_elongation, of_bending = self.shares
         return 1 - memory * (of_elongation + 2 * of_bending) / 3
+
+    def quick_softening(self, softening: float, most: float) -> float:
+        """Return the share of softening, from 0 to 1, against a quick push.
+
+        With a memory of strain a push at pressures of norm p meets 1 / (1 - S / (1 + c p)) times
+        the stiffness of equilibrium, where 1 - S is `quick_share`. The stiffness is taken as linear
+        in p, and right at zero and at the norm `most`, in Pa. `softening`: that in equilibrium.
+        """
+        left, c = self.left(most), self.softening
+        if left == 1:
+            return softening
+        share = self.quick_share
+        of_rest = (1 + softening * c * most) * share / (1 - (1 - share) / left)
+        return min(max((of_rest - 1) / (c * most), 0.0), 1.0)
 
     def remembered_shares(self, n_channels: int) -> Array:
         """Return the shares (c,) of the channels' pressures that act through play and creep."""
@@ -184,7 +230,8 @@ class History(Schema):
         state : (m, c)
             Before the step, for each channel: x, every y_j, every z_k.
         before, now : (c,)
-            Delayed pressures before and after the step, in Pa.
+            Delayed pressures before and after the step, in Pa, as the operators follow them
+            (`followed`).
         step : scalar
             In s, positive.
         """
@@ -221,30 +268,42 @@ class History(Schema):
         memory = np.array([[self.memory_of(channel) for channel in channels]])
         slow = 0 * x
         for index, part in enumerate(self.parts, start=1):
-            slow += part.share * part_of(state[index, :] - x, part.of)
-        return x + self.at_fixed_modulus(x, memory * slow)
+            slow += part.share * part_of(state[index, :] - part_of(x, part.of), part.of)
+        return self.with_memory(x, memory * slow)
 
-    def at_fixed_modulus(self, pressures: Any, remembered: Any) -> Any:
-        """Return the effect on u of remembered pressures s (..., c) at pressures x (..., c)."""
+    def followed(self, pressures: Any) -> Any:
+        """Return what the operators follow at pressures p (..., c): p, or ``p / (1 + c |p|)``."""
+        if self.remembers == "pressure" or not self.softening:
+            return pressures
+        return pressures / (1 + self.softening * _norm(pressures))
+
+    def with_memory(self, x: Any, remembered: Any) -> Any:
+        """Return u (..., c) where lagged pressures, or strains, are x and s is remembered."""
         if not self.softening:
-            return remembered
-        if isinstance(pressures, np.ndarray):
-            norm = np.sqrt((pressures**2).sum(axis=-1, keepdims=True) + _NONE**2)
-            along = (pressures * remembered).sum(axis=-1, keepdims=True)
-        else:
-            norm = ca.sqrt(ca.sumsqr(pressures) + _NONE**2)
-            along = ca.sum2(pressures * remembered)
-        return remembered + self.softening * along / norm * pressures
+            return x + remembered
+        c = self.softening
+        if self.remembers == "strain":
+            v = x + (1 - c * _norm(x)) * remembered
+            return v / (1 - c * _norm(v))
+        along = _total(x * remembered) / _norm(x)
+        return x + (remembered + c * along * x)
 
-    def slopes_at_fixed_modulus(self, pressures: Array, remembered: Array) -> tuple[Array, Array]:
-        """Return the derivatives (N, c, c) of `at_fixed_modulus` by both arguments (N, c)."""
-        x, s, one = pressures, remembered, np.eye(pressures.shape[-1])
-        norm = np.sqrt((x**2).sum(axis=-1) + _NONE**2)[:, np.newaxis, np.newaxis]
-        along = (x * s).sum(axis=-1)[:, np.newaxis, np.newaxis] / norm
-        outer = x[:, :, np.newaxis] * x[:, np.newaxis] / norm
-        mixed = x[:, :, np.newaxis] * s[:, np.newaxis] / norm
-        by_pressures = self.softening * (along * (one - outer / norm) + mixed)
-        return by_pressures, one + self.softening * outer
+    def slopes_with_memory(self, x: Array, remembered: Array) -> tuple[Array, Array]:
+        """Return the derivatives (N, c, c) of `with_memory` by both arguments (N, c)."""
+        c, one, s = self.softening, np.eye(x.shape[-1]), remembered
+        norm = _norm(x)[:, np.newaxis]
+
+        def outer(a: Array, b: Array) -> Array:
+            return a[:, :, np.newaxis] * b[:, np.newaxis]
+
+        if self.remembers == "strain":
+            v = x + (1 - c * norm[:, 0]) * s
+            size = _norm(v)[:, np.newaxis]
+            by_v = (one + c * outer(v, v) / (size * (1 - c * size))) / (1 - c * size)
+            return by_v @ (one - c * outer(s, x) / norm), by_v * (1 - c * norm)
+        along = _total(x * s)[:, np.newaxis] / norm
+        by_x = c * (along * (one - outer(x, x) / norm**2) + outer(x, s) / norm)
+        return one + by_x, one + c * outer(x, x) / norm
 
     def memory_of(self, channel: int) -> float:
         """Return the factor on the shares of a channel of the segment, from 0."""
@@ -261,18 +320,20 @@ class History(Schema):
             Position of each channel within its play (c,): -1 after a long rise, 1 after a long
             fall, 0 in the middle. Operators of elongation take the mean of the channels.
         """
-        rows = [pressures]
-        rows += [part_of(pressures + sides * play.width, play.of) for play in self.play]
-        rows += [part_of(pressures, creep.of) for creep in self.creep]
+        x = self.followed(pressures)
+        rows = [x]
+        rows += [part_of(x + sides * play.width, play.of) for play in self.play]
+        rows += [part_of(x, creep.of) for creep in self.creep]
         return np.array(rows)
 
     def from_rest(self, pressures: Array) -> Array:
         """Return the state (m, c) long after the first rise from zero pressure."""
-        rows = [pressures]
+        x = self.followed(pressures)
+        rows = [x]
         for play in self.play:
-            x = part_of(pressures, play.of)
-            rows.append(np.clip(0.0, x - play.width, x + play.width))
-        rows += [part_of(pressures, creep.of) for creep in self.creep]
+            part = part_of(x, play.of)
+            rows.append(np.clip(0.0, part - play.width, part + play.width))
+        rows += [part_of(x, creep.of) for creep in self.creep]
         return np.array(rows)
 
 
@@ -283,11 +344,20 @@ def part_of(pressures: Any, of: Part) -> Any:
     """Return the part of a segment's pressures (..., c) on which an operator acts, same shape."""
     if of == "pressure":
         return pressures
-    if isinstance(pressures, np.ndarray):
-        mean = pressures.mean(axis=-1, keepdims=True)
-    else:
-        mean = ca.sum2(pressures) / pressures.shape[1]
+    mean = _total(pressures) / pressures.shape[-1]
+    if of == "opposite":
+        return 2 * mean - pressures
     return mean + 0 * pressures if of == "elongation" else pressures - mean
+
+
+def _total(values: Any) -> Any:
+    """Return the sum (..., 1) over channels (..., c)."""
+    return values.sum(axis=-1, keepdims=True) if isinstance(values, np.ndarray) else ca.sum2(values)
+
+
+def _norm(pressures: Any) -> Any:
+    """Return the norm (..., 1) of pressures (..., c), rounded at zero."""
+    return (_total(pressures**2) + _NONE**2) ** 0.5
 
 
 def _convolution(a: ca.SX, b: ca.SX) -> ca.SX:
@@ -458,7 +528,7 @@ class Memory:
         parts = ca.vertsplit(state, [0, *self._ends.tolist()])
         ends, effective = [], []
         for (h, own), part in zip(self._groups, parts, strict=True):
-            p = delayed[own]
+            p = h.followed(delayed[own].T).T
             ends.append(h.next_state(ca.reshape(part, h.n_states, -1), p, p, step))
             effective.append(h.effective(ends[-1], self._places[own.start]).T)
         outputs = [ca.vertcat(*(ca.vec(end) for end in ends)), ca.vertcat(*effective)]

@@ -1,5 +1,6 @@
 """`Manipulator`: pose, Jacobian, compliance and stiffness of an arm, single and batched."""
 
+import math
 import os
 from collections.abc import Sequence
 from functools import lru_cache
@@ -470,10 +471,14 @@ class Manipulator(Arm, ShownInNotebook):
 def quick_description(description: RobotDescription) -> RobotDescription:
     """Return a robot with the stiffness against a quick small push, and the same free shapes."""
     segments = []
-    for segment in description.segments:
-        share = (segment.history or NO_HISTORY).quick_share
-        given = segment.compensation or Compensation()
-        stiffer = given.model_copy(update={"stiffness": given.stiffness / share})
+    for segment, own in zip(description.segments, description.channel_ranges, strict=True):
+        history, given = segment.history or NO_HISTORY, segment.compensation or Compensation()
+        most = math.hypot(*(description.pressure_max[k] for k in own))
+        update = {
+            "stiffness": given.stiffness / history.quick_share,
+            "softening": history.quick_softening(given.softening, most),
+        }
+        stiffer = given.model_copy(update=update)
         segments.append(segment.model_copy(update={"compensation": stiffer, "history": None}))
     return description.model_copy(update={"segments": tuple(segments)})
 

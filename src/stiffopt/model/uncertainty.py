@@ -14,6 +14,9 @@ Plays lead through two drawn pressures.  Creep goes on while pressures are held:
 6 s at each of three drawn ones, and for 1.5 to 6 s at its end.  The tip moves by the slopes half
 the mean of all ways further: at the pressures themselves, a chamber may be in its dead band.
 
+With creep in the model, what it remembers moves the tip by a tenth more or less than it says, in
+any direction; so it does where the history is known, by a twentieth if strain is remembered.
+
 A model without creep knows less of the memory.  Silicone remembers its stretch rather than
 pressures: the tip is about as far from the equilibrium where the arm is soft as where it is stiff.
 And what such a fit calls hysteresis is partly creep, which is over where a pose is held.
@@ -55,6 +58,8 @@ _VISITS = 3  # pressures that each of them visits
 _STAY = 6.0  # s from one of them to the next
 _AGES = (1.5, 6.0)  # s for which the given pressures have been held, from the middle of the motion
 _HELD = 0.9  # share of these variances that held poses show; the rest was creep and motion
+_MISREMEMBERED = 0.1  # error of what a model with creep remembers, over how far it moves the tip
+_MISREMEMBERED_STRAIN = 0.05  # the same where the history is known and strain is remembered
 _STIFFEST = 0.25  # least softness, over that at recorded pressures: a dead band has none
 _SINGULAR = 1e-9  # smallest variance of a direction, over that of all
 NORMAL_QUANTILE = 1.959963984540054  # of 97.5 %, for two-sided intervals of 95 %
@@ -144,7 +149,8 @@ class PositionErrors:
     ----------
     position : predicted (N, 3), in base axes and m.
     parameters, hysteresis, discrepancy, residual : mean squares (N, 3, 3) of its error by source,
-        as in `TipUncertainty`; hysteresis includes that of the time at which the tip moves.
+        as in `TipUncertainty`; hysteresis includes that of the time at which the tip moves. After a
+        known history it is this, and with creep in the model the error of what is remembered.
     shape, tail : degrees of freedom k and v (N,) of the error's squared distance. Unless the
         history is unknown, k is 3 and v that of the calibration, which is infinite without a tail.
     """
@@ -251,7 +257,14 @@ class Uncertainty:
             ways = ways @ transposed
             discrepancy *= np.where(moved, 1.0, _HELD)
         else:
-            ways, hysteresis = np.zeros((len(u), 1, 3)), np.zeros((len(u), 3, 3))
+            late = 0.0 if rates is None else self._delays * rates
+            ways = (effective - pressures + late)[:, np.newaxis] @ np.swapaxes(per_pressure, 1, 2)
+            hysteresis = np.zeros((len(u), 3, 3))
+        if self._description.creeps:
+            known = effective is not None and self._description.remembers_strain
+            share = _MISREMEMBERED_STRAIN if known else _MISREMEMBERED
+            missed = share**2 * (ways**2).sum(axis=2).mean(axis=1) / 3
+            hysteresis = hysteresis + missed[:, np.newaxis, np.newaxis] * np.eye(3)
         if rates is not None and errors is not None:
             way = errors.timing * per_pressure @ rates[..., np.newaxis]
             hysteresis = hysteresis + way @ np.swapaxes(way, 1, 2)
@@ -313,6 +326,12 @@ class Uncertainty:
         return np.concatenate(shares)
 
     @cached_property
+    def _delays(self) -> Vector:
+        """Times (n,) in s by which the channels' pressures act late, at an even speed."""
+        histories = [segment.history or NO_HISTORY for segment in self._description.segments]
+        return np.repeat([each.dead_time + each.lag for each in histories], self._channels)
+
+    @cached_property
     def _typical_moves(self) -> Vector:
         """Mean squares (n,) by which the discrepancy moves the tip within the limits, in m^2."""
         low, high = np.array([self._description.pressure_min, self._description.pressure_max])
@@ -360,19 +379,21 @@ class Uncertainty:
             own = slice(first, first := first + segment.n_channels)
             history, x = segment.history or NO_HISTORY, pressures[:, np.newaxis, own]
             memory = np.array([history.memory_of(c) for c in range(segment.n_channels)])
+            ways, here = history.followed(self._visited[..., own]), history.followed(x)
             for play in history.play:
-                end, held = part_of(x, play.of), np.zeros(1)
-                for visited in (*part_of(self._visited[-2:, :, own], play.of), end):
+                end, held = part_of(here, play.of), np.zeros(1)
+                for visited in (*part_of(ways[-2:], play.of), end):
                     held = np.clip(held, visited - play.width, visited + play.width)
                 found[..., own] += memory * play.share * part_of(held - end, play.of)
             for creep in history.creep:
                 slow = np.zeros(1)
-                for visited in part_of(self._visited[..., own], creep.of):
+                for visited in part_of(ways, creep.of):
                     slow = visited + (slow - visited) * np.exp(-_STAY / creep.time)
                 left = np.exp(-self._ages / creep.time)[:, np.newaxis]
-                crept[..., own] += memory * creep.share * left * (slow - part_of(x, creep.of))
+                slow = part_of(slow - part_of(here, creep.of), creep.of)
+                crept[..., own] += memory * creep.share * left * slow
             for each in (found, crept):
-                each[..., own] = history.at_fixed_modulus(x, each[..., own])
+                each[..., own] = history.with_memory(here, each[..., own]) - x
         errors = self._calibration.errors
         if errors is not None and errors.settled:
             size = np.sqrt(np.mean(found**2, axis=1, keepdims=True))

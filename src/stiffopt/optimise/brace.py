@@ -27,8 +27,8 @@ class Brace(Schema):
     margin : push at the tip, in N, both ways along each direction that is maximised, under which no
         contact may be lost.
     contacts : "sliding": contacts slide without resistance, and one is lost where it lifts off; the
-        stiffness is a lower bound.  "sticking": contacts stick where their object has friction, and
-        one that slips is lost too.
+        stiffness is a lower bound.  "sticking": they stick, and one that slips is lost too; all
+        `objects` must have friction.
     approach : how the equilibrium is reached from rest.  "pressures": with the objects in place;
         "objects": they come to the arm when it is under pressure.
     """
@@ -72,10 +72,17 @@ class Brace(Schema):
                 raise BadKeyError(
                     key, f"there is no object '{name}' in the scene; it has {quoted(known)}"
                 )
-            if not known[name].may_be_leant_on:
+            contact = known[name].contact
+            if contact is None or not contact.allowed:
                 raise BadKeyError(
                     key,
                     f"'{name}' may not be touched; its object needs 'contact: {{allowed: true}}'",
+                )
+            if self.contacts == "sticking" and not contact.friction:
+                raise BadKeyError(
+                    "brace.contacts",
+                    f"nothing sticks to '{name}', which has no friction; give its contact a "
+                    "'friction' above 0, or take 'contacts: sliding'",
                 )
 
 

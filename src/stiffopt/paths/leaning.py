@@ -20,6 +20,8 @@ from stiffopt.model.contact.equilibrium import Contact, ContactEquilibrium, Stic
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.scene import Scene
 from stiffopt.optimise.brace import kept_clear_of, leant_on, quoted
+from stiffopt.optimise.brace_uncertainty import BraceUncertainty
+from stiffopt.optimise.settings import BRACE
 from stiffopt.optimise.solution import PressureSolution
 from stiffopt.optimise.task import Task
 from stiffopt.optimise.tip import TipAt
@@ -45,12 +47,14 @@ class Hold(NamedTuple):
     Attributes
     ----------
     forces : along the normals (k,), in N.
+    deviations : their standard deviations by a calibration (k,), in N; zero without one.
     per_pressure : their derivatives by pressures (k, n), in N/Pa.
     per_push : their derivatives by a force at the tip (k, 3), in base axes.
     sticking : how friction holds those that have some.
     """
 
     forces: Vector
+    deviations: Vector
     per_pressure: Vector
     per_push: Vector
     sticking: Sticking
@@ -99,6 +103,7 @@ def approach_to(
         As `way_into_contact` does.
     """
     states = way_into_contact(robot, solution)
+    deviations = BraceUncertainty(robot, states[-1]).forces / BRACE.sure
     pressures = np.array([eq.pressures for eq in states])
     return BraceApproach(
         times=least_times_along(robot, states, slew),
@@ -106,7 +111,7 @@ def approach_to(
         tips=tuple(TipAt(eq.tip_pose, eq.tip_jacobian, eq.tip_compliance) for eq in states),
         forces=np.array([_largest(eq) for eq in states]),
         contacts=states[-1].contacts,
-        hold=_hold(states[-1]),
+        hold=_hold(states[-1], deviations),
         free_tips=robot.pose(pressures, robot.length)[:, :3, 3],
     )
 
@@ -228,13 +233,13 @@ def _stations(robot: Manipulator) -> Vector:
     return np.linspace(0.0, robot.length, _STATIONS)
 
 
-def _hold(eq: ContactEquilibrium) -> Hold:
+def _hold(eq: ContactEquilibrium, deviations: Vector) -> Hold:
     pushed = [
         (eq.shifted(push=step).normal_forces - eq.shifted(push=-step).normal_forces) / (2 * _PUSH)
         for step in _PUSH * np.eye(3)
     ]
     sticking = eq.sticking.softened(_TANGENTIAL)
-    return Hold(eq.normal_forces, eq.force_gradients, np.array(pushed).T, sticking)
+    return Hold(eq.normal_forces, deviations, eq.force_gradients, np.array(pushed).T, sticking)
 
 
 def _largest(eq: ContactEquilibrium) -> float:

@@ -102,7 +102,7 @@ def _of_csv(name: str, description: RobotDescription) -> MotionTable:
     if missing:
         raise FileError(
             name,
-            f"is no motion of '{description.name}', which has {n} channels: there is no column "
+            f"is not a motion of '{description.name}', which has {n} channels: there is no column "
             f"{missing[0]}",
         )
     if f"p{n + 1}_pa" in table.columns:
@@ -118,7 +118,7 @@ def _of_result(name: str, description: RobotDescription) -> MotionTable:
     results = data.get("results")
     if not isinstance(results, list) or data.get("format") != RESULT_FORMAT:
         raise FileError(
-            name, "is no motion; expected a file that 'stiffopt path --out' or 'plan --out' wrote"
+            name, "is not a motion; expected what 'stiffopt path --out' or 'plan --out' wrote"
         )
     if len(results) != 1:
         raise FileError(name, f"has {len(results)} results; expected one")

@@ -1,8 +1,8 @@
 """Compilation of the simulator's inner loops by numba, with a cache keyed by content.
 
-numba's own cache checks the time stamp of one file, not of other files with functions that it
-calls. Here the cache's folder is named after the text of all files with compiled functions, so that
-changed code is never mixed with unchanged code.
+numba's own cache checks place and time stamp of one file, not of other files with functions that it
+calls. Here the cache's folder is named after place, time stamp and text of all files with compiled
+functions: changed code is never mixed with unchanged code, and an empty folder is one to be filled.
 """
 
 from __future__ import annotations
@@ -25,10 +25,13 @@ _REORDER = {"contract", "reassoc", "arcp", "nsz"}  # fast mathematics that prese
 
 @cache
 def _folder() -> str:
-    texts = [path.read_bytes() for path in sorted(Path(__file__).parent.glob("*.py"))]
-    text = b"".join(text for text in texts if b"@jit" in text)
+    known = hashlib.sha256()
+    for path in sorted(Path(__file__).resolve().parent.glob("*.py")):
+        text = path.read_bytes()
+        if b"@jit" in text:
+            known.update(f"{path} {path.stat().st_mtime_ns} ".encode() + text)
     root = os.environ.get("STIFFOPT_CACHE_DIR") or Path.home() / ".cache" / "stiffopt"
-    return str(Path(root) / "simulator" / hashlib.sha256(text).hexdigest()[:16])
+    return str(Path(root) / "simulator" / known.hexdigest()[:16])
 
 
 _done = False  # whether this process has compiled or loaded its functions

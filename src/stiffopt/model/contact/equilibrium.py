@@ -234,8 +234,8 @@ class ContactEquilibrium:
         check_choice("contacts", contacts, get_args(Grip))
         per_wrench = self._arm.tangent[:6]
         if contacts == "sticking" and (sticking := self._with_friction()):
-            system = self._system_for("tip wrench", sticking)
-            per_wrench = system.of_tip(system.solution())[:6]
+            system, solution = self._arm.pushed(sticking)
+            per_wrench = system.of_tip(solution)[:6]
         R = self._arm.shape.rotation[0]
         turn = np.zeros((6, 6))
         turn[:3, :3] = turn[3:, 3:] = R
@@ -296,7 +296,7 @@ class ContactEquilibrium:
     def sticking(self) -> Sticking:
         """How contacts with friction hold, to first order."""
         arm, own = self._arm, self._with_friction()
-        system = self._system_for("tip wrench", own)
+        system, pushed = arm.pushed(own)
         u, firsts = system.linear.unknowns, [3 + 7 * j for j in own]
         normals = [arm.rows[j].point.normal for j in own]
         across = [np.linalg.svd(n[None])[2][1:] for n in normals]
@@ -321,7 +321,7 @@ class ContactEquilibrium:
         slid: Vector = np.asarray(np.linalg.solve(system.matrix, right), dtype=float)
         moves = system.linear.moves[..., :u] @ slid[:u]
         turn = system.linear.changes[0, TURN, :u] @ slid[:u]
-        pushed, pressed = system.solution(), self._system_for("pressures", own)
+        pressed = self._system_for("pressures", own)
         by_pressure = pressed.solution()
         surfaces = arm.problem.surfaces
         return Sticking(

@@ -150,9 +150,7 @@ class GrowingPush:
         return [self._problem.surfaces[touch.surface].friction for touch in state.touches]
 
     def _tangent(self, arm: LeaningArm, sticking: Collection[int]) -> _Tangent:
-        sections = arm.shape.sections
-        system = ContactSystem(self._problem, arm.state, sections, "tip wrench", sticking)
-        solution = system.solution()
+        system, solution = arm.pushed(sticking)
         changes, moves = system.along(solution)
         along = moves[..., :3] @ self._direction
         turn = float(np.linalg.norm(changes[0, TURN, :3] @ self._direction))

@@ -102,6 +102,7 @@ class LeaningArm:
         rows: list[ContactRow],
     ) -> None:
         self.problem, self.state, self.shape, self.rows = problem, state, shape, rows
+        self._pushed: dict[tuple[int, ...], tuple[ContactSystem, Vector]] = {}
 
     @cached_property
     def is_stable(self) -> bool:
@@ -134,8 +135,20 @@ class LeaningArm:
         quickly = self.shape.tangent()
         if quickly is not None:
             return quickly
-        system = ContactSystem(self.problem, self.state, self.shape.sections, "tip wrench")
-        return system.of_tip(system.solution())
+        system, solution = self.pushed(())
+        return system.of_tip(solution)
+
+    def pushed(self, sticking: Collection[int]) -> tuple[ContactSystem, Vector]:
+        """Return the equations for a wrench on the tip, and their solution (u, 6).
+
+        The contacts `sticking` roll without slipping. They are the same for all directions of a
+        push, so they are kept.
+        """
+        key = tuple(sticking)
+        if key not in self._pushed:
+            system = ContactSystem(self.problem, self.state, self.shape.sections, "tip wrench", key)
+            self._pushed[key] = system, system.solution()
+        return self._pushed[key]
 
     @cached_property
     def body(self) -> tuple[Vector, Vector]:

@@ -1,0 +1,47 @@
+"""Check from its file alone whether a rig can ever be armed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from stiffopt.control.arming import NO_SLEW
+from stiffopt.errors import CommandError, InputError
+from stiffopt.model.description import RobotDescription
+from stiffopt.rig.config import RigDescription, limits_of, slew_of
+from stiffopt.rig.device import MisfitError
+from stiffopt.safety.gate import check_protection
+
+FASTEST = 500.0
+"""Highest rate of the loop, in Hz."""
+
+
+def check_description(settings: RigDescription, robot: RobotDescription) -> Iterator[MisfitError]:
+    """Yield why the loop could never arm the rig of a file, whatever its devices say.
+
+    A rig without a tracker is for scripts, and no mistake.
+    """
+    safety, supply, period = settings.safety, settings.supply, 1 / settings.rate
+    if slew_of(settings, robot) is None:
+        yield MisfitError(NO_SLEW, "safety", "max_slew")
+    if not supply.simulated:
+        try:
+            check_protection(supply.device(limits_of(settings, robot)), safety)
+        except (CommandError, InputError) as error:
+            yield MisfitError(str(error), "supply")
+    if settings.rate > FASTEST:
+        yield MisfitError(f"{settings.rate:g} Hz is too fast; at most {FASTEST:g} Hz", "rate")
+    between = f"the {1e3 * period:g} ms between two commands at a rate of {settings.rate:g} Hz"
+    for key, effect in (
+        ("guard_timeout", "the guard would vent every time"),
+        ("command_timeout", "each command would expire before the next"),
+    ):
+        if (timeout := getattr(safety, key)) <= period:
+            reason = f"{1e3 * timeout:g} ms is not longer than {between}: {effect}"
+            yield MisfitError(reason, "safety", key)
+    frames = getattr(settings.tracker, "rate", None)
+    if frames is not None and 1 / frames > safety.tracker_timeout:
+        yield MisfitError(
+            f"{1e3 * safety.tracker_timeout:g} ms is shorter than the {1e3 / frames:g} ms between "
+            "two frames of the tracker: the tip would never count as seen",
+            *("safety", "tracker_timeout"),
+        )
