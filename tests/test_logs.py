@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -397,6 +398,19 @@ def test_the_mcap_library_reads_the_messages(tmp_path: Path) -> None:
     assert [json.loads(message.data)["time_s"] for _, _, message in messages] == log.time.tolist()
     stamps = [message.log_time for _, _, message in messages]
     np.testing.assert_allclose(np.diff(stamps) * 1e-9, np.diff(log.time), atol=1e-6)
+
+
+def test_a_log_that_begins_late_on_its_clock_has_the_date_of_today(tmp_path: Path) -> None:
+    from mcap.reader import make_reader
+
+    path, (row, *_) = tmp_path / "a.mcap", random_log(5).rows()
+    before = time.time_ns()
+    with McapLogWriter(path, FULL, now=900.0) as writer:
+        writer.append(replace(row, time=900.0))
+    with path.open("rb") as stream:
+        dates = [message.log_time for _, _, message in make_reader(stream).iter_messages()]
+    assert dates
+    assert all(before <= date <= time.time_ns() for date in dates)
 
 
 @pytest.mark.parametrize("content", [b"", b"time_s,p1_pa\n", os.urandom(0) + b"\x89MCAP0\r\n"])

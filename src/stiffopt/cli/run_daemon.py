@@ -76,10 +76,12 @@ def run(
     seconds = float("inf") if duration is None else quantity("--duration", duration, "s", "time")
     if not seconds > 0:
         raise InputError("--duration: expected a time above 0 s")
+    from stiffopt.paths.motion_file import read_motion
+
     robot = load_rig(rig)[1]  # reports its mistakes before anything else is loaded
     with _Signals().handled() as signals:
         wanted = None if task is None else _read_task(task, robot)
-        motion = None if play is None else _read_motion(play, robot)
+        motion = None if play is None else read_motion(play, robot)
         from stiffopt.daemon.daemon import TIMES, Daemon
 
         daemon = Daemon(rig, service=service, log_folder=log_folder, json_lines=style == "json")
@@ -108,13 +110,6 @@ def _read_task(path: str, robot: RobotDescription) -> Task:
         reason = f"is for the robot '{asked}'; this rig has '{robot.name}'"
         raise FileError(path, reason, key="robot")
     return task
-
-
-def _read_motion(path: str, robot: RobotDescription) -> MotionTable:
-    """Read a motion; raise `FileError` if it is wrong or for another robot."""
-    from stiffopt.paths.motion_file import read_motion
-
-    return read_motion(path, robot)
 
 
 def _steered(

@@ -65,7 +65,7 @@ class BracePhase(StrEnum):
 
 
 class Concern(NamedTuple):
-    """What is reported of a contact.
+    """A reason to report a contact.
 
     Attributes
     ----------
@@ -144,7 +144,7 @@ class Bracing:
 
     @property
     def contacts(self) -> str:
-        """Whether the contacts are `held`, `uncertain` or `lost`; empty if there are none."""
+        """State of the contacts: `held`, `uncertain` or `lost`; empty before the arm leans."""
         if self.phase is BracePhase.HELD:
             return "uncertain" if self._doubt else "held"
         return "lost" if self._why else ""

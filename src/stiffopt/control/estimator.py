@@ -490,12 +490,13 @@ def _correction(tuning: EstimatorTuning, vibrates: bool) -> Formula:
         free_after = free + F @ (gain[:2] @ soft.T) + change * (slope_now + free_slope_after)
         offset_after += change * offset_slope_after
 
-    expected = _rotation(turn + lean @ vibration[0, :].T) @ rotation
-    between = lie.rotation_from_quaternion(quaternion) @ expected.T
-    angle = lie.rotation_vector_from_quaternion(lie.quaternion_from_rotation(between))
-    predicted = _rotation(lean @ driven[0, :].T) @ rotation
-    between = lie.rotation_from_quaternion(quaternion) @ predicted.T
-    turned = lie.rotation_vector_from_quaternion(lie.quaternion_from_rotation(between))
+    def turn_from(expected: ca.SX) -> ca.SX:
+        """Return the rotation vector to the measured orientation from the model's, turned."""
+        between = lie.rotation_from_quaternion(quaternion) @ (_rotation(expected) @ rotation).T
+        return lie.rotation_vector_from_quaternion(lie.quaternion_from_rotation(between))
+
+    angle = turn_from(turn + lean @ vibration[0, :].T)
+    turned = turn_from(lean @ driven[0, :].T)
     angular_gain = has_orientation * angular / (angular + t.angular_noise**2)
     inputs = [
         motion, rotation, motion_now, free_motion, pose_offset, soft_plane, lean, covariance,

@@ -43,7 +43,7 @@ class FirstMotion:
 
     @property
     def is_over(self) -> bool:
-        """Whether the tip has followed the model with every channel."""
+        """Whether every channel has moved the tip as the model says."""
         return bool(self._responds.all())
 
     def take(self, modelled: Array, seen: Array, parts: Array) -> None:

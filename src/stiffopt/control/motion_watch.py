@@ -394,7 +394,10 @@ class MotionWatch:
         return self._slipped(distance)
 
     def _lasts(self, missing: deque[float]) -> bool:
-        """Whether the turn of a push has been missing for long enough, by shares of it."""
+        """Whether the turn of a push is missing in enough successive samples, and stays so.
+
+        `missing` are the shares of it that are missing in these.
+        """
         tuning = self._tuning
         return len(missing) == tuning.slips and missing[0] - missing[-1] <= tuning.catches_up
 

@@ -275,7 +275,7 @@ class ControllerStatus:
     ] = ""
     brace_contacts: Annotated[
         str,
-        _tip("whether its contacts are `held`, `uncertain` or `lost`; empty before and without"),
+        _tip("state of its contacts: `held`, `uncertain` or `lost`; empty before the arm leans"),
     ] = ""
     brace_force: Annotated[
         float, _tip("normal force of its least certain contact, as estimated", "N", decimals=5)

@@ -11,8 +11,12 @@ from stiffopt.rig.config import RigDescription, limits_of, slew_of
 from stiffopt.rig.device import MisfitError
 from stiffopt.safety.gate import check_protection
 
-FASTEST = 500.0
-"""Highest rate of the loop, in Hz."""
+_FASTEST = 500.0  # Hz
+
+
+def too_fast(rate: float) -> str:
+    """Return why the loop cannot run at a rate in Hz; empty if it can."""
+    return f"{rate:g} Hz is too fast; at most {_FASTEST:g} Hz" if rate > _FASTEST else ""
 
 
 def check_description(settings: RigDescription, robot: RobotDescription) -> Iterator[MisfitError]:
@@ -28,8 +32,8 @@ def check_description(settings: RigDescription, robot: RobotDescription) -> Iter
             check_protection(supply.device(limits_of(settings, robot)), safety)
         except (CommandError, InputError) as error:
             yield MisfitError(str(error), "supply")
-    if settings.rate > FASTEST:
-        yield MisfitError(f"{settings.rate:g} Hz is too fast; at most {FASTEST:g} Hz", "rate")
+    if why := too_fast(settings.rate):
+        yield MisfitError(why, "rate")
     between = f"the {1e3 * period:g} ms between two commands at a rate of {settings.rate:g} Hz"
     for key, effect in (
         ("guard_timeout", "the guard would vent every time"),

@@ -21,7 +21,7 @@ from stiffopt.control.loop import ControlLoop
 from stiffopt.control.state import Severity, Snapshot, State
 from stiffopt.control.ways import ClearanceWatch
 from stiffopt.daemon.address import bracketed
-from stiffopt.daemon.armable import FASTEST
+from stiffopt.daemon.armable import too_fast
 from stiffopt.daemon.calls import call_in_thread, ends_within
 from stiffopt.daemon.keeper import Keeper, LogEvents, ServiceManager
 from stiffopt.daemon.secret import Secret, check_exposure
@@ -119,10 +119,8 @@ class Daemon:
     ) -> None:
         description, robot = load_rig(rig)
         self.description = description
-        if description.rate > FASTEST:
-            raise FileError(
-                rig, f"{description.rate:g} Hz is too fast; at most {FASTEST:g} Hz", key="rate"
-            )
+        if why := too_fast(description.rate):
+            raise FileError(rig, why, key="rate")
         self.robot = load_robot(robot)
         self.trouble = ""
         self.hung: tuple[str, ...] = ()

@@ -239,10 +239,11 @@ def _chosen(
 
 
 def _may_remember_strain(setup: Setup, robot: RobotDescription) -> bool:
-    """Whether to try a memory of strain: without softening, it is one of pressure.
+    """Return whether to try a memory of strain, after a fit that gave this robot.
 
-    A table of stiffness is compared with quick pushes. If strain is remembered, what they meet
-    depends on the pressures, which the fit does not follow.
+    Without softening it is the same as a memory of pressure. A table of stiffness is compared with
+    quick pushes: with a memory of strain their stiffness depends on the pressures, in a way that
+    the fit does not describe.
     """
     histories = [segment.history or NO_HISTORY for segment in robot.segments]
     return robot.creeps and not setup.tables and any(each.softening for each in histories)

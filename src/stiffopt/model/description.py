@@ -450,13 +450,19 @@ class RobotDescription(Schema):
         return tuple(map(range, ends, ends[1:]))
 
     @property
+    def highest_norms(self) -> tuple[float, ...]:
+        """Norm of each segment's pressures, in Pa, where all are at their upper limits."""
+        high = self.pressure_max
+        return tuple(math.hypot(*(high[k] for k in own)) for own in self.channel_ranges)
+
+    @property
     def creeps(self) -> bool:
-        """Whether the history of any segment contains creep."""
+        """Whether any segment has creep in its history."""
         return any(segment.history and segment.history.creep for segment in self.segments)
 
     @property
     def remembers_strain(self) -> bool:
-        """Whether the history of any segment is of strain instead of pressure."""
+        """Whether any segment remembers strain instead of pressure."""
         histories = (segment.history or NO_HISTORY for segment in self.segments)
         return any(each.remembers == "strain" for each in histories)
 
@@ -565,11 +571,12 @@ class RobotDescription(Schema):
                 )
 
     def _check_softening(self) -> None:
-        """Reject a softening that would leave no modulus at the highest pressures."""
-        for index, own in enumerate(self.channel_ranges):
-            segment = self.segments[index]
-            most = math.hypot(*(self.pressure_max[k] for k in own))
-            history = segment.history or NO_HISTORY
+        """Reject a softening that leaves no modulus, or too little of it for what is remembered.
+
+        Both are checked at the highest pressures.
+        """
+        for index, most in enumerate(self.highest_norms):
+            history = self.segments[index].history or NO_HISTORY
             softening = history.softening
             if 1 + softening * most <= 0:
                 raise BadKeyError(
@@ -577,12 +584,11 @@ class RobotDescription(Schema):
                     f"{softening:g} per Pa leaves no modulus at the highest pressures, with a "
                     f"norm of {most * 1e-5:g} bar; expected between {-1 / most:.3g} and 0",
                 )
-            if history.remembers == "strain" and history.memory_at(most) >= 1:
+            if (total := history.memory_at(most)) >= 1:
                 raise BadKeyError(
                     f"segments.{index}.history.remembers",
                     "with a memory of strain, shares of play and creep grow as the arm softens: "
-                    f"at the highest pressures they add up to {history.memory_at(most):.3g}; "
-                    "expected less than 1",
+                    f"at the highest pressures they add up to {total:.3g}; expected less than 1",
                 )
 
     def _check_recordings(self) -> None:

@@ -64,8 +64,8 @@ from stiffopt.units import Duration, Number, Pressure, Ratio
 Array = NDArray[np.float64]
 
 Part = Literal["pressure", "elongation", "bending", "opposite"]
-"""What an operator acts on: each channel's pressure, their mean, deviations from the mean, or the
-fibres opposite to each channel, twice the mean minus its pressure."""
+"""What an operator acts on: the pressure of each channel, the mean of all channels, each channel's
+deviation from it, or what stretches the fibres opposite it: twice the mean minus its pressure."""
 
 _Share = Annotated[Ratio, Field(ge=0, lt=1)]
 

@@ -1,6 +1,5 @@
 """`Manipulator`: pose, Jacobian, compliance and stiffness of an arm, single and batched."""
 
-import math
 import os
 from collections.abc import Sequence
 from functools import lru_cache
@@ -471,9 +470,8 @@ class Manipulator(Arm, ShownInNotebook):
 def quick_description(description: RobotDescription) -> RobotDescription:
     """Return a robot with the stiffness against a quick small push, and the same free shapes."""
     segments = []
-    for segment, own in zip(description.segments, description.channel_ranges, strict=True):
+    for segment, most in zip(description.segments, description.highest_norms, strict=True):
         history, given = segment.history or NO_HISTORY, segment.compensation or Compensation()
-        most = math.hypot(*(description.pressure_max[k] for k in own))
         update = {
             "stiffness": given.stiffness / history.quick_share,
             "softening": history.quick_softening(given.softening, most),
