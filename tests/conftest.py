@@ -25,7 +25,7 @@ LONGEST = (
         "test_commanding",
         "test_detection",
     ),
-    *("test_bracing", "test_brace", "test_workspace_resumed", "test_posture"),
+    *("test_bracing", "test_bracing_loop", "test_brace", "test_workspace_resumed", "test_posture"),
     *("test_calibrate_cli", "test_open_regulator", "test_ros_end_to_end", "test_run_command"),
     *("test_lab", "test_commanding_processes", "test_supply_contract", "test_world"),
 )
