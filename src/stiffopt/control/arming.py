@@ -227,14 +227,20 @@ def late_ticks(lateness: float, guard_timeout: float, load: float = 0.0) -> str:
     half = 0.5 * guard_timeout
     if lateness < half and load < _BUSY:
         return ""
-    what = f"ticks began {1e3 * lateness:.0f} ms late in the last half minute"
+    what = f"the control loop was repeatedly {1e3 * lateness:.0f} ms late in the last half minute"
     if lateness < half:
-        what = f"{load:.1f} processes want each processor of this computer"
+        what = f"{load:.1f} processes compete for each processor"
     advice = (
-        "give the computer less to do, or this program real-time rights that it lacks, if any "
-        "('stiffopt run' lists them when it starts)"
+        "close other programs, or grant the real-time rights that 'stiffopt run' reported missing "
+        "when it started"
     )
     patience = max(0.1, math.ceil(20 * 2.5 * lateness) / 20)
     if patience > guard_timeout:
-        advice += f", or set safety.guard_timeout: {1e3 * patience:.0f} ms"
-    return f"timing: {what}, and the guard vents after {1e3 * guard_timeout:.0f} ms; {advice}"
+        advice += (
+            f"; if neither helps, set 'safety.guard_timeout: {1e3 * patience:.0f} ms' in the rig "
+            "file"
+        )
+    return (
+        f"timing: this computer is too busy: {what}, and the guard vents the arm after "
+        f"{1e3 * guard_timeout:.0f} ms without a command. To mend it, {advice}"
+    )

@@ -266,6 +266,11 @@ class SupplySettings(DeviceSettings):
 
     simulator: ClassVar[str] = ""
 
+    @property
+    def exchange_time(self) -> float:
+        """Least time between two commands on a slow line, in s; 0: the line is fast."""
+        return 0.0
+
     def device(self, limits: PressureLimits, clock: Clock | None = None) -> PressureSupply:
         """Return the supply, not yet open, limited to the range of rig and channels.
 
