@@ -48,6 +48,7 @@ __all__ = [
     "finite_number",
     "format_quantity",
     "get_ready",
+    "in_unit_of",
     "parse_quantity",
     "quantity_schema",
     "read_from_file",
@@ -213,6 +214,13 @@ def format_quantity(value: float, unit: str, written: str | None = None) -> str:
                 return text
     number = f"{value:.15g}"
     return f"{number if float(number) == value else repr(float(value))} {unit}".rstrip()
+
+
+def in_unit_of(given: Any, value: float, unit: str) -> str:
+    """Return a value in SI as text in the unit of a given text if that is exact, else in SI."""
+    number = _NUMBER.match(given.strip()) if isinstance(given, str) else None
+    written = given.strip()[number.end() :].strip() if number else None
+    return "0" if value == 0 else format_quantity(value, unit, written)
 
 
 def quantity_schema(what: str, *examples: str) -> dict[str, Any]:

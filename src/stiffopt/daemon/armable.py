@@ -32,13 +32,13 @@ def check_description(settings: RigDescription, robot: RobotDescription) -> Iter
     limits = limits_of(settings, robot)
     if slew_of(settings, robot) is None:
         yield MisfitError(NO_SLEW, "safety", "max_slew")
-    if np.array_equal(limits.low, limits.high):
+    if immobile := np.array_equal(limits.low, limits.high):
         yield MisfitError(_NO_PRESSURE, "safety", "max_pressure")
     if not supply.simulated:
         try:
             device = supply.device(limits)
             check_protection(device, safety)
-            if np.array_equal(device.limits.low, device.limits.high):
+            if not immobile and np.array_equal(device.limits.low, device.limits.high):
                 yield MisfitError(_NO_PRESSURE, "supply", "channels")
         except (CommandError, InputError) as error:
             yield MisfitError(str(error), "supply")

@@ -53,13 +53,13 @@ Address = Annotated[str, AfterValidator(_address)]
 """Host and port of a server."""
 
 
-def _channel(pattern: str) -> Any:
-    return Field(pattern=rf"^[A-Za-z0-9_ -]+/{pattern}$")
+def _channel(pattern: str, example: str) -> Any:
+    return Field(pattern=rf"^[A-Za-z0-9_ -]+/{pattern}$", examples=[example])
 
 
-OutputName = Annotated[str, _channel(r"ao\d+")]
-InputName = Annotated[str, _channel(r"(ai\d+|_\w+)")]
-LineName = Annotated[str, _channel(r"port\d+/line\d+")]
+OutputName = Annotated[str, _channel(r"ao\d+", "Dev1/ao0")]
+InputName = Annotated[str, _channel(r"(ai\d+|_\w+)", "Dev1/ai0")]
+LineName = Annotated[str, _channel(r"port\d+/line\d+", "Dev1/port0/line0")]
 
 
 class WatchdogExpiredError(DeviceError):
