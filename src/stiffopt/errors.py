@@ -146,10 +146,8 @@ def require_package(package: str, extra: str, module: str | None = None) -> None
 
     Parameters
     ----------
-    package, extra :
-        As for `MissingExtraError`.
-    module :
-        Name under which it is imported, if that differs from `package`.
+    package, extra : as for `MissingExtraError`.
+    module : name under which it is imported, if that differs from `package`.
     """
     try:
         found = find_spec(module or package) is not None

@@ -149,12 +149,9 @@ def parse_quantity(text: str, unit: str, what: str = "quantity") -> float:
 
     Parameters
     ----------
-    text :
-        For example ``"90 mm"``.
-    unit :
-        The SI unit of the result, for example ``"m"``; ``""`` for a ratio such as ``"1 %"``.
-    what :
-        Name of the quantity, for the error message, for example ``"length"``.
+    text : for example ``"90 mm"``.
+    unit : the SI unit of the result, for example ``"m"``; ``""`` for a ratio such as ``"1 %"``.
+    what : name of the quantity, for the error message, for example ``"length"``.
 
     Returns
     -------
@@ -198,12 +195,9 @@ def format_quantity(value: float, unit: str, written: str | None = None) -> str:
 
     Parameters
     ----------
-    value :
-        In SI, finite.
-    unit :
-        The SI unit of `value`.
-    written :
-        The unit of the text if that is exact, for example ``"mm"``; otherwise `unit` is used.
+    value : in SI, finite.
+    unit : the SI unit of `value`.
+    written : the unit of the text if that is exact, for example ``"mm"``; otherwise `unit` is used.
     """
     if written is not None and written != unit:
         factor = _factor(written, unit)

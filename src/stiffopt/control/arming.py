@@ -216,13 +216,10 @@ def late_ticks(lateness: float, guard_timeout: float, load: float = 0.0) -> str:
 
     Parameters
     ----------
-    lateness :
-        How late ticks began in the last half minute, in s. If that is half of the guard's timeout,
-        it may exceed the timeout within minutes.
-    guard_timeout :
-        The guard's timeout, in s.
-    load :
-        Number of processes that want to run per processor.
+    lateness : how late ticks began in the last half minute, in s. If that is half of the guard's
+        timeout, it may exceed the timeout within minutes.
+    guard_timeout : the guard's timeout, in s.
+    load : number of processes that want to run per processor.
     """
     half = 0.5 * guard_timeout
     if lateness < half and load < _BUSY:

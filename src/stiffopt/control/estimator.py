@@ -90,14 +90,10 @@ class TipEstimator:
 
     Parameters
     ----------
-    period :
-        Duration of a step, in s.
-    n :
-        Number of channels.
-    mode :
-        The arm's first bending mode, or None for an arm that does not vibrate.
-    tuning :
-        Noise and outlier rejection.
+    period : duration of a step, in s.
+    n : number of channels.
+    mode : the arm's first bending mode, or None for an arm that does not vibrate.
+    tuning : noise and outlier rejection.
     """
 
     def __init__(

@@ -28,14 +28,11 @@ class Report:
 
     Parameters
     ----------
-    robot :
-        The model of the arm.
-    arm :
-        The state of the arm.
-    replanner :
-        What is pursued, and the plans for it.
-    largest_offset :
-        Distance of the measured tip from the model's above which the model is wrong, in m.
+    robot : the model of the arm.
+    arm : the state of the arm.
+    replanner : what is pursued, and the plans for it.
+    largest_offset : distance of the measured tip from the model's above which the model is wrong,
+        in m.
     """
 
     def __init__(
@@ -56,10 +53,8 @@ class Report:
 
         Parameters
         ----------
-        now :
-            Time, in s.
-        led :
-            On a trajectory of pressures, its present target and effective pressures (n,), in Pa.
+        now : time, in s.
+        led : on a trajectory of pressures, its present target and effective pressures (n,), in Pa.
         """
         n, arm, pursuit = self._robot.n_pressures, self._arm, self._replanner.pursuit
         if arm.modelled is None:

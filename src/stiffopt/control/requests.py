@@ -39,10 +39,8 @@ class Requests:
 
     Parameters
     ----------
-    robot, limits, slew, scene, tuning :
-        See `TipController`; slew (n,), in Pa/s.
-    tip_speed :
-        See `ControlSettings`.
+    robot, limits, slew, scene, tuning : see `TipController`; slew (n,), in Pa/s.
+    tip_speed : see `ControlSettings`.
     """
 
     def __init__(

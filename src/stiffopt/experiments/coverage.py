@@ -89,14 +89,10 @@ class Coverage:
 
         Parameters
         ----------
-        conductor :
-            Has seen the tip; the arm is at `base`.
-        folder, about :
-            As for `recorded`; the files are named by `round_name`.
-        number :
-            Of the round, from 1.
-        report :
-            Called with the seconds done and a description.
+        conductor : has seen the tip; the arm is at `base`.
+        folder, about : as for `recorded`; the files are named by `round_name`.
+        number : of the round, from 1.
+        report : called with the seconds done and a description.
 
         Returns
         -------

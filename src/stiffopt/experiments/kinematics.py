@@ -158,18 +158,12 @@ def run_kinematics(
 
     Parameters
     ----------
-    rig : Rig
-        Open.
-    folder : Path
-        Gets ``kinematics_1.csv`` (log v1), ``kinematics_1.mcap`` and so on, and then
+    rig : open.
+    folder : gets ``kinematics_1.csv`` (log v1), ``kinematics_1.mcap`` and so on, and then
         ``kinematics_poses_1.csv`` and so on; an incomplete one is named ``kinematics_1.part.csv``.
-    settings : KinematicsSettings
-    rate : float
-        Rate of the commands, in Hz.
-    progress : callable
-        Called with the seconds done, the total and a description.
-    check : callable
-        Called often; it may raise to stop.
+    rate : rate of the commands, in Hz.
+    progress : called with the seconds done, the total and a description.
+    check : called often; it may raise to stop.
 
     Returns
     -------

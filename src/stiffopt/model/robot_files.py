@@ -29,11 +29,9 @@ def load_description(
 
     Parameters
     ----------
-    name_or_path :
-        Text that ends in ``.yaml`` or ``.yml`` or has a path separator is a path, as is a `Path`;
-        any other is the name of a built-in robot.
-    base :
-        Folder from which a relative path starts; by default the current one.
+    name_or_path : text that ends in ``.yaml`` or ``.yml`` or has a path separator is a path, as is
+        a `Path`; any other is the name of a built-in robot.
+    base : folder from which a relative path starts; by default the current one.
 
     Raises
     ------

@@ -141,7 +141,6 @@ class BracedProblem(PressureProblem):
 
     Attributes
     ----------
-    brace : Brace
     scene : the objects that the arm may lean on.
     here : equilibrium from which the next one is sought, or None: from rest.
     only_target : whether the demands on contacts are ignored.

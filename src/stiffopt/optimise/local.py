@@ -37,16 +37,10 @@ class LocalResult:
 
     Attributes
     ----------
-    problem : PressureProblem
-        The program that was solved.
-    point : ProgramPoint
-    value : float
-        Objective there.
-    violation : float
-        Sum of the violations of floors, in logarithms of stiffness.
-    converged : bool
-    is_optimum : bool
-        False: the point is only a candidate, without prices.
+    problem : the program that was solved.
+    value : objective there.
+    violation : sum of the violations of floors, in logarithms of stiffness.
+    is_optimum : False: the point is only a candidate, without prices.
     """
 
     problem: PressureProblem

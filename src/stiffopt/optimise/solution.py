@@ -49,16 +49,11 @@ class Confidence:
 
     Attributes
     ----------
-    starts : int
-        Configurations that were brought towards the pose.
-    reached : int
-        Converged descents from starts that reached the pose.
-    agreeing : int
-        Converged descents that ended within 0.1 % of the best; with a brace, of the answer.
-    optima : int
-        Distinct local optima among them.
-    complete : bool
-        Whether the search ended because enough descents in a row found nothing new (see
+    starts : configurations that were brought towards the pose.
+    reached : converged descents from starts that reached the pose.
+    agreeing : converged descents that ended within 0.1 % of the best; with a brace, of the answer.
+    optima : distinct local optima among them.
+    complete : whether the search ended because enough descents in a row found nothing new (see
         `stiffopt.optimise.search.effort`).  False: it ended before.
     """
 
@@ -474,10 +469,8 @@ class Judgement(NamedTuple):
         Parameters
         ----------
         program : of the task
-        numbers : tuple
-            Residuals (m,), tip pose (4, 4), compliance (6, 6), values of the measures (k,).
-        within : bool
-            Whether the pressures are within their limits.
+        numbers : residuals (m,), tip pose (4, 4), compliance (6, 6), values of the measures (k,).
+        within : whether the pressures are within their limits.
         """
         residuals, tip_pose, compliance, values = numbers
         errors = program.errors(residuals)

@@ -159,8 +159,7 @@ class ForRobot(Schema, ShownInNotebook):
 
         Parameters
         ----------
-        description :
-            The robot, with n channels.
+        description : the robot, with n channels.
 
         Returns
         -------

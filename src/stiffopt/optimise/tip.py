@@ -58,14 +58,13 @@ class TipModel:
 
     Parameters
     ----------
-    robot : Manipulator
-        The arm with its gravity and load.
+    robot : the arm with its gravity and load.
 
     Attributes
     ----------
-    is_fast : bool
-        Whether calls run in machine code, which is compiled when an instance is made.  Without a
-        compiler the model is used, from rest each time, which takes milliseconds for a loaded arm.
+    is_fast : whether calls run in machine code, which is compiled when an instance is made.
+        Without a compiler the model is used, from rest each time, which takes milliseconds for a
+        loaded arm.
 
     Raises
     ------

@@ -23,8 +23,7 @@ class Curve(ABC):
 
     Attributes
     ----------
-    length : float
-        In m.
+    length : in m.
     """
 
     length: float

@@ -103,9 +103,7 @@ class BodyCheck:
 
     Parameters
     ----------
-    robot : Manipulator
-        With its load.
-    scene : Scene
+    robot : with its load.
     """
 
     def __init__(self, robot: Manipulator, scene: Scene) -> None:

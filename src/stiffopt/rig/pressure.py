@@ -178,8 +178,7 @@ class Supply(Device):
 
     Attributes
     ----------
-    limits : PressureLimits
-        Limits of the commands.
+    limits : limits of the commands.
     """
 
     limits: PressureLimits

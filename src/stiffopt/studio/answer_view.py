@@ -35,10 +35,8 @@ class AnswerView:
     Parameters
     ----------
     server : viser.ViserServer
-    description :
-        The robot.
-    is_preview :
-        Whether to draw the arm translucently, as a preview over another one.
+    description : the robot.
+    is_preview : whether to draw the arm translucently, as a preview over another one.
     """
 
     def __init__(self, server: Any, description: RobotDescription, *, is_preview: bool) -> None:

@@ -79,12 +79,9 @@ class Daqmx:
 
     Parameters
     ----------
-    address :
-        Address of NI's gRPC device server; None: the driver on this machine.
-    timeout :
-        Timeout of every call, in s.
-    extra :
-        stiffopt's extra with nidaqmx, for the message if it is missing.
+    address : address of NI's gRPC device server; None: the driver on this machine.
+    timeout : timeout of every call, in s.
+    extra : stiffopt's extra with nidaqmx, for the message if it is missing.
 
     Raises
     ------
@@ -270,9 +267,8 @@ class AnalogueInput(_Task):
 
     Parameters
     ----------
-    shared :
-        Whether another task reads inputs of the same device. If so, reserve it only while reading,
-        which is slower.
+    shared : whether another task reads inputs of the same device. If so, reserve it only while
+        reading, which is slower.
     """
 
     def __init__(

@@ -504,12 +504,9 @@ class ModbusLine:
 
     Parameters
     ----------
-    address :
-        The connection.
-    unit :
-        Number of the device on the line.
-    timeout :
-        Time for each answer, in s.
+    address : the connection.
+    unit : number of the device on the line.
+    timeout : time for each answer, in s.
 
     Attributes
     ----------
@@ -560,10 +557,8 @@ class ModbusLine:
 
         Parameters
         ----------
-        what :
-            The request in words, for messages.
-        function, args, options :
-            Method of pymodbus's client and its arguments.
+        what : the request in words, for messages.
+        function, args, options : method of pymodbus's client and its arguments.
 
         Raises
         ------
