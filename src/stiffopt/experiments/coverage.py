@@ -35,10 +35,8 @@ def spread_pressures(count: int, low: ArrayLike, high: ArrayLike) -> Array:
 
     Parameters
     ----------
-    count :
-        Number of poses.
-    low, high : (n,)
-        Ends of each channel's range, in Pa.
+    count : number of poses.
+    low, high : (n,), ends of each channel's range, in Pa.
     """
     low, high = np.array(low, dtype=float), np.array(high, dtype=float)
     if count == 1:

@@ -79,14 +79,10 @@ class PressureSequence:
 
         Parameters
         ----------
-        base : (n,)
-            Pressures between the teeth, in Pa.
-        peaks :
-            Of the teeth of each channel, in Pa.
-        period :
-            Of a tooth, in s; a tooth takes longer if the channel is too slow.
-        slew : (n,)
-            Largest rate of change, in Pa/s.
+        base : (n,), pressures between the teeth, in Pa.
+        peaks : of the teeth of each channel, in Pa.
+        period : of a tooth, in s; a tooth takes longer if the channel is too slow.
+        slew : (n,), largest rate of change, in Pa/s.
         """
         base = np.asarray(base, dtype=float)
         slew = np.broadcast_to(np.asarray(slew, dtype=float), base.shape)

@@ -110,11 +110,8 @@ class BracedPoint(ProgramPoint):
 
     Attributes
     ----------
-    equilibrium : ContactEquilibrium
-    force : float
-        Sum of the contacts' normal forces, in N.
-    force_gradient : ndarray (n,)
-        Its derivative, per variable.
+    force : sum of the contacts' normal forces, in N.
+    force_gradient : (n,), its derivative, per variable.
     """
 
     __slots__ = ("equilibrium", "force", "force_gradient")

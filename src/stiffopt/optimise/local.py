@@ -87,14 +87,10 @@ class _Place:
 
     Attributes
     ----------
-    point : ProgramPoint
-    values : ndarray (t,)
-        Terms of the objective.
-    value, missed : float
-        The largest term, and the violation of floors.
-    slopes : ndarray (t + f + m, n)
-        Gradients of the terms, of the negative floors, and of the residuals in finite balls, in the
-        order of the multipliers.
+    values : (t,), terms of the objective.
+    value, missed : the largest term, and the violation of floors.
+    slopes : (t + f + m, n), gradients of the terms, of the negative floors, and of the residuals in
+        finite balls, in the order of the multipliers.
     """
 
     __slots__ = ("missed", "point", "slopes", "value", "values")

@@ -84,21 +84,16 @@ class Sensitivities:
 
     Attributes
     ----------
-    tip_jacobian : ndarray (6, n)
-        Tip twist in tip axes per Pa.
-    stiffness_gradient : ndarray (n,) or None
-        First stiffness of the task per Pa, in N/m/Pa or N m/rad/Pa.
-    per_bound : dict of str to float
-        Gain from moving each active pressure limit outwards, in `objective_unit` per Pa.
-    per_tolerance : dict of str to float
-        Gain by name of each term of the target, per m or rad of tolerance or, for an inequality, of
-        margin; and per m less clearance of each object, see `per_clearance`.
-    per_position_tolerance, per_angle_tolerance : float or None
-        Gains for position and angle; None where the target has none.
-    objective_unit : str
-        Unit of the gain: "N/m" or "N*m/rad" of the (smallest) stiffness that is maximised; "m" or
-        "rad" of the error of an unreachable pose; "bar^2" of mean square pressure for a task
-        without a stiffness; "1", the squared relative mismatch, where one is matched.
+    tip_jacobian : (6, n), tip twist in tip axes per Pa.
+    stiffness_gradient : (n,), first stiffness of the task per Pa, in N/m/Pa or N m/rad/Pa.
+    per_bound : gain from moving each active pressure limit outwards, in `objective_unit` per Pa.
+    per_tolerance : gain by name of each term of the target, per m or rad of tolerance or, for an
+        inequality, of margin; and per m less clearance of each object, see `per_clearance`.
+    per_position_tolerance, per_angle_tolerance : gains for position and angle; None where the
+        target has none.
+    objective_unit : unit of the gain: "N/m" or "N*m/rad" of the (smallest) stiffness that is
+        maximised; "m" or "rad" of the error of an unreachable pose; "bar^2" of mean square pressure
+        for a task without a stiffness; "1", the squared relative mismatch, where one is matched.
     """
 
     tip_jacobian: Vector

@@ -51,10 +51,8 @@ class MotionTable:
 
         Parameters
         ----------
-        ranges : (n,)
-            Ranges of the pressures, in Pa; see `trajectory_through`.
-        begin :
-            Time of the first point, in s.
+        ranges : (n,), ranges of the pressures, in Pa; see `trajectory_through`.
+        begin : time of the first point, in s.
 
         Raises
         ------

@@ -135,10 +135,8 @@ class PressureReading:
 
     Attributes
     ----------
-    time : float
-        When it was read.
-    pressures : ndarray
-        Gauge pressures (n,), in Pa; NaN where the device measures none.
+    time : when it was read.
+    pressures : gauge pressures (n,), in Pa; NaN where the device measures none.
     """
 
     time: float

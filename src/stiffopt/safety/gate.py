@@ -38,16 +38,11 @@ class Applied:
 
     Attributes
     ----------
-    pressures : ndarray
-        Set-points (n,) of the supply, in Pa.
-    reading : PressureReading
-        Newest measured pressures, with the time of the measurement.
-    limited : bool
-        Whether the set-points differ from the command, because of its rate or force.
-    refused : str
-        Why the command was refused; empty if it was carried out.
-    force_limited : bool
-        Whether it was reduced because of the total force.
+    pressures : set-points (n,) of the supply, in Pa.
+    reading : newest measured pressures, with the time of the measurement.
+    limited : whether the set-points differ from the command, because of its rate or force.
+    refused : why the command was refused; empty if it was carried out.
+    force_limited : whether it was reduced because of the total force.
     """
 
     pressures: Array

@@ -70,11 +70,8 @@ class AnswerView:
 
         Parameters
         ----------
-        answer : StudioAnswer
-        target : (3,)
-            Position of the target, in m.
-        with_plain :
-            Whether to draw the plain solution too.
+        target : (3,), position of the target, in m.
+        with_plain : whether to draw the plain solution too.
         """
         leaning = answer.solution.equilibrium
         self._arm.show(answer.robot, answer.pressures, leaning)

@@ -164,14 +164,10 @@ def pressures_html(
 
     Parameters
     ----------
-    description :
-        The robot, with n channels.
-    pressures, low, high : (n,)
-        In Pa.
-    at_limit : (n,)
-        Which bars to highlight.
-    marks : (n,), optional
-        In Pa, named `mark` in the legend.
+    description : the robot, with n channels.
+    pressures, low, high : (n,), in Pa.
+    at_limit : (n,), which bars to highlight.
+    marks : (n,), in Pa, named `mark` in the legend.
     """
     p, low, high = (np.asarray(each, dtype=float) for each in (pressures, low, high))
     top, bottom = max(high.max(), p.max()), min(low.min(), 0.0)
