@@ -20,6 +20,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
 from fake_loop import FakeLoop
+from running import wait_for
 from stiffopt.control.state import Alarm, Severity, Snapshot, State, Timing
 from stiffopt.daemon import server as server_module
 from stiffopt.daemon.client import Client, ClientStream
@@ -68,13 +69,6 @@ def client(server: Server) -> Iterator[Client]:
         yield client
 
 
-def eventually(condition: Callable[[], bool], timeout: float = 15.0) -> None:
-    end = time.monotonic() + timeout
-    while not condition():
-        assert time.monotonic() < end, "this did not come about in time"
-        time.sleep(0.01)
-
-
 # Connections --------------------------------------------------------------------------------------
 
 
@@ -96,12 +90,12 @@ def test_connections_that_idle_or_dribble_keep_nobody_away_and_use_up_nothing(
         with Client(server.url, TOKEN) as late:
             late.vent()
         ends_of_ours = 3 * MAX_CONNECTIONS + 2
-        eventually(lambda: open_files() - before <= ends_of_ours + 2 * MAX_CONNECTIONS + 2)
+        wait_for(lambda: open_files() - before <= ends_of_ours + 2 * MAX_CONNECTIONS + 2)
         assert "vent" in loop.names
         other.sendall(b"       }")
         last = other.recv(100)
         assert last.startswith(b"HTTP/1.1 200")  # the newest were not dropped
-    eventually(lambda: open_files() <= before + 3)
+    wait_for(lambda: open_files() <= before + 3)
 
 
 def test_streams_outlive_many_connections(server: Server) -> None:
@@ -145,7 +139,7 @@ def test_where_all_with_the_token_are_being_answered_the_newest_has_to_go(
         for _ in range(2):
             busy.append(stack.enter_context(socket.create_connection(address, 20)))
             busy[-1].sendall(asks + b"\r\n\r\n")
-        eventually(lambda: len(waiting) == 2)
+        wait_for(lambda: len(waiting) == 2)
         late = stack.enter_context(socket.create_connection(address, 10))
         late.sendall(asks + b"\r\n\r\n")
         with suppress(ConnectionResetError):
@@ -221,7 +215,7 @@ class Strangers:
     def __enter__(self) -> Strangers:
         for thread in self._threads:
             thread.start()
-        eventually(lambda: self.opened > len(self._threads))
+        wait_for(lambda: self.opened > len(self._threads))
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -531,7 +525,7 @@ def test_without_heartbeat_the_arm_is_held(loop: FakeLoop, server: Server) -> No
             time.sleep(HEARTBEAT / 3)
             client.renew()
         assert loop.names == ["arm"]
-        eventually(lambda: loop.names == ["arm", "hold"])
+        wait_for(lambda: loop.names == ["arm", "hold"])
         assert "'hung'" in loop.calls[1][1]
         with pytest.raises(CommandError, match="control"):
             client.set_target(position=[0, 0, 0.2])
@@ -544,7 +538,7 @@ def test_the_heartbeat_ends_with_the_thread_that_took_control(
     thread.start()
     thread.join()
     assert client.in_control
-    eventually(lambda: loop.names == ["hold"])
+    wait_for(lambda: loop.names == ["hold"])
 
 
 def test_a_program_that_fails_leaves_the_arm_held(loop: FakeLoop, server: Server) -> None:
@@ -579,7 +573,7 @@ def test_targets_are_streamed_and_states_come_back(loop: FakeLoop, server: Serve
             while time.monotonic() < end:  # streaming is heard
                 stream.send(position=[0, 0, 0.2])
                 assert stream.state().time == 12.5
-            eventually(lambda: stream.accepted + stream.superseded >= 10)
+            wait_for(lambda: stream.accepted + stream.superseded >= 10)
         assert set(loop.names) == {"set_target"}
         assert loop.calls[-1][1].position == (0, 0, 0.2)
         client.release()
@@ -597,7 +591,7 @@ def test_a_refused_target_is_raised_at_the_next_call(loop: FakeLoop, client: Cli
             drain(stream)
         loop.refusal = None
         stream.send(position=[0, 0, 0.2])
-        eventually(lambda: stream.accepted == 1)
+        wait_for(lambda: stream.accepted == 1)
 
 
 def test_a_stream_says_when_it_has_ended(client: Client, server: Server) -> None:
@@ -624,9 +618,9 @@ def test_only_the_newest_of_many_targets_is_passed_on(loop: FakeLoop, client: Cl
         assert under_way.wait(20)
         for k in range(1, 20):
             stream.send(position=[0, 0, 0.1 + k / 1000])
-        eventually(lambda: stream.superseded == 18)  # the last one waits
+        wait_for(lambda: stream.superseded == 18)  # the last one waits
         gate.set()
-        eventually(lambda: stream.accepted == 2)
+        wait_for(lambda: stream.accepted == 2)
     heights = [target.position[2] for _, target in loop.calls]
     assert heights == pytest.approx([0.1, 0.119])
 
@@ -745,7 +739,7 @@ def test_there_is_an_end_to_streams(server: Server) -> None:
         with opened(server) as one_more:
             assert json.loads(one_more.recv(timeout=20))["error"]["code"] == "busy"
     with opened(server, "") as again:
-        eventually(lambda: json.loads(again.recv(timeout=20))["type"] == "state")
+        wait_for(lambda: json.loads(again.recv(timeout=20))["type"] == "state")
 
 
 def test_the_stream_sends_states_without_a_token_at_a_limited_rate(server: Server) -> None:
