@@ -297,6 +297,7 @@ def test_mistakes_are_told(tmp_path: Path, old: str, new: str, line: int | None,
         (Safety, {"guard_timeout": "5 ms"}, "at least 10 ms, not '5 ms'"),
         (Safety, {"guard_timeout": "1 min"}, "at most 2 s, not '1 min'"),  # no number of minutes
         (Safety, {"guard_timeout": 3}, "at most 2 s, not 3"),
+        (Safety, {"guard_timeout": np.float64(2.5)}, "at most 2 s, not 2.5"),
         (Safety, {"hold_timeout": "2 h"}, "at most 1 h, not '2 h'"),  # a time, or 'none'
         (Safety, {"ramp_time": "0 s"}, "greater than 0, not '0 s'"),
         (Safety, {"max_overruns": 2.5}, "a whole number, not 2.5"),

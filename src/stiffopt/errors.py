@@ -191,6 +191,8 @@ def os_reason(error: OSError | ValueError) -> str:
 
 def shown(value: object) -> str:
     """Return a value for an error message: text in quotes, on one line, never long."""
+    if hasattr(value, "tolist"):  # of NumPy
+        value = value.tolist()
     if isinstance(value, dict):
         return "a mapping"
     if isinstance(value, list | tuple):

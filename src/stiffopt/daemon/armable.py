@@ -65,10 +65,10 @@ def check_description(settings: RigDescription, robot: RobotDescription) -> Iter
 def _impatient(supply: SupplySettings, period: float, between: str) -> Iterator[MisfitError]:
     """Yield why the device's own watchdog would vent between two commands, `period` s apart."""
     watchdog = getattr(supply, "watchdog", None)  # a time in s, or a block that has one
-    if watchdog is None:
+    timeout = getattr(watchdog, "timeout", watchdog)
+    place = ("watchdog",) if timeout is watchdog else ("watchdog", "timeout")
+    if not isinstance(timeout, float):
         return
-    place = ("watchdog", "timeout") if hasattr(watchdog, "timeout") else ("watchdog",)
-    timeout = float(getattr(watchdog, "timeout", watchdog))
     if supply.exchange_time > period:
         period = supply.exchange_time
         between = f"the {1e3 * period:.3g} ms that a command takes on the serial line"
