@@ -138,13 +138,12 @@ class Requests:
         """Return a task in the rig's scene; refuse it if the scene lacks the brace's objects."""
         if self._scene is None:
             raise InputError("brace: the rig file has no scene with objects to lean on")
-        on_rig = task.model_copy(update={"scene": self._scene})
-        assert on_rig.brace is not None
+        assert task.brace is not None
         try:
-            on_rig.brace.check(on_rig)
+            task.brace.check_objects(self._scene)
         except BadKeyError as error:
-            raise InputError(f"{dotted(error.loc)}: {error} (in the rig's scene)") from None
-        return on_rig
+            raise InputError(f"brace.{dotted(error.loc)}: {error} (in the rig's scene)") from None
+        return task.model_copy(update={"scene": self._scene})
 
     def _limited(self, task: Task) -> Task:
         """Return a task with the rig's limits of pressure as well; see `limited_range`."""
