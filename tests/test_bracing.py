@@ -247,12 +247,18 @@ def test_contacts_are_held_uncertain_or_lost_by_the_force_and_its_deviation(
     course, lifts = held(approach), lift_off(approach)
     samples(course, approach, np.zeros(3), 40)
     assert course.deviation == pytest.approx(0.2 * approach.hold.forces[0], rel=0.01)
+    (contact,) = course.held
+    assert (contact.object, contact.state) == ("post", "held")
+    assert contact.at == approach.contacts[0].at
+    assert (contact.force, contact.deviation) == (course.force, course.deviation)
     after = samples(course, approach, pushed(approach, share * lifts), 80)
     assert course.contacts == contacts
     kinds = [notice.kind for notice in course.notices()]
     expected = {"held": [], "uncertain": ["brace-uncertain"] * 2, "lost": ["brace-lost"] * 2}
     assert [kind for kind in kinds[1:] if kind != "brace-slips"][-2:] == expected[contacts]
     assert (after is not None) == (contacts == "lost")
+    assert [each.state for each in course.held] == [contacts]
+    assert np.isfinite(course.held[0].force) == (contacts != "lost")
     if contacts != "lost":
         left = (1 - share) * approach.hold.forces[0]
         assert course.force == pytest.approx(left, abs=0.05 * approach.hold.forces[0])
@@ -406,7 +412,12 @@ def test_the_doubt_of_a_second_contact_is_told_and_the_alarm_follows(approach):
     )
     course, other = held(both), 0.11 * lifts[[1, 0, 2]]
     samples(course, both, np.zeros(3), 40)
+    assert [each.state for each in course.held] == ["held", "held"]
     samples(course, both, pushed(both, 0.9 * lifts), 80)
+    post, rib = course.held
+    assert (post.object, post.state, rib.object, rib.state) == ("post", "uncertain", "rib", "held")
+    assert post.force < 0.2 * hold.forces[0]
+    assert rib.force == pytest.approx(hold.forces[0], rel=0.1)
     samples(course, both, pushed(both, other), 20)
     said = course.notices()
     events = [each.text for each in said if each.kind == "brace-uncertain" and not each.standing]
@@ -416,6 +427,10 @@ def test_the_doubt_of_a_second_contact_is_told_and_the_alarm_follows(approach):
     samples(course, both, pushed(both, other), 100)
     (alarm,) = course.notices()
     assert alarm.text == events[1]
+    samples(course, both, pushed(both, 5 * other), 80)
+    assert [(each.object, each.state) for each in course.held] == [("rib", "lost")]
+    course.release(then=TASK)
+    assert course.phase is BracePhase.RELEASING
 
 
 def test_a_slip_that_comes_and_goes_is_reported_once(approach):

@@ -30,6 +30,7 @@ arm settled. Nobody knows whether that is a push. Then
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from enum import StrEnum
 from typing import NamedTuple
 
@@ -39,7 +40,7 @@ from numpy.typing import NDArray
 from stiffopt.control.friction import Friction
 from stiffopt.control.interface import Notice
 from stiffopt.control.sliding import SlideEstimator
-from stiffopt.control.state import Severity
+from stiffopt.control.state import HeldContact, Severity
 from stiffopt.control.tuning import BracingTuning
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import Task
@@ -130,6 +131,8 @@ class Bracing:
         self._concerns: dict[Concern, str] = {}  # what is reported, with its text
         self._calm: dict[Concern, float] = {}  # how long it has not been seen, in s
         self._doubted = 0.0  # for how long contacts have been uncertain, in s
+        self._estimated: Array = np.zeros((0, 2))  # forces of contacts and their deviations (k, 2)
+        self._lost: frozenset[int] = frozenset()  # contacts
         self._why = ""
         self._notices: list[Notice] = []
 
@@ -148,6 +151,22 @@ class Bracing:
         if self.phase is BracePhase.HELD:
             return "uncertain" if self._doubt else "held"
         return "lost" if self._why else ""
+
+    @property
+    def held(self) -> tuple[HeldContact, ...]:
+        """The contacts while the brace is held; after a loss, those that were lost."""
+        if self.approach is None or not self.contacts:
+            return ()
+        doubted = {each.contact for each in self._concerns if each.kind == _UNCERTAIN}
+        found = []
+        for number, each in enumerate(self.approach.contacts):
+            if self.phase is BracePhase.HELD:
+                state = "uncertain" if number in doubted else "held"
+                force, deviation = self._estimated[number].tolist()
+                found.append(HeldContact(each.object, each.at, state, force, deviation))
+            elif number in self._lost:
+                found.append(HeldContact(each.object, each.at, "lost"))
+        return tuple(found)
 
     @property
     def _doubt(self) -> str:
@@ -173,13 +192,18 @@ class Bracing:
         self._friction = Friction(approach.hold, approach.pressures[-1])
         self._left = float(bool(np.abs(pressures).max() > self._tuning.at_rest))
         self._change = np.zeros_like(pressures)
+        self._estimated = np.full((len(approach.contacts), 2), np.nan)
         self.phase = BracePhase.TO_REST
 
-    def release(self, then: Task | None = None, why: str = "") -> None:
-        """Release the contacts, then pursue the task `then`; `why` is the reason for a failure."""
+    def release(self, then: Task | None = None, why: str = "", lost: Iterable[int] = ()) -> None:
+        """Release the contacts, then pursue the task `then`.
+
+        `why` is the reason for a failure, and `lost` are the contacts that were lost.
+        """
         self.next = then or self.next
         if self.phase in (BracePhase.APPROACHING, BracePhase.HELD):
             self.phase, self._why, self._pace = BracePhase.RELEASING, why, 0.0
+            self._lost = frozenset(lost)
             self.force = self.deviation = self.margin = math.nan
             self.push = self.displacement = np.zeros(3)
             text = "goes back on the way that it came"
@@ -290,7 +314,7 @@ class Bracing:
         if self._free >= t.samples:
             where = "the tip is where an arm without contact has it"
             lost = "the brace is lost" if held else "there is nothing where the scene has an object"
-            self.release(why=f"{where}: {lost}")
+            self.release(why=f"{where}: {lost}", lost=range(len(self.approach.contacts)))
             return
         if not held:
             return
@@ -372,8 +396,9 @@ class Bracing:
         if self._slid < t.samples:
             return False
         most = int(np.where(slid, sizes, 0.0).argmax())
-        where = self._named(approach.hold.sticking.own[most])
-        self.release(why=f"{where} has slid by {1e3 * sizes[most]:.1f} mm")
+        slider = approach.hold.sticking.own[most]
+        where = self._named(slider)
+        self.release(why=f"{where} has slid by {1e3 * sizes[most]:.1f} mm", lost=[slider])
         return True
 
     def _feels(self, off: Array, push: Array, before: Array) -> bool:
@@ -477,10 +502,7 @@ class Bracing:
         """Judge whether the contacts hold while no push is felt; see `_judge`."""
         t = self._tuning
         own = self._rest_deviations(before)
-        deviations = np.hypot(own, drift)
-        left = before - t.certain * deviations
-        weakest = int(left.argmin())
-        self.force, self.deviation = float(before[weakest]), float(deviations[weakest])
+        left = self._estimate(before, np.hypot(own, drift))
         self.margin, found = math.nan, {}
         for each in map(int, np.flatnonzero((left < 0) & (drift > t.felt_share * before))):
             text = self._lifted(each, float(before[each] + t.certain * own[each]))
@@ -498,10 +520,7 @@ class Bracing:
         t, size = self._tuning, float(np.linalg.norm(self.push))
         change = self._per_push @ self.push
         forces, own = before + change, self._deviations(before, change)
-        most, deviations = forces + t.certain * own, np.hypot(own, drift)
-        reach = t.certain * deviations
-        weakest = int((forces - reach).argmin())
-        self.force, self.deviation = float(forces[weakest]), float(deviations[weakest])
+        most, least = forces + t.certain * own, self._estimate(forces, np.hypot(own, drift))
         falls = change < 0
         left = size * float(np.min(before[falls] / -change[falls], initial=math.inf))
         if self._sticks:
@@ -509,18 +528,26 @@ class Bracing:
         self.margin = max(left - size, 0.0)
         words = f"under a push of {1e3 * size:.0f} mN"
         if (most < 0).any():
-            self.release(why=f"{self._named(int(most.argmin()))} lifts off {words}")
+            lifted = int(most.argmin())
+            self.release(why=f"{self._named(lifted)} lifts off {words}", lost=[lifted])
             return
         slid, found = self._friction.slid(self.push, before), {}
         kind, how = (_UNCERTAIN, "may slide") if self._sticks else (_SLIPS, "slips")
         for i in np.flatnonzero(slid > t.slid):
             each = self.approach.hold.sticking.own[int(i)]
             found[Concern(kind, each, "slide")] = f"{self._named(each)} {how} {words}"
-        for each in map(int, np.flatnonzero(forces < reach)):
+        for each in map(int, np.flatnonzero(least < 0)):
             text, whole = self._lifted(each, float(most[each])), 1e3 * before[each]
             text = f"{text} {words}; without it, {whole:.0f} mN"
             found[Concern(_UNCERTAIN, each, "lift")] = text
         self._weigh(found, elapsed)
+
+    def _estimate(self, forces: Array, deviations: Array) -> Array:
+        """Take in estimated forces (k,) and their deviations (k,); return their low ends (k,)."""
+        least: Array = forces - self._tuning.certain * deviations
+        self._estimated = np.column_stack([forces, deviations])
+        self.force, self.deviation = self._estimated[int(least.argmin())].tolist()
+        return least
 
     def _weigh(self, found: dict[Concern, str], elapsed: float) -> None:
         """Take in what is of concern at a sample.
@@ -543,7 +570,8 @@ class Bracing:
             self._doubted += elapsed
             if self._doubted > t.longest_push:
                 time = f"{t.longest_push:.0f} s"
-                self.release(why=f"for {time} it was uncertain: {self._doubt}")
+                lost = [each.contact for each in self._concerns if each.kind == _UNCERTAIN]
+                self.release(why=f"for {time} it was uncertain: {self._doubt}", lost=lost)
 
     def _lifted(self, contact: int, most: float) -> str:
         return f"{self._named(contact)} may have lifted off: it has 0 to {1e3 * most:.0f} mN"

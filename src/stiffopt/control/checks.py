@@ -16,12 +16,13 @@ from pydantic import BaseModel
 
 from stiffopt.errors import CommandError, InputError, StiffoptError
 from stiffopt.model.manipulator import Manipulator
+from stiffopt.model.scene import Scene
 from stiffopt.optimise.solver import PressureSolver
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import PressureRange, Task
 from stiffopt.paths.trajectory import Trajectory, Waypoint
 from stiffopt.rig.interface import PressureLimits
-from stiffopt.schema import Schema
+from stiffopt.schema import BadKeyError, Schema
 
 Array = NDArray[np.float64]
 ModelT = TypeVar("ModelT", bound=Schema)
@@ -54,6 +55,18 @@ def check_task(task: Task, limits: PressureLimits) -> None:
     """Refuse a task that is invalid or needs pressures beyond the limits."""
     with refusing("task"):
         limited_range(validated(task, Task).pressure, limits)
+
+
+def check_brace(task: Task, scene: Scene | None) -> None:
+    """Refuse a task that leans on objects which the rig's scene does not have or allow."""
+    if task.brace is None:
+        return
+    if scene is None:
+        raise task.error_at("brace", "the rig file has no scene with objects to lean on")
+    try:
+        task.brace.check_objects(scene)
+    except BadKeyError as error:
+        raise task.error_at(f"brace.{error.loc[0]}", f"{error} (in the rig's scene)") from None
 
 
 def check_target(target: Target) -> None:

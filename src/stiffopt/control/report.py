@@ -111,6 +111,7 @@ class Report:
             brace_force=math.nan if bracing is None else bracing.force,
             brace_force_deviation=math.nan if bracing is None else bracing.deviation,
             brace_margin=math.nan if bracing is None else bracing.margin,
+            leans_on=() if bracing is None else bracing.held,
             task=pursuit.kind,
             stiffness_unit=pursuit.unit,
             model_position=estimate.static,

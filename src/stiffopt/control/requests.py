@@ -9,13 +9,13 @@ from numpy.typing import NDArray
 
 from stiffopt.control.adaptation import Adapted
 from stiffopt.control.bracing import Bracing
-from stiffopt.control.checks import check_press, check_rates, limited_range
+from stiffopt.control.checks import check_brace, check_press, check_rates, limited_range
 from stiffopt.control.course import Course
 from stiffopt.control.forecast import Forecast
 from stiffopt.control.pressing import Pressing
 from stiffopt.control.replanning import AnyCourse, Pursuit
 from stiffopt.control.tuning import ControlTuning
-from stiffopt.errors import EquilibriumError, InputError, dotted
+from stiffopt.errors import EquilibriumError, InputError
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.scene import Scene
 from stiffopt.optimise.press import Press
@@ -24,7 +24,6 @@ from stiffopt.optimise.task import PressureRange, Task
 from stiffopt.optimise.tip import TipModel
 from stiffopt.paths.trajectory import Trajectory
 from stiffopt.rig.interface import PressureLimits
-from stiffopt.schema import BadKeyError
 
 Array = NDArray[np.float64]
 
@@ -134,15 +133,8 @@ class Requests:
 
     def _in_the_rigs_scene(self, task: Task) -> Task:
         """Return a task in the rig's scene; refuse it if the scene lacks the brace's objects."""
-        if self._scene is None:
-            raise InputError("brace: the rig file has no scene with objects to lean on")
-        on_rig = task.model_copy(update={"scene": self._scene})
-        assert on_rig.brace is not None
-        try:
-            on_rig.brace.check(on_rig)
-        except BadKeyError as error:
-            raise InputError(f"{dotted(error.loc)}: {error} (in the rig's scene)") from None
-        return on_rig
+        check_brace(task, self._scene)
+        return task.model_copy(update={"scene": self._scene})
 
     def _limited(self, task: Task) -> Task:
         """Return a task with the rig's limits of pressure as well; see `limited_range`."""

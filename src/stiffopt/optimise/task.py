@@ -22,6 +22,7 @@ from pydantic import (
     Field,
     Tag,
     ValidationInfo,
+    field_validator,
     model_validator,
 )
 from pydantic_core import PydanticKnownError
@@ -218,6 +219,15 @@ class Task(ForRobot):
     stiffness: StiffnessGoal | None = None
     press: Press | None = None
     brace: Brace | None = None
+
+    @field_validator("brace")
+    @classmethod
+    def _on_objects(cls, brace: Brace | None, info: ValidationInfo) -> Brace | None:
+        """Check the names whatever is wrong elsewhere, unless it is the scene."""
+        scene = info.data.get("scene")
+        if brace is not None and scene is not None:
+            brace.check_objects(scene)
+        return brace
 
     @model_validator(mode="after")
     def _can_lean(self) -> Task:
