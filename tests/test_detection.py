@@ -217,6 +217,32 @@ def test_two_clocks_are_made_one(by: float) -> None:
     np.testing.assert_array_equal(kept.pressures, log.commanded)
 
 
+@pytest.mark.parametrize(
+    ("begins", "late"),
+    [
+        ([0, 20, 40, 60], []),
+        ([0, 60, 20, 40], [2]),  # as a shell sorts 1, 10, 2, 3
+        ([60, 0, 20, 40], [1]),
+        ([0, 20, 0, 20], []),  # two days
+        ([0, 0, 0, 0], []),
+    ],
+)
+def test_logs_of_a_sequence_that_are_given_out_of_order_are_told(
+    begins: list[float], late: list[int]
+) -> None:
+    log, robot = log_of(duration=15.0), arm()
+    logs = [(str(begin), replace(log, time=log.time + begin)) for begin in begins]
+    for settings, expected in ((CalibrationSettings(sequence=True), late), (AS_RECORDED, [])):
+        found = recordings_of(robot, logs, settings)
+        told = [
+            i
+            for i, each in enumerate(found)
+            if "in the order of their times" in " ".join(each.remarks)
+        ]
+        assert told == expected
+        assert all(f"before {found[i - 1].name} begins" in found[i].remarks[-1] for i in told)
+
+
 def test_an_arm_that_lags_has_one_clock() -> None:
     robot, log = load_description("stiff-flop-1"), log_of(duration=80.0)
     for by in (0.0, 0.5, 1.0):
