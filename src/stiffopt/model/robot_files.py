@@ -62,9 +62,9 @@ def load_description(
         return robot
     if text not in builtin_robots():
         near = difflib.get_close_matches(text, builtin_robots(), n=1)
-        hint = f"did you mean '{near[0]}'? " if near else ""
+        hint = f"did you mean '{near[0]}'? The" if near else "the"
         raise InputError(
-            f"there is no robot '{text}'; {hint}The built-in robots are "
+            f"there is no robot '{text}'; {hint} built-in robots are "
             f"{', '.join(builtin_robots())}; the path of a robot file ends in .yaml"
         )
     with as_file(files("stiffopt").joinpath("robots", f"{text}.yaml")) as path:
