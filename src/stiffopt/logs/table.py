@@ -48,6 +48,11 @@ def read_table(path: str | os.PathLike[str]) -> Table:
         columns = tuple(part.strip() for part in header.decode("utf-8").split(","))
     except UnicodeDecodeError:
         raise FileError(name, "is not UTF-8 text", line=1) from None
+    for separator, word in ((";", "semicolons"), ("\t", "tabs")):
+        if len(columns) == 1 and separator in columns[0]:
+            raise FileError(
+                name, f"fields are separated by {word}; expected commas, and decimal points", line=1
+            )
     body = body.rstrip(b"\n")
     if not body:
         return Table(name, columns, np.empty((0, len(columns))))
