@@ -301,6 +301,7 @@ def test_mistakes_are_told(tmp_path: Path, old: str, new: str, line: int | None,
         (Safety, {"hold_timeout": "2 h"}, "at most 1 h, not '2 h'"),  # a time, or 'none'
         (Safety, {"ramp_time": "0 s"}, "greater than 0, not '0 s'"),
         (Safety, {"max_overruns": 2.5}, "a whole number, not 2.5"),
+        (Safety, {"max_overruns": float("nan")}, "a finite number, not nan"),
         (ControlSettings, {"damping": "120 %"}, "less than 100 %, not '120 %'"),
         (ModbusSettings, {"read_write": 3}, "read_write: expected true or false, not 3"),
         (NidaqDumpValve, {"line": "Dev1"}, "'Dev1' is not a name such as 'Dev1/port0/line0'"),

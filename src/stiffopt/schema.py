@@ -106,7 +106,12 @@ Pair = Annotated[tuple[ItemT, ItemT], BeforeValidator(items_of(2))]
 
 # pydantic's errors to sentences ------------------------------------------------------------------
 
-_EXPECTED = {"int": "a whole number", "bool": "true or false", "string": "text"}
+_EXPECTED = {
+    "bool": "true or false",
+    "finite": "a finite number",
+    "int": "a whole number",
+    "string": "text",
+}
 """What is expected, by the first word of a kind of mistake such as ``int_parsing``."""
 
 
