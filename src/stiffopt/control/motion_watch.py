@@ -164,9 +164,9 @@ class MotionWatch:
         offset :
             Estimated offset (6,) of the tip's pose from the model's, in m and rad.
         pressures :
-            Effective pressures (n,), in Pa.
+            Effective pressures (n,) at that time, in Pa.
         tip :
-            The model's tip at these pressures.
+            The model's tip now.
         turned :
             Rotation vector (3,) from the predicted orientation to that in the sample, in rad; None:
             not measured.
@@ -256,10 +256,16 @@ class MotionWatch:
 
     @property
     def _shares(self) -> Array:
-        """Permitted errors of the model (segments,), as shares of the motion by each segment."""
+        """Permitted errors of the model (segments,), as shares of the motion by each segment.
+
+        They go from the first to the learned ones with the motion that has shown these: twice the
+        largest of few errors bounds the next one badly.
+        """
         tuning = self._tuning
         learned = min(max(2 * self._error, tuning.least_error), tuning.model_error)
-        return np.where(self._verified > self._min_motion, learned, tuning.model_error)
+        known = self._verified / (self._verified + tuning.half_known)
+        shares: Array = tuning.model_error + known * (learned - tuning.model_error)
+        return shares
 
     def _forget(self) -> None:
         """Forget the error of the model: under a load the arm may respond otherwise."""
