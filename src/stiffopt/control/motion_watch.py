@@ -256,16 +256,10 @@ class MotionWatch:
 
     @property
     def _shares(self) -> Array:
-        """Permitted errors of the model (segments,), as shares of the motion by each segment.
-
-        They go from the first to the learned ones with the motion that has shown these: twice the
-        largest of few errors bounds the next one badly.
-        """
+        """Permitted errors of the model (segments,), as shares of the motion by each segment."""
         tuning = self._tuning
         learned = min(max(2 * self._error, tuning.least_error), tuning.model_error)
-        known = self._verified / (self._verified + tuning.half_known)
-        shares: Array = tuning.model_error + known * (learned - tuning.model_error)
-        return shares
+        return np.where(self._verified > self._min_motion, learned, tuning.model_error)
 
     def _forget(self) -> None:
         """Forget the error of the model: under a load the arm may respond otherwise."""
@@ -343,7 +337,8 @@ class MotionWatch:
         speeds = np.sqrt(((steps[:, _PREDICTED] @ P) ** 2).sum(axis=1)) / steps[:, _TIME]
         late = tuning.late * (speeds + speeds[-1])  # error by a delay of y, in m
         driven = rows[:-1, _DRIVEN] + rows[-1, _DRIVEN]
-        other = late + tuning.swing_error * driven + rows[:-1, _FREE] + 6 * tuning.scatter
+        other = tuning.swing_error * driven + rows[:-1, _FREE] + 6 * tuning.scatter
+        # an arm that is late will be so again: its delay is a part of the error that is learned
         error = float(((off - other)[far] / np.maximum(motion, distance)[far]).max())
         suspects = np.flatnonzero(far & (aside**2 + short**2 > (most * distance) ** 2))
         if not len(suspects):
@@ -351,7 +346,7 @@ class MotionWatch:
         length, model = ((ways[suspects, part] ** 2).sum(axis=1) for part in (_SEEN, _PREDICTED))
         own = own[suspects]
         own[length < tuning.still**2 * model] = 0.0  # a wrong model would move it somewhere
-        explained = own + other[suspects] + tuning.noise
+        explained = own + (late + other)[suspects] + tuning.noise
         worst = int(np.argmax(off[suspects] / explained))
         first = suspects[worst]
         share = float(off[first] / explained[worst])

@@ -346,12 +346,10 @@ class MotionTuning:
     spacing: float = 0.02  # minimum time between two samples that are compared, in s
     longest_pause: float = 0.1  # without control, after which samples are not compared, in s
     # error of the model, as a share of the motion that each segment causes: at first, and the least
-    # that is permitted of an arm that has followed its model; motion of the tip by a segment, in m,
-    # that takes the permitted error halfway to the learned one; and time after which a motion has
-    # proven to be no fault, in s
+    # that is permitted of an arm that has followed its model; time after which a motion has proven
+    # to be no fault, in s
     model_error: float = 0.35
     least_error: float = 0.15
-    half_known: float = 0.01
     proven_after: float = 2.0
     # displacement of the tip at rest, in m, within a time, in s, after which it has to prove itself
     # again: a payload may change its response
