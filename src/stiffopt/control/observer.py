@@ -220,8 +220,8 @@ class ArmObserver:
             if turned is not None:
                 turned = turned - turn_of_a_push(tip, along_stiff_axis=True) @ pushed
         self.watch.take(
-            sample.time, sample.position - pushed, predicted, self.tip.offset, effective, tip,
-            turned=turned, swings=self.tip.swings, deviation=self.tip.deviation,
+            sample.time, sample.position - pushed, predicted, self.tip.offset, self.tip.captured,
+            tip, turned=turned, swings=self.tip.swings, deviation=self.tip.deviation,
         )  # fmt: skip
 
     def lean_on(self, leaning: LeaningTip | None) -> Array:
