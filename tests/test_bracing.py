@@ -596,16 +596,53 @@ def test_an_arm_that_is_let_down_is_not_told_to_slip(approach):
     """The silicone follows its pressures late, so its tip is off the model's at each of them."""
     course, tip, p = held(approach), approach.tips[-1], approach.pressures[-1]
     samples(course, approach, np.zeros(3), 40)
-    course.is_steered = False
     lifting = pushed(approach, (1.0, 0, 0))
     for share in (0.95, 0.9, 0.8):
         for _ in range(8):
+            course.follow(False, share * p)
             course.look(0.025, tip.pose[:3, 3] + lifting, tip, share * p)
     assert course.phase is BracePhase.HELD
     assert [notice.kind for notice in course.notices()] == ["braced"]
+    course.follow(False, p)
     for _ in range(20):  # held, at the same pressures, a contact that is lost is told
         course.look(0.025, tip.pose[:3, 3] + lifting, tip, p)
     assert course.phase is BracePhase.RELEASING
+
+
+def test_an_arm_that_is_let_down_has_no_contacts_and_no_alarm(approach):
+    course = held(approach)
+    samples(course, approach, np.zeros(3), 40)
+    samples(course, approach, pushed(approach, 0.9 * lift_off(approach)), 40)
+    assert course.contacts == "uncertain"
+    assert course.held
+    assert any(notice.standing for notice in course.notices())
+    course.follow(False, approach.pressures[-1])  # held by others, still in contact
+    assert course.contacts == "uncertain"
+    course.follow(False, np.zeros_like(approach.pressures[-1]))
+    assert (course.contacts, course.held) == ("", ())
+    assert np.isnan([course.force, course.deviation, course.margin]).all()
+    assert not any(notice.standing for notice in course.notices())
+
+
+def test_all_contacts_that_lift_off_together_are_lost(approach):
+    hold = approach.hold
+    both = replace(
+        approach,
+        contacts=(approach.contacts[0], approach.contacts[0]._replace(object="rib")),
+        hold=hold._replace(
+            forces=np.repeat(hold.forces, 2),
+            deviations=np.zeros(2),
+            per_pressure=np.repeat(hold.per_pressure, 2, axis=0),
+            per_push=np.repeat(hold.per_push, 2, axis=0),
+        ),
+    )
+    course = held(both)
+    samples(course, both, np.zeros(3), 40)
+    samples(course, both, pushed(both, 3.5 * lift_off(approach)), 80)
+    assert [(each.object, each.state) for each in course.held] == [
+        ("post", "lost"),
+        ("rib", "lost"),
+    ]
 
 
 def test_an_error_of_the_model_and_creep_are_no_push(approach):

@@ -103,7 +103,7 @@ def run(
 
 def _read_task(path: str, robot: RobotDescription, scene: Scene | None) -> Task:
     """Read a task file; raise `FileError` if it is wrong, or for another robot or scene."""
-    from stiffopt.control.checks import check_brace
+    from stiffopt.control.checks import check_scene
     from stiffopt.optimise.task import load_task
 
     task = load_task(path)
@@ -111,7 +111,7 @@ def _read_task(path: str, robot: RobotDescription, scene: Scene | None) -> Task:
     if asked != robot.name:
         reason = f"is for the robot '{asked}'; this rig has '{robot.name}'"
         raise FileError(path, reason, key="robot")
-    check_brace(task, scene)
+    check_scene(task, scene)
     return task
 
 

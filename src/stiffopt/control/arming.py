@@ -30,6 +30,7 @@ NO_SLEW = (
     "pressure.slew in the robot file"
 )
 """Why a rig without a limit of slew is not armed."""
+_LONGEST_PATIENCE = 2.0  # s, greatest safety.guard_timeout
 _BUSY = 1.0  # load of a processor above which programs wait
 
 # limits of how a vented arm may differ from when it was commissioned
@@ -232,7 +233,7 @@ def late_ticks(lateness: float, guard_timeout: float, load: float = 0.0) -> str:
         "when it started"
     )
     patience = max(0.1, math.ceil(20 * 2.5 * lateness) / 20)
-    if patience > guard_timeout:
+    if guard_timeout < patience <= _LONGEST_PATIENCE:
         advice += (
             f"; if neither helps, set 'safety.guard_timeout: {1e3 * patience:.0f} ms' in the rig "
             "file"

@@ -94,6 +94,7 @@ class Bracing:
     ----------
     phase : the present phase.
     is_steered : whether the pressures follow this course; if not, they are held or let down.
+    is_let_down : whether the pressures have been let down, so that nothing is known of contacts.
     next : task to pursue after the release; None: the arm stays at rest.
     force : normal force of the least certain contact, as estimated, in N; NaN without contact.
     deviation : standard deviation of that force, in N.
@@ -105,7 +106,7 @@ class Bracing:
 
     def __init__(self, task: Task, tuning: BracingTuning) -> None:
         self.task, self._tuning = task, tuning
-        self.phase, self.is_steered = BracePhase.PLANNING, True
+        self.phase, self.is_steered, self.is_let_down = BracePhase.PLANNING, True, False
         self.next: Task | None = None
         self.force = self.deviation = self.margin = math.nan
         self.push, self.displacement = np.zeros(3), np.zeros(3)
@@ -147,8 +148,8 @@ class Bracing:
 
     @property
     def contacts(self) -> str:
-        """State of the contacts: `held`, `uncertain` or `lost`; empty before the arm leans."""
-        if self.phase is BracePhase.HELD:
+        """State of the contacts: `held`, `uncertain` or `lost`; empty if the arm does not lean."""
+        if self.phase is BracePhase.HELD and not self.is_let_down:
             return "uncertain" if self._doubt else "held"
         return "lost" if self._why else ""
 
@@ -194,6 +195,16 @@ class Bracing:
         self._change = np.zeros_like(pressures)
         self._estimated = np.full((len(approach.contacts), 2), np.nan)
         self.phase = BracePhase.TO_REST
+
+    def follow(self, is_steered: bool, pressures: Array) -> None:
+        """Take in, at a tick, whether the effective pressures (n,), in Pa, follow this course."""
+        self.is_steered = is_steered
+        off = 0.0 if self.approach is None else float(np.abs(pressures - self.pressures).max())
+        self.is_let_down = not is_steered and off > self._tuning.let_down
+        if self.is_let_down:
+            self._concerns.clear()
+            self._estimated[:] = self.force = self.deviation = self.margin = math.nan
+            self.push = self.displacement = np.zeros(3)
 
     def release(self, then: Task | None = None, why: str = "", lost: Iterable[int] = ()) -> None:
         """Release the contacts, then pursue the task `then`.
@@ -290,8 +301,7 @@ class Bracing:
             quaternion = None
         if not (held or self.phase is BracePhase.APPROACHING):
             return
-        off_plan = t.off_plan if self.is_steered else t.let_down
-        if float(np.abs(pressures - self.pressures).max()) > off_plan:
+        if self.is_let_down or float(np.abs(pressures - self.pressures).max()) > t.off_plan:
             return
         sticks = self._sticks
         creep = t.creep * elapsed / (t.creep_time + self._held) if held else 0.0
@@ -395,10 +405,9 @@ class Bracing:
         self._slid = self._slid + 1 if slid.any() else 0
         if self._slid < t.samples:
             return False
-        most = int(np.where(slid, sizes, 0.0).argmax())
-        slider = approach.hold.sticking.own[most]
-        where = self._named(slider)
-        self.release(why=f"{where} has slid by {1e3 * sizes[most]:.1f} mm", lost=[slider])
+        most, own = int(np.where(slid, sizes, 0.0).argmax()), approach.hold.sticking.own
+        why = f"{self._named(own[most])} has slid by {1e3 * sizes[most]:.1f} mm"
+        self.release(why=why, lost=[own[int(i)] for i in np.flatnonzero(slid)])
         return True
 
     def _feels(self, off: Array, push: Array, before: Array) -> bool:
@@ -528,8 +537,9 @@ class Bracing:
         self.margin = max(left - size, 0.0)
         words = f"under a push of {1e3 * size:.0f} mN"
         if (most < 0).any():
-            lifted = int(most.argmin())
-            self.release(why=f"{self._named(lifted)} lifts off {words}", lost=[lifted])
+            lifted = self._named(int(most.argmin()))
+            lost = np.flatnonzero(most < 0).tolist()
+            self.release(why=f"{lifted} lifts off {words}", lost=lost)
             return
         slid, found = self._friction.slid(self.push, before), {}
         kind, how = (_UNCERTAIN, "may slide") if self._sticks else (_SLIPS, "slips")

@@ -304,7 +304,7 @@ class TipController:
         self._arm.touch.stiffness_error = self.replanner.deviation
         course, steers = self.replanner.pursuit.course, not self._is_held(now)
         if isinstance(course, Bracing):
-            course.is_steered = steers
+            course.follow(steers, self._arm.pressures.effective)
         swings = now - self._moved_at < self._tuning.estimator.swings_on
         self._arm.tip.learns = steers and swings
         counts = self._arm.observe(now, commanded, reading, samples, course)

@@ -106,7 +106,7 @@ class Report:
             wrench_covariance=covariance.ravel(),
             press_force=press_force,
             press_goal=press_goal,
-            brace="" if bracing is None else bracing.phase.value,
+            brace="" if bracing is None or bracing.is_let_down else bracing.phase.value,
             brace_contacts="" if bracing is None else bracing.contacts,
             brace_force=math.nan if bracing is None else bracing.force,
             brace_force_deviation=math.nan if bracing is None else bracing.deviation,

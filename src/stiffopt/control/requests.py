@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from stiffopt.control.adaptation import Adapted
 from stiffopt.control.bracing import Bracing
-from stiffopt.control.checks import check_brace, check_press, check_rates, limited_range
+from stiffopt.control.checks import check_press, check_rates, check_scene, limited_range
 from stiffopt.control.course import Course
 from stiffopt.control.forecast import Forecast
 from stiffopt.control.pressing import Pressing
@@ -57,6 +57,7 @@ class Requests:
 
     def of_task(self, task: Task) -> Pursuit:
         """Return the pursuit of a task, which may press or brace."""
+        check_scene(task, self._scene)
         course: AnyCourse | None = None
         if task.press is not None:
             if task.press.speed > self._tip_speed:
@@ -68,7 +69,7 @@ class Requests:
                 )
             course = Pressing(task.press, task.target, self._tuning.pressing)
         elif task.brace is not None:
-            task = self._in_the_rigs_scene(task)
+            task = task.model_copy(update={"scene": self._scene})
             course = Bracing(task, self._tuning.bracing)
         return Pursuit.of(task, self._limited(task), course)
 
@@ -115,8 +116,8 @@ class Requests:
             self._check_speed(times, self._parts(request.pressures, adapted))
         if isinstance(request, Task):
             check_press(self._robot, self._limits, request)
+            check_scene(request, self._scene)
             if request.brace is not None:
-                self._in_the_rigs_scene(request)
                 return
         if forecast is None or leans:
             return
@@ -130,11 +131,6 @@ class Requests:
                 course = Course(request, 0.0, here.position, here.rotation)
                 request = course.at(0.0)
             forecast.check(self.of_target(request, here.pursuit, course))
-
-    def _in_the_rigs_scene(self, task: Task) -> Task:
-        """Return a task in the rig's scene; refuse it if the scene lacks the brace's objects."""
-        check_brace(task, self._scene)
-        return task.model_copy(update={"scene": self._scene})
 
     def _limited(self, task: Task) -> Task:
         """Return a task with the rig's limits of pressure as well; see `limited_range`."""

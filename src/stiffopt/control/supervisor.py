@@ -521,7 +521,7 @@ class Supervisor:
         if self.lifecycle.state is State.UNCONFIGURED:
             self.controller.begin(self._clock.now())
             self.lifecycle.change(State.INACTIVE)
-            self.events.add(now, "configured", "everything answers; vented")
+            self.events.add(self._clock.now(), "configured", "everything answers; vented")
 
     def arm(
         self, now: float, unwanted: Callable[[], bool] = lambda: False, lateness: float = 0.0

@@ -391,8 +391,11 @@ def _size(problem: BracedProblem, name: str, radius: float) -> float:
 
 def at_rest(problem: BracedProblem) -> str:
     """Return a message if an object that is in place pushes the arm aside at rest, or ""."""
-    inside = inside_at_rest(problem.robot, problem.scene)
+    robot, scene = problem.robot, problem.scene
+    inside = inside_at_rest(robot, scene)
     if not inside or problem.brace.approach == "objects":
+        return ""
+    if robot.clearance(np.zeros(robot.n_pressures), scene) >= 0:  # its weight moves it away
         return ""
     return f"{inside}, which is taken to push it aside; correct the object's place if it does not"
 
