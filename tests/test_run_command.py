@@ -101,7 +101,7 @@ def test_what_cannot_be_run_is_refused(
     assert "robot 'stiff-flop-2-hanging'; this rig has 'stiff-flop-1'" in other
     rib = str(ROOT / "problems" / "leaning_on_a_rib.yaml")
     other = refused(capsys, str(ROOT / "rig" / "brace.yaml"), *alone, rib)
-    assert "brace.objects: there is no object 'rib' in the scene; it has 'post'" in other
+    assert "brace.objects[0]: there is no object 'rib' in the scene; it has 'post'" in other
     monkeypatch.setenv("NOTIFY_SOCKET", "/nowhere")
     assert "must not arm by itself" in refused(capsys, rig, "--arm", "--task", task)
 

@@ -28,7 +28,7 @@ from pydantic import (
 from pydantic_core import PydanticKnownError
 
 from stiffopt.directions import Frame
-from stiffopt.errors import FileError, InputError
+from stiffopt.errors import FileError, InputError, dotted
 from stiffopt.files import SourceFile, line_of, read_file
 from stiffopt.model.description import RobotDescription, one_or_list
 from stiffopt.model.robot_files import load_description
@@ -193,9 +193,11 @@ class ForRobot(Schema, ShownInNotebook):
 
     def error_at(self, key: str, reason: str) -> InputError:
         """Return an error about a key, with file and line if this was read from a file."""
+        place = [int(step) if step.isdigit() else step for step in key.split(".")]
+        key = dotted(place)
         if self.source is None:
             return InputError(f"{type(self).__name__}.{key}: {reason}")
-        return FileError(self.source, reason, line=line_of(self.source, *key.split(".")), key=key)
+        return FileError(self.source, reason, line=line_of(self.source, *place), key=key)
 
 
 class Task(ForRobot):
