@@ -15,8 +15,8 @@ The tip goes along an arc, so sigma grows with the square of what it is moved by
 
 With the model's normal forces N0 before the push, and their derivatives G by it, those under the
 push are N = N0 + G F. What is wrong with N0, F and the model's response has the deviation s. Part
-of s is the force that a push would take away which moves the tip as b has, beyond creep, since the
-arm settled. Nobody knows whether that is a push. Then
+of s is the force that a push may have taken away which moves the tip as y - s has changed since the
+arm settled, but for F. Nobody knows how much of that is creep. Then
 
 - the contacts are *held* while N > 2 s, or while no push is felt and b has not drifted. A force
   that is badly known at rest is stated with its deviation, and is no reason to let go;
@@ -112,7 +112,7 @@ class Bracing:
         self.push, self.displacement = np.zeros(3), np.zeros(3)
         self.covariance: Array = tuning.usual_push**2 * np.eye(3)
         self._error: Array | None = None  # b (3,)
-        self._settled: Array = np.zeros(3)  # b when the arm had settled
+        self._settled: Array = np.zeros(3)  # y - s when the arm had settled
         self._corrected: Array = np.zeros(3)  # of late, by the model; friction may withhold it
         self._residual: Array = np.zeros(3)  # y - s, smoothed over vibrations
         self._held = self._pushed = 0.0  # durations, in s
@@ -307,7 +307,7 @@ class Bracing:
         creep = t.creep * elapsed / (t.creep_time + self._held) if held else 0.0
         friction.follow(pressures, min(elapsed / t.even_time, 1.0), creep)
         residual = seen - tip.pose[:3, 3]
-        if sticks:
+        if sticks and held:  # linearised there: on the way its forces are not those of friction
             residual = residual - friction.tip[:3] @ friction.forces
         if self._error is None:
             self._residual = residual
@@ -342,46 +342,51 @@ class Bracing:
             if not settles and self._has_slid(elapsed, seen, quaternion, pressures):
                 return
         push, covariance = self._push(C, R, off)
-        feels = self._feels(off, push, before)
-        if settles or not feels or (self._pushed > t.longest_push and not self._doubt):
+        feels = not settles and self._feels(off, push, before)
+        if settles:
+            self._settled = residual
+        drift = self._drift(C, R, residual - self._settled - float(feels) * off, tip, pressures)
+        if not feels or (self._pushed > t.longest_push and not self._doubt):
             time = t.settling_time if settles else t.error_time
             self._error = self._error + min(elapsed / time, 1.0) * raw
-            if settles:
-                self._settled = self._error
             self._pushed = self._pushed * float(feels)
             self.push = self.displacement = np.zeros(3)
-            self._rest(before, self._drift(C, R, tip, pressures), elapsed)
+            self._rest(before, drift, elapsed)
             return
         self._pushed += elapsed
         if sticks and not self._doubt:  # what stays is creep in the end
             self._error = self._error + min(elapsed / t.push_creeps, 1.0) * raw
         self.push, self.displacement = push, off
         self.covariance[:] = covariance
-        self._judge(before, self._drift(C, R, tip, pressures), elapsed)
+        self._judge(before, drift, elapsed)
 
-    def _push(self, C: Array, rotation: Array, off: Array) -> tuple[Array, Array]:
+    def _push(
+        self, C: Array, rotation: Array, off: Array, creep: float = 0.0
+    ) -> tuple[Array, Array]:
         """Return the most likely push (3,) that moves the tip by `off` (3,), and its covariance.
 
-        `C`: compliance (3, 3) of the tip, base axes.
+        `C`: compliance (3, 3) of the tip, base axes; `creep`: deviation of what else moves the tip,
+        in m.
         """
-        usual = self._usual(rotation)
-        gain = np.linalg.solve(C @ usual @ C.T + self._noise(off), C @ usual).T
+        usual, noise = self._usual(rotation), self._noise(off) + creep**2 * np.eye(3)
+        gain = np.linalg.solve(C @ usual @ C.T + noise, C @ usual).T
         return gain @ off, usual - gain @ C @ usual
 
-    def _drift(self, C: Array, rotation: Array, tip: TipAt, pressures: Array) -> Array:
+    def _drift(
+        self, C: Array, rotation: Array, change: Array, tip: TipAt, pressures: Array
+    ) -> Array:
         """Return the forces (k,) that contacts may have lost since settling, unknown to anybody.
 
-        A push that lasts becomes part of b. So does creep, which moves the tip as if the pressures
-        grew, and this part does not count. See `_push` for `C`.
+        A push that lasts becomes part of b, and one that is not felt may be taken for a correction
+        that friction withholds. Creep moves the tip too, in any direction where friction holds the
+        body; its deviation is what the tip would move if the pressures grew. `change`: of y - s,
+        without what is felt (3,); see `_push` for `C`.
         """
-        t = self._tuning
-        assert self._error is not None
-        change, began = self._error - self._settled, t.creep_time + self._settling
+        t, began = self._tuning, self._tuning.creep_time + self._settling
         folds = math.log(max((t.creep_time + self._held) / began, 1.0))
-        creep = t.most_creep * folds * float(np.linalg.norm(tip.jacobian[:3] @ pressures))
-        size = float(np.linalg.norm(change))
-        change = max(0.0, 1 - creep / max(size, 1e-12)) * change
-        found: Array = np.maximum(-(self._per_push @ self._push(C, rotation, change)[0]), 0.0)
+        creep = t.unknown_creep * folds * float(np.linalg.norm(tip.jacobian[:3] @ pressures))
+        push = self._push(C, rotation, change, creep)[0]
+        found: Array = np.maximum(-(self._per_push @ push), 0.0)
         return found
 
     def _has_slid(
