@@ -130,6 +130,7 @@ def test_columns_may_be_in_any_order(tmp_path: Path) -> None:
         ("time_s,p1_pa,x,y,z\n0,1,2,3,4\n", 1, "missing; nothing is known of 'x', 'y', 'z'"),
         (f"{NAMES.replace(',', ';')}\n0;1;2;3,5;4;5\n", 1, "by semicolons; expected commas"),
         (f"{NAMES.replace(',', chr(9))}\n0\t1\t2\t3\t4\t5\n", 1, "separated by tabs"),
+        ("# A lab.\nformat: stiffopt-rig/1\nrobot: x\n", 2, "is a rig file; expected a table"),
         (f"{NAMES},pm1_pa\n0,1,2,3,4,5,6\n", 1, "'pm2_pa' is missing"),
         (f"{NAMES},tip_qw\n0,1,2,3,4,5,6\n", 1, "'tip_qx' is missing"),
         (f"{NAMES},mid_x_m\n0,1,2,3,4,5,6\n", 1, "'mid_y_m' is missing"),
