@@ -109,8 +109,8 @@ def _with_frames_found(setup: Setup, found: tuple[Comparison, ...]) -> tuple[Com
             continue
         remark = (
             f"the frame of this log was defined anew: its poses are {words[i]}, and the mean error "
-            f"is {after.errors.mean * 1e3:.1f} mm instead of {before.errors.mean * 1e3:.1f} mm; "
-            "--keep axes leaves them"
+            f"is {after.errors.mean * 1e3:.1f} mm instead of {before.errors.mean * 1e3:.1f} mm "
+            "(--keep axes leaves them); a log of another arm may look so too"
         )
         again[i] = replace(after, remarks=(*after.remarks, remark))
     return tuple(again)
