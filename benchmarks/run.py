@@ -36,6 +36,7 @@ from sections import (
     rates,
 )
 from settings import Settings, quick
+from stiffopt.errors import MissingExtraError
 
 HERE = Path(__file__).resolve().parent
 OUT = HERE.parent / "out" / "bench"
@@ -68,7 +69,11 @@ def run(sizes: Settings, only: list[str], out: Path, update: bool) -> bool:
             continue
         started = perf_counter()
         print(f"{name} ...", end=" ", flush=True)
-        done[name] = measure(sizes)
+        try:
+            done[name] = measure(sizes)
+        except MissingExtraError as error:
+            print(f"left out: {error}")
+            continue
         print(f"{perf_counter() - started:.0f} s", flush=True)
     counted = counts.count()
     if "build" in done and not sizes.quick:

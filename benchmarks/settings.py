@@ -39,10 +39,10 @@ class Settings:
     batch_tasks: int = 2000
     paths: int = 12
     scene_paths: int = 10
-    reference_paths: int = 3
+    reference_paths: int = 1
     reference_points: int = 60
     lattice: int = 2500
-    path_starts: int = 20
+    path_starts: int = 8
 
     @property
     def few_segments(self) -> tuple[int, ...]:

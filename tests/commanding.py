@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from fake_bench import FakeBench
 from fake_control import FakeController
+from fake_supply import HandClock
 from stiffopt.control.loop import ControlLoop
 from stiffopt.errors import StiffoptError
 from stiffopt.experiments.conductor import Conductor
@@ -46,19 +47,6 @@ PERIOD = 0.01
 ROBOT = load_description("stiff-flop-1")
 AREAS = np.array(ROBOT.channel_areas)
 ROBOT_HIGH = 1.5e5
-
-
-class HandClock(Clock):
-    """Time that passes only while somebody sleeps."""
-
-    def __init__(self) -> None:
-        self.t = 50.0
-
-    def now(self) -> float:
-        return self.t
-
-    def sleep_until(self, moment: float) -> None:
-        self.t = max(self.t, moment)
 
 
 @dataclass(frozen=True)

@@ -19,8 +19,8 @@ N = 6
 class ManualClock(Clock):
     """Time that stands still until a test moves it."""
 
-    def __init__(self) -> None:
-        self.time = 100.0
+    def __init__(self, time: float = 100.0) -> None:
+        self.time = time
 
     def now(self) -> float:
         return self.time

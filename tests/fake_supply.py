@@ -15,7 +15,10 @@ SLEW = np.array([5e5, 2e5, 1e5])
 
 
 class HandClock(Clock):
-    t = 50.0
+    """Time that passes only while somebody sleeps, or where a test moves it."""
+
+    def __init__(self, t: float = 50.0) -> None:
+        self.t = t
 
     def now(self) -> float:
         return self.t

@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt.control.state import Alarm, Event, Severity, Snapshot, State, Timing
-from stiffopt.rig.device import Clock
 from stiffopt.rig.interface import PoseSample
 
 Array = NDArray[np.float64]
@@ -17,17 +16,6 @@ LATENCY = 0.025  # s
 BEGIN = 5000.0  # s on the rig's clock
 N = 6
 LOW, HIGH = np.zeros(N), np.full(N, 1.5e5)
-
-
-class StillClock(Clock):
-    def __init__(self, time: float = BEGIN) -> None:
-        self.time = time
-
-    def now(self) -> float:
-        return self.time
-
-    def sleep_until(self, moment: float) -> None:
-        self.time = max(self.time, moment)
 
 
 class FakeEvents:

@@ -15,7 +15,7 @@ import textwrap
 import threading
 import time
 import tty
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,7 @@ import numpy as np
 import pytest
 
 from fake_bench import FakeBench
+from running import wait_for
 from stiffopt.errors import DeviceError, InputError, MissingExtraError
 from stiffopt.lab.aurora_peer import AuroraPeer, crc16
 from stiffopt.rig.drivers import ndi_reader
@@ -54,13 +55,6 @@ def peer(firmware: str = "AURORA Rev 013", **settings: Any) -> Iterator[AuroraPe
 def tracked(firmware: str = "AURORA Rev 013", **settings: Any) -> Iterator[tuple[Any, ...]]:
     with peer(firmware, **settings) as device, device.settings.device() as tracker:
         yield tracker, device.bench, device
-
-
-def wait_for(condition: Callable[[], Any], patience: float = 8.0) -> None:
-    end = time.monotonic() + patience
-    while not condition():
-        assert time.monotonic() < end, "it did not come about"
-        time.sleep(0.01)
 
 
 def next_sample(tracker: AuroraTracker) -> PoseSample:

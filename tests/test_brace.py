@@ -20,7 +20,7 @@ from conftest import use_compiler
 from stiffopt.cli.main import main
 from stiffopt.cli.solve_report import block
 from stiffopt.cli.solved_task import SolvedTask, with_uncertainty
-from stiffopt.errors import DerivativeError, InputError, OutOfTimeError
+from stiffopt.errors import DerivativeError, FileError, InputError, OutOfTimeError
 from stiffopt.model.calibration import Calibration
 from stiffopt.optimise import braced
 from stiffopt.optimise.brace_uncertainty import BraceUncertainty
@@ -338,6 +338,14 @@ def test_refusals(tmp_path, old, new, message):
     assert message in str(caught.value)
 
 
+def test_a_wrong_name_is_told_beside_mistakes_elsewhere(tmp_path):
+    text = TASK.replace("[post]", "[pots]").replace("[-30 mm, 10 mm", "[-30, 10 mm")
+    with pytest.raises(FileError) as caught:
+        stiffopt.load_task(written(tmp_path, text))
+    keys = [each.key for each in (caught.value, *caught.value.others)]
+    assert keys == ["target.position[0]", "brace.objects[0]"]
+
+
 def test_nothing_sticks_to_an_object_without_friction(tmp_path):
     text = TASK.replace("20 mN}", "20 mN, contacts: sticking}")
     assert stiffopt.load_task(written(tmp_path, text)).brace.contacts == "sticking"
@@ -367,6 +375,19 @@ def test_the_reason_for_no_brace(tmp_path, robot, old, new, message):
     found = stiffopt.solve_pressure(robot, stiffopt.load_task(written(tmp_path, text)))
     assert not found.contacts
     assert message in found.message
+
+
+@pytest.mark.parametrize(
+    ("x", "approach", "message"),
+    [(-35, "pressures", ""), (-5, "pressures", "15 mm inside 'post'"), (-5, "objects", "")],
+)
+def test_an_object_that_is_in_the_arm_at_rest_is_told(tmp_path, robot, x, approach, message):
+    text = TASK.replace("[-35 mm, ", f"[{x} mm, ").replace(
+        "20 mN}", f"20 mN, approach: {approach}}}"
+    )
+    problem = BracedProblem(robot, stiffopt.load_task(written(tmp_path, text)))
+    assert message in braced.at_rest(problem)
+    assert bool(message) == bool(braced.at_rest(problem))
 
 
 def test_a_rigid_object_at_the_tip_is_no_brace(tmp_path, robot):

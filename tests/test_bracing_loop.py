@@ -273,6 +273,50 @@ def test_the_loop_tells_that_there_is_nothing_to_lean_on():
     loop.controller.close()
 
 
+SCENE = TASK.scene
+POST = SCENE.objects[0]
+EYE = stiffopt.SceneObject(name="eye", sphere={"centre": (-0.055, 0.01, 0.175), "radius": 0.012})
+
+
+def own(**changes) -> stiffopt.Task:
+    return TASK.model_copy(update={"scene": SCENE.model_copy(update=changes)})
+
+
+@pytest.mark.parametrize(
+    ("task", "reason"),
+    [
+        (own(objects=(POST, EYE)), "the rig has no object 'eye'"),
+        (own(clearance=SCENE.clearance + 1e-3), "its clearance is greater"),
+        (
+            own(objects=(POST.model_copy(update={"capsule": None, "sphere": EYE.sphere}),)),
+            "'post' has another place or shape in the rig's scene",
+        ),
+        (
+            own(objects=(POST.model_copy(update={"contact": POST.contact.model_copy(
+                update={"max_force": 0.1})}),)),
+            "'post' may be pressed with more than 'max_force' in the rig's scene",
+        ),
+        (own(objects=(EYE,)).model_copy(update={"brace": None}), "the rig has no object 'eye'"),
+    ],
+)  # fmt: skip
+def test_a_task_may_not_ask_for_more_than_the_scene_of_the_rig(task, reason):
+    loop = Loop()
+    for give in (loop.controller.check_ahead, loop.controller.set_task):
+        with pytest.raises(
+            InputError, match=f"{reason}.*on a rig the scene of the rig file counts"
+        ):
+            give(task)
+    loop.controller.close()
+
+
+def test_a_task_may_ask_for_less_than_the_scene_of_the_rig():
+    loop = Loop(scene=SCENE.model_copy(update={"objects": (POST, EYE), "clearance": 2e-3}))
+    shifted = float(np.nextafter(POST.capsule.radius, 1.0))  # rounded otherwise
+    post = POST.model_copy(update={"capsule": POST.capsule.model_copy(update={"radius": shifted})})
+    loop.controller.check_ahead(own(objects=(post,), clearance=1e-3))
+    loop.controller.close()
+
+
 # -- motions ----------------------------------------------------------------------------------
 
 

@@ -26,6 +26,7 @@ from stiffopt.cli.main import main
 from stiffopt.errors import CancelledError, FileError, InputError
 from stiffopt.files import save_file
 from stiffopt.identify.calibration import CalibrationResult, calibrate
+from stiffopt.identify.results import what_to_look_at
 from stiffopt.identify.settings import CalibrationSettings
 from stiffopt.identify.structures import STRUCTURES
 from stiffopt.logs import (
@@ -148,6 +149,12 @@ def test_the_calibrated_file_says_what_it_came_from(folder: Path) -> None:
     robot = load_description(folder / "fitted.yaml")
     assert robot.calibration is not None
     assert robot.calibration.logs == ("monday.csv", "tuesday.csv")
+
+
+def test_logs_of_a_fit_that_misses_them_may_be_of_several_arms() -> None:
+    log = stiffopt.validate("stiff-flop-1", [recorded(0)])[0]
+    for logs, told in ([log], False), ([log, log], True):
+        assert ("of the same arm" in what_to_look_at(logs, 0.1)) == told
 
 
 def test_a_fit_that_misses_its_own_logs_is_unfit(

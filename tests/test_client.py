@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import json
-import socket
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, suppress
+from collections.abc import Iterator
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
@@ -16,25 +13,23 @@ from typing import Any
 
 import numpy as np
 import pytest
-from websockets.exceptions import ConnectionClosed, InvalidStatus
-from websockets.sync.client import ClientConnection, connect
 
 from fake_loop import FakeLoop
-from stiffopt.control.state import Alarm, Severity, Snapshot, State, Timing
-from stiffopt.daemon import server as server_module
+from running import wait_for
+from serving import (
+    HEARTBEAT,
+    ROBOT,
+    TOKEN,
+    client_fixture,  # noqa: F401
+    loop_fixture,  # noqa: F401
+    server_fixture,  # noqa: F401
+)
+from stiffopt.control.state import Alarm, Severity, State, Timing
 from stiffopt.daemon.client import Client, ClientStream
-from stiffopt.daemon.messages import MAX_MESSAGE
 from stiffopt.daemon.server import (
-    MAX_CONNECTIONS,
-    MAX_STREAMS,
-    ConnectionLimiter,
-    LimitedConnection,
     Server,
 )
-from stiffopt.daemon.service import create_app
-from stiffopt.daemon.state_json import record_of
 from stiffopt.errors import CommandError, InputError, MissingExtraError, ServiceError
-from stiffopt.model.robot_files import load_description
 from stiffopt.optimise.goal import StiffnessGoal, StiffnessMeasure
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import Task
@@ -42,246 +37,11 @@ from stiffopt.paths.trajectory import Trajectory, Waypoint
 
 pytestmark = pytest.mark.real_time
 
-TOKEN = "a-secret-of-the-tests"
-HEARTBEAT = 1.0
-ROBOT = load_description("stiff-flop-2")
 
-
-@pytest.fixture
-def loop() -> FakeLoop:
-    return FakeLoop()
-
-
-@pytest.fixture
-def server(loop: FakeLoop) -> Iterator[Server]:
-    app = create_app(loop, robot=ROBOT, token=TOKEN, heartbeat=HEARTBEAT, patience=20.0)
-    server = Server(app)
-    server.start()
-    yield server
-    server.stop()
-    assert not server.alive
-
-
-@pytest.fixture
-def client(server: Server) -> Iterator[Client]:
-    with Client(server.url, TOKEN, name="planner") as client:
-        yield client
-
-
-def eventually(condition: Callable[[], bool], timeout: float = 15.0) -> None:
-    end = time.monotonic() + timeout
-    while not condition():
-        assert time.monotonic() < end, "this did not come about in time"
-        time.sleep(0.01)
-
-
-# Connections --------------------------------------------------------------------------------------
-
-
-def open_files() -> int:
-    return len(list(Path("/proc/self/fd").iterdir()))
-
-
-def test_connections_that_idle_or_dribble_keep_nobody_away_and_use_up_nothing(
-    loop: FakeLoop, server: Server
-) -> None:
-    asks = b"POST /v1/vent HTTP/1.1\r\nHost: localhost\r\nAuthorization: Bearer " + TOKEN.encode()
-    says = [b"", b"GET /v1/sta", asks + b"\r\nContent-Length: 9\r\n\r\n{"]
-    before = open_files()
-    with Client(server.url, TOKEN, name="planner") as client, ExitStack() as idle:
-        client.take_control()
-        for k in range(3 * MAX_CONNECTIONS):
-            other = idle.enter_context(socket.create_connection(("127.0.0.1", server.port), 10))
-            other.sendall(says[k % len(says)])
-        with Client(server.url, TOKEN) as late:
-            late.vent()
-        ends_of_ours = 3 * MAX_CONNECTIONS + 2
-        eventually(lambda: open_files() - before <= ends_of_ours + 2 * MAX_CONNECTIONS + 2)
-        assert "vent" in loop.names
-        other.sendall(b"       }")
-        last = other.recv(100)
-        assert last.startswith(b"HTTP/1.1 200")  # the newest were not dropped
-    eventually(lambda: open_files() <= before + 3)
-
-
-def test_streams_outlive_many_connections(server: Server) -> None:
-    with ExitStack() as stack, Client(server.url, TOKEN) as client:
-        client.take_control()
-        stream = stack.enter_context(client.stream(rate=50))
-        first = stream.state()
-        for _ in range(2 * MAX_CONNECTIONS):
-            stack.enter_context(socket.create_connection(("127.0.0.1", server.port), 10))
-        for _ in range(20):
-            assert stream.state().time == first.time
-
-
-def test_a_connection_on_which_nothing_is_answered_is_closed(
-    server: Server, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(server_module, "PATIENCE", 0.2)
-    for said in (b"", b"GET /v1/sta"):
-        with socket.create_connection(("127.0.0.1", server.port), 10) as silent:
-            silent.sendall(said)
-            with suppress(ConnectionResetError):
-                assert silent.recv(100) == b""
-
-
-def test_where_all_with_the_token_are_being_answered_the_newest_has_to_go(
-    loop: FakeLoop, server: Server, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(server_module, "MAX_CONNECTIONS", 2)
-    free = threading.Event()
-    waiting: list[str] = []
-
-    def gate(name: str) -> None:
-        waiting.append(name)
-        free.wait(20)
-
-    loop.gate = gate
-    asks = b"POST /v1/vent HTTP/1.1\r\nHost: localhost\r\nAuthorization: Bearer " + TOKEN.encode()
-    with ExitStack() as stack:
-        busy = []
-        address = "127.0.0.1", server.port
-        for _ in range(2):
-            busy.append(stack.enter_context(socket.create_connection(address, 20)))
-            busy[-1].sendall(asks + b"\r\n\r\n")
-        eventually(lambda: len(waiting) == 2)
-        late = stack.enter_context(socket.create_connection(address, 10))
-        late.sendall(asks + b"\r\n\r\n")
-        with suppress(ConnectionResetError):
-            assert late.recv(100) == b""
-        free.set()
-        for each in busy:
-            assert each.recv(100).startswith(b"HTTP/1.1 200")
-
-
-def dropping(member: LimitedConnection, dropped: list[LimitedConnection]) -> LimitedConnection:
-    member.drop = lambda: dropped.append(member)
-    return member
-
-
-def test_strangers_give_way_to_strangers_and_who_is_trusted_to_nobody() -> None:
-    limiter, dropped = ConnectionLimiter(), list[LimitedConnection]()
-    trusted = dropping(LimitedConnection(), dropped)
-    limiter.add(trusted)
-    assert limiter.trust(trusted)
-    strangers = [dropping(LimitedConnection(), dropped) for _ in range(MAX_CONNECTIONS + 3)]
-    for stranger in strangers:
-        limiter.add(stranger)
-    assert dropped == strangers[:3]
-    limiter.distrust(trusted)
-    assert dropped == strangers[:4]
-    assert not trusted.trusted
-
-
-def test_streams_with_and_without_the_token_have_limits_of_their_own() -> None:
-    limiter = ConnectionLimiter()
-    members = [LimitedConnection() for _ in range(2 * MAX_STREAMS + 2)]
-    for k, member in enumerate(members):
-        member.is_stream = True
-        limiter.add(member)
-        assert limiter.admit_stream(member) is (k < MAX_STREAMS)
-    for k, member in enumerate(members[MAX_STREAMS:]):
-        limiter.trust(member)
-        assert limiter.admit_stream(member) is (k < MAX_STREAMS)
-    assert not limiter.trust(members[0])  # that would be one too many, and it stays as it is
-    assert members[0].served
-    limiter.remove(members[-3])
-    assert limiter.admit_stream(members[-1])
-    limiter.remove(members[-2])
-    limiter.remove(members[-4])
-    assert limiter.trust(members[0])
-
-
-def test_handshakes_of_strangers_come_at_a_limited_rate() -> None:
-    now = [0.0]
-    limiter = ConnectionLimiter(clock=lambda: now[0])
-    assert sum(limiter.permits_handshake() for _ in range(200)) == 50
-    now[0] = 0.5
-    assert sum(limiter.permits_handshake() for _ in range(200)) == 25
-
-
-UPGRADE = (
-    b"GET /v1/stream HTTP/1.1\r\nHost: localhost\r\nUpgrade: websocket\r\n"
-    b"Connection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
-    b"Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n"
-)
-
-
-class Strangers:
-    """Threads that connect without a token, say something, and come again when they are closed."""
-
-    def __init__(self, server: Server, count: int, says: bytes) -> None:
-        self._server, self._says = server, says
-        self.opened, self.end = 0, time.monotonic() + 20
-        self._enough = threading.Event()
-        threads = [threading.Thread(target=self._run, daemon=True) for _ in range(count)]
-        self._threads = threads
-
-    def __enter__(self) -> Strangers:
-        for thread in self._threads:
-            thread.start()
-        eventually(lambda: self.opened > len(self._threads))
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._enough.set()
-        for thread in self._threads:
-            thread.join(10)
-
-    def _run(self) -> None:
-        while not self._enough.is_set() and time.monotonic() < self.end:
-            with (
-                suppress(OSError),
-                socket.create_connection(("127.0.0.1", self._server.port), 5) as other,
-            ):
-                self.opened += 1
-                other.sendall(self._says)
-                other.settimeout(0.2)
-                with suppress(TimeoutError):
-                    while other.recv(4096) and not self._enough.is_set():
-                        pass
-                self._enough.wait(0.2)
-
-
-@pytest.mark.parametrize("says", [UPGRADE, b"", b"GET /v1/sta"], ids=["stream", "silent", "slow"])
-def test_strangers_who_come_again_and_again_keep_the_tokens_holder_from_nothing(
-    loop: FakeLoop, says: bytes
-) -> None:
-    server = Server(create_app(loop, robot=ROBOT, token=TOKEN, heartbeat=30.0, patience=20.0))
-    server.start()
-
-    def soon(do: Callable[[], object]) -> None:
-        begin = time.monotonic()
-        do()
-        assert time.monotonic() - begin < 10  # half of the time that a stranger may take
-
-    with Strangers(server, 100 if says == UPGRADE else 200, says):
-        for _ in range(3):
-            with Client(server.url, TOKEN, name="planner", heartbeat="manual") as client:
-                soon(client.take_control)
-                stream = client.stream(rate=20)
-                soon(stream.__enter__)
-                for _ in range(5):
-                    soon(stream.state)
-                soon(client.vent)
-                stream.__exit__(None, None, None)
-                soon(client.release)
-    server.stop()
-    assert loop.names.count("vent") == 3
-
-
-def test_a_stream_for_which_there_is_no_room_may_show_the_token(server: Server) -> None:
-    with ExitStack() as stack:
-        for _ in range(MAX_STREAMS):
-            told(stack.enter_context(opened(server)), {})
-        with opened(server, "?rate=50") as one_more:
-            assert told(one_more, {"token": TOKEN}) == {"type": "access", "trusted": True}
-            assert json.loads(one_more.recv(timeout=20))["type"] == "state"
-        with opened(server, "?rate=50", Authorization=f"Bearer {TOKEN}") as trusted:
-            assert json.loads(trusted.recv(timeout=20))["type"] == "state"
-        with opened(server, "?rate=50") as stranger:  # no state before it is refused
-            assert json.loads(stranger.recv(timeout=20))["error"]["code"] == "busy"
+def drain(stream: ClientStream) -> None:
+    """Read states until that raises."""
+    for _ in range(1000):
+        stream.state()
 
 
 # Reading and commands -----------------------------------------------------------------------------
@@ -531,7 +291,7 @@ def test_without_heartbeat_the_arm_is_held(loop: FakeLoop, server: Server) -> No
             time.sleep(HEARTBEAT / 3)
             client.renew()
         assert loop.names == ["arm"]
-        eventually(lambda: loop.names == ["arm", "hold"])
+        wait_for(lambda: loop.names == ["arm", "hold"])
         assert "'hung'" in loop.calls[1][1]
         with pytest.raises(CommandError, match="control"):
             client.set_target(position=[0, 0, 0.2])
@@ -544,7 +304,7 @@ def test_the_heartbeat_ends_with_the_thread_that_took_control(
     thread.start()
     thread.join()
     assert client.in_control
-    eventually(lambda: loop.names == ["hold"])
+    wait_for(lambda: loop.names == ["hold"])
 
 
 def test_a_program_that_fails_leaves_the_arm_held(loop: FakeLoop, server: Server) -> None:
@@ -579,7 +339,7 @@ def test_targets_are_streamed_and_states_come_back(loop: FakeLoop, server: Serve
             while time.monotonic() < end:  # streaming is heard
                 stream.send(position=[0, 0, 0.2])
                 assert stream.state().time == 12.5
-            eventually(lambda: stream.accepted + stream.superseded >= 10)
+            wait_for(lambda: stream.accepted + stream.superseded >= 10)
         assert set(loop.names) == {"set_target"}
         assert loop.calls[-1][1].position == (0, 0, 0.2)
         client.release()
@@ -597,7 +357,7 @@ def test_a_refused_target_is_raised_at_the_next_call(loop: FakeLoop, client: Cli
             drain(stream)
         loop.refusal = None
         stream.send(position=[0, 0, 0.2])
-        eventually(lambda: stream.accepted == 1)
+        wait_for(lambda: stream.accepted == 1)
 
 
 def test_a_stream_says_when_it_has_ended(client: Client, server: Server) -> None:
@@ -624,135 +384,8 @@ def test_only_the_newest_of_many_targets_is_passed_on(loop: FakeLoop, client: Cl
         assert under_way.wait(20)
         for k in range(1, 20):
             stream.send(position=[0, 0, 0.1 + k / 1000])
-        eventually(lambda: stream.superseded == 18)  # the last one waits
+        wait_for(lambda: stream.superseded == 18)  # the last one waits
         gate.set()
-        eventually(lambda: stream.accepted == 2)
+        wait_for(lambda: stream.accepted == 2)
     heights = [target.position[2] for _, target in loop.calls]
     assert heights == pytest.approx([0.1, 0.119])
-
-
-# The stream's wire --------------------------------------------------------------------------------
-
-
-def drain(stream: ClientStream) -> None:
-    """Read states until that raises."""
-    for _ in range(1000):
-        stream.state()
-
-
-def opened(server: Server, query: str = "?rate=0", **headers: str) -> ClientConnection:
-    sent = {name.replace("_", "-"): value for name, value in headers.items()}
-    url = server.url.replace("http", "ws") + "/v1/stream" + query
-    return connect(url, additional_headers=sent, proxy=None)
-
-
-def told(socket: ClientConnection, message: Any) -> dict[str, Any]:
-    socket.send(message if isinstance(message, str | bytes) else json.dumps(message))
-    return dict(json.loads(socket.recv(timeout=20)))
-
-
-MALFORMED: list[Any] = [
-    "",
-    "{",
-    "[]",
-    "null",
-    "NaN",
-    "[" * 10_000,
-    b"\x00\xff",
-    {"seq": 1},
-    {"target": {"position_m": [0, 0, 0.2]}},
-    {"target": {"position_m": [0, 0]}, "seq": 1},
-    '{"target": {"position_m": [0, 0, NaN]}, "seq": 1}',
-    {"target": {"position_m": [0, 0, 0.2]}, "seq": -1},
-    {"target": {"position_m": [0, 0, 0.2]}, "seq": 1, "arm": True},
-    {"token": 3},
-    {"password": "x"},
-    '{"target": "' + "x" * MAX_MESSAGE + '"}',
-    '{"target": ' + "1" * 5000 + ', "seq": 1}',
-]
-
-
-def test_malformed_messages_are_answered_and_change_nothing(
-    loop: FakeLoop, client: Client, server: Server
-) -> None:
-    client.take_control()
-    lease = str(client._lease)
-    with opened(server, Authorization=f"Bearer {TOKEN}", Stiffopt_Lease=lease) as socket:
-        for message in MALFORMED:
-            answer = told(socket, message)
-            assert answer["type"] == "error", message
-            assert answer["error"]["message"]
-        assert loop.calls == []
-        good = {"target": {"position_m": [0, 0, 0.2]}, "seq": 5}
-        assert told(socket, good) == {"type": "answer", "seq": 5, "accepted": True}
-
-
-def test_a_message_that_is_far_too_long_ends_the_connection(loop: FakeLoop, server: Server) -> None:
-    with opened(server) as socket, pytest.raises(ConnectionClosed):
-        told(socket, "x" * 1_000_000)
-    assert loop.calls == []
-
-
-def test_token_and_lease_may_come_in_a_message(
-    loop: FakeLoop, client: Client, server: Server
-) -> None:
-    client.take_control()
-    good = {"target": {"position_m": [0, 0, 0.2]}, "seq": 1}
-    with opened(server) as socket:
-        answer = told(socket, good)
-        assert (answer["seq"], answer["error"]["code"]) == (1, "no-token")
-        assert told(socket, {"token": "x"})["error"]["code"] == "wrong-token"
-        assert told(socket, {"token": TOKEN}) == {"type": "access", "trusted": True}
-        assert told(socket, good)["error"]["code"] == "lease"
-        told(socket, {"lease": client._lease})
-        assert told(socket, good)["accepted"]
-        assert told(socket, {"token": "x"})["error"]["code"] == "wrong-token"
-        assert told(socket, good)["error"]["code"] == "no-token"  # a wrong one undoes a right one
-    assert loop.names == ["set_target"]
-
-
-@pytest.mark.parametrize(
-    "headers",
-    [{"Origin": "http://evil.example"}, {"Authorization": "Bearer wrong"}, {"Origin": "null"}],
-)
-def test_strangers_get_no_stream(server: Server, headers: dict[str, str]) -> None:
-    with pytest.raises(InvalidStatus) as refused, opened(server, **headers):
-        pass
-    assert refused.value.response.status_code == 403
-
-
-def test_another_host_name_gets_no_stream(server: Server) -> None:
-    sock = socket.create_connection(("127.0.0.1", server.port))
-    with (
-        pytest.raises(InvalidStatus),
-        connect("ws://evil.example/v1/stream", sock=sock, proxy=None) as socket_,
-    ):
-        socket_.recv(timeout=20)
-
-
-@pytest.mark.parametrize("rate", ["-1", "nan", "fast", ""])
-def test_rates_that_are_none_are_refused(server: Server, rate: str) -> None:
-    with opened(server, f"?rate={rate}") as socket:
-        assert "rate" in json.loads(socket.recv(timeout=20))["error"]["message"]
-        with pytest.raises(ConnectionClosed):
-            socket.recv(timeout=20)
-
-
-def test_there_is_an_end_to_streams(server: Server) -> None:
-    with ExitStack() as stack:
-        for _ in range(MAX_STREAMS):
-            told(stack.enter_context(opened(server)), {})
-        with opened(server) as one_more:
-            assert json.loads(one_more.recv(timeout=20))["error"]["code"] == "busy"
-    with opened(server, "") as again:
-        eventually(lambda: json.loads(again.recv(timeout=20))["type"] == "state")
-
-
-def test_the_stream_sends_states_without_a_token_at_a_limited_rate(server: Server) -> None:
-    with opened(server, "?rate=1e9") as socket:
-        begin = time.monotonic()
-        for _ in range(30):
-            message = json.loads(socket.recv(timeout=20))
-            assert message["type"] == "state"
-            assert record_of(Snapshot, message["state"]).state is State.INACTIVE
-        assert time.monotonic() - begin > 0.2  # 100 Hz at most

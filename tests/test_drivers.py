@@ -7,7 +7,6 @@ import pickle
 import signal
 import subprocess
 import sys
-import time
 import tomllib
 from collections.abc import Callable, Iterator
 from importlib import import_module
@@ -20,6 +19,7 @@ import pytest
 
 import third_party
 from fake_bench import FakeBench
+from running import wait_for
 from stiffopt.errors import DeviceError, FileError, InputError
 from stiffopt.files import file_text, save_file
 from stiffopt.lab.virtual import VirtualLab
@@ -39,14 +39,6 @@ BUILT_IN = {
     "probe": ("simulated", "probe"),
 }
 IN_FULL = "line_driver:LineSettings"
-
-
-def wait_for(condition: Callable[[], Any], timeout: float = 5.0) -> Any:
-    end = time.monotonic() + timeout
-    while not (value := condition()):
-        assert time.monotonic() < end, "that did not happen in time"
-        time.sleep(0.01)
-    return value
 
 
 # Drivers of stiffopt -----------------------------------------------------------------------------

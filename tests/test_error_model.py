@@ -13,6 +13,7 @@ from stiffopt.errors import FileError, InputError
 from stiffopt.identify.error_model import (
     covariance_with,
     error_model,
+    in_turn,
     is_moving,
     kept_unknowns,
     representatives,
@@ -58,6 +59,13 @@ def problem_of(
     settings = CalibrationSettings()
     setup = Setup.of(ONE, recordings_of(ONE, [("log", log)], settings), [], settings)
     return setup.problem(structure, 400)
+
+
+def test_logs_in_turn_have_their_pauses() -> None:
+    first, soon, anew = np.array([5.0, 7.0]), np.array([10.0, 11.0]), np.array([0.0, 4.0])
+    expected = [0, 2, 5, 6, 66, 70]  # a minute where a clock begins anew
+    assert in_turn([first, soon, anew]) == pytest.approx(expected)
+    assert in_turn([first]) == pytest.approx([0, 2])
 
 
 # -- the distance from what was recorded ------------------------------------------------------

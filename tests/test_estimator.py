@@ -208,6 +208,18 @@ def test_arm_that_does_not_swing():
     assert estimator.omega == math.inf
 
 
+def test_pressures_and_model_at_the_capture_of_a_sample_between_ticks():
+    estimator = TipEstimator(PERIOD, 2, None, EstimatorTuning())
+    for k in range(1, 60):
+        p = pressures(k)
+        estimator.advance(k * PERIOD, p, tip_at(p))
+        if k % 3 == 0:
+            estimator.take([sample((k - 3.4) * PERIOD, BASE + J @ pressures(k - 3.4))])
+    between = 0.4 * pressures(53) + 0.6 * pressures(54)  # at the last capture, tick 53.6
+    assert estimator.captured == pytest.approx(between, rel=1e-9)
+    assert estimator.predicted == pytest.approx(BASE + J @ between, abs=1e-12)
+
+
 @pytest.mark.parametrize("softness", [np.inf, -1.0, 1e30])
 def test_an_arm_that_has_no_stiffness_left_does_no_harm(softness):
     """About to buckle, say; an omega of 0 would be for ever after."""

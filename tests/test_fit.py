@@ -164,6 +164,30 @@ def test_what_an_arm_remembers_is_found(
     save_robot(tmp_path / "arm.yaml", result.robot)
     assert load_description(tmp_path / "arm.yaml").segments[0].history == found
     assert validate(result.robot, [second])[0].errors.mean < 0.8e-3
+    again = calibrate(result.robot, [("again.csv", second[1])], settings=few)
+    others = {"creep", "creep, strain"} - ({"creep, strain"} if remembers == "strain" else set())
+    assert {each.structure.name for each in again.candidates} == others  # none of them twice
+
+
+@pytest.mark.parametrize(
+    ("structure", "holds_back", "phases"), [("lag", False, 4), ("lag", True, 6), ("auto", True, 0)]
+)
+def test_progress_ends_where_it_says(
+    structure: str, holds_back: bool, phases: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whichever models turn out not to be worth a fit."""
+    monkeypatch.setattr(calibration, "other_laws", lambda description: [])
+    log = made_log(true_robot("lag"), *course(3, 30.0, 1, rate=4.0), base=BASE, noise=3e-4)
+    told: list[tuple[float, float, str]] = []
+    few = settings(
+        structure, strain_law="auto", holds_back=holds_back, rows=60, trial_rows=60, start_rows=40
+    )
+    calibrate(ONE, [("log.csv", log)], settings=few, progress=lambda *each: told.append(each))
+    words = list(dict.fromkeys(text for _, _, text in told))
+    assert len(words) == told[-1][1] == (phases or told[-1][1])
+    assert next(done // 1 for done, _, text in told if text == words[-1]) == len(words) - 1
+    shares = [done / total for done, total, _ in told]
+    assert all(a <= b for a, b in pairwise(shares))
 
 
 def test_registration_is_found_with_orientations() -> None:

@@ -85,6 +85,50 @@ def test_a_rig_that_could_never_be_armed_is_a_mistake() -> None:
     assert "rate: 600 Hz is too fast" in run("check", "rig.yaml").stdout
 
 
+TCP, SERIAL = "tcp: {host: localhost}", "serial: {port: COM3}"
+
+
+@pytest.mark.parametrize(
+    ("supply", "said"),
+    [
+        (f"{TCP}\n  watchdog: {{address: 9, timeout: 40 ms}}", ""),
+        (
+            f"{TCP}\n  watchdog: {{address: 9, timeout: 20 ms}}",
+            "rig.yaml:7: supply.watchdog.timeout: 20 ms is not longer than the 25 ms between two "
+            "commands at a rate of 40 Hz: the device would vent every time",
+        ),
+        # 6 bytes to the device, 6 read back and 25 of framing at 11 bits a byte and 9600 Bd
+        (
+            f"{SERIAL[:-1]}, baudrate: 9600}}\n  watchdog: {{address: 9, timeout: 40 ms}}",
+            "rig.yaml:7: supply.watchdog.timeout: 40 ms is not longer than the 42.4 ms that a "
+            "command takes on the serial line: the device would vent every time",
+        ),
+        (f"{SERIAL}\n  watchdog: {{address: 9, timeout: 40 ms}}", ""),
+    ],
+)
+def test_a_device_that_would_vent_between_two_commands_is_a_mistake(supply: str, said: str) -> None:
+    text = UNARMED.replace("10 Hz", "40 Hz").replace("arm.yaml", "stiff-flop-1")
+    text = re.sub("safety: .*", "safety: {max_slew: 1 bar/s}", text).replace(TCP, supply)
+    Path("rig.yaml").write_text(text, encoding="utf-8")
+    assert run("check", "--quiet", "rig.yaml").stdout.rstrip() == said
+
+
+def test_a_watchdog_of_an_nidaq_device_is_compared_too() -> None:
+    text = (ROOT / "rig/nidaq-aurora.yaml").read_text(encoding="utf-8")
+    Path("rig.yaml").write_text(re.sub("watchdog: .* ms", "watchdog: 10 ms", text))
+    assert "supply.watchdog: 10 ms is not longer" in run("check", "rig.yaml").stdout
+
+
+@pytest.mark.parametrize(("highest", "says"), [("0 bar", True), ("[0 bar, 1 bar, 0 bar]", False)])
+def test_a_rig_in_which_nothing_can_move_is_a_mistake(highest: str, says: bool) -> None:
+    """A rig with a channel out of use, or two, is none."""
+    Path("rig.yaml").write_text(
+        f"{RIG}robot: stiff-flop-1\nsafety: {{max_pressure: {highest}}}\n", encoding="utf-8"
+    )
+    said = "rig.yaml:4: safety.max_pressure: leaves every channel at one pressure: the arm could"
+    assert run("check", "--quiet", "rig.yaml").stdout.startswith(said) == says
+
+
 def test_first_files_lead_to_an_answer() -> None:
     """The way of a new user: one's own arm, a task, a path, a scene, a rig."""
     assert run("init", "robot", "arm.yaml", "--segments", "2", "--length", "60 mm").exit_code == 0

@@ -8,13 +8,14 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from running import wait_for
 from stiffopt.cli.main import main
 from stiffopt.errors import DeviceError, InputError
 from stiffopt.files import read_file, save_file
@@ -30,14 +31,6 @@ pytestmark = pytest.mark.real_time
 
 RIGS = Path(__file__).parent.parent / "rig"
 ROBOT = load_description("stiff-flop-1")
-
-
-def wait_for(condition: Callable[[], Any], timeout: float = 5.0) -> Any:
-    end = time.monotonic() + timeout
-    while not (value := condition()):
-        assert time.monotonic() < end, "that did not happen in time"
-        time.sleep(0.01)
-    return value
 
 
 def anywhere(description: RigDescription) -> RigDescription:

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import stiffopt as so
+from running import wait_for
 from stiffopt.model import compiler
 from stiffopt.model.description import Compensation, Corrections
 from stiffopt.model.kinematics import Actuation
@@ -181,13 +182,6 @@ def empty_cache(compiled, tmp_path, monkeypatch):
     monkeypatch.setattr("stiffopt.model.compiled._notified", set())
     monkeypatch.setattr("stiffopt.model.compiled._awaited", {})
     return tmp_path
-
-
-def wait_for(condition, seconds=120):
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "it took too long"
-        time.sleep(0.05)
 
 
 def test_the_first_answer_does_not_wait_for_the_compiler(empty_cache):

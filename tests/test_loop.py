@@ -12,6 +12,7 @@ import pytest
 
 from fake_control import Hang
 from simulated_loop import PERIOD, TASK, Lab
+from stiffopt.control.interface import Notice
 from stiffopt.control.lifecycle import Alarms, EventBuffer, Lifecycle
 from stiffopt.control.loop import ControlLoop, TickTiming
 from stiffopt.control.request_queue import Requester, requested_by
@@ -595,6 +596,23 @@ def test_an_alarm_is_an_event_when_it_comes_and_when_it_goes() -> None:
         (1.0, "wet", Severity.ERROR),
         (3.0, "wet-over", Severity.INFO),
     ]
+
+
+def test_an_alarm_that_comes_with_its_own_event_is_reported_once() -> None:
+    arm = Lab().under_pressure()
+    text = "the contact is lost; the arm goes back"
+    alarm = Notice("brace-lost", "the contact is lost", Severity.ERROR, standing=True)
+    arm.controller.said = (Notice("brace-lost", text, Severity.ERROR), alarm)
+    arm.tick()
+    arm.controller.said = (alarm,)
+    arm.ticks(5)
+    assert arm.alarms == {"brace-lost"}
+    events = [event for event in arm.loop.events.since(0)[0] if event.kind == "brace-lost"]
+    assert [event.text for event in events] == [text]
+    arm.controller.said = ()
+    arm.tick()
+    assert not arm.alarms
+    assert arm.kinds[-1] == "brace-lost-over"
 
 
 def test_a_snapshot_tells_how_things_stand() -> None:

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from conftest import is_long
 from fake_control import FakeController
+from fake_supply import HandClock
 from stiffopt.control.interface import ControlOutput, Notice, SampleCounts
 from stiffopt.control.loop import ControlLoop
 from stiffopt.control.state import ControllerStatus, State
@@ -47,17 +48,6 @@ SLEW = np.array([5e5, 2e5, 8e5])
 AREAS = np.array(ROBOT.channel_areas)
 FORCE = 0.7 * float(AREAS @ HIGH)
 SLACK = 1e-6  # Pa, for rounding
-
-
-class HandClock(Clock):
-    def __init__(self) -> None:
-        self.t = 1000.0
-
-    def now(self) -> float:
-        return self.t
-
-    def sleep_until(self, moment: float) -> None:
-        self.t = max(self.t, moment)
 
 
 class Recorder(PressureSupply):
@@ -324,7 +314,7 @@ class World:
 
     def __init__(self, seed: int, low: float = 0.0) -> None:
         self.chance = chance = random.Random(seed)
-        self.clock = HandClock()
+        self.clock = HandClock(1000.0)
         self.supply = Recorder(self.clock, chance, low)
         self.tracker = Sometimes(self.clock, chance)
         self.controller = Whim(chance)

@@ -14,11 +14,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from fake_supply import HandClock
 from modbus_device import HandmadeDevice
 from modbus_devices import LIMITS, WATCHDOG, P, settings, until
 from stiffopt.errors import DeviceError, InputError
 from stiffopt.rig.drivers.modbus import ModbusLine, ModbusSupply, ModbusTcp
-from stiffopt.rig.interface import Clock, PressureLimits
+from stiffopt.rig.interface import PressureLimits
 
 pytestmark = pytest.mark.real_time
 
@@ -33,21 +34,11 @@ def device() -> Iterator[HandmadeDevice]:
     made.close()
 
 
-class StandingClock(Clock):
-    """Time does not pass, so that nobody looks whether others command the device."""
-
-    t = 1.0
-
-    def now(self) -> float:
-        return self.t
-
-    def sleep_until(self, moment: float) -> None:
-        self.t = max(self.t, moment)
-
-
 @contextmanager
 def opened(device: HandmadeDevice, **changes: Any) -> Iterator[ModbusSupply]:
-    supply = settings(device.port, **changes).device(LIMITS, StandingClock())
+    supply = settings(device.port, **changes).device(
+        LIMITS, HandClock()
+    )  # nobody looks whether others command
     with supply:
         supply.arm()
         device.requests.clear()
@@ -192,7 +183,7 @@ def test_what_is_on_the_wire_is_within_both_limits(
     limits = PressureLimits(np.array([low]), np.array([high]))
     given = settings(device.port, channels=[{"setpoint": 0, "reading": 1}], scale=scale)
     given = given.model_copy(update={"table": "holding"})
-    with given.device(limits, StandingClock()) as supply:
+    with given.device(limits, HandClock()) as supply:
         supply.arm()
         for write, size in ((supply.command, 5), (supply.exchange, 9)):
             device.requests.clear()

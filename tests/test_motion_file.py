@@ -68,6 +68,8 @@ def test_what_is_no_motion_is_refused(solution: PathSolution, tmp_path: Path) ->
     assert "is not a motion" in refused(result, text.replace("path-result", "result"))
     assert "no whole result" in refused(result, text.replace("0.5 s", "soon"))
     lines = table.read_text().splitlines()
+    log = "\n".join([lines[0].replace("position_error_m", "tip_qw"), *lines[1:]]) + "\n"
+    assert "is not a motion; expected what 'stiffopt path" in refused(tmp_path / "log.csv", log)
     assert "too few points" in refused(table, "\n".join(lines[:2]) + "\n")
     backwards = "\n".join([lines[0], *lines[:0:-1]]) + "\n"
     assert "do not increase" in refused(table, backwards)

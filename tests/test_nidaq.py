@@ -614,7 +614,7 @@ def test_the_peer_refuses_what_it_does_not_know(started: Any) -> None:
         ({"channels": channels(input={"range": ["1 V", "-1 V"]})}, "must be below"),
         ({"channels": channels(input={"terminals": "single"})}, "not one of"),
         ({"dump_valve": {"line": "Dev1/ao0"}}, "dump_valve.line"),
-        ({"dump_valve": VALVE, "watchdog": "1 ms"}, "watchdog: must be at least 0.01"),
+        ({"dump_valve": VALVE, "watchdog": "1 ms"}, "watchdog: must be at least 10 ms"),
     ],
 )
 def test_a_bad_rig_file(changes: dict[str, Any], message: str) -> None:

@@ -10,7 +10,7 @@ import sys
 import textwrap
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -19,6 +19,7 @@ import pytest
 from numpy.typing import ArrayLike
 
 from fake_bench import FakeBench
+from running import wait_for
 from stiffopt.errors import DeviceError, InputError, MissingExtraError
 from stiffopt.lab.openigtlink_peer import OpenIGTLinkPeer
 from stiffopt.rig.drivers.openigtlink import OpenIGTLinkSettings, OpenIGTLinkTracker, SenderClock
@@ -85,13 +86,6 @@ class Server:
         if self.client is not None:
             self.client.close()
         self.listener.close()
-
-
-def wait_for(condition: Callable[[], Any], patience: float = 5.0) -> None:
-    end = time.monotonic() + patience
-    while not condition():
-        assert time.monotonic() < end, "it did not come about"
-        time.sleep(0.005)
 
 
 def next_samples(tracker: OpenIGTLinkTracker, n: int = 1) -> list[PoseSample]:

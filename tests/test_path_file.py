@@ -295,7 +295,7 @@ CIRCLE = (
         (3, "path: {csv: none.csv}\n" + SPEED, "none.csv: there is no such file"),
         (4, LINE + SPEED.replace("5", "1"), "points: must be at least 2, not 1"),
         (4, LINE + SPEED.replace("5", "5001"), "points: must be at most 5000, not"),
-        (4, LINE + SPEED.replace("5", "2.5"), "points: input should be a valid integer"),
+        (4, LINE + SPEED.replace("5", "2.5"), "points: expected a whole number, not 2.5"),
         (1, LINE + "timing: {speed: 1 mm/s}\n", "needs the key points or spacing, and not both"),
         (4, LINE + SPEED.replace("points: 5", "spacing: 1 um"), "spacing: makes 40001 points of"),
         (4, LINE + SPEED.replace("points: 5", "spacing: 1.0e-300 mm"), "at most 5000 are allowed"),

@@ -13,6 +13,7 @@ from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 import stiffopt as so
+from running import wait_for
 from stiffopt.control.planner import InlinePlanner, ProcessPlanner
 from stiffopt.control.planning import Planning, PlanRequest, model_target
 from stiffopt.control.vibration import BentMode
@@ -43,14 +44,6 @@ def request(robot, serial=1, offset=(0,) * 6, p=PRESSURES, **changes):
     task = Task(robot=ROBOT, target=target, stiffness=goal)
     changes.setdefault("pressure_offset", np.zeros(3))
     return PlanRequest(serial, task, target, np.array(offset, dtype=float), **changes)
-
-
-def wait_for(condition, seconds=60.0):
-    """Real processes take real time; a generous bound for busy machines."""
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "it never came to that"
-        time.sleep(0.002)
 
 
 @pytest.fixture

@@ -18,9 +18,12 @@ from stiffopt.plant.devices import SimulatedRig
 from stiffopt.registration import Placement, Registration
 from stiffopt.rig.assembly import make_rig
 from stiffopt.rig.config import RigDescription, limits_of, load_rig_description, slew_of
+from stiffopt.rig.drivers.modbus import ModbusSettings
+from stiffopt.rig.drivers.nidaq import NidaqDumpValve
 from stiffopt.rig.interface import Rig
-from stiffopt.rig.settings import ServiceSettings
+from stiffopt.rig.settings import ControlSettings, Safety, ServiceSettings
 from stiffopt.safety.rigs import open_rig
+from stiffopt.schema import Schema
 
 RIGS = sorted((Path(__file__).parent.parent / "rig").glob("*.yaml"))
 SIMULATED = ("sim", "sim-two-segment", "paper", "palpation")
@@ -286,6 +289,29 @@ def test_mistakes_are_told(tmp_path: Path, old: str, new: str, line: int | None,
         open_rig(path)
     assert error.value.line == line
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("kind", "given", "said"),
+    [
+        (Safety, {"guard_timeout": "5 ms"}, "at least 10 ms, not '5 ms'"),
+        (Safety, {"guard_timeout": "1 min"}, "at most 2 s, not '1 min'"),  # no number of minutes
+        (Safety, {"guard_timeout": 3}, "at most 2 s, not 3"),
+        (Safety, {"guard_timeout": np.float64(2.5)}, "at most 2 s, not 2.5"),
+        (Safety, {"hold_timeout": "2 h"}, "at most 1 h, not '2 h'"),  # a time, or 'none'
+        (Safety, {"ramp_time": "0 s"}, "greater than 0, not '0 s'"),
+        (Safety, {"max_overruns": 2.5}, "a whole number, not 2.5"),
+        (Safety, {"max_overruns": float("nan")}, "a finite number, not nan"),
+        (ControlSettings, {"damping": "120 %"}, "less than 100 %, not '120 %'"),
+        (ModbusSettings, {"read_write": 3}, "read_write: expected true or false, not 3"),
+        (NidaqDumpValve, {"line": "Dev1"}, "'Dev1' is not a name such as 'Dev1/port0/line0'"),
+    ],
+)
+def test_bounds_have_the_unit_of_what_was_given(
+    kind: type[Schema], given: dict[str, object], said: str
+) -> None:
+    with pytest.raises(InputError, match=re.escape(said)):
+        kind(**given)
 
 
 def test_limits_are_the_tightest_of_robot_and_rig(tmp_path: Path) -> None:

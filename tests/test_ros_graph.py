@@ -422,11 +422,12 @@ ON_THIS_MACHINE = {  # what rmw_cyclonedds makes of "this machine only"
 
 
 LISTENER = """
-import sys, ros_peer
+import os, sys, ros_peer
 from stiffopt.ros.messages import String
 ros_peer.LOOPBACK = f"<CycloneDDS><Domain>{sys.argv[2]}</Domain></CycloneDDS>"
 peer = ros_peer.Peer(int(sys.argv[1]), alone=True)
-print(peer.reader("~/state", String).wait().data)
+print(peer.reader("~/state", String).wait().data, flush=True)
+os._exit(0)  # once in many runs, Cyclone DDS does not return when its objects are collected
 """
 
 

@@ -19,6 +19,7 @@ import urllib.request
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -42,7 +43,7 @@ from stiffopt.cli.path_records import csv_text
 from stiffopt.cli.run_daemon import Screen
 from stiffopt.cli.run_display import Lines, LiveStatus, status
 from stiffopt.control.controller import TipController
-from stiffopt.control.state import Alarm, Event, Severity, State, Timing
+from stiffopt.control.state import Alarm, Event, HeldContact, Severity, State, Timing
 from stiffopt.daemon import daemon as daemon_module
 from stiffopt.daemon.client import Client
 from stiffopt.daemon.daemon import TIMES
@@ -98,6 +99,9 @@ def test_what_cannot_be_run_is_refused(
     assert (told.out, "no such file" in told.err) == ("", True)
     other = refused(capsys, rig, *alone, str(tmp_path / "two.yaml"))
     assert "robot 'stiff-flop-2-hanging'; this rig has 'stiff-flop-1'" in other
+    rib = str(ROOT / "problems" / "leaning_on_a_rib.yaml")
+    other = refused(capsys, str(ROOT / "rig" / "brace.yaml"), *alone, rib)
+    assert "brace.objects[0]: there is no object 'rib' in the scene; it has 'post'" in other
     monkeypatch.setenv("NOTIFY_SOCKET", "/nowhere")
     assert "must not arm by itself" in refused(capsys, rig, "--arm", "--task", task)
 
@@ -450,7 +454,7 @@ class Places:
     foxglove_port = 8765
 
 
-def shown(width: int = 100) -> str:
+def shown(width: int = 100, **state: Any) -> str:
     loop = FakeLoop()
     now = replace(
         loop.now,
@@ -465,6 +469,7 @@ def shown(width: int = 100) -> str:
         wrench=np.arange(6) * 1e-3,
         alarms=(Alarm("tracker-missing", "the tracker [bold]does not see the tip", 1.0),),
         timing=Timing(100, 3, 2e-3, EDGES, COUNTS),
+        **state,
     )
     events = [Event(1.0, "armed", "armed"), Event(2.0, "leak", "channel 2 leaks", Severity.ERROR)]
     console = Console(file=io.StringIO(), width=width, markup=False)
@@ -496,6 +501,20 @@ def test_the_status_says_how_things_stand() -> None:
     bars = [line.count("█") for line in text.splitlines() if "bar" in line]
     assert len(bars) == 6
     assert max(len(line) for line in shown(60).splitlines()) <= 60
+
+
+def test_the_status_shows_the_contacts_of_a_brace() -> None:
+    held = HeldContact("post", 0.1009, "held", 0.2134, 0.0305)
+    unsure = HeldContact("rib [red]", 0.15, "uncertain", 0.004, 0.02)
+    text = shown(brace="held", leans_on=(held, unsure))
+    lines = [" ".join(line.split()) for line in text.splitlines()]
+    assert "brace held" in lines
+    assert "contact 'post' at 101 mm: held, 213 mN (deviation 30 mN)" in lines
+    assert "contact 'rib [red]' at 150 mm: uncertain, 4 mN (deviation 20 mN)" in lines
+    text = shown(brace="releasing", leans_on=(HeldContact("post", 0.1, "lost"),))
+    assert "'post' at 100 mm: lost\n" in "\n".join(map(str.rstrip, text.splitlines()))
+    assert "contact" not in shown()
+    assert "brace" not in shown()
 
 
 def test_a_terminal_that_is_gone_does_no_harm() -> None:

@@ -13,7 +13,8 @@ from typing import Any
 import pytest
 
 from conftest import is_long
-from made_runs import BEGIN, FakeLoop, StillClock, event, snapshot, ticks
+from fake_loop import ManualClock
+from made_runs import BEGIN, FakeLoop, event, snapshot, ticks
 from stiffopt.daemon import recording as recording_module
 from stiffopt.daemon.recording import RecordingLimits, RunRecording
 from stiffopt.daemon.run_log import read_run
@@ -293,7 +294,7 @@ def test_an_alarm_comes_with_the_trouble_and_goes_with_it(tmp_path: Path) -> Non
     (tmp_path / "file").touch()
     made = Telemetry(
         ROBOT, "rig", loop, str(tmp_path / "file" / "runs"), ServiceSettings(foxglove_port=None),
-        clock=StillClock(),
+        clock=ManualClock(BEGIN),
     )  # fmt: skip
     made.start()
     assert "cannot be written" in loop.alarms["log"]

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import shutil
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +11,7 @@ import numpy as np
 import pytest
 
 import stiffopt
+from running import wait_for
 from stiffopt import lie
 
 pytest.importorskip("viser", reason="viser is missing: pip install 'stiffopt[studio]'")
@@ -41,13 +41,6 @@ def browser_page() -> Iterator[Any]:
         browser.close()
 
 
-def until(holds: Callable[[], bool], seconds: float = 30.0) -> None:
-    end = time.monotonic() + seconds
-    while not holds():
-        assert time.monotonic() < end
-        time.sleep(0.05)
-
-
 def on_screen(client: Any, point: Any) -> np.ndarray:
     """Return where a point in space is seen, in pixels."""
     camera = client.camera
@@ -75,7 +68,7 @@ def test_the_arm_follows_a_target_that_is_dragged(browser_page: Any, compiled: P
         page.wait_for_timeout(2500)  # until its handle is drawn; software renders slowly
         drag(page, client, start + X * 0.03, start + X * 0.045)  # its arrow along x
 
-        until(lambda: bench.answer.is_best and bench.answer.design == bench.design)
+        wait_for(lambda: bench.answer.is_best and bench.answer.design == bench.design)
         target = np.asarray(bench.design.task.target.position)
         assert target[0] - start[0] == pytest.approx(0.015, abs=0.005)
         np.testing.assert_allclose(target[1:], start[1:], atol=1e-5)
@@ -123,8 +116,8 @@ def test_direction_and_objects_are_dragged(browser_page: Any, compiled: Path) ->
         np.testing.assert_allclose(handle - view.arm_end, 0.045 * X, atol=1e-6)
         page.wait_for_timeout(2500)  # until its handle is drawn; software renders slowly
         drag(page, client, handle + 0.016 * Z, handle + 0.046 * Z)  # its arrow along z
-        until(lambda: bench.design.measure.direction[2] > 0)
-        until(lambda: bench.answer.is_best and bench.answer.design == bench.design)
+        wait_for(lambda: bench.design.measure.direction[2] > 0)
+        wait_for(lambda: bench.answer.is_best and bench.answer.design == bench.design)
         x, y, z = bench.design.measure.direction
         assert (x, y, z) == (pytest.approx(0.83, abs=0.1), 0.0, pytest.approx(0.55, abs=0.15))
         value = bench.answer.solution.stiffness
@@ -133,25 +126,25 @@ def test_direction_and_objects_are_dragged(browser_page: Any, compiled: Path) ->
 
         page.get_by_role("tab", name="scene").click()
         page.get_by_role("button", name="add an object").click()
-        until(lambda: len(bench.design.objects) == 1)
+        wait_for(lambda: len(bench.design.objects) == 1)
         page.wait_for_timeout(2500)  # until its handle is drawn; software renders slowly
         before = bench.design.objects[0].shape
         handle = view.object_position
         drag(page, client, handle + 0.025 * X, handle + 0.045 * X)
-        until(lambda: bench.design.objects[0].shape != before)
+        wait_for(lambda: bench.design.objects[0].shape != before)
         moved = view.object_position - handle
         np.testing.assert_allclose(moved, 0.02 * X, atol=0.005)
         page.wait_for_selector("text=clearance")
 
         page.get_by_label("may be leant on").check()
-        until(lambda: bench.design.objects[0].contact is not None)
+        wait_for(lambda: bench.design.objects[0].contact is not None)
         page.get_by_label("lean: hold the pressures").check()
         page.wait_for_selector("text=drag an object that may be leant on")
         pressures = bench.answer.pressures
         for _ in range(8):  # towards the arm, until they touch
             handle = view.object_position
             drag(page, client, handle + 0.025 * X, handle + 0.010 * X)
-            until(lambda: bench.leaning is not None and bench.leaning.design == bench.design)
+            wait_for(lambda: bench.leaning is not None and bench.leaning.design == bench.design)
             if bench.leaning.equilibrium.contacts:
                 break
         page.wait_for_selector("text=times the free arm's")
@@ -160,7 +153,7 @@ def test_direction_and_objects_are_dragged(browser_page: Any, compiled: Path) ->
         free, braced = bench.leaning.stiffness
         assert braced > free
         leaning = bench.leaning.equilibrium.tip_pose[:3, 3]
-        until(lambda: np.allclose(view.arm_end, leaning, atol=1e-6))
+        wait_for(lambda: np.allclose(view.arm_end, leaning, atol=1e-6))
         page.get_by_label("lean: hold the pressures").uncheck()
         page.wait_for_selector("text=clearance")
     finally:

@@ -13,7 +13,7 @@ import yaml
 
 from fake_loop import FakeLoop
 from running import wait_for
-from stiffopt.control.state import Alarm, State
+from stiffopt.control.state import Alarm, HeldContact, State
 from stiffopt.daemon.server import Server
 from stiffopt.daemon.service import create_app
 from stiffopt.errors import DeviceError, InputError
@@ -99,8 +99,8 @@ def test_a_braced_arm_is_drawn_as_it_leans(
     rig.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
     watch, robot = watching(), load_robot("stiff-flop-2")
     pressures = np.array([1.1, 0, 0.1, 0, 0.2, 0]) * 1e5
-    known = {"brace_contacts": "uncertain", "brace_force": 0.2, "brace_force_deviation": 0.05}
-    loop.now = replace(loop.now, measured=pressures, brace="held", **known)
+    contact = HeldContact("<post>", 0.101, "uncertain", 0.2, 0.05)
+    loop.now = replace(loop.now, measured=pressures, brace="held", leans_on=(contact,))
     watch.poll()
     leaning = watch.leaning(robot)
     assert leaning is not None
@@ -109,9 +109,8 @@ def test_a_braced_arm_is_drawn_as_it_leans(
     assert leaning.tip_pose == pytest.approx(expected.tip_pose)
     html = texts.rig_html(watch)
     assert "held" in html
-    assert "uncertain" in html
-    assert "0.2 N ± 0.098 N" in html
-    loop.now = replace(loop.now, brace="released", brace_force=float("nan"))
+    assert "&lt;post&gt;&#x27; at 101 mm: uncertain, 200 mN (deviation 50 mN)" in html
+    loop.now = replace(loop.now, brace="released", leans_on=())
     watch.poll()
     assert watch.leaning(robot) is None
 

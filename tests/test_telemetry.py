@@ -17,11 +17,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from fake_loop import ManualClock
 from made_runs import (
     BEGIN,
     PERIOD,
     FakeLoop,
-    StillClock,
     command_at,
     event,
     samples_between,
@@ -45,7 +45,7 @@ WALL = 1_800_000_000_000_000_000  # ns since 1970
 
 
 def telemetry(loop: FakeLoop, folder: Path, **options: Any) -> Telemetry:
-    given: dict[str, Any] = {"clock": StillClock(), "wall": lambda: WALL, "settings": NOWHERE}
+    given: dict[str, Any] = {"clock": ManualClock(BEGIN), "wall": lambda: WALL, "settings": NOWHERE}
     return Telemetry(ROBOT, "a rig", loop, str(folder), **{**given, **options})
 
 

@@ -302,13 +302,16 @@ def creeping(size: float, residual: float = 1e-4) -> RobotDescription:
 
 
 def crept(p: Array, count: int) -> Array:
-    """What creep leaves (count, 3) after three poses of 6 s from 0 to 1 bar and 1.5 to 6 s at p."""
+    """What creep leaves (count, 3) after three poses of 6 s from 0 to 1 bar and 1.5 to 6 s at p.
+
+    Before, the arm had such poses for long, and was at rest for a seventh of the time.
+    """
     rng, found = np.random.default_rng(7), []
     memory = Memory([CREEP] * 3, [0, 1, 2])
     for way, held in zip(
         rng.uniform(0, 1e5, (count, 3, 3)), rng.uniform(1.5, 6, count), strict=True
     ):
-        memory.start(np.zeros(3))
+        memory.settle(np.full(3, 6 / 7 * 0.5e5))
         memory.run(6.0, way)
         found.append(memory.advance(held, p) - p)
     return np.array(found)
@@ -328,7 +331,9 @@ def test_creep_is_left_as_far_as_was_recorded(size: float) -> None:
         slope = arm.tip_pose(middle)[:3, :3] @ arm.tip_jacobian(middle)[:3]
         expected = slope @ (moves.T @ moves / len(moves)) @ slope.T
         found = arm.tip_uncertainty(p).hysteresis
-        np.testing.assert_allclose(found, expected, atol=0.05 * expected.max())
+        assert np.trace(found) == pytest.approx(np.trace(expected), rel=0.03)
+        atol = 0.08 * expected.max()  # channels of 256 ways are correlated by chance, by 1 / 16
+        np.testing.assert_allclose(found, expected, atol=atol)
 
 
 @pytest.mark.parametrize(

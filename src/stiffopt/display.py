@@ -51,12 +51,10 @@ class DisplayUnit:
 
     Attributes
     ----------
-    name : str
-        Its readable name: ``mm``, ``N mm/rad``.
-    per_si : float
-        Its number in one SI unit.
-    more_decimals : int
-        Additional decimals of numbers, compared to the default unit, for the same resolution.
+    name : its readable name: ``mm``, ``N mm/rad``.
+    per_si : its number in one SI unit.
+    more_decimals : additional decimals of numbers, compared to the default unit, for the same
+        resolution.
     """
 
     name: str
@@ -76,9 +74,7 @@ class DisplayUnit:
 
         Parameters
         ----------
-        value : float
-        form : str
-            Its format; decimals, such as ``.3f``, are those in the default unit.
+        form : its format; decimals, such as ``.3f``, are those in the default unit.
         """
         if form.endswith("f"):
             form = f".{max(0, int(form[1:-1]) + self.more_decimals)}f"
@@ -105,8 +101,8 @@ class DisplayUnits:
 
     Attributes
     ----------
-    length, pressure, force, stiffness, rotational_stiffness, angle : DisplayUnit
-        By default mm, bar, N, N/m, N m/rad and degrees; `stiffness` is the translational one.
+    length, pressure, force, stiffness, rotational_stiffness, angle : by default mm, bar, N, N/m, N
+        m/rad and degrees; `stiffness` is the translational one.
     """
 
     length: DisplayUnit
@@ -188,9 +184,8 @@ def choose_units(text: str | None) -> None:
 
     Parameters
     ----------
-    text :
-        Dimensions that are not in it keep their default units. None: the units in the environment
-        variable ``STIFFOPT_UNITS``.
+    text : dimensions that are not in it keep their default units. None: the units in the
+        environment variable ``STIFFOPT_UNITS``.
 
     Raises
     ------

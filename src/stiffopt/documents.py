@@ -51,10 +51,8 @@ def document_of(text: str, name: str) -> Document:
 
     Parameters
     ----------
-    text :
-        Content of the file.
-    name :
-        Name of the file in errors.
+    text : content of the file.
+    name : name of the file in errors.
     """
     return _Composer(name, text).document()
 
@@ -75,12 +73,9 @@ def write_file(
 
     Parameters
     ----------
-    path :
-        The file; its folder must exist.
-    data :
-        Text, numbers, booleans, None, lists, tuples, arrays and mappings with text as keys.
-    comment :
-        Lines above the data, for people.
+    path : the file; its folder must exist.
+    data : text, numbers, booleans, None, lists, tuples, arrays and mappings with text as keys.
+    comment : lines above the data, for people.
     """
     text = "".join(f"# {printable(line)}\n" for line in comment) + to_yaml(data)
     write_whole(path, text.encode())

@@ -146,10 +146,8 @@ def require_package(package: str, extra: str, module: str | None = None) -> None
 
     Parameters
     ----------
-    package, extra :
-        As for `MissingExtraError`.
-    module :
-        Name under which it is imported, if that differs from `package`.
+    package, extra : as for `MissingExtraError`.
+    module : name under which it is imported, if that differs from `package`.
     """
     try:
         found = find_spec(module or package) is not None
@@ -193,6 +191,8 @@ def os_reason(error: OSError | ValueError) -> str:
 
 def shown(value: object) -> str:
     """Return a value for an error message: text in quotes, on one line, never long."""
+    if hasattr(value, "tolist"):  # of NumPy
+        value = value.tolist()
     if isinstance(value, dict):
         return "a mapping"
     if isinstance(value, list | tuple):

@@ -43,12 +43,9 @@ def read_file(path: str | os.PathLike[str], kind: str, model: type[ModelT]) -> M
 
     Parameters
     ----------
-    path :
-        The file.
-    kind :
-        Its required kind, for example ``"robot"`` for files with ``format: stiffopt-robot/1``.
-    model :
-        Its schema.
+    path : the file.
+    kind : its required kind, for example ``"robot"`` for files with ``format: stiffopt-robot/1``.
+    model : its schema.
 
     Raises
     ------

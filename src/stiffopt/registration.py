@@ -103,9 +103,8 @@ class Registration(Schema):
 
         Parameters
         ----------
-        position, quaternion :
-            Of the sensor in the tracker's frame, in m and w first; without a quaternion the
-            sensor's position is used for the tip.
+        position, quaternion : of the sensor in the tracker's frame, in m and w first; without a
+            quaternion the sensor's position is used for the tip.
         """
         T = self.tracker_in_base.transform()
         if quaternion is None:

@@ -15,6 +15,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError
 from pydantic_core import ErrorDetails
 
 from stiffopt.errors import InputError, Loc, dotted, shown
+from stiffopt.units import QuantityKind, in_unit_of
 
 __all__ = [
     "BadKeyError",
@@ -105,6 +106,14 @@ Pair = Annotated[tuple[ItemT, ItemT], BeforeValidator(items_of(2))]
 
 # pydantic's errors to sentences ------------------------------------------------------------------
 
+_EXPECTED = {
+    "bool": "true or false",
+    "finite": "a finite number",
+    "int": "a whole number",
+    "string": "text",
+}
+"""What is expected, by the first word of a kind of mistake such as ``int_parsing``."""
+
 
 def _sentence(model: type[BaseModel], error: ValidationError) -> str:
     """Return the message for mistakes in a call."""
@@ -143,13 +152,18 @@ def explain(
         relation = kind.replace("greater_than_equal", "at least").replace(
             "less_than_equal", "at most"
         )
-        return loc, f"must be {relation.replace('_', ' ')} {bound:g}, not {shown(value)}"
+        limit = in_unit_of(value, bound, _unit_at(model, raw))
+        return loc, f"must be {relation.replace('_', ' ')} {limit}, not {shown(value)}"
     if kind == "string_too_short" or value in ("", [], ()):
         return loc, "must not be empty"
     if kind == "too_long":
         return loc, f"expected at most {context['max_length']} items, not {len(value)}"
-    if kind == "string_type":
-        return loc, f"expected text, not {shown(value)}"
+    examples = [getattr(each, "examples", None) for each in _types_at(model, raw)]
+    if kind == "string_pattern_mismatch" and any(examples):
+        return loc, f"{shown(value)} is not a name such as '{next(filter(None, examples))[0]}'"
+    expected = _EXPECTED.get(kind.partition("_")[0])
+    if expected is not None:
+        return loc, f"expected {expected}, not {shown(value)}"
     message = details["msg"]
     return loc, f"{message[:1].lower()}{message[1:]}"
 
@@ -184,15 +198,7 @@ def _at(data: Any, loc: Loc) -> Any:
 
 def _unknown_key(model: type[BaseModel], raw: Loc) -> str:
     """Suggest the valid key nearest to an unknown one, or list all."""
-    models: list[type[BaseModel]] = [model]
-    for step in raw[:-1]:
-        if isinstance(step, str) and not step.startswith("<"):
-            models = [
-                inner
-                for outer in models
-                if step in outer.model_fields
-                for inner in _models(outer.model_fields[step].annotation)
-            ]
+    models = [each for each in _types_at(model, raw[:-1]) if _is_model(each)]
     known = {
         info.alias or name: None
         for each in models
@@ -204,9 +210,33 @@ def _unknown_key(model: type[BaseModel], raw: Loc) -> str:
     return f"unknown key; {hint}"
 
 
-def _models(annotation: Any) -> Iterator[type[BaseModel]]:
-    """Yield the models in an annotation."""
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        yield annotation
+def _unit_at(model: type[BaseModel], raw: Loc) -> str:
+    """Return the SI unit of the quantity at a place; "" if it has none."""
+    units = (each.unit for each in _types_at(model, raw) if isinstance(each, QuantityKind))
+    return next(units, "")
+
+
+def _types_at(model: type[BaseModel], raw: Loc) -> list[Any]:
+    """Return the types that a place may have, with their annotations."""
+    types: list[Any] = [model]
+    for step in raw:
+        if isinstance(step, str) and not step.startswith("<"):
+            fields = (each.model_fields.get(step) for each in types if _is_model(each))
+            types = [
+                part
+                for info in fields
+                if info is not None
+                for part in (info, *info.metadata, *_parts(info.annotation))
+            ]
+    return types
+
+
+def _is_model(given: Any) -> bool:
+    return isinstance(given, type) and issubclass(given, BaseModel)
+
+
+def _parts(annotation: Any) -> Iterator[Any]:
+    """Yield an annotation, and those in it."""
+    yield annotation
     for inner in get_args(annotation):
-        yield from _models(inner)
+        yield from _parts(inner)

@@ -48,6 +48,7 @@ __all__ = [
     "finite_number",
     "format_quantity",
     "get_ready",
+    "in_unit_of",
     "parse_quantity",
     "quantity_schema",
     "read_from_file",
@@ -148,12 +149,9 @@ def parse_quantity(text: str, unit: str, what: str = "quantity") -> float:
 
     Parameters
     ----------
-    text :
-        For example ``"90 mm"``.
-    unit :
-        The SI unit of the result, for example ``"m"``; ``""`` for a ratio such as ``"1 %"``.
-    what :
-        Name of the quantity, for the error message, for example ``"length"``.
+    text : for example ``"90 mm"``.
+    unit : the SI unit of the result, for example ``"m"``; ``""`` for a ratio such as ``"1 %"``.
+    what : name of the quantity, for the error message, for example ``"length"``.
 
     Returns
     -------
@@ -197,12 +195,9 @@ def format_quantity(value: float, unit: str, written: str | None = None) -> str:
 
     Parameters
     ----------
-    value :
-        In SI, finite.
-    unit :
-        The SI unit of `value`.
-    written :
-        The unit of the text if that is exact, for example ``"mm"``; otherwise `unit` is used.
+    value : in SI, finite.
+    unit : the SI unit of `value`.
+    written : the unit of the text if that is exact, for example ``"mm"``; otherwise `unit` is used.
     """
     if written is not None and written != unit:
         factor = _factor(written, unit)
@@ -213,6 +208,13 @@ def format_quantity(value: float, unit: str, written: str | None = None) -> str:
                 return text
     number = f"{value:.15g}"
     return f"{number if float(number) == value else repr(float(value))} {unit}".rstrip()
+
+
+def in_unit_of(given: Any, value: float, unit: str) -> str:
+    """Return a value in SI as text in the unit of a given text if that is exact, else in SI."""
+    number = _NUMBER.match(given.strip()) if isinstance(given, str) else None
+    written = given.strip()[number.end() :].strip() if number else None
+    return "0" if value == 0 else format_quantity(value, unit, written)
 
 
 def quantity_schema(what: str, *examples: str) -> dict[str, Any]:

@@ -96,7 +96,7 @@ def report(
         verdict=verdict,
         findings=tuple(record.findings),
         lines=tuple(_lines(record)),
-        table=_table(record, found),
+        table=_table(record),
         corrected=corrected,
     )
 
@@ -130,7 +130,7 @@ def _lines(record: CommissioningRecord) -> list[tuple[str, str]]:
     return [*lines, ("swing", swing)]
 
 
-def _table(record: CommissioningRecord, found: Commissioning) -> TextTable:
+def _table(record: CommissioningRecord) -> TextTable:
     unit = display_units().length
     rows = []
     for number, channel in enumerate(record.channels, start=1):

@@ -51,14 +51,10 @@ def write_first_file(
 
     Parameters
     ----------
-    kind :
-        robot, task, path, scene or rig.
-    path :
-        Of the file, which must not exist unless `force`.
-    given :
-        Answers by the names of the options; None for those to ask for.
-    ask :
-        Function that asks a question; None to take the defaults.
+    kind : robot, task, path, scene or rig.
+    path : of the file, which must not exist unless `force`.
+    given : answers by the names of the options; None for those to ask for.
+    ask : function that asks a question; None to take the defaults.
 
     Raises
     ------
@@ -452,8 +448,7 @@ def _middle(robot: Any, aside: float = 0.0) -> str:
 
     Parameters
     ----------
-    aside :
-        The shift, as a share of the arm's length.
+    aside : the shift, as a share of the arm's length.
     """
     lower, upper = (np.array(limit) for limit in (robot.pressure_min, robot.pressure_max))
     share = np.resize([0.5, 0.25, 0.15], robot.n_pressures)

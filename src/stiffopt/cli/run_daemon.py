@@ -29,6 +29,7 @@ from stiffopt.rig.config import load_rig
 if TYPE_CHECKING:
     from stiffopt.daemon.daemon import Daemon
     from stiffopt.model.description import RobotDescription
+    from stiffopt.model.scene import Scene
     from stiffopt.optimise.task import Task
     from stiffopt.paths.motion_file import MotionTable
 
@@ -78,9 +79,9 @@ def run(
         raise InputError("--duration: expected a time above 0 s")
     from stiffopt.paths.motion_file import read_motion
 
-    robot = load_rig(rig)[1]  # reports its mistakes before anything else is loaded
+    description, robot = load_rig(rig)  # reports its mistakes before anything else is loaded
     with _Signals().handled() as signals:
-        wanted = None if task is None else _read_task(task, robot)
+        wanted = None if task is None else _read_task(task, robot, description.scene)
         motion = None if play is None else read_motion(play, robot)
         from stiffopt.daemon.daemon import TIMES, Daemon
 
@@ -100,8 +101,9 @@ def run(
     return code
 
 
-def _read_task(path: str, robot: RobotDescription) -> Task:
-    """Read a task file; raise `FileError` if it is wrong or for another robot."""
+def _read_task(path: str, robot: RobotDescription, scene: Scene | None) -> Task:
+    """Read a task file; raise `FileError` if it is wrong, or for another robot or scene."""
+    from stiffopt.control.checks import check_scene
     from stiffopt.optimise.task import load_task
 
     task = load_task(path)
@@ -109,6 +111,7 @@ def _read_task(path: str, robot: RobotDescription) -> Task:
     if asked != robot.name:
         reason = f"is for the robot '{asked}'; this rig has '{robot.name}'"
         raise FileError(path, reason, key="robot")
+    check_scene(task, scene)
     return task
 
 

@@ -40,6 +40,7 @@ _COLOURS = {
     State.HOLDING: "bold yellow",
     State.FAULT: "bold white on red",
 }
+_CONTACTS = {"held": "green", "uncertain": "yellow", "lost": "bold red"}
 _LEVELS = {Severity.INFO: "dim", Severity.WARNING: "yellow", Severity.ERROR: "bold red"}
 _BAR = 24  # characters of a pressure's bar
 _EVENTS = 6
@@ -197,7 +198,7 @@ def status(
     """
     armed = now.state in (State.ACTIVE, State.HOLDING)
     rows: list[tuple[str, RenderableType]] = [*_stiffness(now)] if armed else []
-    rows += _loop(now, rate)
+    rows += [*_brace(now), *_loop(now, rate)]
     for alarm in now.alarms:
         rows.append(("ALARM", Text(f"{printable(alarm.text)} [{alarm.kind}]", "bold red")))
     parts: list[RenderableType] = [_headline(now, name), labelled(_fields(now, armed))]
@@ -294,6 +295,14 @@ def _stiffness(now: Snapshot) -> list[tuple[str, RenderableType]]:
             pressing = unit.number(now.press_force, ".4f")
             text += f"; presses with {pressing} of {unit.text(now.press_goal)}"
         rows.append(("force", text))
+    return rows
+
+
+def _brace(now: Snapshot) -> list[tuple[str, RenderableType]]:
+    """Return the phase of a brace, and a row for each contact while it is held."""
+    rows: list[tuple[str, RenderableType]] = [("brace", now.brace)] if now.brace else []
+    for each in now.leans_on:
+        rows.append(("contact", Text(printable(str(each)), _CONTACTS.get(each.state, ""))))
     return rows
 
 

@@ -80,20 +80,14 @@ def commission(
 
     Parameters
     ----------
-    rig : Rig
-        Open.
-    expected : ExpectedSteps
-        Of `stiffopt.commissioning.expected.expected_steps`.
-    folder : Path
-        Gets the recording.
-    rate : float
-        Rate of the commands, in Hz.
-    quick : bool
-        Hold the steps only briefly: under a minute for six channels, but slow leaks go unnoticed.
-    frequency : float, optional
-        Of the tip's swing according to the model, in Hz; None if the model predicts none.
-    progress, check : callable
-        As in `stiffopt.experiments.poses.run_poses`.
+    rig : open.
+    expected : of `stiffopt.commissioning.expected.expected_steps`.
+    folder : gets the recording.
+    rate : rate of the commands, in Hz.
+    quick : hold the steps only briefly: under a minute for six channels, but slow leaks go
+        unnoticed.
+    frequency : of the tip's swing according to the model, in Hz; None if the model predicts none.
+    progress, check : as in `stiffopt.experiments.poses.run_poses`.
 
     Raises
     ------

@@ -125,13 +125,7 @@ def causes_of(expected: ExpectedSteps) -> list[Cause]:
 
 
 class Explainer:
-    """Compares hypotheses about the responses to one step of each line.
-
-    Parameters
-    ----------
-    expected : ExpectedSteps
-    responses : Responses
-    """
+    """Compares hypotheses about the responses to one step of each line."""
 
     def __init__(self, expected: ExpectedSteps, responses: Responses) -> None:
         self._expected, self._seen = expected, responses

@@ -80,8 +80,7 @@ def findings_of(
 
     Parameters
     ----------
-    rig : Rig
-        Its settings are compared with the measurements.
+    rig : its settings are compared with the measurements.
     expected, seen, explainer, best : prediction, measurement and its explanation.
     frequency : of the swing according to the model, in Hz; None if the model predicts none.
     """

@@ -141,18 +141,12 @@ def run_steps(
 
     Parameters
     ----------
-    rig : Rig
-        Open.
-    expected : ExpectedSteps
-        The model's predictions; they contain the size of the steps.
-    folder : Path
-        Gets the recording (log v1, CSV and MCAP).
-    rate : float
-        Rate of the commands, in Hz.
-    quick : bool
-        Whether to hold the steps only briefly; slow leaks then go unnoticed.
-    progress, check : callable
-        As in `stiffopt.experiments.poses.run_poses`.
+    rig : open.
+    expected : the model's predictions; they contain the size of the steps.
+    folder : gets the recording (log v1, CSV and MCAP).
+    rate : rate of the commands, in Hz.
+    quick : whether to hold the steps only briefly; slow leaks then go unnoticed.
+    progress, check : as in `stiffopt.experiments.poses.run_poses`.
 
     Raises
     ------

@@ -199,9 +199,7 @@ def fingerprints(robot: RobotDescription, rig: Any) -> tuple[str, str]:
 
     Parameters
     ----------
-    robot : RobotDescription
-    rig : RigDescription
-        None for a rig that was not made from a file.
+    rig : None for a rig that was not made from a file.
     """
     parts = None if rig is None else [_content(rig.supply), _content(rig.tracker)]
     return _hash(parts), _hash(_content(robot))
@@ -225,11 +223,6 @@ def commissioned_control(rig: Any, robot: RobotDescription) -> ControlSettings:
 
     Values given in the rig file take precedence. Without a record of exactly this rig that fits,
     the settings are unchanged.
-
-    Parameters
-    ----------
-    rig : RigDescription
-    robot : RobotDescription
     """
     control: ControlSettings = rig.control
     record = _usable_record(rig, robot)
@@ -241,13 +234,7 @@ def commissioned_control(rig: Any, robot: RobotDescription) -> ControlSettings:
 
 
 def is_commissioned(rig: Any, robot: RobotDescription) -> bool:
-    """Return True if there is a record of exactly this rig that fits.
-
-    Parameters
-    ----------
-    rig : RigDescription
-    robot : RobotDescription
-    """
+    """Return True if there is a record of exactly this rig that fits."""
     return _usable_record(rig, robot) is not None
 
 
@@ -255,11 +242,6 @@ def commissioned_robot(rig: Any, robot: RobotDescription) -> RobotDescription:
     """Return a robot with the moduli and gains that the steps of its commissioning imply.
 
     A calibrated robot is unchanged, and so is one without a record of exactly this rig that fits.
-
-    Parameters
-    ----------
-    rig : RigDescription
-    robot : RobotDescription
     """
     record = None if robot.calibration is not None else _usable_record(rig, robot)
     return robot if record is None else with_measured_steps(robot, record)

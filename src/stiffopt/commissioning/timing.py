@@ -213,7 +213,6 @@ def tip_delay(readings: StepReadings, shift: Array, swing: Swing | None) -> floa
 
     Parameters
     ----------
-    readings : StepReadings
     shift : displacements (n, 3) in the steps, in m.
     swing : of the tip, or None.
     """

@@ -102,10 +102,8 @@ class Learning:
 
     Parameters
     ----------
-    description :
-        The arm as its file describes it.
-    tuning :
-        Tuning of the adaptation.
+    description : the arm as its file describes it.
+    tuning : tuning of the adaptation.
     """
 
     def __init__(self, description: RobotDescription, tuning: AdaptationTuning) -> None:
@@ -160,10 +158,8 @@ class Adaptation:
 
     Parameters
     ----------
-    description :
-        The arm as its file describes it.
-    tuning :
-        Bounds, discrepancy and pace.
+    description : the arm as its file describes it.
+    tuning : bounds, discrepancy and pace.
     """
 
     def __init__(self, description: RobotDescription, tuning: AdaptationTuning) -> None:

@@ -30,6 +30,7 @@ NO_SLEW = (
     "pressure.slew in the robot file"
 )
 """Why a rig without a limit of slew is not armed."""
+_LONGEST_PATIENCE = 2.0  # s, greatest safety.guard_timeout
 _BUSY = 1.0  # load of a processor above which programs wait
 
 # limits of how a vented arm may differ from when it was commissioned
@@ -216,25 +217,28 @@ def late_ticks(lateness: float, guard_timeout: float, load: float = 0.0) -> str:
 
     Parameters
     ----------
-    lateness :
-        How late ticks began in the last half minute, in s. If that is half of the guard's timeout,
-        it may exceed the timeout within minutes.
-    guard_timeout :
-        The guard's timeout, in s.
-    load :
-        Number of processes that want to run per processor.
+    lateness : how late ticks began in the last half minute, in s. If that is half of the guard's
+        timeout, it may exceed the timeout within minutes.
+    guard_timeout : the guard's timeout, in s.
+    load : number of processes that want to run per processor.
     """
     half = 0.5 * guard_timeout
     if lateness < half and load < _BUSY:
         return ""
-    what = f"ticks began {1e3 * lateness:.0f} ms late in the last half minute"
+    what = f"the control loop was repeatedly {1e3 * lateness:.0f} ms late in the last half minute"
     if lateness < half:
-        what = f"{load:.1f} processes want each processor of this computer"
+        what = f"{load:.1f} processes compete for each processor"
     advice = (
-        "give the computer less to do, or this program real-time rights that it lacks, if any "
-        "('stiffopt run' lists them when it starts)"
+        "close other programs, or grant the real-time rights that 'stiffopt run' reported missing "
+        "when it started"
     )
     patience = max(0.1, math.ceil(20 * 2.5 * lateness) / 20)
-    if patience > guard_timeout:
-        advice += f", or set safety.guard_timeout: {1e3 * patience:.0f} ms"
-    return f"timing: {what}, and the guard vents after {1e3 * guard_timeout:.0f} ms; {advice}"
+    if guard_timeout < patience <= _LONGEST_PATIENCE:
+        advice += (
+            f"; if neither helps, set 'safety.guard_timeout: {1e3 * patience:.0f} ms' in the rig "
+            "file"
+        )
+    return (
+        f"timing: this computer is too busy: {what}, and the guard vents the arm after "
+        f"{1e3 * guard_timeout:.0f} ms without a command. To mend it, {advice}"
+    )

@@ -15,8 +15,8 @@ The tip goes along an arc, so sigma grows with the square of what it is moved by
 
 With the model's normal forces N0 before the push, and their derivatives G by it, those under the
 push are N = N0 + G F. What is wrong with N0, F and the model's response has the deviation s. Part
-of s is the force that a push would take away which moves the tip as b has, beyond creep, since the
-arm settled. Nobody knows whether that is a push. Then
+of s is the force that a push may have taken away which moves the tip as y - s has changed since the
+arm settled, but for F. Nobody knows how much of that is creep. Then
 
 - the contacts are *held* while N > 2 s, or while no push is felt and b has not drifted. A force
   that is badly known at rest is stated with its deviation, and is no reason to let go;
@@ -30,6 +30,7 @@ arm settled. Nobody knows whether that is a push. Then
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from enum import StrEnum
 from typing import NamedTuple
 
@@ -39,7 +40,7 @@ from numpy.typing import NDArray
 from stiffopt.control.friction import Friction
 from stiffopt.control.interface import Notice
 from stiffopt.control.sliding import SlideEstimator
-from stiffopt.control.state import Severity
+from stiffopt.control.state import HeldContact, Severity
 from stiffopt.control.tuning import BracingTuning
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import Task
@@ -93,6 +94,7 @@ class Bracing:
     ----------
     phase : the present phase.
     is_steered : whether the pressures follow this course; if not, they are held or let down.
+    is_let_down : whether the pressures have been let down, so that nothing is known of contacts.
     next : task to pursue after the release; None: the arm stays at rest.
     force : normal force of the least certain contact, as estimated, in N; NaN without contact.
     deviation : standard deviation of that force, in N.
@@ -104,13 +106,13 @@ class Bracing:
 
     def __init__(self, task: Task, tuning: BracingTuning) -> None:
         self.task, self._tuning = task, tuning
-        self.phase, self.is_steered = BracePhase.PLANNING, True
+        self.phase, self.is_steered, self.is_let_down = BracePhase.PLANNING, True, False
         self.next: Task | None = None
         self.force = self.deviation = self.margin = math.nan
         self.push, self.displacement = np.zeros(3), np.zeros(3)
         self.covariance: Array = tuning.usual_push**2 * np.eye(3)
         self._error: Array | None = None  # b (3,)
-        self._settled: Array = np.zeros(3)  # b when the arm had settled
+        self._settled: Array = np.zeros(3)  # y - s when the arm had settled
         self._corrected: Array = np.zeros(3)  # of late, by the model; friction may withhold it
         self._residual: Array = np.zeros(3)  # y - s, smoothed over vibrations
         self._held = self._pushed = 0.0  # durations, in s
@@ -130,6 +132,8 @@ class Bracing:
         self._concerns: dict[Concern, str] = {}  # what is reported, with its text
         self._calm: dict[Concern, float] = {}  # how long it has not been seen, in s
         self._doubted = 0.0  # for how long contacts have been uncertain, in s
+        self._estimated: Array = np.zeros((0, 2))  # forces of contacts and their deviations (k, 2)
+        self._lost: frozenset[int] = frozenset()  # contacts
         self._why = ""
         self._notices: list[Notice] = []
 
@@ -144,10 +148,26 @@ class Bracing:
 
     @property
     def contacts(self) -> str:
-        """State of the contacts: `held`, `uncertain` or `lost`; empty before the arm leans."""
-        if self.phase is BracePhase.HELD:
+        """State of the contacts: `held`, `uncertain` or `lost`; empty if the arm does not lean."""
+        if self.phase is BracePhase.HELD and not self.is_let_down:
             return "uncertain" if self._doubt else "held"
         return "lost" if self._why else ""
+
+    @property
+    def held(self) -> tuple[HeldContact, ...]:
+        """The contacts while the brace is held; after a loss, those that were lost."""
+        if self.approach is None or not self.contacts:
+            return ()
+        doubted = {each.contact for each in self._concerns if each.kind == _UNCERTAIN}
+        found = []
+        for number, each in enumerate(self.approach.contacts):
+            if self.phase is BracePhase.HELD:
+                state = "uncertain" if number in doubted else "held"
+                force, deviation = self._estimated[number].tolist()
+                found.append(HeldContact(each.object, each.at, state, force, deviation))
+            elif number in self._lost:
+                found.append(HeldContact(each.object, each.at, "lost"))
+        return tuple(found)
 
     @property
     def _doubt(self) -> str:
@@ -173,13 +193,28 @@ class Bracing:
         self._friction = Friction(approach.hold, approach.pressures[-1])
         self._left = float(bool(np.abs(pressures).max() > self._tuning.at_rest))
         self._change = np.zeros_like(pressures)
+        self._estimated = np.full((len(approach.contacts), 2), np.nan)
         self.phase = BracePhase.TO_REST
 
-    def release(self, then: Task | None = None, why: str = "") -> None:
-        """Release the contacts, then pursue the task `then`; `why` is the reason for a failure."""
+    def follow(self, is_steered: bool, pressures: Array) -> None:
+        """Take in, at a tick, whether the effective pressures (n,), in Pa, follow this course."""
+        self.is_steered = is_steered
+        off = 0.0 if self.approach is None else float(np.abs(pressures - self.pressures).max())
+        self.is_let_down = not is_steered and off > self._tuning.let_down
+        if self.is_let_down:
+            self._concerns.clear()
+            self._estimated[:] = self.force = self.deviation = self.margin = math.nan
+            self.push = self.displacement = np.zeros(3)
+
+    def release(self, then: Task | None = None, why: str = "", lost: Iterable[int] = ()) -> None:
+        """Release the contacts, then pursue the task `then`.
+
+        `why` is the reason for a failure, and `lost` are the contacts that were lost.
+        """
         self.next = then or self.next
         if self.phase in (BracePhase.APPROACHING, BracePhase.HELD):
             self.phase, self._why, self._pace = BracePhase.RELEASING, why, 0.0
+            self._lost = frozenset(lost)
             self.force = self.deviation = self.margin = math.nan
             self.push = self.displacement = np.zeros(3)
             text = "goes back on the way that it came"
@@ -266,14 +301,13 @@ class Bracing:
             quaternion = None
         if not (held or self.phase is BracePhase.APPROACHING):
             return
-        off_plan = t.off_plan if self.is_steered else t.let_down
-        if float(np.abs(pressures - self.pressures).max()) > off_plan:
+        if self.is_let_down or float(np.abs(pressures - self.pressures).max()) > t.off_plan:
             return
         sticks = self._sticks
         creep = t.creep * elapsed / (t.creep_time + self._held) if held else 0.0
         friction.follow(pressures, min(elapsed / t.even_time, 1.0), creep)
         residual = seen - tip.pose[:3, 3]
-        if sticks:
+        if sticks and held:  # linearised there: on the way its forces are not those of friction
             residual = residual - friction.tip[:3] @ friction.forces
         if self._error is None:
             self._residual = residual
@@ -290,7 +324,7 @@ class Bracing:
         if self._free >= t.samples:
             where = "the tip is where an arm without contact has it"
             lost = "the brace is lost" if held else "there is nothing where the scene has an object"
-            self.release(why=f"{where}: {lost}")
+            self.release(why=f"{where}: {lost}", lost=range(len(self.approach.contacts)))
             return
         if not held:
             return
@@ -308,46 +342,51 @@ class Bracing:
             if not settles and self._has_slid(elapsed, seen, quaternion, pressures):
                 return
         push, covariance = self._push(C, R, off)
-        feels = self._feels(off, push, before)
-        if settles or not feels or (self._pushed > t.longest_push and not self._doubt):
+        feels = not settles and self._feels(off, push, before)
+        if settles:
+            self._settled = residual
+        drift = self._drift(C, R, residual - self._settled - float(feels) * off, tip, pressures)
+        if not feels or (self._pushed > t.longest_push and not self._doubt):
             time = t.settling_time if settles else t.error_time
             self._error = self._error + min(elapsed / time, 1.0) * raw
-            if settles:
-                self._settled = self._error
             self._pushed = self._pushed * float(feels)
             self.push = self.displacement = np.zeros(3)
-            self._rest(before, self._drift(C, R, tip, pressures), elapsed)
+            self._rest(before, drift, elapsed)
             return
         self._pushed += elapsed
         if sticks and not self._doubt:  # what stays is creep in the end
             self._error = self._error + min(elapsed / t.push_creeps, 1.0) * raw
         self.push, self.displacement = push, off
         self.covariance[:] = covariance
-        self._judge(before, self._drift(C, R, tip, pressures), elapsed)
+        self._judge(before, drift, elapsed)
 
-    def _push(self, C: Array, rotation: Array, off: Array) -> tuple[Array, Array]:
+    def _push(
+        self, C: Array, rotation: Array, off: Array, creep: float = 0.0
+    ) -> tuple[Array, Array]:
         """Return the most likely push (3,) that moves the tip by `off` (3,), and its covariance.
 
-        `C`: compliance (3, 3) of the tip, base axes.
+        `C`: compliance (3, 3) of the tip, base axes; `creep`: deviation of what else moves the tip,
+        in m.
         """
-        usual = self._usual(rotation)
-        gain = np.linalg.solve(C @ usual @ C.T + self._noise(off), C @ usual).T
+        usual, noise = self._usual(rotation), self._noise(off) + creep**2 * np.eye(3)
+        gain = np.linalg.solve(C @ usual @ C.T + noise, C @ usual).T
         return gain @ off, usual - gain @ C @ usual
 
-    def _drift(self, C: Array, rotation: Array, tip: TipAt, pressures: Array) -> Array:
+    def _drift(
+        self, C: Array, rotation: Array, change: Array, tip: TipAt, pressures: Array
+    ) -> Array:
         """Return the forces (k,) that contacts may have lost since settling, unknown to anybody.
 
-        A push that lasts becomes part of b. So does creep, which moves the tip as if the pressures
-        grew, and this part does not count. See `_push` for `C`.
+        A push that lasts becomes part of b, and one that is not felt may be taken for a correction
+        that friction withholds. Creep moves the tip too, in any direction where friction holds the
+        body; its deviation is what the tip would move if the pressures grew. `change`: of y - s,
+        without what is felt (3,); see `_push` for `C`.
         """
-        t = self._tuning
-        assert self._error is not None
-        change, began = self._error - self._settled, t.creep_time + self._settling
+        t, began = self._tuning, self._tuning.creep_time + self._settling
         folds = math.log(max((t.creep_time + self._held) / began, 1.0))
-        creep = t.most_creep * folds * float(np.linalg.norm(tip.jacobian[:3] @ pressures))
-        size = float(np.linalg.norm(change))
-        change = max(0.0, 1 - creep / max(size, 1e-12)) * change
-        found: Array = np.maximum(-(self._per_push @ self._push(C, rotation, change)[0]), 0.0)
+        creep = t.unknown_creep * folds * float(np.linalg.norm(tip.jacobian[:3] @ pressures))
+        push = self._push(C, rotation, change, creep)[0]
+        found: Array = np.maximum(-(self._per_push @ push), 0.0)
         return found
 
     def _has_slid(
@@ -371,9 +410,9 @@ class Bracing:
         self._slid = self._slid + 1 if slid.any() else 0
         if self._slid < t.samples:
             return False
-        most = int(np.where(slid, sizes, 0.0).argmax())
-        where = self._named(approach.hold.sticking.own[most])
-        self.release(why=f"{where} has slid by {1e3 * sizes[most]:.1f} mm")
+        most, own = int(np.where(slid, sizes, 0.0).argmax()), approach.hold.sticking.own
+        why = f"{self._named(own[most])} has slid by {1e3 * sizes[most]:.1f} mm"
+        self.release(why=why, lost=[own[int(i)] for i in np.flatnonzero(slid)])
         return True
 
     def _feels(self, off: Array, push: Array, before: Array) -> bool:
@@ -477,10 +516,7 @@ class Bracing:
         """Judge whether the contacts hold while no push is felt; see `_judge`."""
         t = self._tuning
         own = self._rest_deviations(before)
-        deviations = np.hypot(own, drift)
-        left = before - t.certain * deviations
-        weakest = int(left.argmin())
-        self.force, self.deviation = float(before[weakest]), float(deviations[weakest])
+        left = self._estimate(before, np.hypot(own, drift))
         self.margin, found = math.nan, {}
         for each in map(int, np.flatnonzero((left < 0) & (drift > t.felt_share * before))):
             text = self._lifted(each, float(before[each] + t.certain * own[each]))
@@ -498,10 +534,7 @@ class Bracing:
         t, size = self._tuning, float(np.linalg.norm(self.push))
         change = self._per_push @ self.push
         forces, own = before + change, self._deviations(before, change)
-        most, deviations = forces + t.certain * own, np.hypot(own, drift)
-        reach = t.certain * deviations
-        weakest = int((forces - reach).argmin())
-        self.force, self.deviation = float(forces[weakest]), float(deviations[weakest])
+        most, least = forces + t.certain * own, self._estimate(forces, np.hypot(own, drift))
         falls = change < 0
         left = size * float(np.min(before[falls] / -change[falls], initial=math.inf))
         if self._sticks:
@@ -509,18 +542,27 @@ class Bracing:
         self.margin = max(left - size, 0.0)
         words = f"under a push of {1e3 * size:.0f} mN"
         if (most < 0).any():
-            self.release(why=f"{self._named(int(most.argmin()))} lifts off {words}")
+            lifted = self._named(int(most.argmin()))
+            lost = np.flatnonzero(most < 0).tolist()
+            self.release(why=f"{lifted} lifts off {words}", lost=lost)
             return
         slid, found = self._friction.slid(self.push, before), {}
         kind, how = (_UNCERTAIN, "may slide") if self._sticks else (_SLIPS, "slips")
         for i in np.flatnonzero(slid > t.slid):
             each = self.approach.hold.sticking.own[int(i)]
             found[Concern(kind, each, "slide")] = f"{self._named(each)} {how} {words}"
-        for each in map(int, np.flatnonzero(forces < reach)):
+        for each in map(int, np.flatnonzero(least < 0)):
             text, whole = self._lifted(each, float(most[each])), 1e3 * before[each]
             text = f"{text} {words}; without it, {whole:.0f} mN"
             found[Concern(_UNCERTAIN, each, "lift")] = text
         self._weigh(found, elapsed)
+
+    def _estimate(self, forces: Array, deviations: Array) -> Array:
+        """Take in estimated forces (k,) and their deviations (k,); return their low ends (k,)."""
+        least: Array = forces - self._tuning.certain * deviations
+        self._estimated = np.column_stack([forces, deviations])
+        self.force, self.deviation = self._estimated[int(least.argmin())].tolist()
+        return least
 
     def _weigh(self, found: dict[Concern, str], elapsed: float) -> None:
         """Take in what is of concern at a sample.
@@ -543,7 +585,8 @@ class Bracing:
             self._doubted += elapsed
             if self._doubted > t.longest_push:
                 time = f"{t.longest_push:.0f} s"
-                self.release(why=f"for {time} it was uncertain: {self._doubt}")
+                lost = [each.contact for each in self._concerns if each.kind == _UNCERTAIN]
+                self.release(why=f"for {time} it was uncertain: {self._doubt}", lost=lost)
 
     def _lifted(self, contact: int, most: float) -> str:
         return f"{self._named(contact)} may have lifted off: it has 0 to {1e3 * most:.0f} mN"

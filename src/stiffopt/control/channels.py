@@ -45,14 +45,10 @@ class Channels:
 
     Parameters
     ----------
-    limits :
-        Limits of the commands.
-    slew :
-        Greatest rate of change (n,), in Pa/s.
-    tolerance :
-        Tolerance of the pressure monitor (n,), in Pa.
-    tuning :
-        Tuning of the regulators.
+    limits : limits of the commands.
+    slew : greatest rate of change (n,), in Pa/s.
+    tolerance : tolerance of the pressure monitor (n,), in Pa.
+    tuning : tuning of the regulators.
 
     Attributes
     ----------
@@ -137,14 +133,11 @@ class Channels:
 
         Parameters
         ----------
-        elapsed :
-            Time since the last call, in s.
-        command, reading :
-            Commands and readings (n,), in Pa; NaN: not measured.
-        offset :
-            Settled pressures relative to commands (n,), in Pa.
-        healthy :
-            Least and greatest pressures (2, n) that regulators without a fault have now, in Pa.
+        elapsed : time since the last call, in s.
+        command, reading : commands and readings (n,), in Pa; NaN: not measured.
+        offset : settled pressures relative to commands (n,), in Pa.
+        healthy : least and greatest pressures (2, n) that regulators without a fault have now, in
+            Pa.
         """
         share = -math.expm1(-elapsed / self._tuning.reading_time)
         looked, follows, strays, sound = self._look.view(

@@ -6,7 +6,8 @@ They apply to all requests: from Python, a client of the daemon or the command l
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, TypeVar
 
@@ -16,18 +17,20 @@ from pydantic import BaseModel
 
 from stiffopt.errors import CommandError, InputError, StiffoptError
 from stiffopt.model.manipulator import Manipulator
+from stiffopt.model.scene import Scene
 from stiffopt.optimise.solver import PressureSolver
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import PressureRange, Task
 from stiffopt.paths.trajectory import Trajectory, Waypoint
 from stiffopt.rig.interface import PressureLimits
-from stiffopt.schema import Schema
+from stiffopt.schema import BadKeyError, Schema
 
 Array = NDArray[np.float64]
 ModelT = TypeVar("ModelT", bound=Schema)
 
 _IGNORED_FIELDS = frozenset({"source"})  # the file that a description was read from
 _ROUNDING = 1e-6  # relative, of a rate
+_EQUAL = 1e-9  # difference of numbers by rounding, relative, and in SI
 _MAX_LISTED = 5  # keys that an error names
 
 
@@ -54,6 +57,58 @@ def check_task(task: Task, limits: PressureLimits) -> None:
     """Refuse a task that is invalid or needs pressures beyond the limits."""
     with refusing("task"):
         limited_range(validated(task, Task).pressure, limits)
+
+
+def check_scene(task: Task, scene: Scene | None) -> None:
+    """Refuse a task that does not suit the rig's scene, which is the one that counts on a rig.
+
+    A scene of the task's own may not ask for more than the rig's: no other objects or shapes, no
+    smaller `max_force`, no greater clearance. The objects of a brace must allow contact.
+    """
+    if task.brace is not None:
+        if scene is None:
+            raise task.error_at("brace", "the rig file has no scene with objects to lean on")
+        try:
+            task.brace.check_objects(scene)
+        except BadKeyError as error:
+            key = ".".join(map(str, ("brace", *error.loc)))
+            raise task.error_at(key, f"{error} (in the rig's scene)") from None
+    if task.scene is not None:
+        _check_own_scene(task, task.scene, scene)
+
+
+def _check_own_scene(task: Task, own: Scene, scene: Scene | None) -> None:
+    """Refuse a scene of the task's `own` that asks for more than the rig's scene."""
+    rigs = {} if scene is None else {item.name: item for item in scene.objects}
+    remedy = "on a rig the scene of the rig file counts: write it there"
+    for item in own.objects:
+        there = rigs.get(item.name)
+        if there is None:
+            raise task.error_at("scene", f"the rig has no object '{item.name}'; {remedy}")
+        if not _is_same(item.shape.model_dump(), there.shape.model_dump()):
+            where = f"'{item.name}' has another place or shape in the rig's scene"
+            raise task.error_at("scene", f"{where}; {remedy}")
+        force = None if item.contact is None else item.contact.max_force
+        if force is None or there.contact is None or not there.contact.allowed:
+            continue
+        most = there.contact.max_force
+        if most is None or most > force * (1 + _EQUAL):
+            where = f"'{item.name}' may be pressed with more than 'max_force' in the rig's scene"
+            raise task.error_at("scene", f"{where}; {remedy}")
+    if scene is not None and own.clearance > scene.clearance * (1 + _EQUAL):
+        where = "its clearance is greater than that of the rig's scene"
+        raise task.error_at("scene", f"{where}; {remedy}")
+
+
+def _is_same(one: Any, other: Any) -> bool:
+    """Return whether two dumped shapes are equal, but for rounding."""
+    if isinstance(one, Mapping) and isinstance(other, Mapping):
+        return one.keys() == other.keys() and all(_is_same(one[key], other[key]) for key in one)
+    if isinstance(one, tuple | list) and isinstance(other, tuple | list):
+        return len(one) == len(other) and all(map(_is_same, one, other))
+    if isinstance(one, float) and isinstance(other, float):
+        return math.isclose(one, other, rel_tol=_EQUAL, abs_tol=_EQUAL)
+    return bool(one == other)
 
 
 def check_target(target: Target) -> None:

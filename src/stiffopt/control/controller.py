@@ -59,26 +59,17 @@ class TipController:
 
     Parameters
     ----------
-    robot :
-        The model of the arm.
-    limits :
-        Limits of the commands.
-    slew :
-        Greatest rate of change (n,), in Pa/s.
-    period :
-        Period of the loop, in s.
-    control, safety :
-        Settings of the rig.
-    vibrates :
-        Whether to model a vibration, if the settings leave that open.
-    scene :
-        Objects that the arm has to keep clear of; None: nothing is checked.
-    plan_in_process :
-        Whether to plan in a separate process; otherwise inline, for simulated time.
-    commissioned :
-        Whether the arm is known to respond as modelled; otherwise its first motion is slow.
-    tuning :
-        Tuning of the parts.
+    robot : the model of the arm.
+    limits : limits of the commands.
+    slew : greatest rate of change (n,), in Pa/s.
+    period : period of the loop, in s.
+    control, safety : settings of the rig.
+    vibrates : whether to model a vibration, if the settings leave that open.
+    scene : objects that the arm has to keep clear of; None: nothing is checked.
+    plan_in_process : whether to plan in a separate process; otherwise inline, for simulated time.
+    commissioned : whether the arm is known to respond as modelled; otherwise its first motion is
+        slow.
+    tuning : tuning of the parts.
 
     Attributes
     ----------
@@ -313,7 +304,7 @@ class TipController:
         self._arm.touch.stiffness_error = self.replanner.deviation
         course, steers = self.replanner.pursuit.course, not self._is_held(now)
         if isinstance(course, Bracing):
-            course.is_steered = steers
+            course.follow(steers, self._arm.pressures.effective)
         swings = now - self._moved_at < self._tuning.estimator.swings_on
         self._arm.tip.learns = steers and swings
         counts = self._arm.observe(now, commanded, reading, samples, course)

@@ -35,12 +35,10 @@ class Course:
 
     Parameters
     ----------
-    trajectory :
-        The waypoints.
-    begin :
-        Time at which it begins, in s.
-    position, rotation :
-        Of the tip at that time, (3,) and (3, 3): the start if the first waypoint is later.
+    trajectory : the waypoints.
+    begin : time at which it begins, in s.
+    position, rotation : of the tip at that time, (3,) and (3, 3): the start if the first waypoint
+        is later.
 
     Raises
     ------

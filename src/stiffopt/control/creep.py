@@ -41,12 +41,9 @@ class CreepEstimator:
 
     Parameters
     ----------
-    n :
-        Number of channels.
-    known :
-        Whether the effective pressures already contain the creep of this robot.
-    tuning :
-        Time constants, priors and noise.
+    n : number of channels.
+    known : whether the effective pressures already contain the creep of this robot.
+    tuning : time constants, priors and noise.
     """
 
     def __init__(self, n: int, known: bool, tuning: CreepTuning) -> None:
@@ -129,16 +126,11 @@ class CreepEstimator:
 
         Parameters
         ----------
-        elapsed :
-            Time since the last sample, in s.
-        away :
-            Measured position (3,) minus the model's, without vibration, in m.
-        grown :
-            Growth of the square of the model's recent way, in m^2.
-        speed :
-            Of the model's tip, in m/s.
-        felt :
-            Projection (3, 3) on the directions in which the arm feels a force.
+        elapsed : time since the last sample, in s.
+        away : measured position (3,) minus the model's, without vibration, in m.
+        grown : growth of the square of the model's recent way, in m^2.
+        speed : of the model's tip, in m/s.
+        felt : projection (3, 3) on the directions in which the arm feels a force.
         """
         t, P = self._tuning, self._covariance
         error = np.arange(3)

@@ -59,6 +59,7 @@ class _PastTip(NamedTuple):
     # rows (5, 3): position, the driven xi and w, and their derivatives by the relative frequency
     motion: Array
     rotation: Array  # (3, 3)
+    pressures: Array  # that the shape has followed (n,), in Pa
 
     @property
     def static(self) -> Array:
@@ -90,14 +91,10 @@ class TipEstimator:
 
     Parameters
     ----------
-    period :
-        Duration of a step, in s.
-    n :
-        Number of channels.
-    mode :
-        The arm's first bending mode, or None for an arm that does not vibrate.
-    tuning :
-        Noise and outlier rejection.
+    period : duration of a step, in s.
+    n : number of channels.
+    mode : the arm's first bending mode, or None for an arm that does not vibrate.
+    tuning : noise and outlier rejection.
     """
 
     def __init__(
@@ -143,6 +140,7 @@ class TipEstimator:
         self.sample: PoseSample | None = None  # the latest that was used
         self.predicted: Array = np.zeros(3)  # position at its capture without the offset
         self.turned: Array = np.zeros(3)  # rotation vector from the orientation predicted likewise
+        self.captured: Array = np.zeros(0)  # pressures (n,) at that time, in Pa
         # amplitudes of the driven and the free vibration at that time, in m
         self.swings = (0.0, 0.0)
         self._first: PoseSample | None = None
@@ -209,8 +207,8 @@ class TipEstimator:
                 tip.pose, tip.jacobian, last.motion, self._free, self.soft_plane, pressures,
                 self._pressures, ahead, self._times, self.excess, self._displacements,
             )  # fmt: skip
-        self._past.append(_PastTip(now, motion, rotation))
         self._pressures = pressures.copy()
+        self._past.append(_PastTip(now, motion, rotation, self._pressures))
 
     def take(self, samples: Sequence[PoseSample]) -> SampleCounts:
         """Correct the state by samples, each at the time of its capture.
@@ -324,7 +322,8 @@ class TipEstimator:
         after = past[index + 1]
         share = (time - before.time) / (after.time - before.time)
         motion = before.motion + share * (after.motion - before.motion)
-        return _PastTip(time, motion, before.rotation if share < 0.5 else after.rotation)
+        pressures = before.pressures + share * (after.pressures - before.pressures)
+        return _PastTip(time, motion, (before if share < 0.5 else after).rotation, pressures)
 
     def _is_plausible(self, sample: PoseSample, past: _PastTip) -> bool:
         """Whether the tip can have moved there since the last sample, or is expected there."""
@@ -367,7 +366,7 @@ class TipEstimator:
         )  # fmt: skip
         self._displacements = np.zeros(2)
         self._used_until = sample.time
-        self.sample, self._rejected = sample, 0
+        self.sample, self.captured, self._rejected = sample, past.pressures, 0
         self.swings = float(swings[0]), float(swings[1])
 
 

@@ -84,14 +84,10 @@ def tracking_rows(
 
     Parameters
     ----------
-    n :
-        Number of channels.
-    vibrates :
-        Whether the arm vibrates.
-    damping, dead_time :
-        Damping ratio of the mode; dead time of the regulators, in s.
-    tuning :
-        Weights of the rows.
+    n : number of channels.
+    vibrates : whether the arm vibrates.
+    damping, dead_time : damping ratio of the mode; dead time of the regulators, in s.
+    tuning : weights of the rows.
     """
     tuning = tuning or FeedbackTuning()
     lever, mode_weight = tuning.lever, tuning.mode_weight

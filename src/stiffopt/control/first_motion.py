@@ -24,10 +24,9 @@ class FirstMotion:
 
     Parameters
     ----------
-    is_known :
-        Whether the arm is known to respond as modelled, so that its first motion may be fast.
-    tuning :
-        Speed of the first motion, and when it ends.
+    is_known : whether the arm is known to respond as modelled, so that its first motion may be
+        fast.
+    tuning : speed of the first motion, and when it ends.
     """
 
     def __init__(self, is_known: bool, tuning: FirstMotionTuning) -> None:

@@ -33,14 +33,11 @@ class Formula:
 
     Parameters
     ----------
-    inputs, outputs :
-        Symbols, and expressions of them.
-    matrices :
-        Inputs and outputs that stay matrices even with a single column, such as a Jacobian with
-        one column per channel.
-    before :
-        A formula whose outputs are the first inputs. They stay where it leaves them, and are no
-        arguments of a call.
+    inputs, outputs : symbols, and expressions of them.
+    matrices : inputs and outputs that stay matrices even with a single column, such as a Jacobian
+        with one column per channel.
+    before : a formula whose outputs are the first inputs. They stay where it leaves them, and are
+        no arguments of a call.
     """
 
     def __init__(

@@ -115,8 +115,10 @@ class Alarms:
         self._lock = threading.Lock()
         self.now: tuple[Alarm, ...] = ()
 
-    def set(self, time: float, kind: str, text: str, severity: Severity = Severity.WARNING) -> None:
-        """Set the alarm of a kind, or change its text."""
+    def set(
+        self, time: float, kind: str, text: str, severity: Severity | None = Severity.WARNING
+    ) -> None:
+        """Set the alarm of a kind, or change its text; None: without an event."""
         with self._lock:
             before = self._standing.get(kind)
             if before is not None and before.text == text:
@@ -124,7 +126,7 @@ class Alarms:
             since = time if before is None else before.since
             self._standing[kind] = Alarm(kind, text, since)
             self.now = tuple(self._standing.values())
-        if before is None:
+        if before is None and severity is not None:
             self._events.add(time, kind, text, severity)
 
     def clear(self, time: float, kind: str) -> None:

@@ -35,8 +35,7 @@ class LeaningTip:
 
     Parameters
     ----------
-    approach :
-        The way into contact. Other pressures use the model of its nearest equilibrium.
+    approach : the way into contact. Other pressures use the model of its nearest equilibrium.
     """
 
     def __init__(self, approach: BraceApproach) -> None:
@@ -60,17 +59,13 @@ class ArmModel:
 
     Parameters
     ----------
-    robot :
-        The arm.
-    path_range :
-        As `linear_range` of `LinearisedTip`, for the tip on the reference's path.
+    robot : the arm.
+    path_range : as `linear_range` of `LinearisedTip`, for the tip on the reference's path.
 
     Attributes
     ----------
-    chambers, path : LinearisedTip
-        The tip at the effective pressures, and on the reference's path.
-    waypoints : TipModel
-        The tip at a trajectory's waypoints, and for other rare uses.
+    chambers, path : the tip at the effective pressures, and on the reference's path.
+    waypoints : the tip at a trajectory's waypoints, and for other rare uses.
 
     Raises
     ------
@@ -119,13 +114,11 @@ class LinearisedTip:
 
     Parameters
     ----------
-    robot :
-        The arm.
-    linear_range :
-        Motion over which the model counts as linear, as a turn in rad: the change of the pressures
-        times the Jacobian, as norms, a displacement being divided by the arm's length. Over 0.03
-        the position is accurate to some micrometres, over 0.07 the Jacobian to a few percent, or to
-        a sixth where an arm bends by nearly half a turn.
+    robot : the arm.
+    linear_range : motion over which the model counts as linear, as a turn in rad: the change of the
+        pressures times the Jacobian, as norms, a displacement being divided by the arm's length.
+        Over 0.03 the position is accurate to some micrometres, over 0.07 the Jacobian to a few
+        percent, or to a sixth where an arm bends by nearly half a turn.
     """
 
     def __init__(self, robot: Manipulator, linear_range: float = 0.03) -> None:

@@ -164,9 +164,9 @@ class MotionWatch:
         offset :
             Estimated offset (6,) of the tip's pose from the model's, in m and rad.
         pressures :
-            Effective pressures (n,), in Pa.
+            Effective pressures (n,) at that time, in Pa.
         tip :
-            The model's tip at these pressures.
+            The model's tip now.
         turned :
             Rotation vector (3,) from the predicted orientation to that in the sample, in rad; None:
             not measured.
@@ -337,7 +337,8 @@ class MotionWatch:
         speeds = np.sqrt(((steps[:, _PREDICTED] @ P) ** 2).sum(axis=1)) / steps[:, _TIME]
         late = tuning.late * (speeds + speeds[-1])  # error by a delay of y, in m
         driven = rows[:-1, _DRIVEN] + rows[-1, _DRIVEN]
-        other = late + tuning.swing_error * driven + rows[:-1, _FREE] + 6 * tuning.scatter
+        other = tuning.swing_error * driven + rows[:-1, _FREE] + 6 * tuning.scatter
+        # an arm that is late will be so again: its delay is a part of the error that is learned
         error = float(((off - other)[far] / np.maximum(motion, distance)[far]).max())
         suspects = np.flatnonzero(far & (aside**2 + short**2 > (most * distance) ** 2))
         if not len(suspects):
@@ -345,7 +346,7 @@ class MotionWatch:
         length, model = ((ways[suspects, part] ** 2).sum(axis=1) for part in (_SEEN, _PREDICTED))
         own = own[suspects]
         own[length < tuning.still**2 * model] = 0.0  # a wrong model would move it somewhere
-        explained = own + other[suspects] + tuning.noise
+        explained = own + (late + other)[suspects] + tuning.noise
         worst = int(np.argmax(off[suspects] / explained))
         first = suspects[worst]
         share = float(off[first] / explained[worst])

@@ -40,24 +40,18 @@ class ArmObserver:
 
     Parameters
     ----------
-    robot, limits, slew, period, control, safety, tuning :
-        See `TipController`; slew (n,), in Pa/s.
-    mode :
-        The arm's first bending mode; None for an arm that does not vibrate.
-    go_back :
-        Called with pressures (n,) at which the model has no equilibrium; changes to a model that
-        has one, by `change_robot`, and returns whether there is one.
+    robot, limits, slew, period, control, safety, tuning : see `TipController`; slew (n,), in Pa/s.
+    mode : the arm's first bending mode; None for an arm that does not vibrate.
+    go_back : called with pressures (n,) at which the model has no equilibrium; changes to a model
+        that has one, by `change_robot`, and returns whether there is one.
 
     Attributes
     ----------
-    channels, pressures, tip, touch, watch :
-        The observer's parts; `tip` is the estimator of the tip.
-    model : ArmModel or None
-        None until `check` has compiled it.
-    modelled : TipAt or None
-        The model's tip at the effective pressures.
-    leaning : LeaningTip or None
-        The model of the braced tip, while the arm may lean on objects.
+    channels, pressures, tip, touch, watch : the observer's parts; `tip` is the estimator of the
+        tip.
+    model : None until `check` has compiled it.
+    modelled : the model's tip at the effective pressures.
+    leaning : the model of the braced tip, while the arm may lean on objects.
     """
 
     def __init__(
@@ -226,8 +220,8 @@ class ArmObserver:
             if turned is not None:
                 turned = turned - turn_of_a_push(tip, along_stiff_axis=True) @ pushed
         self.watch.take(
-            sample.time, sample.position - pushed, predicted, self.tip.offset, effective, tip,
-            turned=turned, swings=self.tip.swings, deviation=self.tip.deviation,
+            sample.time, sample.position - pushed, predicted, self.tip.offset, self.tip.captured,
+            tip, turned=turned, swings=self.tip.swings, deviation=self.tip.deviation,
         )  # fmt: skip
 
     def lean_on(self, leaning: LeaningTip | None) -> Array:

@@ -50,10 +50,8 @@ class ObstructionWatch:
 
         Parameters
         ----------
-        tip, offset :
-            Position (3,) of the tip, in m, and its offset (6,) from the model.
-        target :
-            Position (3,) of the target; NaN along free axes.
+        tip, offset : position (3,) of the tip, in m, and its offset (6,) from the model.
+        target : position (3,) of the target; NaN along free axes.
         """
         t, modelled = self._tuning, tip - offset[:3]
         left = float(np.linalg.norm(np.nan_to_num(target - tip)))

@@ -81,13 +81,10 @@ class ProcessPlanner:
 
     Parameters
     ----------
-    robot :
-        The arm.
-    scene :
-        Objects from which the ways to plans keep clear.
-    patience :
-        Planning time beyond which there is an alarm, in s. The first task of a kind may have to be
-        compiled, which takes seconds.
+    robot : the arm.
+    scene : objects from which the ways to plans keep clear.
+    patience : planning time beyond which there is an alarm, in s. The first task of a kind may have
+        to be compiled, which takes seconds.
     """
 
     def __init__(

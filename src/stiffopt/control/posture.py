@@ -25,14 +25,10 @@ class PostureCourse:
 
     Parameters
     ----------
-    trajectory :
-        The waypoints, with n pressures each.
-    begin :
-        Time at which it begins, in s.
-    start :
-        Start (n + 6,) if the first waypoint is later, as `goal` returns it.
-    pose_at :
-        Returns the model's tip pose (4, 4) at pressures (n,).
+    trajectory : the waypoints, with n pressures each.
+    begin : time at which it begins, in s.
+    start : start (n + 6,) if the first waypoint is later, as `goal` returns it.
+    pose_at : returns the model's tip pose (4, 4) at pressures (n,).
     """
 
     def __init__(

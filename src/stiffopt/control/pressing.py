@@ -49,10 +49,8 @@ class Pressing:
 
     Parameters
     ----------
-    press, target :
-        The press, and the target at which the approach begins.
-    tuning :
-        Times and limits.
+    press, target : the press, and the target at which the approach begins.
+    tuning : times and limits.
 
     Attributes
     ----------
@@ -164,24 +162,16 @@ class Pressing:
 
         Parameters
         ----------
-        elapsed :
-            Time since the last tick, in s.
-        arrived :
-            Whether the arm rests at its target.
-        known :
-            Whether no better estimate of its stiffness is due soon.
-        tip, offset :
-            Position (3,) of the tip, in m, and its offset (6,) from the model.
-        felt :
-            Estimated force on the tip.
-        creep :
-            Estimator of the tip's creep.
-        rotation, compliance :
-            Rotation (3, 3) of the model's tip, and compliance (3, 3) of its position, in m/N, both
-            in base axes.
-        short :
-            Way (3,) from the nearest pose that the arm reaches by its model to the present target,
-            in m.
+        elapsed : time since the last tick, in s.
+        arrived : whether the arm rests at its target.
+        known : whether no better estimate of its stiffness is due soon.
+        tip, offset : position (3,) of the tip, in m, and its offset (6,) from the model.
+        felt : estimated force on the tip.
+        creep : estimator of the tip's creep.
+        rotation, compliance : rotation (3, 3) of the model's tip, and compliance (3, 3) of its
+            position, in m/N, both in base axes.
+        short : way (3,) from the nearest pose that the arm reaches by its model to the present
+            target, in m.
         """
         t = self._tuning
         is_free = self.phase in (Phase.GOING, Phase.ENDED)

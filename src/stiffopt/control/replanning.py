@@ -145,12 +145,9 @@ class Replanner:
 
         Parameters
         ----------
-        now :
-            Time, in s.
-        position, rotation :
-            Of the tip now, (3,) and (3, 3).
-        pressures, offset :
-            Effective pressures (n,), in Pa, and the tip's offset (6,) now.
+        now : time, in s.
+        position, rotation : of the tip now, (3,) and (3, 3).
+        pressures, offset : effective pressures (n,), in Pa, and the tip's offset (6,) now.
         """
         target, here = self.pursuit.target, target_arrays(self.pursuit.target)[0]
         if self.pursuit.course is not None or target is None:
@@ -188,21 +185,14 @@ class Replanner:
 
         Parameters
         ----------
-        now :
-            Time, in s.
-        offset, pressure_offset :
-            See `PlanRequest`.
-        omega :
-            Angular frequency of the vibration, in rad/s.
-        delay :
-            Delay of the reference behind the plan, in s.
-        available :
-            Lowest and highest pressures (n,) that the channels can have, in Pa. A change of more
-            than a little starts a search of all configurations.
-        way :
-            See `PlanRequest`; None without a scene.
-        windows, here :
-            See `PlanRequest`; `here` is None for an arm that does not vibrate.
+        now : time, in s.
+        offset, pressure_offset : see `PlanRequest`.
+        omega : angular frequency of the vibration, in rad/s.
+        delay : delay of the reference behind the plan, in s.
+        available : lowest and highest pressures (n,) that the channels can have, in Pa. A change of
+            more than a little starts a search of all configurations.
+        way : see `PlanRequest`; None without a scene.
+        windows, here : see `PlanRequest`; `here` is None for an arm that does not vibrate.
 
         Returns
         -------

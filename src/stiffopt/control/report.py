@@ -28,14 +28,11 @@ class Report:
 
     Parameters
     ----------
-    robot :
-        The model of the arm.
-    arm :
-        The state of the arm.
-    replanner :
-        What is pursued, and the plans for it.
-    largest_offset :
-        Distance of the measured tip from the model's above which the model is wrong, in m.
+    robot : the model of the arm.
+    arm : the state of the arm.
+    replanner : what is pursued, and the plans for it.
+    largest_offset : distance of the measured tip from the model's above which the model is wrong,
+        in m.
     """
 
     def __init__(
@@ -56,10 +53,8 @@ class Report:
 
         Parameters
         ----------
-        now :
-            Time, in s.
-        led :
-            On a trajectory of pressures, its present target and effective pressures (n,), in Pa.
+        now : time, in s.
+        led : on a trajectory of pressures, its present target and effective pressures (n,), in Pa.
         """
         n, arm, pursuit = self._robot.n_pressures, self._arm, self._replanner.pursuit
         if arm.modelled is None:
@@ -111,11 +106,12 @@ class Report:
             wrench_covariance=covariance.ravel(),
             press_force=press_force,
             press_goal=press_goal,
-            brace="" if bracing is None else bracing.phase.value,
+            brace="" if bracing is None or bracing.is_let_down else bracing.phase.value,
             brace_contacts="" if bracing is None else bracing.contacts,
             brace_force=math.nan if bracing is None else bracing.force,
             brace_force_deviation=math.nan if bracing is None else bracing.deviation,
             brace_margin=math.nan if bracing is None else bracing.margin,
+            leans_on=() if bracing is None else bracing.held,
             task=pursuit.kind,
             stiffness_unit=pursuit.unit,
             model_position=estimate.static,

@@ -9,13 +9,13 @@ from numpy.typing import NDArray
 
 from stiffopt.control.adaptation import Adapted
 from stiffopt.control.bracing import Bracing
-from stiffopt.control.checks import check_press, check_rates, limited_range
+from stiffopt.control.checks import check_press, check_rates, check_scene, limited_range
 from stiffopt.control.course import Course
 from stiffopt.control.forecast import Forecast
 from stiffopt.control.pressing import Pressing
 from stiffopt.control.replanning import AnyCourse, Pursuit
 from stiffopt.control.tuning import ControlTuning
-from stiffopt.errors import EquilibriumError, InputError, dotted
+from stiffopt.errors import EquilibriumError, InputError
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.scene import Scene
 from stiffopt.optimise.press import Press
@@ -24,7 +24,6 @@ from stiffopt.optimise.task import PressureRange, Task
 from stiffopt.optimise.tip import TipModel
 from stiffopt.paths.trajectory import Trajectory
 from stiffopt.rig.interface import PressureLimits
-from stiffopt.schema import BadKeyError
 
 Array = NDArray[np.float64]
 
@@ -39,10 +38,8 @@ class Requests:
 
     Parameters
     ----------
-    robot, limits, slew, scene, tuning :
-        See `TipController`; slew (n,), in Pa/s.
-    tip_speed :
-        See `ControlSettings`.
+    robot, limits, slew, scene, tuning : see `TipController`; slew (n,), in Pa/s.
+    tip_speed : see `ControlSettings`.
     """
 
     def __init__(
@@ -60,6 +57,7 @@ class Requests:
 
     def of_task(self, task: Task) -> Pursuit:
         """Return the pursuit of a task, which may press or brace."""
+        check_scene(task, self._scene)
         course: AnyCourse | None = None
         if task.press is not None:
             if task.press.speed > self._tip_speed:
@@ -71,7 +69,7 @@ class Requests:
                 )
             course = Pressing(task.press, task.target, self._tuning.pressing)
         elif task.brace is not None:
-            task = self._in_the_rigs_scene(task)
+            task = task.model_copy(update={"scene": self._scene})
             course = Bracing(task, self._tuning.bracing)
         return Pursuit.of(task, self._limited(task), course)
 
@@ -118,8 +116,8 @@ class Requests:
             self._check_speed(times, self._parts(request.pressures, adapted))
         if isinstance(request, Task):
             check_press(self._robot, self._limits, request)
+            check_scene(request, self._scene)
             if request.brace is not None:
-                self._in_the_rigs_scene(request)
                 return
         if forecast is None or leans:
             return
@@ -133,18 +131,6 @@ class Requests:
                 course = Course(request, 0.0, here.position, here.rotation)
                 request = course.at(0.0)
             forecast.check(self.of_target(request, here.pursuit, course))
-
-    def _in_the_rigs_scene(self, task: Task) -> Task:
-        """Return a task in the rig's scene; refuse it if the scene lacks the brace's objects."""
-        if self._scene is None:
-            raise InputError("brace: the rig file has no scene with objects to lean on")
-        on_rig = task.model_copy(update={"scene": self._scene})
-        assert on_rig.brace is not None
-        try:
-            on_rig.brace.check(on_rig)
-        except BadKeyError as error:
-            raise InputError(f"{dotted(error.loc)}: {error} (in the rig's scene)") from None
-        return on_rig
 
     def _limited(self, task: Task) -> Task:
         """Return a task with the rig's limits of pressure as well; see `limited_range`."""

@@ -106,6 +106,22 @@ class AdaptedNumber:
 
 
 @dataclass(frozen=True)
+class HeldContact:
+    """A contact of a brace."""
+
+    object: Annotated[str, Shown("object that the arm leans on")]
+    at: Annotated[float, Shown("where along the arm, from its base", "m")]
+    state: Annotated[str, Shown("`held`, `uncertain` or `lost`")]
+    force: Annotated[float, Shown("its normal force, as estimated", "N")] = math.nan
+    deviation: Annotated[float, Shown("standard deviation of that force", "N")] = math.nan
+
+    def __str__(self) -> str:
+        force = f", {1e3 * self.force:.0f} mN (deviation {1e3 * self.deviation:.0f} mN)"
+        known = force if math.isfinite(self.force) else ""
+        return f"'{self.object}' at {1e3 * self.at:.0f} mm: {self.state}{known}"
+
+
+@dataclass(frozen=True)
 class Timing:
     """How punctual the loop is.
 
@@ -286,6 +302,13 @@ class ControllerStatus:
     brace_margin: Annotated[
         float, _tip("further push, as it is felt, by which a contact is lost", "N", decimals=5)
     ] = math.nan
+    leans_on: Annotated[
+        tuple[HeldContact, ...],
+        _tip(
+            "each contact of a brace that is held, with its `state`, `force_n` and `deviation_n`; "
+            "after a loss, those that were lost"
+        ),
+    ] = ()
     adapted: Annotated[
         tuple[AdaptedNumber, ...],
         Shown("numbers of the model as estimated during operation"),

@@ -404,12 +404,17 @@ class Supervisor:
             self.alarms.clear(now, "force-limit")
 
     def _report_notices(self, now: float) -> None:
-        """Turn the controller's notices into alarms and events."""
+        """Turn the controller's notices into alarms and events.
+
+        An alarm that comes with an event of its kind is not reported twice.
+        """
         notices = self.controller.notices()
         standing = frozenset(n.kind for n in notices if n.standing)
+        told = frozenset(n.kind for n in notices if not n.standing)
         for notice in notices:
             if notice.standing:
-                self.alarms.set(now, notice.kind, notice.text, notice.severity)
+                severity = None if notice.kind in told else notice.severity
+                self.alarms.set(now, notice.kind, notice.text, severity)
             else:
                 self.events.add(now, notice.kind, notice.text, notice.severity)
             if notice.hold and self.lifecycle.armed and "doubt" not in self._holds:
@@ -516,7 +521,7 @@ class Supervisor:
         if self.lifecycle.state is State.UNCONFIGURED:
             self.controller.begin(self._clock.now())
             self.lifecycle.change(State.INACTIVE)
-            self.events.add(now, "configured", "everything answers; vented")
+            self.events.add(self._clock.now(), "configured", "everything answers; vented")
 
     def arm(
         self, now: float, unwanted: Callable[[], bool] = lambda: False, lateness: float = 0.0

@@ -32,14 +32,11 @@ class TipFeedback:
 
     Parameters
     ----------
-    arm :
-        The observer of the arm.
-    limits, slew, period, control, safety :
-        See `TipController`; slew (n,), in Pa/s.
-    mode :
-        The arm's first bending mode; None for an arm that does not vibrate.
-    tuning, motion_error, step_error :
-        Tuning of the feedback, and of what it learns on trajectories and in steps.
+    arm : the observer of the arm.
+    limits, slew, period, control, safety : see `TipController`; slew (n,), in Pa/s.
+    mode : the arm's first bending mode; None for an arm that does not vibrate.
+    tuning, motion_error, step_error : tuning of the feedback, and of what it learns on trajectories
+        and in steps.
 
     Attributes
     ----------
@@ -112,26 +109,17 @@ class TipFeedback:
 
         Parameters
         ----------
-        tip :
-            The model's tip on the reference's path.
-        reference :
-            The reference, with the offset that its plan accounts for.
-        prescribed :
-            Components (5,) that the target prescribes; see `prescribed_components`.
-        offset :
-            Present estimate of the tip's offset (6,).
-        goal :
-            Command (n,) of the reference, in Pa.
-        limits :
-            Lowest and highest command (n,), in Pa.
-        follows :
-            Whether the tip follows a trajectory, or steps to a target; None: neither, and what its
-            motion does to the offset is not learned.
-        most :
-            Largest correction of the position, in m.
-        bent :
-            Modes of the arm near here, from which the estimator's `excess` is; None: those of the
-            straight arm.
+        tip : the model's tip on the reference's path.
+        reference : the reference, with the offset that its plan accounts for.
+        prescribed : components (5,) that the target prescribes; see `prescribed_components`.
+        offset : present estimate of the tip's offset (6,).
+        goal : command (n,) of the reference, in Pa.
+        limits : lowest and highest command (n,), in Pa.
+        follows : whether the tip follows a trajectory, or steps to a target; None: neither, and
+            what its motion does to the offset is not learned.
+        most : largest correction of the position, in m.
+        bent : modes of the arm near here, from which the estimator's `excess` is; None: those of
+            the straight arm.
         """
         arm, position = self._arm, tip.pose[:3, 3]
         self._learn(position, follows)

@@ -96,16 +96,11 @@ class TouchEstimator:
 
     Parameters
     ----------
-    segments :
-        Number of channels of each segment.
-    vibrates :
-        Whether the arm vibrates.
-    damping :
-        Damping ratio of the vibration.
-    tuning :
-        Noise, and thresholds of the force.
-    creep :
-        Estimates the creep of the tip; nothing of it is known by default.
+    segments : number of channels of each segment.
+    vibrates : whether the arm vibrates.
+    damping : damping ratio of the vibration.
+    tuning : noise, and thresholds of the force.
+    creep : estimates the creep of the tip; nothing of it is known by default.
 
     Attributes
     ----------
@@ -170,14 +165,11 @@ class TouchEstimator:
 
         Parameters
         ----------
-        direction :
-            Direction (3,) of the approach, base axes; None: no approach. There must be no contact
-            when it begins.
-        speed :
-            Speed of the approach, in m/s.
-        presses :
-            Whether the tip presses on something now. It then hardly moves along the direction: the
-            force displaces it by as much as the pressures would move it.
+        direction : direction (3,) of the approach, base axes; None: no approach. There must be no
+            contact when it begins.
+        speed : speed of the approach, in m/s.
+        presses : whether the tip presses on something now. It then hardly moves along the
+            direction: the force displaces it by as much as the pressures would move it.
         """
         self._presses = presses
         if direction is None:
@@ -224,17 +216,12 @@ class TouchEstimator:
 
         Parameters
         ----------
-        time :
-            Time of capture, in s.
-        away :
-            Measured position (3,) minus the model's prediction for that time, in m. The prediction
-            includes the vibration that pressures excite.
-        pressures :
-            Effective pressures (n,), in Pa.
-        tip :
-            The model's tip at these pressures.
-        omega :
-            Angular frequency of the vibration, in rad/s.
+        time : time of capture, in s.
+        away : measured position (3,) minus the model's prediction for that time, in m. The
+            prediction includes the vibration that pressures excite.
+        pressures : effective pressures (n,), in Pa.
+        tip : the model's tip at these pressures.
+        omega : angular frequency of the vibration, in rad/s.
         """
         t = self._tuning
         elapsed = gap = time - self._time

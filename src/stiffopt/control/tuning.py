@@ -589,9 +589,9 @@ class BracingTuning:
     creep: float = 0.01
     creep_time: float = 3.0
     slid: float = 1e-4
-    # creep since the arm settled that is not taken for a slow push: share by which pressures seem
-    # to grow, per e-fold
-    most_creep: float = 0.02
+    # deviation of the creep since the arm settled, which may be a slow push: share by which
+    # pressures seem to grow, per e-fold
+    unknown_creep: float = 0.02
     # time for which friction at the contacts may withhold a correction of the tip, in s
     withheld_time: float = 5.0
     # time after which a push becomes the model's error too, and uncertain contacts let go, in s

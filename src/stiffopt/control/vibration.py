@@ -99,12 +99,10 @@ class BentMode:
 
     Attributes
     ----------
-    jacobian : (3, n)
-        Displacement of the tip in these modes per pressure, at rest, in m/Pa, base axes.
-    linear : (3, n)
-        The whole displacement of the tip per pressure there.
-    plane : (3, 3)
-        Projection on the plane in which the modes move the tip.
+    jacobian : (3, n), displacement of the tip in these modes per pressure, at rest, in m/Pa, base
+        axes.
+    linear : (3, n), the whole displacement of the tip per pressure there.
+    plane : (3, 3), projection on the plane in which the modes move the tip.
     """
 
     jacobian: Array

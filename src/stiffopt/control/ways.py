@@ -48,10 +48,8 @@ class Ways:
 
         Parameters
         ----------
-        way :
-            Its corners.
-        waypoints :
-            Whether all corners but the first are waypoints, to be named in the reason.
+        way : its corners.
+        waypoints : whether all corners but the first are waypoints, to be named in the reason.
         """
         robot = self._robot
         states, legs = _divided(np.clip(way, robot.pressure_min, robot.pressure_max))

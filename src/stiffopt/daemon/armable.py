@@ -4,13 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+import numpy as np
+
 from stiffopt.control.arming import NO_SLEW
 from stiffopt.errors import CommandError, InputError
 from stiffopt.model.description import RobotDescription
 from stiffopt.rig.config import RigDescription, limits_of, slew_of
 from stiffopt.rig.device import MisfitError
+from stiffopt.rig.pressure import SupplySettings
 from stiffopt.safety.gate import check_protection
 
+_NO_PRESSURE = "leaves every channel at one pressure: the arm could never move"
 _FASTEST = 500.0  # Hz
 
 
@@ -25,11 +29,17 @@ def check_description(settings: RigDescription, robot: RobotDescription) -> Iter
     A rig without a tracker is for scripts, and no mistake.
     """
     safety, supply, period = settings.safety, settings.supply, 1 / settings.rate
+    limits = limits_of(settings, robot)
     if slew_of(settings, robot) is None:
         yield MisfitError(NO_SLEW, "safety", "max_slew")
+    if immobile := np.array_equal(limits.low, limits.high):
+        yield MisfitError(_NO_PRESSURE, "safety", "max_pressure")
     if not supply.simulated:
         try:
-            check_protection(supply.device(limits_of(settings, robot)), safety)
+            device = supply.device(limits)
+            check_protection(device, safety)
+            if not immobile and np.array_equal(device.limits.low, device.limits.high):
+                yield MisfitError(_NO_PRESSURE, "supply", "channels")
         except (CommandError, InputError) as error:
             yield MisfitError(str(error), "supply")
     if why := too_fast(settings.rate):
@@ -42,10 +52,28 @@ def check_description(settings: RigDescription, robot: RobotDescription) -> Iter
         if (timeout := getattr(safety, key)) <= period:
             reason = f"{1e3 * timeout:g} ms is not longer than {between}: {effect}"
             yield MisfitError(reason, "safety", key)
+    yield from _impatient(supply, period, between)
     frames = getattr(settings.tracker, "rate", None)
     if frames is not None and 1 / frames > safety.tracker_timeout:
         yield MisfitError(
             f"{1e3 * safety.tracker_timeout:g} ms is shorter than the {1e3 / frames:g} ms between "
             "two frames of the tracker: the tip would never count as seen",
             *("safety", "tracker_timeout"),
+        )
+
+
+def _impatient(supply: SupplySettings, period: float, between: str) -> Iterator[MisfitError]:
+    """Yield why the device's own watchdog would vent between two commands, `period` s apart."""
+    watchdog = getattr(supply, "watchdog", None)  # a time in s, or a block that has one
+    timeout = getattr(watchdog, "timeout", watchdog)
+    place = ("watchdog",) if timeout is watchdog else ("watchdog", "timeout")
+    if not isinstance(timeout, float):
+        return
+    if supply.exchange_time > period:
+        period = supply.exchange_time
+        between = f"the {1e3 * period:.3g} ms that a command takes on the serial line"
+    if timeout <= period:
+        yield MisfitError(
+            f"{1e3 * timeout:g} ms is not longer than {between}: the device would vent every time",
+            *("supply", *place),
         )

@@ -158,15 +158,11 @@ class Operations:
 
         Parameters
         ----------
-        identity :
-            The lease that the client sent.
-        function :
-            Calls the loop. It may raise `InputError`. It runs in another thread, since it may take
-            long and other clients must be answered meanwhile.
-        urgent :
-            Whether it makes the arm safer: then no limit of waiting calls applies.
-        ends_task :
-            Whether it ends the present task.
+        identity : the lease that the client sent.
+        function : calls the loop. It may raise `InputError`. It runs in another thread, since it
+            may take long and other clients must be answered meanwhile.
+        urgent : whether it makes the arm safer: then no limit of waiting calls applies.
+        ends_task : whether it ends the present task.
         """
         with self.lease.used(identity):
             await self._call(function, urgent=urgent)

@@ -25,12 +25,9 @@ def check_place(
 
     Parameters
     ----------
-    hosts, origins :
-        All Host and Origin headers of the request.
-    known :
-        Names of this machine besides localhost.
-    server, setting :
-        How a refusal calls the server, and the setting of its name.
+    hosts, origins : all Host and Origin headers of the request.
+    known : names of this machine besides localhost.
+    server, setting : how a refusal calls the server, and the setting of its name.
     """
     names = {"localhost", *(host.lower().rstrip(".") for host in known)} - {""}
     name = _host_name(hosts[0]) if len(hosts) == 1 else ""

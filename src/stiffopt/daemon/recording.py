@@ -48,14 +48,11 @@ class RunRecording:
 
     Parameters
     ----------
-    folder, name :
-        Folder of the files, readable by this user alone, and the rig's name, for their names.
-    context, about :
-        Context of foxglove, and metadata of each file.
-    wall, free :
-        Return the date in s since 1970, and the free bytes of a folder.
-    limits :
-        Limits of the recording.
+    folder, name : folder of the files, readable by this user alone, and the rig's name, for their
+        names.
+    context, about : context of foxglove, and metadata of each file.
+    wall, free : return the date in s since 1970, and the free bytes of a folder.
+    limits : limits of the recording.
 
     Attributes
     ----------

@@ -97,14 +97,10 @@ def create_app(
 
     Parameters
     ----------
-    loop, robot, heartbeat, clock, patience :
-        See `Operations`.
-    token :
-        The token that a client needs to move the arm.
-    metrics :
-        Returns the metrics for ``/metrics``; None: there is no such page.
-    hosts :
-        Names of this machine besides localhost to which clients may send requests.
+    loop, robot, heartbeat, clock, patience : see `Operations`.
+    token : the token that a client needs to move the arm.
+    metrics : returns the metrics for ``/metrics``; None: there is no such page.
+    hosts : names of this machine besides localhost to which clients may send requests.
 
     The application's ``state.limiter`` limits the connections in a `Server`. `InputError`: a header
     cannot carry the token.

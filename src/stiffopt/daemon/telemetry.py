@@ -68,20 +68,13 @@ class Telemetry:
 
     Parameters
     ----------
-    robot, name :
-        The model of the arm, which the recording keeps, and the name of the rig.
-    loop, clock :
-        The rig's loop and clock.
-    folder :
-        Folder of the recordings.
-    settings :
-        Settings of Foxglove's port.
-    backbone :
-        Returns poses (m, 4, 4) along the arm for pressures (n,), in Pa.
-    about :
-        Further metadata for the recording, such as the text of the rig file.
-    wall :
-        Nanoseconds since 1970; read once, so that messages do not jump with the wall clock.
+    robot, name : the model of the arm, which the recording keeps, and the name of the rig.
+    loop, clock : the rig's loop and clock.
+    folder : folder of the recordings.
+    settings : settings of Foxglove's port.
+    backbone : returns poses (m, 4, 4) along the arm for pressures (n,), in Pa.
+    about : further metadata for the recording, such as the text of the rig file.
+    wall : nanoseconds since 1970; read once, so that messages do not jump with the wall clock.
 
     Raises
     ------

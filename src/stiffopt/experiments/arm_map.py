@@ -104,19 +104,14 @@ def map_arm(
 
     Parameters
     ----------
-    robot : Manipulator
-    groups :
-        Groups of channels (from 1) that are pressurised together; by default the first channel of
-        each segment, and the first two of each segment.
-    pressures : (P,), optional
-        Of the group's channels, in Pa; by default seven up to the highest that all channels allow.
-    points : int
-        Number of points along the arm; the middle and the tip are among them.
+    groups : groups of channels (from 1) that are pressurised together; by default the first channel
+        of each segment, and the first two of each segment.
+    pressures : (P,), of the group's channels, in Pa; by default seven up to the highest that all
+        channels allow.
+    points : number of points along the arm; the middle and the tip are among them.
     directions : (d, 3)
-    boundary, frame :
-        Of the stiffness; see `Manipulator.stiffness`.
-    progress : callable
-        Called with the number of points done and the total.
+    boundary, frame : of the stiffness; see `Manipulator.stiffness`.
+    progress : called with the number of points done and the total.
 
     Raises
     ------
@@ -180,15 +175,10 @@ def map_tip(
 
     Parameters
     ----------
-    robot : Manipulator
-    channels :
-        The two, counted from 1.
-    levels : int
-        Number of pressures of each, from its lowest to its highest.
-    others : (n,), optional
-        Pressures of the other channels, in Pa; by default their lowest.
-    directions, boundary, frame, progress :
-        See `map_arm`.
+    channels : the two, counted from 1.
+    levels : number of pressures of each, from its lowest to its highest.
+    others : (n,), pressures of the other channels, in Pa; by default their lowest.
+    directions, boundary, frame, progress : see `map_arm`.
 
     Raises
     ------

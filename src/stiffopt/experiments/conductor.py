@@ -99,12 +99,9 @@ class Conductor:
 
     Parameters
     ----------
-    rig : Rig
-        Open, with a tracker, from `stiffopt.open_rig`.
-    rate : float
-        Ticks per second.
-    check : callable, optional
-        Called in each tick; it may raise to stop the experiment.
+    rig : open, with a tracker, from `stiffopt.open_rig`.
+    rate : ticks per second.
+    check : called in each tick; it may raise to stop the experiment.
     """
 
     def __init__(self, rig: Rig, rate: float, check: Callable[[], None] = lambda: None) -> None:

@@ -35,10 +35,8 @@ def spread_pressures(count: int, low: ArrayLike, high: ArrayLike) -> Array:
 
     Parameters
     ----------
-    count :
-        Number of poses.
-    low, high : (n,)
-        Ends of each channel's range, in Pa.
+    count : number of poses.
+    low, high : (n,), ends of each channel's range, in Pa.
     """
     low, high = np.array(low, dtype=float), np.array(high, dtype=float)
     if count == 1:
@@ -89,14 +87,10 @@ class Coverage:
 
         Parameters
         ----------
-        conductor :
-            Has seen the tip; the arm is at `base`.
-        folder, about :
-            As for `recorded`; the files are named by `round_name`.
-        number :
-            Of the round, from 1.
-        report :
-            Called with the seconds done and a description.
+        conductor : has seen the tip; the arm is at `base`.
+        folder, about : as for `recorded`; the files are named by `round_name`.
+        number : of the round, from 1.
+        report : called with the seconds done and a description.
 
         Returns
         -------

@@ -161,13 +161,9 @@ class RawRecording:
 
     Parameters
     ----------
-    folder : Path
-    repetition : int
-        Counted from 1; part of the file names.
-    conductor : Conductor
-        Source of the frames; it has seen the tip.
-    rig : str
-        Name of the rig, for the MCAP file.
+    repetition : counted from 1; part of the file names.
+    conductor : source of the frames; it has seen the tip.
+    rig : name of the rig, for the MCAP file.
     """
 
     def __init__(self, folder: Path, repetition: int, conductor: Conductor, rig: str) -> None:

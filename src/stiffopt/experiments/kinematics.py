@@ -79,14 +79,10 @@ class PressureSequence:
 
         Parameters
         ----------
-        base : (n,)
-            Pressures between the teeth, in Pa.
-        peaks :
-            Of the teeth of each channel, in Pa.
-        period :
-            Of a tooth, in s; a tooth takes longer if the channel is too slow.
-        slew : (n,)
-            Largest rate of change, in Pa/s.
+        base : (n,), pressures between the teeth, in Pa.
+        peaks : of the teeth of each channel, in Pa.
+        period : of a tooth, in s; a tooth takes longer if the channel is too slow.
+        slew : (n,), largest rate of change, in Pa/s.
         """
         base = np.asarray(base, dtype=float)
         slew = np.broadcast_to(np.asarray(slew, dtype=float), base.shape)
@@ -158,18 +154,12 @@ def run_kinematics(
 
     Parameters
     ----------
-    rig : Rig
-        Open.
-    folder : Path
-        Gets ``kinematics_1.csv`` (log v1), ``kinematics_1.mcap`` and so on, and then
+    rig : open.
+    folder : gets ``kinematics_1.csv`` (log v1), ``kinematics_1.mcap`` and so on, and then
         ``kinematics_poses_1.csv`` and so on; an incomplete one is named ``kinematics_1.part.csv``.
-    settings : KinematicsSettings
-    rate : float
-        Rate of the commands, in Hz.
-    progress : callable
-        Called with the seconds done, the total and a description.
-    check : callable
-        Called often; it may raise to stop.
+    rate : rate of the commands, in Hz.
+    progress : called with the seconds done, the total and a description.
+    check : called often; it may raise to stop.
 
     Returns
     -------

@@ -83,17 +83,11 @@ def run_poses(
 
     Parameters
     ----------
-    rig : Rig
-        Open.
-    folder : Path
-        Gets ``poses.csv`` (log v1) and ``poses.mcap``.
-    settings : PosesFile
-    rate : float
-        Rate of the commands, in Hz.
-    progress : callable
-        Called with the number of poses done, the total and a description.
-    check : callable
-        Called often; it may raise to stop.
+    rig : open.
+    folder : gets ``poses.csv`` (log v1) and ``poses.mcap``.
+    rate : rate of the commands, in Hz.
+    progress : called with the number of poses done, the total and a description.
+    check : called often; it may raise to stop.
 
     Raises
     ------

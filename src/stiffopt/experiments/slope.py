@@ -52,13 +52,10 @@ def fit_line(
 
     Parameters
     ----------
-    x, y : (N,)
-        Points; those that are not finite are left out.
-    trend : (N,), optional
-        Another regressor, such as time; the slope is that at a constant trend. A trend that is
-        strongly correlated with x is left out.
-    curved :
-        Whether to fit a parabola and return its slope at x = 0.
+    x, y : (N,), points; those that are not finite are left out.
+    trend : (N,), another regressor, such as time; the slope is that at a constant trend. A trend
+        that is strongly correlated with x is left out.
+    curved : whether to fit a parabola and return its slope at x = 0.
     """
     u, v = np.asarray(x, dtype=float), np.asarray(y, dtype=float)
     w = np.zeros_like(u) if trend is None else np.asarray(trend, dtype=float)

@@ -120,22 +120,14 @@ def run_stiffness(
 
     Parameters
     ----------
-    rig : Rig
-        Open, with a tracker and a probe.
-    folder : Path
-        Gets ``points.csv``, with the steps of all series, and a recording of each repetition, as
-        ``stiffness_1.csv`` (log v1) and ``stiffness_1.mcap``.
-    settings : StiffnessSettings
-    model : Manipulator
-        Only limits the size of the steps; the data are independent of it.
-    rate : float
-        Rate of the commands, in Hz.
-    progress : callable
-        Called with the number of series done, the total and a description.
-    check : callable
-        Called often; it may raise to stop.
-    aside : callable
-        Returns the context in which the probe is aligned, perhaps by a person.
+    rig : open, with a tracker and a probe.
+    folder : gets ``points.csv``, with the steps of all series, and a recording of each repetition,
+        as ``stiffness_1.csv`` (log v1) and ``stiffness_1.mcap``.
+    model : only limits the size of the steps; the data are independent of it.
+    rate : rate of the commands, in Hz.
+    progress : called with the number of series done, the total and a description.
+    check : called often; it may raise to stop.
+    aside : returns the context in which the probe is aligned, perhaps by a person.
 
     Returns
     -------

@@ -106,10 +106,7 @@ def evaluate_stiffness(
 
     Parameters
     ----------
-    folder : Path
-        Of an experiment, complete or not.
-    settings : StiffnessSettings
-    model : Manipulator
+    folder : of an experiment, complete or not.
 
     Raises
     ------

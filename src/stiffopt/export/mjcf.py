@@ -51,7 +51,6 @@ class _Link:
 
     Attributes
     ----------
-    name : str
     placed : pose (4, 4) of the joint in the axes of the link before.
     stiffness : (6, 6) of the joint, linear first; None: it is fixed.
     parts : its pieces, from the joint on.

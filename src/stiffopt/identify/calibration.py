@@ -156,7 +156,8 @@ def calibrate(
     for key in settings.fixed:
         Parameter(key).value(description)  # raises if there is no such number
     laws = other_laws(description) if settings.strain_law == "auto" else []
-    teller = _Teller(progress, len(structures) + len(laws) + 1)
+    fits = len(structures) + len(laws) + 1 if logs and settings.holds_back else 0
+    teller = _Teller(progress, 2 * fits + (4 if logs else 2))
     candidates: list[Candidate] = []
     try:
         with giving_up(timeout, cancel):
@@ -200,9 +201,8 @@ def _chosen(
 ) -> Candidate:
     """Fit structures, then the best one under other strain laws; return the best candidate.
 
-    A model with creep of an arm that softens is then tried with a memory of strain, unless the
-    settings name both model and law; it is chosen if it predicts better. Every fitted candidate is
-    appended to `candidates`.
+    It is then tried with a memory of strain, where that is another model, and has it if it predicts
+    better. Every fitted candidate is appended to `candidates`.
     """
     description, recordings = setup.description, setup.recordings
     first = near = _screened(setup, teller)
@@ -212,6 +212,7 @@ def _chosen(
             and structure.can_be_told(recordings)
             and _is_worth_it(structure, candidates)
         ):
+            teller.skip_fit()
             continue
         candidates.append(_candidate(setup, structure, (first, near), teller))
         leader = min(candidates, key=lambda each: each.score).fit
@@ -230,23 +231,31 @@ def _chosen(
             others.append(_candidate(setup, structure, (near,), teller))
             candidates.append(others[-1])
         chosen = best(others)
-    named = "auto" not in (setup.settings.structure, setup.settings.strain_law)
-    if not named and _may_remember_strain(setup, chosen.fit.problem.description):
+    if _may_remember_strain(setup, chosen):
         near = chosen.fit.problem.named(chosen.fit.x)
         candidates.append(_candidate(setup, chosen.structure.of_strain(), (near,), teller))
         chosen = min(chosen, candidates[-1], key=lambda each: each.score)
+    else:
+        teller.skip_fit()
     return chosen
 
 
-def _may_remember_strain(setup: Setup, robot: RobotDescription) -> bool:
-    """Return whether to try a memory of strain, after a fit that gave this robot.
+def _may_remember_strain(setup: Setup, chosen: Candidate) -> bool:
+    """Return whether to try the chosen model with a memory of strain.
 
+    The settings may name both model and law, or the robot file may have this memory already.
     Without softening it is the same as a memory of pressure. A table of stiffness is compared with
     quick pushes: with a memory of strain their stiffness depends on the pressures, in a way that
     the fit does not describe.
     """
-    histories = [segment.history or NO_HISTORY for segment in robot.segments]
-    return robot.creeps and not setup.tables and any(each.softening for each in histories)
+    robot = chosen.fit.problem.description
+    softens = any((segment.history or NO_HISTORY).softening for segment in robot.segments)
+    if "auto" not in (setup.settings.structure, setup.settings.strain_law):
+        return False
+    if not robot.creeps or not softens or setup.tables:
+        return False
+    of_strain = chosen.structure.of_strain().applied(setup.description, setup.seen, setup.is_fine)
+    return of_strain != robot
 
 
 def _candidate(
@@ -264,9 +273,9 @@ def _candidate(
 class _Teller:
     """Reports progress in phases, each with an unknown number of evaluations."""
 
-    def __init__(self, progress: Progress | None, fits: int) -> None:
+    def __init__(self, progress: Progress | None, phases: int) -> None:
         self._progress = progress
-        self._phases = 2.0 * fits + 3.0
+        self._phases = float(phases)
         self._phase = 0
         self._evaluations = 0
         self._words = ""
@@ -276,6 +285,10 @@ class _Teller:
         self._evaluations = 0
         self._words = words
         self()
+
+    def skip_fit(self) -> None:
+        """Leave out the two phases of a candidate."""
+        self._phases -= 2
 
     def __call__(self) -> None:
         checkpoint()

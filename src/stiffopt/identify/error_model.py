@@ -37,6 +37,7 @@ from numpy.typing import NDArray
 
 from stiffopt.identify.discrepancy import centres
 from stiffopt.identify.fit import Fit
+from stiffopt.identify.past import pause_between
 from stiffopt.identify.problem import CalibrationProblem, Sample
 from stiffopt.identify.results import Errors
 from stiffopt.identify.settings import ERRORS, FIT
@@ -253,9 +254,14 @@ def _even_variance(moves: Array, fit: Fit) -> Array:
 
 
 def in_turn(times: Sequence[Array]) -> Array:
-    """Return the times (N,) in s of logs that follow each other, from those of each (N_i,)."""
-    ends = np.cumsum([0.0, *(each[-1] - each[0] for each in times)])
-    return np.concatenate([each - each[0] + end for each, end in zip(times, ends, strict=False)])
+    """Return the times (N,) in s of logs that follow each other, from those of each (N_i,).
+
+    At the beginning of a log it has been `pause_between` since the last row of the one before.
+    """
+    found = [times[0] - times[0][0]]
+    for earlier, later in pairwise(times):
+        found.append(later - later[0] + found[-1][-1] + pause_between(earlier, later))
+    return np.concatenate(found)
 
 
 def _spread(slope: Array, covariance: Array) -> Array:

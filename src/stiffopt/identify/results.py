@@ -310,6 +310,8 @@ def what_to_look_at(calibrated: Sequence[Comparison], length: float) -> str:
     )
     if alone:
         text += f"{', '.join(alone)}, far worse than the others, and then at "
+    if len(calibrated) > 1:
+        text += "whether all logs are of the same arm in the same place (else: --rezero), "
     return text + (
         "the order of the channels (--channels), the body in whose frame poses are taken (--frame) "
         "and its axes, the registration, lengths and chambers of the robot file, and whether the "

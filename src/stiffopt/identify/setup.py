@@ -121,10 +121,32 @@ def recordings_of(
     span = np.subtract(description.pressure_max, description.pressure_min)
     if "clock" not in settings.keep:
         found = [on_one_clock(recording, span) for recording in found]
-    return [
+    found = [
         begun(recording, span) if log.measured is None else recording
         for recording, (_, log) in zip(found, read, strict=True)
     ]
+    return _with_order_checked(found) if settings.sequence else found
+
+
+def _with_order_checked(recordings: Sequence[Recording]) -> list[Recording]:
+    """Return logs of a sequence with a remark on each that seems to belong before the previous one.
+
+    Such a log ends before the previous one begins. A log whose clock begins anew does so too, but
+    mostly has the times of an earlier one.
+    """
+    found = list(recordings[:1])
+    for previous, recording in pairwise(recordings):
+        begin, end = recording.time[[0, -1]]
+        own_times = all(end < each.time[0] or begin > each.time[-1] for each in found)
+        if end < previous.time[0] and own_times:
+            remark = (
+                f"it ends at {end:.6g} s, before {previous.name} begins, which is given before it; "
+                "if they have one clock, give the logs of a sequence in the order of their times "
+                "(a shell puts _10 before _2)"
+            )
+            recording = replace(recording, remarks=(*recording.remarks, remark))
+        found.append(recording)
+    return found
 
 
 @dataclass(frozen=True, eq=False)

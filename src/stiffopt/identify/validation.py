@@ -72,9 +72,24 @@ def validate(
         progress(1, 2, "comparing")
     setup = Setup.of(description, recordings, (), settings)
     found = compare(setup)
-    if description.calibration is None or "axes" in settings.keep:
+    if description.calibration is None:
         return found
-    return _with_frames_found(setup, found)
+    if "axes" not in settings.keep:
+        found = _with_frames_found(setup, found)
+    return tuple(_with_doubt(each, description.length) for each in found)
+
+
+def _with_doubt(found: Comparison, length: float) -> Comparison:
+    """Return the comparison with a calibrated robot, with a remark if it is far off."""
+    share = found.errors.mean / length
+    if share <= DETECTION.off:
+        return found
+    remark = (
+        f"the mean error is {100 * share:.0f} % of the arm's length; look at whether the log is of "
+        "the arm of this calibration, the order of the channels (--channels), the frame (--frame), "
+        "and whether the pressures are those that the arm had"
+    )
+    return replace(found, remarks=(*found.remarks, remark))
 
 
 def _with_frames_found(setup: Setup, found: tuple[Comparison, ...]) -> tuple[Comparison, ...]:
@@ -94,8 +109,8 @@ def _with_frames_found(setup: Setup, found: tuple[Comparison, ...]) -> tuple[Com
             continue
         remark = (
             f"the frame of this log was defined anew: its poses are {words[i]}, and the mean error "
-            f"is {after.errors.mean * 1e3:.1f} mm instead of {before.errors.mean * 1e3:.1f} mm; "
-            "--keep axes leaves them"
+            f"is {after.errors.mean * 1e3:.1f} mm instead of {before.errors.mean * 1e3:.1f} mm "
+            "(--keep axes leaves them); a log of another arm may look so too"
         )
         again[i] = replace(after, remarks=(*after.remarks, remark))
     return tuple(again)

@@ -43,8 +43,7 @@ def json_schema(kind: str) -> dict[str, Any]:
 
     Parameters
     ----------
-    kind :
-        A key of `MODELS`.
+    kind : a key of `MODELS`.
     """
     module, _, name = MODELS[kind].partition(":")
     model: type[BaseModel] = getattr(import_module(module), name)

@@ -59,8 +59,7 @@ class Bench:
 
     Parameters
     ----------
-    world :
-        A world in real time.
+    world : a world in real time.
 
     Attributes
     ----------

@@ -50,8 +50,7 @@ def built_firmware(**settings: int) -> Path:
 
     Parameters
     ----------
-    settings :
-        Settings of the Makefile, such as ``PAIRS=0``. The environment variable
+    settings : settings of the Makefile, such as ``PAIRS=0``. The environment variable
         ``STIFFOPT_FIRMWARE`` has precedence over them, in the same form.
 
     Raises

@@ -92,15 +92,11 @@ class DaqServer:
 
     Parameters
     ----------
-    address :
-        Address to listen on, on this machine; None: any free port.
-    extra :
-        stiffopt's extra with nidaqmx, for the message if it is missing.
-    outputs, inputs, lines :
-        By name, functions that accept the voltage of an analogue output, return that of an analogue
-        input, and accept the level of a digital line.
-    fault :
-        Returns the fault of the device: ``ok``, ``off``, ``slow`` and others.
+    address : address to listen on, on this machine; None: any free port.
+    extra : stiffopt's extra with nidaqmx, for the message if it is missing.
+    outputs, inputs, lines : by name, functions that accept the voltage of an analogue output,
+        return that of an analogue input, and accept the level of a digital line.
+    fault : returns the fault of the device: ``ok``, ``off``, ``slow`` and others.
     """
 
     def __init__(

@@ -32,10 +32,8 @@ class OpenRegulatorPeer(DevicePeer[OpenRegulatorSettings]):
 
     Parameters
     ----------
-    settings, bench :
-        See `DevicePeer`.
-    built :
-        Settings of the firmware's Makefile, such as ``SILENCE_MS``, for tests.
+    settings, bench : see `DevicePeer`.
+    built : settings of the firmware's Makefile, such as ``SILENCE_MS``, for tests.
 
     Attributes
     ----------

@@ -60,8 +60,7 @@ class ZaberPeer(ServedPeer[ZaberProbeSettings]):
 
     Parameters
     ----------
-    homed :
-        Whether it has been homed since it was switched on.
+    homed : whether it has been homed since it was switched on.
     """
 
     def __init__(self, settings: ZaberProbeSettings, bench: Bench, *, homed: bool = True) -> None:
@@ -215,8 +214,7 @@ class ProbePeer(DevicePeer[ZaberProbeSettings]):
 
     Parameters
     ----------
-    homed :
-        Whether the stage has been homed since it was switched on.
+    homed : whether the stage has been homed since it was switched on.
     """
 
     def __init__(self, settings: ZaberProbeSettings, bench: Bench, *, homed: bool = True) -> None:

@@ -23,10 +23,8 @@ def with_real_devices(
 
     Parameters
     ----------
-    description, robot :
-        The rig and its robot.
-    drivers :
-        Drivers that replace a simulated `supply`, `tracker` and `probe`.
+    description, robot : the rig and its robot.
+    drivers : drivers that replace a simulated `supply`, `tracker` and `probe`.
 
     Raises
     ------
@@ -66,13 +64,10 @@ class VirtualLab:
 
     Parameters
     ----------
-    description :
-        The rig. If its devices are simulated, `supply`, `tracker` and `probe` name the drivers of
-        the real ones that replace them.
-    robot :
-        Its robot.
-    supply, tracker, probe :
-        Drivers with a peer.
+    description : the rig. If its devices are simulated, `supply`, `tracker` and `probe` name the
+        drivers of the real ones that replace them.
+    robot : its robot.
+    supply, tracker, probe : drivers with a peer.
     """
 
     def __init__(

@@ -19,8 +19,7 @@ class LogWriter:
 
     Parameters
     ----------
-    path, layout :
-        The file, whose folder must exist, and its columns.
+    path, layout : the file, whose folder must exist, and its columns.
 
     Attributes
     ----------

@@ -19,6 +19,8 @@ Array = NDArray[np.float64]
 _TIME = "time_s"
 _AXES = ("x", "y", "z")
 _PARTS = ("qw", "qx", "qy", "qz")
+_UNITS = {"s": "s", "pa": "Pa", "m": "m", "n": "N"}  # by the ends of names
+_SHOWN = 6  # names of a message
 _PRESSURE = re.compile(r"pm?\d+_pa")
 _BODY = re.compile(r"([a-z][a-z0-9]*(?:_[a-z0-9]+)*)_(?:[xyz]_m|q[wxyz])")
 
@@ -294,7 +296,13 @@ def _pressures(prefix: str, n: int) -> list[str]:
 def _missing(name: str, unknown: Sequence[str]) -> str:
     misnamed = [each for each in unknown if not _PRESSURE.fullmatch(each)]
     near = difflib.get_close_matches(name, misnamed, n=1)
-    hint = f" (is {shown(near[0])} meant to be that?)" if near else ""
+    if near:
+        unit = _UNITS.get(name.rpartition("_")[2])
+        in_unit = f", in {unit}" if unit else ""
+        hint = f" (is {shown(near[0])} meant to be that{in_unit}?)"
+    else:
+        others = ", ".join(map(shown, misnamed[:_SHOWN]))
+        hint = f"; nothing is known of {others}" if others else ""
     return f"the column '{name}' is missing{hint}; a log starts with a row of names"
 
 

@@ -31,14 +31,10 @@ class McapWriter:
 
     Parameters
     ----------
-    file :
-        Descriptor of an empty file, open for writing; this object closes it.
-    context :
-        Context of foxglove.
-    metadata :
-        Records of metadata, by name.
-    profile :
-        Profile of the file: the conventions by which messages are to be read.
+    file : descriptor of an empty file, open for writing; this object closes it.
+    context : context of foxglove.
+    metadata : records of metadata, by name.
+    profile : profile of the file: the conventions by which messages are to be read.
 
     Attributes
     ----------

@@ -37,12 +37,9 @@ class McapLogWriter:
 
     Parameters
     ----------
-    path, layout :
-        The file, whose folder must exist, and its columns.
-    about :
-        Metadata to keep in the file.
-    now :
-        Present time of the log, in s.
+    path, layout : the file, whose folder must exist, and its columns.
+    about : metadata to keep in the file.
+    now : present time of the log, in s.
 
     Raises
     ------

@@ -14,6 +14,8 @@ import numpy as np
 from stiffopt.errors import FileError, os_reason, shown
 from stiffopt.logs.log import Array
 
+_OTHER = re.compile(rb"^format: *stiffopt-(\w+)/", re.MULTILINE)
+_HEAD = 10_000  # bytes in which a file of another kind says so
 _ALLOWED = b"0123456789+-.eE,\n \t"
 _NUMBER = re.compile(r"\s*[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?\s*")
 
@@ -44,10 +46,19 @@ def read_table(path: str | os.PathLike[str]) -> Table:
     header, _, body = text.partition(b"\n")
     if not header.strip():
         raise FileError(name, "is empty; expected a row of names", line=1)
+    if other := _OTHER.search(text, 0, _HEAD):
+        line = 1 + text.count(b"\n", 0, other.start())
+        kind = other.group(1).decode()
+        raise FileError(name, f"is a {kind} file; expected a table of numbers (CSV)", line=line)
     try:
         columns = tuple(part.strip() for part in header.decode("utf-8").split(","))
     except UnicodeDecodeError:
         raise FileError(name, "is not UTF-8 text", line=1) from None
+    for separator, word in ((";", "semicolons"), ("\t", "tabs")):
+        if len(columns) == 1 and separator in columns[0]:
+            raise FileError(
+                name, f"fields are separated by {word}; expected commas, and decimal points", line=1
+            )
     body = body.rstrip(b"\n")
     if not body:
         return Table(name, columns, np.empty((0, len(columns))))

@@ -178,16 +178,13 @@ class Buffer:
 
     Parameters
     ----------
-    function, rows :
-        The function, and the number of rows.
-    before :
-        A buffer whose results are the first arguments: both share their memory.
+    function, rows : the function, and the number of rows.
+    before : a buffer whose results are the first arguments: both share their memory.
 
     Attributes
     ----------
     targets, results : views (rows, r, c) of arguments and results, without the leading axis for one
         row; arguments that are columns lack the last axis. Arguments from `before` are left out.
-    evaluate : callable
     """
 
     def __init__(self, function: ca.Function, rows: int, before: Buffer | None = None) -> None:

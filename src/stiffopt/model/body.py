@@ -178,12 +178,7 @@ class BodyModel(ctypes.Structure):
 
 
 class ModelInC:
-    """An arm's `BodyModel`; this object owns the memory.
-
-    Attributes
-    ----------
-    address : int
-    """
+    """An arm's `BodyModel`; this object owns the memory."""
 
     def __init__(self, arm: Arm, rod: LoadedArm | None) -> None:
         pieces, numbers = Pieces(arm), arm.numbers
@@ -210,10 +205,8 @@ class NativeBody:
 
     Attributes
     ----------
-    address : int
-        Of the `BodyModel`.
-    code : Library
-        The library, with the functions of clearance.c.
+    address : of the `BodyModel`.
+    code : the library, with the functions of clearance.c.
 
     Raises
     ------

@@ -119,8 +119,7 @@ class ErrorModel(Schema):
         Parameters
         ----------
         channels : number of channels of each segment.
-        pressures : (N, n)
-            In Pa.
+        pressures : (N, n), in Pa.
         """
         found = distances_from(channels, pressures, np.array(self.recorded))
         return np.asarray(np.maximum(found - self.spacing, 0.0))

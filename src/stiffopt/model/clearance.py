@@ -132,10 +132,8 @@ def nearest_point(station: StationOf, item: MeasuredObject, ranges: Sequence[Bod
 
     Parameters
     ----------
-    station :
-        The body.
-    ranges :
-        All of it; for objects other than rings, a part of it is allowed.
+    station : the body.
+    ranges : all of it; for objects other than rings, a part of it is allowed.
     """
     search = _Search(station, item)
     first, *others = ranges

@@ -173,16 +173,6 @@ class History(Schema):
         return 1 + self.softening * norm if self.remembers == "strain" else 1.0
 
     @property
-    def largest_memory(self) -> float:
-        """Largest effect of hysteresis on the shape, as a pressure at the modulus of rest, in Pa.
-
-        For a channel with another `memory` it is multiplied by that.
-        """
-        # |A v| <= k max |v| with k = 2 (1 - 1/c) for bending, 3 - 4/c for opposite fibres
-        most = {"bending": 2, "opposite": 3}
-        return sum(part.share * part.width * most.get(part.of, 1) for part in self.play)
-
-    @property
     def quick_share(self) -> float:
         """Share of a small, quick change that has its effect at once, over all channels.
 

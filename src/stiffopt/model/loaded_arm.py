@@ -56,10 +56,8 @@ class LoadedArm:
 
     Attributes
     ----------
-    address : int
-        Of its `Rod`.
-    state_size : int
-        Number of doubles of an equilibrium's state.
+    address : of its `Rod`.
+    state_size : number of doubles of an equilibrium's state.
 
     Raises
     ------

@@ -119,8 +119,7 @@ class Obstacle(Schema, ABC):
 
         Parameters
         ----------
-        clearance :
-            Clearance asked of the arm's body, in m.
+        clearance : clearance asked of the arm's body, in m.
 
         Raises
         ------
@@ -159,10 +158,8 @@ class Obstacle(Schema, ABC):
 
         Parameters
         ----------
-        base_radius :
-            Of the arm, in m.
-        clearance :
-            Clearance asked for, in m.
+        base_radius : of the arm, in m.
+        clearance : clearance asked for, in m.
         """
         missing = base_radius + clearance - self.from_base
         return _RISEN * missing if missing > 0 and self._is_behind_base else 0.0

@@ -29,11 +29,9 @@ def load_description(
 
     Parameters
     ----------
-    name_or_path :
-        Text that ends in ``.yaml`` or ``.yml`` or has a path separator is a path, as is a `Path`;
-        any other is the name of a built-in robot.
-    base :
-        Folder from which a relative path starts; by default the current one.
+    name_or_path : text that ends in ``.yaml`` or ``.yml`` or has a path separator is a path, as is
+        a `Path`; any other is the name of a built-in robot.
+    base : folder from which a relative path starts; by default the current one.
 
     Raises
     ------
@@ -62,9 +60,9 @@ def load_description(
         return robot
     if text not in builtin_robots():
         near = difflib.get_close_matches(text, builtin_robots(), n=1)
-        hint = f"did you mean '{near[0]}'? " if near else ""
+        hint = f"did you mean '{near[0]}'? The" if near else "the"
         raise InputError(
-            f"there is no robot '{text}'; {hint}The built-in robots are "
+            f"there is no robot '{text}'; {hint} built-in robots are "
             f"{', '.join(builtin_robots())}; the path of a robot file ends in .yaml"
         )
     with as_file(files("stiffopt").joinpath("robots", f"{text}.yaml")) as path:

@@ -183,7 +183,6 @@ class Stretch:
 
     Attributes
     ----------
-    proximal, distal : float
     towards_base : function of the distance from its distal end towards the base, to quaternion and
         position (from the tip).
     notes : (10, 6) quaternion, position and moment at its distal end, and its length times their

@@ -252,13 +252,10 @@ def response(carried: Vector, force: Vector, s: Places, t: Places) -> Vector:
 
     Parameters
     ----------
-    carried : (N, stations, 3, 3, 9)
-        Changes of rotation, moment and vector to the tip along turns of the tip and wrenches
-        there; the first station is the base, and the others ascend.
-    force : (N, 3, 9)
-        Changes of the force.
-    s, t : (k,)
-        Indices of the stations.
+    carried : (N, stations, 3, 3, 9), changes of rotation, moment and vector to the tip along turns
+        of the tip and wrenches there; the first station is the base, and the others ascend.
+    force : (N, 3, 9), changes of the force.
+    s, t : (k,), indices of the stations.
     """
     here, there, base = carried[:, s], carried[:, t], carried[:, :1]
     forces = np.broadcast_to(force[:, None], there[:, :, 0].shape)

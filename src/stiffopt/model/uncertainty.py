@@ -11,8 +11,10 @@ Hysteresis depends on how the arm came to its pressures.  Its mean square, about
 which is what `tip_pose` returns, is that over ways from rest to pressures drawn from the recorded
 range, and from there; but at most that of effective minus commanded pressures as recorded.
 Plays lead through two drawn pressures.  Creep goes on while pressures are held: a way stays for
-6 s at each of three drawn ones, and for 1.5 to 6 s at its end.  The tip moves by the slopes half
-the mean of all ways further: at the pressures themselves, a chamber may be in its dead band.
+6 s at each of three drawn ones, and for 1.5 to 6 s at its end.  It begins at the mean of the drawn
+pressures and of rest, which takes a seventh of the time, as in the rounds of an experiment: slow
+creep remembers longer than the way lasts.  The tip moves by the slopes half the mean of all ways
+further: at the pressures themselves, a chamber may be in its dead band.
 
 With creep in the model, what it remembers moves the tip by a tenth more or less than it says, in
 any direction; so it does where the history is known, by a twentieth if strain is remembered.
@@ -56,6 +58,7 @@ _LEVEL = 0.95  # probability of the reported regions
 _WAYS = 256  # ways to given pressures
 _VISITS = 3  # pressures that each of them visits
 _STAY = 6.0  # s from one of them to the next
+_AT_REST = 1 / 7  # share of the time before a way that the arm was at rest
 _AGES = (1.5, 6.0)  # s for which the given pressures have been held, from the middle of the motion
 _HELD = 0.9  # share of these variances that held poses show; the rest was creep and motion
 _MISREMEMBERED = 0.1  # error of what a model with creep remembers, over how far it moves the tip
@@ -386,8 +389,9 @@ class Uncertainty:
                     held = np.clip(held, visited - play.width, visited + play.width)
                 found[..., own] += memory * play.share * part_of(held - end, play.of)
             for creep in history.creep:
-                slow = np.zeros(1)
-                for visited in part_of(ways, creep.of):
+                poses = part_of(ways, creep.of)
+                slow = (1 - _AT_REST) * poses.mean(axis=(0, 1))
+                for visited in poses:
                     slow = visited + (slow - visited) * np.exp(-_STAY / creep.time)
                 left = np.exp(-self._ages / creep.time)[:, np.newaxis]
                 slow = part_of(slow - part_of(here, creep.of), creep.of)

@@ -115,7 +115,7 @@ class Answers:
         """Explain a judged result; a given message is kept."""
         task = problem.task
         active = active_bounds(self.robot, task, pressures)
-        sensitivities = self._sensitivities(problem, result, judgement, pressures, active)
+        sensitivities = self._sensitivities(problem, result, pressures, active)
         freedom = diagnosis.freedom(problem, pressures / problem.unit)
         if not message and not judgement.pose_holds:
             holding = [*map(repr, judgement.touched), *self._holding(result, active)]
@@ -150,7 +150,6 @@ class Answers:
         self,
         problem: PressureProblem,
         result: LocalResult,
-        judgement: Judgement,
         pressures: Vector,
         active: dict[str, tuple[int, int]],
     ) -> Sensitivities | None:

@@ -42,7 +42,7 @@ class Brace(Schema):
         return f"Brace(on {quoted(self.objects)}, margin {1e3 * self.margin:g} mN)"
 
     def check(self, task: Task) -> None:
-        """Reject a brace that does not suit its task.
+        """Reject a brace that does not suit the goals of its task; see `check_objects`.
 
         Raises
         ------
@@ -63,9 +63,18 @@ class Brace(Schema):
             )
         if task.scene is None:
             raise BadKeyError("brace", "needs a scene with the objects to lean on")
-        known = {item.name: item for item in task.scene.objects}
+
+    def check_objects(self, scene: Scene) -> None:
+        """Reject objects that a scene lacks, or that may not be touched as the brace says.
+
+        Raises
+        ------
+        BadKeyError
+            With the key of the brace and the reason.
+        """
+        known = {item.name: item for item in scene.objects}
         for index, name in enumerate(self.objects):
-            key = f"brace.objects.{index}"
+            key = f"objects.{index}"
             if name in self.objects[:index]:
                 raise BadKeyError(key, f"names '{name}' twice")
             if name not in known:
@@ -80,7 +89,7 @@ class Brace(Schema):
                 )
             if self.contacts == "sticking" and not contact.friction:
                 raise BadKeyError(
-                    "brace.contacts",
+                    "contacts",
                     f"nothing sticks to '{name}', which has no friction; give its contact a "
                     "'friction' above 0, or take 'contacts: sliding'",
                 )

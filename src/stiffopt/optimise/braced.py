@@ -22,7 +22,7 @@ from stiffopt import lie
 from stiffopt.display import display_units
 from stiffopt.errors import EquilibriumError, StoppedError
 from stiffopt.model.arm_clearance import measured_scene
-from stiffopt.model.contact.equilibrium import ContactEquilibrium
+from stiffopt.model.contact.equilibrium import ContactEquilibrium, inside_at_rest
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.optimise.brace import quoted
 from stiffopt.optimise.brace_uncertainty import BraceUncertainty
@@ -357,7 +357,9 @@ def _braced_answer(
     problem.here = eq
     return PressureSolution(
         status="solved",
-        message="; ".join(filter(None, (_doubt(problem, eq), _other_equilibrium(problem, eq)))),
+        message="; ".join(
+            filter(None, (at_rest(problem), _doubt(problem, eq), _other_equilibrium(problem, eq)))
+        ),
         task=task,
         pressures=eq.pressures,
         tip_pose=judgement.tip_pose,
@@ -385,6 +387,17 @@ def _size(problem: BracedProblem, name: str, radius: float) -> float:
     forces = {f"{FORCE_ON}{item.name}": item.contact for item in problem.scene.objects}
     contact = forces.get(name)
     return radius if contact is None or contact.max_force is None else contact.max_force
+
+
+def at_rest(problem: BracedProblem) -> str:
+    """Return a message if an object that is in place pushes the arm aside at rest, or ""."""
+    robot, scene = problem.robot, problem.scene
+    inside = inside_at_rest(robot, scene)
+    if not inside or problem.brace.approach == "objects":
+        return ""
+    if robot.clearance(np.zeros(robot.n_pressures), scene) >= 0:  # its weight moves it away
+        return ""
+    return f"{inside}, which is taken to push it aside; correct the object's place if it does not"
 
 
 def _doubt(problem: BracedProblem, eq: ContactEquilibrium) -> str:

@@ -34,8 +34,7 @@ class CompiledSearch:
 
     Parameters
     ----------
-    answers :
-        The solver's factory of solutions.
+    answers : the solver's factory of solutions.
     """
 
     def __init__(self, answers: Answers) -> None:

@@ -78,17 +78,13 @@ class AnswerDerivatives:
 
     Parameters
     ----------
-    robot : Manipulator
-        The arm, which carries the task's load.
-    task : Task
-    pressures : (n,)
-        The answer, in Pa.
+    robot : the arm, which carries the task's load.
+    pressures : (n,), the answer, in Pa.
 
     Attributes
     ----------
-    weak : tuple of str
-        Constraints that are about to become active or inactive.  If there are any, derivatives hold
-        only on the side on which the active constraints stay the same.
+    weak : constraints that are about to become active or inactive.  If there are any, derivatives
+        hold only on the side on which the active constraints stay the same.
 
     Raises
     ------

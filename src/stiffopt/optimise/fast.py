@@ -92,16 +92,12 @@ class CompiledAnswer(NamedTuple):
 
     Attributes
     ----------
-    pressures : ndarray (n,)
-        In Pa.
-    confidence : Confidence
-    counts : dict of str to int
-        Work done.
-    judged : tuple
-        Arguments of `Judgement.of`: residuals, tip pose, compliance and values at the pressures.
-    slope : ndarray (n,)
-        For the closest configuration: gradient of its error's Lagrangian without limits, per share
-        of a pressure's range.
+    pressures : (n,), in Pa.
+    counts : work done.
+    judged : arguments of `Judgement.of`: residuals, tip pose, compliance and values at the
+        pressures.
+    slope : (n,), for the closest configuration: gradient of its error's Lagrangian without limits,
+        per share of a pressure's range.
     """
 
     pressures: Vector
@@ -118,20 +114,14 @@ class FastSolver:
 
     Parameters
     ----------
-    library : Library
-        Functions of the structure, with the compiled solver.
-    robot : Manipulator
-    program : Program
-        Any of that structure; for one with obstacles see `among`.
-    table : SampleTable
-        Starts of searches; that of a loaded arm includes the arm in machine code.
+    library : functions of the structure, with the compiled solver.
+    program : any of that structure; for one with obstacles see `among`.
+    table : starts of searches; that of a loaded arm includes the arm in machine code.
 
     Attributes
     ----------
-    table : SampleTable
-        Starts of searches.
-    targets, guess : slice
-        Places of the target's parameters and of the guess in a row.
+    table : starts of searches.
+    targets, guess : places of the target's parameters and of the guess in a row.
     """
 
     def __init__(

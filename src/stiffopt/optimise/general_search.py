@@ -28,8 +28,7 @@ class GeneralSearch:
 
     Parameters
     ----------
-    answers :
-        The solver's factory of solutions.
+    answers : the solver's factory of solutions.
     """
 
     def __init__(self, answers: Answers) -> None:

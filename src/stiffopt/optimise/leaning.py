@@ -110,11 +110,8 @@ class BracedPoint(ProgramPoint):
 
     Attributes
     ----------
-    equilibrium : ContactEquilibrium
-    force : float
-        Sum of the contacts' normal forces, in N.
-    force_gradient : ndarray (n,)
-        Its derivative, per variable.
+    force : sum of the contacts' normal forces, in N.
+    force_gradient : (n,), its derivative, per variable.
     """
 
     __slots__ = ("equilibrium", "force", "force_gradient")
@@ -141,7 +138,6 @@ class BracedProblem(PressureProblem):
 
     Attributes
     ----------
-    brace : Brace
     scene : the objects that the arm may lean on.
     here : equilibrium from which the next one is sought, or None: from rest.
     only_target : whether the demands on contacts are ignored.

@@ -53,10 +53,8 @@ class FollowedObstacles(Obstacles):
 
     Attributes
     ----------
-    pressures : ndarray (n,)
-        Pressures at which the minima were found, in Pa.
-    least : tuple of LeastDistance
-        The minimum of each row.
+    pressures : (n,), pressures at which the minima were found, in Pa.
+    least : the minimum of each row.
     """
 
     arm: Manipulator = field(repr=False, compare=False)

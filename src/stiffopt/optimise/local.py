@@ -37,16 +37,10 @@ class LocalResult:
 
     Attributes
     ----------
-    problem : PressureProblem
-        The program that was solved.
-    point : ProgramPoint
-    value : float
-        Objective there.
-    violation : float
-        Sum of the violations of floors, in logarithms of stiffness.
-    converged : bool
-    is_optimum : bool
-        False: the point is only a candidate, without prices.
+    problem : the program that was solved.
+    value : objective there.
+    violation : sum of the violations of floors, in logarithms of stiffness.
+    is_optimum : False: the point is only a candidate, without prices.
     """
 
     problem: PressureProblem
@@ -93,14 +87,10 @@ class _Place:
 
     Attributes
     ----------
-    point : ProgramPoint
-    values : ndarray (t,)
-        Terms of the objective.
-    value, missed : float
-        The largest term, and the violation of floors.
-    slopes : ndarray (t + f + m, n)
-        Gradients of the terms, of the negative floors, and of the residuals in finite balls, in the
-        order of the multipliers.
+    values : (t,), terms of the objective.
+    value, missed : the largest term, and the violation of floors.
+    slopes : (t + f + m, n), gradients of the terms, of the negative floors, and of the residuals in
+        finite balls, in the order of the multipliers.
     """
 
     __slots__ = ("missed", "point", "slopes", "value", "values")

@@ -78,8 +78,7 @@ class ObstaclesInC:
 
     Attributes
     ----------
-    address : int
-        Of the `Obstacles`.
+    address : of the `Obstacles`.
     """
 
     def __init__(self, obstacles: "Obstacles", arm: Manipulator, rod: LoadedArm | None) -> None:
@@ -120,13 +119,10 @@ class Obstacles:
 
     Attributes
     ----------
-    scene : Scene
-    description : RobotDescription
-        The arm.
-    range_groups : tuple of int
-        Number of ranges (soft or rigid pieces of the body) up to the end of each segment.
-    row_objects : tuple of int
-        Index of each row's object.
+    description : the arm.
+    range_groups : number of ranges (soft or rigid pieces of the body) up to the end of each
+        segment.
+    row_objects : index of each row's object.
     """
 
     scene: Scene

@@ -30,12 +30,9 @@ class Prepared:
 
     Attributes
     ----------
-    robot : Manipulator
-        The arm, which carries the task's load.
-    lower, upper : ndarray (n,)
-        Pressure limits in Pa.
-    unit : str or None
-        Unit of the task's first stiffness.
+    robot : the arm, which carries the task's load.
+    lower, upper : (n,), pressure limits in Pa.
+    unit : unit of the task's first stiffness.
     """
 
     def __init__(self, robot: Manipulator, task: Task, seed: int) -> None:

@@ -24,15 +24,12 @@ class Multipliers:
 
     Attributes
     ----------
-    bounds : ndarray (n,)
-        Per unit of the variables; positive at an active upper bound, negative at a lower one.
-    balls : tuple of ndarray
-        Vector for each of the point's `bounded` constraints, per unit of the term; its length is
-        the price of the radius.
-    terms : ndarray (m,)
-        Weights of the objective's terms, which sum to one.
-    floors : ndarray
-        Per unit of each floor's logarithm.
+    bounds : (n,), per unit of the variables; positive at an active upper bound, negative at a lower
+        one.
+    balls : vector for each of the point's `bounded` constraints, per unit of the term; its length
+        is the price of the radius.
+    terms : (m,), weights of the objective's terms, which sum to one.
+    floors : per unit of each floor's logarithm.
     """
 
     bounds: Vector

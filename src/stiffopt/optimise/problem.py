@@ -34,10 +34,8 @@ class Ball:
 
     Attributes
     ----------
-    constraint : Constraint
     residual : ndarray (k,)
-    jacobian : ndarray (k, n)
-        Per variable.
+    jacobian : (k, n), per variable.
     """
 
     constraint: Constraint
@@ -76,22 +74,16 @@ class ProgramPoint:
 
     Attributes
     ----------
-    x : ndarray (n,)
-        Pressures, as shares of the channels' ranges; all derivatives are with respect to them.
-    residual : ndarray (m,)
-        Residuals of all terms, in their units.
+    x : (n,), pressures, as shares of the channels' ranges; all derivatives are with respect to
+        them.
+    residual : (m,), residuals of all terms, in their units.
     jacobian : ndarray (m, n)
-    constraints : tuple of Constraint
-        Bounds on the rows.
-    errors : tuple of float
-        Error of each constraint, see `Ball.error`.
-    reached : bool
-        Whether every constraint holds.
-    terms : ndarray (t,)
-        Terms of the task's objective; empty where only the pose was evaluated.
+    constraints : bounds on the rows.
+    errors : error of each constraint, see `Ball.error`.
+    reached : whether every constraint holds.
+    terms : (t,), terms of the task's objective; empty where only the pose was evaluated.
     term_gradients : ndarray (t, n)
-    floors : ndarray (f,)
-        Logarithms of the stiffnesses that have a lower bound.
+    floors : (f,), logarithms of the stiffnesses that have a lower bound.
     floor_gradients : ndarray (f, n)
     """
 
@@ -177,17 +169,11 @@ class PressureProblem:
 
     Attributes
     ----------
-    lower, upper : ndarray (n,)
-        Bounds of the variables.
-    unit : ndarray (n,)
-        Pressures in Pa that are one unit of the variables.
-    objective : Objective
-    floors : ndarray (f,)
-        Lower bounds on `ProgramPoint.floors`; empty where floors are ignored.
-    constraints : tuple of Constraint
-        Bounds on the residual.
-    radii : dict of str to float
-        Radii that replace the target's, by name of the term.
+    lower, upper : (n,), bounds of the variables.
+    unit : (n,), pressures in Pa that are one unit of the variables.
+    floors : (f,), lower bounds on `ProgramPoint.floors`; empty where floors are ignored.
+    constraints : bounds on the residual.
+    radii : radii that replace the target's, by name of the term.
     """
 
     def __init__(self, robot: Manipulator, task: Task) -> None:
@@ -391,14 +377,10 @@ class Bounding:
 
     Attributes
     ----------
-    constraints : tuple of Constraint
-        With rows numbered within `rows`.
-    indices : tuple of int
-        Their indices among all constraints.
-    rows : slice or ndarray of int
-        Their rows of the residual.
-    radius, scale : ndarray (m,)
-        Values of each row's constraint.
+    constraints : with rows numbered within `rows`.
+    indices : their indices among all constraints.
+    rows : their rows of the residual.
+    radius, scale : (m,), values of each row's constraint.
     """
 
     def __init__(self, constraints: tuple[Constraint, ...]) -> None:

@@ -47,13 +47,10 @@ class Constraint(NamedTuple):
 
     Attributes
     ----------
-    name : str
-        Name of the term.
-    radius : float
-        Bound on the length of the rows, ``|r| <= radius``; if `one_sided`, bound on the single row,
-        ``r <= radius``.
-    scale : float
-        Typical size of the residual far from the target, in its unit.
+    name : name of the term.
+    radius : bound on the length of the rows, ``|r| <= radius``; if `one_sided`, bound on the single
+        row, ``r <= radius``.
+    scale : typical size of the residual far from the target, in its unit.
     """
 
     name: str
@@ -79,16 +76,11 @@ class Program:
 
     Attributes
     ----------
-    terms : tuple of Term
-    measures : tuple of Measure
-        The maximised or matched ones, then the floors.
+    measures : the maximised or matched ones, then the floors.
     aim : whether the first measures are maximised or matched; without any, pressure is minimised.
-    n_floors : int
-        Number of stiffnesses with a lower bound.
-    reference : float
-        Pressure in Pa that is one unit of mean square pressure.
-    obstacles : Obstacles or None
-        Objects around the arm; their rows of the residual follow those of the terms.
+    n_floors : number of stiffnesses with a lower bound.
+    reference : pressure in Pa that is one unit of mean square pressure.
+    obstacles : objects around the arm; their rows of the residual follow those of the terms.
     """
 
     terms: tuple[Term, ...]

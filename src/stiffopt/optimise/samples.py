@@ -20,23 +20,16 @@ class SampleTable:
 
     Parameters
     ----------
-    robot : Manipulator
-    lower, upper : ndarray (n,)
-        Range in Pa.
-    seed : int
-        Shifts the low-discrepancy sequence.
-    arm : LoadedArm, optional
-        The robot in machine code, to find equilibria under load.
-    count : int, optional
-        Number of configurations, before those without an equilibrium are left out.
+    lower, upper : (n,), range in Pa.
+    seed : shifts the low-discrepancy sequence.
+    arm : the robot in machine code, to find equilibria under load.
+    count : number of configurations, before those without an equilibrium are left out.
 
     Attributes
     ----------
-    pressures : ndarray (N, n)
-        In Pa.
+    pressures : (N, n), in Pa.
     poses : ndarray (N, 4, 4)
-    states : ndarray (N, s)
-        States of the equilibria; only with `arm`.
+    states : (N, s), states of the equilibria; only with `arm`.
     """
 
     def __init__(

@@ -39,12 +39,9 @@ def effort(rows: int, covered: float, loaded: bool = False) -> Effort:
 
     Parameters
     ----------
-    rows : int
-        Components of the residuals that must be zero.
-    covered : float
-        Share of the sampled configurations that meet the target.
-    loaded : bool
-        Whether machine code searches for an arm under gravity or a load.
+    rows : components of the residuals that must be zero.
+    covered : share of the sampled configurations that meet the target.
+    loaded : whether machine code searches for an arm under gravity or a load.
     """
     placed, loose = SEARCH.placed, SEARCH.loose
     if loaded:
@@ -85,19 +82,13 @@ class Search:
 
     Attributes
     ----------
-    results : tuple of LocalResult
-        Ends of descents, the best first, without those that stopped next to a known optimum.
-    nearest : tuple of ProgramPoint
-        Ends of starts that did not reach the pose, if none reached it.
-    confidence : Confidence
-        In the best result.
-    ends : tuple of LocalResult
-        Ends of the converged descents, one of each, those included that stopped next to a known
+    results : ends of descents, the best first, without those that stopped next to a known optimum.
+    nearest : ends of starts that did not reach the pose, if none reached it.
+    confidence : in the best result.
+    ends : ends of the converged descents, one of each, those included that stopped next to a known
         optimum.
-    same : float
-        Difference of values below which ends count as one optimum.
-    best_found : int
-        How many descents must have found an answer for a complete search.
+    same : difference of values below which ends count as one optimum.
+    best_found : how many descents must have found an answer for a complete search.
     """
 
     results: tuple[LocalResult, ...]

@@ -49,16 +49,11 @@ class Confidence:
 
     Attributes
     ----------
-    starts : int
-        Configurations that were brought towards the pose.
-    reached : int
-        Converged descents from starts that reached the pose.
-    agreeing : int
-        Converged descents that ended within 0.1 % of the best; with a brace, of the answer.
-    optima : int
-        Distinct local optima among them.
-    complete : bool
-        Whether the search ended because enough descents in a row found nothing new (see
+    starts : configurations that were brought towards the pose.
+    reached : converged descents from starts that reached the pose.
+    agreeing : converged descents that ended within 0.1 % of the best; with a brace, of the answer.
+    optima : distinct local optima among them.
+    complete : whether the search ended because enough descents in a row found nothing new (see
         `stiffopt.optimise.search.effort`).  False: it ended before.
     """
 
@@ -89,21 +84,16 @@ class Sensitivities:
 
     Attributes
     ----------
-    tip_jacobian : ndarray (6, n)
-        Tip twist in tip axes per Pa.
-    stiffness_gradient : ndarray (n,) or None
-        First stiffness of the task per Pa, in N/m/Pa or N m/rad/Pa.
-    per_bound : dict of str to float
-        Gain from moving each active pressure limit outwards, in `objective_unit` per Pa.
-    per_tolerance : dict of str to float
-        Gain by name of each term of the target, per m or rad of tolerance or, for an inequality, of
-        margin; and per m less clearance of each object, see `per_clearance`.
-    per_position_tolerance, per_angle_tolerance : float or None
-        Gains for position and angle; None where the target has none.
-    objective_unit : str
-        Unit of the gain: "N/m" or "N*m/rad" of the (smallest) stiffness that is maximised; "m" or
-        "rad" of the error of an unreachable pose; "bar^2" of mean square pressure for a task
-        without a stiffness; "1", the squared relative mismatch, where one is matched.
+    tip_jacobian : (6, n), tip twist in tip axes per Pa.
+    stiffness_gradient : (n,), first stiffness of the task per Pa, in N/m/Pa or N m/rad/Pa.
+    per_bound : gain from moving each active pressure limit outwards, in `objective_unit` per Pa.
+    per_tolerance : gain by name of each term of the target, per m or rad of tolerance or, for an
+        inequality, of margin; and per m less clearance of each object, see `per_clearance`.
+    per_position_tolerance, per_angle_tolerance : gains for position and angle; None where the
+        target has none.
+    objective_unit : unit of the gain: "N/m" or "N*m/rad" of the (smallest) stiffness that is
+        maximised; "m" or "rad" of the error of an unreachable pose; "bar^2" of mean square pressure
+        for a task without a stiffness; "1", the squared relative mismatch, where one is matched.
     """
 
     tip_jacobian: Vector
@@ -474,10 +464,8 @@ class Judgement(NamedTuple):
         Parameters
         ----------
         program : of the task
-        numbers : tuple
-            Residuals (m,), tip pose (4, 4), compliance (6, 6), values of the measures (k,).
-        within : bool
-            Whether the pressures are within their limits.
+        numbers : residuals (m,), tip pose (4, 4), compliance (6, 6), values of the measures (k,).
+        within : whether the pressures are within their limits.
         """
         residuals, tip_pose, compliance, values = numbers
         errors = program.errors(residuals)

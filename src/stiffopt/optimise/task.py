@@ -22,12 +22,13 @@ from pydantic import (
     Field,
     Tag,
     ValidationInfo,
+    field_validator,
     model_validator,
 )
 from pydantic_core import PydanticKnownError
 
 from stiffopt.directions import Frame
-from stiffopt.errors import FileError, InputError
+from stiffopt.errors import FileError, InputError, dotted
 from stiffopt.files import SourceFile, line_of, read_file
 from stiffopt.model.description import RobotDescription, one_or_list
 from stiffopt.model.robot_files import load_description
@@ -159,8 +160,7 @@ class ForRobot(Schema, ShownInNotebook):
 
         Parameters
         ----------
-        description :
-            The robot, with n channels.
+        description : the robot, with n channels.
 
         Returns
         -------
@@ -193,9 +193,11 @@ class ForRobot(Schema, ShownInNotebook):
 
     def error_at(self, key: str, reason: str) -> InputError:
         """Return an error about a key, with file and line if this was read from a file."""
+        place = [int(step) if step.isdigit() else step for step in key.split(".")]
+        key = dotted(place)
         if self.source is None:
             return InputError(f"{type(self).__name__}.{key}: {reason}")
-        return FileError(self.source, reason, line=line_of(self.source, *key.split(".")), key=key)
+        return FileError(self.source, reason, line=line_of(self.source, *place), key=key)
 
 
 class Task(ForRobot):
@@ -219,6 +221,15 @@ class Task(ForRobot):
     stiffness: StiffnessGoal | None = None
     press: Press | None = None
     brace: Brace | None = None
+
+    @field_validator("brace")
+    @classmethod
+    def _on_objects(cls, brace: Brace | None, info: ValidationInfo) -> Brace | None:
+        """Check the names whatever is wrong elsewhere, unless it is the scene."""
+        scene = info.data.get("scene")
+        if brace is not None and scene is not None:
+            brace.check_objects(scene)
+        return brace
 
     @model_validator(mode="after")
     def _can_lean(self) -> Task:

@@ -34,12 +34,10 @@ class TipAt(NamedTuple):
 
     Attributes
     ----------
-    pose : ndarray (4, 4)
-        In the base frame.
-    jacobian : ndarray (6, n)
-        Twist of the tip in tip axes per pressure: three rows in m/Pa, then three in rad/Pa.
-    compliance : ndarray (6, 6)
-        In tip axes, linear first, as `Manipulator.tip_compliance`.
+    pose : (4, 4), in the base frame.
+    jacobian : (6, n), twist of the tip in tip axes per pressure: three rows in m/Pa, then three in
+        rad/Pa.
+    compliance : (6, 6), in tip axes, linear first, as `Manipulator.tip_compliance`.
     """
 
     pose: Vector
@@ -58,14 +56,13 @@ class TipModel:
 
     Parameters
     ----------
-    robot : Manipulator
-        The arm with its gravity and load.
+    robot : the arm with its gravity and load.
 
     Attributes
     ----------
-    is_fast : bool
-        Whether calls run in machine code, which is compiled when an instance is made.  Without a
-        compiler the model is used, from rest each time, which takes milliseconds for a loaded arm.
+    is_fast : whether calls run in machine code, which is compiled when an instance is made.
+        Without a compiler the model is used, from rest each time, which takes milliseconds for a
+        loaded arm.
 
     Raises
     ------

@@ -120,11 +120,8 @@ class WarmCalls:
 
     Attributes
     ----------
-    fast : FastSolver
-    program : Program
-        Of the task.
-    like : ndarray
-        Block of numbers of the task (see `FastSolver.block`).
+    program : of the task.
+    like : block of numbers of the task (see `FastSolver.block`).
     """
 
     def __init__(self, fast: FastSolver, row: Vector, program: Program) -> None:

@@ -23,8 +23,7 @@ class RouteAttempts:
 
     Attributes
     ----------
-    alone : ndarray (N,)
-        Largest values of the local optima; not a number where there is none.
+    alone : (N,), largest values of the local optima; not a number where there is none.
     """
 
     def __init__(

@@ -23,8 +23,7 @@ class Curve(ABC):
 
     Attributes
     ----------
-    length : float
-        In m.
+    length : in m.
     """
 
     length: float
@@ -46,10 +45,8 @@ class Polyline(Curve):
 
     Parameters
     ----------
-    points : (k, 3)
-        In m; some may coincide.
-    closed : bool
-        Whether it ends where it begins.
+    points : (k, 3), in m; some may coincide.
+    closed : whether it ends where it begins.
     """
 
     def __init__(self, points: Vector, closed: bool = False) -> None:
@@ -82,12 +79,9 @@ class ArcCurve(Curve):
 
     Parameters
     ----------
-    centre, start : (3,)
-        In m.
-    axis : (3,)
-        Unit normal of its plane; the arc turns about it by the right-hand rule.
-    angle : float
-        Angle of the arc, in rad.
+    centre, start : (3,), in m.
+    axis : (3,), unit normal of its plane; the arc turns about it by the right-hand rule.
+    angle : angle of the arc, in rad.
     """
 
     def __init__(self, centre: Vector, start: Vector, axis: Vector, angle: float) -> None:
@@ -114,10 +108,8 @@ class SplineCurve(Curve):
 
     Parameters
     ----------
-    points : (k, 3)
-        In m, k >= 2, neighbours distinct.
-    closed : bool
-        Whether the last point equals the first and the spline is periodic; else it is natural.
+    points : (k, 3), in m, k >= 2, neighbours distinct.
+    closed : whether the last point equals the first and the spline is periodic; else it is natural.
     """
 
     def __init__(self, points: Vector, closed: bool = False) -> None:
@@ -176,8 +168,7 @@ def path_axes(tangents: Vector) -> Vector:
 
     Parameters
     ----------
-    tangents : (N, 3)
-        Unit vectors.
+    tangents : (N, 3), unit vectors.
 
     Returns
     -------
@@ -197,20 +188,13 @@ class PathPoints:
 
     Attributes
     ----------
-    targets : tuple of Target (N,)
-        All prescribe the same components of the pose.
-    goals : tuple of StiffnessGoal or None (N,)
-        With directions in base or tip axes.
-    positions : ndarray (N, 3)
-        In m, base frame.
-    tangents : ndarray (N, 3)
-        Unit vectors.
-    lengths : ndarray (N,)
-        Arc length from the first point, in m.
-    times : ndarray (N,) or None
-        In s, from 0; None if the rates decide.
-    curve : Curve
-        The curve through the points.
+    targets : (N,), all prescribe the same components of the pose.
+    goals : (N,), with directions in base or tip axes.
+    positions : (N, 3), in m, base frame.
+    tangents : (N, 3), unit vectors.
+    lengths : (N,), arc length from the first point, in m.
+    times : (N,), in s, from 0; None if the rates decide.
+    curve : the curve through the points.
     """
 
     targets: tuple[Target, ...]

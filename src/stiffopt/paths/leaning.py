@@ -91,11 +91,8 @@ def approach_to(
 
     Parameters
     ----------
-    robot : Manipulator
-    solution : PressureSolution
-        Of a task with a brace; it leans on an object.
-    slew : float or (n,)
-        Largest rates of change, in Pa/s.
+    solution : of a task with a brace; it leans on an object.
+    slew : largest rates of change, one or (n,), in Pa/s.
 
     Raises
     ------

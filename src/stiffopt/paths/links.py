@@ -30,15 +30,11 @@ class Layers:
 
     Attributes
     ----------
-    candidates : list of PathCandidate
-    is_lane : ndarray (m,)
-        Whether a candidate is a further one.
-    first : ndarray (N + 1,)
-        Number of the first candidate at each point, and m.
+    is_lane : (m,), whether a candidate is a further one.
+    first : (N + 1,), number of the first candidate at each point, and m.
     point : ndarray (m,)
     values, pressures : ndarray (m,), (m, n)
-    best : ndarray (N,)
-        Largest value at each point.
+    best : (N,), largest value at each point.
     """
 
     def __init__(

@@ -12,9 +12,10 @@ from numpy.typing import ArrayLike, NDArray
 from stiffopt.errors import InputError, shown
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.scene import Scene
+from stiffopt.optimise.solution import Status
 from stiffopt.optimise.task import Load, Task
 from stiffopt.paths.configurations import End, checked_pressures, several
-from stiffopt.paths.solution import PathSolution, Status
+from stiffopt.paths.solution import PathSolution
 
 Vector = NDArray[np.float64]
 

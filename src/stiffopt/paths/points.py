@@ -35,11 +35,9 @@ class PathCandidate(NamedTuple):
 
     Attributes
     ----------
-    pressures : ndarray (n,)
-        In Pa.
-    value : float
-        Logarithm of the smallest stiffness that is maximised; if none is, the negative mean square
-        of the relative pressures.
+    pressures : (n,), in Pa.
+    value : logarithm of the smallest stiffness that is maximised; if none is, the negative mean
+        square of the relative pressures.
     """
 
     pressures: Vector
@@ -103,9 +101,7 @@ class BodyCheck:
 
     Parameters
     ----------
-    robot : Manipulator
-        With its load.
-    scene : Scene
+    robot : with its load.
     """
 
     def __init__(self, robot: Manipulator, scene: Scene) -> None:
@@ -127,13 +123,9 @@ class PathTasks:
 
     Attributes
     ----------
-    robot : Manipulator
-        The arm, which carries the load.
-    lower, upper, unit : ndarray (n,)
-        Limits, and ranges of the channels, in Pa.
-    scene : Scene or None
-    is_compiled : bool
-        Whether they are solved by machine code.
+    robot : the arm, which carries the load.
+    lower, upper, unit : (n,), limits, and ranges of the channels, in Pa.
+    is_compiled : whether they are solved by machine code.
     """
 
     def __init__(self, robot: Manipulator, tasks: Sequence[Task], seed: int) -> None:

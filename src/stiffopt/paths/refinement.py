@@ -43,11 +43,8 @@ def refined(
 
     Parameters
     ----------
-    tasks : PathTasks
-    pressures : (N, n)
-        In Pa; they solve the tasks and keep the steps.
-    steps : (N - 1, n)
-        Largest changes from point to point, in Pa.
+    pressures : (N, n), in Pa; they solve the tasks and keep the steps.
+    steps : (N - 1, n), largest changes from point to point, in Pa.
     over : "worst" or "mean"
     fixed : indices of points that must not change.
     """

@@ -28,7 +28,6 @@ class Route:
 
     Attributes
     ----------
-    candidates : list of PathCandidate
     crossings : number of crossings from branch to branch.
     """
 

@@ -37,14 +37,11 @@ class Sequences:
 
     Parameters
     ----------
-    layers : Layers
-    links : Links
     code : machine code, or None.
 
     Attributes
     ----------
-    usable : ndarray (m,)
-        Values of the candidates that sequences may use; minus infinity for the others.
+    usable : (m,), values of the candidates that sequences may use; minus infinity for the others.
     """
 
     def __init__(self, layers: Layers, links: Links, code: Library | None) -> None:

@@ -1,7 +1,6 @@
 """`PathSolution`: the solution of a path or motion, pressures over time."""
 
 from dataclasses import dataclass, field
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +10,7 @@ from stiffopt.errors import InputError
 from stiffopt.model.contact.equilibrium import ContactEquilibrium
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.notebook import ShownInNotebook
+from stiffopt.optimise.solution import Status
 from stiffopt.paths.trajectory import Trajectory, trajectory_through
 
 Vector = NDArray[np.float64]
@@ -20,8 +20,6 @@ LEANS = (
     "goes the same way"
 )
 """Why a motion into contact cannot be played."""
-
-Status = Literal["solved", "unreachable", "failed"]
 
 
 @dataclass(frozen=True, eq=False, repr=False)

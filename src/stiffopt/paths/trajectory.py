@@ -93,16 +93,11 @@ def trajectory_through(
 
     Parameters
     ----------
-    times : (N,)
-        In s, increasing from 0.
-    pressures : (N, n)
-        In Pa.
-    tips : (N, 3)
-        In m, in the base frame.
-    ranges : (n,)
-        Ranges of the pressures, in Pa.
-    begin :
-        Time of the first point, in s; it leaves the arm time to go there.
+    times : (N,), in s, increasing from 0.
+    pressures : (N, n), in Pa.
+    tips : (N, 3), in m, in the base frame.
+    ranges : (n,), ranges of the pressures, in Pa.
+    begin : time of the first point, in s; it leaves the arm time to go there.
 
     Raises
     ------

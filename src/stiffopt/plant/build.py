@@ -90,14 +90,10 @@ def make_rod(
 
     Parameters
     ----------
-    robot :
-        Description of the arm.
-    settings :
-        Settings of the plant.
-    mismatch :
-        The mismatch of this arm, including its random part.
-    station :
-        Arc length at rest that must be a node, in m; None for the tip.
+    robot : description of the arm.
+    settings : settings of the plant.
+    mismatch : the mismatch of this arm, including its random part.
+    station : arc length at rest that must be a node, in m; None for the tip.
     """
     grid = settings.discretisation
     bending, shear = grid.bending_degree + 1, grid.shear_degree + 1
@@ -148,10 +144,8 @@ def station_of(robot: RobotDescription, at: float) -> tuple[int, float, float]:
 
     Parameters
     ----------
-    robot :
-        Defines the lengths; those of the simulated arm do not count.
-    at :
-        Arc length at rest, connectors included, in m.
+    robot : defines the lengths; those of the simulated arm do not count.
+    at : arc length at rest, connectors included, in m.
 
     Raises
     ------

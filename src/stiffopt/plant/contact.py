@@ -380,12 +380,9 @@ def touch(
 
     Parameters
     ----------
-    R, r, R0, r0 :
-        Poses of the nodes at its end, (N, 3, 3) and (N, 3), and at its beginning.
-    grip :
-        Stretch of the springs across the normals at its beginning (k, P, 3), m.
-    rubs :
-        Whether there is friction.
+    R, r, R0, r0 : poses of the nodes at its end, (N, 3, 3) and (N, 3), and at its beginning.
+    grip : stretch of the springs across the normals at its beginning (k, P, 3), m.
+    rubs : whether there is friction.
     """
     x, F, depth, normal = np.empty(3), np.empty(3), out.depth, out.normal
     out.wrench[:] = 0.0

@@ -172,8 +172,7 @@ class SimulatedRig(Rig):
 
     Attributes
     ----------
-    world :
-        The simulated truth, which no controller may read, and the place to inject faults.
+    world : the simulated truth, which no controller may read, and the place to inject faults.
     """
 
     world: World

@@ -67,20 +67,13 @@ def regulate(
 
     Parameters
     ----------
-    regulators :
-        Their parameters.
-    delayed :
-        Set-points that have not reached the regulators yet (d, n), a ring buffer.
-    first :
-        Index of the oldest in the ring.
-    set_point :
-        The newest set-points (n,).
-    pressure :
-        In the chambers (n,), without ripple; updated.
-    ripple :
-        Added at each step (m, n).
-    trace :
-        Set to the pressure midway through each step (m, n).
+    regulators : their parameters.
+    delayed : set-points that have not reached the regulators yet (d, n), a ring buffer.
+    first : index of the oldest in the ring.
+    set_point : the newest set-points (n,).
+    pressure : in the chambers (n,), without ripple; updated.
+    ripple : added at each step (m, n).
+    trace : set to the pressure midway through each step (m, n).
 
     Returns
     -------
@@ -239,12 +232,10 @@ class SimulatedStage:
 
     Parameters
     ----------
-    settings, plant, rng :
-        Settings of the probe, the arm that it pushes, and the source of the sensor's noise.
-    faults :
-        Present fault of each device; that of ``probe`` counts.
-    lock :
-        Held while the plant or the stage changes: any thread may call any method.
+    settings, plant, rng : settings of the probe, the arm that it pushes, and the source of the
+        sensor's noise.
+    faults : present fault of each device; that of ``probe`` counts.
+    lock : held while the plant or the stage changes: any thread may call any method.
 
     Attributes
     ----------

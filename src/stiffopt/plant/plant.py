@@ -114,10 +114,8 @@ class Plant:
 
     Parameters
     ----------
-    robot :
-        Description of the arm.
-    settings :
-        How this arm differs, and how it is simulated.
+    robot : description of the arm.
+    settings : how this arm differs, and how it is simulated.
 
     Raises
     ------
@@ -234,14 +232,10 @@ class Plant:
 
         Parameters
         ----------
-        normal :
-            Unit vector (3,) in the base frame from the probe towards the tip; None: no plate.
-        at :
-            Position of the plate along it, in m: it touches a tip that is less far along.
-        stiffness :
-            Of the contact, in N/m.
-        speed :
-            Speed of the plate while time passes next, in m/s.
+        normal : unit vector (3,) in the base frame from the probe towards the tip; None: no plate.
+        at : position of the plate along it, in m: it touches a tip that is less far along.
+        stiffness : of the contact, in N/m.
+        speed : speed of the plate while time passes next, in m/s.
         """
         self._plate = None if normal is None else (np.array(normal, float), at, speed, stiffness)
 
@@ -270,10 +264,8 @@ class Plant:
 
         Parameters
         ----------
-        duration :
-            In s; rounded to whole steps.
-        pressures :
-            Gauge pressures (n,), in Pa.
+        duration : in s; rounded to whole steps.
+        pressures : gauge pressures (n,), in Pa.
 
         Raises
         ------
@@ -328,10 +320,8 @@ class Plant:
 
         Parameters
         ----------
-        pressures :
-            In the chambers (n,), in Pa.
-        load :
-            Replaces the present one from now on, if given.
+        pressures : in the chambers (n,), in Pa.
+        load : replaces the present one from now on, if given.
 
         Raises
         ------

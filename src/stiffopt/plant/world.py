@@ -57,14 +57,10 @@ class World:
 
     Parameters
     ----------
-    robot :
-        Description of the arm.
-    limits :
-        Limits of the pressures.
-    plant, supply, tracker, probe :
-        Settings.
-    real_time :
-        Whether time passes by itself; otherwise it passes in `advance_to`.
+    robot : description of the arm.
+    limits : limits of the pressures.
+    plant, supply, tracker, probe : settings.
+    real_time : whether time passes by itself; otherwise it passes in `advance_to`.
     """
 
     def __init__(
@@ -249,10 +245,8 @@ class World:
 
         Parameters
         ----------
-        device, fault :
-            See `known_faults`.
-        channel :
-            Faulty channel of the supply (from 0); None: all of them.
+        device, fault : see `known_faults`.
+        channel : faulty channel of the supply (from 0); None: all of them.
 
         Raises
         ------

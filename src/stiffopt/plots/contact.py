@@ -28,12 +28,8 @@ def plot_contact(
 
     Parameters
     ----------
-    robot : Manipulator
-    equilibrium : ContactEquilibrium
-        Of that arm in that scene.
-    scene : Scene
-    view : (elevation, azimuth), optional
-        See `draw_arm`.
+    equilibrium : of that arm in that scene.
+    view : (elevation, azimuth), see `draw_arm`.
     """
     figure = style.new_figure(6.6, 6.6)
     axes = style.add_space(figure, (0.02, 0.02, 0.96, 0.94))

@@ -22,14 +22,10 @@ def draw_objects(axes: Any, scene: Scene, size: float, seen: Vector) -> tuple[Ve
 
     Parameters
     ----------
-    axes :
-        In 3-D.
-    scene :
-        The objects around the arm.
-    size :
-        Length of the arm, in that unit; unbounded objects are cut off at about it.
-    seen : (k, 3)
-        Points that the figure shows anyway, in that unit.
+    axes : in 3-D.
+    scene : the objects around the arm.
+    size : length of the arm, in that unit; unbounded objects are cut off at about it.
+    seen : (k, 3), points that the figure shows anyway, in that unit.
 
     Returns
     -------

@@ -19,11 +19,8 @@ def segment_poses(robot: Manipulator, pressures: ArrayLike, count: int) -> Vecto
 
     Parameters
     ----------
-    robot : Manipulator
-    pressures : (n,)
-        In Pa.
-    count : int
-        Number of stations of each segment, at least 2.
+    pressures : (n,), in Pa.
+    count : number of stations of each segment, at least 2.
     """
     stations = segment_stations(robot, count).ravel()
     poses = np.concatenate([np.eye(4)[None], robot.pose(pressures, stations[1:])])

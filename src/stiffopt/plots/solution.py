@@ -105,11 +105,8 @@ def plot_pareto(
 
     Parameters
     ----------
-    front : sequence of PressureSolution
-        As `stiffopt.pareto_front` returns it.
-    plain : float, optional
-        First stiffness of the plain solution, which ignores stiffness, for comparison.
-    title : str, optional
+    front : as `stiffopt.pareto_front` returns it.
+    plain : first stiffness of the plain solution, which ignores stiffness, for comparison.
 
     Raises
     ------

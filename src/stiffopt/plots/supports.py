@@ -36,12 +36,8 @@ def plot_supports(
 
     Parameters
     ----------
-    robot : Manipulator
-    found : SupportMap
-    title : str, optional
-        Begins the title.
-    view : (elevation, azimuth), optional
-        See `draw_arm`.
+    title : begins the title.
+    view : (elevation, azimuth), see `draw_arm`.
     """
     figure = style.new_figure(13, 8.0)
     axes = style.add_space(figure, (0.02, 0.03, 0.45, 0.77))

@@ -135,10 +135,8 @@ class PressureReading:
 
     Attributes
     ----------
-    time : float
-        When it was read.
-    pressures : ndarray
-        Gauge pressures (n,), in Pa; NaN where the device measures none.
+    time : when it was read.
+    pressures : gauge pressures (n,), in Pa; NaN where the device measures none.
     """
 
     time: float
@@ -178,8 +176,7 @@ class Supply(Device):
 
     Attributes
     ----------
-    limits : PressureLimits
-        Limits of the commands.
+    limits : limits of the commands.
     """
 
     limits: PressureLimits
@@ -265,6 +262,11 @@ class SupplySettings(DeviceSettings):
     """
 
     simulator: ClassVar[str] = ""
+
+    @property
+    def exchange_time(self) -> float:
+        """Least time between two commands on a slow line, in s; 0: the line is fast."""
+        return 0.0
 
     def device(self, limits: PressureLimits, clock: Clock | None = None) -> PressureSupply:
         """Return the supply, not yet open, limited to the range of rig and channels.

@@ -15,12 +15,9 @@ class ForceSample:
 
     Attributes
     ----------
-    time : float
-        When it was measured.
-    force : float
-        Force of the probe on the tip along its axis, in N.
-    position : float
-        Position of the probe along its axis, in m.
+    time : when it was measured.
+    force : force of the probe on the tip along its axis, in N.
+    position : position of the probe along its axis, in m.
     """
 
     time: float

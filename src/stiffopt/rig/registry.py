@@ -66,10 +66,8 @@ def driver_class(kind: str, driver: Any) -> type[DeviceSettings]:
 
     Parameters
     ----------
-    kind :
-        Kind of the device, a key of `KINDS`.
-    driver :
-        Value in the rig file: a name, or ``package.module:Class``.
+    kind : kind of the device, a key of `KINDS`.
+    driver : value in the rig file: a name, or ``package.module:Class``.
 
     Raises
     ------

@@ -67,16 +67,11 @@ class FollowAction:
 
     Parameters
     ----------
-    node, client :
-        The node on the graph, and the client of the daemon.
-    channels :
-        Names of all channels.
-    read :
-        Makes a trajectory from a message, or raises `InputError`.
-    move, once :
-        Queue a command that sets the arm in motion, or another one.
-    reply, refuse :
-        Answer a request, and report why something is not done.
+    node, client : the node on the graph, and the client of the daemon.
+    channels : names of all channels.
+    read : makes a trajectory from a message, or raises `InputError`.
+    move, once : queue a command that sets the arm in motion, or another one.
+    reply, refuse : answer a request, and report why something is not done.
     """
 
     def __init__(

@@ -85,14 +85,10 @@ class Bridge:
 
     Parameters
     ----------
-    rig, description, robot :
-        Path and content of the rig file, and the arm.
-    url, token :
-        URL and token of the daemon.
-    node :
-        The node that publishes everything.
-    say :
-        Called with notices for people.
+    rig, description, robot : path and content of the rig file, and the arm.
+    url, token : URL and token of the daemon.
+    node : the node that publishes everything.
+    say : called with notices for people.
     """
 
     def __init__(

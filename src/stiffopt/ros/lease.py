@@ -27,12 +27,9 @@ class GraphLease:
 
     Parameters
     ----------
-    client :
-        Client of the daemon, with the heartbeat ``manual``.
-    heartbeat :
-        Heartbeat of the daemon, in s.
-    tell :
-        Called with the reason why control has ended.
+    client : client of the daemon, with the heartbeat ``manual``.
+    heartbeat : heartbeat of the daemon, in s.
+    tell : called with the reason why control has ended.
     """
 
     def __init__(

@@ -207,13 +207,10 @@ class RosNode:
 
     Parameters
     ----------
-    names :
-        Names of the node, its topics and services.
-    domain, interface :
-        The DDS domain, and the network interface; None for loopback, which no other machine can
-        reach.
-    distro :
-        ``humble`` or ``jazzy``: the layout of the discovery messages.
+    names : names of the node, its topics and services.
+    domain, interface : the DDS domain, and the network interface; None for loopback, which no other
+        machine can reach.
+    distro : ``humble`` or ``jazzy``: the layout of the discovery messages.
 
     Raises
     ------

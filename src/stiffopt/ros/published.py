@@ -94,16 +94,11 @@ class StateMessages:
 
     Parameters
     ----------
-    robot :
-        The model of the arm.
-    rig :
-        The name of the rig.
-    node :
-        Name of the node in logs.
-    epoch :
-        Date of time 0 on the rig's clock, in s since 1970.
-    prefix :
-        Prefix of the names of frames.
+    robot : the model of the arm.
+    rig : the name of the rig.
+    node : name of the node in logs.
+    epoch : date of time 0 on the rig's clock, in s since 1970.
+    prefix : prefix of the names of frames.
     """
 
     def __init__(

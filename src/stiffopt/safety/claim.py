@@ -32,12 +32,9 @@ class Claim:
 
     Parameters
     ----------
-    endpoints :
-        Returns the names to be claimed (`PressureSupply.endpoints`); called in `take`.
-    holder :
-        Returns who has claimed an endpoint, for the error message.
-    wait :
-        Time for which `take` waits for a claim that another process has, in s.
+    endpoints : returns the names to be claimed (`PressureSupply.endpoints`); called in `take`.
+    holder : returns who has claimed an endpoint, for the error message.
+    wait : time for which `take` waits for a claim that another process has, in s.
     """
 
     def __init__(

@@ -64,15 +64,12 @@ class ExpectedPressure:
 
     Parameters
     ----------
-    regulation :
-        Slowest response of the regulators.
-    slew :
-        Rate of change (n,) that they reach at least, in Pa/s.
+    regulation : slowest response of the regulators.
+    slew : rate of change (n,) that they reach at least, in Pa/s.
 
     Attributes
     ----------
-    lowest, highest : ndarray
-        The bounds (n,) at present, in Pa.
+    lowest, highest : the bounds (n,) at present, in Pa.
     """
 
     def __init__(self, regulation: Regulation, slew: Array) -> None:

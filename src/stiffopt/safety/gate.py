@@ -38,16 +38,11 @@ class Applied:
 
     Attributes
     ----------
-    pressures : ndarray
-        Set-points (n,) of the supply, in Pa.
-    reading : PressureReading
-        Newest measured pressures, with the time of the measurement.
-    limited : bool
-        Whether the set-points differ from the command, because of its rate or force.
-    refused : str
-        Why the command was refused; empty if it was carried out.
-    force_limited : bool
-        Whether it was reduced because of the total force.
+    pressures : set-points (n,) of the supply, in Pa.
+    reading : newest measured pressures, with the time of the measurement.
+    limited : whether the set-points differ from the command, because of its rate or force.
+    refused : why the command was refused; empty if it was carried out.
+    force_limited : whether it was reduced because of the total force.
     """
 
     pressures: Array
@@ -109,25 +104,18 @@ class SafetyGate:
 
     Parameters
     ----------
-    supply :
-        The supply; nothing else may command it while the gate is in use.
-    slew :
-        Greatest rate of change, one value or one per channel (n,), in Pa/s.
-    safety :
-        Limits of pressure, force and age.
-    force_per_pressure :
-        Chamber area of each channel (n,), in m^2, see `RobotDescription.channel_areas`; needed if
-        `safety` limits the force.
-    clock :
-        Clock of the rig.
-    period :
-        Time between commands, in s. After a pause longer than `CommandRules.pause_periods` of
+    supply : the supply; nothing else may command it while the gate is in use.
+    slew : greatest rate of change, one value or one per channel (n,), in Pa/s.
+    safety : limits of pressure, force and age.
+    force_per_pressure : chamber area of each channel (n,), in m^2, see
+        `RobotDescription.channel_areas`; needed if `safety` limits the force.
+    clock : clock of the rig.
+    period : time between commands, in s. After a pause longer than `CommandRules.pause_periods` of
         them, a step is no larger than these periods allow.
 
     Attributes
     ----------
-    limits : PressureLimits
-        Limits of the commands: the supply's, tightened by those of `safety`.
+    limits : limits of the commands: the supply's, tightened by those of `safety`.
 
     Raises
     ------
@@ -268,8 +256,7 @@ class SafetyGate:
 
         Parameters
         ----------
-        now :
-            Time on the rig's clock, in s.
+        now : time on the rig's clock, in s.
 
         Returns
         -------
@@ -399,12 +386,9 @@ def gate_before(rig: Rig, safety: Safety, period: float) -> SafetyGate:
 
     Parameters
     ----------
-    rig :
-        Rig without a gate, as `stiffopt.rig.assembly.make_rig` returns it.
-    safety :
-        Limits of pressure, force and age.
-    period :
-        Time between commands, in s.
+    rig : rig without a gate, as `stiffopt.rig.assembly.make_rig` returns it.
+    safety : limits of pressure, force and age.
+    period : time between commands, in s.
     """
     if not isinstance(rig.supply, PressureSupply):
         raise InputError("this rig's supply has a gate before it already")

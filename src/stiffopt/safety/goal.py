@@ -65,19 +65,14 @@ class GoalFollower:
 
     Parameters
     ----------
-    gate :
-        The gate in front of the supply.
-    period :
-        Time between ticks, in s.
-    ramp_time :
-        Duration of letting the pressures down after a goal has expired, in s.
-    clock :
-        Clock of the rig.
+    gate : the gate in front of the supply.
+    period : time between ticks, in s.
+    ramp_time : duration of letting the pressures down after a goal has expired, in s.
+    clock : clock of the rig.
 
     Attributes
     ----------
-    due : float
-        Time of the next tick on the rig's clock, in s; inf while there is nothing to do.
+    due : time of the next tick on the rig's clock, in s; inf while there is nothing to do.
     """
 
     def __init__(self, gate: SafetyGate, *, period: float, ramp_time: float, clock: Clock) -> None:
@@ -253,10 +248,8 @@ class GoalSupply(Supply):
 
     Parameters
     ----------
-    outlet :
-        Accepts the goals: a follower in this process, or the link to a guard that has one.
-    clock :
-        Clock of the rig.
+    outlet : accepts the goals: a follower in this process, or the link to a guard that has one.
+    clock : clock of the rig.
     """
 
     def __init__(self, outlet: GoalFollower | GuardLink, clock: Clock) -> None:
@@ -330,10 +323,8 @@ class TickingClock(Clock):
 
     Parameters
     ----------
-    clock :
-        Clock that lets simulated time pass.
-    follower :
-        Ticked whenever it is due.
+    clock : clock that lets simulated time pass.
+    follower : ticked whenever it is due.
     """
 
     def __init__(self, clock: Clock, follower: GoalFollower) -> None:

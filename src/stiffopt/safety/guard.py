@@ -66,29 +66,18 @@ class Guard:
 
     Parameters
     ----------
-    outlet :
-        The gate in front of the supply; open.
-    channel :
-        Connection to the client.
-    timeout :
-        Silence of a stream after which the guard vents, in s.
-    follower :
-        Brings the supply to goals; None: only streams are accepted.
-    line :
-        Vent line for calls of ``stiffopt vent``; None: there is none.
-    clock :
-        Returns the time in s; `time.monotonic` is common to all processes.
-    pause :
-        Sleeps for some s.
-    epoch :
-        Time 0 of the rig's own clock on `clock`, in s.
-    hosted :
-        Tracker, probe and truth of a simulated rig.
-    as_json :
-        Whether log lines on stderr are JSON instead of sentences.
-    orphaned :
-        Returns whether the client's process has ended. A forked child of it may keep its end of the
-        channel open.
+    outlet : the gate in front of the supply; open.
+    channel : connection to the client.
+    timeout : silence of a stream after which the guard vents, in s.
+    follower : brings the supply to goals; None: only streams are accepted.
+    line : vent line for calls of ``stiffopt vent``; None: there is none.
+    clock : returns the time in s; `time.monotonic` is common to all processes.
+    pause : sleeps for some s.
+    epoch : time 0 of the rig's own clock on `clock`, in s.
+    hosted : tracker, probe and truth of a simulated rig.
+    as_json : whether log lines on stderr are JSON instead of sentences.
+    orphaned : returns whether the client's process has ended. A forked child of it may keep its end
+        of the channel open.
     """
 
     def __init__(

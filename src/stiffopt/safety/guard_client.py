@@ -63,10 +63,8 @@ class GuardProcess:
 
     Parameters
     ----------
-    rig :
-        Description of the rig whose supply it owns, and of its robot.
-    json_lines :
-        Whether it writes JSON lines on stderr.
+    rig : description of the rig whose supply it owns, and of its robot.
+    json_lines : whether it writes JSON lines on stderr.
 
     Attributes
     ----------
@@ -168,10 +166,8 @@ class Exchange:
 
     Parameters
     ----------
-    channel :
-        Connection to the guard.
-    patience :
-        Longest time of one call of the supply's driver, in s.
+    channel : connection to the guard.
+    patience : longest time of one call of the supply's driver, in s.
 
     Attributes
     ----------
@@ -337,15 +333,11 @@ class GuardLink:
 
     Parameters
     ----------
-    description, robot :
-        The rig and its robot.
-    limits :
-        Limits of the commands.
-    spare :
-        Second object for the same supply, never opened before, for venting directly when the guard
-        has ended. None for a simulated supply, which ends with its guard.
-    json_lines :
-        Whether the guard writes JSON lines on stderr instead of sentences.
+    description, robot : the rig and its robot.
+    limits : limits of the commands.
+    spare : second object for the same supply, never opened before, for venting directly when the
+        guard has ended. None for a simulated supply, which ends with its guard.
+    json_lines : whether the guard writes JSON lines on stderr instead of sentences.
 
     Attributes
     ----------

@@ -92,8 +92,7 @@ class HostedDevices:
 
     Parameters
     ----------
-    rig :
-        A simulated rig.
+    rig : a simulated rig.
     """
 
     def __init__(self, rig: Rig) -> None:

@@ -238,8 +238,7 @@ class GuardChannel:
 
     Parameters
     ----------
-    end :
-        One end of a `socket.SOCK_SEQPACKET` pair.
+    end : one end of a `socket.SOCK_SEQPACKET` pair.
 
     Attributes
     ----------
@@ -313,12 +312,10 @@ def json_line(level: str, kind: str, text: str, when: datetime | None = None, **
 
     Parameters
     ----------
-    level, kind, text :
-        Severity (``info``, ``warning``, ``error``), a word for programs, a sentence for people.
-    when :
-        Time with its time zone; None: now.
-    more :
-        Further keys.
+    level, kind, text : severity (``info``, ``warning``, ``error``), a word for programs, a sentence
+        for people.
+    when : time with its time zone; None: now.
+    more : further keys.
     """
     moment = (when or datetime.now(UTC)).astimezone(UTC)
     stamp = moment.isoformat(timespec="milliseconds").replace("+00:00", "Z")

@@ -56,21 +56,15 @@ class PressureMonitor:
 
     Parameters
     ----------
-    limits :
-        Limits of the commands.
-    safety :
-        The tolerance, how long it may be exceeded, and the greatest age of a reading.
-    regulation :
-        Slowest response of healthy regulators.
-    slew :
-        Greatest rate of change of a pressure, one value or (n,), in Pa/s.
+    limits : limits of the commands.
+    safety : the tolerance, how long it may be exceeded, and the greatest age of a reading.
+    regulation : slowest response of healthy regulators.
+    slew : greatest rate of change of a pressure, one value or (n,), in Pa/s.
 
     Attributes
     ----------
-    saturated : ndarray of bool
-        Channels (n,) that stay below what they should have; a new array when it changes.
-    unsupervised : tuple of int
-        Channels, counted from 0, that have never been measured.
+    saturated : channels (n,) that stay below what they should have; a new array when it changes.
+    unsupervised : channels, counted from 0, that have never been measured.
     """
 
     def __init__(

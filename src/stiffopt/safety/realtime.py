@@ -61,8 +61,7 @@ def real_time(priority: int = 80) -> Iterator[RealTimeReport]:
 
     Parameters
     ----------
-    priority :
-        From 1 to 99; kernel threads that serve interrupts have 50.
+    priority : from 1 to 99; kernel threads that serve interrupts have 50.
     """
     granted: list[str] = []
     denied: list[str] = []

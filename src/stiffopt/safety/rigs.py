@@ -64,12 +64,9 @@ def gated_rig(rig: Rig, safety: Safety, period: float) -> Rig:
 
     Parameters
     ----------
-    rig :
-        Rig of devices that have no gate in front of them.
-    safety :
-        Limits of pressure, force and age.
-    period :
-        Time between commands, in s.
+    rig : rig of devices that have no gate in front of them.
+    safety : limits of pressure, force and age.
+    period : time between commands, in s.
     """
     gate = gate_before(rig, safety, period)
     follower = GoalFollower.before(gate, safety, period, rig.clock)
@@ -91,10 +88,8 @@ def guarded_rig(
 
     Parameters
     ----------
-    description, robot :
-        Content of a rig file, and its robot.
-    json_lines :
-        Whether the guard writes JSON lines on stderr.
+    description, robot : content of a rig file, and its robot.
+    json_lines : whether the guard writes JSON lines on stderr.
 
     Raises
     ------

@@ -31,10 +31,8 @@ class Shortage:
 
     Parameters
     ----------
-    tolerance :
-        Shortage (n,) that is too much, in Pa; a response must be at least half of it.
-    time :
-        Minimum duration of these conditions, in s.
+    tolerance : shortage (n,) that is too much, in Pa; a response must be at least half of it.
+    time : minimum duration of these conditions, in s.
     """
 
     def __init__(self, tolerance: Array, time: float) -> None:
@@ -61,14 +59,10 @@ class Shortage:
 
         Parameters
         ----------
-        elapsed :
-            Time since the last reading, in s.
-        short :
-            Channels (n,) that have been below what is due for too long, for no known reason.
-        due, reading :
-            Expected and measured pressures (n,), in Pa.
-        at_rest :
-            Channels (n,) whose commands are at rest; readings of others show nothing here.
+        elapsed : time since the last reading, in s.
+        short : channels (n,) that have been below what is due for too long, for no known reason.
+        due, reading : expected and measured pressures (n,), in Pa.
+        at_rest : channels (n,) whose commands are at rest; readings of others show nothing here.
         """
         self._due[~short] = self._gave[~short] = np.nan
         first = short & at_rest & np.isnan(self._due)
@@ -104,15 +98,13 @@ class SupplyLine:
 
     Parameters
     ----------
-    shortage :
-        Pressure (n,) below what is due beyond which a channel is short, in Pa; readings that differ
-        by less count as the same.
+    shortage : pressure (n,) below what is due beyond which a channel is short, in Pa; readings that
+        differ by less count as the same.
 
     Attributes
     ----------
-    pressure : float
-        Pressure, in Pa, that the line has had at least since it limited several channels; inf if it
-        never did, or has failed.
+    pressure : pressure, in Pa, that the line has had at least since it limited several channels;
+        inf if it never did, or has failed.
     """
 
     def __init__(self, shortage: Array) -> None:
@@ -135,10 +127,8 @@ class SupplyLine:
 
         Parameters
         ----------
-        missing :
-            Expected less measured pressures (n,), in Pa.
-        reading, reached :
-            Measured pressures (n,), and the highest since arming, in Pa.
+        missing : expected less measured pressures (n,), in Pa.
+        reading, reached : measured pressures (n,), and the highest since arming, in Pa.
         """
         short = missing > self._shortage  # False where nothing is measured (NaN)
         if not (self.known or short.any()):

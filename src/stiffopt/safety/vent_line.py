@@ -89,8 +89,7 @@ class VentLine:
 
     Parameters
     ----------
-    endpoints :
-        Names of the supply that the guard owns, see `PressureSupply.endpoints`.
+    endpoints : names of the supply that the guard owns, see `PressureSupply.endpoints`.
     """
 
     def __init__(self, endpoints: Sequence[str]) -> None:
@@ -190,10 +189,8 @@ def ask_to_vent(endpoint: str, patience: float = 5.0) -> list[Reply]:
 
     Parameters
     ----------
-    endpoint :
-        Name of the supply.
-    patience :
-        Time for all answers together, in s.
+    endpoint : name of the supply.
+    patience : time for all answers together, in s.
     """
     asked: list[tuple[SocketPeer, socket.socket | None]] = []
     strangers = 0

@@ -35,10 +35,8 @@ class AnswerView:
     Parameters
     ----------
     server : viser.ViserServer
-    description :
-        The robot.
-    is_preview :
-        Whether to draw the arm translucently, as a preview over another one.
+    description : the robot.
+    is_preview : whether to draw the arm translucently, as a preview over another one.
     """
 
     def __init__(self, server: Any, description: RobotDescription, *, is_preview: bool) -> None:
@@ -72,11 +70,8 @@ class AnswerView:
 
         Parameters
         ----------
-        answer : StudioAnswer
-        target : (3,)
-            Position of the target, in m.
-        with_plain :
-            Whether to draw the plain solution too.
+        target : (3,), position of the target, in m.
+        with_plain : whether to draw the plain solution too.
         """
         leaning = answer.solution.equilibrium
         self._arm.show(answer.robot, answer.pressures, leaning)

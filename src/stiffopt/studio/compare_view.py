@@ -17,9 +17,7 @@ class CompareView:
     Parameters
     ----------
     server : viser.ViserServer
-    bench : Workbench
-    redraw :
-        Called when the plain solution is switched on or off.
+    redraw : called when the plain solution is switched on or off.
     """
 
     def __init__(self, server: Any, bench: Workbench, redraw: Callable[[], None]) -> None:
@@ -71,10 +69,8 @@ class CopyView:
 
     Parameters
     ----------
-    gui :
-        Of viser.
-    design :
-        Returns the present design.
+    gui : of viser.
+    design : returns the present design.
     """
 
     def __init__(self, gui: Any, design: Callable[[], Design]) -> None:

@@ -67,12 +67,9 @@ class ArmTube:
     Parameters
     ----------
     server : viser.ViserServer
-    name :
-        Of the node in the scene tree.
-    description :
-        The robot, which fixes the number of tubes.
-    colour, opacity :
-        Replace the colours of segments, for an arm shown for comparison.
+    name : of the node in the scene tree.
+    description : the robot, which fixes the number of tubes.
+    colour, opacity : replace the colours of segments, for an arm shown for comparison.
     """
 
     def __init__(

@@ -166,8 +166,7 @@ class LeaningView:
     Parameters
     ----------
     server : viser.ViserServer
-    description :
-        The robot.
+    description : the robot.
     """
 
     def __init__(self, server: Any, description: RobotDescription) -> None:

@@ -20,8 +20,7 @@ class MapView:
     Parameters
     ----------
     server : viser.ViserServer
-    found : WorkspaceMap
-        Of the drawn arm.
+    found : of the drawn arm.
     """
 
     def __init__(self, server: Any, found: WorkspaceMap) -> None:

@@ -25,7 +25,6 @@ class OpenStudio:
 
     Attributes
     ----------
-    page : StudioPage
     view : draws on the page.
     """
 
@@ -56,16 +55,11 @@ def open_studio(
 
     Parameters
     ----------
-    file :
-        A built-in robot, or a file of a kind that the studio shows.
-    robot :
-        For a file that names none; by default `stiffopt.studio.sources.ROBOT`.
-    map_file :
-        A workspace map to show with a robot, a task or a scene.
-    token :
-        For a rig: its daemon's token, or the file with it; without it the rig is only shown.
-    host, port :
-        Address to listen on, see `StudioPage`.
+    file : a built-in robot, or a file of a kind that the studio shows.
+    robot : for a file that names none; by default `stiffopt.studio.sources.ROBOT`.
+    map_file : a workspace map to show with a robot, a task or a scene.
+    token : for a rig: its daemon's token, or the file with it; without it the rig is only shown.
+    host, port : address to listen on, see `StudioPage`.
 
     Raises
     ------

@@ -53,8 +53,7 @@ class KeyCheck:
 
     Parameters
     ----------
-    hosts :
-        Accepted host names, besides addresses and localhost.
+    hosts : accepted host names, besides addresses and localhost.
     """
 
     def __init__(self, hosts: tuple[str, ...] = ()) -> None:
@@ -114,10 +113,8 @@ class StudioPage:
 
     Parameters
     ----------
-    host, port :
-        Address to listen on; port 0 takes any free one.
-    label :
-        Title of the panel.
+    host, port : address to listen on; port 0 takes any free one.
+    label : title of the panel.
 
     Attributes
     ----------

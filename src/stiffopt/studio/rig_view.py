@@ -26,7 +26,6 @@ class RigView:
     Parameters
     ----------
     server : viser.ViserServer
-    watch : RigWatch
     """
 
     def __init__(self, server: Any, watch: RigWatch) -> None:

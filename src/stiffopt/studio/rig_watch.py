@@ -46,12 +46,9 @@ class RigWatch:
 
     Parameters
     ----------
-    file :
-        The rig file.
-    token :
-        The token or its file; None to read only.
-    is_watched :
-        Returns whether a browser is connected; if not, control is not renewed.
+    file : the rig file.
+    token : the token or its file; None to read only.
+    is_watched : returns whether a browser is connected; if not, control is not renewed.
 
     Attributes
     ----------

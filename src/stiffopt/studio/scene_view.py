@@ -45,12 +45,9 @@ class SceneView:
     Parameters
     ----------
     server : viser.ViserServer
-    design :
-        Returns the present design.
-    change :
-        Called with the kind of a change and a function that changes the design.
-    hold :
-        Called with whether to hold the pressures, so that the arm leans on objects.
+    design : returns the present design.
+    change : called with the kind of a change and a function that changes the design.
+    hold : called with whether to hold the pressures, so that the arm leans on objects.
     """
 
     def __init__(

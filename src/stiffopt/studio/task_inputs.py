@@ -40,14 +40,10 @@ class TargetInputs:
 
     Parameters
     ----------
-    gui :
-        Of viser.
-    on :
-        Forwards changes.
-    tip :
-        Pose (4, 4) of the tip now.
-    turned :
-        Quaternion (w first) of the target's handle.
+    gui : of viser.
+    on : forwards changes.
+    tip : pose (4, 4) of the tip now.
+    turned : quaternion (w first) of the target's handle.
     """
 
     def __init__(
@@ -95,12 +91,9 @@ class StiffnessInputs:
 
     Parameters
     ----------
-    gui :
-        Of viser.
-    on :
-        Forwards changes.
-    design :
-        The initial design, whose goal can be chosen again.
+    gui : of viser.
+    on : forwards changes.
+    design : the initial design, whose goal can be chosen again.
     """
 
     def __init__(self, gui: Any, on: On, design: Design) -> None:
@@ -147,12 +140,9 @@ class LoadInputs:
 
     Parameters
     ----------
-    gui :
-        Of viser.
-    on :
-        Forwards changes.
-    design :
-        The initial design, whose gravity can be chosen again.
+    gui : of viser.
+    on : forwards changes.
+    design : the initial design, whose gravity can be chosen again.
     """
 
     def __init__(self, gui: Any, on: On, design: Design) -> None:

@@ -34,11 +34,8 @@ class TaskView:
     Parameters
     ----------
     server : viser.ViserServer
-    bench : Workbench
-    found : WorkspaceMap, optional
-        A map of the same arm, to show as a cloud.
-    is_preview : bool
-        Whether to draw the arm translucently, as a preview over another one.
+    found : a map of the same arm, to show as a cloud.
+    is_preview : whether to draw the arm translucently, as a preview over another one.
     """
 
     def __init__(

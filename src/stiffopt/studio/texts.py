@@ -17,7 +17,6 @@ from stiffopt.control.state import Event, Snapshot
 from stiffopt.display import FIGURES, display_units
 from stiffopt.files import file_text
 from stiffopt.model.description import RobotDescription
-from stiffopt.model.uncertainty import NORMAL_QUANTILE
 from stiffopt.optimise.measures.directional import StiffnessMeasure
 from stiffopt.optimise.solution import PressureSolution
 from stiffopt.plots import style
@@ -164,14 +163,10 @@ def pressures_html(
 
     Parameters
     ----------
-    description :
-        The robot, with n channels.
-    pressures, low, high : (n,)
-        In Pa.
-    at_limit : (n,)
-        Which bars to highlight.
-    marks : (n,), optional
-        In Pa, named `mark` in the legend.
+    description : the robot, with n channels.
+    pressures, low, high : (n,), in Pa.
+    at_limit : (n,), which bars to highlight.
+    marks : (n,), in Pa, named `mark` in the legend.
     """
     p, low, high = (np.asarray(each, dtype=float) for each in (pressures, low, high))
     top, bottom = max(high.max(), p.max()), min(low.min(), 0.0)
@@ -389,12 +384,8 @@ def _rig_rows(state: Snapshot) -> Iterable[tuple[str, str]]:
         yield "stiffness", f"{now} of {unit.text(state.best_stiffness, FIGURES)}"
     if state.brace:
         yield "brace", state.brace
-    if state.brace_contacts:
-        yield "contacts", state.brace_contacts
-    if np.isfinite(state.brace_force):
-        force, reach = display_units().force, NORMAL_QUANTILE * state.brace_force_deviation
-        interval = f"{force.text(state.brace_force, '.3g')} ± {force.text(reach, '.2g')}"
-        yield "contact force", interval
+    for each in state.leans_on:
+        yield "contact", escape(str(each))
     for alarm in state.alarms:
         yield "alarm", f"<span style='color:#b35c00'>{escape(alarm.text)}</span>"
 

@@ -25,7 +25,6 @@ class TimelineView:
     Parameters
     ----------
     server : viser.ViserServer
-    timeline : Timeline
     """
 
     def __init__(self, server: Any, timeline: Timeline) -> None:

@@ -239,9 +239,8 @@ class NewestWins:
 
     Parameters
     ----------
-    quickly, fully :
-        Called after a request, and once no request has come for `REST` seconds. Their argument is
-        a function that returns whether a newer request has come.
+    quickly, fully : called after a request, and once no request has come for `REST` seconds. Their
+        argument is a function that returns whether a newer request has come.
 
     Attributes
     ----------

@@ -498,17 +498,28 @@ class _LostAlongLineError(EquilibriumError):
     """The way from rest is lost while the arm lies along a surface."""
 
 
+def inside_at_rest(arm: Manipulator, scene: Scene) -> str:
+    """Return how deep a straight arm, without pressure and weight, is inside an object, or ""."""
+    return _inside(contact_problem(arm, scene))
+
+
+def _inside(problem: ContactProblem) -> str:
+    depths = problem.straight.state.condition.retreat
+    if not depths.any():
+        return ""
+    worst = int(depths.argmax())
+    depth = display_units().length.text(float(depths[worst]), ".2g")
+    return f"the arm at rest is {depth} inside '{problem.surfaces[worst].name}'"
+
+
 def _at_rest(problem: ContactProblem) -> ContactEquilibrium:
-    """Return the equilibrium without pressures; say which objects the straight arm is inside."""
+    """Return the equilibrium without pressures; say which object the straight arm is inside."""
     arm, share = problem.hanging
-    inside = problem.straight.state.condition.retreat
-    if share < 1.0 and inside.any():
-        worst = int(inside.argmax())
-        depth = display_units().length.text(float(inside[worst]), ".2g")
+    inside = _inside(problem)
+    if share < 1.0 and inside:
         raise EquilibriumError(
-            f"the arm at rest is {depth} inside '{problem.surfaces[worst].name}', which cannot "
-            "push it out continuously; move the object, or let it come to the arm under pressure "
-            "(approach: objects)"
+            f"{inside}, which cannot push it out continuously; move the object, or let it come to "
+            "the arm under pressure (approach: objects)"
         )
     return _arrived(arm, share, "its own weight and payload")
 

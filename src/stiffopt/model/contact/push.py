@@ -97,7 +97,7 @@ class GrowingPush:
             step = min(step, left if is_known else left / 2)
             step = min(step, _LARGEST_SWING / max(tangent.turn, 1e-9))
             push = step * np.concatenate([self._direction, np.zeros(3)])
-            found = self._problem.pushed(arm, tangent.system, tangent.solution, push)
+            found = self._problem.pushed(tangent.system, tangent.solution, push)
             missed = None if found is None else self._problem.missed(found)
             if found is None or missed is None or _has_tilted(arm, found):
                 step /= 2

@@ -122,9 +122,7 @@ class ContactProblem:
             nodes = interpolated(nodes, _at_moved(state, touches), mesh)
         return Contacts(state.condition, mesh, nodes, touches), slide, is_same
 
-    def pushed(
-        self, arm: LeaningArm, system: ContactSystem, solution: Vector, push: Vector
-    ) -> LeaningArm | None:
+    def pushed(self, system: ContactSystem, solution: Vector, push: Vector) -> LeaningArm | None:
         """Find the equilibrium after a small push (6,) at the tip, with contacts that stick.
 
         Parameters

@@ -11,7 +11,7 @@ from pydantic import Field, ValidationInfo, field_serializer, field_validator
 from stiffopt import lie
 from stiffopt.directions import Direction, Frame
 from stiffopt.display import display_units
-from stiffopt.model.compliance import held_stiffness
+from stiffopt.model.compliance import Boundary, Kind, held_stiffness
 from stiffopt.model.shape import FreeShape, stiffness_along
 from stiffopt.optimise.measure import Measure, Role, Vector
 from stiffopt.schema import JsonSchemaOfFile
@@ -23,9 +23,6 @@ from stiffopt.units import (
     quantity_schema,
     read_from_file,
 )
-
-Kind = Literal["translation", "rotation"]
-Boundary = Literal["free", "guided", "clamped"]
 
 _STIFFNESS_UNITS = {"translation": "N/m", "rotation": "N*m/rad"}
 

@@ -53,13 +53,13 @@ Address = Annotated[str, AfterValidator(_address)]
 """Host and port of a server."""
 
 
-def _channel(pattern: str) -> Any:
-    return Field(pattern=rf"^[A-Za-z0-9_ -]+/{pattern}$")
+def _channel(pattern: str, example: str) -> Any:
+    return Field(pattern=rf"^[A-Za-z0-9_ -]+/{pattern}$", examples=[example])
 
 
-OutputName = Annotated[str, _channel(r"ao\d+")]
-InputName = Annotated[str, _channel(r"(ai\d+|_\w+)")]
-LineName = Annotated[str, _channel(r"port\d+/line\d+")]
+OutputName = Annotated[str, _channel(r"ao\d+", "Dev1/ao0")]
+InputName = Annotated[str, _channel(r"(ai\d+|_\w+)", "Dev1/ai0")]
+LineName = Annotated[str, _channel(r"port\d+/line\d+", "Dev1/port0/line0")]
 
 
 class WatchdogExpiredError(DeviceError):
@@ -79,12 +79,9 @@ class Daqmx:
 
     Parameters
     ----------
-    address :
-        Address of NI's gRPC device server; None: the driver on this machine.
-    timeout :
-        Timeout of every call, in s.
-    extra :
-        stiffopt's extra with nidaqmx, for the message if it is missing.
+    address : address of NI's gRPC device server; None: the driver on this machine.
+    timeout : timeout of every call, in s.
+    extra : stiffopt's extra with nidaqmx, for the message if it is missing.
 
     Raises
     ------
@@ -270,9 +267,8 @@ class AnalogueInput(_Task):
 
     Parameters
     ----------
-    shared :
-        Whether another task reads inputs of the same device. If so, reserve it only while reading,
-        which is slower.
+    shared : whether another task reads inputs of the same device. If so, reserve it only while
+        reading, which is slower.
     """
 
     def __init__(

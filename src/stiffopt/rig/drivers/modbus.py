@@ -41,6 +41,7 @@ from stiffopt.units import Duration
 Array = NDArray[np.float64]
 Registers = dict[int, tuple[int, ...]]
 
+_FRAMING = 25  # bytes that one request of function 23, its answer and two pauses add to the values
 _ILLEGAL_FUNCTION = 1
 _EXCEPTIONS = {
     1: "it does not know this function",
@@ -115,6 +116,11 @@ class ModbusSerial(Schema):
     def endpoints(self) -> tuple[str, ...]:
         """Return the endpoints by which a supply on this line is claimed."""
         return serial_endpoints(self.port)
+
+    @property
+    def bits(self) -> int:
+        """Bits of a byte on the line, with those of start, parity and stop."""
+        return 9 + (self.parity != "none") + self.stop_bits
 
     def options(self) -> dict[str, Any]:
         """Return the settings by pymodbus's names."""
@@ -224,6 +230,16 @@ class ModbusSettings(SupplySettings):
         if connection is None:
             raise InputError("expected one of the keys 'tcp' and 'serial'")
         return connection
+
+    @property
+    def exchange_time(self) -> float:
+        """Least time of a command on a serial line, with its answers and readings, in s."""
+        if self.serial is None:
+            return 0.0
+        copies = 2 if self.verify else 1  # of each set-point: written, and read back
+        points = (*self.setpoints * copies, *self.readings.values())
+        payload = 2 * sum(len(point.addresses) for point in points)
+        return (payload + _FRAMING) * self.serial.bits / self.serial.baudrate
 
     def measures(self, channel: int) -> bool:
         """Whether the channel has a register of readings."""
@@ -488,12 +504,9 @@ class ModbusLine:
 
     Parameters
     ----------
-    address :
-        The connection.
-    unit :
-        Number of the device on the line.
-    timeout :
-        Time for each answer, in s.
+    address : the connection.
+    unit : number of the device on the line.
+    timeout : time for each answer, in s.
 
     Attributes
     ----------
@@ -544,10 +557,8 @@ class ModbusLine:
 
         Parameters
         ----------
-        what :
-            The request in words, for messages.
-        function, args, options :
-            Method of pymodbus's client and its arguments.
+        what : the request in words, for messages.
+        function, args, options : method of pymodbus's client and its arguments.
 
         Raises
         ------

@@ -148,12 +148,9 @@ class BoardLine:
 
     Parameters
     ----------
-    port, baudrate :
-        Of the serial line.
-    board :
-        Number of the board that must answer.
-    timeout :
-        Time for each answer, in s.
+    port, baudrate : of the serial line.
+    board : number of the board that must answer.
+    timeout : time for each answer, in s.
     """
 
     def __init__(self, port: str, baudrate: int, board: int, timeout: float) -> None:

@@ -154,10 +154,8 @@ class ZaberProbeSettings(ProbeSettings):
 
         Parameters
         ----------
-        clock :
-            Clock of the rig.
-        prompt :
-            Asks a person to do something and returns when it is done; None: on the terminal.
+        clock : clock of the rig.
+        prompt : asks a person to do something and returns when it is done; None: on the terminal.
         """
         return ZaberProbe(self, clock, prompt)
 
@@ -343,8 +341,7 @@ class ZaberStage:
 
     Parameters
     ----------
-    guard :
-        Called continually while the stage moves; if it raises, the stage is stopped.
+    guard : called continually while the stage moves; if it raises, the stage is stopped.
     """
 
     def __init__(self, settings: ZaberStageSettings, timeout: float, clock: Clock) -> None:
