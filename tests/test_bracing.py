@@ -444,20 +444,26 @@ def test_the_arm_does_not_let_go_of_contacts_that_are_certain_again(approach):
     assert course.contacts == "held"
 
 
-def test_the_doubt_of_a_second_contact_is_told_and_the_alarm_follows(approach):
-    """A push along x would lift off the post, and a tenth of it along y a rib."""
-    hold, lifts = approach.hold, lift_off(approach)
-    rate = float(hold.per_push[0, 0])
-    both = replace(
+def with_a_rib(approach: BraceApproach, per_push: np.ndarray) -> BraceApproach:
+    """The approach to a post and a rib, with equal forces; `per_push` (2, 3) changes them."""
+    hold, contact = approach.hold, approach.contacts[0]
+    return replace(
         approach,
-        contacts=(approach.contacts[0], approach.contacts[0]._replace(object="rib")),
+        contacts=(contact, contact._replace(object="rib")),
         hold=hold._replace(
             forces=np.repeat(hold.forces, 2),
             deviations=np.zeros(2),
             per_pressure=np.repeat(hold.per_pressure, 2, axis=0),
-            per_push=np.array([[rate, 0.0, 0.0], [0.0, 10 * rate, 0.0]]),
+            per_push=per_push,
         ),
     )
+
+
+def test_the_doubt_of_a_second_contact_is_told_and_the_alarm_follows(approach):
+    """A push along x would lift off the post, and a tenth of it along y a rib."""
+    hold, lifts = approach.hold, lift_off(approach)
+    rate = float(hold.per_push[0, 0])
+    both = with_a_rib(approach, np.array([[rate, 0.0, 0.0], [0.0, 10 * rate, 0.0]]))
     course, other = held(both), 0.11 * lifts[[1, 0, 2]]
     samples(course, both, np.zeros(3), 40)
     assert [each.state for each in course.held] == ["held", "held"]
@@ -673,17 +679,7 @@ def test_an_arm_that_is_let_down_has_no_contacts_and_no_alarm(approach):
 
 
 def test_all_contacts_that_lift_off_together_are_lost(approach):
-    hold = approach.hold
-    both = replace(
-        approach,
-        contacts=(approach.contacts[0], approach.contacts[0]._replace(object="rib")),
-        hold=hold._replace(
-            forces=np.repeat(hold.forces, 2),
-            deviations=np.zeros(2),
-            per_pressure=np.repeat(hold.per_pressure, 2, axis=0),
-            per_push=np.repeat(hold.per_push, 2, axis=0),
-        ),
-    )
+    both = with_a_rib(approach, np.repeat(approach.hold.per_push, 2, axis=0))
     course = held(both)
     samples(course, both, np.zeros(3), 40)
     samples(course, both, pushed(both, 3.5 * lift_off(approach)), 80)

@@ -112,7 +112,8 @@ _EXPECTED = {
     "int": "a whole number",
     "string": "text",
 }
-"""What is expected, by the first word of a kind of mistake such as ``int_parsing``."""
+"""Words for an expected value. The key is the first word of pydantic's error type: ``int`` of
+``int_parsing``."""
 
 
 def _sentence(model: type[BaseModel], error: ValidationError) -> str:

@@ -21,7 +21,7 @@ from stiffopt.control.interface import Controller
 from stiffopt.control.tracker_watch import Sight, TrackerWatch
 from stiffopt.errors import InputError
 from stiffopt.rig.interface import PressureReading, Rig, SupplySettings
-from stiffopt.rig.settings import CommissioningSettings
+from stiffopt.rig.settings import MAX_GUARD_TIMEOUT, CommissioningSettings
 from stiffopt.safety.gate import Outlet
 from stiffopt.safety.monitors import PressureMonitor
 
@@ -30,7 +30,6 @@ NO_SLEW = (
     "pressure.slew in the robot file"
 )
 """Why a rig without a limit of slew is not armed."""
-_LONGEST_PATIENCE = 2.0  # s, greatest safety.guard_timeout
 _BUSY = 1.0  # load of a processor above which programs wait
 
 # limits of how a vented arm may differ from when it was commissioned
@@ -233,7 +232,7 @@ def late_ticks(lateness: float, guard_timeout: float, load: float = 0.0) -> str:
         "when it started"
     )
     patience = max(0.1, math.ceil(20 * 2.5 * lateness) / 20)
-    if guard_timeout < patience <= _LONGEST_PATIENCE:
+    if guard_timeout < patience <= MAX_GUARD_TIMEOUT:
         advice += (
             f"; if neither helps, set 'safety.guard_timeout: {1e3 * patience:.0f} ms' in the rig "
             "file"

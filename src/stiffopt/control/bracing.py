@@ -198,9 +198,10 @@ class Bracing:
 
     def follow(self, is_steered: bool, pressures: Array) -> None:
         """Take in, at a tick, whether the effective pressures (n,), in Pa, follow this course."""
-        self.is_steered = is_steered
-        off = 0.0 if self.approach is None else float(np.abs(pressures - self.pressures).max())
-        self.is_let_down = not is_steered and off > self._tuning.let_down
+        self.is_steered, self.is_let_down = is_steered, False
+        if not is_steered and self.approach is not None:
+            off = float(np.abs(pressures - self.pressures).max())
+            self.is_let_down = off > self._tuning.let_down
         if self.is_let_down:
             self._concerns.clear()
             self._estimated[:] = self.force = self.deviation = self.margin = math.nan

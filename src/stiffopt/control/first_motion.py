@@ -42,7 +42,7 @@ class FirstMotion:
 
     @property
     def is_over(self) -> bool:
-        """Whether every channel has moved the tip as the model says."""
+        """True once every channel has moved the tip as the model predicts."""
         return bool(self._responds.all())
 
     def take(self, modelled: Array, seen: Array, parts: Array) -> None:

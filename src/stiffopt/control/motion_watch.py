@@ -395,9 +395,9 @@ class MotionWatch:
         return self._slipped(distance)
 
     def _lasts(self, missing: deque[float]) -> bool:
-        """Whether the turn of a push is missing in enough successive samples, and stays so.
+        """Return True if enough successive samples lacked the rotation that a push causes.
 
-        `missing` are the shares of it that are missing in these.
+        `missing` has the lacking share for each sample, which may hardly fall among them.
         """
         tuning = self._tuning
         return len(missing) == tuning.slips and missing[0] - missing[-1] <= tuning.catches_up

@@ -291,7 +291,9 @@ class ControllerStatus:
     ] = ""
     brace_contacts: Annotated[
         str,
-        _tip("state of its contacts: `held`, `uncertain` or `lost`; empty before the arm leans"),
+        _tip(
+            "state of its contacts: `held`, `uncertain` or `lost`; empty if the arm does not lean"
+        ),
     ] = ""
     brace_force: Annotated[
         float, _tip("normal force of its least certain contact, as estimated", "N", decimals=5)

@@ -457,12 +457,12 @@ class RobotDescription(Schema):
 
     @property
     def creeps(self) -> bool:
-        """Whether any segment has creep in its history."""
+        """True if the history of any segment includes creep."""
         return any(segment.history and segment.history.creep for segment in self.segments)
 
     @property
     def remembers_strain(self) -> bool:
-        """Whether any segment remembers strain instead of pressure."""
+        """True if hysteresis and creep of any segment follow strain, not pressure."""
         histories = (segment.history or NO_HISTORY for segment in self.segments)
         return any(each.remembers == "strain" for each in histories)
 

@@ -64,8 +64,11 @@ from stiffopt.units import Duration, Number, Pressure, Ratio
 Array = NDArray[np.float64]
 
 Part = Literal["pressure", "elongation", "bending", "opposite"]
-"""What an operator acts on: the pressure of each channel, the mean of all channels, each channel's
-deviation from it, or what stretches the fibres opposite it: twice the mean minus its pressure."""
+"""The pressures on which an operator acts.
+
+``pressure``: that of each channel.  ``elongation``: the mean of all channels.  ``bending``: each
+channel's deviation from the mean.  ``opposite``: twice the mean minus each channel's pressure,
+which stretches the fibres opposite it."""
 
 _Share = Annotated[Ratio, Field(ge=0, lt=1)]
 

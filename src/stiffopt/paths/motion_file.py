@@ -20,7 +20,7 @@ from stiffopt.units import parse_quantity
 RESULT_FORMAT = "stiffopt-path-result/1"
 """Format of a result file of paths and motions."""
 
-NO_MOTION = "is not a motion; expected what 'stiffopt path --out' or 'plan --out' wrote"
+_NO_MOTION = "is not a motion; expected what 'stiffopt path --out' or 'plan --out' wrote"
 
 LEANING = "leaning"
 """Column or key that says at which points the arm is in contact."""
@@ -108,7 +108,7 @@ def _of_csv(name: str, description: RobotDescription) -> MotionTable:
     if f"p{n + 1}_pa" in table.columns:
         raise FileError(name, f"has more channels than '{description.name}'")
     if POSITION_ERROR not in table.columns:
-        raise FileError(name, NO_MOTION)
+        raise FileError(name, _NO_MOTION)
     if LEANING in table.columns and table[LEANING].any():
         raise FileError(name, LEANS)
     values = np.column_stack([table[each] for each in wanted])
@@ -119,7 +119,7 @@ def _of_result(name: str, description: RobotDescription) -> MotionTable:
     data = read_document(name).data
     results = data.get("results")
     if not isinstance(results, list) or data.get("format") != RESULT_FORMAT:
-        raise FileError(name, NO_MOTION)
+        raise FileError(name, _NO_MOTION)
     if len(results) != 1:
         raise FileError(name, f"has {len(results)} results; expected one")
     result: dict[str, Any] = results[0]

@@ -11,6 +11,8 @@ from stiffopt.model.description import PerChannelPressure, PerChannelRate
 from stiffopt.schema import BadKeyError, Schema
 from stiffopt.units import Duration, Force, Frequency, Length, Ratio, Speed
 
+MAX_GUARD_TIMEOUT = 2.0  # s
+
 
 def _none(value: Any) -> Any:
     """Read the word ``none`` as None: a file has no other way to write it."""
@@ -68,7 +70,7 @@ class Safety(Schema):
     max_slew: PerChannelRate | None = None
     max_force: Annotated[Force, Field(gt=0)] | None = None
     command_timeout: Annotated[Duration, Field(gt=0, le=10)] = 0.5
-    guard_timeout: Annotated[Duration, Field(ge=0.01, le=2)] = 0.05
+    guard_timeout: Annotated[Duration, Field(ge=0.01, le=MAX_GUARD_TIMEOUT)] = 0.05
     tracker_timeout: Annotated[Duration, Field(gt=0, le=10)] = 0.5
     tracker_frames: Annotated[int, Field(ge=1, le=100)] = 3
     max_tip_speed: Annotated[Speed, Field(gt=0)] = 0.6
