@@ -13,6 +13,7 @@ from stiffopt.errors import FileError, InputError
 from stiffopt.identify.error_model import (
     covariance_with,
     error_model,
+    held_for,
     in_turn,
     is_moving,
     kept_unknowns,
@@ -419,6 +420,14 @@ def test_a_motion_counts_as_one_of_all_channels(together: bool) -> None:
     assert np.abs(late).max() > 1e3
     share = 1.0 if together else 5 / 3  # of three channels, of one
     assert known.moving == pytest.approx(np.sqrt(np.mean(late**2, axis=0) * share), rel=1e-3)
+
+
+def test_for_how_long_pressures_were_held() -> None:
+    time = np.array([0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.5, 6.0])
+    moving = np.array([False, False, True, True, False, False, False, True])
+    unknown = np.nan
+    expected = [unknown, unknown, unknown, unknown, 1.5, 2.0, 3.0, unknown]  # moving for 1 s more
+    np.testing.assert_array_equal(held_for(time, moving), expected)
 
 
 def test_a_robot_file_keeps_its_error_model(tmp_path: object) -> None:
