@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -32,7 +33,13 @@ from stiffopt.model.calibration import Calibration, ErrorModel, FittedParameter,
 from stiffopt.model.history import History, Play
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.robot_files import load_description, save_robot
-from stiffopt.model.uncertainty import ReadingSlopes, Uncertainty, levels, squared_radius
+from stiffopt.model.uncertainty import (
+    PositionErrors,
+    ReadingSlopes,
+    Uncertainty,
+    levels,
+    squared_radius,
+)
 
 Array = NDArray[np.float64]
 
@@ -342,6 +349,27 @@ def test_a_first_reading_tells_the_history_only_if_the_model_is_certain(
     found = validate(robot, [("log", log)])[0]
     rise = float(found.pressures[0, 0] - found.effective[0, 0])
     assert (rise > 9e3) if believed else (abs(rise) < 5e3)
+
+
+def test_validation_knows_for_how_long_poses_were_held(monkeypatch: pytest.MonkeyPatch) -> None:
+    """From all rows, though the regions of only few of them are compared."""
+    robot = ONE.model_copy(update={"calibration": Calibration(errors=ROUGH)})
+    time = np.arange(0.0, 20.0, 0.2)
+    pressures = np.tile([8e4, 0.0, 0.0], (len(time), 1))
+    pressures[time > 5.9, 1] = 1e4
+    log = Log(time, pressures, Manipulator(ONE).tip_pose(pressures)[:, :3, 3])
+    seen, errors = {}, Uncertainty.errors
+
+    def noted(self: Uncertainty, *arguments: Any, **given: Any) -> PositionErrors:
+        seen.update(given)
+        return errors(self, *arguments, **given)
+
+    monkeypatch.setattr(Uncertainty, "errors", noted)
+    monkeypatch.setattr("stiffopt.identify.validation.ERRORS", replace(ERRORS, compared=12))
+    validate(robot, [("log", log)])
+    rows = np.linspace(0, len(time) - 1, 12).astype(int)
+    expected = np.where(time[rows] > 7, time[rows] - 6.0, np.nan)
+    np.testing.assert_allclose(seen["held"], expected, atol=0.21)
 
 
 # -- the fit ----------------------------------------------------------------------------------
