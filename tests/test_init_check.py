@@ -185,6 +185,19 @@ def test_rigs_with_devices(supply: str, tracker: str) -> None:
 
 
 @pytest.mark.parametrize(
+    ("robot", "safety"),
+    [
+        ("stiff-flop-2", {"tracker_timeout": "0.5 s"}),
+        ("ucl-stiff-flop", {"max_slew": "5 bar/s", "tracker_timeout": "0.5 s"}),
+    ],
+)
+def test_a_rig_limits_the_slew_where_its_robot_does_not(robot: str, safety: dict[str, str]) -> None:
+    made = run("init", "rig", "--robot", robot)
+    assert made.exit_code == 0, made.output
+    assert read_document("my-rig.yaml").data["safety"] == safety
+
+
+@pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (("robot", "--length", "90"), "--length: '90' has no unit"),

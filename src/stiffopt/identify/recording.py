@@ -468,8 +468,8 @@ def _check_excitation(
     if spread < PLAUSIBLE.still * description.length or not moves:
         raise FileError(
             name,
-            f"the tip does not move: its positions vary by {spread * 1e3:.2g} mm, of which "
-            f"{min(noise, spread) * 1e3:.2g} mm are noise; expected motion well above that",
+            f"the tip does not move: its positions vary by {spread * 1e3:.3f} mm, of which "
+            f"{min(noise, spread) * 1e3:.3f} mm are noise; expected motion well above that",
         )
 
 
