@@ -17,6 +17,7 @@ from rich.console import Console
 
 import stiffopt
 from conftest import use_compiler
+from leaning_arm import few_starts as with_few_starts
 from stiffopt.cli.main import main
 from stiffopt.cli.solve_report import block
 from stiffopt.cli.solved_task import SolvedTask, with_uncertainty
@@ -28,7 +29,7 @@ from stiffopt.optimise.leaning import MARGIN_ON, BracedProblem
 from stiffopt.optimise.local import LocalResult
 from stiffopt.optimise.problem import PressureProblem
 from stiffopt.optimise.search import Search
-from stiffopt.optimise.settings import BRACE, Effort
+from stiffopt.optimise.settings import BRACE
 from stiffopt.paths.leaning import way_into_contact
 
 PROBLEMS = Path(__file__).parents[1] / "problems"
@@ -52,10 +53,8 @@ RIB = """    - {name: rib, sphere: {centre: [-32 mm, 30 mm, 140 mm], radius: 5 m
 @pytest.fixture(scope="module", autouse=True)
 def few_starts(code_cache: Path) -> Iterator[None]:
     """A search of few starts: all of it is what `benchmarks/brace.py` looks at."""
-    with pytest.MonkeyPatch.context() as patch:
+    with with_few_starts(), pytest.MonkeyPatch.context() as patch:
         use_compiler(patch, code_cache)
-        few = replace(BRACE, effort=Effort(3, 1, 2), screened=256)
-        patch.setattr(braced, "BRACE", few)
         yield
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -11,34 +10,24 @@ import numpy as np
 import pytest
 
 import stiffopt
-from leaning_arm import LIMITS, PERIOD, ROBOT, TASK, brace_approach, braced_solution, few_starts
+from leaning_arm import (
+    LIMITS,
+    PERIOD,
+    ROBOT,
+    TASK,
+    approach_fixture,  # noqa: F401
+    few_starts_fixture,  # noqa: F401
+    solution_fixture,  # noqa: F401
+)
 from stiffopt import lie
 from stiffopt.control.bracing import BracePhase, Bracing
 from stiffopt.control.friction import Friction
 from stiffopt.control.linearised_tip import LeaningTip
 from stiffopt.control.sliding import SlideEstimator
 from stiffopt.control.tuning import BracingTuning, SlidingTuning
-from stiffopt.optimise.solution import PressureSolution
 from stiffopt.optimise.tip import TipAt
 from stiffopt.paths.configurations import Unsolved
 from stiffopt.paths.leaning import FORCE_RATE, SPEED, BraceApproach, approach_to
-
-
-@pytest.fixture(scope="module", autouse=True)
-def with_few_starts() -> Iterator[None]:
-    with few_starts():
-        yield
-
-
-@pytest.fixture
-def solution() -> PressureSolution:
-    return braced_solution()
-
-
-@pytest.fixture
-def approach() -> BraceApproach:
-    return brace_approach()
-
 
 # -- the way ----------------------------------------------------------------------------------
 

@@ -104,11 +104,20 @@ TCP, SERIAL = "tcp: {host: localhost}", "serial: {port: COM3}"
             "command takes on the serial line: the device would vent every time",
         ),
         (f"{SERIAL}\n  watchdog: {{address: 9, timeout: 40 ms}}", ""),
+        # three requests: 24 and 6, 20 and 6, 20 and 2; and 23 for the trigger
+        (
+            f"{SERIAL[:-1]}, baudrate: 9600}}\n  watchdog: {{address: 9, timeout: 110 ms, "
+            "trigger: 10}",
+            "rig.yaml:7: supply.watchdog.timeout: 110 ms is not longer than the 116 ms that a "
+            "command takes on the serial line: the device would vent every time",
+        ),
     ],
 )
 def test_a_device_that_would_vent_between_two_commands_is_a_mistake(supply: str, said: str) -> None:
     text = UNARMED.replace("10 Hz", "40 Hz").replace("arm.yaml", "stiff-flop-1")
     text = re.sub("safety: .*", "safety: {max_slew: 1 bar/s}", text).replace(TCP, supply)
+    if "trigger" in supply:
+        text = text.replace("{setpoint: 3}", "{setpoint: 3, reading: 0}")
     Path("rig.yaml").write_text(text, encoding="utf-8")
     assert run("check", "--quiet", "rig.yaml").stdout.rstrip() == said
 
@@ -117,6 +126,37 @@ def test_a_watchdog_of_an_nidaq_device_is_compared_too() -> None:
     text = (ROOT / "rig/nidaq-aurora.yaml").read_text(encoding="utf-8")
     Path("rig.yaml").write_text(re.sub("watchdog: .* ms", "watchdog: 10 ms", text))
     assert "supply.watchdog: 10 ms is not longer" in run("check", "rig.yaml").stdout
+
+
+@pytest.mark.parametrize(("timeout", "says"), [("500 ms", False), ("600 ms", True), ("", False)])
+@pytest.mark.parametrize("rig", ["modbus-aurora", "nidaq-aurora"])
+def test_a_driver_that_waits_longer_than_a_command_is_valid_is_a_mistake(
+    rig: str, timeout: str, says: bool
+) -> None:
+    """The default of a driver may be longer, as that of NI's is."""
+    text = (ROOT / f"rig/{rig}.yaml").read_text(encoding="utf-8")
+    line = f"\n  timeout: {timeout}" if timeout else ""
+    Path("rig.yaml").write_text(re.sub("\n  timeout: .*", line, text), encoding="utf-8")
+    said = "supply.timeout: 600 ms is longer than the 500 ms for which a command is valid"
+    assert (said in run("check", "rig.yaml").stdout) == says
+    assert run("check", "rig.yaml").exit_code == 2 * says
+
+
+def test_a_task_beside_a_rig_is_compared_with_its_scene() -> None:
+    """By place and shape: what the object is called in the task does not matter."""
+    rig, task = ROOT / "rig/brace.yaml", ROOT / "problems/braced/post.yaml"
+    assert run("check", "--quiet", str(rig), str(task)).exit_code == 0
+    Path("task.yaml").write_text(task.read_text(encoding="utf-8"), encoding="utf-8")
+    scene = task.with_suffix(".scene.yaml").read_text(encoding="utf-8")
+    Path("post.scene.yaml").write_text(scene.replace("radius: 5", "radius: 6"), encoding="utf-8")
+    assert run("check", "--quiet", "task.yaml").exit_code == 0
+    found = run("check", "--quiet", "task.yaml", str(rig))
+    assert found.exit_code == 2
+    assert "task.yaml" in found.stdout
+    assert "'post' has another place or shape in the rig's scene" in found.stdout
+    other = RIG + "robot: stiff-flop-1\n"
+    Path("rig.yaml").write_text(other, encoding="utf-8")
+    assert run("check", "--quiet", "task.yaml", "rig.yaml").exit_code == 0
 
 
 @pytest.mark.parametrize(("highest", "says"), [("0 bar", True), ("[0 bar, 1 bar, 0 bar]", False)])

@@ -360,7 +360,7 @@ def test_foxglove_is_served_only_where_a_file_names_a_port(
     assert ServiceSettings(foxglove_port=port).foxglove_port == port
 
 
-@pytest.mark.parametrize("text", ["null", "off", "65536", "-1"])
+@pytest.mark.parametrize("text", ["null", "off", "65536", "-1", "8470"])
 def test_what_is_no_port_for_foxglove_is_refused(tmp_path: Path, text: str) -> None:
     path = tmp_path / "rig.yaml"
     path.write_text(

@@ -17,6 +17,7 @@ from pydantic import BaseModel
 
 from stiffopt.errors import CommandError, InputError, StiffoptError
 from stiffopt.model.manipulator import Manipulator
+from stiffopt.model.obstacle import Obstacle
 from stiffopt.model.scene import Scene
 from stiffopt.optimise.solver import PressureSolver
 from stiffopt.optimise.target import Target
@@ -62,8 +63,8 @@ def check_task(task: Task, limits: PressureLimits) -> None:
 def check_scene(task: Task, scene: Scene | None) -> None:
     """Refuse a task that does not suit the rig's scene, which is the one that counts on a rig.
 
-    A scene of the task's own may not ask for more than the rig's: no other objects or shapes, no
-    smaller `max_force`, no greater clearance. The objects of a brace must allow contact.
+    A scene of the task's own may not ask for more than the rig's: no other shapes, whatever their
+    names, no smaller `max_force`, no greater clearance. The objects of a brace must allow contact.
     """
     if task.brace is not None:
         if scene is None:
@@ -79,25 +80,28 @@ def check_scene(task: Task, scene: Scene | None) -> None:
 
 def _check_own_scene(task: Task, own: Scene, scene: Scene | None) -> None:
     """Refuse a scene of the task's `own` that asks for more than the rig's scene."""
-    rigs = {} if scene is None else {item.name: item for item in scene.objects}
+    objects = () if scene is None else scene.objects
     remedy = "on a rig the scene of the rig file counts: write it there"
     for item in own.objects:
-        there = rigs.get(item.name)
-        if there is None:
-            raise task.error_at("scene", f"the rig has no object '{item.name}'; {remedy}")
-        if not _is_same(item.shape.model_dump(), there.shape.model_dump()):
-            where = f"'{item.name}' has another place or shape in the rig's scene"
+        same = [there for there in objects if _is_same_shape(item.shape, there.shape)]
+        if not same:
+            where = f"the rig has no object '{item.name}'"
+            if any(there.name == item.name for there in objects):
+                where = f"'{item.name}' has another place or shape in the rig's scene"
             raise task.error_at("scene", f"{where}; {remedy}")
         force = None if item.contact is None else item.contact.max_force
-        if force is None or there.contact is None or not there.contact.allowed:
-            continue
-        most = there.contact.max_force
-        if most is None or most > force * (1 + _EQUAL):
+        allowed = [each.contact for each in same if each.contact and each.contact.allowed]
+        most = max((math.inf if c.max_force is None else c.max_force for c in allowed), default=0.0)
+        if force is not None and most > force * (1 + _EQUAL):
             where = f"'{item.name}' may be pressed with more than 'max_force' in the rig's scene"
             raise task.error_at("scene", f"{where}; {remedy}")
     if scene is not None and own.clearance > scene.clearance * (1 + _EQUAL):
         where = "its clearance is greater than that of the rig's scene"
         raise task.error_at("scene", f"{where}; {remedy}")
+
+
+def _is_same_shape(one: Obstacle, other: Obstacle) -> bool:
+    return type(one) is type(other) and _is_same(one.model_dump(), other.model_dump())
 
 
 def _is_same(one: Any, other: Any) -> bool:

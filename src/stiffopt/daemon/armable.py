@@ -26,7 +26,9 @@ def too_fast(rate: float) -> str:
 def check_description(settings: RigDescription, robot: RobotDescription) -> Iterator[MisfitError]:
     """Yield why the loop could never arm the rig of a file, whatever its devices say.
 
-    A rig without a tracker is for scripts, and no mistake.
+    A rig without a tracker is for scripts, and no mistake. A driver's `timeout` that the file
+    itself makes longer than commands are valid is one, although the arm could be armed: for so
+    long nothing vents it. A driver's own default may be longer, for devices that open slowly.
     """
     safety, supply, period = settings.safety, settings.supply, 1 / settings.rate
     limits = limits_of(settings, robot)
@@ -53,6 +55,13 @@ def check_description(settings: RigDescription, robot: RobotDescription) -> Iter
             reason = f"{1e3 * timeout:g} ms is not longer than {between}: {effect}"
             yield MisfitError(reason, "safety", key)
     yield from _impatient(supply, period, between)
+    wait, valid = getattr(supply, "timeout", 0.0), safety.command_timeout
+    if "timeout" in supply.model_fields_set and wait > valid:
+        yield MisfitError(
+            f"{1e3 * wait:g} ms is longer than the {1e3 * valid:g} ms for which a command is valid "
+            "(safety.command_timeout): while the driver waits for an answer, nothing can vent",
+            *("supply", "timeout"),
+        )
     frames = getattr(settings.tracker, "rate", None)
     if frames is not None and 1 / frames > safety.tracker_timeout:
         yield MisfitError(
