@@ -26,6 +26,7 @@ from stiffopt.model.batch import InterpretedFunction
 from stiffopt.model.clearance import Nearest
 from stiffopt.model.codegen import dense
 from stiffopt.model.contact.equilibrium import ContactEquilibrium, Grip
+from stiffopt.model.contact.way import Rubbing, from_rest, rubbed
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.scene import Scene, SceneObject
 from stiffopt.model.shape import PointOfArm
@@ -35,6 +36,7 @@ from stiffopt.optimise.brace_uncertainty import BraceUncertainty
 from stiffopt.optimise.measures.directional import StiffnessMeasure
 from stiffopt.optimise.problem import Objective, PressureProblem, ProgramPoint
 from stiffopt.optimise.program import Constraint, Program
+from stiffopt.optimise.quadratic import solve_qp
 from stiffopt.optimise.settings import BRACE, OBSTACLES
 from stiffopt.optimise.solution import Judgement, Preload, are_within
 from stiffopt.optimise.task import Task
@@ -142,6 +144,7 @@ class BracedProblem(PressureProblem):
     here : equilibrium from which the next one is sought, or None: from rest.
     only_target : whether the demands on contacts are ignored.
     spare : share of tolerances, forces and margins that is not used.
+    friction : by which friction may change contact forces, in N, held back as well.
     leant : whether a posture that leans was found at the target, its contacts not yet judged.
     missed : points at the target at which contacts do not meet their demands.
     """
@@ -153,7 +156,7 @@ class BracedProblem(PressureProblem):
         self.scene: Scene = leant_on(task.scene, task.brace)
         self.here: ContactEquilibrium | None = None
         self.only_target = self.leant = False
-        self.spare = BRACE.spare
+        self.spare, self.friction = BRACE.spare, 0.0
         self.missed: list[ProgramPoint] = []
         super().__init__(robot, task)
 
@@ -195,10 +198,10 @@ class BracedProblem(PressureProblem):
 
     # -- evaluation -------------------------------------------------------------------------
 
-    def tightened(self) -> BracedProblem:
-        """Return the same program with more to spare."""
+    def tightened(self, friction: float) -> BracedProblem:
+        """Return the same program with more to spare, and with a force for `friction`."""
         other = copy(self)
-        other.spare = BRACE.more_spare
+        other.spare, other.friction = BRACE.more_spare, (1 + BRACE.more_spare) * friction
         other._set_constraints()
         other.restart()
         return other
@@ -284,10 +287,11 @@ class BracedProblem(PressureProblem):
         C = eq.compliance(self.brace.contacts) if full else np.eye(6)
         residuals, values = self.judged_by(eq, C)
         margin, forces = (1 + self.spare) * self.brace.margin, eq.normal_forces
-        pushed = [eq.shifted(push=margin * push).normal_forces - known.forces for push in pushes]
+        doubt = known.forces + self.friction if pushes else 0.0
+        pushed = [eq.shifted(push=margin * push).normal_forces - doubt for push in pushes]
         slips = foretold = np.zeros(0)
         if pushes:
-            forces = forces + known.forces
+            forces = forces + doubt
             if self.brace.contacts == "sticking":
                 slips, foretold = self._slips(eq, pushes, known.grip, base)
         at = np.array([each.s for each in near])
@@ -384,22 +388,45 @@ class BracedProblem(PressureProblem):
 
     # -- judgement --------------------------------------------------------------------------
 
-    def judgement(self, eq: ContactEquilibrium) -> Judgement:
-        """Judge an equilibrium by the task."""
+    def rubbing(self, eq: ContactEquilibrium) -> Rubbing | None:
+        """Return what friction does on the way from rest to an equilibrium; None without friction.
+
+        Objects that come to the arm are taken to leave no friction.
+
+        Raises
+        ------
+        EquilibriumError
+            The way is lost.
+        """
+        if self.brace.approach == "objects" or not eq.sticking.own:
+            return None
+        states = list(from_rest(self.robot, self.scene, eq.pressures))
+        if not states[-1].contacts:
+            raise EquilibriumError("in smaller steps the arm comes to lean on nothing")
+        return rubbed(states)
+
+    def judgement(self, eq: ContactEquilibrium, rubbing: Rubbing | None = None) -> Judgement:
+        """Judge an equilibrium by the task, with what friction does on the way to it."""
         C = eq.compliance(self.brace.contacts)
         residuals, values = self.judged_by(eq, C)
         rows = [*residuals.tolist(), *self.obstacle_rows(self._nearest(eq, quickly=False))]
         within = are_within(eq.pressures, self.lower * self.unit, self.upper * self.unit)
         found = Judgement.of(self.program, (rows, eq.tip_pose, C, values.tolist()), within)
-        return found._replace(shortfalls=(*found.shortfalls, *self.refusals(eq)))
+        return found._replace(shortfalls=(*found.shortfalls, *self.refusals(eq, rubbing)))
 
-    def refusals(self, eq: ContactEquilibrium) -> Iterator[str]:
+    def refusals(self, eq: ContactEquilibrium, rubbing: Rubbing | None = None) -> Iterator[str]:
         """Yield the reasons why an equilibrium is not acceptable."""
         unit, known = display_units().force, BraceUncertainty(self.robot, eq)
+        doubts, why = known.forces, "the calibration leaves"
+        if rubbing is not None:
+            both = "friction and the calibration leave"
+            why = both if known.forces.any() else "friction leaves"
+            doubts = doubts + rubbing.forces
+            yield from self._out_of_reach(eq, rubbing)
         for own, force in eq.pressed():
-            each, doubt = eq.contacts[own[0]], float(np.sum(known.forces[own]))
+            each, doubt = eq.contacts[own[0]], float(np.sum(doubts[own]))
             if force + doubt > each.max_force * (1 + 1e-9):
-                more = f", and {unit.text(doubt)} that the calibration leaves in doubt"
+                more = f", and {unit.text(doubt)} that {why} in doubt"
                 yield (
                     f"the arm leans on '{each.object}' with {unit.text(force)}"
                     f"{more if doubt else ''}; at most {unit.text(each.max_force)} is allowed"
@@ -423,12 +450,48 @@ class BracedProblem(PressureProblem):
                 f"a push of {unit.text(least)} {what}; the margin is {unit.text(self.brace.margin)}"
             )
             return
-        left, doubt = self._left_in_doubt(eq, known.forces)
+        left, doubt = self._left_in_doubt(eq, doubts)
         if left < -1e-6:
             yield (
                 f"a push of the margin leaves a contact force of {unit.text(left + doubt)}, less "
-                f"than the {unit.text(doubt)} that the calibration leaves in doubt"
+                f"than the {unit.text(doubt)} that {why} in doubt"
             )
+
+    def _out_of_reach(self, eq: ContactEquilibrium, rubbing: Rubbing) -> Iterator[str]:
+        """Yield that pressures cannot bring the tip back that friction has moved; see `_corrected`.
+
+        Contacts stick meanwhile.
+        """
+        position = self.task.target.position
+        if position is None:
+            return
+        rows = [i for i, each in enumerate(position) if each is not None]
+        R, held = eq.tip_pose[:3, :3], rubbing.sticking
+        jacobian = R @ eq.tip_jacobian[:3] + held.bent()[0][:3] @ held.per_pressure
+        left = self._corrected(eq.pressures, rubbing.tip[rows], jacobian[rows])
+        if left > self.task.target.tolerance.position:
+            length, most = display_units().length, display_units().pressure.text(BRACE.corrected)
+            away = length.text(float(np.linalg.norm(rubbing.tip)), ".2g")
+            yield (
+                f"friction on the way keeps the tip {away} away; pressures that are corrected by "
+                f"{most} leave it {length.text(left, '.2g')} from the target"
+            )
+
+    def _corrected(self, pressures: Vector, off: Vector, jacobian: Vector) -> float:
+        """Return how far from its place a tip that is off by so much (k,) stays, in m.
+
+        The pressures (n,) change by at most `BRACE.corrected` each, within their limits; `jacobian`
+        (k, n).
+        """
+        most = BRACE.corrected
+        low = np.maximum(self.lower * self.unit - pressures, -most) / most
+        high = np.minimum(self.upper * self.unit - pressures, most) / most
+        # in mm, with little weight on the changes themselves
+        A, b, n = 1e3 * most * jacobian, 1e3 * off, len(pressures)
+        H, g, none = A.T @ A + 1e-6 * np.eye(n), A.T @ b, np.zeros((0, n))
+        found = solve_qp(H, g, none, np.minimum(low, 0.0), np.maximum(high, 0.0))
+        step = np.zeros(n) if found is None else found[0]
+        return float(np.linalg.norm(off + most * jacobian @ step))
 
     def _held_at_tip(self, eq: ContactEquilibrium) -> bool:
         """Return True if a rigid object holds the tip along a direction that is maximised."""
