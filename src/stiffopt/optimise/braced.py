@@ -193,8 +193,7 @@ def reached_again(problem: BracedProblem, judged: Braced) -> Braced | None:
     close by, which misses the target by little.  Then there is more to spare.  Returns None if that
     is not remedied.
     """
-    rubbing = judged.rubbing
-    problem = problem.tightened(0.0 if rubbing is None else float(rubbing.forces.max()))
+    problem = problem.tightened()
     problem.here = judged.equilibrium
     point = reach_in_contact(problem, judged.result.point.x)
     if point is None or not point.reached:

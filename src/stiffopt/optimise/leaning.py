@@ -144,7 +144,6 @@ class BracedProblem(PressureProblem):
     here : equilibrium from which the next one is sought, or None: from rest.
     only_target : whether the demands on contacts are ignored.
     spare : share of tolerances, forces and margins that is not used.
-    friction : by which friction may change contact forces, in N, held back as well.
     leant : whether a posture that leans was found at the target, its contacts not yet judged.
     missed : points at the target at which contacts do not meet their demands.
     """
@@ -156,7 +155,7 @@ class BracedProblem(PressureProblem):
         self.scene: Scene = leant_on(task.scene, task.brace)
         self.here: ContactEquilibrium | None = None
         self.only_target = self.leant = False
-        self.spare, self.friction = BRACE.spare, 0.0
+        self.spare = BRACE.spare
         self.missed: list[ProgramPoint] = []
         super().__init__(robot, task)
 
@@ -198,10 +197,10 @@ class BracedProblem(PressureProblem):
 
     # -- evaluation -------------------------------------------------------------------------
 
-    def tightened(self, friction: float) -> BracedProblem:
-        """Return the same program with more to spare, and with a force for `friction`."""
+    def tightened(self) -> BracedProblem:
+        """Return the same program with more to spare."""
         other = copy(self)
-        other.spare, other.friction = BRACE.more_spare, (1 + BRACE.more_spare) * friction
+        other.spare = BRACE.more_spare
         other._set_constraints()
         other.restart()
         return other
@@ -287,11 +286,10 @@ class BracedProblem(PressureProblem):
         C = eq.compliance(self.brace.contacts) if full else np.eye(6)
         residuals, values = self.judged_by(eq, C)
         margin, forces = (1 + self.spare) * self.brace.margin, eq.normal_forces
-        doubt = known.forces + self.friction if pushes else 0.0
-        pushed = [eq.shifted(push=margin * push).normal_forces - doubt for push in pushes]
+        pushed = [eq.shifted(push=margin * push).normal_forces - known.forces for push in pushes]
         slips = foretold = np.zeros(0)
         if pushes:
-            forces = forces + doubt
+            forces = forces + known.forces
             if self.brace.contacts == "sticking":
                 slips, foretold = self._slips(eq, pushes, known.grip, base)
         at = np.array([each.s for each in near])
@@ -417,16 +415,12 @@ class BracedProblem(PressureProblem):
     def refusals(self, eq: ContactEquilibrium, rubbing: Rubbing | None = None) -> Iterator[str]:
         """Yield the reasons why an equilibrium is not acceptable."""
         unit, known = display_units().force, BraceUncertainty(self.robot, eq)
-        doubts, why = known.forces, "the calibration leaves"
         if rubbing is not None:
-            both = "friction and the calibration leave"
-            why = both if known.forces.any() else "friction leaves"
-            doubts = doubts + rubbing.forces
             yield from self._out_of_reach(eq, rubbing)
         for own, force in eq.pressed():
-            each, doubt = eq.contacts[own[0]], float(np.sum(doubts[own]))
+            each, doubt = eq.contacts[own[0]], float(np.sum(known.forces[own]))
             if force + doubt > each.max_force * (1 + 1e-9):
-                more = f", and {unit.text(doubt)} that {why} in doubt"
+                more = f", and {unit.text(doubt)} that the calibration leaves in doubt"
                 yield (
                     f"the arm leans on '{each.object}' with {unit.text(force)}"
                     f"{more if doubt else ''}; at most {unit.text(each.max_force)} is allowed"
@@ -450,11 +444,11 @@ class BracedProblem(PressureProblem):
                 f"a push of {unit.text(least)} {what}; the margin is {unit.text(self.brace.margin)}"
             )
             return
-        left, doubt = self._left_in_doubt(eq, doubts)
+        left, doubt = self._left_in_doubt(eq, known.forces)
         if left < -1e-6:
             yield (
                 f"a push of the margin leaves a contact force of {unit.text(left + doubt)}, less "
-                f"than the {unit.text(doubt)} that {why} in doubt"
+                f"than the {unit.text(doubt)} that the calibration leaves in doubt"
             )
 
     def _out_of_reach(self, eq: ContactEquilibrium, rubbing: Rubbing) -> Iterator[str]:
