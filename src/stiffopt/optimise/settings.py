@@ -209,6 +209,7 @@ class BraceSettings:
     least_price : gain from a whole tolerance or limit, as a share of the stiffness, to be reported.
     largest_push : largest push that is tested, in N.
     sure : standard deviations of a contact force, by a calibration's errors, that are held back.
+    corrected : largest change of a pressure, in Pa, by which a loop corrects the tip.
     """
 
     force: float = 5e-3
@@ -227,6 +228,7 @@ class BraceSettings:
     least_price: float = 1e-3
     largest_push: float = 1.0
     sure: float = 2.0
+    corrected: float = 1e4
 
 
 @dataclass(frozen=True)
