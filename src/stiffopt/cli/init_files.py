@@ -400,7 +400,8 @@ def _nidaq(n: int) -> str:
         for k in range(n)
     )
     return (
-        f"  driver: nidaq\n  channels:\n{lines}"
+        "  driver: nidaq\n  timeout: 200 ms    # well below safety.command_timeout\n"
+        f"  channels:\n{lines}"
         "  # empties the arm without power\n"
         "  dump_valve: {line: Dev1/port0/line0, closed_when: high}\n"
     )

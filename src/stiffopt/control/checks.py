@@ -17,8 +17,7 @@ from pydantic import BaseModel
 
 from stiffopt.errors import CommandError, InputError, StiffoptError
 from stiffopt.model.manipulator import Manipulator
-from stiffopt.model.obstacle import Obstacle
-from stiffopt.model.scene import Scene
+from stiffopt.model.scene import Scene, SceneObject
 from stiffopt.optimise.solver import PressureSolver
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import PressureRange, Task
@@ -63,8 +62,8 @@ def check_task(task: Task, limits: PressureLimits) -> None:
 def check_scene(task: Task, scene: Scene | None) -> None:
     """Refuse a task that does not suit the rig's scene, which is the one that counts on a rig.
 
-    A scene of the task's own may not ask for more than the rig's: no other shapes, whatever their
-    names, no smaller `max_force`, no greater clearance. The objects of a brace must allow contact.
+    A scene of the task's own may not ask for more than the rig's: no other shapes, under whatever
+    name, no smaller `max_force`, no greater clearance. The objects of a brace must allow contact.
     """
     if task.brace is not None:
         if scene is None:
@@ -80,19 +79,22 @@ def check_scene(task: Task, scene: Scene | None) -> None:
 
 def _check_own_scene(task: Task, own: Scene, scene: Scene | None) -> None:
     """Refuse a scene of the task's `own` that asks for more than the rig's scene."""
-    objects = () if scene is None else scene.objects
+    rigs = {} if scene is None else {item.name: item for item in scene.objects}
     remedy = "on a rig the scene of the rig file counts: write it there"
     for item in own.objects:
-        same = [there for there in objects if _is_same_shape(item.shape, there.shape)]
-        if not same:
-            where = f"the rig has no object '{item.name}'"
-            if any(there.name == item.name for there in objects):
-                where = f"'{item.name}' has another place or shape in the rig's scene"
+        alike = (each for each in rigs.values() if _is_alike(item, each))
+        there = rigs[item.name] if item.name in rigs else next(alike, None)
+        if there is None:
+            where = f"the rig has no object '{item.name}', nor one of its shape there"
+            raise task.error_at("scene", f"{where}; {remedy}")
+        if not _is_alike(item, there):
+            where = f"'{item.name}' has another place or shape in the rig's scene"
             raise task.error_at("scene", f"{where}; {remedy}")
         force = None if item.contact is None else item.contact.max_force
-        allowed = [each.contact for each in same if each.contact and each.contact.allowed]
-        most = max((math.inf if c.max_force is None else c.max_force for c in allowed), default=0.0)
-        if force is not None and most > force * (1 + _EQUAL):
+        if force is None or there.contact is None or not there.contact.allowed:
+            continue
+        most = there.contact.max_force
+        if most is None or most > force * (1 + _EQUAL):
             where = f"'{item.name}' may be pressed with more than 'max_force' in the rig's scene"
             raise task.error_at("scene", f"{where}; {remedy}")
     if scene is not None and own.clearance > scene.clearance * (1 + _EQUAL):
@@ -100,8 +102,10 @@ def _check_own_scene(task: Task, own: Scene, scene: Scene | None) -> None:
         raise task.error_at("scene", f"{where}; {remedy}")
 
 
-def _is_same_shape(one: Obstacle, other: Obstacle) -> bool:
-    return type(one) is type(other) and _is_same(one.model_dump(), other.model_dump())
+def _is_alike(one: SceneObject, other: SceneObject) -> bool:
+    """Return whether two objects have one shape at one place, whatever their names."""
+    shapes = one.shape, other.shape
+    return type(shapes[0]) is type(shapes[1]) and _is_same(*(s.model_dump() for s in shapes))
 
 
 def _is_same(one: Any, other: Any) -> bool:

@@ -26,9 +26,7 @@ def too_fast(rate: float) -> str:
 def check_description(settings: RigDescription, robot: RobotDescription) -> Iterator[MisfitError]:
     """Yield why the loop could never arm the rig of a file, whatever its devices say.
 
-    A rig without a tracker is for scripts, and no mistake. A driver's `timeout` that the file
-    itself makes longer than commands are valid is one, although the arm could be armed: for so
-    long nothing vents it. A driver's own default may be longer, for devices that open slowly.
+    A rig without a tracker is for scripts, and no mistake.
     """
     safety, supply, period = settings.safety, settings.supply, 1 / settings.rate
     limits = limits_of(settings, robot)
@@ -55,13 +53,7 @@ def check_description(settings: RigDescription, robot: RobotDescription) -> Iter
             reason = f"{1e3 * timeout:g} ms is not longer than {between}: {effect}"
             yield MisfitError(reason, "safety", key)
     yield from _impatient(supply, period, between)
-    wait, valid = getattr(supply, "timeout", 0.0), safety.command_timeout
-    if "timeout" in supply.model_fields_set and wait > valid:
-        yield MisfitError(
-            f"{1e3 * wait:g} ms is longer than the {1e3 * valid:g} ms for which a command is valid "
-            "(safety.command_timeout): while the driver waits for an answer, nothing can vent",
-            *("supply", "timeout"),
-        )
+    yield from _patient(supply, safety.command_timeout)
     frames = getattr(settings.tracker, "rate", None)
     if frames is not None and 1 / frames > safety.tracker_timeout:
         yield MisfitError(
@@ -71,12 +63,33 @@ def check_description(settings: RigDescription, robot: RobotDescription) -> Iter
         )
 
 
-def _impatient(supply: SupplySettings, period: float, between: str) -> Iterator[MisfitError]:
-    """Yield why the device's own watchdog would vent between two commands, `period` s apart."""
+def _watchdog(supply: SupplySettings) -> tuple[float | None, tuple[str, ...]]:
+    """Return the time of the device's own watchdog, in s or None, and its key in the supply."""
     watchdog = getattr(supply, "watchdog", None)  # a time in s, or a block that has one
     timeout = getattr(watchdog, "timeout", watchdog)
     place = ("watchdog",) if timeout is watchdog else ("watchdog", "timeout")
-    if not isinstance(timeout, float):
+    return (timeout if isinstance(timeout, float) else None), place
+
+
+def _patient(supply: SupplySettings, command_timeout: float) -> Iterator[MisfitError]:
+    """Yield why a device that does not answer keeps its pressures for longer than a command lasts.
+
+    The guard can do nothing while the driver waits, but a watchdog in the device vents meanwhile.
+    """
+    timeout, watchdog = getattr(supply, "timeout", 0.0), _watchdog(supply)[0]
+    if timeout > command_timeout and (watchdog is None or watchdog > command_timeout):
+        yield MisfitError(
+            f"{1e3 * timeout:g} ms is longer than safety.command_timeout, "
+            f"{1e3 * command_timeout:g} ms: an arm whose device does not answer would keep its "
+            "pressures until then; shorten it, or give the device a watchdog",
+            *("supply", "timeout"),
+        )
+
+
+def _impatient(supply: SupplySettings, period: float, between: str) -> Iterator[MisfitError]:
+    """Yield why the device's own watchdog would vent between two commands, `period` s apart."""
+    timeout, place = _watchdog(supply)
+    if timeout is None:
         return
     if supply.exchange_time > period:
         period = supply.exchange_time

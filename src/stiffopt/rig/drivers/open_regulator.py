@@ -126,12 +126,10 @@ class OpenRegulatorSupply(PressureSupply):
         self._outputs = np.array([channel.output for channel in settings.channels]) - 1
         self._line: BoardLine
         self._identity: Identity
-        self._held_counts: tuple[int, ...] | None = (
-            None  # set-points that the board has; None: unknown
-        )
-        self._last_report: tuple[float, Status] | None = (
-            None  # time of the last report, and the report
-        )
+        self._held_counts: tuple[int, ...] | None = None
+        """Set-points that the board has; None: unknown."""
+        self._last_report: tuple[float, Status] | None = None
+        """Time of the last report, and the report."""
         self.patience = settings.startup + 6 * settings.timeout
 
     @property
