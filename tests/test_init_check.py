@@ -123,6 +123,34 @@ def test_a_device_that_would_vent_between_two_commands_is_a_mistake(supply: str,
     assert run("check", "--quiet", "rig.yaml").stdout.rstrip() == said
 
 
+def test_a_rig_whose_arm_is_inside_an_object_at_rest_is_a_mistake() -> None:
+    text = (ROOT / "rig/brace.yaml").read_text(encoding="utf-8")
+    for place, said in [
+        ("-20.1 mm", ""),
+        (
+            "-17 mm",  # the arm's radius is 15 mm, the post's 5 mm
+            "rig.yaml:13: scene.objects[0]: without pressures the arm is 3 mm inside 'post', and "
+            "the loop would hold it there; correct the place or the size of the object",
+        ),
+    ]:
+        Path("rig.yaml").write_text(text.replace("-35 mm", place), encoding="utf-8")
+        assert run("check", "--quiet", "rig.yaml").stdout.rstrip() == said
+
+
+def test_the_weight_may_hold_an_arm_clear_of_an_object() -> None:
+    ball = "  - {name: ball, sphere: {centre: [0 mm, 0 mm, 120 mm], radius: 5 mm}}\n"
+    Path("scene.yaml").write_text(f"format: stiffopt-scene/1\nobjects:\n{ball}", encoding="utf-8")
+    robot = (ROOT / "src/stiffopt/robots/stiff-flop-2.yaml").read_text(encoding="utf-8")
+    rig = "format: stiffopt-rig/1\nrobot: arm.yaml\nscene: scene.yaml\nsupply: {driver: simulated}"
+    Path("rig.yaml").write_text(f"{rig}\nsafety: {{max_slew: 5 bar/s}}\n", encoding="utf-8")
+    Path("arm.yaml").write_text(robot, encoding="utf-8")
+    said = run("check", "--quiet", "rig.yaml").stdout
+    assert said.startswith("rig.yaml:3: scene: without pressures the arm is 20 mm inside 'ball'")
+    sideways = "gravity: [20 m/s^2, 0 m/s^2, 0 m/s^2]\ntip_mass: 20 g\n"
+    Path("arm.yaml").write_text(robot + sideways, encoding="utf-8")
+    assert run("check", "--quiet", "rig.yaml").stdout == ""
+
+
 def test_a_watchdog_of_an_nidaq_device_is_compared_too() -> None:
     text = (ROOT / "rig/nidaq-aurora.yaml").read_text(encoding="utf-8")
     Path("rig.yaml").write_text(re.sub("watchdog: .* ms", "watchdog: 10 ms", text))

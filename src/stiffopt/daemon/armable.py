@@ -1,4 +1,4 @@
-"""Check from its file alone whether a rig can ever be armed."""
+"""Check from its file alone whether a rig can ever be armed and move its arm."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ import numpy as np
 from stiffopt.control.arming import NO_SLEW
 from stiffopt.errors import CommandError, InputError
 from stiffopt.model.description import RobotDescription
+from stiffopt.model.manipulator import Manipulator
+from stiffopt.model.scene import Scene
 from stiffopt.rig.config import RigDescription, limits_of, slew_of
 from stiffopt.rig.device import MisfitError
 from stiffopt.rig.pressure import SupplySettings
@@ -16,6 +18,7 @@ from stiffopt.safety.gate import check_protection
 
 _NO_PRESSURE = "leaves every channel at one pressure: the arm could never move"
 _FASTEST = 500.0  # Hz
+_OVERLAP = 5e-4  # m; by about as much a clearance can be too small beside a mesh or a tube's bend
 
 
 def too_fast(rate: float) -> str:
@@ -24,7 +27,7 @@ def too_fast(rate: float) -> str:
 
 
 def check_description(settings: RigDescription, robot: RobotDescription) -> Iterator[MisfitError]:
-    """Yield why the loop could never arm the rig of a file, whatever its devices say.
+    """Yield why the loop could never arm or move the rig of a file, whatever its devices say.
 
     A rig without a tracker is for scripts, and no mistake.
     """
@@ -61,6 +64,20 @@ def check_description(settings: RigDescription, robot: RobotDescription) -> Iter
             "two frames of the tracker: the tip would never count as seen",
             *("safety", "tracker_timeout"),
         )
+    if settings.scene is not None:
+        yield from _inside_at_rest(settings.scene, robot)
+
+
+def _inside_at_rest(scene: Scene, robot: RobotDescription) -> Iterator[MisfitError]:
+    """Yield which objects the arm is inside without pressures, under its weight."""
+    found = Manipulator(robot).clearances(np.zeros(robot.n_pressures), scene)
+    for index, (name, distance) in enumerate(zip(found.names, found.distances, strict=True)):
+        if distance < -_OVERLAP:
+            yield MisfitError(
+                f"without pressures the arm is {-1e3 * distance:.3g} mm inside '{name}', and the "
+                "loop would hold it there; correct the place or the size of the object",
+                *(("scene",) if scene.source else ("scene", "objects", index)),
+            )
 
 
 def _watchdog(supply: SupplySettings) -> tuple[float | None, tuple[str, ...]]:
