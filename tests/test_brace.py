@@ -223,6 +223,36 @@ def test_a_stiffness_that_moves_no_tip_is_in_doubt(robot, task, solution):
     assert ratios == pytest.approx([-1.96 * factor, 1.96 * factor], rel=0.01)
 
 
+def test_a_posture_that_a_likely_error_makes_soft_is_refused(robot, task, solution):
+    def arm(residual):
+        known = Calibration(position_residual=residual)
+        return stiffopt.Manipulator(robot.description.model_copy(update={"calibration": known}))
+
+    measure, scene = task.stiffness.maximise[0], BracedProblem(robot, task).scene
+    # the axes of equal errors are those of the base; from rest instead of continued
+    known, residual = arm(8e-3), 8e-3
+    eq = known.contact_equilibrium(solution.pressures, scene)
+    J = known.tip_pose(eq.pressures)[:3, :3] @ known.tip_jacobian(eq.pressures)[:3]
+    least = min(
+        known.contact_equilibrium(eq.pressures + np.linalg.pinv(J) @ way, scene).stiffness(
+            [1, 0, 0]
+        )
+        for way in residual * np.vstack([np.eye(3), -np.eye(3)])
+    )
+    found = BraceUncertainty(known, eq).least_stiffness(measure, task)
+    assert found == pytest.approx(least, rel=1e-3)
+    assert 0.5 * eq.stiffness([1, 0, 0]) < found < eq.stiffness([1, 0, 0])
+    said = f"errors of the calibration (one standard deviation) leave {0:.4g} N/m"
+    for residual, refused in ((8e-3, False), (30e-3, True), (40e-3, True)):
+        eq = arm(residual).contact_equilibrium(solution.pressures, scene)
+        reasons = list(BracedProblem(arm(residual), task).refusals(eq))
+        assert any("(one standard deviation) leave" in why for why in reasons) == refused
+    assert any(said in why for why in reasons)  # lost within one deviation
+    assert BraceUncertainty(robot, solution.equilibrium).least_stiffness(measure, task) == (
+        pytest.approx(solution.stiffness)
+    )
+
+
 def test_where_forces_are_in_doubt_slips_come_sooner(robot, task, solution):
     """The push that loses a sticking contact is in proportion to the contact's force."""
     known = Calibration(position_residual=8e-3)

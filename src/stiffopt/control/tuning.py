@@ -629,7 +629,7 @@ class BracingTuning:
     pressure_weight: float = 2e-8  # the same for a pressure, in m/Pa
     most_change: float = BRACE.corrected  # largest change of a planned pressure, in Pa
     # error of the tip that is reported if it does not fall by a share for a time, in m and s
-    off_target: float = 1e-3
+    off_target: float = BRACE.missed
     progress: float = 0.1
     patience: float = 10.0
     sliding: SlidingTuning = field(default_factory=SlidingTuning)

@@ -450,6 +450,22 @@ class BracedProblem(PressureProblem):
                 f"a push of the margin leaves a contact force of {unit.text(left + doubt)}, less "
                 f"than the {unit.text(doubt)} that the calibration leaves in doubt"
             )
+        yield from self._not_robust(eq, known)
+
+    def _not_robust(self, eq: ContactEquilibrium, known: BraceUncertainty) -> Iterator[str]:
+        """Yield which stiffness that is maximised a likely error of the calibration takes away."""
+        for measure in self.directions:
+            given = (
+                measure.direction, measure.kind, measure.boundary, measure.frame,
+                self.brace.contacts,
+            )  # fmt: skip
+            k, least = eq.stiffness(*given), known.least_stiffness(measure, self.task)
+            if least < BRACE.robust * k:
+                unit = display_units().stiffness
+                yield (
+                    f"errors of the calibration (one standard deviation) leave {unit.text(least)} "
+                    f"of the stiffness of {unit.text(k)}"
+                )
 
     def _out_of_reach(self, eq: ContactEquilibrium, rubbing: Rubbing) -> Iterator[str]:
         """Yield that pressures cannot bring the tip back that friction has moved; see `_corrected`.
@@ -463,7 +479,7 @@ class BracedProblem(PressureProblem):
         R, held = eq.tip_pose[:3, :3], rubbing.sticking
         jacobian = R @ eq.tip_jacobian[:3] + held.bent()[0][:3] @ held.per_pressure
         left = self._corrected(eq.pressures, rubbing.tip[rows], jacobian[rows])
-        if left > self.task.target.tolerance.position:
+        if left > max(self.task.target.tolerance.position, BRACE.missed):
             length, most = display_units().length, display_units().pressure.text(BRACE.corrected)
             away = length.text(float(np.linalg.norm(rubbing.tip)), ".2g")
             yield (
