@@ -357,7 +357,7 @@ def test_the_picture_of_a_motion_shows_the_arm_in_contact(solution):
     free = 1e-3 * np.array(ends) - ROBOT.tip_pose(found.pressures[-1])[:3, 3]
     assert np.linalg.norm(free, axis=1).min() > 2e-3
     (contact,) = found.equilibria[-1].contacts
-    assert f"{np.linalg.norm(contact.force):.3g} N" in [
+    assert f"{np.linalg.norm(contact.force):.3g} N by 'post'" in [
         text.get_text() for text in figure.findobj(Text)
     ]
 

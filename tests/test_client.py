@@ -122,11 +122,11 @@ def test_a_task_file_of_this_machine_may_be_given(
 
 
 def test_what_the_daemon_refuses_is_raised(loop: FakeLoop, client: Client, server: Server) -> None:
-    with pytest.raises(CommandError, match="needs control: call 'take_control'"):
+    with pytest.raises(CommandError, match="needs control: take it first"):
         client.arm()
     with client.stream(rate=0) as stream:
         stream.send(position=[0, 0, 0.2])
-        with pytest.raises(CommandError, match="needs control: call 'take_control'"):
+        with pytest.raises(CommandError, match="needs control: take it first"):
             drain(stream)
     with (
         Client(server.url) as reader,

@@ -407,32 +407,6 @@ def test_a_doubted_motion_stops_without_a_swing():
     assert swings[0] < 0.5 * swings[1]
 
 
-def test_a_doubted_sensor_that_feedback_has_followed_is_not_followed_any_more():
-    """Of an arm that does not vibrate, all of a second's correction is undone."""
-    bench = Bench(HANGING)
-    bench.settled(duration=3.0)
-    before, camera = bench.tip[:3, 3].copy(), bench.rig.world.camera
-    see, began = camera.sensor_in_tracker, bench.rig.clock.now()
-
-    def drifting():
-        pose = see().copy()
-        pose[0, 3] += 0.01 * (bench.rig.clock.now() - began)
-        return pose
-
-    camera.sensor_in_tracker = drifting
-    bench.run(0.8)
-    assert np.linalg.norm(bench.tip[:3, 3] - before) > 4e-3
-    bench.run(bench.period, steer=False)  # its command is known from now on
-    bench.controller._arm.watch.doubt = Doubt("drift", "made up")
-    while (stopping := bench.controller.stop(bench.rig.clock.now())) is not None:
-        assert np.all(np.abs(stopping - bench.command) <= bench.slew * bench.period + 1e-3)
-        bench.command = stopping
-        bench.run(bench.period, steer=False)
-        assert bench.rig.clock.now() < began + 2.0
-    bench.run(0.5, steer=False)
-    assert np.linalg.norm(bench.tip[:3, 3] - before) < 1.5e-3
-
-
 def test_touch_and_creep_get_tip_and_pressures_of_the_same_time():
     bench = moving(rested=2.0, moved=0.1, dynamics="quasi-static")
     arm, ways, errors = bench.controller._arm, [], []

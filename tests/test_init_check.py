@@ -69,7 +69,7 @@ def test_a_rig_that_could_never_be_armed_is_a_mistake() -> None:
         "rig.yaml:4: supply: this supply has neither a watchdog nor a dump valve",
         "rig.yaml:10: safety.guard_timeout: 100 ms is not longer than the 100 ms between two comm",
         "rig.yaml:10: safety.command_timeout: 50 ms is not longer",
-        "rig.yaml: supply.timeout: 200 ms is longer than safety.command_timeout, 50 ms",
+        "rig.yaml: supply.timeout: 200 ms, its default, is longer than safety.command_timeout, 50 ms",
         "rig.yaml:10: safety.tracker_timeout: 90 ms is shorter than the 100 ms between two frames",
     ]
     lines = found.stdout.splitlines()
@@ -169,6 +169,14 @@ def test_a_device_that_keeps_its_pressures_for_longer_than_a_command_lasts_is_a_
     assert said in run("check", "rig.yaml").stdout
     Path("rig.yaml").write_text(re.sub("watchdog: .* ms", "watchdog: 0.6 s", late))
     assert said in run("check", "rig.yaml").stdout
+    unsaid = re.sub("  (timeout|watchdog): .* ms.*\n", "", text)
+    Path("rig.yaml").write_text(unsaid)
+    assert "supply.timeout: 1000 ms, its default, is longer" in run("check", "rig.yaml").stdout
+    board = (ROOT / "rig/open-regulator.yaml").read_text(encoding="utf-8")
+    board = board.replace("driver: open-regulator\n", "driver: open-regulator\n  timeout: 0.6 s\n")
+    Path("rig.yaml").write_text(board)
+    assert "timeout: 0.6 s" in board
+    assert "supply.timeout" not in run("check", "rig.yaml").stdout  # it always vents by itself
 
 
 def test_a_task_beside_a_rig_is_compared_with_its_scene() -> None:

@@ -10,6 +10,7 @@ import pytest
 from scipy.optimize import lsq_linear
 
 import stiffopt
+from stiffopt.errors import EquilibriumError
 from stiffopt.model.contact import way
 from stiffopt.model.contact.equilibrium import ContactEquilibrium
 from stiffopt.model.contact.way import Rubbing, from_rest, rubbed
@@ -95,12 +96,20 @@ def test_an_answer_that_friction_keeps_from_its_place_is_refused(is_sliding):
         assert "pressures that are corrected by 0.1 bar leave it" in told[0]
 
 
-def test_what_friction_may_change_the_force_by_includes_its_own():
-    """The force grows by friction across the normal, and by what that changes along it."""
-    found, eq = rubbed(states(True, 0.2)), states(True, 0.2)[-1]
-    along = float(np.abs(found.sticking.bent()[1] @ found.tangential)[0])
-    whole, across = float(eq.normal_forces[0]), float(np.linalg.norm(found.tangential))
-    assert found.forces[0] == pytest.approx(np.hypot(whole + along, across) - whole)
+def test_friction_that_presses_an_object_beyond_its_greatest_force_is_refused():
+    own, eq = problem(False, margin=1e-4), states(False, 0.2)[-1]
+    found, force = own.rubbing(eq), float(eq.normal_forces[0])
+    assert found is not None
+    assert found.normals == pytest.approx(found.sticking.bent()[1] @ found.tangential)
+    for more, refused in ((0.09, False), (0.11, True), (-0.5, False)):
+        rubbing = found._replace(normals=np.array([0.4 * (1 + more) - force]))
+        told = [each for each in own.refusals(eq, rubbing) if "presses the arm on 'post'" in each]
+        assert bool(told) == refused
+
+
+def test_an_arm_that_leans_on_nothing_has_not_rubbed():
+    with pytest.raises(EquilibriumError, match="lean on nothing"):
+        rubbed(states(True, 0.2)[:1])
 
 
 def test_the_tip_is_corrected_as_far_as_pressures_may_change():

@@ -123,10 +123,9 @@ class TipController:
             tuning.motion_error,
             tuning.step_error,
         )
-        # the latest places of the reference, and what feedback added to its commands (longer)
-        self._ways: deque[Array] = deque(maxlen=max(1, round(tuning.reference.taken_back / period)))
-        self._added: deque[Array] = deque(
-            maxlen=max(1, round(tuning.reference.correction_undone / period))
+        # the latest places of the reference, with what feedback added to its commands
+        self._ways: deque[tuple[Array, Array]] = deque(
+            maxlen=max(1, round(tuning.reference.taken_back / period))
         )
         self._first_motion = FirstMotion(commissioned, tuning.first_motion)
         sliding = replace(tuning.bracing.sliding, noise=control.tracker_noise)
@@ -172,7 +171,6 @@ class TipController:
         self._windows.begin()
         self._led_to: Target | None = None  # present target of a trajectory of pressures
         self._ways.clear()
-        self._added.clear()
 
     def set_task(self, task: Task) -> None:
         """Pursue a task; see `Controller.set_task`."""
@@ -292,7 +290,6 @@ class TipController:
         self._reference.begin(np.concatenate([here + pressures.history_offset, offset]))
         self._feedback.resume()
         self._ways.clear()
-        self._added.clear()
         self._at_rest = False
 
     def observe(
@@ -377,13 +374,13 @@ class TipController:
         if moves:
             self._moved_at = now
         if self._arm.leaning is not None:
+            self._ways.clear()  # a free posture is no way back for an arm that leans, or leant
             return self._feedforward(reference.command - pressures.command_offset, last)
         tip = self._arm.on_path(reference.path[:n])
         if now - self._went_back_at > self._tuning.adaptation.blind_time:
             self._arm.watch.intend(now, tip.pose[:3, 3] + reference.path[n : n + 3])
         if self._arm.channels.pace == 0 and self._ways and moves:
-            added = self._added_before - pressures.command_offset
-            return self._feedforward(reference.command + added, last)
+            return self._feedforward(self._without_feedback, last)
         course = self.replanner.pursuit.course
         bent = self._bend(None if isinstance(course, PostureCourse) else self.replanner.bent)
         self._led_to = None
@@ -403,8 +400,7 @@ class TipController:
         )
         if command is None:
             return self._output(last.copy(), self._feedback.saturated, valid=False)
-        self._ways.append(reference.path.copy())
-        self._added.append(command - goal)
+        self._ways.append((reference.path.copy(), command - goal))
         return self._output(command, self._feedback.saturated)
 
     def _motion_share(self, path: Array) -> Array:
@@ -426,33 +422,26 @@ class TipController:
 
         The reference goes back to where it was a while before. On its smooth path the arm does not
         begin to vibrate, as it would if its commands froze. What feedback adds becomes what it was
-        then, or longer before if the arm does not vibrate: it may have followed a sensor that is
-        wrong, or made up for a chamber that is late. A channel that moves against its command gets
-        the pressure at which it last followed: even reversed it goes back to that.
+        then, since it may have followed a sensor that is wrong. A channel that moves against its
+        command gets the pressure at which it last followed: even reversed it goes back to that.
         """
         channels, last = self._arm.channels, self._arm.pressures.command
-        doubt = self._arm.watch.doubt
-        undoes = doubt is not None and doubt.undo > 0
-        if self._vibrates:
-            undoes = doubt is not None or bool(channels.opposed.any())
-        if not undoes or not self._ways:
+        is_doubted = self._arm.watch.doubt is not None or channels.opposed.any()
+        if not self._vibrates or not is_doubted or not self._ways:
             return None
-        goal = self._ways[0]
+        goal = self._ways[0][0]
+        if self._is_near(goal[: len(last)]):
+            return None
         self._reference.advance(goal)
-        # what an arm that vibrates gets suddenly would make it swing
-        added = self._added_before if self._vibrates else self._added[0]
-        command = self._reference.command + added - self._arm.pressures.command_offset
-        command = np.where(channels.opposed, channels.last_followed, command)
-        pressures = self._feedforward(command, last).pressures
-        least = self._tuning.reference.at_rest * self._period
-        if self._is_near(goal[: len(last)]) and are_within(least, pressures - last):
-            return None
-        return pressures
+        command = np.where(channels.opposed, channels.last_followed, self._without_feedback)
+        return self._feedforward(command, last).pressures
 
     @property
-    def _added_before(self) -> Array:
-        """What feedback added to the commands (n,) at the first of the latest `_ways`."""
-        return self._added[-len(self._ways)]
+    def _without_feedback(self) -> Array:
+        """Commands (n,) of the reference, with what feedback added to them a while before."""
+        command = self._reference.command - self._arm.pressures.command_offset
+        added: Array = self._ways[0][1]
+        return command + added
 
     def _awaited(self, plan: Array, now: float) -> Array:
         """Return the reference's goal (n + 6,): the plan, unless channels or tip do not follow.
@@ -469,7 +458,7 @@ class TipController:
             course.wait((1 - pace) * min(now - self._computed_at, _HELD * self._period))
             return plan
         # an arm that vibrates goes on for a while before its smooth path turns
-        path = self._ways[0] if self._vibrates and self._ways else self._reference.path
+        path = self._ways[0][0] if self._vibrates and self._ways else self._reference.path
         goal: Array = path + pace * (plan - path)
         return goal
 

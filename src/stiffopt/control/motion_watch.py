@@ -9,8 +9,7 @@ look for what no push, payload or model error explains:
   changed along the motion of s, the arm is weaker or softer than modelled. A change that has begun
   with such a turn is a push. It may excite higher modes, in which the tip turns otherwise, so the
   test pauses. A tip at rest is judged sooner, by y - s and its own turn, vibration included;
-* drift: y - s keeps moving, faster than the model's error can change while s moves. Along the stiff
-  axis, where no push displaces the tip, it is noticed sooner;
+* drift: y - s keeps moving, faster than the model's error can change while s moves;
 * swing: y - r oscillates, and does not decay.
 
 A push or a payload moves y - s too, but then it rests. Drift is tested at three time scales, to
@@ -206,7 +205,7 @@ class MotionWatch:
         turning = None if turned is None else tip
         if turning is not None:
             self.doubt = self.doubt or self._jump(jacobian, turning)
-        self.doubt = self.doubt or self._drift(jacobian, tip, turning) or self._swing()
+        self.doubt = self.doubt or self._drift(jacobian, turning) or self._swing()
 
     def _is_pushed(self) -> bool:
         """Return whether something has just displaced the tip while the reference rested."""
@@ -459,68 +458,42 @@ class MotionWatch:
         is_along = aside < tuning.aside * float(np.linalg.norm(moved))
         return share if is_along and abs(share) < tuning.largest_error else 0.0
 
-    def _drift(self, jacobian: Array, tip: TipAt, turning: TipAt | None) -> Doubt | None:
+    def _drift(self, jacobian: Array, turning: TipAt | None) -> Doubt | None:
         """Test whether the tip keeps moving without a cause in the pressures.
 
         `turning` is the model's tip; None if the tracker measures no orientations.
         """
         for scale in self._tuning.scales:
-            change, speed = self._drifted(scale, jacobian)
-            if speed and not self._is_push(change, turning):
-                return self._drifts(speed)
-        _, speed = self._drifted(self._tuning.along_stiff_axis, jacobian, tip)
-        return self._drifts(speed) if speed else None
+            if speed := self._drift_speed(scale, jacobian, turning):
+                return Doubt(
+                    "drift",
+                    f"the tip seems to move on at {1e3 * speed:.1f} mm/s although its pressures do "
+                    "not explain it: the sensor slips or has come off, the tracker drifts, or "
+                    "something pushes the arm; look at it, then set the task again",
+                )
+        return None
 
-    @staticmethod
-    def _drifts(speed: float) -> Doubt:
-        return Doubt(
-            "drift",
-            f"the tip seems to move on at {1e3 * speed:.1f} mm/s although its pressures do not "
-            "explain it: the sensor slips or has come off, the tracker drifts, or something pushes "
-            "the arm; look at it, then set the task again",
-        )
-
-    def _drifted(
-        self, scale: DriftScale, jacobian: Array, stiff: TipAt | None = None
-    ) -> tuple[Array, float]:
-        """Return the change (21 + n,) of the samples over all intervals of a scale, and the speed.
-
-        The speed is that of a drift, in m/s; 0 if there is none. With the model's tip `stiff`, only
-        what is along its stiff axis counts, if no usual force displaces the tip so far there.
-        """
+    def _drift_speed(self, scale: DriftScale, jacobian: Array, turning: TipAt | None) -> float:
+        """Return the speed of a drift over all intervals of a scale, in m/s; 0 if there is none."""
         duration = scale.interval * scale.count
         first = self._rows[0, _TIME] if self._count else np.inf
         if self._rows[self._count - 1, _TIME] - duration < first:
-            return np.zeros(0), 0.0
+            return 0.0
         rows = self._since(duration)
         whole = rows[-1] - rows[0]
         drift = whole[_SEEN] - whole[_PREDICTED]
         size = math.hypot(*drift.tolist())
         least = scale.least_speed * scale.interval + 2 * self._tuning.scatter
         if size < scale.count * least:  # the sum of the parts along it
-            return whole, 0.0
-        if stiff is not None:
-            compliances, axes = np.linalg.eigh(stiff.compliance[:3, :3])
-            axis = stiff.pose[:3, :3] @ axes[:, 0]
-            whole_size, drift = size, axis * (axis @ drift)
-            size = math.hypot(*drift.tolist())
-            by_force = compliances[0] * self._tuning.axial_force
-            if size < max(by_force, self._tuning.most_error * whole_size):
-                return whole, 0.0
+            return 0.0
         ends = rows[-1, _TIME] - scale.interval * np.arange(scale.count, -1, -1)
         marks = rows[np.minimum(rows[:, _TIME].searchsorted(ends), len(rows) - 1)]
         offsets = marks[:, _SEEN] - marks[:, _PREDICTED]
         along = np.diff(offsets, axis=0) @ drift / max(size, 1e-9)
         explained = self._explained(np.diff(marks, axis=0), jacobian)
-        if stiff is not None and self._lies_still(whole):
-            explained = np.zeros(scale.count)
-        lasts = bool((along - explained >= least).all())
-        return marks[-1] - marks[0], size / duration if lasts else 0.0
-
-    def _lies_still(self, way: Array) -> bool:
-        """Return whether the tip lay still on a way (21 + n,): a wrong model would move it."""
-        seen, predicted = (math.hypot(*way[part].tolist()) for part in (_SEEN, _PREDICTED))
-        return seen < self._tuning.still * predicted
+        if (along - explained < least).any() or self._is_push(marks[-1] - marks[0], turning):
+            return 0.0
+        return size / duration
 
     def _is_push(self, change: Array, turning: TipAt | None) -> bool:
         """Return whether a growing push explains the change: it turns the tip too.

@@ -124,10 +124,8 @@ class ReferenceTuning:
     slew_share: float = 0.9
     # motion over which the model on the reference is not linearised again; see `LinearisedTip`
     model_range: float = 0.07
-    # time by which a doubted motion is taken back, in s; and what feedback adds to it, for an arm
-    # that does not vibrate: as long as a doubt may take to arise
+    # time by which a doubted motion of an arm that vibrates is taken back, in s
     taken_back: float = 0.3
-    correction_undone: float = 1.0
     # distance from the plan at which it has arrived, in Pa, and rate below which it rests, in Pa/s
     there: float = 5e3
     at_rest: float = 5e4
@@ -398,9 +396,6 @@ class MotionTuning:
         DriftScale(1.0, 5, 6e-4),
         DriftScale(2.5, 4, 3.5e-4),
     )
-    # the same along the tip's stiff axis, and a force that may act there, in N
-    along_stiff_axis: DriftScale = DriftScale(0.4, 4, 4e-4)
-    axial_force: float = 0.5
     turn: float = 1e-3  # motion back after which a swing has turned, in m
     swings: int = 4  # successive swings between turning points
     least_swing: float = 4.5e-3  # smallest size of a swing, in m

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 
 import numpy as np
@@ -93,12 +94,15 @@ def _patient(supply: SupplySettings, command_timeout: float) -> Iterator[MisfitE
 
     The guard can do nothing while the driver waits, but a watchdog in the device vents meanwhile.
     """
-    timeout, watchdog = getattr(supply, "timeout", 0.0), _watchdog(supply)[0]
-    if timeout > command_timeout and (watchdog is None or watchdog > command_timeout):
+    timeout, watchdog = getattr(supply, "timeout", None) or 0.0, _watchdog(supply)[0]
+    vents = min(supply.vents_within, math.inf if watchdog is None else watchdog)
+    if timeout > command_timeout and vents > command_timeout:
+        by_default = "" if "timeout" in supply.model_fields_set else ", its default,"
         yield MisfitError(
-            f"{1e3 * timeout:g} ms is longer than safety.command_timeout, "
+            f"{1e3 * timeout:g} ms{by_default} is longer than safety.command_timeout, "
             f"{1e3 * command_timeout:g} ms: an arm whose device does not answer would keep its "
-            "pressures until then; shorten it, or give the device a watchdog",
+            "pressures until then; shorten it, or give the device a watchdog that vents within "
+            "safety.command_timeout",
             *("supply", "timeout"),
         )
 

@@ -590,7 +590,9 @@ def _in_python(code: str, message: str) -> str:
     if code == "no-token":
         give = f"give 'token' to the Client or set {_TOKEN}, to the token or its file"
         return f"this needs the daemon's token: {give}"
-    return "this needs control: call 'take_control'" if LEASE_HEADER in message else message
+    return (
+        "this needs control: take it first ('take_control')" if LEASE_HEADER in message else message
+    )
 
 
 def _refusal_in(answer: Any) -> tuple[str, str]:

@@ -254,9 +254,9 @@ def _with_levels(setup: Setup, logs: Sequence[Comparison]) -> list[Comparison]:
     ])  # fmt: skip
     p, u, rates = (np.concatenate([getattr(each, name) for each in logs])[rows]
                    for name in ("pressures", "effective", "rates"))  # fmt: skip
-    moving = np.concatenate([each.moving for each in logs])
-    time = in_turn([each.time for each in logs])
-    held, moving, time = held_for(time, moving)[rows], moving[rows], time[rows]
+    moving = np.concatenate([each.moving for each in logs])[rows]
+    time = in_turn([each.time for each in logs])[rows]
+    held = np.concatenate([held_for(each.time, each.moving) for each in logs])[rows]
     source = Uncertainty(setup.description)
     known = source.errors(p, effective=u, rates=rates, time=time)
     unknown = source.errors(p, moving=moving, held=held)

@@ -432,8 +432,9 @@ def _rubbed(rubbing: Rubbing | None) -> str:
     units = display_units()
     return (
         f"when it is reached from rest, friction holds the tip "
-        f"{units.length.text(float(np.linalg.norm(rubbing.tip)), '.2g')} away, and changes contact "
-        f"forces by {units.force.text(float(rubbing.forces.max()), '.2g')}, until that is corrected"
+        f"{units.length.text(float(np.linalg.norm(rubbing.tip)), '.2g')} away, and changes normal "
+        f"forces by {units.force.text(float(np.abs(rubbing.normals).max()), '.2g')}, until that is "
+        "corrected"
     )
 
 

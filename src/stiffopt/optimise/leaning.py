@@ -399,9 +399,10 @@ class BracedProblem(PressureProblem):
         if self.brace.approach == "objects" or not eq.sticking.own:
             return None
         states = list(from_rest(self.robot, self.scene, eq.pressures))
-        if not states[-1].contacts:
-            raise EquilibriumError("in smaller steps the arm comes to lean on nothing")
-        return rubbed(states)
+        found, apart = rubbed(states), states[-1].tip_pose[:3, 3] - eq.tip_pose[:3, 3]
+        if float(np.linalg.norm(apart)) > BRACE.same:
+            raise EquilibriumError("in smaller steps the arm comes to another equilibrium")
+        return found
 
     def judgement(self, eq: ContactEquilibrium, rubbing: Rubbing | None = None) -> Judgement:
         """Judge an equilibrium by the task, with what friction does on the way to it."""
@@ -424,6 +425,13 @@ class BracedProblem(PressureProblem):
                 yield (
                     f"the arm leans on '{each.object}' with {unit.text(force)}"
                     f"{more if doubt else ''}; at most {unit.text(each.max_force)} is allowed"
+                )
+            rub = 0.0 if rubbing is None else float(np.maximum(rubbing.normals[own], 0.0).sum())
+            if force + rub > each.max_force * (1 + BRACE.rubbed):
+                yield (
+                    f"friction on the way presses the arm on '{each.object}' with "
+                    f"{unit.text(rub)} more than {unit.text(force)}; at most "
+                    f"{unit.text(each.max_force)} is allowed"
                 )
         if not eq.stable:
             yield "the equilibrium is not stable"
@@ -478,7 +486,9 @@ class BracedProblem(PressureProblem):
         rows = [i for i, each in enumerate(position) if each is not None]
         R, held = eq.tip_pose[:3, :3], rubbing.sticking
         jacobian = R @ eq.tip_jacobian[:3] + held.bent()[0][:3] @ held.per_pressure
-        left = self._corrected(eq.pressures, rubbing.tip[rows], jacobian[rows])
+        aim = np.array([0.0 if each is None else each for each in position])
+        off = eq.tip_pose[:3, 3] + rubbing.tip - aim
+        left = self._corrected(eq.pressures, off[rows], jacobian[rows])
         if left > max(self.task.target.tolerance.position, BRACE.missed):
             length, most = display_units().length, display_units().pressure.text(BRACE.corrected)
             away = length.text(float(np.linalg.norm(rubbing.tip)), ".2g")

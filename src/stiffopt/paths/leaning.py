@@ -35,7 +35,6 @@ SPEED = 0.02  # m/s, largest, of any part of the body
 FORCE_RATE = 0.1  # N/s, largest change of a contact's force
 GRADUAL = 1.0  # s, in which the way gets its speed or loses it
 _STATIONS = 41  # of the body
-_SAME = 2e-4  # m; tips that are nearer belong to the same equilibrium
 _AS_STIFF = 0.05  # largest difference of stiffnesses in the same equilibrium
 _PUSH = 2e-3  # N, step of finite differences by a push at the tip
 _FORGIVEN = 1e-4  # m, tolerated lack of clearance from other objects
@@ -129,7 +128,7 @@ def way_into_contact(robot: Manipulator, solution: PressureSolution) -> list[Con
     end = states[-1]
     names, wanted = ({each.object for each in found.contacts} for found in (end, solution))
     apart = float(np.linalg.norm(end.tip_pose[:3, 3] - solution.tip_pose[:3, 3]))
-    if apart > _SAME or (wanted and names != wanted):
+    if apart > BRACE.same or (wanted and names != wanted):
         raise Unsolved(
             "all pressures growing together lead to another equilibrium: the tip is "
             f"{1e3 * apart:.2g} mm away, leaning on {quoted(sorted(names)) or 'nothing'}"

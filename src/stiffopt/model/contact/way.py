@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.errors import EquilibriumError
 from stiffopt.model.contact.sticking import Sticking
 from stiffopt.model.scene import Scene
 
@@ -35,13 +36,13 @@ class Rubbing(NamedTuple):
     sticking : how the contacts hold at the end.
     tangential : their forces (2k,), components along `Sticking.across`, in N.
     tip : by which these move the tip (3,), base axes, in m.
-    forces : by how much the force of each contact (contacts,) may be larger or smaller, in N.
+    normals : by which these change the normal forces of all contacts (contacts,), in N.
     """
 
     sticking: Sticking
     tangential: Vector
     tip: Vector
-    forces: Vector
+    normals: Vector
 
 
 def from_rest(arm: Manipulator, scene: Scene, p: Vector) -> Iterator[ContactEquilibrium]:
@@ -62,12 +63,18 @@ def rubbed(states: Iterable[ContactEquilibrium]) -> Rubbing:
     """Return what friction does on a way, at its end.
 
     A force belongs to the nearest contact with the same object at the next equilibrium.
+
+    Raises
+    ------
+    EquilibriumError
+        The arm touches nothing at the end.
     """
     carried: list[tuple[str, float, Vector]] = []  # object, arc length, and tangential force (3,)
     before: Vector | None = None
+    found: Rubbing | None = None
     for eq in states:
         if not eq.contacts:
-            carried, before = [], eq.pressures
+            carried, before, found = [], eq.pressures, None
             continue
         held = eq.sticking.softened(TANGENTIAL)
         own = [eq.contacts[j] for j in held.own]
@@ -85,7 +92,7 @@ def rubbed(states: Iterable[ContactEquilibrium]) -> Rubbing:
         parts = np.einsum("ki,kij->kj", forces.reshape(-1, 2), held.across)
         carried = [(each.object, each.at, part) for each, part in zip(own, parts, strict=True)]
         before = eq.pressures
-    more = np.abs(normals @ forces)
-    most = normal + more
-    most[list(held.own)] = np.hypot(most[list(held.own)], np.linalg.norm(parts, axis=1))
-    return Rubbing(held, forces, tip[:3] @ forces, np.maximum(most - normal, more))
+        found = Rubbing(held, forces, tip[:3] @ forces, normals @ forces)
+    if found is None:
+        raise EquilibriumError("in smaller steps the arm comes to lean on nothing")
+    return found

@@ -74,6 +74,7 @@ class OpenRegulatorSettings(SupplySettings):
 
     extra: ClassVar[str] = EXTRA
     peer: ClassVar[str] = "stiffopt.lab.open_regulator_peer:OpenRegulatorPeer"
+    vents_within: ClassVar[float] = 0.1
 
     driver: Literal["open-regulator"] = "open-regulator"
     port: Annotated[str, Field(min_length=1)]
@@ -96,8 +97,8 @@ class OpenRegulatorSettings(SupplySettings):
         """Refuse a rate at which the board would vent between two commands."""
         if rig.rate < _SLOWEST:
             raise MisfitError(
-                f"an open regulator vents after 100 ms without a command; expected at least "
-                f"{_SLOWEST:g} Hz",
+                f"an open regulator vents after {1e3 * self.vents_within:g} ms without a command; "
+                f"expected at least {_SLOWEST:g} Hz",
                 "rate",
             )
 
