@@ -220,9 +220,14 @@ def with_true_values(robot: RobotDescription, m: Mismatch) -> RobotDescription:
             ),
         }
         segments.append(segment.model_copy(update=update))
-    tracker = Placement.of(m.base.inverse() @ m.registration.transform())
-    recordings = Recordings(registration=Registration(tracker_in_base=tracker))
-    return robot.model_copy(update={"segments": tuple(segments), "recordings": recordings})
+    nominal_in_base = m.base.inverse()
+    tracker = Placement.of(nominal_in_base @ m.registration.transform())
+    update = {
+        "segments": tuple(segments),
+        "recordings": Recordings(registration=Registration(tracker_in_base=tracker)),
+        "gravity": tuple((nominal_in_base[:3, :3] @ robot.gravity).tolist()),
+    }
+    return robot.model_copy(update=update)
 
 
 # -- measures ----------------------------------------------------------------------------------

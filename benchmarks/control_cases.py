@@ -444,8 +444,7 @@ class TrueModel:
 
     def __init__(self, robot: RobotDescription, mismatch: Mismatch, payload: float = 0.0) -> None:
         self.base: Array = mismatch.base.transform()
-        gravity = self.base[:3, :3].T @ np.array(robot.gravity)
-        update = {"gravity": tuple(gravity.tolist()), "tip_mass": robot.tip_mass + payload}
+        update = {"tip_mass": robot.tip_mass + payload}
         self.model = load_robot(with_true_values(robot, mismatch).model_copy(update=update))
         # nobody needs the code of this very arm again
         cache = tempfile.TemporaryDirectory()

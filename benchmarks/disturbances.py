@@ -16,7 +16,8 @@ The second is what the loop causes of it: the distance from that way and from th
 fault alone takes the tip, with the commands frozen from its beginning. They differ where a chamber
 bursts or leaks, or something pushes the arm; all that follows from commands after the beginning of
 the fault counts, also before the fault is visible. A push or a payload must not be detected as a
-fault. Below each row on the way, both distances of each run, and what was told. With
+fault. Below each row on the way, both distances of each run, and what was told. With `--recorded`,
+first motions are fast, as after a commissioning (before the faults of the set-up began). With
 `--commission`, `stiffopt commission --quick` looks for the faults of the set-up instead: its first
 finding, whether it permits arming, and how far the tip moved from rest.
 """
@@ -404,8 +405,14 @@ class Outcome:
     words: str = ""
 
 
-def run_row(case: Case, row: Row, dynamics: str, *, frozen: bool = False) -> Outcome:
-    """Run one row on one arm; `frozen`: without the loop from the beginning of the fault."""
+def run_row(
+    case: Case, row: Row, dynamics: str, *, recorded: bool = False, frozen: bool = False
+) -> Outcome:
+    """Run one row on one arm.
+
+    `recorded`: the controller knows of a record of commissioning; `frozen`: without the loop from
+    the beginning of the fault.
+    """
     plant = case.description.plant.model_copy(update={"faults": True})
     tracker = case.description.tracker.model_copy(update={"noise": row.noise})
     description = case.description.model_copy(update={"plant": plant, "tracker": tracker})
@@ -415,7 +422,7 @@ def run_row(case: Case, row: Row, dynamics: str, *, frozen: bool = False) -> Out
     controller = TipController(
         load_robot(case.believed), rig.supply.limits, rig.slew, period=PERIOD,
         control=rig.settings.control, safety=rig.settings.safety, vibrates=dynamics == "full",
-        commissioned=False,
+        commissioned=recorded,
     )  # fmt: skip
     run = LoopRun(rig, controller, case.point)
     try:
@@ -515,23 +522,23 @@ def _commissioned(cases: list[Case], rows: list[Row]) -> list[list[str]]:
     return lines
 
 
-def _looped(cases: list[Case], rows: list[Row], dynamics: str) -> list[list[str]]:
+def _looped(cases: list[Case], rows: list[Row], dynamics: str, recorded: bool) -> list[list[str]]:
     """Lines of the table of the control loop."""
     lines = []
-    usual = [run_row(case, ROWS[-1], dynamics).tips for case in cases]
+    usual = [run_row(case, ROWS[-1], dynamics, recorded=recorded).tips for case in cases]
     for row in rows:
-        found = [run_row(case, row, dynamics) for case in cases]
+        found = [run_row(case, row, dynamics, recorded=recorded) for case in cases]
         ways = usual
         if row.usual is not None:
             alone = replace(ROWS[-1], begin=row.usual)
-            ways = [run_row(case, alone, dynamics).tips for case in cases]
+            ways = [run_row(case, alone, dynamics, recorded=recorded).tips for case in cases]
         noticed = [outcome for outcome in found if outcome.kind]
         kinds = Counter(outcome.kind for outcome in noticed)
         ends = Counter(outcome.end for outcome in found)
         off = [
             (
                 _farthest(outcome.tips, way),
-                _farthest(outcome.tips, _with_fault(case, row, dynamics, way)),
+                _farthest(outcome.tips, _with_fault(case, row, dynamics, way, recorded)),
             )
             for case, way, outcome in zip(cases, ways, found, strict=True)
             if len(outcome.tips)
@@ -552,11 +559,12 @@ def _looped(cases: list[Case], rows: list[Row], dynamics: str) -> list[list[str]
     return lines
 
 
-def _with_fault(case: Case, row: Row, dynamics: str, way: Array) -> Array:
+def _with_fault(case: Case, row: Row, dynamics: str, way: Array, recorded: bool) -> Array:
     """Return a way (T, 3) and the places to which a fault alone brings the tip."""
     if row.at_once:  # nothing is commanded yet
         return way
-    return np.concatenate([way, run_row(case, row, dynamics, frozen=True).tips])
+    alone = run_row(case, row, dynamics, recorded=recorded, frozen=True)
+    return np.concatenate([way, alone.tips])
 
 
 def _farthest(tips: Array, way: Array) -> float:
@@ -572,6 +580,7 @@ def main() -> None:
     parser.add_argument("--dynamics", choices=DYNAMICS, nargs="+", default=list(DYNAMICS))
     parser.add_argument("--rows", nargs="+", help="only rows whose name has one of these words")
     parser.add_argument("--commission", action="store_true", help="look for faults of the set-up")
+    parser.add_argument("--recorded", action="store_true", help="with a record of commissioning")
     parser.add_argument("--tip-speed", type=float, help="`control.tip_speed` of the rig, in m/s")
     arguments = parser.parse_args()
     seeds = range(arguments.seed, arguments.seed + arguments.cases)
@@ -585,7 +594,7 @@ def main() -> None:
         return
     head = ["what", "noticed", "as", "told, s", "off its way, mm", "by the loop, mm", "ends"]
     for dynamics in arguments.dynamics:
-        lines = _looped(cases, rows, dynamics)
+        lines = _looped(cases, rows, dynamics, arguments.recorded)
         print(f"\n### plant: {dynamics}\n", *table(head, lines), sep="\n")
 
 

@@ -44,3 +44,19 @@ def braced_solution() -> PressureSolution:
 def brace_approach() -> BraceApproach:
     """The way into contact with it."""
     return approach_to(ROBOT, braced_solution())
+
+
+@pytest.fixture(scope="module", autouse=True, name="with_few_starts")
+def few_starts_fixture() -> Iterator[None]:
+    with few_starts():
+        yield
+
+
+@pytest.fixture(name="solution")
+def solution_fixture() -> PressureSolution:
+    return braced_solution()
+
+
+@pytest.fixture(name="approach")
+def approach_fixture() -> BraceApproach:
+    return brace_approach()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import signal
 import subprocess
 import sys
@@ -13,6 +14,7 @@ from pathlib import Path
 from threading import Thread
 from typing import Any
 
+import numpy as np
 import yaml
 
 RIGS = Path(__file__).resolve().parent.parent / "rig"
@@ -160,3 +162,21 @@ def _command(pid: int) -> bytes:
         return Path(f"/proc/{pid}/cmdline").read_bytes()
     except OSError:
         return b""
+
+
+@contextmanager
+def virtual_lab(rig: Path, out: Path) -> Iterator[tuple[Process, Callable[[], np.ndarray]]]:
+    """The virtual lab of a rig, and what tells the pressures in the chambers, in bar."""
+    with running("lab", str(rig), "--out", str(out)) as process:
+        wait_for(out.exists, 180)
+
+        def pressures() -> np.ndarray:
+            told = len(process.err)
+            process.say("status")
+            wait_for(lambda: any("pressures" in line for line in process.err[told:]))
+            text = " ".join(" ".join(process.err[told:]).split())
+            found = re.search(r"pressures ([-\d., ]+) bar", text)
+            assert found
+            return np.array([float(p) for p in found[1].split(",")])
+
+        yield process, pressures

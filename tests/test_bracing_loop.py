@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -13,38 +13,28 @@ import pytest
 from matplotlib.text import Text
 
 import stiffopt
-from leaning_arm import PERIOD, ROBOT, TASK, brace_approach, braced_solution, few_starts
+from leaning_arm import (
+    PERIOD,
+    ROBOT,
+    TASK,
+    approach_fixture,  # noqa: F401
+    few_starts_fixture,  # noqa: F401
+    solution_fixture,  # noqa: F401
+)
 from stiffopt.cli.main import main
 from stiffopt.control import planning
+from stiffopt.control.checks import check_scene
 from stiffopt.control.controller import TipController
 from stiffopt.control.state import ControllerStatus
 from stiffopt.errors import FileError, InputError
-from stiffopt.optimise.solution import PressureSolution
 from stiffopt.optimise.solver import PressureSolver
-from stiffopt.paths.leaning import GRADUAL, BraceApproach, gradual
+from stiffopt.paths.leaning import GRADUAL, gradual
 from stiffopt.paths.motion_file import read_motion
 from stiffopt.paths.trajectory import Trajectory, Waypoint
 from stiffopt.plant.settings import PlantLoad, PlantSettings, Silicone
 from stiffopt.plots import plot_motion
 from stiffopt.rig.assembly import make_rig
 from stiffopt.rig.config import RigDescription, limits_of, slew_of
-
-
-@pytest.fixture(scope="module", autouse=True)
-def with_few_starts() -> Iterator[None]:
-    with few_starts():
-        yield
-
-
-@pytest.fixture
-def solution() -> PressureSolution:
-    return braced_solution()
-
-
-@pytest.fixture
-def approach() -> BraceApproach:
-    return brace_approach()
-
 
 # -- the loop ---------------------------------------------------------------------------------
 
@@ -309,6 +299,17 @@ def test_a_task_may_not_ask_for_more_than_the_scene_of_the_rig(task, reason):
     loop.controller.close()
 
 
+def test_an_object_of_a_task_is_found_by_its_shape_whatever_its_name():
+    renamed = POST.model_copy(update={"name": "rod"})
+    check_scene(own(objects=(renamed,)), SCENE)
+    contact = POST.contact.model_copy(update={"max_force": 0.1})
+    with pytest.raises(InputError, match="'rod' may be pressed with more than 'max_force'"):
+        check_scene(own(objects=(renamed.model_copy(update={"contact": contact}),)), SCENE)
+    ends = stiffopt.SceneObject(name="post", cylinder=POST.capsule.model_dump(by_alias=True))
+    with pytest.raises(InputError, match="'post' has another place or shape"):
+        check_scene(own(objects=(ends,)), SCENE)
+
+
 def test_a_task_may_ask_for_less_than_the_scene_of_the_rig():
     loop = Loop(scene=SCENE.model_copy(update={"objects": (POST, EYE), "clearance": 2e-3}))
     shifted = float(np.nextafter(POST.capsule.radius, 1.0))  # rounded otherwise
@@ -356,7 +357,7 @@ def test_the_picture_of_a_motion_shows_the_arm_in_contact(solution):
     free = 1e-3 * np.array(ends) - ROBOT.tip_pose(found.pressures[-1])[:3, 3]
     assert np.linalg.norm(free, axis=1).min() > 2e-3
     (contact,) = found.equilibria[-1].contacts
-    assert f"{np.linalg.norm(contact.force):.3g} N" in [
+    assert f"{np.linalg.norm(contact.force):.3g} N by 'post'" in [
         text.get_text() for text in figure.findobj(Text)
     ]
 

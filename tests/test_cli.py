@@ -16,16 +16,8 @@ from typing import Any
 import pytest
 
 import stiffopt
-from cli_tasks import (
-    FAR,
-    ONE,
-    TWO,
-    Write,
-    lines,
-    process,
-    run,
-    write_fixture,  # noqa: F401
-)
+from cli_tasks import FAR, ONE, TWO, Write, lines, process, run
+from cli_tasks import write_fixture as write_fixture
 from stiffopt.cli.console import plain_data
 from stiffopt.cli.solve_records import json_record
 from stiffopt.cli.solved_task import SolvedTask

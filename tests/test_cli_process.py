@@ -13,16 +13,8 @@ from typing import Any
 import pytest
 
 import stiffopt
-from cli_tasks import (
-    FAR,
-    ONE,
-    TWO,
-    Write,
-    lines,
-    process,
-    run,
-    write_fixture,  # noqa: F401
-)
+from cli_tasks import FAR, ONE, TWO, Write, lines, process, run
+from cli_tasks import write_fixture as write_fixture
 from stiffopt.cli import batch, exits, solve_run
 from stiffopt.cli import main as entry
 from stiffopt.documents import read_document

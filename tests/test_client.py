@@ -122,8 +122,17 @@ def test_a_task_file_of_this_machine_may_be_given(
 
 
 def test_what_the_daemon_refuses_is_raised(loop: FakeLoop, client: Client, server: Server) -> None:
-    with pytest.raises(CommandError, match="needs control"):
+    with pytest.raises(CommandError, match="needs control: take it first"):
         client.arm()
+    with client.stream(rate=0) as stream:
+        stream.send(position=[0, 0, 0.2])
+        with pytest.raises(CommandError, match="needs control: take it first"):
+            drain(stream)
+    with (
+        Client(server.url) as reader,
+        pytest.raises(CommandError, match=r"daemon's token: give 'token' to .* STIFFOPT_TOKEN"),
+    ):
+        reader.take_control()
     client.take_control()
     client.take_control()  # it has it already
     with Client(server.url, TOKEN) as other, pytest.raises(CommandError, match="'planner' has"):

@@ -23,6 +23,7 @@ from conftest import is_long
 from control_baselines import CONTROLLERS, Gains, IntegralFeedback
 from control_cases import DIRECTIONS, STEPS, draw_case, draw_path, settling_time, with_true_file
 from stiffopt.model.description import Recordings
+from stiffopt.model.manipulator import load_robot
 from stiffopt.plant.plant import Plant
 from stiffopt.plant.settings import Discretisation
 from stiffopt.registration import Placement, Registration
@@ -207,6 +208,25 @@ def test_a_file_with_the_true_values_has_no_error_and_predicts_what_the_probe_me
         (error,) = found.values[f"stiffness {axis}"]["calibrated"]
         assert abs(error) < 4  # %
     assert "| settled tip, % of length, mean / p95 |" in calibration.markdown("sim", found)
+
+
+def test_a_file_with_the_true_values_hangs_as_the_arm_does_from_its_tilted_base():
+    description, _ = calibration.described(calibration.Case("sim-two-segment", agrees=True), 3)
+    hanging = load_robot("stiff-flop-2-hanging").description
+    segments = [s.model_copy(update={"strain_law": "rest-length"}) for s in hanging.segments]
+    robot = hanging.model_copy(update={"segments": tuple(segments)})
+    plant = Plant(robot, description.plant)
+    same = calibration.with_true_values(robot, plant.mismatch)
+    files = {
+        "true": calibration.Known.of(same),
+        "not tilted": calibration.Known.of(same.model_copy(update={"gravity": robot.gravity})),
+    }
+    found = calibration.Found()
+    pressures = np.random.default_rng(1).uniform(0, 0.5, (3, 6)) * robot.pressure_max
+    calibration.held_out(plant, files, pressures, found)
+    errors = found.values["settled"]  # % of length
+    assert np.max(errors["true"]) < 0.01
+    assert np.min(errors["not tilted"]) > 1
 
 
 @pytest.mark.long

@@ -407,6 +407,23 @@ def test_a_doubted_motion_stops_without_a_swing():
     assert swings[0] < 0.5 * swings[1]
 
 
+def test_touch_and_creep_get_tip_and_pressures_of_the_same_time():
+    bench = moving(rested=2.0, moved=0.1, dynamics="quasi-static")
+    arm, ways, errors = bench.controller._arm, [], []
+    take = arm.touch.take
+
+    def taken(time, away, pressures, *others):
+        predicted = arm.tip.sample.position - away
+        ways.append(predicted)
+        errors.append(np.linalg.norm(arm.at_waypoint(pressures).pose[:3, 3] - predicted))
+        take(time, away, pressures, *others)
+
+    arm.touch.take = taken
+    bench.run(0.4)
+    assert np.linalg.norm(np.diff(ways, axis=0), axis=1).max() > 1.5e-3
+    assert max(errors) < 2e-4
+
+
 def test_the_motion_watch_compares_tip_and_pressures_of_the_same_time():
     """In a fast motion, the pressures when a sample arrives are 30 ms ahead: 1 mm and more."""
     bench = moving(rested=2.0, moved=0.5, dynamics="quasi-static")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from stiffopt.errors import FileError, InputError
 from stiffopt.identify.error_model import (
     covariance_with,
     error_model,
+    held_for,
     in_turn,
     is_moving,
     kept_unknowns,
@@ -31,7 +33,13 @@ from stiffopt.model.calibration import Calibration, ErrorModel, FittedParameter,
 from stiffopt.model.history import History, Play
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.robot_files import load_description, save_robot
-from stiffopt.model.uncertainty import ReadingSlopes, Uncertainty, levels, squared_radius
+from stiffopt.model.uncertainty import (
+    PositionErrors,
+    ReadingSlopes,
+    Uncertainty,
+    levels,
+    squared_radius,
+)
 
 Array = NDArray[np.float64]
 
@@ -343,6 +351,27 @@ def test_a_first_reading_tells_the_history_only_if_the_model_is_certain(
     assert (rise > 9e3) if believed else (abs(rise) < 5e3)
 
 
+def test_validation_knows_for_how_long_poses_were_held(monkeypatch: pytest.MonkeyPatch) -> None:
+    """From all rows, though the regions of only few of them are compared."""
+    robot = ONE.model_copy(update={"calibration": Calibration(errors=ROUGH)})
+    time = np.arange(0.0, 20.0, 0.2)
+    pressures = np.tile([8e4, 0.0, 0.0], (len(time), 1))
+    pressures[time > 5.9, 1] = 1e4
+    log = Log(time, pressures, Manipulator(ONE).tip_pose(pressures)[:, :3, 3])
+    seen, errors = {}, Uncertainty.errors
+
+    def noted(self: Uncertainty, *arguments: Any, **given: Any) -> PositionErrors:
+        seen.update(given)
+        return errors(self, *arguments, **given)
+
+    monkeypatch.setattr(Uncertainty, "errors", noted)
+    monkeypatch.setattr("stiffopt.identify.validation.ERRORS", replace(ERRORS, compared=12))
+    validate(robot, [("log", log)])
+    rows = np.linspace(0, len(time) - 1, 12).astype(int)
+    expected = np.where(time[rows] > 7, time[rows] - 6.0, np.nan)
+    np.testing.assert_allclose(seen["held"], expected, atol=0.21)
+
+
 # -- the fit ----------------------------------------------------------------------------------
 
 
@@ -419,6 +448,14 @@ def test_a_motion_counts_as_one_of_all_channels(together: bool) -> None:
     assert np.abs(late).max() > 1e3
     share = 1.0 if together else 5 / 3  # of three channels, of one
     assert known.moving == pytest.approx(np.sqrt(np.mean(late**2, axis=0) * share), rel=1e-3)
+
+
+def test_for_how_long_pressures_were_held() -> None:
+    time = np.array([0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.5, 6.0])
+    moving = np.array([False, False, True, True, False, False, False, True])
+    unknown = np.nan
+    expected = [unknown, unknown, unknown, unknown, 1.5, 2.0, 3.0, unknown]  # moving for 1 s more
+    np.testing.assert_array_equal(held_for(time, moving), expected)
 
 
 def test_a_robot_file_keeps_its_error_model(tmp_path: object) -> None:

@@ -40,8 +40,9 @@ def friction_at(*names: str, friction: float = MU) -> Friction:
         for each in step * np.eye(3)
     ]
     hold = Hold(
-        eq.normal_forces, np.zeros(len(names)), eq.force_gradients, np.array(forces).T, eq.sticking
-    )
+        eq.normal_forces, np.zeros(len(names)), eq.force_gradients, np.array(forces).T,
+        eq.sticking, np.zeros(len(eq.sticking.per_pressure)),
+    )  # fmt: skip
     return Friction(hold, PRESSURES)
 
 
@@ -74,7 +75,8 @@ def test_contacts_at_almost_the_same_station_stay_within_their_cones():
     assert np.linalg.eigvalsh(sticking.per_slide) == pytest.approx(
         [*stiffness[1:] / (1 + 1e-4 * stiffness[1:]), 1e4], rel=0.05
     )
-    hold = Hold(eq.normal_forces, np.zeros(2), eq.force_gradients, np.zeros((2, 3)), sticking)
+    slopes = eq.force_gradients, np.zeros((2, 3))
+    hold = Hold(eq.normal_forces, np.zeros(2), *slopes, sticking, np.zeros(4))
     friction = Friction(hold, pressures)
     for share in np.linspace(0.0, 1.0, 60):
         friction.follow(share * pressures, 0.2, 1e-4)
@@ -117,7 +119,7 @@ def test_contacts_slide_to_the_least_energy():
     normals = np.array([0.05, 0.02])
     friction._sticking = held._replace(normals=0 * held.normals)  # normal forces stay
     trial = np.array([0.04, -0.03, 0.01, 0.02])
-    slides = friction._slides(trial, normals)
+    slides = friction._sticking.slid_back(trial, normals)
 
     def energy(s: np.ndarray) -> float:
         bent = 0.5 * s @ held.per_slide @ s + trial @ s

@@ -69,13 +69,14 @@ def test_a_rig_that_could_never_be_armed_is_a_mistake() -> None:
         "rig.yaml:4: supply: this supply has neither a watchdog nor a dump valve",
         "rig.yaml:10: safety.guard_timeout: 100 ms is not longer than the 100 ms between two comm",
         "rig.yaml:10: safety.command_timeout: 50 ms is not longer",
+        "rig.yaml: supply.timeout: 200 ms, its default, is longer than safety.command_timeou",
         "rig.yaml:10: safety.tracker_timeout: 90 ms is shorter than the 100 ms between two frames",
     ]
     lines = found.stdout.splitlines()
     assert len(lines) == len(expected)
     assert all(line.startswith(text) for line, text in zip(lines, expected, strict=True)), lines
     mended = UNARMED.replace("10 Hz", "40 Hz").replace("safety: {", "safety: {max_slew: 1 bar/s, ")
-    mended = mended.replace("scale:", "dump_valve: {coil: 0}\n  scale:")
+    mended = mended.replace("scale:", "dump_valve: {coil: 0}\n  scale:").replace("50 ms", "0.2 s")
     Path("rig.yaml").write_text(mended, encoding="utf-8")
     assert run("check", "--quiet", "rig.yaml").stdout == ""
     for_scripts = re.sub("tracker: .*\n", "", mended)
@@ -104,19 +105,95 @@ TCP, SERIAL = "tcp: {host: localhost}", "serial: {port: COM3}"
             "command takes on the serial line: the device would vent every time",
         ),
         (f"{SERIAL}\n  watchdog: {{address: 9, timeout: 40 ms}}", ""),
+        # three requests: 24 and 6, 20 and 6, 20 and 2; and 23 for the trigger
+        (
+            f"{SERIAL[:-1]}, baudrate: 9600}}\n  watchdog: {{address: 9, timeout: 110 ms, "
+            "trigger: 10}",
+            "rig.yaml:7: supply.watchdog.timeout: 110 ms is not longer than the 116 ms that a "
+            "command takes on the serial line: the device would vent every time",
+        ),
     ],
 )
 def test_a_device_that_would_vent_between_two_commands_is_a_mistake(supply: str, said: str) -> None:
     text = UNARMED.replace("10 Hz", "40 Hz").replace("arm.yaml", "stiff-flop-1")
     text = re.sub("safety: .*", "safety: {max_slew: 1 bar/s}", text).replace(TCP, supply)
+    if "trigger" in supply:
+        text = text.replace("{setpoint: 3}", "{setpoint: 3, reading: 0}")
     Path("rig.yaml").write_text(text, encoding="utf-8")
     assert run("check", "--quiet", "rig.yaml").stdout.rstrip() == said
+
+
+def test_a_rig_whose_arm_is_inside_an_object_at_rest_is_a_mistake() -> None:
+    text = (ROOT / "rig/brace.yaml").read_text(encoding="utf-8")
+    for place, said in [
+        ("-20.1 mm", ""),
+        (
+            "-17 mm",  # the arm's radius is 15 mm, the post's 5 mm
+            "rig.yaml:13: scene.objects[0]: without pressures the arm is 3 mm inside 'post', and "
+            "the loop would hold it there; correct the place or the size of the object",
+        ),
+    ]:
+        Path("rig.yaml").write_text(text.replace("-35 mm", place), encoding="utf-8")
+        assert run("check", "--quiet", "rig.yaml").stdout.rstrip() == said
+
+
+def test_the_weight_may_hold_an_arm_clear_of_an_object() -> None:
+    ball = "  - {name: ball, sphere: {centre: [0 mm, 0 mm, 120 mm], radius: 5 mm}}\n"
+    Path("scene.yaml").write_text(f"format: stiffopt-scene/1\nobjects:\n{ball}", encoding="utf-8")
+    robot = (ROOT / "src/stiffopt/robots/stiff-flop-2.yaml").read_text(encoding="utf-8")
+    rig = "format: stiffopt-rig/1\nrobot: arm.yaml\nscene: scene.yaml\nsupply: {driver: simulated}"
+    Path("rig.yaml").write_text(f"{rig}\nsafety: {{max_slew: 5 bar/s}}\n", encoding="utf-8")
+    Path("arm.yaml").write_text(robot, encoding="utf-8")
+    said = run("check", "--quiet", "rig.yaml").stdout
+    assert said.startswith("rig.yaml:3: scene: without pressures the arm is 20 mm inside 'ball'")
+    sideways = "gravity: [20 m/s^2, 0 m/s^2, 0 m/s^2]\ntip_mass: 20 g\n"
+    Path("arm.yaml").write_text(robot + sideways, encoding="utf-8")
+    assert run("check", "--quiet", "rig.yaml").stdout == ""
 
 
 def test_a_watchdog_of_an_nidaq_device_is_compared_too() -> None:
     text = (ROOT / "rig/nidaq-aurora.yaml").read_text(encoding="utf-8")
     Path("rig.yaml").write_text(re.sub("watchdog: .* ms", "watchdog: 10 ms", text))
     assert "supply.watchdog: 10 ms is not longer" in run("check", "rig.yaml").stdout
+
+
+def test_a_device_that_keeps_its_pressures_for_longer_than_a_command_lasts_is_a_mistake() -> None:
+    """The guard can do nothing while a driver waits; a watchdog in the device can."""
+    text = (ROOT / "rig/nidaq-aurora.yaml").read_text(encoding="utf-8")
+    assert "timeout: 200 ms" in text
+    late = text.replace("timeout: 200 ms", "timeout: 600 ms")
+    Path("rig.yaml").write_text(late)
+    assert run("check", "--quiet", "rig.yaml").stdout == ""
+    Path("rig.yaml").write_text(re.sub("  watchdog: .* ms.*\n", "", late))
+    said = "supply.timeout: 600 ms is longer than safety.command_timeout, 500 ms"
+    assert said in run("check", "rig.yaml").stdout
+    Path("rig.yaml").write_text(re.sub("watchdog: .* ms", "watchdog: 0.6 s", late))
+    assert said in run("check", "rig.yaml").stdout
+    unsaid = re.sub("  (timeout|watchdog): .* ms.*\n", "", text)
+    Path("rig.yaml").write_text(unsaid)
+    assert "supply.timeout: 1000 ms, its default, is longer" in run("check", "rig.yaml").stdout
+    board = (ROOT / "rig/open-regulator.yaml").read_text(encoding="utf-8")
+    board = board.replace("driver: open-regulator\n", "driver: open-regulator\n  timeout: 0.6 s\n")
+    Path("rig.yaml").write_text(board)
+    assert "timeout: 0.6 s" in board
+    assert "supply.timeout" not in run("check", "rig.yaml").stdout  # it always vents by itself
+
+
+def test_a_task_beside_a_rig_is_compared_with_its_scene() -> None:
+    """By place and shape: what the object is called in the task does not matter."""
+    rig, task = ROOT / "rig/brace.yaml", ROOT / "problems/braced/post.yaml"
+    assert run("check", "--quiet", str(rig), str(task)).exit_code == 0
+    Path("task.yaml").write_text(task.read_text(encoding="utf-8"), encoding="utf-8")
+    scene = task.with_suffix(".scene.yaml").read_text(encoding="utf-8")
+    Path("post.scene.yaml").write_text(scene.replace("radius: 5", "radius: 6"), encoding="utf-8")
+    assert run("check", "--quiet", "task.yaml").exit_code == 0
+    found = run("check", "--quiet", "task.yaml", str(rig))
+    assert found.exit_code == 2
+    assert "task.yaml" in found.stdout
+    assert "'post' has another place or shape in the rig's scene" in found.stdout
+    other = RIG + "robot: stiff-flop-1\n"
+    Path("rig.yaml").write_text(other, encoding="utf-8")
+    assert run("check", "--quiet", "task.yaml", "rig.yaml").exit_code == 0
 
 
 @pytest.mark.parametrize(("highest", "says"), [("0 bar", True), ("[0 bar, 1 bar, 0 bar]", False)])
@@ -182,6 +259,19 @@ def test_rigs_with_devices(supply: str, tracker: str) -> None:
     data = read_document("my-rig.yaml").data
     assert len(data["supply"]["channels"]) == 6
     assert data.get("tracker", {"driver": "none"})["driver"] == tracker
+
+
+@pytest.mark.parametrize(
+    ("robot", "safety"),
+    [
+        ("stiff-flop-2", {"tracker_timeout": "0.5 s"}),
+        ("ucl-stiff-flop", {"max_slew": "5 bar/s", "tracker_timeout": "0.5 s"}),
+    ],
+)
+def test_a_rig_limits_the_slew_where_its_robot_does_not(robot: str, safety: dict[str, str]) -> None:
+    made = run("init", "rig", "--robot", robot)
+    assert made.exit_code == 0, made.output
+    assert read_document("my-rig.yaml").data["safety"] == safety
 
 
 @pytest.mark.parametrize(

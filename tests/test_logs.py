@@ -127,6 +127,8 @@ def test_columns_may_be_in_any_order(tmp_path: Path) -> None:
         (f"{NAMES.replace('p1_pa', 'p3_pa')}\n", 1, "'p1_pa' is missing; a log"),
         (f"{NAMES.replace('p1_pa', 'p1_bar')}\n", 1, "'p1_pa' is missing (is 'p1_bar' meant"),
         (f"{NAMES.replace('tip_x_m', 'tip_x_mm')}\n", 1, "(is 'tip_x_mm' meant to be that, in m?)"),
+        ("0,1,2,-3e-3,4,5\n1,1,2,3,4,5\n", 1, "starts with a row of numbers; expected a row of"),
+        (f"{NAMES.replace('p2_pa', 'p2_kpa')}\n", 1, "'p2_kpa'; did you mean 'p2_pa'?"),
         ("time_s,p1_pa,x,y,z\n0,1,2,3,4\n", 1, "missing; nothing is known of 'x', 'y', 'z'"),
         (f"{NAMES.replace(',', ';')}\n0;1;2;3,5;4;5\n", 1, "by semicolons; expected commas"),
         (f"{NAMES.replace(',', chr(9))}\n0\t1\t2\t3\t4\t5\n", 1, "separated by tabs"),

@@ -61,6 +61,11 @@ def test_the_report_and_the_picture(scene, capsys, tmp_path, compiled):
     assert picture.stat().st_size > 10_000
 
 
+def test_an_arm_that_touches_nothing(scene, capsys):
+    assert lean(scene, pressures="0, 0, 0, 0, 0, 0 bar") == 0
+    assert "at these pressures the arm touches no object" in capsys.readouterr().out
+
+
 def test_bad_input(scene, capsys):
     assert lean(scene, pressures="0.8, 0, 0 bar") == 2
     assert "expected pressures of shape (6,)" in capsys.readouterr().err

@@ -469,7 +469,9 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
 
 def test_each_goal_has_a_line(capsys: pytest.CaptureFixture[str]) -> None:
     assert planned("--robot", "stiff-flop-2", "--to", A) == 0
-    lines = [line.split() for line in capsys.readouterr().out.splitlines()]
+    said = capsys.readouterr().out
+    assert "not checked: neither --scene nor a task gives a scene" in said
+    lines = [line.split() for line in said.splitlines()]
     assert ["to", *B.split()] in lines
     assert lines.count(A.split()) == 1
 

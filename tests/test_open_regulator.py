@@ -19,7 +19,7 @@ import pytest
 
 from board_host import ARM, READ, SET, Host, command, frame_of, need_firmware
 from fake_bench import FakeBench
-from running import ONE, RIGS, guard_of, patient_rig, running, wait_for
+from running import ONE, RIGS, guard_of, patient_rig, running, virtual_lab, wait_for
 from stiffopt.daemon.client import Client
 from stiffopt.errors import CommandError, DeviceError, FileError, InputError
 from stiffopt.lab.firmware import built_firmware
@@ -533,18 +533,7 @@ def test_the_run_command_drives_simulated_silicone_through_real_firmware(
     )
     task = tmp_path / "task.yaml"
     task.write_text(ONE, encoding="utf-8")
-    with running("lab", str(rig), "--out", str(out)) as lab:
-        wait_for(out.exists, 180)
-
-        def pressures() -> np.ndarray:
-            told = len(lab.err)
-            lab.say("status")
-            wait_for(lambda: any("pressures" in line for line in lab.err[told:]))
-            text = " ".join(" ".join(lab.err[told:]).split())
-            found = re.search(r"pressures ([-\d., ]+) bar", text)
-            assert found
-            return np.array([float(p) for p in found[1].split(",")])
-
+    with virtual_lab(rig, out) as (lab, pressures):
         with running("run", str(out)) as run:
             started = run.line("started")
             with Client(started["url"], started["token_file"]) as client:

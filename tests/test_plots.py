@@ -20,6 +20,7 @@ from stiffopt import plots
 from stiffopt.display import display_units
 from stiffopt.model.obstacles import OBSTACLES
 from stiffopt.optimise.solution import PressureSolution
+from stiffopt.plots.contact import plot_contact
 
 MAXIMISE = {"maximise": {"direction": (1, 0, 0)}}
 
@@ -384,3 +385,16 @@ def test_panels_of_an_empty_path_say_so() -> None:
     for draw in draws:
         with pytest.raises(stiffopt.InputError, match="nothing to draw"):
             draw()
+
+
+def test_a_contact_force_is_labelled_with_its_object():
+    arm = stiffopt.load_robot("stiff-flop-2")
+    rib = stiffopt.SceneObject(
+        name="rib",
+        capsule={"from": (0.02, -0.05, 0.12), "to": (0.02, 0.05, 0.12), "radius": 0.005},
+        contact={"allowed": True},
+    )
+    scene = stiffopt.Scene(objects=[rib])
+    leaning = arm.contact_equilibrium(np.zeros(6), scene, load=[0.02, 0, 0, 0, 0, 0])
+    size = np.linalg.norm(leaning.contacts[0].force)
+    assert f"{size:.3g} N by 'rib'" in texts(plot_contact(arm, leaning, scene))

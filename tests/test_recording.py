@@ -471,8 +471,9 @@ def test_channels_that_are_not_used() -> None:
     assert "nothing is learnt about segment 1 channel 2, as" in remark(recording, "learnt")
     with pytest.raises(InputError, match="no pressure moves by more than 2 %"):
         prepared(replace(log, commanded=0.01 * log.commanded + 5e4))
-    with pytest.raises(InputError, match="no pressure moves"):
-        prepared(replace(log, commanded=0 * log.commanded))
+    for constant in (0.0, 200.0):  # and not in mbar
+        with pytest.raises(InputError, match="no pressure moves"):
+            prepared(replace(log, commanded=0 * log.commanded + constant))
 
 
 def test_pressures_beyond_the_limits() -> None:

@@ -143,6 +143,14 @@ def test_a_supply_that_does_not_take_it_is_given_back(supply: FakeSupply) -> Non
 # the watch ---------------------------------------------------------------------------------------
 
 
+def asked(watching: Callable[..., GuardWatch], supply: FakeSupply) -> tuple[FakeGuard, GuardWatch]:
+    """Return a guard that has been asked whether it lives, and its watch."""
+    guard = FakeGuard()
+    watch = watching(guard, supply)
+    wait_for(lambda: guard.pings)
+    return guard, watch
+
+
 def test_a_guard_that_lives_is_asked_and_left_alone(
     supply: FakeSupply, watching: Callable[..., GuardWatch]
 ) -> None:
@@ -159,9 +167,8 @@ def test_a_guard_that_lives_is_asked_and_left_alone(
 def test_after_a_guard_that_was_killed_the_supply_is_vented(
     supply: FakeSupply, watching: Callable[..., GuardWatch], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(
-        rescue, "CLIENT", replace(CLIENT, ping=1000.0)
-    )  # the kernel says so at once
+    # the kernel says so at once
+    monkeypatch.setattr(rescue, "CLIENT", replace(CLIENT, ping=1000.0))
     guard = ProcessGuard()
     assert guard.pid is not None
     assert guard.process is not None
@@ -182,9 +189,7 @@ def test_it_is_noticed_also_where_the_kernel_does_not_tell(
 ) -> None:
     monkeypatch.delattr(os, "pidfd_open")
     monkeypatch.setattr(rescue, "CLIENT", replace(CLIENT, ping=0.01))
-    guard = FakeGuard()
-    watch = watching(guard, supply)
-    wait_for(lambda: guard.pings)
+    guard, watch = asked(watching, supply)
     guard.alive = False
     assert watch.wait(PATIENCE)
     assert supply.opened == 1
@@ -193,9 +198,7 @@ def test_it_is_noticed_also_where_the_kernel_does_not_tell(
 def test_a_guard_that_hangs_is_ended_and_the_supply_vented(
     supply: FakeSupply, watching: Callable[..., GuardWatch]
 ) -> None:
-    guard = FakeGuard()
-    watch = watching(guard, supply)
-    wait_for(lambda: guard.pings)
+    guard, watch = asked(watching, supply)
     assert not guard.killed
     guard.hung = True
     assert watch.wait(PATIENCE)
@@ -206,9 +209,7 @@ def test_a_guard_that_hangs_is_ended_and_the_supply_vented(
 def test_a_guard_that_ends_as_it_should_is_not_replaced(
     supply: FakeSupply, watching: Callable[..., GuardWatch]
 ) -> None:
-    guard = FakeGuard()
-    watch = watching(guard, supply)
-    wait_for(lambda: guard.pings)
+    guard, watch = asked(watching, supply)
     before = time.monotonic()
     watch.stop(PATIENCE)
     guard.alive = False

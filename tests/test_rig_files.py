@@ -204,6 +204,8 @@ robot: stiff-flop-1
 supply: {driver: simulated}
 tracker: {driver: simulated}
 """
+SUPPLY, TRACKER = "supply: {driver: simulated}\n", "tracker: {driver: simulated}"
+BEFORE = "{driver: simulated}\ntracker"
 MODBUS = """\
 supply:
   driver: modbus
@@ -229,53 +231,33 @@ def written(tmp_path: Path, text: str) -> Path:
             "did you mean 'simulated'",
         ),
         ("supply: {driver: simulated}", "supply: {lag: 1 s}", 4, "'driver' is missing"),
-        ("tracker: {driver: simulated}", "tracker: {driver: modbus}", 5, "no driver 'modbus'"),
+        (TRACKER, "tracker: {driver: modbus}", 5, "no driver 'modbus'"),
         ("stiff-flop-1", "stiff-flop-9", 3, "there is no robot"),
         ("stiff-flop-1", "nowhere/arm.yaml", None, "there is no such file"),
-        ("{driver: simulated}\ntracker", "{driver: simulated, lagg: 1 s}\ntracker", 4, "'lag'"),
-        ("{driver: simulated}\ntracker", "{driver: simulated, lag: 60}\ntracker", 4, "no unit"),
+        (BEFORE, "{driver: simulated, lagg: 1 s}\ntracker", 4, "'lag'"),
+        (BEFORE, "{driver: simulated, lag: 60}\ntracker", 4, "no unit"),
+        (BEFORE, "{driver: simulated, lag: -1 s}\ntracker", 4, "at least 0"),
+        (SUPPLY, MODBUS, 8, "2 channels; the robot"),
+        (TRACKER, "safety: {max_pressure: 2 bar}", 5, "above the robot's"),
+        (TRACKER, "safety: {max_slew: 9 bar/s}", 5, "above the robot's"),
+        (TRACKER, "control: {tip_speed: 0 mm/s}", 5, "greater than 0"),
+        (TRACKER, "control: {tip_speed: 20}", 5, "no unit"),
         (
-            "{driver: simulated}\ntracker",
-            "{driver: simulated, lag: -1 s}\ntracker",
-            4,
-            "at least 0",
-        ),
-        ("supply: {driver: simulated}\n", MODBUS, 8, "2 channels; the robot"),
-        ("tracker: {driver: simulated}", "safety: {max_pressure: 2 bar}", 5, "above the robot's"),
-        ("tracker: {driver: simulated}", "safety: {max_slew: 9 bar/s}", 5, "above the robot's"),
-        ("tracker: {driver: simulated}", "control: {tip_speed: 0 mm/s}", 5, "greater than 0"),
-        ("tracker: {driver: simulated}", "control: {tip_speed: 20}", 5, "no unit"),
-        (
-            "tracker: {driver: simulated}",
+            TRACKER,
             "control: {tip_speed: 700 mm/s}",
             5,
             "700 mm/s is above safety.max_tip_speed, 600 mm/s",
         ),
-        (
-            "tracker: {driver: simulated}",
-            "safety: {max_pressure: [1 bar, 1 bar]}",
-            5,
-            "2 values; expected one, or 3",
-        ),
-        ("tracker: {driver: simulated}", "tracker: {driver: aurora}", 4, "is simulated and the"),
-        ("tracker: {driver: simulated}", "plant: {mismatch: {gain: [1, 1]}}", 5, "2 values"),
-        ("tracker: {driver: simulated}", "plant: {dynamics: slow}", 5, "is not one of"),
+        (TRACKER, "safety: {max_pressure: [1 bar, 1 bar]}", 5, "2 values; expected one, or 3"),
+        (TRACKER, "tracker: {driver: aurora}", 4, "is simulated and the"),
+        (TRACKER, "plant: {mismatch: {gain: [1, 1]}}", 5, "2 values"),
+        (TRACKER, "plant: {dynamics: slow}", 5, "is not one of"),
         ("name: mine", "rate: 0 Hz", 2, "greater than 0"),
-        ("tracker: {driver: simulated}", "safety: {max_pressure: -1 bar}", 5, "below the robot's"),
+        (TRACKER, "safety: {max_pressure: -1 bar}", 5, "below the robot's"),
+        (TRACKER, "tracker: {driver: simulated, rate: 2000 Hz}", 5, "faster than the steps"),
+        (TRACKER, "plant: {discretisation: {sub_intervals: 3}}", 5, "too few for these degrees"),
         (
-            "tracker: {driver: simulated}",
-            "tracker: {driver: simulated, rate: 2000 Hz}",
-            5,
-            "faster than the steps",
-        ),
-        (
-            "tracker: {driver: simulated}",
-            "plant: {discretisation: {sub_intervals: 3}}",
-            5,
-            "too few for these degrees",
-        ),
-        (
-            "supply: {driver: simulated}\n",
+            SUPPLY,
             MODBUS.replace("{setpoint: 1}]", "{setpoint: 1, max: 9 bar}, {setpoint: 2}]"),
             8,
             "9 bar is above the robot's 1.5 bar",
@@ -360,7 +342,7 @@ def test_foxglove_is_served_only_where_a_file_names_a_port(
     assert ServiceSettings(foxglove_port=port).foxglove_port == port
 
 
-@pytest.mark.parametrize("text", ["null", "off", "65536", "-1"])
+@pytest.mark.parametrize("text", ["null", "off", "65536", "-1", "8470"])
 def test_what_is_no_port_for_foxglove_is_refused(tmp_path: Path, text: str) -> None:
     path = tmp_path / "rig.yaml"
     path.write_text(

@@ -8,13 +8,11 @@ killed, at a random moment; the chambers are empty soon after, whatever it is.
 from __future__ import annotations
 
 import os
-import re
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
 from threading import Thread
 
@@ -23,7 +21,7 @@ import pytest
 
 from board_host import need_firmware
 from ros_peer import own_domain
-from running import ONE, Process, guard_of, patient_rig, running, wait_for
+from running import ONE, Process, guard_of, patient_rig, virtual_lab, wait_for
 
 pytestmark = pytest.mark.real_time
 
@@ -54,24 +52,6 @@ class Holder:
         self._thread.join(10)
         assert self.process.stdout is not None
         self.process.stdout.close()
-
-
-@contextmanager
-def lab(rig: Path, out: Path) -> Iterator[Callable[[], np.ndarray]]:
-    """The virtual lab of a rig; gives what tells the pressures in the chambers, in bar."""
-    with running("lab", str(rig), "--out", str(out)) as process:
-        wait_for(out.exists, 180)
-
-        def pressures() -> np.ndarray:
-            told = len(process.err)
-            process.say("status")
-            wait_for(lambda: any("pressures" in line for line in process.err[told:]))
-            text = " ".join(" ".join(process.err[told:]).split())
-            found = re.search(r"pressures ([-\d., ]+) bar", text)
-            assert found
-            return np.array([float(p) for p in found[1].split(",")])
-
-        yield pressures
 
 
 def daemon_of(node: Process) -> int:
@@ -152,7 +132,7 @@ def test_it_holds_a_stiff_pose_and_whatever_is_killed_the_chambers_empty(
     )  # fmt: skip
     task, out = tmp_path / "task.yaml", tmp_path / "lab.yaml"
     task.write_text(ONE, encoding="utf-8")
-    with lab(rig, out) as pressures:
+    with virtual_lab(rig, out) as (_, pressures):
         session = Session(out)
         try:
             for number, victim in enumerate(victims):

@@ -35,6 +35,7 @@ from running import (
     guard_of,
     patient_rig,
     running,
+    virtual_lab,
     wait_for,
 )
 from stiffopt.cli import run_daemon
@@ -294,19 +295,7 @@ def test_the_lab_is_driven_over_its_protocols_and_vented_whatever_happens(
     assert str(port) in text
     shipped.write_text(text)
     out = tmp_path / "lab.yaml"
-    with running("lab", str(shipped), "--out", str(out)) as lab:
-        wait_for(out.exists, 180)
-
-        def pressures() -> np.ndarray:
-            told = len(lab.err)
-            lab.say("status")
-            wait_for(lambda: any("pressures" in line for line in lab.err[told:]))
-            found = re.search(
-                r"pressures ([-\d., ]+) bar", " ".join(" ".join(lab.err[told:]).split())
-            )
-            assert found
-            return np.array([float(p) for p in found[1].split(",")])
-
+    with virtual_lab(shipped, out) as (_, pressures):
         with running("run", str(out)) as run:
             started = run.line("started")
             with Client(started["url"], started["token_file"]) as client:

@@ -45,17 +45,9 @@ class Api:
         self.operations = self.app.state.operations
         self.lease: str | None = None
 
-    def __call__(
-        self,
-        method: str,
-        path: str,
-        body: Any = None,
-        *,
-        token: str | None = TOKEN,
-        headers: dict[str, str] | None = None,
-        content: bytes | None = None,
-    ) -> httpx.Response:
-        return asyncio.run(self.ask(method, path, body, token, headers or {}, content))
+    def __call__(self, *request: Any, **options: Any) -> httpx.Response:
+        """Wait for the answer of `ask`."""
+        return asyncio.run(self.ask(*request, **options))
 
     async def ask(
         self,

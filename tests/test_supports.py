@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +13,9 @@ import pytest
 import stiffopt
 from cli_tasks import TWO, Write, lines, run, write_fixture  # noqa: F401
 from conftest import use_compiler
+from leaning_arm import few_starts as with_few_starts
 from stiffopt.errors import InputError
-from stiffopt.optimise import braced, supports
-from stiffopt.optimise.settings import BRACE, Effort
+from stiffopt.optimise import supports
 from stiffopt.optimise.supports import SupportMap, suggest_supports
 
 ROBOT = stiffopt.load_robot("stiff-flop-2")
@@ -26,10 +25,8 @@ TARGET = {"position": (-0.03, 0.01, 0.19)}
 
 @pytest.fixture(scope="module", autouse=True)
 def few_starts(code_cache: Path) -> Iterator[None]:
-    with pytest.MonkeyPatch.context() as patch:
+    with with_few_starts(), pytest.MonkeyPatch.context() as patch:
         use_compiler(patch, code_cache)
-        few = replace(BRACE, effort=Effort(3, 1, 2), screened=256)
-        patch.setattr(braced, "BRACE", few)
         patch.setattr(supports, "_TESTS", 2)
         yield
 

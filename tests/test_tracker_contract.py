@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
+from typing import Any
 
 import numpy as np
 import pytest
@@ -57,23 +58,19 @@ class BenchControl:
         self.show(PLACE, TURN)
 
 
-@contextmanager
-def aurora(registration: Registration) -> Iterator[tuple[PoseTracker, Control]]:
-    bench = FakeBench()
-    peer = AuroraPeer(AuroraSettings(driver="aurora", registration=registration), bench)
-    tracker = peer.start().device()
-    try:
-        yield tracker, BenchControl(bench)
-    finally:
-        tracker.close()
-        peer.close()
+def aurora(registration: Registration) -> AbstractContextManager[tuple[PoseTracker, Control]]:
+    return with_peer(AuroraPeer, AuroraSettings(driver="aurora", registration=registration))
 
 
-@contextmanager
-def openigtlink(registration: Registration) -> Iterator[tuple[PoseTracker, Control]]:
-    bench = FakeBench()
+def openigtlink(registration: Registration) -> AbstractContextManager[tuple[PoseTracker, Control]]:
     settings = OpenIGTLinkSettings(driver="openigtlink", registration=registration)
-    peer = OpenIGTLinkPeer(settings, bench)
+    return with_peer(OpenIGTLinkPeer, settings)
+
+
+@contextmanager
+def with_peer(kind: Any, settings: Any) -> Iterator[tuple[PoseTracker, Control]]:
+    bench = FakeBench()
+    peer = kind(settings, bench)
     tracker = peer.start().device()
     try:
         yield tracker, BenchControl(bench)

@@ -301,19 +301,22 @@ def creeping(size: float, residual: float = 1e-4) -> RobotDescription:
     return calibrated(history=CREEP, errors=errors, parameters=(), correlation=())
 
 
-def crept(p: Array, count: int) -> Array:
+def crept(p: Array, count: int, held: float | None = None) -> Array:
     """What creep leaves (count, 3) after three poses of 6 s from 0 to 1 bar and 1.5 to 6 s at p.
+
+    If it is known for how long the last one has been `held`, half a motion of 1.6 s came before.
 
     Before, the arm had such poses for long, and was at rest for a seventh of the time.
     """
     rng, found = np.random.default_rng(7), []
     memory = Memory([CREEP] * 3, [0, 1, 2])
-    for way, held in zip(
-        rng.uniform(0, 1e5, (count, 3, 3)), rng.uniform(1.5, 6, count), strict=True
-    ):
+    ways, ages = rng.uniform(0, 1e5, (count, 3, 3)), rng.uniform(1.5, 6, count)
+    if held is not None:
+        ages[:] = 0.8 + held
+    for way, age in zip(ways, ages, strict=True):
         memory.settle(np.full(3, 6 / 7 * 0.5e5))
         memory.run(6.0, way)
-        found.append(memory.advance(held, p) - p)
+        found.append(memory.advance(age, p) - p)
     return np.array(found)
 
 
@@ -368,6 +371,31 @@ def test_regions_with_creep_hold_what_they_say(residual: float) -> None:
         levels.append(source.levels(errors, source.errors(p[np.newaxis])))
     for level in (0.5, 0.68, 0.9, 0.95, 0.99):
         assert np.mean(np.concatenate(levels) <= level) == pytest.approx(level, abs=0.05)
+
+
+@pytest.mark.parametrize("held", [0.5, 3.0, 20.0])
+def test_regions_with_creep_know_for_how_long_pressures_were_held(held: float) -> None:
+    robot = creeping(1e6)
+    source, arm = Uncertainty(robot), Manipulator(robot)
+    moves = crept(P, 3000, held)
+    errors = arm.tip_pose(P + moves)[:, :3, 3] - arm.tip_pose(P)[:3, 3]
+    errors += np.random.default_rng(9).normal(0, 1e-4, errors.shape)
+    size = np.trace(arm.tip_uncertainty(P, held=held).hysteresis)
+    assert size == pytest.approx(np.mean((errors**2).sum(axis=1)) - 3e-8, rel=0.05)
+    many = source.errors(np.tile(P, (3, 1)), held=np.array([np.nan, held, 1e3]))
+    unknown, known, long_held = np.trace(many.hysteresis, axis1=1, axis2=2)
+    assert unknown == pytest.approx(np.trace(arm.tip_uncertainty(P).hysteresis))
+    assert known == pytest.approx(size)
+    assert long_held < 1e-6 * unknown
+
+
+def test_only_held_pressures_have_been_held_for_a_time() -> None:
+    arm = Manipulator(creeping(1e3))
+    for held in (-1.0, np.nan):
+        with pytest.raises(InputError, match=r"0 s or longer; got (-1\.0|nan)"):
+            arm.tip_uncertainty(P, held=held)
+    with pytest.raises(InputError, match=r"got 2\.0, and that they move"):
+        arm.tip_uncertainty(P, moving=True, held=2.0)
 
 
 def test_hysteresis_moves_the_tip_less_where_the_arm_is_soft() -> None:

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import os
+import sys
+import warnings
 from collections.abc import Sequence
 from importlib.util import find_spec
+from traceback import walk_stack
 
 MAX_MISTAKES = 10
 """Largest number of mistakes of a file in one message."""
@@ -178,6 +181,15 @@ class ServiceError(StiffoptError, ConnectionError):
 
 class SlowWarning(UserWarning):
     """Machine code cannot be compiled or stored here; results are the same but slower."""
+
+
+def warn_slow(text: str) -> None:
+    """Give a `SlowWarning` at the line of the program that called this package."""
+    outermost = 1
+    for level, (frame, _) in enumerate(walk_stack(sys._getframe()), start=1):
+        if str(frame.f_globals.get("__name__")).partition(".")[0] == __package__:
+            outermost = level
+    warnings.warn(text, SlowWarning, stacklevel=outermost + 1)
 
 
 class UnfitWarning(UserWarning):

@@ -12,7 +12,8 @@ Check files without using them: all mistakes at once, one per line, with file, l
 
 Robot, task, path, scene and rig files are checked together with the files that they name; logs
 (.csv, .mcap) are read. It is a mistake if a rig with a tracker could never be armed by 'stiffopt
-run'. Nothing is solved and no device is touched.
+run'. Beside one rig file, tasks for its robot are compared with its scene too. Nothing is solved
+and no device is touched.
 """
 
 CHECK_EPILOG = """\

@@ -7,6 +7,7 @@ import os
 import re
 import stat
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +23,11 @@ _FORMAT = re.compile(r"stiffopt-([a-z]+)/\d+")
 def check_files(paths: Sequence[str], *, as_json: bool, quiet: bool) -> int:
     """Check files, print their mistakes and return the exit code."""
     code = SOLVED
+    rigs = [path for path in paths if _is_rig(path)]
     for path in paths:
         kind, mistakes = check_file(path)
+        if kind == "task" and not mistakes and len(rigs) == 1:
+            mistakes = _mistakes(path, partial(_check_on_rig, path, rigs[0]))
         if mistakes:
             code = BAD_INPUT
         if as_json:
@@ -49,14 +53,32 @@ def _record(mistake: FileError) -> dict[str, Any]:
 def check_file(path: str) -> tuple[str, list[FileError]]:
     """Return the kind of a file, empty if unknown, and its mistakes."""
     kind = ""
-    try:
+
+    def check() -> None:
+        nonlocal kind
         kind = _kind_of(path)
         _CHECKS[kind](path)
+
+    mistakes = _mistakes(path, check)
+    return kind, mistakes
+
+
+def _mistakes(path: str, check: Callable[[], None]) -> list[FileError]:
+    """Return the mistakes that a check of a file reports."""
+    try:
+        check()
     except FileError as error:
-        return kind, [error, *error.others]
+        return [error, *error.others]
     except StiffoptError as error:
-        return kind, [FileError(path, str(error))]
-    return kind, []
+        return [FileError(path, str(error))]
+    return []
+
+
+def _is_rig(path: str) -> bool:
+    try:
+        return _kind_of(path) == "rig"
+    except StiffoptError:
+        return False
 
 
 def _kind_of(path: str) -> str:
@@ -105,6 +127,21 @@ def _check_task(path: str) -> None:
     from stiffopt.optimise.task import load_task
 
     _check_with_robot(load_task(path))
+
+
+def _check_on_rig(path: str, rig: str) -> None:
+    """Compare a task with the scene of a rig that has its robot."""
+    from stiffopt.control.checks import check_scene
+    from stiffopt.optimise.task import load_task
+    from stiffopt.rig.config import load_rig
+
+    task = load_task(path)
+    try:
+        description, robot = load_rig(rig)
+    except StiffoptError:
+        return  # told of the rig itself
+    if task.resolve_robot().name == robot.name:
+        check_scene(task, description.scene)
 
 
 def _check_path(path: str) -> None:

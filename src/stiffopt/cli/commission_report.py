@@ -137,8 +137,9 @@ def _table(record: CommissioningRecord) -> TextTable:
         drives = "+".join(map(str, channel.drives)) or "nothing"
         way, expected = (_vector(v) for v in (channel.displacement, channel.expected))
         gauge = "-" if channel.gauge is None else f"{100 * channel.gauge:.0f} %"
+        ratio = np.linalg.norm(channel.displacement) / np.linalg.norm(channel.expected)
         lag = _milliseconds(channel)
-        rows.append((str(number), drives, way, expected, f"{_ratio(channel):.2f}", gauge, lag))
+        rows.append((str(number), drives, way, expected, f"{ratio:.2f}", gauge, lag))
     return TextTable(
         "",
         ("channel", "drives", f"tip ({unit})", "modelled", "ratio", "gauge", "lag (ms)"),
@@ -152,10 +153,6 @@ def _table(record: CommissioningRecord) -> TextTable:
 def _vector(values: Sequence[float]) -> str:
     unit = display_units().length
     return ", ".join(unit.number(value, ".2f") for value in values)
-
-
-def _ratio(channel: RecordedChannel) -> float:
-    return float(np.linalg.norm(channel.displacement) / np.linalg.norm(channel.expected))
 
 
 def _milliseconds(channel: RecordedChannel) -> str:

@@ -71,7 +71,7 @@ def summary(robot: Manipulator, found: ContactEquilibrium) -> RenderableType:
         ("stable", "yes" if found.stable else "no"),
     ]
     if not found.contacts:
-        facts.append(("contacts", "none"))
+        facts.append(("contacts", "none: at these pressures the arm touches no object"))
     if said["friction_tip_m"]:
         facts.append(("friction", friction_text(found)))
     parts: list[RenderableType] = [

@@ -366,7 +366,8 @@ def _rig(answers: _Answers, path: str) -> tuple[str, list[str]]:
     text = f"robot: {written}\nrate: 100 Hz\nsupply:\n{_SUPPLIES[supply](n)}"
     if tracker != "none":
         text += f"tracker:\n{_TRACKERS[tracker]}"
-    text += "safety: {tracker_timeout: 0.5 s}    # what may happen, and what counts as a fault\n"
+    slew = "" if robot.description.pressure_slew else "max_slew: 5 bar/s, "  # the arm's is unknown
+    text += f"safety: {{{slew}tracker_timeout: 0.5 s}}    # what may happen; what is a fault\n"
     text += "log: {folder: runs}\n"
     if supply == "simulated":
         text += "# how the simulated arm differs from its robot file\n"
@@ -399,7 +400,8 @@ def _nidaq(n: int) -> str:
         for k in range(n)
     )
     return (
-        f"  driver: nidaq\n  channels:\n{lines}"
+        "  driver: nidaq\n  timeout: 200 ms    # well below safety.command_timeout\n"
+        f"  channels:\n{lines}"
         "  # empties the arm without power\n"
         "  dump_valve: {line: Dev1/port0/line0, closed_when: high}\n"
     )

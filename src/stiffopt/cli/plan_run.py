@@ -178,6 +178,8 @@ class PlanCommand:
             return
         yield "time", Text(f"{solution.times[-1]:.4g} s, {len(solution.times)} points")
         yield from rate_lines(solution)
+        if scene is None:
+            yield "clearance", Text("not checked: neither --scene nor a task gives a scene")
         yield from clearance_lines(solution, scene)
         if solution.confidence:
             yield "search", Text(solution.confidence)

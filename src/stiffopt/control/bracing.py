@@ -305,11 +305,12 @@ class Bracing:
         if self.is_let_down or float(np.abs(pressures - self.pressures).max()) > t.off_plan:
             return
         sticks = self._sticks
-        creep = t.creep * elapsed / (t.creep_time + self._held) if held else 0.0
-        friction.follow(pressures, min(elapsed / t.even_time, 1.0), creep)
         residual = seen - tip.pose[:3, 3]
-        if sticks and held:  # linearised there: on the way its forces are not those of friction
-            residual = residual - friction.tip[:3] @ friction.forces
+        if held:  # the plan has followed friction to there
+            creep = t.creep * elapsed / (t.creep_time + self._held)
+            friction.follow(pressures, min(elapsed / t.even_time, 1.0), creep)
+            if sticks:
+                residual = residual - friction.tip[:3] @ friction.forces
         if self._error is None:
             self._residual = residual
         self._residual = self._residual + min(elapsed / t.swing_time, 1.0) * (
@@ -323,9 +324,7 @@ class Bracing:
         is_free = distance > enough and share > t.free_share
         self._free = self._free + 1 if is_free else 0
         if self._free >= t.samples:
-            where = "the tip is where an arm without contact has it"
-            lost = "the brace is lost" if held else "there is nothing where the scene has an object"
-            self.release(why=f"{where}: {lost}", lost=range(len(self.approach.contacts)))
+            self._let_go_astray(seen, tip.pose[:3, 3])
             return
         if not held:
             return
@@ -360,6 +359,34 @@ class Bracing:
         self.push, self.displacement = push, off
         self.covariance[:] = covariance
         self._judge(before, drift, elapsed)
+
+    def _let_go_astray(self, seen: Array, planned: Array) -> None:
+        """Release contacts with a tip (3,) that is not where the plan has it (3,).
+
+        Where it is not at a free arm's place either, the arm still touches something.
+        """
+        assert self.approach is not None
+        t, contacts, free = self._tuning, self.approach.contacts, self._free_tip()
+        off, from_free, apart = (
+            float(np.linalg.norm(each)) for each in (seen - planned, seen - free, free - planned)
+        )
+        if from_free <= max((1 - t.free_share) * apart, t.min_distance):
+            held = self.phase is BracePhase.HELD
+            lost = "the brace is lost" if held else "there is nothing where the scene has an object"
+            where = "the tip is where an arm without contact has it"
+            self.release(why=f"{where}: {lost}", lost=range(len(contacts)))
+            return
+        why = (
+            f"the tip is {1e3 * off:.0f} mm from where the plan put it, and {1e3 * from_free:.0f} "
+            "mm from where an arm without contact has it"
+        )
+        rough = {contacts[j].object for j in self.approach.hold.sticking.own}
+        names = " and ".join(f"'{each}'" for each in sorted(rough or {c.object for c in contacts}))
+        if rough:
+            why += f"; friction on {names} probably holds the body: give it a larger friction"
+        else:
+            why += f": check the place of {names}, and give it its friction if it has any"
+        self.release(why=f"{why}, and solve again")
 
     def _push(
         self, C: Array, rotation: Array, off: Array, creep: float = 0.0
@@ -627,6 +654,8 @@ class Bracing:
         elif not self._is_off and least > t.off_target and self._held > since + t.patience:
             self._is_off = True
             text = f"the tip stays {1e3 * off:.1f} mm from its target while the arm leans"
+            if self.approach.hold.sticking.own:
+                text += "; friction may hold the body"
             self._notify("brace-off-target", text, Severity.WARNING)
         hold, friction = self.approach.hold, self._friction
         rows, wanted = [jacobian, t.force_weight * hold.per_pressure], [error]

@@ -17,7 +17,7 @@ from pydantic import BaseModel
 
 from stiffopt.errors import CommandError, InputError, StiffoptError
 from stiffopt.model.manipulator import Manipulator
-from stiffopt.model.scene import Scene
+from stiffopt.model.scene import Scene, SceneObject
 from stiffopt.optimise.solver import PressureSolver
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import PressureRange, Task
@@ -62,8 +62,8 @@ def check_task(task: Task, limits: PressureLimits) -> None:
 def check_scene(task: Task, scene: Scene | None) -> None:
     """Refuse a task that does not suit the rig's scene, which is the one that counts on a rig.
 
-    A scene of the task's own may not ask for more than the rig's: no other objects or shapes, no
-    smaller `max_force`, no greater clearance. The objects of a brace must allow contact.
+    A scene of the task's own may not ask for more than the rig's: no other shapes, under whatever
+    name, no smaller `max_force`, no greater clearance. The objects of a brace must allow contact.
     """
     if task.brace is not None:
         if scene is None:
@@ -82,10 +82,12 @@ def _check_own_scene(task: Task, own: Scene, scene: Scene | None) -> None:
     rigs = {} if scene is None else {item.name: item for item in scene.objects}
     remedy = "on a rig the scene of the rig file counts: write it there"
     for item in own.objects:
-        there = rigs.get(item.name)
+        alike = (each for each in rigs.values() if _is_alike(item, each))
+        there = rigs[item.name] if item.name in rigs else next(alike, None)
         if there is None:
-            raise task.error_at("scene", f"the rig has no object '{item.name}'; {remedy}")
-        if not _is_same(item.shape.model_dump(), there.shape.model_dump()):
+            where = f"the rig has no object '{item.name}', nor one of its shape there"
+            raise task.error_at("scene", f"{where}; {remedy}")
+        if not _is_alike(item, there):
             where = f"'{item.name}' has another place or shape in the rig's scene"
             raise task.error_at("scene", f"{where}; {remedy}")
         force = None if item.contact is None else item.contact.max_force
@@ -98,6 +100,12 @@ def _check_own_scene(task: Task, own: Scene, scene: Scene | None) -> None:
     if scene is not None and own.clearance > scene.clearance * (1 + _EQUAL):
         where = "its clearance is greater than that of the rig's scene"
         raise task.error_at("scene", f"{where}; {remedy}")
+
+
+def _is_alike(one: SceneObject, other: SceneObject) -> bool:
+    """Return whether two objects have one shape at one place, whatever their names."""
+    shapes = one.shape, other.shape
+    return type(shapes[0]) is type(shapes[1]) and _is_same(*(s.model_dump() for s in shapes))
 
 
 def _is_same(one: Any, other: Any) -> bool:

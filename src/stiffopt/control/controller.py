@@ -374,6 +374,7 @@ class TipController:
         if moves:
             self._moved_at = now
         if self._arm.leaning is not None:
+            self._ways.clear()  # a free posture is no way back for an arm that leans, or leant
             return self._feedforward(reference.command - pressures.command_offset, last)
         tip = self._arm.on_path(reference.path[:n])
         if now - self._went_back_at > self._tuning.adaptation.blind_time:

@@ -211,7 +211,8 @@ class ArmObserver:
             self.touch.expect(None)
             if isinstance(course, Pressing) and course.begins_free and self.touch.felt.touches:
                 self.touch.forget()
-        self.touch.take(sample.time, sample.position - predicted, effective, tip, self.tip.omega)
+        away, captured = sample.position - predicted, self.tip.captured
+        self.touch.take(sample.time, away, captured, tip, self.tip.omega)
         if isinstance(course, Pressing) and course.is_blocked:
             return  # an object of unknown force holds the tip: its motion is not the model's
         turned = self.tip.turned if self.tip.turn_known else None
@@ -220,7 +221,7 @@ class ArmObserver:
             if turned is not None:
                 turned = turned - turn_of_a_push(tip, along_stiff_axis=True) @ pushed
         self.watch.take(
-            sample.time, sample.position - pushed, predicted, self.tip.offset, self.tip.captured,
+            sample.time, sample.position - pushed, predicted, self.tip.offset, captured,
             tip, turned=turned, swings=self.tip.swings, deviation=self.tip.deviation,
         )  # fmt: skip
 

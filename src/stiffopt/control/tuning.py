@@ -9,6 +9,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
+from stiffopt.optimise.settings import BRACE
+
 
 @dataclass(frozen=True)
 class EstimatorTuning:
@@ -620,9 +622,9 @@ class BracingTuning:
     correction_speed: float = 5e-4
     force_weight: float = 0.1  # error of the tip equivalent to a change of contact force, in m/N
     pressure_weight: float = 2e-8  # the same for a pressure, in m/Pa
-    most_change: float = 1e4  # largest change of a planned pressure, in Pa
+    most_change: float = BRACE.corrected  # largest change of a planned pressure, in Pa
     # error of the tip that is reported if it does not fall by a share for a time, in m and s
-    off_target: float = 1e-3
+    off_target: float = BRACE.missed
     progress: float = 0.1
     patience: float = 10.0
     sliding: SlidingTuning = field(default_factory=SlidingTuning)

@@ -402,7 +402,7 @@ class Client:
         code, message = _refusal_in(answer)
         if code == _LOST and self._lease == lease:
             self._lease = None
-        raise error_of(answer.status_code, message)
+        raise error_of(answer.status_code, _in_python(code, message))
 
 
 class ClientStream:
@@ -544,7 +544,8 @@ class ClientStream:
             if error["code"] == "superseded":
                 self.superseded += 1
             else:
-                self._refused = error_of(_STATUS.get(error["code"], 409), error["message"])
+                reason = _in_python(error["code"], error["message"])
+                self._refused = error_of(_STATUS.get(error["code"], 409), reason)
 
 
 def daemon_url(service: ServiceSettings) -> str:
@@ -581,6 +582,16 @@ def _trajectory(times: Any, positions: Any) -> Trajectory:
             Waypoint(time=float(time), target=Target(position=position))
             for time, position in zip(times, positions, strict=True)
         ]
+    )
+
+
+def _in_python(code: str, message: str) -> str:
+    """Return what to do about a refusal, where the daemon's own words are of HTTP."""
+    if code == "no-token":
+        give = f"give 'token' to the Client or set {_TOKEN}, to the token or its file"
+        return f"this needs the daemon's token: {give}"
+    return (
+        "this needs control: take it first ('take_control')" if LEASE_HEADER in message else message
     )
 
 

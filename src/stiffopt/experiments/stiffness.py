@@ -7,7 +7,7 @@ whole is repeated. The stiffness is the slope of force over displacement.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from pathlib import Path
@@ -18,7 +18,7 @@ from pydantic import Field
 
 from stiffopt.directions import Direction, direction_name
 from stiffopt.errors import InputError
-from stiffopt.experiments.conductor import Array, Conductor, TrackedFrame, at_rest, check_pressures
+from stiffopt.experiments.conductor import Array, Conductor, at_rest, check_pressures
 from stiffopt.experiments.folder import ExperimentSettings, Progress, RawRecording
 from stiffopt.experiments.probing import PointsFile, Probing, Series, SeriesKey
 from stiffopt.model.manipulator import Manipulator
@@ -163,11 +163,6 @@ def run_stiffness(
     return run.notes()
 
 
-def _still(rows: Sequence[TrackedFrame]) -> bool:
-    """Return whether the tip creeps too slowly to move noticeably during a series."""
-    return at_rest(rows, window=_REST_WINDOW)
-
-
 class _StiffnessRun:
     """A run of the experiment, with its state between two series."""
 
@@ -232,7 +227,8 @@ class _StiffnessRun:
 
     def _rest(self, p: Array) -> bool:
         self._conductor.ramp(p)
-        return self._conductor.settle(p, _still, self._settings.settle)
+        still = partial(at_rest, window=_REST_WINDOW)  # or creeps too slowly to matter
+        return self._conductor.settle(p, still, self._settings.settle)
 
     def _planned(self, p: Array, key: SeriesKey) -> Series:
         """Return a series in which the model predicts at most `StiffnessSettings.force`."""

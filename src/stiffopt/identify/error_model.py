@@ -384,6 +384,17 @@ def is_moving(time: Array, pressures: Array) -> Rows:
     return np.asarray(moving_channels(time, pressures).any(axis=1))
 
 
+def held_for(time: Array, moving: Rows) -> Array:
+    """Return for how long pressures have been held, in s (N,), at times (N,) in s.
+
+    That is since the last row in which they were `moving` (`is_moving`); NaN in moving rows, and
+    before the first.
+    """
+    last = np.maximum.accumulate(np.where(moving, time, -np.inf))
+    held = time - last + ERRORS.hold
+    return np.where(moving | np.isinf(held), np.nan, held)
+
+
 def moving_channels(time: Array, pressures: Array) -> Rows:
     """Return which pressures (N, n) changed within the last `ERRORS.hold` seconds."""
     step = ERRORS.still * max(float(np.ptp(pressures, axis=0).max()), 1.0)

@@ -412,8 +412,18 @@ def _check_pressures(name: str, pressures: Array, description: RobotDescription)
     """Refuse pressures (N, n) that are not in Pa or never change; return remarks on odd ones."""
     low, high = np.array(description.pressure_min), np.array(description.pressure_max)
     limit = np.maximum(np.abs(low), np.abs(high))
-    share = float(np.max(np.max(np.abs(pressures), axis=0) / limit))
-    if 0 < share < PLAUSIBLE.tiny_pressure:
+    largest = np.max(np.abs(pressures), axis=0)
+    share = float(np.max(largest / limit))
+    in_another_unit = share < PLAUSIBLE.tiny_pressure
+    span = largest if in_another_unit else high - low
+    idle = np.ptp(pressures, axis=0) <= PLAUSIBLE.idle * span
+    if idle.all():
+        raise FileError(
+            name,
+            f"no pressure moves by more than {100 * PLAUSIBLE.idle:g} % of its range; "
+            "expected a recording in which they do",
+        )
+    if in_another_unit:
         near = {unit: share * factor for unit, factor in _PRESSURE_UNITS.items()}
         unit = max((u for u in near if near[u] < 1.2), key=near.__getitem__, default="kPa")
         raise FileError(
@@ -430,13 +440,6 @@ def _check_pressures(name: str, pressures: Array, description: RobotDescription)
                 f"{description.channel_name(channel)} is at {worst * 1e-5:.3g} bar, beyond the "
                 f"robot's limits of {low[channel] * 1e-5:g} to {high[channel] * 1e-5:g} bar"
             )
-    idle = np.ptp(pressures, axis=0) <= PLAUSIBLE.idle * (high - low)
-    if idle.all():
-        raise FileError(
-            name,
-            f"no pressure moves by more than {100 * PLAUSIBLE.idle:g} % of its range; "
-            "expected a recording in which they do",
-        )
     if idle.any():
         names = ", ".join(description.channel_name(c) for c in np.flatnonzero(idle).tolist())
         remarks.append(
@@ -468,8 +471,8 @@ def _check_excitation(
     if spread < PLAUSIBLE.still * description.length or not moves:
         raise FileError(
             name,
-            f"the tip does not move: its positions vary by {spread * 1e3:.2g} mm, of which "
-            f"{min(noise, spread) * 1e3:.2g} mm are noise; expected motion well above that",
+            f"the tip does not move: its positions vary by {spread * 1e3:.3f} mm, of which "
+            f"{min(noise, spread) * 1e3:.3f} mm are noise; expected motion well above that",
         )
 
 

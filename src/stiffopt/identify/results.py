@@ -314,8 +314,8 @@ def what_to_look_at(calibrated: Sequence[Comparison], length: float) -> str:
         text += "whether all logs are of the same arm in the same place (else: --rezero), "
     return text + (
         "the order of the channels (--channels), the body in whose frame poses are taken (--frame) "
-        "and its axes, the registration, lengths and chambers of the robot file, and whether the "
-        "pressures are those that the arm had"
+        "and its axes (are they right-handed?), the registration, lengths and chambers of the "
+        "robot file, and whether the pressures are those that the arm had"
     )
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from stiffopt.errors import StiffoptError
 from stiffopt.identify.detection import replaced
-from stiffopt.identify.error_model import in_turn, is_moving
+from stiffopt.identify.error_model import held_for, in_turn, is_moving
 from stiffopt.identify.fit import fit
 from stiffopt.identify.problem import CalibrationProblem, Noise, Predicted, Sample
 from stiffopt.identify.recording import Recording
@@ -256,9 +256,10 @@ def _with_levels(setup: Setup, logs: Sequence[Comparison]) -> list[Comparison]:
                    for name in ("pressures", "effective", "rates"))  # fmt: skip
     moving = np.concatenate([each.moving for each in logs])[rows]
     time = in_turn([each.time for each in logs])[rows]
+    held = np.concatenate([held_for(each.time, each.moving) for each in logs])[rows]
     source = Uncertainty(setup.description)
     known = source.errors(p, effective=u, rates=rates, time=time)
-    unknown = source.errors(p, moving=moving)
+    unknown = source.errors(p, moving=moving, held=held)
     off = np.concatenate([each.measured - each.predicted for each in logs])[rows]
     off = off @ setup.base[:3, :3]
     found = []

@@ -107,7 +107,7 @@ class LogLayout:
         if missing:
             raise FileError(path, _missing(missing[0], unknown), line=1)
         if unknown:
-            raise FileError(path, _unknown(unknown[0], wanted), line=1)
+            raise FileError(path, _unknown(unknown[0], wanted, layout.n), line=1)
         return layout
 
 
@@ -306,7 +306,7 @@ def _missing(name: str, unknown: Sequence[str]) -> str:
     return f"the column '{name}' is missing{hint}; a log starts with a row of names"
 
 
-def _unknown(name: str, wanted: Sequence[str]) -> str:
-    near = difflib.get_close_matches(name, [*wanted, "force_n", "stage_m"], n=1)
+def _unknown(name: str, wanted: Sequence[str], n: int) -> str:
+    near = difflib.get_close_matches(name, [*wanted, f"p{n + 1}_pa", "force_n", "stage_m"], n=1)
     hint = f"did you mean '{near[0]}'?" if near else f"the columns here are {', '.join(wanted)}"
     return f"unknown column {shown(name)}; {hint}"

@@ -59,6 +59,8 @@ def read_table(path: str | os.PathLike[str]) -> Table:
             raise FileError(
                 name, f"fields are separated by {word}; expected commas, and decimal points", line=1
             )
+    if not header.translate(None, _ALLOWED):
+        raise FileError(name, "starts with a row of numbers; expected a row of names", line=1)
     body = body.rstrip(b"\n")
     if not body:
         return Table(name, columns, np.empty((0, len(columns))))

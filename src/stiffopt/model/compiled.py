@@ -18,7 +18,6 @@ import pickle
 import sys
 import threading
 import time
-import warnings
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
@@ -28,7 +27,7 @@ from pathlib import Path
 
 import casadi as ca
 
-from stiffopt.errors import SlowWarning
+from stiffopt.errors import warn_slow
 from stiffopt.model import compiler as build
 from stiffopt.model import stopping
 from stiffopt.model.batch import CompiledFunction, InterpretedFunction
@@ -406,4 +405,4 @@ def _warn_once(text: str) -> None:
     kind = text.partition(":")[0]
     if kind not in _notified:
         _notified.add(kind)
-        warnings.warn(text, SlowWarning, stacklevel=5)
+        warn_slow(text)

@@ -329,24 +329,28 @@ class Manipulator(Arm, ShownInNotebook):
             ("stiffness gradient", measure), lambda tip: tip.total_jacobian(stiffness(tip)), p
         )[..., 0, :]
 
-    def tip_uncertainty(self, p: ArrayLike, *, moving: bool = False) -> TipUncertainty:
+    def tip_uncertainty(
+        self, p: ArrayLike, *, moving: bool = False, held: float | None = None
+    ) -> TipUncertainty:
         """Return the uncertainty of the tip and its stiffness after a calibration.
 
         Parameters
         ----------
         p : commanded pressures (n,) in Pa; earlier commands are unknown.
         moving : whether the pressures change, as in the recordings, or are held.
+        held : for how long they have been held, in s, if known: where the model has creep, the tip
+            comes nearer to the equilibrium with time.
 
         Raises
         ------
         InputError
-            The robot was not calibrated.
+            The robot was not calibrated, or `held` is not a time of held pressures.
         """
         p = self._single(p)
         known = self.kept(
             ("uncertainty", self.tip_load), lambda: Uncertainty(self.description, self.tip_load)
         )
-        return known.at(p, moving=moving)
+        return known.at(p, moving=moving, held=held)
 
     # -- screws and loads -------------------------------------------------------------------
 

@@ -11,10 +11,11 @@ Hysteresis depends on how the arm came to its pressures.  Its mean square, about
 which is what `tip_pose` returns, is that over ways from rest to pressures drawn from the recorded
 range, and from there; but at most that of effective minus commanded pressures as recorded.
 Plays lead through two drawn pressures.  Creep goes on while pressures are held: a way stays for
-6 s at each of three drawn ones, and for 1.5 to 6 s at its end.  It begins at the mean of the drawn
-pressures and of rest, which takes a seventh of the time, as in the rounds of an experiment: slow
-creep remembers longer than the way lasts.  The tip moves by the slopes half the mean of all ways
-further: at the pressures themselves, a chamber may be in its dead band.
+6 s at each of three drawn ones, and at its end for 1.5 to 6 s, or for as long as is known.  It
+begins at the mean of the drawn pressures and of rest, which takes a seventh of the time, as in the
+rounds of an experiment: slow creep remembers longer than the way lasts.  The tip moves by the
+slopes half the mean of all ways further: at the pressures themselves, a chamber may be in its dead
+band.
 
 With creep in the model, what it remembers moves the tip by a tenth more or less than it says, in
 any direction; so it does where the history is known, by a twentieth if strain is remembered.
@@ -60,6 +61,7 @@ _VISITS = 3  # pressures that each of them visits
 _STAY = 6.0  # s from one of them to the next
 _AT_REST = 1 / 7  # share of the time before a way that the arm was at rest
 _AGES = (1.5, 6.0)  # s for which the given pressures have been held, from the middle of the motion
+_MOTION = 0.8  # s from the middle of a motion to its end
 _HELD = 0.9  # share of these variances that held poses show; the rest was creep and motion
 _MISREMEMBERED = 0.1  # error of what a model with creep remembers, over how far it moves the tip
 _MISREMEMBERED_STRAIN = 0.05  # the same where the history is known and strain is remembered
@@ -205,10 +207,21 @@ class Uncertainty:
         )
         self._covariance = self._calibration.covariance
 
-    def at(self, pressures: Vector, *, moving: bool = False) -> TipUncertainty:
-        """Return the uncertainty at commanded pressures (n,), held or `moving`; history unknown."""
+    def at(
+        self, pressures: Vector, *, moving: bool = False, held: float | None = None
+    ) -> TipUncertainty:
+        """Return the uncertainty at commanded pressures (n,), history unknown.
+
+        They are `moving`, or have been `held` for a time in s, where that is known.
+        """
+        if held is not None and (moving or not held >= 0):
+            raise InputError(
+                f"pressures that are held have been so for 0 s or longer; got {held!r}"
+                + (", and that they move" if moving else "")
+            )
         p = pressures[np.newaxis]
-        found = self.errors(p, moving=np.array([moving]))
+        times = np.array([np.nan if held is None else held])
+        found = self.errors(p, moving=np.array([moving]), held=times)
         extrapolation = self._description.extrapolation(pressures)
         return TipUncertainty(
             parameters=found.parameters[0],
@@ -231,6 +244,7 @@ class Uncertainty:
         rates: Vector | None = None,
         time: Vector | None = None,
         moving: NDArray[np.bool_] | None = None,
+        held: Vector | None = None,
     ) -> PositionErrors:
         """Return the errors of predictions.
 
@@ -241,6 +255,7 @@ class Uncertainty:
             (N,) in s, increasing; without these the prediction is `tip_pose` at the commanded ones.
         rates : time derivatives (N, n) of the effective pressures, in Pa/s; zero by default.
         moving : which rows (N,) are not held; none by default.
+        held : times (N,) in s for which pressures have been held; NaN, as by default, if unknown.
         """
         u = pressures if effective is None else effective
         position, per_number, per_pressure = self._slopes.at(u)
@@ -251,7 +266,7 @@ class Uncertainty:
         discrepancy = even_variance(moves, before, self._memory)
         if effective is None:
             moved = moving if moving is not None else np.zeros(len(pressures), dtype=bool)
-            ways = self._remembered(pressures, per_pressure)
+            ways = self._remembered(pressures, per_pressure, held)
             acting = per_pressure
             if self._knows_creep:
                 _, _, acting = self._slopes.at(pressures + ways.mean(axis=1) / 2)
@@ -357,14 +372,16 @@ class Uncertainty:
             found[moving] += np.maximum(more, 0.0)[..., np.newaxis] * np.eye(ways.shape[2])
         return np.asarray(found)
 
-    def _remembered(self, pressures: Vector, per_pressure: Vector) -> Vector:
+    def _remembered(
+        self, pressures: Vector, per_pressure: Vector, held: Vector | None = None
+    ) -> Vector:
         """Return effective minus commanded pressures (N, W, n) in Pa after W ways to (N, n).
 
         `per_pressure` are the tip's slopes (N, 3, n) there. Without creep in the model, the ways
         leave the tip about as far away at all pressures, though a pressure moves it further where
         the arm is soft. At the median of the recorded pressures they are those of the plays.
         """
-        found, crept = self._ways(pressures)
+        found, crept = self._ways(pressures, held)
         if self._calibration.errors is None:
             return found
         if self._knows_creep:
@@ -373,9 +390,16 @@ class Uncertainty:
         found *= np.sqrt(_HELD / np.maximum(softness, _STIFFEST))[:, np.newaxis]
         return found
 
-    def _ways(self, pressures: Vector) -> tuple[Vector, Vector]:
-        """Return what plays and what creep leave after W ways to pressures (N, n): (N, W, n)."""
+    def _ways(self, pressures: Vector, held: Vector | None = None) -> tuple[Vector, Vector]:
+        """Return what plays and what creep leave after W ways to pressures (N, n): (N, W, n).
+
+        They have been held for the given times (N,) in s; for drawn ones where that is NaN.
+        """
         robot, first = self._description, 0
+        ages = self._ages
+        if held is not None:
+            held = held[:, np.newaxis]
+            ages = np.where(np.isnan(held), ages, _MOTION + held)
         found = np.zeros((len(pressures), _WAYS, robot.n_pressures))
         crept = np.zeros_like(found)
         for segment in robot.segments:
@@ -393,7 +417,7 @@ class Uncertainty:
                 slow = (1 - _AT_REST) * poses.mean(axis=(0, 1))
                 for visited in poses:
                     slow = visited + (slow - visited) * np.exp(-_STAY / creep.time)
-                left = np.exp(-self._ages / creep.time)[:, np.newaxis]
+                left = np.exp(-ages / creep.time)[..., np.newaxis]
                 slow = part_of(slow - part_of(here, creep.of), creep.of)
                 crept[..., own] += memory * creep.share * left * slow
             for each in (found, crept):
@@ -441,7 +465,7 @@ class Uncertainty:
 
     @cached_property
     def _ages(self) -> Vector:
-        """Times (W,) in s for which pressures are held at the ends of the ways."""
+        """Times (W,) in s for which pressures are held at the ends of the ways, if unknown."""
         strata = (np.arange(_WAYS) + 0.5) / _WAYS
         return np.asarray(np.interp(np.random.default_rng(1).permuted(strata), (0, 1), _AGES))
 

@@ -4,6 +4,9 @@ A calibration states the covariance of the free tip.  It is expressed as that of
 least norm) that would move the tip as much, and carried on to contact forces.  The stiffness also
 depends on parameters that move the tip little, such as moduli and gains that grow together; its
 derivatives by the calibration's parameters are differences of equilibria.
+
+Where a braced arm is near buckling, a small error takes most of its stiffness, which no derivative
+shows: `least_stiffness` goes as far as one standard deviation.
 """
 
 from __future__ import annotations
@@ -14,6 +17,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.errors import EquilibriumError
 from stiffopt.model.contact.equilibrium import ContactEquilibrium
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.parameters import Parameter, varied
@@ -38,12 +42,16 @@ class BraceUncertainty:
     def __init__(self, robot: Manipulator, eq: ContactEquilibrium) -> None:
         self._robot, self._eq = robot, eq
 
-    def _pressures(self, squares: Vector) -> Vector:
-        """Return the mean square (n, n) of pressures that move the free tip with one (3, 3)."""
+    @cached_property
+    def _per_tip(self) -> Vector:
+        """The pressures (n, 3) of least norm that move the free tip, in Pa/m."""
         robot, p = self._robot, self._eq.pressures
         R = robot.tip_pose(p)[:3, :3]
-        per_tip = np.linalg.pinv(R @ robot.tip_jacobian(p)[:3])
-        return np.asarray(per_tip @ squares @ per_tip.T)
+        return np.asarray(np.linalg.pinv(R @ robot.tip_jacobian(p)[:3]))
+
+    def _pressures(self, squares: Vector) -> Vector:
+        """Return the mean square (n, n) of pressures that move the free tip with one (3, 3)."""
+        return np.asarray(self._per_tip @ squares @ self._per_tip.T)
 
     @cached_property
     def forces(self) -> Vector:
@@ -66,6 +74,27 @@ class BraceUncertainty:
         """
         lost = np.max(self.forces / self._eq.normal_forces, initial=0.0)
         return max(1.0 - float(lost), _LEAST_GRIP)
+
+    def least_stiffness(self, measure: StiffnessMeasure, task: Task) -> float:
+        """Return the least stiffness that one standard deviation of the tip leaves; 0 if none.
+
+        The tip's errors go one such deviation each way along their three axes, and contacts stay.
+        """
+        assert task.brace is not None
+        given = (
+            measure.direction, measure.kind, measure.boundary, measure.frame, task.brace.contacts
+        )  # fmt: skip
+        least = self._eq.stiffness(*given)
+        if self._robot.description.calibration is None:
+            return least
+        squares, axes = np.linalg.eigh(self._robot.tip_uncertainty(self._eq.pressures).covariance)
+        for change in (self._per_tip @ (np.sqrt(np.maximum(squares, 0.0)) * axes)).T:
+            for sign in (1.0, -1.0):
+                try:
+                    least = min(least, self._eq.shifted(sign * change).stiffness(*given))
+                except EquilibriumError:
+                    return 0.0
+        return least
 
     def stiffness_interval(self, measure: StiffnessMeasure, task: Task) -> tuple[float, float]:
         """Return the 95 % interval of a stiffness of the task's answer, in N/m or N m/rad.

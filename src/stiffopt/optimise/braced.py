@@ -23,6 +23,7 @@ from stiffopt.display import display_units
 from stiffopt.errors import EquilibriumError, StoppedError
 from stiffopt.model.arm_clearance import measured_scene
 from stiffopt.model.contact.equilibrium import ContactEquilibrium, inside_at_rest
+from stiffopt.model.contact.way import Rubbing
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.optimise.brace import quoted
 from stiffopt.optimise.brace_uncertainty import BraceUncertainty
@@ -177,9 +178,12 @@ def from_rest(problem: BracedProblem, result: LocalResult) -> Braced | None:
         eq = problem.robot.contact_equilibrium(
             pressures, problem.scene, approach=problem.brace.approach
         )
+        rubbing = problem.rubbing(eq)
     except EquilibriumError:
         return None
-    return Braced(result, eq, problem.judgement(eq)) if eq.contacts else None
+    if not eq.contacts:
+        return None
+    return Braced(result, eq, problem.judgement(eq, rubbing), rubbing)
 
 
 def reached_again(problem: BracedProblem, judged: Braced) -> Braced | None:
@@ -202,11 +206,15 @@ def reached_again(problem: BracedProblem, judged: Braced) -> Braced | None:
 
 
 class Braced(NamedTuple):
-    """An optimum in contact, with its equilibrium from rest and its judgement."""
+    """An optimum in contact, with its equilibrium from rest and its judgement.
+
+    Also what friction does on the way there, or None.
+    """
 
     result: LocalResult
     equilibrium: ContactEquilibrium
     judgement: Judgement
+    rubbing: Rubbing | None = None
 
     @property
     def least(self) -> float:
@@ -358,7 +366,15 @@ def _braced_answer(
     return PressureSolution(
         status="solved",
         message="; ".join(
-            filter(None, (at_rest(problem), _doubt(problem, eq), _other_equilibrium(problem, eq)))
+            filter(
+                None,
+                (
+                    at_rest(problem),
+                    _doubt(problem, eq),
+                    _rubbed(best.rubbing),
+                    _other_equilibrium(problem, eq),
+                ),
+            )
         ),
         task=task,
         pressures=eq.pressures,
@@ -407,6 +423,19 @@ def _doubt(problem: BracedProblem, eq: ContactEquilibrium) -> str:
         return ""
     by = display_units().force.text(doubt, ".2g")
     return f"contact forces may be smaller or larger by {by}, by errors of the calibration"
+
+
+def _rubbed(rubbing: Rubbing | None) -> str:
+    """Return what friction does on the way from rest, or ""."""
+    if rubbing is None:
+        return ""
+    units = display_units()
+    return (
+        f"when it is reached from rest, friction holds the tip "
+        f"{units.length.text(float(np.linalg.norm(rubbing.tip)), '.2g')} away, and changes normal "
+        f"forces by {units.force.text(float(np.abs(rubbing.normals).max()), '.2g')}, until that is "
+        "corrected"
+    )
 
 
 def _other_equilibrium(problem: BracedProblem, eq: ContactEquilibrium) -> str:

@@ -26,6 +26,7 @@ from stiffopt.model.batch import InterpretedFunction
 from stiffopt.model.clearance import Nearest
 from stiffopt.model.codegen import dense
 from stiffopt.model.contact.equilibrium import ContactEquilibrium, Grip
+from stiffopt.model.contact.way import Rubbing, from_rest, rubbed
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.scene import Scene, SceneObject
 from stiffopt.model.shape import PointOfArm
@@ -35,6 +36,7 @@ from stiffopt.optimise.brace_uncertainty import BraceUncertainty
 from stiffopt.optimise.measures.directional import StiffnessMeasure
 from stiffopt.optimise.problem import Objective, PressureProblem, ProgramPoint
 from stiffopt.optimise.program import Constraint, Program
+from stiffopt.optimise.quadratic import solve_qp
 from stiffopt.optimise.settings import BRACE, OBSTACLES
 from stiffopt.optimise.solution import Judgement, Preload, are_within
 from stiffopt.optimise.task import Task
@@ -384,18 +386,38 @@ class BracedProblem(PressureProblem):
 
     # -- judgement --------------------------------------------------------------------------
 
-    def judgement(self, eq: ContactEquilibrium) -> Judgement:
-        """Judge an equilibrium by the task."""
+    def rubbing(self, eq: ContactEquilibrium) -> Rubbing | None:
+        """Return what friction does on the way from rest to an equilibrium; None without friction.
+
+        Objects that come to the arm are taken to leave no friction.
+
+        Raises
+        ------
+        EquilibriumError
+            The way is lost.
+        """
+        if self.brace.approach == "objects" or not eq.sticking.own:
+            return None
+        states = list(from_rest(self.robot, self.scene, eq.pressures))
+        found, apart = rubbed(states), states[-1].tip_pose[:3, 3] - eq.tip_pose[:3, 3]
+        if float(np.linalg.norm(apart)) > BRACE.same:
+            raise EquilibriumError("in smaller steps the arm comes to another equilibrium")
+        return found
+
+    def judgement(self, eq: ContactEquilibrium, rubbing: Rubbing | None = None) -> Judgement:
+        """Judge an equilibrium by the task, with what friction does on the way to it."""
         C = eq.compliance(self.brace.contacts)
         residuals, values = self.judged_by(eq, C)
         rows = [*residuals.tolist(), *self.obstacle_rows(self._nearest(eq, quickly=False))]
         within = are_within(eq.pressures, self.lower * self.unit, self.upper * self.unit)
         found = Judgement.of(self.program, (rows, eq.tip_pose, C, values.tolist()), within)
-        return found._replace(shortfalls=(*found.shortfalls, *self.refusals(eq)))
+        return found._replace(shortfalls=(*found.shortfalls, *self.refusals(eq, rubbing)))
 
-    def refusals(self, eq: ContactEquilibrium) -> Iterator[str]:
+    def refusals(self, eq: ContactEquilibrium, rubbing: Rubbing | None = None) -> Iterator[str]:
         """Yield the reasons why an equilibrium is not acceptable."""
         unit, known = display_units().force, BraceUncertainty(self.robot, eq)
+        if rubbing is not None:
+            yield from self._out_of_reach(eq, rubbing)
         for own, force in eq.pressed():
             each, doubt = eq.contacts[own[0]], float(np.sum(known.forces[own]))
             if force + doubt > each.max_force * (1 + 1e-9):
@@ -403,6 +425,13 @@ class BracedProblem(PressureProblem):
                 yield (
                     f"the arm leans on '{each.object}' with {unit.text(force)}"
                     f"{more if doubt else ''}; at most {unit.text(each.max_force)} is allowed"
+                )
+            rub = 0.0 if rubbing is None else float(np.maximum(rubbing.normals[own], 0.0).sum())
+            if force + rub > each.max_force * (1 + BRACE.rubbed):
+                yield (
+                    f"friction on the way presses the arm on '{each.object}' with "
+                    f"{unit.text(rub)} more than {unit.text(force)}; at most "
+                    f"{unit.text(each.max_force)} is allowed"
                 )
         if not eq.stable:
             yield "the equilibrium is not stable"
@@ -429,6 +458,60 @@ class BracedProblem(PressureProblem):
                 f"a push of the margin leaves a contact force of {unit.text(left + doubt)}, less "
                 f"than the {unit.text(doubt)} that the calibration leaves in doubt"
             )
+        yield from self._not_robust(eq, known)
+
+    def _not_robust(self, eq: ContactEquilibrium, known: BraceUncertainty) -> Iterator[str]:
+        """Yield which stiffness that is maximised a likely error of the calibration takes away."""
+        for measure in self.directions:
+            given = (
+                measure.direction, measure.kind, measure.boundary, measure.frame,
+                self.brace.contacts,
+            )  # fmt: skip
+            k, least = eq.stiffness(*given), known.least_stiffness(measure, self.task)
+            if least < BRACE.robust * k:
+                unit = display_units().stiffness
+                yield (
+                    f"errors of the calibration (one standard deviation) leave {unit.text(least)} "
+                    f"of the stiffness of {unit.text(k)}"
+                )
+
+    def _out_of_reach(self, eq: ContactEquilibrium, rubbing: Rubbing) -> Iterator[str]:
+        """Yield that pressures cannot bring the tip back that friction has moved; see `_corrected`.
+
+        Contacts stick meanwhile.
+        """
+        position = self.task.target.position
+        if position is None:
+            return
+        rows = [i for i, each in enumerate(position) if each is not None]
+        R, held = eq.tip_pose[:3, :3], rubbing.sticking
+        jacobian = R @ eq.tip_jacobian[:3] + held.bent()[0][:3] @ held.per_pressure
+        aim = np.array([0.0 if each is None else each for each in position])
+        off = eq.tip_pose[:3, 3] + rubbing.tip - aim
+        left = self._corrected(eq.pressures, off[rows], jacobian[rows])
+        if left > max(self.task.target.tolerance.position, BRACE.missed):
+            length, most = display_units().length, display_units().pressure.text(BRACE.corrected)
+            away = length.text(float(np.linalg.norm(rubbing.tip)), ".2g")
+            yield (
+                f"friction on the way keeps the tip {away} away; pressures that are corrected by "
+                f"{most} leave it {length.text(left, '.2g')} from the target"
+            )
+
+    def _corrected(self, pressures: Vector, off: Vector, jacobian: Vector) -> float:
+        """Return how far from its place a tip that is off by so much (k,) stays, in m.
+
+        The pressures (n,) change by at most `BRACE.corrected` each, within their limits; `jacobian`
+        (k, n).
+        """
+        most = BRACE.corrected
+        low = np.maximum(self.lower * self.unit - pressures, -most) / most
+        high = np.minimum(self.upper * self.unit - pressures, most) / most
+        # in mm, with little weight on the changes themselves
+        A, b, n = 1e3 * most * jacobian, 1e3 * off, len(pressures)
+        H, g, none = A.T @ A + 1e-6 * np.eye(n), A.T @ b, np.zeros((0, n))
+        found = solve_qp(H, g, none, np.minimum(low, 0.0), np.maximum(high, 0.0))
+        step = np.zeros(n) if found is None else found[0]
+        return float(np.linalg.norm(off + most * jacobian @ step))
 
     def _held_at_tip(self, eq: ContactEquilibrium) -> bool:
         """Return True if a rigid object holds the tip along a direction that is maximised."""

@@ -209,6 +209,11 @@ class BraceSettings:
     least_price : gain from a whole tolerance or limit, as a share of the stiffness, to be reported.
     largest_push : largest push that is tested, in N.
     sure : standard deviations of a contact force, by a calibration's errors, that are held back.
+    robust : least share of a stiffness that one standard deviation of the tip's errors must leave.
+    same : largest distance, in m, of the tips of one equilibrium that is reached in two ways.
+    rubbed : largest share of a greatest force by which friction on the way may exceed it.
+    corrected, missed : largest change of a pressure, in Pa, by which a loop corrects the tip that
+        friction moves; how far it may then be from its target, in m, if the tolerance is smaller.
     """
 
     force: float = 5e-3
@@ -227,6 +232,11 @@ class BraceSettings:
     least_price: float = 1e-3
     largest_push: float = 1.0
     sure: float = 2.0
+    robust: float = 0.5
+    same: float = 2e-4
+    rubbed: float = 0.1
+    corrected: float = 1e4
+    missed: float = 1e-3
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,9 @@ from numpy.typing import NDArray
 from stiffopt.display import display_units
 from stiffopt.errors import EquilibriumError
 from stiffopt.model.arm_clearance import measured_scene
-from stiffopt.model.contact.equilibrium import Contact, ContactEquilibrium, Sticking
+from stiffopt.model.contact.equilibrium import Contact, ContactEquilibrium
+from stiffopt.model.contact.sticking import Sticking
+from stiffopt.model.contact.way import STATES, Rubbing, from_rest, rubbed
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.scene import Scene
 from stiffopt.optimise.brace import kept_clear_of, leant_on, quoted
@@ -32,12 +34,9 @@ Vector = NDArray[np.float64]
 SPEED = 0.02  # m/s, largest, of any part of the body
 FORCE_RATE = 0.1  # N/s, largest change of a contact's force
 GRADUAL = 1.0  # s, in which the way gets its speed or loses it
-_STATES = 61  # equilibria along the way
 _STATIONS = 41  # of the body
-_SAME = 2e-4  # m; tips that are nearer belong to the same equilibrium
 _AS_STIFF = 0.05  # largest difference of stiffnesses in the same equilibrium
 _PUSH = 2e-3  # N, step of finite differences by a push at the tip
-_TANGENTIAL = 1e-4  # m/N, compliance of a contact that sticks; an arm along itself has 40 times it
 _FORGIVEN = 1e-4  # m, tolerated lack of clearance from other objects
 
 
@@ -51,6 +50,7 @@ class Hold(NamedTuple):
     per_pressure : their derivatives by pressures (k, n), in N/Pa.
     per_push : their derivatives by a force at the tip (k, 3), in base axes.
     sticking : how friction holds those that have some.
+    tangential : the forces of friction that the way leaves, as in `Rubbing`, in N.
     """
 
     forces: Vector
@@ -58,6 +58,7 @@ class Hold(NamedTuple):
     per_pressure: Vector
     per_push: Vector
     sticking: Sticking
+    tangential: Vector
 
 
 @dataclass(frozen=True)
@@ -108,7 +109,7 @@ def approach_to(
         tips=tuple(TipAt(eq.tip_pose, eq.tip_jacobian, eq.tip_compliance) for eq in states),
         forces=np.array([_largest(eq) for eq in states]),
         contacts=states[-1].contacts,
-        hold=_hold(states[-1], deviations),
+        hold=_hold(states[-1], deviations, rubbed(states)),
         free_tips=robot.pose(pressures, robot.length)[:, :3, 3],
     )
 
@@ -127,7 +128,7 @@ def way_into_contact(robot: Manipulator, solution: PressureSolution) -> list[Con
     end = states[-1]
     names, wanted = ({each.object for each in found.contacts} for found in (end, solution))
     apart = float(np.linalg.norm(end.tip_pose[:3, 3] - solution.tip_pose[:3, 3]))
-    if apart > _SAME or (wanted and names != wanted):
+    if apart > BRACE.same or (wanted and names != wanted):
         raise Unsolved(
             "all pressures growing together lead to another equilibrium: the tip is "
             f"{1e3 * apart:.2g} mm away, leaning on {quoted(sorted(names)) or 'nothing'}"
@@ -175,10 +176,9 @@ def way_from_rest(robot: Manipulator, task: Task, p: Vector) -> list[ContactEqui
     scene, others = leant_on(task.scene, task.brace), kept_clear_of(task.scene, task.brace)
     states: list[ContactEquilibrium] = []
     try:
-        for share in np.linspace(0.0, 1.0, _STATES if p.any() else 1):
-            nearby = states[-1] if states else None
-            states.append(robot.contact_equilibrium(share * p, scene, nearby=nearby))
+        states.extend(from_rest(robot, scene, p))
     except EquilibriumError as error:
+        share = len(states) / (STATES - 1)
         raise Unsolved(f"the way from rest is lost at {share:.0%} of it: {error}") from None
     for number, eq in enumerate(states):
         for own, force in eq.pressed():
@@ -230,13 +230,13 @@ def _stations(robot: Manipulator) -> Vector:
     return np.linspace(0.0, robot.length, _STATIONS)
 
 
-def _hold(eq: ContactEquilibrium, deviations: Vector) -> Hold:
+def _hold(eq: ContactEquilibrium, deviations: Vector, rubbing: Rubbing) -> Hold:
     pushed = [
         (eq.shifted(push=step).normal_forces - eq.shifted(push=-step).normal_forces) / (2 * _PUSH)
         for step in _PUSH * np.eye(3)
     ]
-    sticking = eq.sticking.softened(_TANGENTIAL)
-    return Hold(eq.normal_forces, deviations, eq.force_gradients, np.array(pushed).T, sticking)
+    slopes = eq.force_gradients, np.array(pushed).T
+    return Hold(eq.normal_forces, deviations, *slopes, rubbing.sticking, rubbing.tangential)
 
 
 def _largest(eq: ContactEquilibrium) -> float:

@@ -67,7 +67,7 @@ class TreeSearch:
                 bounds.setHigh(index, float(self._weights[index] * self._high[channel]))
             space.setBounds(bounds)
             info = base.SpaceInformation(space)
-            info.setStateValidityChecker(_always)
+            info.setStateValidityChecker(lambda _: True)
             info.setMotionValidator(self._validator(base, info, start))
             info.setup()
             problem = base.ProblemDefinition(info)
@@ -124,10 +124,6 @@ class TreeSearch:
         p = start.copy()
         p[self._free] = state[0 : len(self._free)] / self._weights
         return np.clip(p, self._low, self._high)
-
-
-def _always(_: Any) -> bool:
-    return True
 
 
 @contextmanager

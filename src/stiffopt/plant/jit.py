@@ -9,14 +9,13 @@ from __future__ import annotations
 
 import hashlib
 import os
-import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
 
-from stiffopt.errors import MissingExtraError, SlowWarning
+from stiffopt.errors import MissingExtraError, warn_slow
 
 FunctionT = TypeVar("FunctionT", bound=Callable[..., Any])
 
@@ -46,11 +45,7 @@ def compiling_once() -> Iterator[None]:
     global _done
     with _lock():
         if not _done and not any(Path(_folder()).rglob("*.nbi")):
-            warnings.warn(
-                "the simulator is compiled, once; that takes up to a minute",
-                SlowWarning,
-                stacklevel=4,
-            )
+            warn_slow("the simulator is compiled, once; that takes up to a minute")
         yield
         _done = True
 

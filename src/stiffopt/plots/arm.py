@@ -65,9 +65,7 @@ def draw_arm(
     drawing.draw_base()
     drawing.draw_tube(np.asarray(pressures, dtype=float))
     drawing.explain_segments()
-    if scene is not None:
-        drawing.draw_objects(scene)
-    return drawing.finish(view)
+    return drawing.finish(view, scene)
 
 
 class Label(NamedTuple):
@@ -206,8 +204,8 @@ class ArmDrawing:
         self.corners.append(point[None])
         self.marks.append(point)
 
-    def finish(self, view: View | None = None) -> list[Any]:
-        """Set one scale for all axes and the view, and place the labels.
+    def finish(self, view: View | None = None, scene: Scene | None = None) -> list[Any]:
+        """Draw a scene, set one scale for all axes and the view, and place the labels.
 
         Returns
         -------
@@ -218,6 +216,8 @@ class ArmDrawing:
 
         from stiffopt.plots.labels import place_labels
 
+        if scene is not None:
+            self.draw_objects(scene)
         points = np.vstack(self.corners)
         low, high = points.min(axis=0), points.max(axis=0)
         sides = (high - low) + 0.04 * self.size

@@ -69,13 +69,13 @@ def draw_leaning_tube(
 
 
 def draw_forces(drawing: ArmDrawing, equilibrium: ContactEquilibrium) -> None:
-    """Draw the contact forces on the arm as arrows."""
+    """Draw the contact forces on the arm as arrows, each with the object that exerts it."""
     unit = drawing.unit
     largest = max((np.linalg.norm(each.force) for each in equilibrium.contacts), default=1.0)
     for each in equilibrium.contacts:
         arrow = _LONGEST * drawing.size * each.force / largest
         drawing.draw_arrow(unit.of(each.position), arrow, style.LOAD, 6)
         text = display_units().force.text(float(np.linalg.norm(each.force)), ".3g")
-        drawing.add_label(unit.of(each.position) + arrow, text, style.LOAD)
+        drawing.add_label(unit.of(each.position) + arrow, f"{text} by '{each.object}'", style.LOAD)
     if equilibrium.contacts:
         drawing.add_line(style.LOAD, "force on the arm")

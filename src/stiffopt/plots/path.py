@@ -265,9 +265,7 @@ def draw_asked_path(
     drawing.draw_tube(robot.pressure_min)
     drawing.explain_segments()
     _draw_requested(drawing, path)
-    if path.scene is not None:
-        drawing.draw_objects(path.scene)
-    return drawing.finish(view)
+    return drawing.finish(view, path.scene)
 
 
 def _draw_requested(drawing: ArmDrawing, path: Path) -> None:

@@ -329,10 +329,7 @@ def draw_solution(
         drawing.draw_free_ellipsoid()
     drawing.draw_target()
     drawing.draw_loads()
-    scene = scene or solution.task.scene
-    if scene is not None:
-        drawing.draw_objects(scene)
-    return drawing.finish(view)
+    return drawing.finish(view, scene or solution.task.scene)
 
 
 def draw_task(axes: Any, robot: Manipulator, task: Task, *, view: View | None = None) -> list[Any]:
@@ -367,9 +364,7 @@ def draw_task(axes: Any, robot: Manipulator, task: Task, *, view: View | None = 
     drawing.draw_directions()
     drawing.draw_target()
     drawing.draw_loads()
-    if task.scene is not None:
-        drawing.draw_objects(task.scene)
-    return drawing.finish(view)
+    return drawing.finish(view, task.scene)
 
 
 def _require_pressures(solution: PressureSolution) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import atexit
+import math
 import sys
 import threading
 from abc import abstractmethod
@@ -259,9 +260,12 @@ class SupplySettings(DeviceSettings):
     ----------
     simulator : for a `simulated` supply, the ``module:function`` that makes the rig of the whole
         simulated arm, see `stiffopt.rig.assembly.make_rig`.
+    vents_within : for a device that always vents when commands stop, whatever the file says: the
+        time until then, in s.
     """
 
     simulator: ClassVar[str] = ""
+    vents_within: ClassVar[float] = math.inf
 
     @property
     def exchange_time(self) -> float:

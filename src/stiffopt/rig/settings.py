@@ -149,6 +149,12 @@ class ServiceSettings(Schema):
     token: Annotated[str, Field(min_length=1)] = "STIFFOPT_TOKEN"
     token_file: str | None = None
 
+    @model_validator(mode="after")
+    def _has_two_ports(self) -> ServiceSettings:
+        if self.foxglove_port and self.foxglove_port == self.port:
+            raise BadKeyError("foxglove_port", f"{self.port} is the port of the service itself")
+        return self
+
 
 class RosSettings(Schema):
     """What `stiffopt ros` publishes on a ROS 2 graph, and what it accepts from there.

@@ -438,7 +438,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             owns = _open_rig(channel)
         except StiffoptError as error:
             channel.send(
-                GuardNotice("failed", {"kind": type(error).__name__, "args": _plain(error)})
+                GuardNotice(
+                    "failed", {"kind": type(error).__name__, "args": list(map(str, error.args))}
+                )
             )
             return 1
         guard = Guard(
@@ -493,10 +495,6 @@ def _open_rig(channel: GuardChannel) -> Owned:
         owns = owned(*pickle.load(sys.stdin.buffer))
         owns.gate.open()
     return owns
-
-
-def _plain(error: BaseException) -> list[str]:
-    return [str(part) for part in error.args]
 
 
 if __name__ == "__main__":

@@ -15,7 +15,6 @@ import subprocess
 import sys
 import threading
 import time
-import warnings
 from collections import deque
 from contextlib import suppress
 from typing import Any
@@ -23,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stiffopt.errors import DeviceError, GuardTripped, MissingExtraError, SlowWarning
+from stiffopt.errors import DeviceError, GuardTripped, MissingExtraError, warn_slow
 from stiffopt.model.description import RobotDescription
 from stiffopt.rig.config import RigDescription
 from stiffopt.rig.interface import (
@@ -112,7 +111,7 @@ class GuardProcess:
             for message in self.channel.receive(_START_SLICE):
                 match message:
                     case GuardNotice("notice", about):
-                        warnings.warn(about["text"], SlowWarning, stacklevel=3)
+                        warn_slow(about["text"])
                         patience = CLIENT.slow
                     case GuardNotice("failed", about):
                         raise _failure(**about)

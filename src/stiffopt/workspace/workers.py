@@ -15,7 +15,6 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError, ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from time import monotonic
-from types import TracebackType
 from typing import Any, Self
 
 from stiffopt.errors import InputError, StiffoptError, require_package
@@ -82,12 +81,7 @@ class Threads(AbstractContextManager["Threads"]):
         self._count = count or (1 if plan.robot.is_loaded else os.cpu_count() or 1)
         self._pool = ThreadPoolExecutor(self._count, thread_name_prefix="map")
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._pool.shutdown(wait=True, cancel_futures=True)
 
     @property
@@ -129,12 +123,7 @@ class Cluster(AbstractContextManager["Cluster"]):
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         try:
             self._client.cancel(list(self._futures), force=True)
         except Exception:  # the cluster may be gone

@@ -19,6 +19,7 @@ from stiffopt.model.contact.lines import SPACINGS
 from stiffopt.model.contact.push import ContactLoss, GrowingPush, rigid_if_huge
 from stiffopt.model.contact.rod import TURN, Condition, Rod, rotations
 from stiffopt.model.contact.solve import ContactProblem
+from stiffopt.model.contact.sticking import Sticking
 from stiffopt.model.contact.surface import ContactSurface
 from stiffopt.model.contact.system import ContactSystem, LeaningArm
 from stiffopt.model.scene import Scene
@@ -66,55 +67,6 @@ class FrictionBounds(NamedTuple):
 
     tip: float
     forces: Vector
-
-
-class Sticking(NamedTuple):
-    """How the k contacts with friction hold, linear about an equilibrium without their friction.
-
-    Each has a tangential force with two components, on the arm. They change with pressures and
-    pushes while the body does not slide, and with its slides. Those without friction stay closed.
-
-    Attributes
-    ----------
-    own : their indices among all contacts (k,).
-    friction : coefficients (k,).
-    per_pressure : derivatives of the forces (2k, n), in N/Pa.
-    per_push : by a force at the tip in base axes (2k, 3).
-    per_slide : by slides of the body (2k, 2k), in N/m.
-    tip : derivatives of the tip's place and turn, base axes, by the slides (6, 2k).
-    normals : of the normal forces of all contacts by the slides (contacts, 2k), in N/m.
-    """
-
-    own: tuple[int, ...]
-    friction: Vector
-    per_pressure: Vector
-    per_push: Vector
-    per_slide: Vector
-    tip: Vector
-    normals: Vector
-
-    def slides(self, forces: Vector) -> Vector:
-        """Return the slides (2k,), in m, that tangential forces (2k,) withhold."""
-        return np.asarray(-np.linalg.solve(self.per_slide, forces))
-
-    def softened(self, compliance: float) -> Sticking:
-        """Return the same for contacts whose surfaces give way along themselves, by so many m/N.
-
-        Two contacts that stick at almost the same station hold almost the same thing, so that K,
-        the stiffness against slides, is huge in one direction, or negative by rounding. With the
-        compliance c, ``G = (1 + c K)^-1`` is the share of a slide that the body takes part in.
-        """
-        stiffness, axes = np.linalg.eigh((self.per_slide + self.per_slide.T) / 2)
-        rigid = stiffness <= 0
-        share = np.where(rigid, 0.0, 1 / (1 + compliance * np.maximum(stiffness, 0.0)))
-        given = axes * share @ axes.T
-        return self._replace(
-            per_pressure=given @ self.per_pressure,
-            per_push=given @ self.per_push,
-            per_slide=axes * np.where(rigid, 1 / compliance, stiffness * share) @ axes.T,
-            tip=self.tip @ given,
-            normals=self.normals @ given,
-        )
 
 
 class ContactEquilibrium:
@@ -326,6 +278,7 @@ class ContactEquilibrium:
         surfaces = arm.problem.surfaces
         return Sticking(
             tuple(own),
+            np.array(across).reshape(len(own), 2, 3),
             np.array([surfaces[arm.state.touches[j].surface].friction for j in own]),
             tangential(by_pressure, pressed.along(by_pressure)[1]),
             tangential(pushed, system.along(pushed)[1])[:, :3],

@@ -41,7 +41,10 @@ from stiffopt.units import Duration
 Array = NDArray[np.float64]
 Registers = dict[int, tuple[int, ...]]
 
-_FRAMING = 25  # bytes that one request of function 23, its answer and two pauses add to the values
+_WRITE, _READ, _TRIGGER = 24, 20, 23
+"""Bytes of a request and its answer on a serial line, with two pauses of 3.5 bytes, but for the
+values; of the watchdog's register with them."""
+_ALSO_READ = 1  # byte by which function 23 exceeds `_WRITE`, but for the values
 _ILLEGAL_FUNCTION = 1
 _EXCEPTIONS = {
     1: "it does not know this function",
@@ -236,10 +239,49 @@ class ModbusSettings(SupplySettings):
         """Least time of a command on a serial line, with its answers and readings, in s."""
         if self.serial is None:
             return 0.0
-        copies = 2 if self.verify else 1  # of each set-point: written, and read back
-        points = (*self.setpoints * copies, *self.readings.values())
-        payload = 2 * sum(len(point.addresses) for point in points)
-        return (payload + _FRAMING) * self.serial.bits / self.serial.baudrate
+        joint = self.joint_run
+        reads = self.verified_runs
+        if joint is None:
+            reads += self.measured_runs
+        else:
+            reads = tuple(run for run in reads if not run.is_within(joint))
+        size = sum(_WRITE + 2 * run.count for run in self.written_runs)
+        size += sum(_READ + 2 * run.count for run in reads)
+        if joint is not None:
+            size += _ALSO_READ + 2 * joint.count
+        if self.watchdog is not None and self.watchdog.trigger is not None:
+            size += _TRIGGER
+        return size * self.serial.bits / self.serial.baudrate
+
+    @property
+    def written_runs(self) -> tuple[RegisterRun, ...]:
+        """Registers that each command writes, a request each."""
+        return runs_of(enumerate(self.setpoints))
+
+    @property
+    def verified_runs(self) -> tuple[RegisterRun, ...]:
+        """Registers that are read back, a request each."""
+        return runs_of(enumerate(self.read_backs)) if self.verify else ()
+
+    @property
+    def measured_runs(self) -> tuple[RegisterRun, ...]:
+        """Registers of the readings, a request each."""
+        return runs_of(self.readings.items())
+
+    @property
+    def joint_run(self) -> RegisterRun | None:
+        """Registers to read by function 23, if it can write and read all at once."""
+        readings = list(self.readings.items())
+        verified = [item for run in self.verified_runs for item in run.points]
+        if not self.read_write or len(self.written_runs) > 1:
+            return None
+        if any(run.table != "holding" for run in self.measured_runs):
+            return None
+        for points in (readings + verified, readings):
+            runs = runs_of(points)
+            if len(runs) == 1:
+                return runs[0]
+        return None
 
     def measures(self, channel: int) -> bool:
         """Whether the channel has a register of readings."""
@@ -281,10 +323,10 @@ class ModbusSupply(PressureSupply):
         self._setpoints = settings.setpoints
         self._read_backs = settings.read_backs
         self._readings = settings.readings
-        self._written = runs_of(enumerate(self._setpoints))
-        self._verified = runs_of(enumerate(self._read_backs)) if settings.verify else ()
-        self._measured = runs_of(self._readings.items())
-        self._joint = self._joint_run() if settings.read_write else None
+        self._written = settings.written_runs
+        self._verified = settings.verified_runs
+        self._measured = settings.measured_runs
+        self._joint = settings.joint_run
         self._held_registers: Registers | None = (
             None  # registers that the device must have; None: unknown
         )
@@ -301,18 +343,6 @@ class ModbusSupply(PressureSupply):
     def prepare(self) -> None:
         """Import pymodbus, which takes a third of a second."""
         pymodbus_library("pymodbus.client")
-
-    def _joint_run(self) -> RegisterRun | None:
-        """Return the registers to read by function 23, if it can write and read all at once."""
-        readings = list(self._readings.items())
-        verified = [item for run in self._verified for item in run.points]
-        if len(self._written) > 1 or any(run.table != "holding" for run in self._measured):
-            return None
-        for points in (readings + verified, readings):
-            runs = runs_of(points)
-            if len(runs) == 1:
-                return runs[0]
-        return None
 
     def _open(self) -> None:
         settings = self.settings
@@ -453,7 +483,7 @@ class ModbusSupply(PressureSupply):
         measured = np.full(self.n, np.nan)
         self._decode(joint, values, measured)
         for run in self._verified:
-            if set(run.points) <= set(joint.points):
+            if run.is_within(joint):
                 self._verify(joint, values, registers)
             else:
                 self._read_back(run, registers)

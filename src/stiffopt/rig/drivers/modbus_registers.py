@@ -313,6 +313,10 @@ class RegisterRun:
         what = f"{self.start} to {last}" if self.count > 1 else f"{self.start}"
         return f"{self.table} register{'s' if self.count > 1 else ''} {what}"
 
+    def is_within(self, other: RegisterRun) -> bool:
+        """Whether another run has all its points."""
+        return set(self.points) <= set(other.points)
+
     def cut(self, registers: Sequence[int], point: PressureRegister) -> Sequence[int]:
         """Return the registers of a point from those of the run."""
         offset = point.address - self.start

@@ -74,6 +74,7 @@ class OpenRegulatorSettings(SupplySettings):
 
     extra: ClassVar[str] = EXTRA
     peer: ClassVar[str] = "stiffopt.lab.open_regulator_peer:OpenRegulatorPeer"
+    vents_within: ClassVar[float] = 0.1
 
     driver: Literal["open-regulator"] = "open-regulator"
     port: Annotated[str, Field(min_length=1)]
@@ -96,8 +97,8 @@ class OpenRegulatorSettings(SupplySettings):
         """Refuse a rate at which the board would vent between two commands."""
         if rig.rate < _SLOWEST:
             raise MisfitError(
-                f"an open regulator vents after 100 ms without a command; expected at least "
-                f"{_SLOWEST:g} Hz",
+                f"an open regulator vents after {1e3 * self.vents_within:g} ms without a command; "
+                f"expected at least {_SLOWEST:g} Hz",
                 "rate",
             )
 
@@ -126,12 +127,10 @@ class OpenRegulatorSupply(PressureSupply):
         self._outputs = np.array([channel.output for channel in settings.channels]) - 1
         self._line: BoardLine
         self._identity: Identity
-        self._held_counts: tuple[int, ...] | None = (
-            None  # set-points that the board has; None: unknown
-        )
-        self._last_report: tuple[float, Status] | None = (
-            None  # time of the last report, and the report
-        )
+        self._held_counts: tuple[int, ...] | None = None
+        """Set-points that the board has; None: unknown."""
+        self._last_report: tuple[float, Status] | None = None
+        """Time of the last report, and the report."""
         self.patience = settings.startup + 6 * settings.timeout
 
     @property

@@ -1,0 +1,132 @@
+"""Friction on the way from rest into contact, and answers that it keeps from their place."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.optimize import lsq_linear
+
+import stiffopt
+from stiffopt.errors import EquilibriumError
+from stiffopt.model.contact import way
+from stiffopt.model.contact.equilibrium import ContactEquilibrium
+from stiffopt.model.contact.way import Rubbing, from_rest, rubbed
+from stiffopt.optimise.leaning import BracedProblem
+
+ROBOT = stiffopt.load_robot("stiff-flop-2")
+# an arm that slides along a post while it is pressed against it, and one that hardly slides
+SLIDING = (
+    {"from": (-0.0076, -0.0496, 0.14), "to": (0.0955, 0.0102, 0.1263), "radius": 0.0079},
+    [49237.0, 150000.0, 65553.0, 79276.0, 62592.0, 36861.0],
+)
+RESTING = (
+    {"from": (-0.0373, 0.0626, 0.0732), "to": (-0.048, -0.0569, 0.0694), "radius": 0.0145},
+    [109170.0, 0.0, 15636.0, 11363.0, 115865.0, 65304.0],
+)
+
+
+def scene(capsule: dict[str, Any], friction: float) -> stiffopt.Scene:
+    contact = {"allowed": True, "max_force": 0.4, "friction": friction}
+    return stiffopt.Scene(objects=[{"name": "post", "capsule": capsule, "contact": contact}])
+
+
+@cache
+def states(is_sliding: bool, friction: float) -> list[ContactEquilibrium]:
+    capsule, p = SLIDING if is_sliding else RESTING
+    return list(from_rest(ROBOT, scene(capsule, friction), np.array(p)))
+
+
+def problem(is_sliding: bool, **brace: Any) -> BracedProblem:
+    capsule, _ = SLIDING if is_sliding else RESTING
+    task = stiffopt.Task(
+        robot="stiff-flop-2",
+        target={"position": states(is_sliding, 0.2)[-1].tip_pose[:3, 3].tolist()},
+        stiffness={"maximise": {"direction": (1.0, 0.0, 0.0)}},
+        scene=scene(capsule, 0.2),
+        brace={"objects": ["post"], **brace},
+    )
+    return BracedProblem(ROBOT, task)
+
+
+def test_a_body_that_slides_all_the_way_has_all_its_friction_against_the_slide():
+    """The stations' centre line is seen to move against the force, and the tip is behind it."""
+    found, (*_, before, end) = rubbed(states(True, 0.2)), states(True, 0.2)
+    force = found.tangential @ found.sticking.across[0]
+    assert np.linalg.norm(force) == pytest.approx(0.2 * end.normal_forces[0], rel=0.02)
+    at = np.array([end.contacts[0].at])
+    moved = end.line(at)[0] - before.line(at)[0]
+    normal = end.contacts[0].normal
+    moved = (moved - normal * (moved[0] @ normal))[0]
+    assert force @ moved < -0.7 * np.linalg.norm(force) * np.linalg.norm(moved)
+    assert np.linalg.norm(found.tip) <= end.friction.tip * 1.02
+
+
+def test_friction_is_in_proportion_to_its_coefficient_where_all_is_used():
+    tips = [rubbed(states(True, mu)).tip for mu in (0.02, 0.01)]
+    assert tips[0] == pytest.approx(2 * tips[1], rel=0.05, abs=1e-5)
+
+
+def test_more_steps_of_the_way_change_little(monkeypatch):
+    monkeypatch.setattr(way, "STATES", 241)
+    capsule, p = SLIDING
+    finer = rubbed(from_rest(ROBOT, scene(capsule, 0.2), np.array(p)))
+    coarse = rubbed(states(True, 0.2))
+    assert coarse.tip == pytest.approx(finer.tip, abs=0.03 * float(np.linalg.norm(finer.tip)))
+
+
+def test_an_arm_that_touches_nothing_has_no_friction_to_follow():
+    high = {"from": (0.3, -0.05, 0.1), "to": (0.3, 0.05, 0.1), "radius": 0.005}
+    clear = list(from_rest(ROBOT, scene(high, 0.2), np.array(SLIDING[1])))
+    assert not any(each.contacts for each in clear)
+    assert problem(True, approach="objects").rubbing(states(True, 0.2)[-1]) is None
+
+
+@pytest.mark.parametrize("is_sliding", [True, False])
+def test_an_answer_that_friction_keeps_from_its_place_is_refused(is_sliding):
+    own, eq = problem(is_sliding, margin=1e-4), states(is_sliding, 0.2)[-1]
+    rubbing = own.rubbing(eq)
+    assert rubbing is not None
+    assert not [each for each in own.refusals(eq) if "friction" in each]
+    told = [each for each in own.refusals(eq, rubbing) if "friction on the way" in each]
+    assert len(told) == is_sliding
+    if told:
+        assert "pressures that are corrected by 0.1 bar leave it" in told[0]
+
+
+def test_friction_that_presses_an_object_beyond_its_greatest_force_is_refused():
+    own, eq = problem(False, margin=1e-4), states(False, 0.2)[-1]
+    found, force = own.rubbing(eq), float(eq.normal_forces[0])
+    assert found is not None
+    assert found.normals == pytest.approx(found.sticking.bent()[1] @ found.tangential)
+    for more, refused in ((0.09, False), (0.11, True), (-0.5, False)):
+        rubbing = found._replace(normals=np.array([0.4 * (1 + more) - force]))
+        told = [each for each in own.refusals(eq, rubbing) if "presses the arm on 'post'" in each]
+        assert bool(told) == refused
+
+
+def test_an_arm_that_leans_on_nothing_has_not_rubbed():
+    with pytest.raises(EquilibriumError, match="lean on nothing"):
+        rubbed(states(True, 0.2)[:1])
+
+
+def test_the_tip_is_corrected_as_far_as_pressures_may_change():
+    own, rng = problem(False), np.random.default_rng(3)
+    for size in (1e-4, 3e-3, 3e-2):
+        p = rng.uniform(0, 1.5e5, 6)
+        J, off = rng.normal(size=(3, 6)) * 2e-7, size * rng.normal(size=3)
+        low = np.maximum(own.lower * own.unit - p, -1e4)
+        high = np.minimum(own.upper * own.unit - p, 1e4)
+        best = lsq_linear(1e4 * J, -off, (low / 1e4, high / 1e4), tol=1e-12)
+        left = float(np.linalg.norm(best.fun))
+        assert own._corrected(p, off, J) == pytest.approx(left, rel=1e-2, abs=2e-6)
+
+
+def test_forces_move_on_to_the_nearest_contact_of_their_object():
+    """Equilibria that are the same twice carry everything on."""
+    *rest, end = states(True, 0.2)
+    once, twice = rubbed([*rest, end]), rubbed([*rest, end, end])
+    assert isinstance(once, Rubbing)
+    assert twice.tangential == pytest.approx(once.tangential, rel=1e-2, abs=1e-6)
