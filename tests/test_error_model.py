@@ -352,7 +352,7 @@ def test_a_first_reading_tells_the_history_only_if_the_model_is_certain(
 
 
 def test_validation_knows_for_how_long_poses_were_held(monkeypatch: pytest.MonkeyPatch) -> None:
-    """From all rows, though the regions of only few of them are compared."""
+    """From all rows of a log, though the regions of only few are compared; each log begins anew."""
     robot = ONE.model_copy(update={"calibration": Calibration(errors=ROUGH)})
     time = np.arange(0.0, 20.0, 0.2)
     pressures = np.tile([8e4, 0.0, 0.0], (len(time), 1))
@@ -366,10 +366,12 @@ def test_validation_knows_for_how_long_poses_were_held(monkeypatch: pytest.Monke
 
     monkeypatch.setattr(Uncertainty, "errors", noted)
     monkeypatch.setattr("stiffopt.identify.validation.ERRORS", replace(ERRORS, compared=12))
-    validate(robot, [("log", log)])
-    rows = np.linspace(0, len(time) - 1, 12).astype(int)
-    expected = np.where(time[rows] > 7, time[rows] - 6.0, np.nan)
-    np.testing.assert_allclose(seen["held"], expected, atol=0.21)
+    for names in (["log"], ["one", "other"]):
+        logs = [(name, log) for name in names]
+        validate(robot, logs, settings=CalibrationSettings(sequence=True))
+        own = np.tile(time[np.linspace(0, len(time) - 1, 12).astype(int)], len(names))
+        expected = np.where(own > 7, own - 6.0, np.nan)
+        np.testing.assert_allclose(seen["held"], expected, atol=0.21)
 
 
 # -- the fit ----------------------------------------------------------------------------------
