@@ -13,7 +13,7 @@ import stiffopt
 from stiffopt.errors import EquilibriumError
 from stiffopt.model.contact import way
 from stiffopt.model.contact.equilibrium import ContactEquilibrium
-from stiffopt.model.contact.way import Rubbing, from_rest, rubbed
+from stiffopt.model.contact.way import Rubbing, rubbed, states_from_rest
 from stiffopt.optimise.leaning import BracedProblem
 
 ROBOT = stiffopt.load_robot("stiff-flop-2")
@@ -36,7 +36,7 @@ def scene(capsule: dict[str, Any], friction: float) -> stiffopt.Scene:
 @cache
 def states(is_sliding: bool, friction: float) -> list[ContactEquilibrium]:
     capsule, p = SLIDING if is_sliding else RESTING
-    return list(from_rest(ROBOT, scene(capsule, friction), np.array(p)))
+    return list(states_from_rest(ROBOT, scene(capsule, friction), np.array(p)))
 
 
 def problem(is_sliding: bool, **brace: Any) -> BracedProblem:
@@ -72,14 +72,14 @@ def test_friction_is_in_proportion_to_its_coefficient_where_all_is_used():
 def test_more_steps_of_the_way_change_little(monkeypatch):
     monkeypatch.setattr(way, "STATES", 241)
     capsule, p = SLIDING
-    finer = rubbed(from_rest(ROBOT, scene(capsule, 0.2), np.array(p)))
+    finer = rubbed(states_from_rest(ROBOT, scene(capsule, 0.2), np.array(p)))
     coarse = rubbed(states(True, 0.2))
     assert coarse.tip == pytest.approx(finer.tip, abs=0.03 * float(np.linalg.norm(finer.tip)))
 
 
 def test_an_arm_that_touches_nothing_has_no_friction_to_follow():
     high = {"from": (0.3, -0.05, 0.1), "to": (0.3, 0.05, 0.1), "radius": 0.005}
-    clear = list(from_rest(ROBOT, scene(high, 0.2), np.array(SLIDING[1])))
+    clear = list(states_from_rest(ROBOT, scene(high, 0.2), np.array(SLIDING[1])))
     assert not any(each.contacts for each in clear)
     assert problem(True, approach="objects").rubbing(states(True, 0.2)[-1]) is None
 

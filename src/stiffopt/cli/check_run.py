@@ -7,7 +7,6 @@ import os
 import re
 import stat
 from collections.abc import Callable, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,9 +24,7 @@ def check_files(paths: Sequence[str], *, as_json: bool, quiet: bool) -> int:
     code = SOLVED
     rigs = [path for path in paths if _is_rig(path)]
     for path in paths:
-        kind, mistakes = check_file(path)
-        if kind == "task" and not mistakes and len(rigs) == 1:
-            mistakes = _mistakes(path, partial(_check_on_rig, path, rigs[0]))
+        kind, mistakes = check_file(path, rigs[0] if len(rigs) == 1 else None)
         if mistakes:
             code = BAD_INPUT
         if as_json:
@@ -50,28 +47,22 @@ def _record(mistake: FileError) -> dict[str, Any]:
     }
 
 
-def check_file(path: str) -> tuple[str, list[FileError]]:
-    """Return the kind of a file, empty if unknown, and its mistakes."""
-    kind = ""
+def check_file(path: str, rig: str | None = None) -> tuple[str, list[FileError]]:
+    """Return the kind of a file, empty if unknown, and its mistakes.
 
-    def check() -> None:
-        nonlocal kind
+    A task for the robot of `rig`, a rig file, is compared with the scene there.
+    """
+    kind = ""
+    try:
         kind = _kind_of(path)
         _CHECKS[kind](path)
-
-    mistakes = _mistakes(path, check)
-    return kind, mistakes
-
-
-def _mistakes(path: str, check: Callable[[], None]) -> list[FileError]:
-    """Return the mistakes that a check of a file reports."""
-    try:
-        check()
+        if kind == "task" and rig is not None:
+            _check_on_rig(path, rig)
     except FileError as error:
-        return [error, *error.others]
+        return kind, [error, *error.others]
     except StiffoptError as error:
-        return [FileError(path, str(error))]
-    return []
+        return kind, [FileError(path, str(error))]
+    return kind, []
 
 
 def _is_rig(path: str) -> bool:

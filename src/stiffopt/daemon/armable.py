@@ -19,7 +19,7 @@ from stiffopt.safety.gate import check_protection
 
 _NO_PRESSURE = "leaves every channel at one pressure: the arm could never move"
 _FASTEST = 500.0  # Hz
-_OVERLAP = 5e-4  # m; by about as much a clearance can be too small beside a mesh or a tube's bend
+_OVERLAP = 5e-4  # m; computed clearances from meshes and bent tubes may be too small by as much
 
 
 def too_fast(rate: float) -> str:

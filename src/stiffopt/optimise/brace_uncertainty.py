@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +22,7 @@ from stiffopt.errors import EquilibriumError
 from stiffopt.model.contact.equilibrium import ContactEquilibrium
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.parameters import Parameter, varied
-from stiffopt.model.uncertainty import NORMAL_QUANTILE
+from stiffopt.model.uncertainty import NORMAL_QUANTILE, TipUncertainty
 from stiffopt.optimise.brace import leant_on
 from stiffopt.optimise.goal import StiffnessMeasure
 from stiffopt.optimise.settings import BRACE
@@ -33,6 +34,13 @@ _LEAST_GRIP = 0.05  # where the contact itself is in doubt; its normal force is 
 _STEP = 0.3  # standard deviations, of differences by parameters
 
 
+def _arguments(measure: StiffnessMeasure, task: Task) -> tuple[Any, ...]:
+    """Return the arguments of `ContactEquilibrium.stiffness` for a measure of a braced task."""
+    assert task.brace is not None
+    m = measure
+    return m.direction, m.kind, m.boundary, m.frame, task.brace.contacts
+
+
 class BraceUncertainty:
     """The uncertainty of an equilibrium in contact that remains after the arm's calibration.
 
@@ -41,6 +49,10 @@ class BraceUncertainty:
 
     def __init__(self, robot: Manipulator, eq: ContactEquilibrium) -> None:
         self._robot, self._eq = robot, eq
+
+    @cached_property
+    def _errors(self) -> TipUncertainty:
+        return self._robot.tip_uncertainty(self._eq.pressures)
 
     @cached_property
     def _per_tip(self) -> Vector:
@@ -62,7 +74,7 @@ class BraceUncertainty:
         if self._robot.description.calibration is None:
             return np.zeros(len(self._eq.contacts))
         slopes = self._eq.force_gradients
-        squares = self._pressures(self._robot.tip_uncertainty(self._eq.pressures).covariance)
+        squares = self._pressures(self._errors.covariance)
         variances = np.einsum("ci,ij,cj->c", slopes, squares, slopes)
         return np.asarray(BRACE.sure * np.sqrt(np.maximum(variances, 0.0)))
 
@@ -80,14 +92,11 @@ class BraceUncertainty:
 
         The tip's errors go one such deviation each way along their three axes, and contacts stay.
         """
-        assert task.brace is not None
-        given = (
-            measure.direction, measure.kind, measure.boundary, measure.frame, task.brace.contacts
-        )  # fmt: skip
+        given = _arguments(measure, task)
         least = self._eq.stiffness(*given)
         if self._robot.description.calibration is None:
             return least
-        squares, axes = np.linalg.eigh(self._robot.tip_uncertainty(self._eq.pressures).covariance)
+        squares, axes = np.linalg.eigh(self._errors.covariance)
         for change in (self._per_tip @ (np.sqrt(np.maximum(squares, 0.0)) * axes)).T:
             for sign in (1.0, -1.0):
                 try:
@@ -101,14 +110,11 @@ class BraceUncertainty:
 
         On a logarithmic scale, and for contacts that stay.
         """
-        assert task.brace is not None
-        given = (
-            measure.direction, measure.kind, measure.boundary, measure.frame, task.brace.contacts
-        )  # fmt: skip
+        given = _arguments(measure, task)
         k, known = self._eq.stiffness(*given), self._robot.description.calibration
         if known is None:
             return k, k
-        errors = self._robot.tip_uncertainty(self._eq.pressures)
+        errors = self._errors
         squares = self._pressures(errors.hysteresis + errors.discrepancy + errors.residual)
         slope = self._eq.stiffness_gradient(*given) / k
         parameters = [Parameter(fitted.key) for fitted in known.parameters]

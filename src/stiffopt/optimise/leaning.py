@@ -26,7 +26,7 @@ from stiffopt.model.batch import InterpretedFunction
 from stiffopt.model.clearance import Nearest
 from stiffopt.model.codegen import dense
 from stiffopt.model.contact.equilibrium import ContactEquilibrium, Grip
-from stiffopt.model.contact.way import Rubbing, from_rest, rubbed
+from stiffopt.model.contact.way import Rubbing, rubbed, states_from_rest
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.scene import Scene, SceneObject
 from stiffopt.model.shape import PointOfArm
@@ -398,7 +398,7 @@ class BracedProblem(PressureProblem):
         """
         if self.brace.approach == "objects" or not eq.sticking.own:
             return None
-        states = list(from_rest(self.robot, self.scene, eq.pressures))
+        states = list(states_from_rest(self.robot, self.scene, eq.pressures))
         found, apart = rubbed(states), states[-1].tip_pose[:3, 3] - eq.tip_pose[:3, 3]
         if float(np.linalg.norm(apart)) > BRACE.same:
             raise EquilibriumError("in smaller steps the arm comes to another equilibrium")
@@ -463,11 +463,7 @@ class BracedProblem(PressureProblem):
     def _not_robust(self, eq: ContactEquilibrium, known: BraceUncertainty) -> Iterator[str]:
         """Yield which stiffness that is maximised a likely error of the calibration takes away."""
         for measure in self.directions:
-            given = (
-                measure.direction, measure.kind, measure.boundary, measure.frame,
-                self.brace.contacts,
-            )  # fmt: skip
-            k, least = eq.stiffness(*given), known.least_stiffness(measure, self.task)
+            k, least = self._stiffness(eq, measure), known.least_stiffness(measure, self.task)
             if least < BRACE.robust * k:
                 unit = display_units().stiffness
                 yield (
@@ -515,11 +511,12 @@ class BracedProblem(PressureProblem):
 
     def _held_at_tip(self, eq: ContactEquilibrium) -> bool:
         """Return True if a rigid object holds the tip along a direction that is maximised."""
-        grip = self.brace.contacts
-        return any(
-            eq.stiffness(m.direction, m.kind, m.boundary, m.frame, grip) > RIGID
-            for m in self.directions
-        )
+        return any(self._stiffness(eq, measure) > RIGID for measure in self.directions)
+
+    def _stiffness(self, eq: ContactEquilibrium, measure: StiffnessMeasure) -> float:
+        """Return a measure's stiffness, with contacts as the task has them."""
+        m = measure
+        return eq.stiffness(m.direction, m.kind, m.boundary, m.frame, self.brace.contacts)
 
     def _left_in_doubt(self, eq: ContactEquilibrium, doubt: Vector) -> tuple[float, float]:
         """Return the force that a push of the margin leaves beyond the doubt, and that, in N."""

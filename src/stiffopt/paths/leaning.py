@@ -18,7 +18,7 @@ from stiffopt.errors import EquilibriumError
 from stiffopt.model.arm_clearance import measured_scene
 from stiffopt.model.contact.equilibrium import Contact, ContactEquilibrium
 from stiffopt.model.contact.sticking import Sticking
-from stiffopt.model.contact.way import STATES, Rubbing, from_rest, rubbed
+from stiffopt.model.contact.way import STATES, Rubbing, rubbed, states_from_rest
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.scene import Scene
 from stiffopt.optimise.brace import kept_clear_of, leant_on, quoted
@@ -176,7 +176,7 @@ def way_from_rest(robot: Manipulator, task: Task, p: Vector) -> list[ContactEqui
     scene, others = leant_on(task.scene, task.brace), kept_clear_of(task.scene, task.brace)
     states: list[ContactEquilibrium] = []
     try:
-        states.extend(from_rest(robot, scene, p))
+        states.extend(states_from_rest(robot, scene, p))
     except EquilibriumError as error:
         share = len(states) / (STATES - 1)
         raise Unsolved(f"the way from rest is lost at {share:.0%} of it: {error}") from None

@@ -90,7 +90,6 @@ class Sticking(NamedTuple):
         """
         slides = np.zeros_like(forces)
         parts = [slice(2 * i, 2 * i + 2) for i in range(len(self.own))]
-        principal = [np.linalg.eigh(self.per_slide[own, own]) for own in parts]
         for _ in range(_ROUNDS):
             last = slides.copy()
             for i, own in enumerate(parts):
@@ -98,20 +97,21 @@ class Sticking(NamedTuple):
                 force = forces[own] + K @ slides - K[:, own] @ slides[own]
                 j = self.own[i]
                 most = self.friction[i] * float(normals[j] + self.normals[j] @ slides)
-                slides[own] = _slide(force, max(most, _LEAST), *principal[i])
+                slides[own] = _slide(force, max(most, _LEAST), K[:, own])
             if np.abs(slides - last).max(initial=0.0) <= _SAME * np.abs(slides).max(initial=0.0):
                 break
         return slides
 
 
-def _slide(force: Vector, most: float, stiffness: Vector, axes: Vector) -> Vector:
+def _slide(force: Vector, most: float, K: Vector) -> Vector:
     """Return the slide (2,) of a contact whose force (2,) exceeds the most that friction holds.
 
-    `stiffness` (2,) along the columns of `axes` (2, 2). Newton's method for the inverse of the
-    force, which grows nearly linearly with lambda.
+    `K`: stiffness (2, 2) against slides, in N/m. Newton's method for the inverse of the force,
+    which grows nearly linearly with lambda.
     """
     if math.hypot(*force) <= most:
         return np.zeros(2)
+    stiffness, axes = np.linalg.eigh(K)
     own, share = axes.T @ force, 0.0
     stiffness = np.maximum(stiffness, _SAME * stiffness.max())
     for _ in range(_ROUNDS):

@@ -29,7 +29,7 @@ TANGENTIAL = 1e-4  # m/N, compliance of a contact that sticks; an arm along itse
 
 
 class Rubbing(NamedTuple):
-    """What friction does to an arm that has come into contact.
+    """The effect of friction on an arm that has come into contact.
 
     Attributes
     ----------
@@ -45,7 +45,7 @@ class Rubbing(NamedTuple):
     normals: Vector
 
 
-def from_rest(arm: Manipulator, scene: Scene, p: Vector) -> Iterator[ContactEquilibrium]:
+def states_from_rest(arm: Manipulator, scene: Scene, p: Vector) -> Iterator[ContactEquilibrium]:
     """Yield equilibria from rest to pressures (n,), which grow in proportion.
 
     Raises

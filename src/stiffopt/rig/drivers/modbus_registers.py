@@ -314,7 +314,7 @@ class RegisterRun:
         return f"{self.table} register{'s' if self.count > 1 else ''} {what}"
 
     def is_within(self, other: RegisterRun) -> bool:
-        """Whether another run has all its points."""
+        """Return True if the other run contains every point of this one."""
         return set(self.points) <= set(other.points)
 
     def cut(self, registers: Sequence[int], point: PressureRegister) -> Sequence[int]:
