@@ -101,10 +101,8 @@ class Registration(Schema):
     def tip_in_base(self, position: Array, quaternion: Array | None) -> tuple[Array, Array | None]:
         """Return position (3,) and quaternion (4,) or None of the tip in the base frame.
 
-        Parameters
-        ----------
-        position, quaternion : of the sensor in the tracker's frame, in m and w first; without a
-            quaternion the sensor's position is used for the tip.
+        `position`, `quaternion`: of the sensor in the tracker's frame, in m and w first; without a
+        quaternion the sensor's position is used for the tip.
         """
         T = self.tracker_in_base.transform()
         if quaternion is None:

@@ -53,10 +53,7 @@ def solve_file(
 
     With `post_force`, the largest contact force in N, also suggest where to lean on a new object.
 
-    Raises
-    ------
-    InputError
-        The task file or its robot is invalid; the message names the file.
+    Raises `InputError`: the task file or its robot is invalid; the message names the file.
     """
     task = load_task(file)
     try:

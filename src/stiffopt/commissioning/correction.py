@@ -76,10 +76,8 @@ def write_corrected(
 ) -> None:
     """Write the corrected rig file into the folder of the old one, and check it.
 
-    Raises
-    ------
-    FileError
-        It is in another folder, where its relative paths would be wrong, or it is invalid.
+    Raises `FileError`: it is in another folder, where its relative paths would be wrong, or it is
+    invalid.
     """
     check_place(out, path)
     comment = [

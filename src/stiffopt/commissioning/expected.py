@@ -82,10 +82,7 @@ class ExpectedSteps:
 def expected_steps(description: RobotDescription, limits: PressureLimits) -> ExpectedSteps:
     """Choose the size of the steps and predict their effect.
 
-    Raises
-    ------
-    InputError
-        The limits leave no pressure for steps.
+    Raises `InputError`: the limits leave no pressure for steps.
     """
     n, segments = description.n_pressures, range(description.n_segments)
     parameters = [

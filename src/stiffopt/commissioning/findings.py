@@ -56,9 +56,7 @@ _WORST = 3.0  # standard deviations from the files' value from which a number do
 class Finding:
     """A finding; see `stiffopt.commissioning.record.RecordedFinding` for the other fields.
 
-    Attributes
-    ----------
-    cause : name of the cause (`Cause`), or ``wiring``, ``gauge``, ``tracker``, ``timing`` ...
+    `cause`: name of the cause (`Cause`), or ``wiring``, ``gauge``, ``tracker``, ``timing`` ...
     """
 
     cause: str

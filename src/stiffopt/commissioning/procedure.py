@@ -139,6 +139,8 @@ def run_steps(
 ) -> StepReadings:
     """Move the channels one after another, and return all measurements.
 
+    Raises `DangerError`: the tip moves as no sound arm can; `DeviceError`: a device fails.
+
     Parameters
     ----------
     rig : open.
@@ -147,13 +149,6 @@ def run_steps(
     rate : rate of the commands, in Hz.
     quick : whether to hold the steps only briefly; slow leaks then go unnoticed.
     progress, check : as in `stiffopt.experiments.poses.run_poses`.
-
-    Raises
-    ------
-    DangerError
-        The tip moves as no sound arm can.
-    DeviceError
-        A device fails.
     """
     conductor = Conductor(rig, rate, check)
     watch = _StepWatch(conductor, Safety() if rig.settings is None else rig.settings.safety)

@@ -334,9 +334,7 @@ def _look(n: int, tuning: RegulatorTuning) -> Formula:
 class _Rest:
     """Finds shortfalls of n channels that grow in size while their commands rest.
 
-    Attributes
-    ----------
-    changed : flags (n,) of these channels.
+    `changed`: flags (n,) of these channels.
     """
 
     def __init__(self, n: int, tuning: RegulatorTuning) -> None:

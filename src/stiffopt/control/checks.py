@@ -179,10 +179,7 @@ def highest_pressures(task: Task, limits: PressureLimits) -> Array:
 def check_press(robot: Manipulator, limits: PressureLimits, task: Task) -> None:
     """Refuse a press that the arm cannot exert within the rig's limits, or cannot feel.
 
-    Raises
-    ------
-    InputError
-        With the reason.
+    Raises `InputError` with the reason.
     """
     if task.press is None:
         return

@@ -33,17 +33,15 @@ class Course:
     Positions, directions and quaternions follow cubic splines through the waypoints; directions and
     quaternions are normalised. The splines begin and end at rest, and stay at their ends.
 
+    Raises `InputError`: successive waypoints have opposite directions, or no finite spline passes
+    through them.
+
     Parameters
     ----------
     trajectory : the waypoints.
     begin : time at which it begins, in s.
     position, rotation : of the tip at that time, (3,) and (3, 3): the start if the first waypoint
         is later.
-
-    Raises
-    ------
-    InputError
-        Successive waypoints have opposite directions, or no finite spline passes through them.
     """
 
     def __init__(

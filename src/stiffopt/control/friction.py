@@ -26,9 +26,8 @@ class Friction:
 
     Parameters
     ----------
-    hold, planned :
-        The contacts, linearised about their equilibrium without friction at the end of the way, and
-        its pressures (n,).
+    hold, planned : the contacts, linearised about their equilibrium without friction at the end of
+        the way, and its pressures (n,).
 
     Attributes
     ----------

@@ -41,10 +41,8 @@ class GaugeWatch:
     def dead(self, measured: Sequence[bool], noisy: Sequence[bool]) -> Iterator[str]:
         """Yield the problems of the gauges.
 
-        Parameters
-        ----------
-        measured : whether each channel has a gauge.
-        noisy : whether that gauge had noise when it was commissioned.
+        `measured`: whether each channel has a gauge. `noisy`: whether that gauge had noise when it
+        was commissioned.
         """
         if len(self._readings) < _ENOUGH:
             if any(measured):

@@ -26,9 +26,7 @@ Array = NDArray[np.float64]
 class MotionErrorEstimator:
     """Estimates the change of the tip's offset with the motion of the model.
 
-    Attributes
-    ----------
-    slope : A (3, 3), displacement of the tip per displacement of the model's; zero before `learn`.
+    `slope`: A (3, 3), displacement of the tip per displacement of the model's; zero before `learn`.
     """
 
     def __init__(self, tuning: MotionErrorTuning) -> None:

@@ -183,6 +183,8 @@ class Replanner:
     ) -> Array | None:
         """Request a plan when it is time; return the newest.
 
+        Returns effective pressures and offset of the plan (n + 6,); None without a plan.
+
         Parameters
         ----------
         now : time, in s.
@@ -193,10 +195,6 @@ class Replanner:
             more than a little starts a search of all configurations.
         way : see `PlanRequest`; None without a scene.
         windows, here : see `PlanRequest`; `here` is None for an arm that does not vibrate.
-
-        Returns
-        -------
-        Effective pressures and offset of the plan (n + 6,); None without a plan.
         """
         task, target = self.pursuit.task, self.pursuit.target
         interval = self._tuning.interval

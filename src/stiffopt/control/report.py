@@ -51,10 +51,8 @@ class Report:
     def status(self, now: float, led: tuple[Target, Array] | None) -> ControllerStatus:
         """Return the controller's part of the state.
 
-        Parameters
-        ----------
-        now : time, in s.
-        led : on a trajectory of pressures, its present target and effective pressures (n,), in Pa.
+        `now`: time, in s. `led`: on a trajectory of pressures, its present target and effective
+        pressures (n,), in Pa.
         """
         n, arm, pursuit = self._robot.n_pressures, self._arm, self._replanner.pursuit
         if arm.modelled is None:

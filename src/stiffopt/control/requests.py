@@ -36,10 +36,8 @@ class Requests:
 
     All methods raise `InputError` with the reason of a refusal, and change nothing.
 
-    Parameters
-    ----------
-    robot, limits, slew, scene, tuning : see `TipController`; slew (n,), in Pa/s.
-    tip_speed : see `ControlSettings`.
+    `robot`, `limits`, `slew`, `scene`, `tuning`: see `TipController`; slew (n,), in Pa/s.
+    `tip_speed`: see `ControlSettings`.
     """
 
     def __init__(

@@ -34,14 +34,10 @@ class SlideEstimator:
 
     Parameters
     ----------
-    approach :
-        The way into contact.
-    friction :
-        Of the contacts, linear about its end.
-    usual :
-        Covariance (3, 3) of pushes, base axes, in N^2.
-    tuning :
-        What is expected of errors, pushes and slides.
+    approach : the way into contact.
+    friction : of the contacts, linear about its end.
+    usual : covariance (3, 3) of pushes, base axes, in N^2.
+    tuning : what is expected of errors, pushes and slides.
     """
 
     def __init__(
@@ -70,12 +66,10 @@ class SlideEstimator:
 
         Parameters
         ----------
-        elapsed, held :
-            Time since the last sample, and in contact, in s.
-        seen, quaternion :
-            Measured position (3,), in m, and orientation (4,), w first; None if it is not measured.
-        pressures :
-            Effective pressures (n,), in Pa.
+        elapsed, held : time since the last sample, and in contact, in s.
+        seen, quaternion : measured position (3,), in m, and orientation (4,), w first; None if it
+            is not measured.
+        pressures : effective pressures (n,), in Pa.
         """
         off = np.concatenate([seen - self._pose[:3, 3], np.zeros(3)])
         if quaternion is not None:

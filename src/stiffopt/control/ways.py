@@ -46,10 +46,8 @@ class Ways:
         The way is divided until the body cannot come nearer between two states by more than 0.2 mm
         than is accepted.
 
-        Parameters
-        ----------
-        way : its corners.
-        waypoints : whether all corners but the first are waypoints, to be named in the reason.
+        `way`: its corners. `waypoints`: whether all corners but the first are waypoints, to be
+        named in the reason.
         """
         robot = self._robot
         states, legs = _divided(np.clip(way, robot.pressure_min, robot.pressure_max))

@@ -18,9 +18,7 @@ Array = NDArray[np.float64]
 class WindowWatch:
     """Collects windows while the arm rests: the newest one of each posture.
 
-    Attributes
-    ----------
-    windows : the present windows; a new tuple when they change.
+    `windows`: the present windows; a new tuple when they change.
     """
 
     def __init__(self, tuning: WindowTuning) -> None:

@@ -84,29 +84,20 @@ class Daemon:
     here or by a client. `stop`, or the end of a `with` block, lets the pressures down, vents, and
     ends everything.
 
+    Raises `FileError`: a file is wrong; `MissingExtraError`: a library is not installed.
+
     Parameters
     ----------
-    rig :
-        The rig file.
-    service :
-        Whether to open ports: the control interface, and Foxglove.
-    log_folder :
-        Folder of the recordings; None: the rig file's.
-    json_lines :
-        Whether the guard writes JSON on stderr.
+    rig : the rig file.
+    service : whether to open ports: the control interface, and Foxglove.
+    log_folder : folder of the recordings; None: the rig file's.
+    json_lines : whether the guard writes JSON on stderr.
 
     Attributes
     ----------
     trouble : after `stop`, why the arm may not be vented; empty if it is vented for certain.
     hung : parts that had not ended when `stop` did. Their threads do not keep the process from
         ending, but a library in them may: see `os._exit`.
-
-    Raises
-    ------
-    FileError
-        A file is wrong.
-    MissingExtraError
-        A library is not installed.
     """
 
     def __init__(
@@ -211,15 +202,9 @@ class Daemon:
 
         The arm stays vented.
 
-        Raises
-        ------
-        InputError
-            A port is not free, the token is too short for others to reach it, a device does not
-            answer, or a check failed.
-        MissingExtraError
-            A library is not installed.
-        DeviceError
-            The guard does not start.
+        Raises `InputError`: a port is not free, the token is too short for others to reach it, a
+        device does not answer, or a check failed; `MissingExtraError`: a library is not installed;
+        `DeviceError`: the guard does not start.
         """
         if self._started:
             raise InputError("a daemon can be started only once; make another one")

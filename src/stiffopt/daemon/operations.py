@@ -202,10 +202,7 @@ class Operations:
 
         With `lasting`, the loop carries it out even after the patience has ended.
 
-        Raises
-        ------
-        RefusalError
-            It fails, does not return in time, or too many calls are waiting.
+        Raises `RefusalError`: it fails, does not return in time, or too many calls are waiting.
         """
         if self._running >= _MAX_CALLS and not urgent:
             raise RefusalError(503, "busy", "the control loop has too much to do; try again")

@@ -23,10 +23,8 @@ ARRIVED_ANGLE = radians(1.0)
 class ErrorStatistics(NamedTuple):
     """Statistics of errors in some ticks of a run, in the unit of the errors.
 
-    Attributes
-    ----------
-    mean, p95, largest : the mean, the 95th percentile and the largest error.
-    ticks : number of errors.
+    `mean`, `p95`, `largest`: the mean, the 95th percentile and the largest error. `ticks`: number
+    of errors.
     """
 
     mean: float

@@ -107,12 +107,8 @@ class RecordedRun:
 def read_run(path: str | os.PathLike[str]) -> RecordedRun:
     """Read a recording of the daemon, even if it was cut short by a kill.
 
-    Raises
-    ------
-    FileError
-        It cannot be read, is no recording of a run, or has no whole message left.
-    MissingExtraError
-        mcap is not installed.
+    Raises `FileError`: it cannot be read, is no recording of a run, or has no whole message left;
+    `MissingExtraError`: mcap is not installed.
     """
     found = read_mcap(path)
     if LOG_METADATA in found.metadata:

@@ -66,6 +66,8 @@ RATES = TelemetryRates()
 class Telemetry:
     """Logs what a loop does, to Foxglove and to a recording.
 
+    Raises `MissingExtraError`: foxglove-sdk is not installed.
+
     Parameters
     ----------
     robot, name : the model of the arm, which the recording keeps, and the name of the rig.
@@ -75,11 +77,6 @@ class Telemetry:
     backbone : returns poses (m, 4, 4) along the arm for pressures (n,), in Pa.
     about : further metadata for the recording, such as the text of the rig file.
     wall : nanoseconds since 1970; read once, so that messages do not jump with the wall clock.
-
-    Raises
-    ------
-    MissingExtraError
-        foxglove-sdk is not installed.
     """
 
     def __init__(

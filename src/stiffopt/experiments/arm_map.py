@@ -102,6 +102,9 @@ def map_arm(
 ) -> ArmMap:
     """Map the stiffness along an arm.
 
+    Raises `InputError`: the robot lacks a channel, or does not allow a pressure;
+    `EquilibriumError`: the arm has no stable equilibrium at one of the pressures.
+
     Parameters
     ----------
     groups : groups of channels (from 1) that are pressurised together; by default the first channel
@@ -112,13 +115,6 @@ def map_arm(
     directions : (d, 3)
     boundary, frame : of the stiffness; see `Manipulator.stiffness`.
     progress : called with the number of points done and the total.
-
-    Raises
-    ------
-    InputError
-        The robot lacks a channel, or does not allow a pressure.
-    EquilibriumError
-        The arm has no stable equilibrium at one of the pressures.
     """
     points = checked_integer("points, the number of points along the arm,", points, 2)
     if groups is None:
@@ -173,19 +169,15 @@ def map_tip(
 ) -> TipMap:
     """Map the stiffness of the tip over the pressures of two channels.
 
+    Raises `InputError`: these are not two channels of the robot; `EquilibriumError`: the arm has no
+    stable equilibrium at one of the pressures.
+
     Parameters
     ----------
     channels : the two, counted from 1.
     levels : number of pressures of each, from its lowest to its highest.
     others : (n,), pressures of the other channels, in Pa; by default their lowest.
     directions, boundary, frame, progress : see `map_arm`.
-
-    Raises
-    ------
-    InputError
-        These are not two channels of the robot.
-    EquilibriumError
-        The arm has no stable equilibrium at one of the pressures.
     """
     levels = checked_integer("levels, the number of pressures of a channel,", levels, 2)
     pair = _checked_channels(robot, channels)

@@ -62,10 +62,7 @@ class KinematicsSettings(ExperimentSettings):
 class PressureSequence:
     """Pressures that change linearly between given times.
 
-    Attributes
-    ----------
-    times : (K,), in s, increasing from 0.
-    pressures : (K, n), in Pa.
+    `times`: (K,), in s, increasing from 0. `pressures`: (K, n), in Pa.
     """
 
     times: Array
@@ -152,6 +149,8 @@ def run_kinematics(
 ) -> list[str]:
     """Record the repetitions and the rounds of combined poses that are missing in a folder.
 
+    Returns notes for the user.
+
     Parameters
     ----------
     rig : open.
@@ -160,11 +159,6 @@ def run_kinematics(
     rate : rate of the commands, in Hz.
     progress : called with the seconds done, the total and a description.
     check : called often; it may raise to stop.
-
-    Returns
-    -------
-    list of str
-        Notes for the user.
 
     Raises
     ------

@@ -118,6 +118,8 @@ def run_stiffness(
 ) -> list[str]:
     """Do the series of the experiment that are missing in a folder.
 
+    Returns notes for the user.
+
     Parameters
     ----------
     rig : open, with a tracker and a probe.
@@ -128,11 +130,6 @@ def run_stiffness(
     progress : called with the number of series done, the total and a description.
     check : called often; it may raise to stop.
     aside : returns the context in which the probe is aligned, perhaps by a person.
-
-    Returns
-    -------
-    list of str
-        Notes for the user.
 
     Raises
     ------

@@ -104,14 +104,7 @@ def evaluate_stiffness(
 ) -> StiffnessResult:
     """Fit the stiffness of all series in a folder, and compare it with a model.
 
-    Parameters
-    ----------
-    folder : of an experiment, complete or not.
-
-    Raises
-    ------
-    FileError
-        The points cannot be read.
+    `folder`: of an experiment, complete or not. Raises `FileError`: the points cannot be read.
     """
     series = PointsFile(folder, settings.channels).read()
     top = max(settings.pressures)

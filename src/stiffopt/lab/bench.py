@@ -174,11 +174,9 @@ class DevicePeer(ABC, Generic[SettingsT]):
 
     Parameters
     ----------
-    settings :
-        Settings of the real driver, as in the rig file. The peer follows them (register map,
+    settings : settings of the real driver, as in the rig file. The peer follows them (register map,
         scales, channels), so that a lab can rehearse with its own file.
-    bench :
-        The bench behind it.
+    bench : the bench behind it.
 
     Attributes
     ----------
@@ -195,17 +193,8 @@ class DevicePeer(ABC, Generic[SettingsT]):
     def stand_in(cls, simulated: Any, n: int) -> SettingsT:
         """Return settings with which this device replaces a simulated one.
 
-        Parameters
-        ----------
-        simulated :
-            Settings of the simulated device.
-        n :
-            Number of the arm's channels.
-
-        Raises
-        ------
-        InputError
-            It has no default settings.
+        `simulated`: settings of the simulated device. `n`: number of the arm's channels. Raises
+        `InputError`: it has no default settings.
         """
         raise InputError(f"{cls.__name__} needs settings in the rig file")
 
@@ -218,16 +207,9 @@ class DevicePeer(ABC, Generic[SettingsT]):
     def start(self) -> SettingsT:
         """Listen on loopback, on a free port or pseudo-terminal.
 
-        Returns
-        -------
-        The settings, with the address at which the real driver reaches this peer.
-
-        Raises
-        ------
-        DeviceError
-            The address in the settings is in use.
-        MissingExtraError
-            The library of the protocol is not installed.
+        Returns the settings, with the address at which the real driver reaches this peer. Raises
+        `DeviceError`: the address in the settings is in use; `MissingExtraError`: the library of
+        the protocol is not installed.
         """
 
     @abstractmethod

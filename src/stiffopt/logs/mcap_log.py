@@ -35,18 +35,14 @@ _SCALARS = ("time_s", "force_n", "stage_m")
 class McapLogWriter:
     """Writes the rows of a log to an MCAP file, replacing an existing one.
 
+    Raises `FileError`: it cannot be written, now or later; `MissingExtraError`: foxglove-sdk is not
+    installed.
+
     Parameters
     ----------
     path, layout : the file, whose folder must exist, and its columns.
     about : metadata to keep in the file.
     now : present time of the log, in s.
-
-    Raises
-    ------
-    FileError
-        It cannot be written, now or later.
-    MissingExtraError
-        foxglove-sdk is not installed.
     """
 
     def __init__(

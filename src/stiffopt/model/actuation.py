@@ -29,10 +29,8 @@ NORM_SMOOTHING = 0.01
 class Section:
     """Free strain and compliance of the section of one segment, per length at rest.
 
-    Attributes
-    ----------
-    strain : backbone strain (6,), linear part first: the pose obeys ``dT/dS = T strain^``.
-    compliance : section compliance (6, 6): extra strain per internal wrench, in section axes.
+    `strain`: backbone strain (6,), linear part first: the pose obeys ``dT/dS = T strain^``.
+    `compliance`: section compliance (6, 6): extra strain per internal wrench, in section axes.
     """
 
     strain: ca.SX
@@ -69,9 +67,7 @@ class SectionGeometry:
     def turned(self, azimuth: NDArray[np.float64]) -> SectionGeometry:
         """Return the same section with the lever arms of its channels turned about the axis.
 
-        Parameters
-        ----------
-        azimuth : of each channel (c,), from x towards y, in rad; empty for none.
+        `azimuth`: of each channel (c,), from x towards y, in rad; empty for none.
         """
         if not azimuth.any():
             return self

@@ -43,10 +43,7 @@ def check_choice(name: str, value: object, choices: tuple[str, ...]) -> None:
 def real_numbers(value: ArrayLike) -> Vector:
     """Return an array of real numbers; reject text, booleans and complex numbers.
 
-    Raises
-    ------
-    ValueError
-        If there is anything but real numbers, or rows differ in length.
+    Raises `ValueError` if there is anything but real numbers, or rows differ in length.
     """
     numbers = np.asarray(value)
     if numbers.dtype.kind not in "iuf":

@@ -251,10 +251,7 @@ class Arm:
 
         Stability is not checked when starting from a nearby one.
 
-        Raises
-        ------
-        EquilibriumError
-            If none is reached continuously (and, from rest, stable).
+        Raises `EquilibriumError` if none is reached continuously (and, from rest, stable).
         """
         if nearby is None:
             return self._equilibrium().settle(p, self._loads)
@@ -322,10 +319,7 @@ class Arm:
     def checked_pressures(self, p: ArrayLike) -> Vector:
         """Return one set of finite pressures (n,); the strain law's limits are not checked.
 
-        Raises
-        ------
-        PressureError
-            If they are anything else.
+        Raises `PressureError` if they are anything else.
         """
         values = self._checked(p)
         if values.ndim != 1:

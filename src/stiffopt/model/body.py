@@ -199,6 +199,8 @@ class ModelInC:
 class NativeBody:
     """The body of an arm in machine code.
 
+    Raises `EquilibriumError` if the unpressurised arm falls over.
+
     Parameters
     ----------
     code : library of the functions of `stiffopt.model.body_functions` with clearance.c.
@@ -207,11 +209,6 @@ class NativeBody:
     ----------
     address : of the `BodyModel`.
     code : the library, with the functions of clearance.c.
-
-    Raises
-    ------
-    EquilibriumError
-        If the unpressurised arm falls over.
     """
 
     def __init__(self, code: Library, arm: Arm) -> None:

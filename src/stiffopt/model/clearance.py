@@ -130,10 +130,7 @@ def survey(station: StationOf, ends: Sequence[tuple[float, float, int]]) -> list
 def nearest_point(station: StationOf, item: MeasuredObject, ranges: Sequence[BodyRange]) -> Nearest:
     """Return the point of a body that is nearest to an object.
 
-    Parameters
-    ----------
-    station : the body.
-    ranges : all of it; for objects other than rings, a part of it is allowed.
+    `station`: the body. `ranges`: all of it; for objects other than rings, a part of it is allowed.
     """
     search = _Search(station, item)
     first, *others = ranges

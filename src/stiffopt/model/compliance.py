@@ -133,12 +133,9 @@ def directional_stiffness(
 
     Parameters
     ----------
-    compliance : (6, 6)
-        Compliance in the frame of the loaded point.
-    rotation : (3, 3)
-        Axes of that frame in the base frame.
-    direction : (3,)
-        Unit vector in base axes (`frame` "base") or in the point's own ("tip").
+    compliance : (6, 6), compliance in the frame of the loaded point.
+    rotation : (3, 3), axes of that frame in the base frame.
+    direction : (3,), unit vector in base axes (`frame` "base") or in the point's own ("tip").
     frame, kind, boundary
         ``free``: ``1 / (d'C_vv d)``; ``guided``: the other two translations are held,
         ``d'C_vv^-1 d``; ``clamped``: rotation is held too, ``d'(C^-1)_vv d``.  With `kind`

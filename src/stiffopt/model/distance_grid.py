@@ -31,10 +31,7 @@ _MOST_POINTS = 4_000_000
 class Surface:
     """A closed surface of triangles, wound so that their normals point outwards.
 
-    Attributes
-    ----------
-    vertices : (k, 3), in m.
-    faces : indices (m, 3) of vertices.
+    `vertices`: (k, 3), in m. `faces`: indices (m, 3) of vertices.
     """
 
     vertices: Array
@@ -86,16 +83,9 @@ class DistanceGrid:
 def read_surface(path: Path, changed: int, scale: float) -> Surface:
     """Read an STL or OBJ file.
 
-    Parameters
-    ----------
-    changed : modification time of the file; part of the cache key.
-    scale : length of one unit of the file, in m.
-
-    Raises
-    ------
-    InputError
-        It cannot be read, is empty or not closed.
-    MissingExtraError
+    `changed`: modification time of the file; part of the cache key. `scale`: length of one unit of
+    the file, in m. Raises `InputError`: it cannot be read, is empty or not closed;
+    `MissingExtraError`.
     """
     require_package("trimesh", "mesh")
     require_package("libigl", "mesh", "igl")

@@ -89,10 +89,8 @@ class Continuation(NamedTuple):
 class Equilibrium:
     """Numerical equilibria of one shooting problem.
 
-    Parameters
-    ----------
-    shooting : the arm.
-    at : arc length of the station on which `Loads.station` acts; None is the tip.
+    `shooting`: the arm. `at`: arc length of the station on which `Loads.station` acts; None is the
+    tip.
     """
 
     def __init__(self, shooting: Shooting, at: float | None = None) -> None:
@@ -185,10 +183,8 @@ class Equilibrium:
     def settle(self, pressures: Vector, loads: Loads) -> EquilibriumState:
         """Find the equilibrium reached from rest: first the arm's weight, then pressures and loads.
 
-        Raises
-        ------
-        EquilibriumError
-            If the arm buckles or falls over on the way; the message says where.
+        Raises `EquilibriumError` if the arm buckles or falls over on the way; the message says
+        where.
         """
         hanging = self._at_rest(loads.gravity)
         end = hanging._replace(pressures=pressures, loads=loads)

@@ -43,10 +43,8 @@ _SWITCHES = {"connector", "dead_band"}
 class Layout:
     """What formulas and machine code of an arm are made for.
 
-    Attributes
-    ----------
-    skeleton : the arm's segments without their numbers; equal for arms of the same layout.
-    example : some arm of this layout.
+    `skeleton`: the arm's segments without their numbers; equal for arms of the same layout.
+    `example`: some arm of this layout.
     """
 
     skeleton: str
@@ -129,9 +127,7 @@ def free_tip_function(
 ) -> ca.Function:
     """Return a function of pressures (n,) and parameters: the arm's numbers, then a caller's own.
 
-    Parameters
-    ----------
-    outputs : function from the tip's shape and the symbols of the caller's parameters to outputs.
+    `outputs`: function from the tip's shape and the symbols of the caller's parameters to outputs.
     """
     arm = symbolic_arm(layout)
     own = ca.SX.sym("own", n_parameters)

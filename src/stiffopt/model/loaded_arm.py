@@ -54,15 +54,8 @@ class _Rod(ctypes.Structure):
 class LoadedArm:
     """An arm under gravity or a load in machine code: its rod, and equilibria from rest.
 
-    Attributes
-    ----------
-    address : of its `Rod`.
-    state_size : number of doubles of an equilibrium's state.
-
-    Raises
-    ------
-    EquilibriumError
-        If the unpressurised arm falls over.
+    `address`: of its `Rod`. `state_size`: number of doubles of an equilibrium's state. Raises
+    `EquilibriumError` if the unpressurised arm falls over.
     """
 
     def __init__(self, code: Library, robot: Arm) -> None:

@@ -86,10 +86,7 @@ class MotionClearance:
 class ClearMotions:
     """Check motions of one arm in one scene; for one thread at a time.
 
-    Parameters
-    ----------
-    arm : with its load.
-    scene : its own `clearance` is ignored.
+    `arm`: with its load. `scene`: its own `clearance` is ignored.
     """
 
     def __init__(self, arm: Manipulator, scene: Scene) -> None:

@@ -70,10 +70,7 @@ class Shape(Protocol):
 class PointOfArm:
     """Position and axes of a point of the arm.
 
-    Attributes
-    ----------
-    position : in the base frame, (3,).
-    rotation : axes (3, 3) of the section in the base frame.
+    `position`: in the base frame, (3,). `rotation`: axes (3, 3) of the section in the base frame.
     """
 
     position: ca.SX | ca.MX
@@ -104,10 +101,7 @@ class ShapePiece:
 class FreeShape:
     """The unloaded arm: a product of exponentials (eq. 7) and its compliance (eq. 17).
 
-    Attributes
-    ----------
-    pressures : pressures (n,) of the whole arm.
-    pieces : from the base to the station.
+    `pressures`: pressures (n,) of the whole arm. `pieces`: from the base to the station.
     """
 
     pressures: ca.SX

@@ -177,15 +177,8 @@ class PositionErrors:
 class Uncertainty:
     """Uncertainties of a calibrated robot.
 
-    Parameters
-    ----------
-    description : with a calibration.
-    tip_load : load on the tip, as in `Manipulator.tip_load`.
-
-    Raises
-    ------
-    InputError
-        The robot was not calibrated.
+    `description`: with a calibration. `tip_load`: load on the tip, as in `Manipulator.tip_load`.
+    Raises `InputError`: the robot was not calibrated.
     """
 
     def __init__(

@@ -32,12 +32,8 @@ Vector = NDArray[np.float64]
 class Answers:
     """Factory of one solver's solutions.
 
-    Parameters
-    ----------
-    prepared :
-        Limits, samples and compiled solvers for the kind of task.
-    solve_at_once :
-        Solves another task on the arm; see `PressureSolver.solve_at_once`.
+    `prepared`: limits, samples and compiled solvers for the kind of task. `solve_at_once`: solves
+    another task on the arm; see `PressureSolver.solve_at_once`.
     """
 
     def __init__(

@@ -131,10 +131,7 @@ class BraceUncertainty:
     def _varied(self, task: Task, parameter: Parameter, coordinate: float) -> ContactEquilibrium:
         """Return the equilibrium with another parameter, or the known one if nothing is touched.
 
-        Raises
-        ------
-        EquilibriumError
-            There is none.
+        Raises `EquilibriumError`: there is none.
         """
         assert task.scene is not None
         assert task.brace is not None

@@ -32,9 +32,7 @@ Vector = NDArray[np.float64]
 class CompiledSearch:
     """Search by machine code for one kind of task; returns None until code is compiled.
 
-    Parameters
-    ----------
-    answers : the solver's factory of solutions.
+    `answers`: the solver's factory of solutions.
     """
 
     def __init__(self, answers: Answers) -> None:

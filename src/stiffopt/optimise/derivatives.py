@@ -76,6 +76,8 @@ class _Active:
 class AnswerDerivatives:
     """Derivatives of the answer to a task.
 
+    Raises `DerivativeError` if the answer is not an isolated optimum.
+
     Parameters
     ----------
     robot : the arm, which carries the task's load.
@@ -85,11 +87,6 @@ class AnswerDerivatives:
     ----------
     weak : constraints that are about to become active or inactive.  If there are any, derivatives
         hold only on the side on which the active constraints stay the same.
-
-    Raises
-    ------
-    DerivativeError
-        If the answer is not an isolated optimum.
     """
 
     def __init__(self, robot: Manipulator, task: Task, pressures: Vector) -> None:

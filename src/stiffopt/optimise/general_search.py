@@ -26,9 +26,7 @@ _ONE = Effort(1, 1, 1)
 class GeneralSearch:
     """Solve any task, more slowly than `CompiledSearch`.
 
-    Parameters
-    ----------
-    answers : the solver's factory of solutions.
+    `answers`: the solver's factory of solutions.
     """
 
     def __init__(self, answers: Answers) -> None:

@@ -51,10 +51,8 @@ class LeastDistance(NamedTuple):
 class FollowedObstacles(Obstacles):
     """The objects around one arm, with one row for each local minimum near the clearance.
 
-    Attributes
-    ----------
-    pressures : (n,), pressures at which the minima were found, in Pa.
-    least : the minimum of each row.
+    `pressures`: (n,), pressures at which the minima were found, in Pa. `least`: the minimum of each
+    row.
     """
 
     arm: Manipulator = field(repr=False, compare=False)

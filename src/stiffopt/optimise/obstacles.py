@@ -76,9 +76,7 @@ def _quickly_nearest(
 class ObstaclesInC:
     """Obstacles around an arm as a structure in C; this object owns the memory.
 
-    Attributes
-    ----------
-    address : of the `Obstacles`.
+    `address`: of the `Obstacles`.
     """
 
     def __init__(self, obstacles: "Obstacles", arm: Manipulator, rod: LoadedArm | None) -> None:

@@ -115,10 +115,7 @@ class Prepared:
 def prepared(robot: Manipulator, task: Task, seed: int) -> Prepared:
     """Return the preparation for a task; recent ones are reused.
 
-    Raises
-    ------
-    InputError
-        If the task's pressure limits do not suit the robot.
+    Raises `InputError` if the task's pressure limits do not suit the robot.
     """
     scene = None if task.scene is None else SceneKey(task.scene)
     key = (task.stiffness, task.tip_load, task.pressure, scene, robot.tip_load, seed)

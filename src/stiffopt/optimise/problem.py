@@ -32,10 +32,7 @@ Vector = NDArray[np.float64]
 class Ball:
     """A constraint with its residual at a point.
 
-    Attributes
-    ----------
-    residual : ndarray (k,)
-    jacobian : (k, n), per variable.
+    `residual`: (k,). `jacobian`: (k, n), per variable.
     """
 
     constraint: Constraint

@@ -316,11 +316,9 @@ class DerivativeSettings:
 class ProgramSettings:
     """Objectives of the nonlinear program (`stiffopt.optimise.program`).
 
-    Attributes
-    ----------
-    maximise, match, least_pressure : decrease of each objective that no longer matters.
-    some_pressure : weight of the mean square pressure where a stiffness is matched, to choose the
-        lowest of the pressures that match equally well.
+    `maximise`, `match`, `least_pressure`: decrease of each objective that no longer matters.
+    `some_pressure`: weight of the mean square pressure where a stiffness is matched, to choose the
+    lowest of the pressures that match equally well.
     """
 
     maximise: float = 1e-7

@@ -502,10 +502,7 @@ def are_within(pressures: Vector, lower: Vector, upper: Vector) -> bool:
 def judge(robot: Manipulator, task: Task, pressures: Vector) -> Judgement:
     """Judge pressures (n,) by the model of the arm (which carries the task's load).
 
-    Raises
-    ------
-    EquilibriumError
-        If no equilibrium at these pressures is reached from rest.
+    Raises `EquilibriumError` if no equilibrium at these pressures is reached from rest.
     """
     program = Program.of(task, robot.description)
     found = Evaluator(robot, functions(robot, program)["judge"])

@@ -122,10 +122,7 @@ class ForRobot(Schema, ShownInNotebook):
     def resolve_robot(self) -> RobotDescription:
         """Return the robot; a relative path starts at the folder of the file.
 
-        Raises
-        ------
-        InputError
-            No robot is named, it does not exist, or its file is wrong.
+        Raises `InputError`: no robot is named, it does not exist, or its file is wrong.
         """
         if self.robot is None:
             name = type(self).__name__
@@ -145,10 +142,7 @@ class ForRobot(Schema, ShownInNotebook):
     def check_scene(self, description: RobotDescription) -> None:
         """Reject a scene that does not suit a robot.
 
-        Raises
-        ------
-        InputError
-            See `Scene.check_against`.
+        Raises `InputError`: see `Scene.check_against`.
         """
         if self.scene is not None:
             self.scene.check_against(description, self.source)
@@ -158,19 +152,13 @@ class ForRobot(Schema, ShownInNotebook):
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the pressure limits of each channel: the robot's, tightened by `pressure`.
 
-        Parameters
-        ----------
-        description : the robot, with n channels.
+        `description`: the robot, with n channels. Raises `InputError`: a list of the wrong length,
+        or a channel whose range is empty.
 
         Returns
         -------
         lower, upper : (n,) arrays
             In Pa, with lower <= upper.
-
-        Raises
-        ------
-        InputError
-            A list of the wrong length, or a channel whose range is empty.
         """
         lower = np.array(description.pressure_min)
         upper = np.array(description.pressure_max)

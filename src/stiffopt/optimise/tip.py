@@ -54,6 +54,8 @@ class TipModel:
 
     An instance belongs to one thread; see `copy`.  Calls release the interpreter lock.
 
+    Raises `EquilibriumError` if the unpressurised arm falls over under its weight.
+
     Parameters
     ----------
     robot : the arm with its gravity and load.
@@ -63,11 +65,6 @@ class TipModel:
     is_fast : whether calls run in machine code, which is compiled when an instance is made.
         Without a compiler the model is used, from rest each time, which takes milliseconds for a
         loaded arm.
-
-    Raises
-    ------
-    EquilibriumError
-        If the unpressurised arm falls over under its weight.
     """
 
     def __init__(self, robot: Manipulator) -> None:
@@ -85,10 +82,8 @@ class TipModel:
 
         This takes much less time than a new instance.
 
-        Raises
-        ------
-        EquilibriumError
-            If the unpressurised arm falls over under its weight; the instance is unusable then.
+        Raises `EquilibriumError` if the unpressurised arm falls over under its weight; the instance
+        is unusable then.
         """
         self._robot = robot
         if self._code is not None:
@@ -97,12 +92,8 @@ class TipModel:
     def at(self, pressures: ArrayLike) -> TipAt:
         """Return the tip at pressures (n,) in Pa.
 
-        Raises
-        ------
-        PressureError
-            Pressures that are not n finite numbers, or are beyond the strain law.
-        EquilibriumError
-            The loaded arm has no stable equilibrium there.
+        Raises `PressureError`: pressures that are not n finite numbers, or are beyond the strain
+        law; `EquilibriumError`: the loaded arm has no stable equilibrium there.
         """
         robot, p = self._robot, self._robot.checked_pressures(pressures)
         found = None if self._code is None else self._code(p)

@@ -118,10 +118,7 @@ class _WarmMemory(NamedTuple):
 class WarmCalls:
     """Warm calls for one task; their memory is reused.
 
-    Attributes
-    ----------
-    program : of the task.
-    like : block of numbers of the task (see `FastSolver.block`).
+    `program`: of the task. `like`: block of numbers of the task (see `FastSolver.block`).
     """
 
     def __init__(self, fast: FastSolver, row: Vector, program: Program) -> None:

@@ -21,9 +21,7 @@ class RouteAttempts:
 
     Pressures are given at the `given` points; other arguments are those of `RouteSearch`.
 
-    Attributes
-    ----------
-    alone : (N,), largest values of the local optima; not a number where there is none.
+    `alone`: (N,), largest values of the local optima; not a number where there is none.
     """
 
     def __init__(

@@ -76,6 +76,9 @@ def checked_pressures(name: str, robot: Manipulator, pressures: ArrayLike) -> Ve
 class TaskConfigurations:
     """Finds configurations that solve a task.
 
+    Raises `Unsolved`: the task has no solution; `StoppedError`: the solver failed, or the time is
+    over.
+
     Parameters
     ----------
     name : of the end, for messages.
@@ -87,13 +90,6 @@ class TaskConfigurations:
     ----------
     best : the stiffest configuration.
     limits : lower and upper limits of the pressures, (n,) each.
-
-    Raises
-    ------
-    Unsolved
-        The task has no solution.
-    StoppedError
-        The solver failed, or the time is over.
     """
 
     def __init__(self, name: str, robot: Manipulator, task: Task, seed: int) -> None:

@@ -19,12 +19,7 @@ _ALONG_Z = 1e-6  # sine of a tangent's angle to the base's z axis below which x 
 
 
 class Curve(ABC):
-    """A curve in space, parametrised by the arc length from its start.
-
-    Attributes
-    ----------
-    length : in m.
-    """
+    """A curve in space, parametrised by the arc length from its start. `length`: in m."""
 
     length: float
 
@@ -43,10 +38,7 @@ class Polyline(Curve):
     At a point, the tangent bisects the directions of the two lines; if the line turns straight
     back, it is that of the second. Between points, tangents are interpolated.
 
-    Parameters
-    ----------
-    points : (k, 3), in m; some may coincide.
-    closed : whether it ends where it begins.
+    `points`: (k, 3), in m; some may coincide. `closed`: whether it ends where it begins.
     """
 
     def __init__(self, points: Vector, closed: bool = False) -> None:
@@ -106,10 +98,8 @@ class SplineCurve(Curve):
 
     Simpson's rule on a fine grid gives the arc length.
 
-    Parameters
-    ----------
-    points : (k, 3), in m, k >= 2, neighbours distinct.
-    closed : whether the last point equals the first and the spline is periodic; else it is natural.
+    `points`: (k, 3), in m, k >= 2, neighbours distinct. `closed`: whether the last point equals the
+    first and the spline is periodic; else it is natural.
     """
 
     def __init__(self, points: Vector, closed: bool = False) -> None:
@@ -166,9 +156,7 @@ def path_axes(tangents: Vector) -> Vector:
     x is the tangent, z is the base's z axis made perpendicular to it (the base's x axis where the
     tangent is along z), and y is the cross product of z and x.
 
-    Parameters
-    ----------
-    tangents : (N, 3), unit vectors.
+    `tangents`: (N, 3), unit vectors.
 
     Returns
     -------

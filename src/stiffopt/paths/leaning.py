@@ -90,15 +90,8 @@ def approach_to(
 ) -> BraceApproach:
     """Return the motion from rest to a braced solution.
 
-    Parameters
-    ----------
-    solution : of a task with a brace; it leans on an object.
-    slew : largest rates of change, one or (n,), in Pa/s.
-
-    Raises
-    ------
-    Unsolved
-        As `way_into_contact` does.
+    `solution`: of a task with a brace; it leans on an object. `slew`: largest rates of change, one
+    or (n,), in Pa/s. Raises `Unsolved` as `way_into_contact` does.
     """
     states = way_into_contact(robot, solution)
     deviations = BraceUncertainty(robot, states[-1]).forces / BRACE.sure
@@ -117,10 +110,7 @@ def approach_to(
 def way_into_contact(robot: Manipulator, solution: PressureSolution) -> list[ContactEquilibrium]:
     """Return the equilibria from rest to a braced solution.
 
-    Raises
-    ------
-    Unsolved
-        As `way_from_rest` does, or the way ends in another equilibrium.
+    Raises `Unsolved` as `way_from_rest` does, or the way ends in another equilibrium.
     """
     assert solution.tip_pose is not None
     assert solution.pressures is not None
@@ -165,11 +155,8 @@ def touches_at(robot: Manipulator, task: Task, p: Vector) -> bool:
 def way_from_rest(robot: Manipulator, task: Task, p: Vector) -> list[ContactEquilibrium]:
     """Return the equilibria from rest to pressures (n,) among the objects of a task with a brace.
 
-    Raises
-    ------
-    Unsolved
-        The way is lost, presses an object with more than its largest force, or brings the body too
-        near to an object that must not be touched.
+    Raises `Unsolved`: the way is lost, presses an object with more than its largest force, or
+    brings the body too near to an object that must not be touched.
     """
     assert task.brace is not None
     assert task.scene is not None

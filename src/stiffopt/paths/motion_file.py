@@ -51,15 +51,8 @@ class MotionTable:
     def trajectory(self, ranges: Vector, begin: float) -> Trajectory:
         """Return the trajectory for a control loop.
 
-        Parameters
-        ----------
-        ranges : (n,), ranges of the pressures, in Pa; see `trajectory_through`.
-        begin : time of the first point, in s.
-
-        Raises
-        ------
-        FileError
-            It has too many points.
+        `ranges`: (n,), ranges of the pressures, in Pa; see `trajectory_through`. `begin`: time of
+        the first point, in s. Raises `FileError`: it has too many points.
         """
         try:
             return trajectory_through(self.times, self.pressures, self.tips, ranges, begin)
@@ -75,11 +68,8 @@ def is_motion_csv(file: str | os.PathLike[str]) -> bool:
 def read_motion(file: str | os.PathLike[str], description: RobotDescription) -> MotionTable:
     """Read a motion of a robot: CSV, or a result file with one result.
 
-    Raises
-    ------
-    FileError
-        The file cannot be read, holds no complete motion, one of another robot, or one that leans
-        on objects.
+    Raises `FileError`: the file cannot be read, holds no complete motion, one of another robot, or
+    one that leans on objects.
     """
     name = os.fspath(file)
     if name.lower().endswith(".csv"):

@@ -26,11 +26,8 @@ _PER_PIECE = 6  # pressures on each piece of a way at which the calibrated uncer
 class MotionRequest:
     """The checked arguments of `plan_motion`.
 
-    Attributes
-    ----------
-    bare, robot : the robot without and with the load of the motion.
-    margin : clearance added for the calibrated uncertainty, in m; None without a calibration or a
-        scene.
+    `bare`, `robot`: the robot without and with the load of the motion. `margin`: clearance added
+    for the calibrated uncertainty, in m; None without a calibration or a scene.
     """
 
     bare: Manipulator

@@ -33,11 +33,8 @@ Mask = NDArray[np.bool_]
 class PathCandidate(NamedTuple):
     """Pressures that solve the task at a point.
 
-    Attributes
-    ----------
-    pressures : (n,), in Pa.
-    value : logarithm of the smallest stiffness that is maximised; if none is, the negative mean
-        square of the relative pressures.
+    `pressures`: (n,), in Pa. `value`: logarithm of the smallest stiffness that is maximised; if
+    none is, the negative mean square of the relative pressures.
     """
 
     pressures: Vector
@@ -71,12 +68,8 @@ class Brought(NamedTuple):
 class Slopes(NamedTuple):
     """The tasks at k points, linearised; derivatives are per share of a channel's range.
 
-    Attributes
-    ----------
-    residuals, jacobians : ndarray (k, m), (k, m, n)
-        Of the terms.
-    costs, gradients : ndarray (k, t), (k, t, n)
-        Negative logarithms of the stiffnesses; the largest of each point is minimised.
+    `residuals`, `jacobians`: of the terms. `costs`, `gradients`: negative logarithms of the
+    stiffnesses; the largest of each point is minimised.
     """
 
     residuals: Vector
@@ -99,9 +92,7 @@ def joined(ranges: Iterable[range]) -> list[range]:
 class BodyCheck:
     """Checks that the body keeps the clearance of a scene between the points of a path.
 
-    Parameters
-    ----------
-    robot : with its load.
+    `robot`: with its load.
     """
 
     def __init__(self, robot: Manipulator, scene: Scene) -> None:

@@ -26,9 +26,7 @@ from stiffopt.paths.settings import ROUTE
 class Route:
     """A sequence of candidates, one at each point.
 
-    Attributes
-    ----------
-    crossings : number of crossings from branch to branch.
+    `crossings`: number of crossings from branch to branch.
     """
 
     candidates: list[PathCandidate]
@@ -58,8 +56,7 @@ class RouteSearch:
     tasks : PathTasks
     layers : list of list of PathCandidate
         Local optima at each of N points.
-    steps : (N - 1, n)
-        Largest changes of pressure from point to point, in Pa.
+    steps : (N - 1, n), largest changes of pressure from point to point, in Pa.
     over : "worst" or "mean"
         Which value along the path to maximise.
     lanes : list of list of PathCandidate, optional

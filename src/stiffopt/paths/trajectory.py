@@ -91,6 +91,8 @@ def trajectory_through(
     If there are more points than a trajectory may have, or points closer in time, those are left
     out whose pressures linear interpolation reproduces to a thousandth of their range.
 
+    Raises `InputError`: too many points remain.
+
     Parameters
     ----------
     times : (N,), in s, increasing from 0.
@@ -98,11 +100,6 @@ def trajectory_through(
     tips : (N, 3), in m, in the base frame.
     ranges : (n,), ranges of the pressures, in Pa.
     begin : time of the first point, in s; it leaves the arm time to go there.
-
-    Raises
-    ------
-    InputError
-        Too many points remain.
     """
     kept = np.arange(len(times))
     if len(kept) > MAX_WAYPOINTS or (np.diff(times) < CLOSEST).any():

@@ -26,16 +26,14 @@ _RANGE = 0.3  # longest branch, as a share of the space's diagonal
 class TreeSearch:
     """Searches for ways between pressures (n,) in Pa.
 
+    Raises `MissingExtraError`.
+
     Parameters
     ----------
     is_clear : checks motions.
     low, high : limits of the pressures, (n,).
     weights : (n,), bound on the body's displacement per pressure, in m/Pa.
     seed : the same seed gives the same ways, unless time ends the search.
-
-    Raises
-    ------
-    MissingExtraError
     """
 
     def __init__(

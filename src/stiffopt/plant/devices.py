@@ -170,9 +170,7 @@ class SimulatedProbe(ForceProbe):
 class SimulatedRig(Rig):
     """A rig whose arm is simulated.
 
-    Attributes
-    ----------
-    world : the simulated truth, which no controller may read, and the place to inject faults.
+    `world`: the simulated truth, which no controller may read, and the place to inject faults.
     """
 
     world: World

@@ -65,6 +65,8 @@ def regulate(
 ) -> int:
     """Simulate the regulators for a number of steps.
 
+    Returns the index of the oldest set-point in the ring afterwards.
+
     Parameters
     ----------
     regulators : their parameters.
@@ -74,10 +76,6 @@ def regulate(
     pressure : in the chambers (n,), without ripple; updated.
     ripple : added at each step (m, n).
     trace : set to the pressure midway through each step (m, n).
-
-    Returns
-    -------
-    Index of the oldest set-point in the ring afterwards.
     """
     h = regulators.step
     depth = len(delayed)
@@ -128,9 +126,7 @@ class Frame:
 class Camera:
     """Simulated tracking camera: captures the sensor at the tip and delivers frames late.
 
-    Attributes
-    ----------
-    count : frames captured so far, lost ones included.
+    `count`: frames captured so far, lost ones included.
     """
 
     def __init__(

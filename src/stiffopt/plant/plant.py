@@ -112,17 +112,9 @@ class Settling:
 class Plant:
     """The simulated arm: chamber pressures in, poses out, step by step.
 
-    Parameters
-    ----------
-    robot : description of the arm.
-    settings : how this arm differs, and how it is simulated.
-
-    Raises
-    ------
-    InputError
-        The settings do not fit the robot.
-    MissingExtraError
-        numba is not installed.
+    `robot`: description of the arm. `settings`: how this arm differs, and how it is simulated.
+    Raises `InputError`: the settings do not fit the robot; `MissingExtraError`: numba is not
+    installed.
     """
 
     settling = Settling()
@@ -203,13 +195,7 @@ class Plant:
         return T
 
     def set_load(self, load: PlantLoad | None) -> None:
-        """Apply a wrench from now on, or none.
-
-        Raises
-        ------
-        InputError
-            The load is not on the arm.
-        """
+        """Apply a wrench from now on, or none. Raises `InputError`: the load is not on the arm."""
         station = None if load is None else load.at
         if station != (None if self._load is None else self._load.at):
             self._mesh(station)
@@ -262,15 +248,8 @@ class Plant:
     def advance(self, duration: float, pressures: ArrayLike) -> None:
         """Advance time at constant pressures in the chambers.
 
-        Parameters
-        ----------
-        duration : in s; rounded to whole steps.
-        pressures : gauge pressures (n,), in Pa.
-
-        Raises
-        ------
-        SimulationError
-            The simulation fails.
+        `duration`: in s; rounded to whole steps. `pressures`: gauge pressures (n,), in Pa. Raises
+        `SimulationError`: the simulation fails.
         """
         steps = round(duration / self.step)
         self.follow(np.tile(self._checked(pressures), (steps, 1)))
@@ -278,10 +257,7 @@ class Plant:
     def follow(self, pressures: Array) -> None:
         """Take one step at each row of chamber pressures (m, n), in Pa.
 
-        Raises
-        ------
-        SimulationError
-            The simulation fails; the state is that before the failure.
+        Raises `SimulationError`: the simulation fails; the state is that before the failure.
         """
         full = self.settings.dynamics == "full"
         scheme = Scheme(self.step, 0.5 if full else 1.0, True)
@@ -318,15 +294,8 @@ class Plant:
         A history in the robot file, by contrast, restarts with a rise from no pressure to these,
         see `stiffopt.model.history.Memory.start`.
 
-        Parameters
-        ----------
-        pressures : in the chambers (n,), in Pa.
-        load : replaces the present one from now on, if given.
-
-        Raises
-        ------
-        EquilibriumError
-            A slow arm would reach no equilibrium.
+        `pressures`: in the chambers (n,), in Pa. `load`: replaces the present one from now on, if
+        given. Raises `EquilibriumError`: a slow arm would reach no equilibrium.
         """
         if load is not None:
             self.set_load(load)

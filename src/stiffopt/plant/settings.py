@@ -134,10 +134,7 @@ class Mismatch(Schema):
     def check_lengths(self, robot: RobotDescription) -> None:
         """Refuse a list without exactly one value per channel or per segment of a robot.
 
-        Raises
-        ------
-        MisfitError
-            With the name of the list.
+        Raises `MisfitError` with the name of the list.
         """
         channels, segments = robot.n_pressures, robot.n_segments
         for name, length, noun in (
@@ -202,10 +199,7 @@ class SoftSurface(Schema):
 def check_touchable(scene: Scene) -> Scene:
     """Refuse a scene with a shape that the simulated arm cannot touch.
 
-    Raises
-    ------
-    InputError
-        With the name of the object.
+    Raises `InputError` with the name of the object.
     """
     for item in scene.objects:
         if item.shape.key not in TOUCHABLE:
@@ -293,10 +287,7 @@ def plant_of(description: Any) -> PlantSettings:
 
     Without a scene of its own it has those objects of the rig's scene that the arm may lean on.
 
-    Raises
-    ------
-    InputError
-        The simulated arm cannot touch one of them.
+    Raises `InputError`: the simulated arm cannot touch one of them.
     """
     plant, scene = description.plant, description.scene
     plant = plant if isinstance(plant, PlantSettings) else PlantSettings()

@@ -243,15 +243,9 @@ class World:
     def inject(self, device: str, fault: str, channel: int | None = None) -> None:
         """Make a device faulty from now on, or ``ok`` again.
 
-        Parameters
-        ----------
-        device, fault : see `known_faults`.
-        channel : faulty channel of the supply (from 0); None: all of them.
-
-        Raises
-        ------
-        InputError
-            There is no such device, fault or channel, or the rig file does not allow faults.
+        `device`, `fault`: see `known_faults`. `channel`: faulty channel of the supply (from 0);
+        None: all of them. Raises `InputError`: there is no such device, fault or channel, or the
+        rig file does not allow faults.
         """
         if not self.plant.settings.faults:
             raise InputError("faults are not enabled; set 'faults: true' in the rig file's plant")

@@ -207,10 +207,7 @@ class ArmDrawing:
     def finish(self, view: View | None = None, scene: Scene | None = None) -> list[Any]:
         """Draw a scene, set one scale for all axes and the view, and place the labels.
 
-        Returns
-        -------
-        list
-            Handles for a legend.
+        Returns handles for a legend.
         """
         from matplotlib.ticker import MaxNLocator
 

@@ -66,10 +66,8 @@ def place_labels(axes: Any, labels: Sequence[Label], covered: Vector, marks: Vec
     axes :
     labels : sequence of Label
         The most important first.
-    covered : (k, 3)
-        Points of the axes, close together, which texts avoid.
-    marks : (j, 3)
-        Points with a marker, which texts avoid with a margin.
+    covered : (k, 3), points of the axes, close together, which texts avoid.
+    marks : (j, 3), points with a marker, which texts avoid with a margin.
     """
     if not labels:
         return

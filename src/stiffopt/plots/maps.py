@@ -45,10 +45,7 @@ def plot_workspace(found: WorkspaceMap, *, title: str | None = None) -> Figure:
     section contains the arm at rest; the level one is where the workspace is widest.
     The title is by default the name of the robot.
 
-    Raises
-    ------
-    InputError
-        The map has no cell with a sample.
+    Raises `InputError`: the map has no cell with a sample.
     """
     if not len(found.table):
         raise InputError("there is nothing to draw: no sample has a stable equilibrium")

@@ -17,10 +17,7 @@ Vector = NDArray[np.float64]
 def segment_poses(robot: Manipulator, pressures: ArrayLike, count: int) -> Vector:
     """Return poses (segments, count, 4, 4) along each segment with its connector, ends included.
 
-    Parameters
-    ----------
-    pressures : (n,), in Pa.
-    count : number of stations of each segment, at least 2.
+    `pressures`: (n,), in Pa. `count`: number of stations of each segment, at least 2.
     """
     stations = segment_stations(robot, count).ravel()
     poses = np.concatenate([np.eye(4)[None], robot.pose(pressures, stations[1:])])
@@ -62,10 +59,8 @@ class StiffnessEllipsoid(NamedTuple):
     The square of a semi-axis is the free stiffness along it; the square root keeps thin ellipsoids
     visible.
 
-    Attributes
-    ----------
-    stiffnesses : (3,), along its axes, in N/m, increasing.
-    axes : (3, 3), the columns, right-handed.
+    `stiffnesses`: (3,), along its axes, in N/m, increasing. `axes`: (3, 3), the columns,
+    right-handed.
     """
 
     stiffnesses: Vector

@@ -87,10 +87,7 @@ def require_matplotlib() -> None:
 def new_figure(width: float, height: float, **settings: Any) -> Figure:
     """Return an empty figure of a size in inches.
 
-    Raises
-    ------
-    MissingExtraError
-        If matplotlib is not installed.
+    Raises `MissingExtraError` if matplotlib is not installed.
     """
     require_matplotlib()
     from matplotlib.figure import Figure

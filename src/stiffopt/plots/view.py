@@ -40,10 +40,7 @@ class ViewAngles(NamedTuple):
     def of(cls, robot: Manipulator, view: View | None = None) -> ViewAngles:
         """Return the requested view, or the default one, with x to the right.
 
-        Raises
-        ------
-        InputError
-            The view is not two angles, or its elevation exceeds 90 deg.
+        Raises `InputError`: the view is not two angles, or its elevation exceeds 90 deg.
         """
         hangs = robot.description.gravity[2] > 0
         if view is None:

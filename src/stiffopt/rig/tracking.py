@@ -102,10 +102,7 @@ class PoseTracker(Device):
     registration, sign of the quaternion and plausibility. `read` never waits: if a device is
     silent, only the age of the latest sample shows it.
 
-    Attributes
-    ----------
-    registration : Registration
-        Turns the device's readings into poses of the tip in the base frame.
+    `registration`: turns the device's readings into poses of the tip in the base frame.
     """
 
     def __init__(

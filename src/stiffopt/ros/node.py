@@ -188,10 +188,7 @@ class Service:
 def network_interface(name: str | None) -> str:
     """Return the name of a network interface; None: that of loopback.
 
-    Raises
-    ------
-    InputError
-        There is no such interface.
+    Raises `InputError`: there is no such interface.
     """
     place = name or _LOOPBACK
     existing = [name for _, name in socket.if_nameindex()]
@@ -205,17 +202,14 @@ def network_interface(name: str | None) -> str:
 class RosNode:
     """A node with topics and services; other nodes find it once `announce` is called.
 
+    Raises `InputError`: there is no such interface, or DDS refuses it.
+
     Parameters
     ----------
     names : names of the node, its topics and services.
     domain, interface : the DDS domain, and the network interface; None for loopback, which no other
         machine can reach.
     distro : ``humble`` or ``jazzy``: the layout of the discovery messages.
-
-    Raises
-    ------
-    InputError
-        There is no such interface, or DDS refuses it.
     """
 
     def __init__(

@@ -48,10 +48,8 @@ def check_frame(header: Header, base: str) -> None:
 def target_of(message: PoseStamped | PointStamped, base: str, now: float) -> Target:
     """Return the target of a pose, or of a point, in the base frame.
 
-    Raises
-    ------
-    InputError
-        It is old, in another frame or not finite, or its quaternion does not have length 1.
+    Raises `InputError`: it is old, in another frame or not finite, or its quaternion does not have
+    length 1.
     """
     check_stamp(message.header, now)
     check_frame(message.header, base)
@@ -77,10 +75,8 @@ def trajectory_of(message: JointTrajectory, robot: Manipulator, now: float) -> T
     The model determines the tip's targets. Velocities, accelerations and effort are not used:
     between two points the pressures change linearly.
 
-    Raises
-    ------
-    InputError
-        It is old, does not name each channel once, or its points are no pressures over time.
+    Raises `InputError`: it is old, does not name each channel once, or its points are no pressures
+    over time.
     """
     check_stamp(message.header, now)
     channels = channel_names(robot.description)

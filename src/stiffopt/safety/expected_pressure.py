@@ -20,10 +20,8 @@ _MAX_COMMANDS = 1000  # commands kept, at most, while a dead time passes
 class Regulation:
     """The slowest response of healthy regulators: a dead time and a first-order lag.
 
-    Attributes
-    ----------
-    lag, lag_falling : time constants (n,) of rising and falling pressures, in s.
-    dead_time : time until a command has any effect, in s.
+    `lag`, `lag_falling`: time constants (n,) of rising and falling pressures, in s. `dead_time`:
+    time until a command has any effect, in s.
     """
 
     lag: Array

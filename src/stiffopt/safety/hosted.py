@@ -63,10 +63,7 @@ class Owned:
 def owned(description: RigDescription, robot: RobotDescription) -> Owned:
     """Make what the guard of a rig owns, without connecting to anything.
 
-    Raises
-    ------
-    MissingExtraError
-        A library is not installed.
+    Raises `MissingExtraError`: a library is not installed.
     """
     simulated = description.supply.simulated
     away = {} if simulated else {"probe": None, "tracker": None}
@@ -90,9 +87,7 @@ def simulated_endpoint(description: RigDescription) -> str:
 class HostedDevices:
     """Tracker, probe and truth of a simulated rig in real time, inside the guard process.
 
-    Parameters
-    ----------
-    rig : a simulated rig.
+    `rig`: a simulated rig.
     """
 
     def __init__(self, rig: Rig) -> None:
@@ -111,12 +106,8 @@ class HostedDevices:
     def ask(self, word: str, about: dict[str, Any]) -> Any:
         """Carry out the request ``inject``, ``truth``, ``pressures`` or one of a `ForwardedProbe`.
 
-        Raises
-        ------
-        DeviceError
-            There is no such request, or the probe fails.
-        InputError
-            There is no such fault, or the rig file does not allow faults.
+        Raises `DeviceError`: there is no such request, or the probe fails; `InputError`: there is
+        no such fault, or the rig file does not allow faults.
         """
         self.world.catch_up()
         match word:

@@ -139,10 +139,7 @@ class GuardRequest:
 class GuardNotice:
     """A report of a starting guard: ``notice``, then ``ready`` or ``failed``.
 
-    Attributes
-    ----------
-    kind : which of these.
-    about : its details by name.
+    `kind`: which of these. `about`: its details by name.
     """
 
     kind: str
@@ -174,13 +171,7 @@ Message = CommandFrame | GuardAnswer | GuardRequest | GuardNotice | TrackedPoses
 
 
 def unpack(packet: bytes) -> Message:
-    """Decode a packet.
-
-    Raises
-    ------
-    ValueError
-        The packet is no valid message.
-    """
+    """Decode a packet. Raises `ValueError`: the packet is no valid message."""
     try:
         match packet[:1]:
             case b"C" | b"G" as kind:

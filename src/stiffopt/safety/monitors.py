@@ -20,10 +20,7 @@ Array = NDArray[np.float64]
 class Trouble:
     """A fault that the monitor has found.
 
-    Attributes
-    ----------
-    kind : ``pressure-reading``, ``regulator-stuck`` or ``leak``.
-    text : a sentence for people.
+    `kind`: ``pressure-reading``, ``regulator-stuck`` or ``leak``. `text`: a sentence for people.
     """
 
     kind: str

@@ -29,10 +29,8 @@ class Shortage:
     share `much` of it, even while commands move. Between these cases, a leak that takes all that
     its regulator can deliver is indistinguishable from a line that has no more.
 
-    Parameters
-    ----------
-    tolerance : shortage (n,) that is too much, in Pa; a response must be at least half of it.
-    time : minimum duration of these conditions, in s.
+    `tolerance`: shortage (n,) that is too much, in Pa; a response must be at least half of it.
+    `time`: minimum duration of these conditions, in s.
     """
 
     def __init__(self, tolerance: Array, time: float) -> None:
@@ -125,10 +123,8 @@ class SupplyLine:
     def look(self, missing: Array, reading: Array, reached: Array) -> NDArray[np.bool_]:
         """Return which channels (n,) have the pressure of a sagging line.
 
-        Parameters
-        ----------
-        missing : expected less measured pressures (n,), in Pa.
-        reading, reached : measured pressures (n,), and the highest since arming, in Pa.
+        `missing`: expected less measured pressures (n,), in Pa. `reading`, `reached`: measured
+        pressures (n,), and the highest since arming, in Pa.
         """
         short = missing > self._shortage  # False where nothing is measured (NaN)
         if not (self.known or short.any()):

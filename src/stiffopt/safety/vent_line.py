@@ -87,9 +87,7 @@ class Caller:
 class VentLine:
     """The guard's end of the vent line; it never blocks.
 
-    Parameters
-    ----------
-    endpoints : names of the supply that the guard owns, see `PressureSupply.endpoints`.
+    `endpoints`: names of the supply that the guard owns, see `PressureSupply.endpoints`.
     """
 
     def __init__(self, endpoints: Sequence[str]) -> None:
@@ -187,10 +185,7 @@ def guards_of(endpoint: str) -> list[SocketPeer]:
 def ask_to_vent(endpoint: str, patience: float = 5.0) -> list[Reply]:
     """Call all guards of an endpoint that accept this user, and return their replies.
 
-    Parameters
-    ----------
-    endpoint : name of the supply.
-    patience : time for all answers together, in s.
+    `endpoint`: name of the supply. `patience`: time for all answers together, in s.
     """
     asked: list[tuple[SocketPeer, socket.socket | None]] = []
     strangers = 0

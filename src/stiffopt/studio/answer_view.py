@@ -68,10 +68,8 @@ class AnswerView:
     def show(self, answer: StudioAnswer, target: Vector, *, with_plain: bool) -> None:
         """Draw a solution.
 
-        Parameters
-        ----------
-        target : (3,), position of the target, in m.
-        with_plain : whether to draw the plain solution too.
+        `target`: (3,), position of the target, in m. `with_plain`: whether to draw the plain
+        solution too.
         """
         leaning = answer.solution.equilibrium
         self._arm.show(answer.robot, answer.pressures, leaning)

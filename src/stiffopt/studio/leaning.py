@@ -62,12 +62,8 @@ class Leaning:
 
         With a brace it is reached as that says, else the objects come to the arm.
 
-        Raises
-        ------
-        InputError
-            No object allows contact.
-        EquilibriumError
-            The arm slips off, snaps through or buckles on the way.
+        Raises `InputError`: no object allows contact; `EquilibriumError`: the arm slips off, snaps
+        through or buckles on the way.
         """
         scene = design.task.scene
         if scene is None or not any(each.may_be_leant_on for each in scene.objects):
@@ -163,10 +159,7 @@ def force_arrows(equilibrium: ContactEquilibrium | None, length: float) -> Any:
 class LeaningView:
     """Draws a leaning arm: its shape, the forces on it, and its braced stiffness.
 
-    Parameters
-    ----------
-    server : viser.ViserServer
-    description : the robot.
+    `server`: viser.ViserServer. `description`: the robot.
     """
 
     def __init__(self, server: Any, description: RobotDescription) -> None:

@@ -88,10 +88,7 @@ def replaced(objects: Sequence[SceneObject], item: SceneObject) -> tuple[SceneOb
 def save_scene(path: str | os.PathLike[str], scene: Scene) -> None:
     """Write a scene file; only another scene file is overwritten.
 
-    Raises
-    ------
-    FileError
-        The file exists and is not a scene file, or cannot be written.
+    Raises `FileError`: the file exists and is not a scene file, or cannot be written.
     """
     if Path(path).suffix.lower() not in (".yaml", ".yml"):
         raise FileError(path, "is no name of a scene file; expected one that ends in .yaml")

@@ -120,13 +120,7 @@ class Timeline:
 
     @classmethod
     def of_path(cls, path: Path, solution: PathSolution) -> Timeline:
-        """Return the timeline of a solved path.
-
-        Raises
-        ------
-        InputError
-            The solution has no points.
-        """
+        """Return the timeline of a solved path. Raises `InputError`: the solution has no points."""
         if not len(solution.times):
             raise InputError(f"there is nothing to play: {solution.message}")
         charts = []

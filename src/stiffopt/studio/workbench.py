@@ -114,10 +114,7 @@ class Workbench:
 
         Returns False, and leaves the design as it is, if nothing changes.
 
-        Raises
-        ------
-        InputError
-            The change is invalid; the design stays as it was.
+        Raises `InputError`: the change is invalid; the design stays as it was.
         """
         with self._lock:
             new = change(self.design)
@@ -154,10 +151,7 @@ class Workbench:
     def hold(self, *, held: bool) -> None:
         """Hold the solution's pressures, so that the arm leans on objects; or stop holding them.
 
-        Raises
-        ------
-        InputError
-            There is no solution.
+        Raises `InputError`: there is no solution.
         """
         if held and self.answer is None:
             raise InputError("there are no pressures to hold yet")

@@ -201,10 +201,7 @@ class MapPlan:
     ) -> "MapPlan":
         """Return the plan for the arguments of `map_workspace`, after checking them.
 
-        Raises
-        ------
-        InputError
-            One of them is wrong.
+        Raises `InputError`: one of them is wrong.
         """
         if not isinstance(robot, Manipulator):
             raise InputError(

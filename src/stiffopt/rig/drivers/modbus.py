@@ -513,12 +513,7 @@ def _insist(act: Callable[[], object]) -> None:
 
 
 class ModbusRefusedError(DeviceError):
-    """The device has refused the request.
-
-    Attributes
-    ----------
-    code : exception code of the protocol.
-    """
+    """The device has refused the request. `code`: exception code of the protocol."""
 
     def __init__(self, message: str, code: int) -> None:
         super().__init__(message)
@@ -585,17 +580,9 @@ class ModbusLine:
     def ask(self, what: str, function: str, *args: Any, **options: Any) -> Any:
         """Send one request and return the answer.
 
-        Parameters
-        ----------
-        what : the request in words, for messages.
-        function, args, options : method of pymodbus's client and its arguments.
-
-        Raises
-        ------
-        ModbusRefusedError
-            The device refuses.
-        DeviceError
-            It does not answer, or answers wrongly.
+        `what`: the request in words, for messages. `function`, `args`, `options`: method of
+        pymodbus's client and its arguments. Raises `ModbusRefusedError`: the device refuses;
+        `DeviceError`: it does not answer, or answers wrongly.
         """
         with self._lock:
             self.connect()

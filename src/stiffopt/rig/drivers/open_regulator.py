@@ -145,10 +145,7 @@ class OpenRegulatorSupply(PressureSupply):
     def statistics(self) -> dict[str, int]:
         """Return the board's counters since its start; see docs/open-regulator.md.
 
-        Raises
-        ------
-        DeviceError
-            It does not answer.
+        Raises `DeviceError`: it does not answer.
         """
         self._must_be_open()
         names = ("reset", "time_ms", "frames", "bad_frames", "refused", "vented", "longest_tick_us")

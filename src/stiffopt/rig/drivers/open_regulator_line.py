@@ -187,10 +187,7 @@ class BoardLine:
     def ask(self, kind: int, payload: bytes = b"") -> bytes:
         """Send a request and return the payload of the answer.
 
-        Raises
-        ------
-        DeviceError
-            The board refuses, does not answer, or answers wrongly.
+        Raises `DeviceError`: the board refuses, does not answer, or answers wrongly.
         """
         body = self._exchange(kind, payload, self.board, self.timeout)
         if body[0] != VERSION:

@@ -87,9 +87,7 @@ class OpenIGTLinkTracker(StreamedTracker):
 
     PLUS sends nothing for a tool that it does not see: only the age of the last sample shows it.
 
-    Attributes
-    ----------
-    heard : names of the devices in the messages; helpful if `OpenIGTLinkSettings.name` is wrong.
+    `heard`: names of the devices in the messages; helpful if `OpenIGTLinkSettings.name` is wrong.
     """
 
     def __init__(self, settings: OpenIGTLinkSettings, clock: Clock | None = None) -> None:
