@@ -47,18 +47,11 @@ _EXAMPLE = "'mm, bar, N/mm'"
 
 @dataclass(frozen=True)
 class DisplayUnit:
-    """A unit in which numbers are displayed.
+    """A unit in which numbers are displayed."""
 
-    Attributes
-    ----------
-    name : its readable name: ``mm``, ``N mm/rad``.
-    per_si : its number in one SI unit.
-    more_decimals : additional decimals of numbers, compared to the default unit, for the same
-        resolution.
-    """
-
-    name: str
-    per_si: float = 1.0
+    name: str  # its readable name: ``mm``, ``N mm/rad``
+    per_si: float = 1.0  # its number in one SI unit
+    # additional decimals of numbers, compared to the default unit, for the same resolution
     more_decimals: int = 0
 
     def of(self, value: Any) -> Any:

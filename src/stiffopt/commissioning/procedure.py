@@ -44,28 +44,21 @@ class ChannelStep:
 
 @dataclass(frozen=True, eq=False)
 class StepReadings:
-    """All measurements during the steps, in SI; times are those of the rig's clock.
+    """All measurements during the steps, in SI; times are those of the rig's clock."""
 
-    Attributes
-    ----------
-    time, position, quaternion, age : of the tracker's frames, (N,), (N, 3), (N, 4), (N,). `age` is
-        the time from capture to arrival. NaN where the tip was not seen.
-    tick, commanded, measured : times (M,), and pressures (M, n).
-    rest : begin and end of the rest before the steps.
-    steps : one for each channel.
-    size : of the steps, in Pa.
-    """
-
+    # time, position, quaternion, age: of the tracker's frames, (N,), (N, 3), (N, 4), (N,). `age` is
+    # the time from capture to arrival. NaN where the tip was not seen
     time: Array
     position: Array
     quaternion: Array | None
     age: Array
+    # tick, commanded, measured: times (M,), and pressures (M, n)
     tick: Array
     commanded: Array
     measured: Array
-    rest: tuple[float, float]
-    steps: tuple[ChannelStep, ...]
-    size: float
+    rest: tuple[float, float]  # begin and end of the rest before the steps
+    steps: tuple[ChannelStep, ...]  # one for each channel
+    size: float  # of the steps, in Pa
 
 
 @dataclass

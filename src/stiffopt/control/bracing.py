@@ -66,18 +66,11 @@ class BracePhase(StrEnum):
 
 
 class Concern(NamedTuple):
-    """A reason to report a contact.
+    """A reason to report a contact."""
 
-    Attributes
-    ----------
-    kind : `brace-uncertain` or `brace-slips`.
-    contact : its index.
-    cause : `slide` or `lift` under a push, or `drift` of b.
-    """
-
-    kind: str
-    contact: int
-    cause: str
+    kind: str  # `brace-uncertain` or `brace-slips`
+    contact: int  # its index
+    cause: str  # `slide` or `lift` under a push, or `drift` of b
 
 
 class Bracing:

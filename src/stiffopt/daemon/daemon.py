@@ -45,33 +45,24 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class DaemonTimes:
-    """Time limits of the parts of a daemon, in s.
+    """Time limits of the parts of a daemon, in s."""
 
-    Attributes
-    ----------
-    arming : for an arm that was just connected to become ready to be armed.
-    arming_again : between attempts to arm; the tracker sees the tip some times meanwhile.
-    telemetry : for telemetry to start.
-    tidy : between garbage collections.
-    stop : beyond `Safety.ramp_time`, for a daemon to end, whatever hangs. The limits below add up
-        to less, so that the command can still report the outcome.
-    control : beyond the ramp, for the control thread to end.
-    to_first_point : minimum for the way to a motion's first point.
-    keeper, vent, supply, rest : for the end of the keeper, of a direct command to vent, of the
-        supply, and of all other parts.
-    """
-
-    arming: float = 10.0
+    arming: float = 10.0  # for an arm that was just connected to become ready to be armed
+    # between attempts to arm; the tracker sees the tip some times meanwhile
     arming_again: float = 0.2
-    telemetry: float = 5.0
-    tidy: float = 10.0
+    telemetry: float = 5.0  # for telemetry to start
+    tidy: float = 10.0  # between garbage collections
+    # beyond `Safety.ramp_time`, for a daemon to end, whatever hangs. The limits below add up to
+    # less, so that the command can still report the outcome
     stop: float = 15.0
-    control: float = 6.0
+    control: float = 6.0  # beyond the ramp, for the control thread to end
+    # keeper, vent, supply, rest: for the end of the keeper, of a direct command to vent, of the
+    # supply, and of all other parts
     keeper: float = 0.5
     vent: float = 1.0
     supply: float = 3.0
     rest: float = 2.5
-    to_first_point: float = 2.0
+    to_first_point: float = 2.0  # minimum for the way to a motion's first point
 
 
 TIMES = DaemonTimes()

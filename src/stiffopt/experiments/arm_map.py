@@ -22,35 +22,22 @@ Progress = Callable[[float, float], None]
 
 @dataclass(frozen=True, eq=False)
 class ArmMap:
-    """Stiffness at points along an arm.
+    """Stiffness at points along an arm."""
 
-    Attributes
-    ----------
-    robot : name.
-    length : at rest, in m.
-    groups : G groups of channels (from 1); the channels of a group are pressurised together.
-    pressures : of the group's channels, (P,), in Pa.
-    at : arc lengths of the points at rest (S,), in m.
-    directions : unit vectors (d, 3).
-    boundary, frame : of the stiffness.
-    stiffness : (G, P, S, d), in N/m.
-    positions : of the points in the base frame (G, P, S, 3), in m.
-    backbones : shapes of the arm (G, P, B, 3), from its base, in m.
-    hangs : whether z points down.
-    """
-
-    robot: str
-    length: float
+    robot: str  # name
+    length: float  # at rest, in m
+    # G groups of channels (from 1); the channels of a group are pressurised together
     groups: tuple[tuple[int, ...], ...]
-    pressures: Array
-    at: Array
-    directions: Array
+    pressures: Array  # of the group's channels, (P,), in Pa
+    at: Array  # arc lengths of the points at rest (S,), in m
+    directions: Array  # unit vectors (d, 3)
+    # boundary, frame: of the stiffness
     boundary: str
     frame: str
-    stiffness: Array
-    positions: Array
-    backbones: Array
-    hangs: bool
+    stiffness: Array  # (G, P, S, d), in N/m
+    positions: Array  # of the points in the base frame (G, P, S, 3), in m
+    backbones: Array  # shapes of the arm (G, P, B, 3), from its base, in m
+    hangs: bool  # whether z points down
 
     @property
     def middle(self) -> int:
@@ -60,28 +47,19 @@ class ArmMap:
 
 @dataclass(frozen=True, eq=False)
 class TipMap:
-    """Stiffness of the tip over the pressures of two channels.
+    """Stiffness of the tip over the pressures of two channels."""
 
-    Attributes
-    ----------
-    robot : name.
-    channels : the two, counted from 1.
-    first, second : their pressures (A,) and (B,), in Pa.
-    others : pressures (n,) of the other channels, in Pa.
-    directions : unit vectors (d, 3).
-    boundary, frame : of the stiffness.
-    stiffness : (A, B, d), in N/m; NaN where the arm has no equilibrium.
-    """
-
-    robot: str
-    channels: tuple[int, int]
+    robot: str  # name
+    channels: tuple[int, int]  # the two, counted from 1
+    # first, second: their pressures (A,) and (B,), in Pa
     first: Array
     second: Array
-    others: Array
-    directions: Array
+    others: Array  # pressures (n,) of the other channels, in Pa
+    directions: Array  # unit vectors (d, 3)
+    # boundary, frame: of the stiffness
     boundary: str
     frame: str
-    stiffness: Array
+    stiffness: Array  # (A, B, d), in N/m; NaN where the arm has no equilibrium
 
 
 def first_channels(robot: Manipulator, count: int) -> tuple[int, ...]:

@@ -47,19 +47,12 @@ class _Part(NamedTuple):
 
 @dataclass
 class _Link:
-    """A rigid body and the joint that connects it to the link before.
-
-    Attributes
-    ----------
-    placed : pose (4, 4) of the joint in the axes of the link before.
-    stiffness : (6, 6) of the joint, linear first; None: it is fixed.
-    parts : its pieces, from the joint on.
-    """
+    """A rigid body and the joint that connects it to the link before."""
 
     name: str
-    placed: Vector
-    stiffness: Vector | None
-    parts: list[_Part] = field(default_factory=list)
+    placed: Vector  # pose (4, 4) of the joint in the axes of the link before
+    stiffness: Vector | None  # (6, 6) of the joint, linear first; None: it is fixed
+    parts: list[_Part] = field(default_factory=list)  # its pieces, from the joint on
 
 
 def mjcf(

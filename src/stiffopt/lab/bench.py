@@ -34,20 +34,12 @@ _START = 5.0  # s for a device to start listening, and for it to stop
 
 @dataclass(frozen=True)
 class TrackerFrame:
-    """One frame of the tracker's hardware.
+    """One frame of the tracker's hardware."""
 
-    Attributes
-    ----------
-    number : of the frame.
-    time : of its capture, on `time.monotonic`.
-    position : of the sensor in the tracker's frame (3,), in m; NaN if it is not seen.
-    quaternion : (4,), w first, of any sign, with the tracker's noise.
-    """
-
-    number: int
-    time: float
-    position: Array
-    quaternion: Array
+    number: int  # of the frame
+    time: float  # of its capture, on `time.monotonic`
+    position: Array  # of the sensor in the tracker's frame (3,), in m; NaN if it is not seen
+    quaternion: Array  # (4,), w first, of any sign, with the tracker's noise
 
 
 class Bench:

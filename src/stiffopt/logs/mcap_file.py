@@ -155,18 +155,13 @@ class _Memory:
 
 @dataclass
 class McapContents:
-    """The contents of an MCAP file.
+    """The contents of an MCAP file."""
 
-    Attributes
-    ----------
-    metadata : records of metadata, by name.
-    messages : topics and contents of the JSON messages, in the order of writing.
-    complete : whether the recording was ended properly and is undamaged.
-    """
-
+    # records of metadata, by name
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
+    # topics and contents of the JSON messages, in the order of writing
     messages: list[tuple[str, Any]] = field(default_factory=list)
-    complete: bool = False
+    complete: bool = False  # whether the recording was ended properly and is undamaged
 
     def of_topic(self, topic: str) -> list[Any]:
         """Return the messages of a topic."""

@@ -41,23 +41,15 @@ class Section:
 class SectionGeometry:
     """Area properties of the silicone of a section and the lever arms of its channels.
 
-    Attributes
-    ----------
-    area : silicone area A, without core and chambers, in m^2.
-    centroid : centroid (2,) in section axes, in m; zero for symmetric layouts.
-    second_moment : ``int r r^T dA`` (2, 2) about the centroid, in m^4; its [1, 1] entry is I_x of
-        eq. 10.
-    channel_force : chamber area of each channel (c,), in m^2: axial force per unit pressure.
-    channel_moment : ``int r dA`` over each channel's chambers (c, 2), in m^3.
-
     All may also be symbols, see `stiffopt.model.layout`.
     """
 
-    area: Any
-    centroid: Any
+    area: Any  # silicone area A, without core and chambers, in m^2
+    centroid: Any  # centroid (2,) in section axes, in m; zero for symmetric layouts
+    # ``int r r^T dA`` (2, 2) about the centroid, in m^4; its [1, 1] entry is I_x of eq. 10
     second_moment: Any
-    channel_force: Any
-    channel_moment: Any
+    channel_force: Any  # chamber area of each channel (c,), in m^2: axial force per unit pressure
+    channel_moment: Any  # ``int r dA`` over each channel's chambers (c, 2), in m^3
 
     @property
     def is_eccentric(self) -> bool:

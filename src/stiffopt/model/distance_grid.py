@@ -60,18 +60,11 @@ def distance_of(surface: Surface, point: tuple[float, ...]) -> float:
 
 @dataclass(frozen=True)
 class DistanceGrid:
-    """Signed distances at the corners of cubes.
+    """Signed distances at the corners of cubes."""
 
-    Attributes
-    ----------
-    origin : first corner (3,), in m.
-    spacing : edge of a cube, in m.
-    values : (nx, ny, nz), in m.
-    """
-
-    origin: Array
-    spacing: float
-    values: NDArray[np.float32]
+    origin: Array  # first corner (3,), in m
+    spacing: float  # edge of a cube, in m
+    values: NDArray[np.float32]  # (nx, ny, nz), in m
 
     @property
     def cells(self) -> tuple[int, ...]:

@@ -72,18 +72,11 @@ class EquilibriumState(NamedTuple):
 
 
 class Continuation(NamedTuple):
-    """The end of a path of equilibria.
+    """The end of a path of equilibria."""
 
-    Attributes
-    ----------
-    state : the last equilibrium that was found.
-    share : share of the path at which it is; 1.0 is the end.
-    unstable : whether the path ends because stability is lost there.
-    """
-
-    state: EquilibriumState
-    share: float
-    unstable: bool
+    state: EquilibriumState  # the last equilibrium that was found
+    share: float  # share of the path at which it is; 1.0 is the end
+    unstable: bool  # whether the path ends because stability is lost there
 
 
 class Equilibrium:

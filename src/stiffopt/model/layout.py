@@ -53,20 +53,13 @@ class Layout:
 
 @dataclass(frozen=True)
 class SymbolicArm:
-    """The formulas of all arms of a layout.
+    """The formulas of all arms of a layout."""
 
-    Attributes
-    ----------
-    numbers : the arm's numbers (k,), see `numbers_of`.
-    actuation : sections and margins as functions of the pressures and these numbers.
-    centroids : centroid (2,) of each segment's section, in m; sparse if it lies on the axis.
-    tip : the unloaded arm up to its tip.
-    """
-
-    numbers: ca.SX
-    actuation: Actuation
+    numbers: ca.SX  # the arm's numbers (k,), see `numbers_of`
+    actuation: Actuation  # sections and margins as functions of the pressures and these numbers
+    # centroid (2,) of each segment's section, in m; sparse if it lies on the axis
     centroids: tuple[ca.SX, ...]
-    tip: FreeShape
+    tip: FreeShape  # the unloaded arm up to its tip
 
 
 def layout_of(description: RobotDescription) -> Layout:

@@ -79,22 +79,13 @@ class PointOfArm:
 
 @dataclass(frozen=True)
 class ShapePiece:
-    """A soft piece of constant strain, or a rigid one.
+    """A soft piece of constant strain, or a rigid one."""
 
-    Attributes
-    ----------
-    motion : pose (4, 4) of its far end in its near end.
-    half : pose of its far end in its middle.
-    pressures : pressures (c,) that it depends on.
-    section : None if it is rigid.
-    length : at rest, in m.
-    """
-
-    motion: ca.SX
-    half: ca.SX
-    pressures: ca.SX
-    section: Section | None
-    length: ca.SX | float
+    motion: ca.SX  # pose (4, 4) of its far end in its near end
+    half: ca.SX  # pose of its far end in its middle
+    pressures: ca.SX  # pressures (c,) that it depends on
+    section: Section | None  # None if it is rigid
+    length: ca.SX | float  # at rest, in m
 
 
 @dataclass(frozen=True)

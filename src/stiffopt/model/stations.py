@@ -128,21 +128,14 @@ class FreeStations:
 
 
 class Carried(NamedTuple):
-    """States at stations, and their changes along directions, propagated from the tip.
+    """States at stations, and their changes along directions, propagated from the tip."""
 
-    Attributes
-    ----------
-    axes : (k, 9) by columns.
-    positions, tangents : (k, 3)
-    changes : (k, 3, 3, d) of rotation, moment and vector to the tip, in base axes.
-    force : (3, d) change of the force, the same along the whole arm.
-    """
-
-    axes: Vector
+    axes: Vector  # (k, 9) by columns
+    # positions, tangents: (k, 3)
     positions: Vector
     tangents: Vector
-    changes: Vector
-    force: Vector
+    changes: Vector  # (k, 3, 3, d) of rotation, moment and vector to the tip, in base axes
+    force: Vector  # (3, d) change of the force, the same along the whole arm
 
 
 class LoadedStations:

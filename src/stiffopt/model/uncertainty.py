@@ -148,23 +148,18 @@ class TipUncertainty:
 
 @dataclass(frozen=True, eq=False)
 class PositionErrors:
-    """Errors of predictions of the tip's position.
+    """Errors of predictions of the tip's position."""
 
-    Attributes
-    ----------
-    position : predicted (N, 3), in base axes and m.
-    parameters, hysteresis, discrepancy, residual : mean squares (N, 3, 3) of its error by source,
-        as in `TipUncertainty`; hysteresis includes that of the time at which the tip moves. After a
-        known history it is this, and with creep in the model the error of what is remembered.
-    shape, tail : degrees of freedom k and v (N,) of the error's squared distance. Unless the
-        history is unknown, k is 3 and v that of the calibration, which is infinite without a tail.
-    """
-
-    position: Vector
+    position: Vector  # predicted (N, 3), in base axes and m
+    # parameters, hysteresis, discrepancy, residual: mean squares (N, 3, 3) of its error by source,
+    # as in `TipUncertainty`; hysteresis includes that of the time at which the tip moves. After a
+    # known history it is this, and with creep in the model the error of what is remembered
     parameters: Vector
     hysteresis: Vector
     discrepancy: Vector
     residual: Vector
+    # shape, tail: degrees of freedom k and v (N,) of the error's squared distance. Unless the
+    # history is unknown, k is 3 and v that of the calibration, which is infinite without a tail
     shape: Vector
     tail: Vector
 

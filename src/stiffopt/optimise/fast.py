@@ -88,22 +88,15 @@ class _OneTask(ctypes.Structure):
 
 
 class CompiledAnswer(NamedTuple):
-    """An answer of the compiled solver.
+    """An answer of the compiled solver."""
 
-    Attributes
-    ----------
-    pressures : (n,), in Pa.
-    counts : work done.
-    judged : arguments of `Judgement.of`: residuals, tip pose, compliance and values at the
-        pressures.
-    slope : (n,), for the closest configuration: gradient of its error's Lagrangian without limits,
-        per share of a pressure's range.
-    """
-
-    pressures: Vector
+    pressures: Vector  # (n,), in Pa
     confidence: Confidence
-    counts: dict[str, int]
+    counts: dict[str, int]  # work done
+    # arguments of `Judgement.of`: residuals, tip pose, compliance and values at the pressures
     judged: tuple[list[float], Vector, Vector, list[float]]
+    # (n,), for the closest configuration: gradient of its error's Lagrangian without limits, per
+    # share of a pressure's range
     slope: Vector | None = None
 
 

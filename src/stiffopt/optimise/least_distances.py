@@ -32,17 +32,11 @@ _EXACT = 1e-13  # precision of a minimum, m of arc length
 
 
 class LeastDistance(NamedTuple):
-    """A local minimum, along the body, of the distance from one object.
+    """A local minimum, along the body, of the distance from one object."""
 
-    Attributes
-    ----------
-    which : index of the object.
-    s : arc length at rest, in m.
-    low, high : ends of the range of the body that contains it.
-    """
-
-    which: int
-    s: float
+    which: int  # index of the object
+    s: float  # arc length at rest, in m
+    # low, high: ends of the range of the body that contains it
     low: float
     high: float
 

@@ -33,22 +33,14 @@ _CURVED = 2.0  # estimated second-order error of a correction e, in units of e^2
 
 @dataclass(frozen=True, eq=False)
 class LocalResult:
-    """End of a descent.
+    """End of a descent."""
 
-    Attributes
-    ----------
-    problem : the program that was solved.
-    value : objective there.
-    violation : sum of the violations of floors, in logarithms of stiffness.
-    is_optimum : False: the point is only a candidate, without prices.
-    """
-
-    problem: PressureProblem
+    problem: PressureProblem  # the program that was solved
     point: ProgramPoint
-    value: float
-    violation: float
+    value: float  # objective there
+    violation: float  # sum of the violations of floors, in logarithms of stiffness
     converged: bool
-    is_optimum: bool = True
+    is_optimum: bool = True  # False: the point is only a candidate, without prices
 
     @classmethod
     def at(cls, problem: PressureProblem, point: ProgramPoint) -> "LocalResult":

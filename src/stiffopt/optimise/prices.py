@@ -20,22 +20,15 @@ Vector = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Multipliers:
-    """Lagrange multipliers: gain of the objective per unit of each constraint.
+    """Lagrange multipliers: gain of the objective per unit of each constraint."""
 
-    Attributes
-    ----------
-    bounds : (n,), per unit of the variables; positive at an active upper bound, negative at a lower
-        one.
-    balls : vector for each of the point's `bounded` constraints, per unit of the term; its length
-        is the price of the radius.
-    terms : (m,), weights of the objective's terms, which sum to one.
-    floors : per unit of each floor's logarithm.
-    """
-
+    # (n,), per unit of the variables; positive at an active upper bound, negative at a lower one
     bounds: Vector
+    # vector for each of the point's `bounded` constraints, per unit of the term; its length is the
+    # price of the radius
     balls: tuple[Vector, ...]
-    terms: Vector
-    floors: Vector
+    terms: Vector  # (m,), weights of the objective's terms, which sum to one
+    floors: Vector  # per unit of each floor's logarithm
 
 
 def prices_at(problem: PressureProblem, point: ProgramPoint) -> Multipliers | None:

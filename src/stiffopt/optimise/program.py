@@ -43,21 +43,15 @@ def pressure_ranges(description: RobotDescription) -> Vector:
 
 
 class Constraint(NamedTuple):
-    """A bound on the rows first to end - 1 of the residual.
+    """A bound on the rows first to end - 1 of the residual."""
 
-    Attributes
-    ----------
-    name : name of the term.
-    radius : bound on the length of the rows, ``|r| <= radius``; if `one_sided`, bound on the single
-        row, ``r <= radius``.
-    scale : typical size of the residual far from the target, in its unit.
-    """
-
-    name: str
+    name: str  # name of the term
     first: int
     end: int
+    # bound on the length of the rows, ``|r| <= radius``; if `one_sided`, bound on the single row,
+    # ``r <= radius``
     radius: float
-    scale: float
+    scale: float  # typical size of the residual far from the target, in its unit
     one_sided: bool
 
 
@@ -72,22 +66,15 @@ class ProgramStructure(NamedTuple):
 
 @dataclass(frozen=True)
 class Program:
-    """A task's terms and stiffness measures.
-
-    Attributes
-    ----------
-    measures : the maximised or matched ones, then the floors.
-    aim : whether the first measures are maximised or matched; without any, pressure is minimised.
-    n_floors : number of stiffnesses with a lower bound.
-    reference : pressure in Pa that is one unit of mean square pressure.
-    obstacles : objects around the arm; their rows of the residual follow those of the terms.
-    """
+    """A task's terms and stiffness measures."""
 
     terms: tuple[Term, ...]
-    measures: tuple[Measure, ...]
+    measures: tuple[Measure, ...]  # the maximised or matched ones, then the floors
+    # whether the first measures are maximised or matched; without any, pressure is minimised
     aim: Aim
-    n_floors: int
-    reference: float = BAR
+    n_floors: int  # number of stiffnesses with a lower bound
+    reference: float = BAR  # pressure in Pa that is one unit of mean square pressure
+    # objects around the arm; their rows of the residual follow those of the terms
     obstacles: Obstacles | None = None
 
     @classmethod

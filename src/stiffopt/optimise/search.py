@@ -78,25 +78,18 @@ def starts(problem: PressureProblem, table: SampleTable) -> tuple[Iterator[Vecto
 
 @dataclass(frozen=True)
 class Search:
-    """Outcome of a global search.
+    """Outcome of a global search."""
 
-    Attributes
-    ----------
-    results : ends of descents, the best first, without those that stopped next to a known optimum.
-    nearest : ends of starts that did not reach the pose, if none reached it.
-    confidence : in the best result.
-    ends : ends of the converged descents, one of each, those included that stopped next to a known
-        optimum.
-    same : difference of values below which ends count as one optimum.
-    best_found : how many descents must have found an answer for a complete search.
-    """
-
+    # ends of descents, the best first, without those that stopped next to a known optimum
     results: tuple[LocalResult, ...]
+    # ends of starts that did not reach the pose, if none reached it
     nearest: tuple[ProgramPoint, ...]
-    confidence: Confidence
+    confidence: Confidence  # in the best result
+    # ends of the converged descents, one of each, those included that stopped next to a known
+    # optimum
     ends: tuple[LocalResult, ...] = ()
-    same: float = SEARCH.same_optimum
-    best_found: int = 1
+    same: float = SEARCH.same_optimum  # difference of values below which ends count as one optimum
+    best_found: int = 1  # how many descents must have found an answer for a complete search
 
     def confidence_in(self, result: LocalResult) -> Confidence:
         """Return how sure the search is of another result than the best, with its own descent."""

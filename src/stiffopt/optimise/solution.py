@@ -45,22 +45,15 @@ def _protect(owner: object, *names: str) -> None:
 
 @dataclass(frozen=True)
 class Confidence:
-    """How sure the global search is of its answer.
+    """How sure the global search is of its answer."""
 
-    Attributes
-    ----------
-    starts : configurations that were brought towards the pose.
-    reached : converged descents from starts that reached the pose.
-    agreeing : converged descents that ended within 0.1 % of the best; with a brace, of the answer.
-    optima : distinct local optima among them.
-    complete : whether the search ended because enough descents in a row found nothing new (see
-        `stiffopt.optimise.search.effort`).  False: it ended before.
-    """
-
-    starts: int
-    reached: int
+    starts: int  # configurations that were brought towards the pose
+    reached: int  # converged descents from starts that reached the pose
+    # converged descents that ended within 0.1 % of the best; with a brace, of the answer
     agreeing: int
-    optima: int
+    optima: int  # distinct local optima among them
+    # whether the search ended because enough descents in a row found nothing new (see
+    # `stiffopt.optimise.search.effort`).  False: it ended before
     complete: bool
 
     def __str__(self) -> str:
@@ -133,18 +126,11 @@ class NearestObject(NamedTuple):
 
 
 class Preload(NamedTuple):
-    """The push at the tip that the contacts of a brace withstand.
+    """The push at the tip that the contacts of a brace withstand."""
 
-    Attributes
-    ----------
-    direction : of the push (3,), in base axes.
-    contacts : whether they slide without resistance, or stick where there is friction.
-    loss : the push by which the first contact is lost, and how.
-    """
-
-    direction: Vector
-    contacts: Grip
-    loss: ContactLoss
+    direction: Vector  # of the push (3,), in base axes
+    contacts: Grip  # whether they slide without resistance, or stick where there is friction
+    loss: ContactLoss  # the push by which the first contact is lost, and how
 
 
 class Explanation(NamedTuple):

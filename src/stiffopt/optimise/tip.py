@@ -30,19 +30,12 @@ _integer, _pointer = ctypes.c_int64, ctypes.c_void_p
 
 
 class TipAt(NamedTuple):
-    """The tip at one set of pressures; the arrays belong to the caller.
+    """The tip at one set of pressures; the arrays belong to the caller."""
 
-    Attributes
-    ----------
-    pose : (4, 4), in the base frame.
-    jacobian : (6, n), twist of the tip in tip axes per pressure: three rows in m/Pa, then three in
-        rad/Pa.
-    compliance : (6, 6), in tip axes, linear first, as `Manipulator.tip_compliance`.
-    """
-
-    pose: Vector
+    pose: Vector  # (4, 4), in the base frame
+    # (6, n), twist of the tip in tip axes per pressure: three rows in m/Pa, then three in rad/Pa
     jacobian: Vector
-    compliance: Vector
+    compliance: Vector  # (6, 6), in tip axes, linear first, as `Manipulator.tip_compliance`
 
 
 class TipModel:

@@ -28,18 +28,12 @@ _ALIKE = 0.02  # of the ranges; configurations that differ by less count as one
 
 @dataclass(frozen=True, eq=False)
 class Configuration:
-    """Pressures at which a motion may end.
+    """Pressures at which a motion may end."""
 
-    Attributes
-    ----------
-    pressures : (n,), in Pa.
-    worth : its stiffness as a share of the best known for its task; 1 if nothing is maximised.
-    name : of the end to which it belongs: "goal 2".
-    """
-
-    pressures: Vector
+    pressures: Vector  # (n,), in Pa
+    # its stiffness as a share of the best known for its task; 1 if nothing is maximised
     worth: float = 1.0
-    name: str = ""
+    name: str = ""  # of the end to which it belongs: "goal 2"
 
 
 class Unsolved(Exception):  # noqa: N818

@@ -172,26 +172,15 @@ def path_axes(tangents: Vector) -> Vector:
 
 @dataclass(frozen=True, eq=False)
 class PathPoints:
-    """The points of a path, and its curve.
+    """The points of a path, and its curve."""
 
-    Attributes
-    ----------
-    targets : (N,), all prescribe the same components of the pose.
-    goals : (N,), with directions in base or tip axes.
-    positions : (N, 3), in m, base frame.
-    tangents : (N, 3), unit vectors.
-    lengths : (N,), arc length from the first point, in m.
-    times : (N,), in s, from 0; None if the rates decide.
-    curve : the curve through the points.
-    """
-
-    targets: tuple[Target, ...]
-    goals: tuple[StiffnessGoal | None, ...]
-    positions: Vector
-    tangents: Vector
-    lengths: Vector
-    times: Vector | None
-    curve: Curve
+    targets: tuple[Target, ...]  # (N,), all prescribe the same components of the pose
+    goals: tuple[StiffnessGoal | None, ...]  # (N,), with directions in base or tip axes
+    positions: Vector  # (N, 3), in m, base frame
+    tangents: Vector  # (N, 3), unit vectors
+    lengths: Vector  # (N,), arc length from the first point, in m
+    times: Vector | None  # (N,), in s, from 0; None if the rates decide
+    curve: Curve  # the curve through the points
 
     def __len__(self) -> int:
         return len(self.targets)

@@ -63,26 +63,15 @@ class Hold(NamedTuple):
 
 @dataclass(frozen=True)
 class BraceApproach:
-    """A motion from rest into contact.
+    """A motion from rest into contact."""
 
-    Attributes
-    ----------
-    times : (k,), in s.
-    pressures : (k, n), in Pa, growing in proportion from zero.
-    tips : of the equilibria on the way, with their Jacobians and compliances.
-    forces : largest force of a contact (k,), in N.
-    contacts : at the end.
-    hold : their forces and limits at the end.
-    free_tips : positions (k, 3), in m, of the tip at these pressures without contact.
-    """
-
-    times: Vector
-    pressures: Vector
-    tips: tuple[TipAt, ...]
-    forces: Vector
-    contacts: tuple[Contact, ...]
-    hold: Hold
-    free_tips: Vector
+    times: Vector  # (k,), in s
+    pressures: Vector  # (k, n), in Pa, growing in proportion from zero
+    tips: tuple[TipAt, ...]  # of the equilibria on the way, with their Jacobians and compliances
+    forces: Vector  # largest force of a contact (k,), in N
+    contacts: tuple[Contact, ...]  # at the end
+    hold: Hold  # their forces and limits at the end
+    free_tips: Vector  # positions (k, 3), in m, of the tip at these pressures without contact
 
 
 def approach_to(

@@ -67,23 +67,17 @@ class Layers:
 
 @dataclass
 class Links:
-    """Links from a candidate to one at a later point, sorted by their ends.
+    """Links from a candidate to one at a later point, sorted by their ends."""
 
-    Attributes
-    ----------
-    origin, goal : numbers of the candidates at both ends.
-    worst, total : smallest value and sum of values in between; estimates until `known`.
-    known : whether these are computed.
-    checked : whether the body is known to keep clear along a link.
-    between : the candidates along each computed crossing, by the link's number.
-    """
-
+    # origin, goal: numbers of the candidates at both ends
     origin: Indices
     goal: Indices
+    # worst, total: smallest value and sum of values in between; estimates until `known`
     worst: Vector
     total: Vector
-    known: Mask
-    checked: Mask
+    known: Mask  # whether these are computed
+    checked: Mask  # whether the body is known to keep clear along a link
+    # the candidates along each computed crossing, by the link's number
     between: dict[int, list[PathCandidate]] = field(default_factory=dict)
 
     def with_crossings(self, others: Links) -> Links:

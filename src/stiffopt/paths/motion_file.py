@@ -33,20 +33,12 @@ Vector = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class MotionTable:
-    """A motion: pressures over time.
+    """A motion: pressures over time."""
 
-    Attributes
-    ----------
-    file : from which it was read.
-    times : (N,), in s, increasing.
-    pressures : (N, n), in Pa; linear between two times.
-    tips : (N, 3), positions of the tip in the base frame, in m.
-    """
-
-    file: str
-    times: Vector
-    pressures: Vector
-    tips: Vector
+    file: str  # from which it was read
+    times: Vector  # (N,), in s, increasing
+    pressures: Vector  # (N, n), in Pa; linear between two times
+    tips: Vector  # (N, 3), positions of the tip in the base frame, in m
 
     def trajectory(self, ranges: Vector, begin: float) -> Trajectory:
         """Return the trajectory for a control loop.

@@ -88,22 +88,15 @@ def _windows(pressures: Vector, steps: Vector) -> list[range]:
 
 @dataclass
 class _State:
-    """A window at some pressures, with its linearisation.
+    """A window at some pressures, with its linearisation."""
 
-    Attributes
-    ----------
-    x : ndarray (k, n)
-        As shares of the ranges.
-    slopes : Slopes
-    near, near_slopes : ndarray (k, b), (k, b, n)
-        Values of one-sided constraints, which must be at most 0, and their derivatives.
-    merit, excess : the merit function, and the sum of the constraints' violations.
-    """
-
-    x: Vector
-    slopes: Slopes
+    x: Vector  # ndarray (k, n) As shares of the ranges
+    slopes: Slopes  # Slopes
+    # near, near_slopes: ndarray (k, b), (k, b, n) Values of one-sided constraints, which must be at
+    # most 0, and their derivatives
     near: Vector
     near_slopes: Vector
+    # merit, excess: the merit function, and the sum of the constraints' violations
     merit: float
     excess: float
 

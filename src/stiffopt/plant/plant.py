@@ -48,64 +48,40 @@ class SimulationError(DeviceError):
 
 @dataclass(frozen=True)
 class Energies:
-    """Energies of the plant, in J.
+    """Energies of the plant, in J."""
 
-    Attributes
-    ----------
-    kinetic : of the motion.
-    elastic : in the silicone, the springs of creep and hysteresis included.
-    gravity : potential, zero where the arm's mass is at the base.
-    contact : in the contact with the probe and with objects.
-    dissipated : by viscosity, creep, hysteresis, impacts and friction so far.
-    work : of the pressures so far.
-    load_work : of the load's force and of the moving probe so far (moments are not counted).
-    """
-
-    kinetic: float
-    elastic: float
-    gravity: float
-    contact: float
-    dissipated: float
-    work: float
-    load_work: float
+    kinetic: float  # of the motion
+    elastic: float  # in the silicone, the springs of creep and hysteresis included
+    gravity: float  # potential, zero where the arm's mass is at the base
+    contact: float  # in the contact with the probe and with objects
+    dissipated: float  # by viscosity, creep, hysteresis, impacts and friction so far
+    work: float  # of the pressures so far
+    load_work: float  # of the load's force and of the moving probe so far (moments are not counted)
 
 
 class ObjectForce(NamedTuple):
-    """The contact force of an object on the arm.
+    """The contact force of an object on the arm."""
 
-    Attributes
-    ----------
-    object : its name.
-    force : on the arm (3,), in base axes, in N.
-    at : arc length at rest of the middle of the contact, in m.
-    depth : greatest depth of the body in the object, in m.
-    """
-
-    object: str
-    force: Array
-    at: float
-    depth: float
+    object: str  # its name
+    force: Array  # on the arm (3,), in base axes, in N
+    at: float  # arc length at rest of the middle of the contact, in m
+    depth: float  # greatest depth of the body in the object, in m
 
 
 @dataclass(frozen=True)
 class Settling:
-    """How `Plant.settle` follows a slow arm to rest: by steps of growing length.
+    """How `Plant.settle` follows a slow arm to rest: by steps of growing length."""
 
-    Attributes
-    ----------
-    first, shortest, last : lengths of steps, in s: of the first; of the shortest one before it
-        gives up; and of the last one, after which viscosity has no effect any more.
-    growth, cut : factor on the next step after a success, and divisor after a failure.
-    tries : maximum number of steps.
-    viscosity : lower bound of the viscosity that slows the arm down, over the modulus, in s.
-    """
-
+    # first, shortest, last: lengths of steps, in s: of the first; of the shortest one before it
+    # gives up; and of the last one, after which viscosity has no effect any more
     first: float = 0.02
     shortest: float = 1e-6
     last: float = 1e9
+    # growth, cut: factor on the next step after a success, and divisor after a failure
     growth: float = 3.0
     cut: float = 5.0
-    tries: int = 400
+    tries: int = 400  # maximum number of steps
+    # lower bound of the viscosity that slows the arm down, over the modulus, in s
     viscosity: float = 0.02
 
 

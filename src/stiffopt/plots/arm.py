@@ -78,25 +78,18 @@ class Label(NamedTuple):
 
 @dataclass
 class ArmDrawing:
-    """3-D axes and their contents, in the display unit of lengths.
-
-    Attributes
-    ----------
-    axes :
-    robot : Manipulator
-    corners : points (k, 3) that must be visible.
-    covered : points (k, 3), close together, which labels avoid.
-    marks : points (3,) with a marker, which labels avoid too.
-    labels : texts beside points, the most important first.
-    handles : for a legend.
-    """
+    """3-D axes and their contents, in the display unit of lengths."""
 
     axes: Any
     robot: Manipulator
+    # points (k, 3) that must be visible
     corners: list[Vector] = field(default_factory=list, kw_only=True)
-    handles: list[Any] = field(default_factory=list, kw_only=True)
+    handles: list[Any] = field(default_factory=list, kw_only=True)  # for a legend
+    # texts beside points, the most important first
     labels: list[Label] = field(default_factory=list, kw_only=True)
+    # points (k, 3), close together, which labels avoid
     covered: list[Vector] = field(default_factory=list, kw_only=True)
+    # points (3,) with a marker, which labels avoid too
     marks: list[Vector] = field(default_factory=list, kw_only=True)
 
     @property

@@ -23,18 +23,11 @@ _ASIDE, _BELOW, _ABOVE = 40.0, 37.0, 4.0  # points, margins for the numbers at t
 
 
 class ViewAngles(NamedTuple):
-    """A view of a standing or a hanging arm, in rad.
+    """A view of a standing or a hanging arm, in rad."""
 
-    Attributes
-    ----------
-    elevation : of the eye above the horizontal through the arm, as the page shows it.
-    azimuth : of the eye about the z axis of the base, from the x axis.
-    hangs : whether z points down on the page.
-    """
-
-    elevation: float
-    azimuth: float
-    hangs: bool
+    elevation: float  # of the eye above the horizontal through the arm, as the page shows it
+    azimuth: float  # of the eye about the z axis of the base, from the x axis
+    hangs: bool  # whether z points down on the page
 
     @classmethod
     def of(cls, robot: Manipulator, view: View | None = None) -> ViewAngles:

@@ -27,17 +27,12 @@ class NodeNames:
     """The full names of a node's topics and services.
 
     Raises `InputError`: one of them is invalid in ROS 2, or two rules are for the same name.
-
-    Attributes
-    ----------
-    node : name of the node.
-    namespace : begins with ``/``; ``/`` alone means none.
-    remap : names that replace others. Both may be full (``/a``), relative to the namespace
-        (``a``) or to the node (``~/a``).
     """
 
-    node: str
-    namespace: str = "/"
+    node: str  # name of the node
+    namespace: str = "/"  # begins with ``/``; ``/`` alone means none
+    # names that replace others. Both may be full (``/a``), relative to the namespace (``a``) or to
+    # the node (``~/a``)
     remap: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

@@ -70,18 +70,11 @@ def _qos(depth: int, *more: Any, reliable: bool = True, latched: bool = False) -
 
 @dataclass(frozen=True)
 class Writer:
-    """The writer of a message.
+    """The writer of a message."""
 
-    Attributes
-    ----------
-    handle : of the writer, in this process.
-    participant : of its process; a context in ROS 2.
-    lease : time within which it must assert its liveliness, in s; infinite if it need not.
-    """
-
-    handle: int
-    participant: UUID
-    lease: float
+    handle: int  # of the writer, in this process
+    participant: UUID  # of its process; a context in ROS 2
+    lease: float  # time within which it must assert its liveliness, in s; infinite if it need not
 
 
 @dataclass(frozen=True)

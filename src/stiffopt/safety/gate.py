@@ -34,22 +34,14 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Applied:
-    """Outcome of a command.
+    """Outcome of a command."""
 
-    Attributes
-    ----------
-    pressures : set-points (n,) of the supply, in Pa.
-    reading : newest measured pressures, with the time of the measurement.
-    limited : whether the set-points differ from the command, because of its rate or force.
-    refused : why the command was refused; empty if it was carried out.
-    force_limited : whether it was reduced because of the total force.
-    """
-
-    pressures: Array
-    reading: PressureReading
+    pressures: Array  # set-points (n,) of the supply, in Pa
+    reading: PressureReading  # newest measured pressures, with the time of the measurement
+    # whether the set-points differ from the command, because of its rate or force
     limited: bool = False
-    refused: str = ""
-    force_limited: bool = False
+    refused: str = ""  # why the command was refused; empty if it was carried out
+    force_limited: bool = False  # whether it was reduced because of the total force
 
 
 class Outlet(Protocol):

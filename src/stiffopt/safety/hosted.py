@@ -40,23 +40,15 @@ _LOOK = 0.005  # s between checks of a moving stage
 
 @dataclass(frozen=True)
 class Owned:
-    """The objects that a guard owns.
+    """The objects that a guard owns."""
 
-    Attributes
-    ----------
-    gate : the gate in front of the supply, not yet open.
-    follower : brings the supply to the goals of programs, through the gate.
-    timeout : silence of a stream after which the guard vents, in s.
-    line : makes the vent line on which the guard listens for `stiffopt vent`.
-    epoch : time 0 of the rig's clock on `time.monotonic`, in s.
-    hosted : tracker, probe and truth of a simulated rig; None for real devices.
-    """
-
-    gate: SafetyGate
-    follower: GoalFollower
-    timeout: float
+    gate: SafetyGate  # the gate in front of the supply, not yet open
+    follower: GoalFollower  # brings the supply to the goals of programs, through the gate
+    timeout: float  # silence of a stream after which the guard vents, in s
+    # makes the vent line on which the guard listens for `stiffopt vent`
     line: Callable[[], VentLine]
-    epoch: float = 0.0
+    epoch: float = 0.0  # time 0 of the rig's clock on `time.monotonic`, in s
+    # tracker, probe and truth of a simulated rig; None for real devices
     hosted: HostedDevices | None = None
 
 

@@ -36,24 +36,16 @@ JSON = "json"
 
 @dataclass(frozen=True)
 class CommandFrame:
-    """A pressure command to the guard.
+    """A pressure command to the guard."""
 
-    Attributes
-    ----------
-    sequence : number of the message; the client counts all its messages.
-    sent : when it was sent, in s.
-    time, valid_for : when the command was given and for how long it is valid, in s.
-    pressures : (n,), in Pa.
-    goal : True: the guard approaches and repeats the pressures while they are valid, see
-        `stiffopt.safety.goal`. False: one command of a stream; the guard vents when the stream
-        stops.
-    """
-
-    sequence: int
-    sent: float
+    sequence: int  # number of the message; the client counts all its messages
+    sent: float  # when it was sent, in s
+    # time, valid_for: when the command was given and for how long it is valid, in s
     time: float
     valid_for: float
-    pressures: Array
+    pressures: Array  # (n,), in Pa
+    # True: the guard approaches and repeats the pressures while they are valid, see
+    # `stiffopt.safety.goal`. False: one command of a stream; the guard vents when the stream stops
     goal: bool = False
 
     def pack(self) -> bytes:
@@ -65,37 +57,25 @@ class CommandFrame:
 
 @dataclass(frozen=True)
 class GuardAnswer:
-    """The guard's answer to a command or request, with the state of the supply.
+    """The guard's answer to a command or request, with the state of the supply."""
 
-    Attributes
-    ----------
-    sequence : number of the message that is answered; 0: a report of the guard. It replaces the
-        missing answers to older commands.
-    commanded : set-points (n,) of the supply, in Pa.
-    measured, time : measured pressures (n,), in Pa, and when they were read; NaN if unknown.
-    armed : whether the guard accepts commands.
-    limited, force_limited : whether the command was limited at all, and by the total force.
-    trips : number of trips of the guard so far.
-    broken : number of packets so far that the guard could not decode.
-    tripped : why the guard is tripped now; empty if it is not.
-    refused : why the command was refused; empty if it was carried out.
-    error : why the request failed; empty if it did not.
-    value : result of a request that has one.
-    """
-
+    # number of the message that is answered; 0: a report of the guard. It replaces the missing
+    # answers to older commands
     sequence: int
-    commanded: Array
+    commanded: Array  # set-points (n,) of the supply, in Pa
+    # measured, time: measured pressures (n,), in Pa, and when they were read; NaN if unknown
     measured: Array
     time: float
-    armed: bool = False
+    armed: bool = False  # whether the guard accepts commands
+    # limited, force_limited: whether the command was limited at all, and by the total force
     limited: bool = False
     force_limited: bool = False
-    trips: int = 0
-    broken: int = 0
-    tripped: str = ""
-    refused: str = ""
-    error: str = ""
-    value: Any = None
+    trips: int = 0  # number of trips of the guard so far
+    broken: int = 0  # number of packets so far that the guard could not decode
+    tripped: str = ""  # why the guard is tripped now; empty if it is not
+    refused: str = ""  # why the command was refused; empty if it was carried out
+    error: str = ""  # why the request failed; empty if it did not
+    value: Any = None  # result of a request that has one
 
     def pack(self) -> bytes:
         """Return the packet (bytes)."""
@@ -117,18 +97,11 @@ class GuardAnswer:
 
 @dataclass(frozen=True)
 class GuardRequest:
-    """A request to the guard: ``arm``, ``vent``, ``read``, ``restrict``, ``ping``, ``close`` ...
+    """A request to the guard: ``arm``, ``vent``, ``read``, ``restrict``, ``ping``, ``close`` ..."""
 
-    Attributes
-    ----------
-    sequence : number of the message; the client counts all its messages.
-    do : name of the request.
-    about : its arguments by name.
-    """
-
-    sequence: int
-    do: str
-    about: dict[str, Any] = field(default_factory=dict)
+    sequence: int  # number of the message; the client counts all its messages
+    do: str  # name of the request
+    about: dict[str, Any] = field(default_factory=dict)  # its arguments by name
 
     def pack(self) -> bytes:
         """Return the packet (bytes)."""

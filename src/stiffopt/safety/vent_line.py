@@ -150,18 +150,11 @@ def _listening(endpoint: str) -> socket.socket:
 
 @dataclass(frozen=True)
 class Reply:
-    """Reply of a guard that was called to vent, or the lack of one.
+    """Reply of a guard that was called to vent, or the lack of one."""
 
-    Attributes
-    ----------
-    guard : the guard's process.
-    answered : whether it answered.
-    error : why its supply may not be vented; empty if it reports that it is.
-    """
-
-    guard: SocketPeer
-    answered: bool
-    error: str = ""
+    guard: SocketPeer  # the guard's process
+    answered: bool  # whether it answered
+    error: str = ""  # why its supply may not be vented; empty if it reports that it is
 
 
 def trusted(uid: int) -> bool:

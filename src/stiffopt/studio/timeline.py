@@ -31,63 +31,36 @@ _EVENTS = 4  # shown at a time
 
 
 class TimelineChart(NamedTuple):
-    """A chart over time.
+    """A chart over time."""
 
-    Attributes
-    ----------
-    title : with the unit.
-    names : of the k lines.
-    values : (N, k).
-    shows_pressures : whether they are pressures of channels.
-    """
-
-    title: str
-    names: tuple[str, ...]
-    values: Vector
-    shows_pressures: bool = False
+    title: str  # with the unit
+    names: tuple[str, ...]  # of the k lines
+    values: Vector  # (N, k)
+    shows_pressures: bool = False  # whether they are pressures of channels
 
 
 class TimelineMoment(NamedTuple):
-    """The state at one moment of a timeline.
+    """The state at one moment of a timeline."""
 
-    Attributes
-    ----------
-    row : index of the last row until then.
-    pressures : (n,), in Pa, interpolated.
-    seen : (3,), last measured position of the tip, in m, or None.
-    """
-
-    row: int
-    pressures: Vector
-    seen: Vector | None
+    row: int  # index of the last row until then
+    pressures: Vector  # (n,), in Pa, interpolated
+    seen: Vector | None  # (3,), last measured position of the tip, in m, or None
 
 
 @dataclass(frozen=True, eq=False)
 class Timeline:
-    """Pressures over time, with charts, positions and events.
+    """Pressures over time, with charts, positions and events."""
 
-    Attributes
-    ----------
-    robot : the arm, with the load of the path.
-    times : (N,), in s, from 0, increasing.
-    pressures : (N, n), in Pa, without gaps.
-    charts : quantities to draw over time.
-    headline : status and message, for the user.
-    asked : (N, 3), target positions, in m, or None.
-    seen : (N, 3), measured positions of the tip, in m, NaN where it was not seen; or None.
-    events : times and texts.
-    scene : the objects around the arm, or None.
-    """
-
-    robot: Manipulator
-    times: Vector
-    pressures: Vector
-    charts: tuple[TimelineChart, ...] = ()
-    headline: str = ""
-    asked: Vector | None = None
+    robot: Manipulator  # the arm, with the load of the path
+    times: Vector  # (N,), in s, from 0, increasing
+    pressures: Vector  # (N, n), in Pa, without gaps
+    charts: tuple[TimelineChart, ...] = ()  # quantities to draw over time
+    headline: str = ""  # status and message, for the user
+    asked: Vector | None = None  # (N, 3), target positions, in m, or None
+    # (N, 3), measured positions of the tip, in m, NaN where it was not seen; or None
     seen: Vector | None = None
-    events: tuple[tuple[float, str], ...] = ()
-    scene: Scene | None = None
+    events: tuple[tuple[float, str], ...] = ()  # times and texts
+    scene: Scene | None = None  # the objects around the arm, or None
 
     @property
     def duration(self) -> float:

@@ -36,19 +36,13 @@ _STEPS = 200  # that can be undone
 
 @dataclass(frozen=True, eq=False)
 class StudioAnswer:
-    """The solution of a design.
+    """The solution of a design."""
 
-    Attributes
-    ----------
-    design : the design that it solves.
-    solution : with pressures.
-    plain : the plain solution, with the least pressures for the same pose; None if unknown.
-    is_best : whether it comes from the global search, not only from one near the previous one.
-    """
-
-    design: Design
-    solution: PressureSolution
+    design: Design  # the design that it solves
+    solution: PressureSolution  # with pressures
+    # the plain solution, with the least pressures for the same pose; None if unknown
     plain: PressureSolution | None
+    # whether it comes from the global search, not only from one near the previous one
     is_best: bool
 
     @property

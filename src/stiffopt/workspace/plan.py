@@ -167,22 +167,13 @@ def _shift(seed: int, channel: int) -> int:
 
 @dataclass(frozen=True)
 class MapPlan:
-    """Everything that determines the values of a map.
+    """Everything that determines the values of a map."""
 
-    Attributes
-    ----------
-    robot : the arm, with the load at its tip.
-    measures : the stiffness measures (m,), with unit directions.
-    sampling : the sampled pressures.
-    cell : edge length of a cell, in m.
-    scene : objects that the body keeps clear of, or None.
-    """
-
-    robot: Manipulator
-    measures: tuple[DirectionalMeasure, ...]
-    sampling: Sampling
-    cell: float
-    scene: Scene | None = None
+    robot: Manipulator  # the arm, with the load at its tip
+    measures: tuple[DirectionalMeasure, ...]  # the stiffness measures (m,), with unit directions
+    sampling: Sampling  # the sampled pressures
+    cell: float  # edge length of a cell, in m
+    scene: Scene | None = None  # objects that the body keeps clear of, or None
 
     @classmethod
     def of(
