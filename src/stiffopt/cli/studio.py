@@ -7,16 +7,6 @@ import typer
 from stiffopt.cli.exits import with_exit_code
 from stiffopt.cli.options import Units, option
 
-STUDIO_HELP = """\
-Open a page in the browser that shows a robot and a task, to be changed by hand.
-
-FILE is a built-in robot, or a robot, task or scene file: drag the target and the arm follows, with
-its pressures and its stiffness. A path file, a motion (.csv of 'stiffopt plan') and a recording
-(.csv, .mcap) are played. A rig file shows the arm of its running daemon; with the daemon's token
-the page can also command it. The page is for this machine, and only the printed address opens it.
-Needs the extra 'studio'.
-"""
-
 STUDIO_EPILOG = """\
 \b
 Examples:
@@ -52,7 +42,14 @@ def studio(
         bool, typer.Option("--no-browser", help="Only print the address.")
     ] = False,
 ) -> None:
-    """Open the studio."""
+    """Open a page in the browser that shows a robot and a task, to be changed by hand.
+
+    FILE is a built-in robot, or a robot, task or scene file: drag the target and the arm follows,
+    with its pressures and its stiffness. A path file, a motion (.csv of 'stiffopt plan') and a
+    recording (.csv, .mcap) are played. A rig file shows the arm of its running daemon; with the
+    daemon's token the page can also command it. The page is for this machine, and only the printed
+    address opens it. Needs the extra 'studio'.
+    """
     from stiffopt.cli.studio_run import run  # here, so that --help waits for no numerics
 
     run(

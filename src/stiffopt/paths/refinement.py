@@ -91,7 +91,7 @@ class _State:
     """A window at some pressures, with its linearisation."""
 
     x: Vector  # ndarray (k, n) As shares of the ranges
-    slopes: Slopes  # Slopes
+    slopes: Slopes
     # near, near_slopes: ndarray (k, b), (k, b, n) Values of one-sided constraints, which must be at
     # most 0, and their derivatives
     near: Vector
