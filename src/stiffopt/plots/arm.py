@@ -36,30 +36,19 @@ def draw_arm(
 ) -> list[Any]:
     """Draw an arm in space, in the display unit of lengths.
 
+    Returns handles for a legend. Raises `InputError`: the pressures do not suit the arm, or the
+    view is invalid.
+
     Parameters
     ----------
-    axes :
-        In 3-D: ``figure.add_subplot(projection="3d", computed_zorder=False)``. Their limits, labels
-        and view are set.
-    robot : Manipulator
-    pressures : (n,)
-        In Pa.
-    scene : Scene, optional
-        The objects around it.
-    view : (elevation, azimuth), optional
-        The viewpoint: the angle of the eye above the horizontal, and about the z axis of the base
-        from its x axis; in rad, or as text with a unit: ``("20 deg", "-60 deg")``. By default x
-        points to the right, and z up or, for a hanging arm, down.
-
-    Returns
-    -------
-    list
-        Handles for a legend.
-
-    Raises
-    ------
-    InputError
-        The pressures do not suit the arm, or the view is invalid.
+    axes : in 3-D: ``figure.add_subplot(projection="3d", computed_zorder=False)``. Their limits,
+        labels and view are set.
+    pressures : (n,), in Pa.
+    scene : the objects around it.
+    view : (elevation, azimuth), the viewpoint: the angle of the eye above the horizontal, and about
+        the z axis of the base from its x axis; in rad, or as text with a unit:
+        ``("20 deg", "-60 deg")``. By default x points to the right, and z up or, for a hanging arm,
+        down.
     """
     drawing = ArmDrawing(axes, robot)
     drawing.draw_base()

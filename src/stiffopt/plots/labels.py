@@ -64,8 +64,7 @@ def place_labels(axes: Any, labels: Sequence[Label], covered: Vector, marks: Vec
     Parameters
     ----------
     axes :
-    labels : sequence of Label
-        The most important first.
+    labels : the most important first.
     covered : (k, 3), points of the axes, close together, which texts avoid.
     marks : (j, 3), points with a marker, which texts avoid with a margin.
     """

@@ -39,21 +39,14 @@ def plot_path(
 ) -> Figure:
     """Draw a solved path: the arm along it, and stiffness, clearance and pressures over time.
 
+    Raises `InputError`: the solution has no points, or the view is invalid; `MissingExtraError` if
+    matplotlib is not installed.
+
     Parameters
     ----------
-    path : Path
-    solution : PathSolution
-    title : str, optional
-        By default the name of the path's file.
-    view : (elevation, azimuth), optional
-        From where to look at the arm, in rad or as text with a unit; see `draw_arm`.
-
-    Raises
-    ------
-    InputError
-        The solution has no points, or the view is invalid.
-    MissingExtraError
-        If matplotlib is not installed.
+    title : by default the name of the path's file.
+    view : (elevation, azimuth), from where to look at the arm, in rad or as text with a unit; see
+        `draw_arm`.
     """
     source = path.source
     name = solution.robot.description.name if source is None else source.stem
@@ -78,22 +71,15 @@ def plot_motion(
 ) -> Figure:
     """Draw a motion of `stiffopt.plan_motion` as `plot_path` draws a path.
 
+    Raises `InputError`: the solution has no points, or the view is invalid; `MissingExtraError` if
+    matplotlib is not installed.
+
     Parameters
     ----------
-    solution : PathSolution
-    scene : Scene, optional
-        The scene that the motion keeps clear of.
-    title : str, optional
-        By default the name of the robot.
-    view : (elevation, azimuth), optional
-        From where to look at the arm, in rad or as text with a unit; see `draw_arm`.
-
-    Raises
-    ------
-    InputError
-        The solution has no points, or the view is invalid.
-    MissingExtraError
-        If matplotlib is not installed.
+    scene : the scene that the motion keeps clear of.
+    title : by default the name of the robot.
+    view : (elevation, azimuth), from where to look at the arm, in rad or as text with a unit; see
+        `draw_arm`.
     """
     robot = solution.robot
     limits = robot.pressure_min, robot.pressure_max
@@ -175,29 +161,16 @@ def draw_path(
 ) -> list[Any]:
     """Draw the arm at some of the points, and the path of its tip.
 
+    Returns handles for a legend. Raises `InputError`: the solution has no points, or the view is
+    invalid.
+
     Parameters
     ----------
-    axes :
-        In 3-D, as for `draw_arm`.
-    solution : PathSolution
-    path : Path, optional
-        The requested path, to draw beside the followed one.
-    scene : Scene, optional
-        The objects around the arm.
-    view : (elevation, azimuth), optional
-        See `draw_arm`.
-    labelled : bool
-        Whether to label the point of least stiffness.
-
-    Returns
-    -------
-    list
-        Handles for a legend.
-
-    Raises
-    ------
-    InputError
-        The solution has no points, or the view is invalid.
+    axes : in 3-D, as for `draw_arm`.
+    path : the requested path, to draw beside the followed one.
+    scene : the objects around the arm.
+    view : (elevation, azimuth), see `draw_arm`.
+    labelled : whether to label the point of least stiffness.
     """
     _require_points(solution)
     drawing = ArmDrawing(axes, solution.robot)
@@ -241,24 +214,12 @@ def draw_asked_path(
 ) -> list[Any]:
     """Draw a requested path, and the arm at its lowest pressures.
 
+    Returns handles for a legend. Raises `InputError`: the view is invalid.
+
     Parameters
     ----------
-    axes :
-        In 3-D, as for `draw_arm`.
-    robot : Manipulator
-    path : Path
-    view : (elevation, azimuth), optional
-        See `draw_arm`.
-
-    Returns
-    -------
-    list
-        Handles for a legend.
-
-    Raises
-    ------
-    InputError
-        The view is invalid.
+    axes : in 3-D, as for `draw_arm`.
+    view : (elevation, azimuth), see `draw_arm`.
     """
     drawing = ArmDrawing(axes, robot)
     drawing.draw_base()
@@ -285,16 +246,12 @@ def _label_stiffness(drawing: ArmDrawing, solution: PathSolution, tips: Vector) 
 def draw_stiffness_along(axes: Any, solution: PathSolution) -> None:
     """Draw stiffness over time, and the best stiffness of each single point.
 
+    Raises `InputError`: the solution has no stiffness: its path maximises none, or it has no
+    points.
+
     Parameters
     ----------
-    axes :
-        Of matplotlib.
-    solution : PathSolution
-
-    Raises
-    ------
-    InputError
-        The solution has no stiffness: its path maximises none, or it has no points.
+    axes : of matplotlib.
     """
     index = solution.worst_index
     if solution.stiffness is None or index is None:
@@ -343,18 +300,12 @@ def _stretches(times: Vector, where: NDArray[np.bool_]) -> Iterator[tuple[float,
 def draw_clearance_along(axes: Any, solution: PathSolution, required: float | None = None) -> None:
     """Draw clearance over time, and the required clearance.
 
+    Raises `InputError`: the solution has no clearance: there is no scene, or it has no points.
+
     Parameters
     ----------
-    axes :
-        Of matplotlib.
-    solution : PathSolution
-    required : float, optional
-        In m.
-
-    Raises
-    ------
-    InputError
-        The solution has no clearance: there is no scene, or it has no points.
+    axes : of matplotlib.
+    required : in m.
     """
     if solution.clearance is None or not len(solution.times):
         raise InputError("there is nothing to draw: the solution has no clearance")
@@ -374,20 +325,13 @@ def draw_pressures_along(
 ) -> None:
     """Draw the pressures of a segment over time; steps at the full rate stand out.
 
+    Raises `InputError`: the solution has no points, or the arm has no such segment.
+
     Parameters
     ----------
-    axes :
-        Of matplotlib.
-    solution : PathSolution
-    segment : int
-        From 1, at the base.
-    limits : ((n,), (n,)), optional
-        Lower and upper limits of all channels in Pa; by default the robot's.
-
-    Raises
-    ------
-    InputError
-        The solution has no points, or the arm has no such segment.
+    axes : of matplotlib.
+    segment : from 1, at the base.
+    limits : ((n,), (n,)), lower and upper limits of all channels in Pa; by default the robot's.
     """
     _require_points(solution)
     segments = solution.robot.description.segments

@@ -134,10 +134,7 @@ def stacked_panels(
 def save_figure(figure: Figure, path: str | os.PathLike[str]) -> None:
     """Write a figure atomically, in the format of the path's ending.
 
-    Raises
-    ------
-    FileError
-        The file cannot be written.
+    Raises `FileError`: the file cannot be written.
     """
     buffer = BytesIO()
     try:
