@@ -9,14 +9,12 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stiffopt import lie
+from stiffopt.arrays import Array
 from stiffopt.directions import Quaternion
 from stiffopt.schema import Schema, Vector
 from stiffopt.units import Length
-
-Array = NDArray[np.float64]
 
 
 @lru_cache(maxsize=64)

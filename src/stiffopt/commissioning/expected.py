@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.commissioning.settings import BELIEF, PROCEDURE
 from stiffopt.errors import InputError
 from stiffopt.model.actuation import SectionGeometry
@@ -19,7 +19,6 @@ from stiffopt.model.parameters import Parameter
 from stiffopt.model.parametric import ParametricArm
 from stiffopt.rig.interface import PressureLimits
 
-Array = NDArray[np.float64]
 Source = tuple[int, ...]
 """Channels (from 0) whose chambers one line fills: one, none, or two that share it."""
 

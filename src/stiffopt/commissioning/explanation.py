@@ -23,13 +23,12 @@ from functools import cached_property
 from itertools import combinations, permutations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.commissioning.expected import ExpectedSteps, Source, rotation_vectors
 from stiffopt.commissioning.responses import Responses
 from stiffopt.commissioning.settings import BELIEF, LIMITS
 
-Array = NDArray[np.float64]
 Wiring = tuple[Source, ...]
 """For each command line, the channels whose chambers it fills."""
 

@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.commissioning.expected import ExpectedSteps
 from stiffopt.commissioning.settings import PROCEDURE
 from stiffopt.errors import DeviceError
@@ -20,8 +20,6 @@ from stiffopt.experiments.conductor import Conductor, TickRecord, TrackedFrame
 from stiffopt.experiments.folder import Progress, recorded
 from stiffopt.rig.interface import Rig
 from stiffopt.rig.settings import Safety
-
-Array = NDArray[np.float64]
 
 LOG = "commissioning"
 """Name of the recording, without ending."""

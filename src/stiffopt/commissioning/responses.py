@@ -5,13 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.commissioning.expected import rotation_vectors
 from stiffopt.commissioning.procedure import ChannelStep, StepReadings
 from stiffopt.commissioning.timing import Delays, Swing, delays_of, fit_swing, settled, tip_delay
-
-Array = NDArray[np.float64]
 
 _BEGIN = 0.25  # s after a step, in which the regulators still follow
 

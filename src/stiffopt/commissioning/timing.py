@@ -6,12 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.commissioning.procedure import StepReadings
 from stiffopt.model.history import lagged
-
-Array = NDArray[np.float64]
 
 _CREEP = 1.5  # s, time constant of creep
 _FREQUENCIES = np.geomspace(0.4, 12.0, 70)  # Hz, initial values of the search, as the next three

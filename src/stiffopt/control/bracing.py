@@ -35,8 +35,8 @@ from enum import StrEnum
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.control.friction import Friction
 from stiffopt.control.interface import Notice
 from stiffopt.control.sliding import SlideEstimator
@@ -47,9 +47,6 @@ from stiffopt.optimise.task import Task
 from stiffopt.optimise.tip import TipAt
 from stiffopt.paths.configurations import maximised
 from stiffopt.paths.leaning import BraceApproach
-
-Array = NDArray[np.float64]
-
 
 _UNCERTAIN, _SLIPS = "brace-uncertain", "brace-slips"
 

@@ -12,9 +12,9 @@ from contextlib import contextmanager
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import BaseModel
 
+from stiffopt.arrays import Array
 from stiffopt.errors import CommandError, InputError, StiffoptError
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.scene import Scene, SceneObject
@@ -25,7 +25,6 @@ from stiffopt.paths.trajectory import Trajectory, Waypoint
 from stiffopt.rig.interface import PressureLimits
 from stiffopt.schema import BadKeyError, Schema
 
-Array = NDArray[np.float64]
 ModelT = TypeVar("ModelT", bound=Schema)
 
 _IGNORED_FIELDS = frozenset({"source"})  # the file that a description was read from

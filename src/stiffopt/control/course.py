@@ -7,15 +7,13 @@ import math
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from stiffopt import lie
+from stiffopt.arrays import Array
 from stiffopt.errors import InputError
 from stiffopt.optimise.target import Target
 from stiffopt.paths.trajectory import Trajectory, check_times
-
-Array = NDArray[np.float64]
 
 _OPPOSITE = -0.99  # cosine below which directions count as opposite: no unique way between them
 _SHORT = 0.05  # length below which an interpolated direction is undefined

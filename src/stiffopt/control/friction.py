@@ -11,12 +11,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.model.contact.push import until_equal
 from stiffopt.paths.leaning import Hold
-
-Array = NDArray[np.float64]
 
 _SAME = 1e-3  # share of the cone within which a force is on it
 

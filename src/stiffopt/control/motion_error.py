@@ -15,12 +15,10 @@ from __future__ import annotations
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.control.formula import Formula
 from stiffopt.control.tuning import MotionErrorTuning
-
-Array = NDArray[np.float64]
 
 
 class MotionErrorEstimator:

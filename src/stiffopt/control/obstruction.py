@@ -11,11 +11,9 @@ creep by a share of the way before.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.control.tuning import ObstructionTuning
-
-Array = NDArray[np.float64]
 
 
 class ObstructionWatch:

@@ -18,11 +18,10 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.control.formula import Formula
 
-Array = NDArray[np.float64]
 Symbols = Any  # of CasADi
 
 _LAGS = 4

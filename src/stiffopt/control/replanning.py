@@ -7,8 +7,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.control.adaptation import Adapted, Estimate, Window
 from stiffopt.control.bracing import Bracing
 from stiffopt.control.course import Course
@@ -26,7 +26,6 @@ from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import Task
 from stiffopt.paths.trajectory import Trajectory, Waypoint
 
-Array = NDArray[np.float64]
 AnyCourse = Course | PostureCourse | Pressing | Bracing
 
 _TOO_SOFT = (

@@ -17,14 +17,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stiffopt import lie
+from stiffopt.arrays import Array
 from stiffopt.control.friction import Friction
 from stiffopt.control.tuning import SlidingTuning
 from stiffopt.paths.leaning import BraceApproach
-
-Array = NDArray[np.float64]
 
 _ERROR, _CREEP, _PUSH, _FIRST = slice(0, 6), slice(6, 12), slice(12, 15), 15  # in the state
 

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stiffopt.commissioning.record import commissioned_control, commissioned_robot, is_commissioned
 from stiffopt.control.controller import TipController
@@ -38,9 +37,6 @@ from stiffopt.safety.rigs import guarded_rig
 if TYPE_CHECKING:
     from stiffopt.daemon.server import Server
     from stiffopt.daemon.telemetry import Telemetry
-
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -12,9 +12,9 @@ from math import isfinite
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stiffopt import units
+from stiffopt.arrays import Array
 from stiffopt.control.loop import ControlLoop
 from stiffopt.control.request_queue import Requester, requested_by
 from stiffopt.control.state import Snapshot, State
@@ -250,6 +250,6 @@ async def _ended(call: Future[Any]) -> None:
     await ended.wait()
 
 
-def _whole(values: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
+def _whole(values: Array | None) -> Array | None:
     """Return the values if all are known."""
     return values if values is not None and np.isfinite(values).all() else None

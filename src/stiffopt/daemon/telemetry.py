@@ -15,8 +15,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.control.loop import ControlLoop
 from stiffopt.control.state import Snapshot
 from stiffopt.daemon.recording import RunRecording
@@ -27,8 +27,6 @@ from stiffopt.model.description import RobotDescription
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.rig.device import Clock
 from stiffopt.rig.settings import ServiceSettings
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

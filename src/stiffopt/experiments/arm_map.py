@@ -6,14 +6,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from stiffopt.arrays import Array
 from stiffopt.errors import InputError
 from stiffopt.model.arguments import checked_integer
 from stiffopt.model.compliance import Boundary, Frame
 from stiffopt.model.manipulator import Manipulator
-
-Array = NDArray[np.float64]
 
 NEAREST_BASE = 0.2
 """Share of the length from which stiffness is mapped; at the base it is infinite."""

@@ -13,8 +13,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
+from stiffopt.arrays import Array
 from stiffopt.errors import InputError
-from stiffopt.experiments.conductor import CONDUCTOR, Array, Conductor, at_rest
+from stiffopt.experiments.conductor import CONDUCTOR, Conductor, at_rest
 from stiffopt.experiments.folder import recorded
 from stiffopt.rig.interface import Rig
 from stiffopt.safety.gate import effective_slew

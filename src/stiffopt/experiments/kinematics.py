@@ -17,8 +17,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Field
 
+from stiffopt.arrays import Array
 from stiffopt.errors import FileError
-from stiffopt.experiments.conductor import Array, Conductor, at_rest, check_pressures
+from stiffopt.experiments.conductor import Conductor, at_rest, check_pressures
 from stiffopt.experiments.coverage import coverage_for, round_count, round_name
 from stiffopt.experiments.folder import ExperimentSettings, Progress, recorded
 from stiffopt.logs import read_log

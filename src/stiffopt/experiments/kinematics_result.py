@@ -14,8 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
+from stiffopt.arrays import Array
 from stiffopt.errors import InputError
-from stiffopt.experiments.conductor import Array
 from stiffopt.experiments.coverage import round_name
 from stiffopt.experiments.kinematics import KinematicsSettings, recording_name
 from stiffopt.logs import Log, read_log

@@ -16,9 +16,10 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field
 
+from stiffopt.arrays import Array
 from stiffopt.directions import Direction, direction_name
 from stiffopt.errors import InputError
-from stiffopt.experiments.conductor import Array, Conductor, at_rest, check_pressures
+from stiffopt.experiments.conductor import Conductor, at_rest, check_pressures
 from stiffopt.experiments.folder import ExperimentSettings, Progress, RawRecording
 from stiffopt.experiments.probing import PointsFile, Probing, Series, SeriesKey
 from stiffopt.model.manipulator import Manipulator

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from stiffopt.experiments.conductor import Array
+from stiffopt.arrays import Array
 from stiffopt.experiments.probing import PointsFile, SeriesPoints
 from stiffopt.experiments.slope import LineFit, SlopeEstimate, combine, fit_lines
 from stiffopt.experiments.stiffness import StiffnessSettings

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from stiffopt.arrays import Array
 from stiffopt.errors import DeviceError, InputError
 from stiffopt.rig.device import DeviceSettings
 
@@ -22,7 +22,6 @@ if TYPE_CHECKING:  # importing numba is slow, and peers do not need it
     from stiffopt.plant.hardware import Frame
     from stiffopt.plant.world import World
 
-Array = NDArray[np.float64]
 SettingsT = TypeVar("SettingsT", bound=DeviceSettings)
 
 FULL_SCALE = 10e5

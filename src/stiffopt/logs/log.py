@@ -12,9 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.errors import FileError, InputError, shown
-
-Array = NDArray[np.float64]
 
 _TIME = "time_s"
 _AXES = ("x", "y", "z")

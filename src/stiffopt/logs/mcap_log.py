@@ -21,8 +21,9 @@ from typing import Any, Self
 
 import numpy as np
 
+from stiffopt.arrays import Array
 from stiffopt.errors import FileError, require_package
-from stiffopt.logs.log import Array, Log, LogLayout, LogRow, log_of_values, numbers_of
+from stiffopt.logs.log import Log, LogLayout, LogRow, log_of_values, numbers_of
 from stiffopt.logs.mcap_file import McapContents, McapWriter, read_mcap
 from stiffopt.logs.table import writing
 

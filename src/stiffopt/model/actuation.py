@@ -14,9 +14,9 @@ from typing import Any, ClassVar
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from stiffopt import lie
+from stiffopt.arrays import Array
 from stiffopt.model.calibration import FittedNumber
 from stiffopt.model.description import Compensation, Segment
 from stiffopt.schema import BadKeyError, Schema
@@ -56,7 +56,7 @@ class SectionGeometry:
         """Whether the centroid may lie off the axis."""
         return not ca.SX(self.centroid).is_zero()
 
-    def turned(self, azimuth: NDArray[np.float64]) -> SectionGeometry:
+    def turned(self, azimuth: Array) -> SectionGeometry:
         """Return the same section with the lever arms of its channels turned about the axis.
 
         `azimuth`: of each channel (c,), from x towards y, in rad; empty for none.
@@ -90,7 +90,7 @@ class SectionGeometry:
         )
 
 
-def _without_rounding(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+def _without_rounding(matrix: Array) -> Array:
     """Drop off-diagonal entries that are only rounding, to keep the model's graph sparse."""
     return np.where(np.abs(matrix) < 1e-12 * np.abs(matrix).max(), 0.0, matrix)
 

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.model.batch import in_parallel
 from stiffopt.model.body import NativeBody
 from stiffopt.model.clearance import Nearest, nearest_point, range_ends, survey
@@ -23,7 +24,6 @@ from stiffopt.model.scene import Scene
 if TYPE_CHECKING:
     from stiffopt.model.manipulator import Manipulator
 
-Array = NDArray[np.float64]
 
 _CHUNK = 64  # poses that a thread takes at a time
 _DEGREE = 22  # of polynomials along a range; their error is a nanometre

@@ -12,12 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from stiffopt.arrays import Array, Flags
 from stiffopt.errors import shown
 from stiffopt.model.history import lagged
 from stiffopt.schema import BadKeyError, Items, Schema
 from stiffopt.units import Angle, Duration, Length, Number, Pressure, Ratio
 
-Array = NDArray[np.float64]
 _POSITIVE = Field(ge=0)
 _ROUNDING = 1e-3  # of correlations, which are written with few digits
 _MORE_MEMORY = 0.07  # of the pressure acts through hysteresis that no model has
@@ -292,7 +292,7 @@ class Calibration(Schema):
         root = deviations[:, np.newaxis] * vectors * np.sqrt(np.maximum(values, 0.0))
         return np.asarray(root @ root.T)
 
-    def covers(self, channels: Sequence[int], pressures: Array) -> NDArray[np.bool_]:
+    def covers(self, channels: Sequence[int], pressures: Array) -> Flags:
         """Return which pressures (N, n) count as recorded.
 
         `channels`: number of channels of each segment. `pressures`: (N, n), in Pa.

@@ -14,12 +14,10 @@ from math import asin, inf, isfinite, sqrt
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.model.description import RobotDescription
 from stiffopt.model.distances import MeasuredObject
-
-Array = NDArray[np.float64]
 
 CLEARANCE_ERROR = 4e-6  # m, largest error of a least distance
 _SHORTEST = 1e-6  # m of arc length; shorter intervals are not divided

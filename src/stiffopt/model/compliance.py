@@ -10,12 +10,10 @@ from typing import Literal
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from stiffopt import lie
+from stiffopt.arrays import Array
 from stiffopt.model.actuation import Section
-
-Vector = NDArray[np.float64]
 
 Frame = Literal["base", "tip"]
 Kind = Literal["translation", "rotation"]
@@ -148,7 +146,7 @@ def directional_stiffness(
     return d.T @ stiffness_block(compliance, kind, boundary) @ d
 
 
-def stiffness_of(C: Vector, d: Vector, kind: Kind, boundary: Boundary) -> Vector:
+def stiffness_of(C: Array, d: Array, kind: Kind, boundary: Boundary) -> Array:
     """Return `directional_stiffness` (...) of compliances (..., 6, 6) that are known as numbers.
 
     The unit directions d (..., 3) are in the axes of the compliances.
@@ -158,12 +156,12 @@ def stiffness_of(C: Vector, d: Vector, kind: Kind, boundary: Boundary) -> Vector
         own, other = other, own
     block, d = C[..., own, own], d[..., None]
     if boundary == "free":
-        flexibility: Vector = np.sum(d * (block @ d), axis=(-2, -1))
+        flexibility: Array = np.sum(d * (block @ d), axis=(-2, -1))
         return 1 / flexibility
     if boundary == "clamped":
         reaction = np.linalg.solve(C[..., other, other], C[..., other, own])
         block = block - C[..., own, other] @ reaction
-    found: Vector = np.sum(d * np.linalg.solve(block, d), axis=(-2, -1))
+    found: Array = np.sum(d * np.linalg.solve(block, d), axis=(-2, -1))
     return found
 
 

@@ -16,10 +16,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.errors import InputError, os_reason, require_package
 from stiffopt.model.compiler import BuildError, cache_directory, write_atomically
-
-Array = NDArray[np.float64]
 
 _NEAR = 0.025  # m, margin of the fine grid about the surface
 _FAR = 0.15  # m, least margin of the coarse grid; at least the largest extent

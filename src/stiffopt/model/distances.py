@@ -21,13 +21,12 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.model.batch import BatchFunction
 from stiffopt.model.codegen import dense
 from stiffopt.model.compiled import Library, interpreted, library
 from stiffopt.model.obstacle import Obstacle
 from stiffopt.model.obstacles import OBSTACLES
-
-Array = NDArray[np.float64]
 
 _SOURCES = (str(Path(__file__).with_name("native") / "scene.c"),)
 _COURSES = {"convex": 0, "concave": 1, "any": 2}  # as in scene.h

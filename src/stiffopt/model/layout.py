@@ -20,8 +20,8 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.model.actuation import SectionGeometry, StrainLaw
 from stiffopt.model.codegen import dense
 from stiffopt.model.description import Compensation, Corrections, RobotDescription, Segment
@@ -30,8 +30,6 @@ from stiffopt.model.laws import strain_law
 from stiffopt.model.parameters import explicit
 from stiffopt.model.shape import FreeShape
 from stiffopt.schema import Schema
-
-Vector = NDArray[np.float64]
 
 _NOT_IN_FORMULAS = {"chambers", "channels", "density", "history", "inner_radius"}
 """Keys of a segment that act through its section's geometry, or do not affect statics."""
@@ -79,7 +77,7 @@ def layout_of(description: RobotDescription) -> Layout:
     return Layout(json.dumps(segments, sort_keys=True), description)
 
 
-def numbers_of(description: RobotDescription) -> Vector:
+def numbers_of(description: RobotDescription) -> Array:
     """Return the numbers (k,) of an arm, in SI, in the order of its layout."""
     found: list[float] = []
     drawn = is_as_drawn(description)

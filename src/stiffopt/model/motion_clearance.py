@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.errors import EquilibriumError, PressureError
 from stiffopt.model.arm_clearance import ArmClearance, Ranges
 from stiffopt.model.clearance import range_ends
@@ -29,7 +30,6 @@ from stiffopt.model.stopping import checkpoint
 if TYPE_CHECKING:
     from stiffopt.model.manipulator import Manipulator
 
-Array = NDArray[np.float64]
 
 MOTION_ERROR = 3e-5
 """Largest amount by which a clear motion may fall short of the clearance asked for, in m."""

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, model_validator
 
+from stiffopt.arrays import Array
 from stiffopt.model.batch import InterpretedFunction
 from stiffopt.schema import BadKeyError, Schema, Vector
 from stiffopt.units import Length, within
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from stiffopt.model.description import RobotDescription
     from stiffopt.model.distance_grid import DistanceGrid
 
-Array = NDArray[np.float64]
 Along = Literal["convex", "concave", "any"]
 
 Point = Vector[Annotated[Length, within(1e3, "m")]]

@@ -15,8 +15,6 @@ from functools import cached_property
 from typing import Any, TypeVar
 
 import casadi as ca
-import numpy as np
-from numpy.typing import NDArray
 
 from stiffopt.errors import InputError, shown
 from stiffopt.model.actuation import Section
@@ -32,7 +30,6 @@ from stiffopt.model.kinematics import Actuation
 from stiffopt.model.laws import law_class, strain_laws
 from stiffopt.schema import Schema
 
-Vector = NDArray[np.float64]
 _SchemaT = TypeVar("_SchemaT", bound=Schema)
 _Path = tuple[str | int, ...]
 

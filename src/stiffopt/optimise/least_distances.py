@@ -12,8 +12,8 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.errors import DerivativeError
 from stiffopt.model.arm_clearance import ArmBody, gradients
 from stiffopt.model.clearance import Nearest, range_ends
@@ -22,8 +22,6 @@ from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.stopping import checkpoint
 from stiffopt.optimise.obstacles import Obstacles
 from stiffopt.optimise.settings import OBSTACLES
-
-Vector = NDArray[np.float64]
 
 _SPACING = 1 / 200  # of stations for finding minima, as a share of the arm's length
 _AROUND = 1e-3  # half width of the first interval searched for a minimum, m of arc length
@@ -50,7 +48,7 @@ class FollowedObstacles(Obstacles):
     """
 
     arm: Manipulator = field(repr=False, compare=False)
-    pressures: Vector = field(repr=False, compare=False)
+    pressures: Array = field(repr=False, compare=False)
     least: tuple[LeastDistance, ...] = field(init=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -71,7 +69,7 @@ class FollowedObstacles(Obstacles):
             for i in np.flatnonzero(least).tolist():
                 yield LeastDistance(index, float(s[i]), *ends[i].tolist())
 
-    def rows(self, arm: Manipulator, p: Vector) -> tuple[Vector, Vector]:
+    def rows(self, arm: Manipulator, p: Array) -> tuple[Array, Array]:
         """See `Obstacles.rows`."""
         checkpoint()
         body = ArmBody(arm, p)
@@ -86,7 +84,7 @@ class FollowedObstacles(Obstacles):
 class _Profile:
     """Stations of a body with their distances, and the slopes of these along it."""
 
-    def __init__(self, body: ArmBody, item: MeasuredObject, at: Vector) -> None:
+    def __init__(self, body: ArmBody, item: MeasuredObject, at: Array) -> None:
         self.at = at
         self.positions, tangents, radii = body(at)
         seen = item.distances(self.positions)

@@ -6,14 +6,12 @@ from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
+from stiffopt.arrays import Array
 from stiffopt.directions import Direction, Frame
 from stiffopt.schema import Schema
 from stiffopt.units import Force, Length, Speed, within
-
-Array = NDArray[np.float64]
 
 SOFT_SHARE = 0.15
 """Compliance, as a share of the largest, below which a direction is too stiff to feel forces."""

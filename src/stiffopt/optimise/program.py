@@ -14,8 +14,8 @@ from typing import Any, Literal, NamedTuple
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.model.description import RobotDescription
 from stiffopt.model.shape import Shape
 from stiffopt.optimise.measure import Measure
@@ -25,14 +25,12 @@ from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import Task
 from stiffopt.optimise.term import Term
 
-Vector = NDArray[np.float64]
-
 BAR = 1e5  # Pa
 
 Aim = Literal["maximise", "match", "least pressure"]
 
 
-def pressure_ranges(description: RobotDescription) -> Vector:
+def pressure_ranges(description: RobotDescription) -> Array:
     """Return the units (n,) of the optimiser's variables in Pa: the range of each channel.
 
     A channel without a range takes the largest range of the others.
@@ -121,7 +119,7 @@ class Program:
         )
 
     @property
-    def parameters(self) -> Vector:
+    def parameters(self) -> Array:
         """All parameters, in the order of the functions' arguments."""
         return np.array((*self.target_parameters, *self.measure_parameters))
 

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import (
     BeforeValidator,
     Discriminator,
@@ -27,6 +26,7 @@ from pydantic import (
 )
 from pydantic_core import PydanticKnownError
 
+from stiffopt.arrays import Array
 from stiffopt.directions import Frame
 from stiffopt.errors import FileError, InputError, dotted
 from stiffopt.files import SourceFile, line_of, read_file
@@ -147,9 +147,7 @@ class ForRobot(Schema, ShownInNotebook):
         if self.scene is not None:
             self.scene.check_against(description, self.source)
 
-    def pressure_bounds(
-        self, description: RobotDescription
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def pressure_bounds(self, description: RobotDescription) -> tuple[Array, Array]:
         """Return the pressure limits of each channel: the robot's, tightened by `pressure`.
 
         `description`: the robot, with n channels. Raises `InputError`: a list of the wrong length,

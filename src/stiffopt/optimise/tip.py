@@ -11,8 +11,9 @@ from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from stiffopt.arrays import Array
 from stiffopt.errors import EquilibriumError
 from stiffopt.model.compiled import Library, compiling_at_once, library
 from stiffopt.model.layout import Layout
@@ -20,8 +21,6 @@ from stiffopt.model.loaded_arm import LoadedArm
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.rod import rod_functions
 from stiffopt.model.tip_functions import tip_formulas
-
-Vector = NDArray[np.float64]
 
 _SOURCES = (str(Path(__file__).with_name("native") / "tip.c"),)
 _FOUND, _BEYOND_LAW, _NO_EQUILIBRIUM = range(3)  # as in tip.c
@@ -32,10 +31,10 @@ _integer, _pointer = ctypes.c_int64, ctypes.c_void_p
 class TipAt(NamedTuple):
     """The tip at one set of pressures; the arrays belong to the caller."""
 
-    pose: Vector  # (4, 4), in the base frame
+    pose: Array  # (4, 4), in the base frame
     # (6, n), twist of the tip in tip axes per pressure: three rows in m/Pa, then three in rad/Pa
-    jacobian: Vector
-    compliance: Vector  # (6, 6), in tip axes, linear first, as `Manipulator.tip_compliance`
+    jacobian: Array
+    compliance: Array  # (6, 6), in tip axes, linear first, as `Manipulator.tip_compliance`
 
 
 class TipModel:
@@ -115,7 +114,7 @@ class _LoadedTip:
         self._state[:] = np.nan
         self._arm.change(robot)
 
-    def __call__(self, pressures: Vector) -> TipAt | None:
+    def __call__(self, pressures: Array) -> TipAt | None:
         self._pressures[:], before = pressures, self._state.copy()
         outcome = self._tip(*self._call)
         if outcome == _FOUND:
@@ -142,7 +141,7 @@ class _FreeTip:
         """Take another arm's numbers."""
         self._numbers = robot.numbers
 
-    def __call__(self, pressures: Vector) -> TipAt | None:
+    def __call__(self, pressures: Array) -> TipAt | None:
         pose, jacobian, compliance, margin = self._function(pressures, self._numbers)
         return TipAt(pose, jacobian, compliance) if margin[0, 0] > 0 else None
 

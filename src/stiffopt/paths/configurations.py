@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from typing import cast
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from stiffopt.arrays import Array
 from stiffopt.display import display_units
 from stiffopt.errors import InputError, StoppedError
 from stiffopt.model.arguments import checked_vector
@@ -17,7 +18,6 @@ from stiffopt.optimise.goal import StiffnessMeasure
 from stiffopt.optimise.solver import PressureSolver
 from stiffopt.optimise.task import Task
 
-Vector = NDArray[np.float64]
 End = ArrayLike | Task
 
 _LOCAL = 3  # number of searches from random guesses, for other local optima
@@ -30,7 +30,7 @@ _ALIKE = 0.02  # of the ranges; configurations that differ by less count as one
 class Configuration:
     """Pressures at which a motion may end."""
 
-    pressures: Vector  # (n,), in Pa
+    pressures: Array  # (n,), in Pa
     # its stiffness as a share of the best known for its task; 1 if nothing is maximised
     worth: float = 1.0
     name: str = ""  # of the end to which it belongs: "goal 2"
@@ -54,7 +54,7 @@ def several(goal: End | Sequence[End]) -> list[End]:
     return [cast(End, goal)]
 
 
-def checked_pressures(name: str, robot: Manipulator, pressures: ArrayLike) -> Vector:
+def checked_pressures(name: str, robot: Manipulator, pressures: ArrayLike) -> Array:
     """Return pressures (n,), or raise `InputError` if they are outside the robot's limits."""
     p = checked_vector(f"the {name}'s pressures", pressures, robot.n_pressures)
     low, high = robot.pressure_min, robot.pressure_max
@@ -98,7 +98,7 @@ class TaskConfigurations:
         self._maximised = len(maximised(task))
         self._most = min(solution.stiffnesses[: self._maximised], default=None)
 
-    def others(self, start: Vector) -> list[Configuration]:
+    def others(self, start: Array) -> list[Configuration]:
         """Search further configurations, near the start of a motion and near random guesses."""
         low, high = self.limits
         span = high - low

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.documents import read_document
 from stiffopt.errors import FileError, InputError
 from stiffopt.logs.table import read_bytes, read_table
@@ -28,19 +28,17 @@ LEANING = "leaning"
 POSITION_ERROR = "position_error_m"
 """A column that no log has; it identifies a solution."""
 
-Vector = NDArray[np.float64]
-
 
 @dataclass(frozen=True, eq=False)
 class MotionTable:
     """A motion: pressures over time."""
 
     file: str  # from which it was read
-    times: Vector  # (N,), in s, increasing
-    pressures: Vector  # (N, n), in Pa; linear between two times
-    tips: Vector  # (N, 3), positions of the tip in the base frame, in m
+    times: Array  # (N,), in s, increasing
+    pressures: Array  # (N, n), in Pa; linear between two times
+    tips: Array  # (N, 3), positions of the tip in the base frame, in m
 
-    def trajectory(self, ranges: Vector, begin: float) -> Trajectory:
+    def trajectory(self, ranges: Array, begin: float) -> Trajectory:
         """Return the trajectory for a control loop.
 
         `ranges`: (n,), ranges of the pressures, in Pa; see `trajectory_through`. `begin`: time of
@@ -123,5 +121,5 @@ def _of_result(name: str, description: RobotDescription) -> MotionTable:
     return motion
 
 
-def _si(values: list[str], unit: str, what: str) -> Vector:
+def _si(values: list[str], unit: str, what: str) -> Array:
     return np.array([parse_quantity(value, unit, what) for value in values])

@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.polynomial import legendre
-from numpy.typing import NDArray
 
 from stiffopt import lie
+from stiffopt.arrays import Array
 from stiffopt.errors import InputError
 from stiffopt.model.description import Compensation, Corrections, RobotDescription, Segment
 from stiffopt.model.history import NO_HISTORY, Memory
@@ -17,8 +17,6 @@ from stiffopt.plant.material import LINEAR, YEOH, SectionMaterial
 from stiffopt.plant.rod import DiscreteRod
 from stiffopt.plant.settings import Mismatch, PlantSettings
 from stiffopt.registration import Placement
-
-Array = NDArray[np.float64]
 
 _ON_RING = 6  # fibres on each of two rings
 _SAME = 1e-6  # of a segment's length; a load as near to a node as this acts on the node

@@ -12,9 +12,10 @@ from threading import RLock
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from stiffopt import lie
+from stiffopt.arrays import Array
 from stiffopt.plant.jit import jit
 from stiffopt.plant.plant import Plant
 from stiffopt.plant.settings import (
@@ -23,7 +24,6 @@ from stiffopt.plant.settings import (
     SimulatedTrackerSettings,
 )
 
-Array = NDArray[np.float64]
 Compiled = Any  # an array of floats in compiled code; numba infers the rest
 
 IMMOBILE = ("off", "stuck")

@@ -18,8 +18,9 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from stiffopt.arrays import Array
 from stiffopt.errors import DeviceError, EquilibriumError, InputError, PressureError
 from stiffopt.model.description import RobotDescription
 from stiffopt.plant import contact, dynamics, material, rod
@@ -36,8 +37,6 @@ from stiffopt.plant.jit import compiling_once
 from stiffopt.plant.material import FibreMemory, Scheme
 from stiffopt.plant.rod import RodLoads, contact_energy, contact_force, depth_of
 from stiffopt.plant.settings import PlantLoad, PlantSettings
-
-Array = NDArray[np.float64]
 
 _STILL = 1e-3  # s, step for the stiffness against fast motions, without creep or slip
 

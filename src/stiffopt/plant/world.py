@@ -11,8 +11,9 @@ import threading
 import time
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from stiffopt.arrays import Array
 from stiffopt.errors import InputError
 from stiffopt.model.description import RobotDescription
 from stiffopt.plant.hardware import (
@@ -32,8 +33,6 @@ from stiffopt.plant.settings import (
     SimulatedTrackerSettings,
 )
 from stiffopt.rig.interface import Clock, PressureLimits
-
-Array = NDArray[np.float64]
 
 FAULTS = {
     "supply": ("ok", "off", "stuck", "garbage", "wrong", "slow", "leak", "high"),

@@ -9,8 +9,8 @@ from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array, Flags
 from stiffopt.display import display_units
 from stiffopt.errors import InputError
 from stiffopt.model.manipulator import Manipulator
@@ -27,7 +27,6 @@ from stiffopt.plots.wording import stiffness_text
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-Vector = NDArray[np.float64]
 
 _POSES = 5  # of the arm
 _LOGARITHMIC = 30  # largest by smallest stiffness from which the scale is logarithmic
@@ -88,7 +87,7 @@ def plot_motion(
 
 
 def _figure(
-    solution: PathSolution, path: Path | None, scene: Scene | None, limits: tuple[Vector, Vector],
+    solution: PathSolution, path: Path | None, scene: Scene | None, limits: tuple[Array, Array],
     view: View | None, title: str, key_numbers: Callable[[], str],
 ) -> Figure:  # fmt: skip
     style.require_matplotlib()
@@ -236,7 +235,7 @@ def _draw_requested(drawing: ArmDrawing, path: Path) -> None:
     drawing.corners.append(points)
 
 
-def _label_stiffness(drawing: ArmDrawing, solution: PathSolution, tips: Vector) -> None:
+def _label_stiffness(drawing: ArmDrawing, solution: PathSolution, tips: Array) -> None:
     """Label the point of least stiffness."""
     if solution.worst is not None and np.isfinite(solution.worst):
         text = f"least stiff:\n{stiffness_text(solution.worst, solution.stiffness_unit)}"
@@ -289,7 +288,7 @@ def draw_stiffness_along(axes: Any, solution: PathSolution) -> None:
     _legend(axes)
 
 
-def _stretches(times: Vector, where: NDArray[np.bool_]) -> Iterator[tuple[float, float]]:
+def _stretches(times: Array, where: Flags) -> Iterator[tuple[float, float]]:
     """Yield the beginning and end of each stretch, halfway to the next samples."""
     edges = np.concatenate([times[:1], (times[1:] + times[:-1]) / 2, times[-1:]])
     changes = np.flatnonzero(np.diff(np.concatenate([[False], where, [False]]).astype(int)))
@@ -321,7 +320,7 @@ def draw_clearance_along(axes: Any, solution: PathSolution, required: float | No
 
 
 def draw_pressures_along(
-    axes: Any, solution: PathSolution, segment: int, limits: tuple[Vector, Vector] | None = None
+    axes: Any, solution: PathSolution, segment: int, limits: tuple[Array, Array] | None = None
 ) -> None:
     """Draw the pressures of a segment over time; steps at the full rate stand out.
 
@@ -358,7 +357,7 @@ def draw_pressures_along(
     _legend(axes)
 
 
-def _mark_fast_steps(axes: Any, times: Vector, values: Vector, fast: Any) -> None:
+def _mark_fast_steps(axes: Any, times: Array, values: Array, fast: Any) -> None:
     """Mark the steps, given by `fast` (N - 1, k), in which pressures (N, k) change at full rate."""
     from matplotlib.collections import LineCollection
 

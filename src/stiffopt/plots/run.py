@@ -7,8 +7,8 @@ from textwrap import shorten
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array, Flags
 from stiffopt.control.state import Event
 from stiffopt.daemon.run_errors import ARRIVED, ARRIVED_ANGLE, ErrorStatistics, RunStages
 from stiffopt.daemon.run_log import RecordedRun, RunSpan
@@ -33,7 +33,6 @@ from stiffopt.plots.style import (
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-Array = NDArray[np.float64]
 
 _WIDE = 11.5  # inches
 _HEAD = 1.82  # inches, title and four lines
@@ -267,7 +266,7 @@ def error_lines(run: RecordedRun, stages: RunStages | None = None) -> list[str]:
     ]
 
 
-def _errors_text(run: RecordedRun, ticks: NDArray[np.bool_]) -> str:
+def _errors_text(run: RecordedRun, ticks: Flags) -> str:
     length, angle = display_units().length, display_units().angle
     known = (
         (ErrorStatistics.of(length.of(run.position_error[ticks])), length),

@@ -8,13 +8,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.obstacle import Obstacle
 
-Vector = NDArray[np.float64]
 
-
-def segment_poses(robot: Manipulator, pressures: ArrayLike, count: int) -> Vector:
+def segment_poses(robot: Manipulator, pressures: ArrayLike, count: int) -> Array:
     """Return poses (segments, count, 4, 4) along each segment with its connector, ends included.
 
     `pressures`: (n,), in Pa. `count`: number of stations of each segment, at least 2.
@@ -24,12 +23,12 @@ def segment_poses(robot: Manipulator, pressures: ArrayLike, count: int) -> Vecto
     return poses.reshape(robot.n_segments, count, 4, 4)
 
 
-def segment_stations(robot: Manipulator, count: int) -> Vector:
+def segment_stations(robot: Manipulator, count: int) -> Array:
     """Return arc lengths (segments, count), in m, along each segment with its connector."""
     return robot.kept(("segment stations", count), lambda: _stations(robot, count))
 
 
-def _stations(robot: Manipulator, count: int) -> Vector:
+def _stations(robot: Manipulator, count: int) -> Array:
     lengths = [each.length + each.connector for each in robot.description.segments]
     ends = np.concatenate([[0.0], np.cumsum(lengths)])
     ends[-1] = robot.length
@@ -63,8 +62,8 @@ class StiffnessEllipsoid(NamedTuple):
     right-handed.
     """
 
-    stiffnesses: Vector
-    axes: Vector
+    stiffnesses: Array
+    axes: Array
 
     @classmethod
     def of(cls, compliance: ArrayLike, rotation: ArrayLike) -> StiffnessEllipsoid:
@@ -74,6 +73,6 @@ class StiffnessEllipsoid(NamedTuple):
         values, axes = np.linalg.eigh(stiffness)
         return cls(np.abs(values), axes * np.sign(np.linalg.det(axes)))
 
-    def radii(self, largest: float) -> Vector:
+    def radii(self, largest: float) -> Array:
         """Return the semi-axes (3,), scaled to a largest one."""
         return np.asarray(largest * np.sqrt(self.stiffnesses / self.stiffnesses.max()))

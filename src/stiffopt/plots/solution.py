@@ -8,9 +8,9 @@ from itertools import zip_longest
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stiffopt import lie
+from stiffopt.arrays import Array
 from stiffopt.display import FIGURES, display_units
 from stiffopt.errors import InputError
 from stiffopt.model.manipulator import Manipulator
@@ -36,7 +36,6 @@ from stiffopt.plots.wording import (
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-Vector = NDArray[np.float64]
 
 _MAX_LABELS = 15  # largest number of pressures with a number on their bar
 _NEAR_BOUND = 0.06  # of the axis; a bar nearer to its limit has its number above the limit
@@ -333,12 +332,12 @@ class _Drawing(ArmDrawing):
     solution: PressureSolution
 
     @property
-    def tip(self) -> Vector:
+    def tip(self) -> Array:
         """Position of the tip in the axes."""
         return np.asarray(self.unit.of(np.asarray(self.solution.tip_pose)[:3, 3]))
 
     @property
-    def rotation(self) -> Vector:
+    def rotation(self) -> Array:
         """Orientation of the tip."""
         return np.asarray(self.solution.tip_pose)[:3, :3]
 
@@ -427,7 +426,7 @@ class _Drawing(ArmDrawing):
         if target.orientation is not None:
             self._draw_triad(point, target.orientation, length)
 
-    def _draw_point(self, point: Vector, free: list[int]) -> None:
+    def _draw_point(self, point: Array, free: list[int]) -> None:
         self.axes.plot(
             *point[:, None], marker="X", markersize=11, color=style.TARGET,
             markeredgecolor="white", linestyle="none", zorder=10,
@@ -451,7 +450,7 @@ class _Drawing(ArmDrawing):
             )
             self.covered.append(np.linspace(self.tip, point, 40))
 
-    def _draw_triad(self, point: Vector, quaternion: Any, length: float) -> None:
+    def _draw_triad(self, point: Array, quaternion: Any, length: float) -> None:
         wanted = np.asarray(lie.rotation_from_quaternion(np.array(quaternion)))
         for k, shade in enumerate(("#d62728", "#2ca02c", "#1f4fd6")):
             self.draw_arrow(point, 0.8 * length * wanted[:, k], shade, 8, "--")

@@ -13,15 +13,14 @@ from textwrap import shorten
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.documents import write_whole
 from stiffopt.errors import FileError, printable, require_package
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-Array = NDArray[np.float64]
 
 # -- colours --------------------------------------------------------------------------------------
 

@@ -7,13 +7,12 @@ from math import degrees, radians
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.errors import InputError, shown
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.units import finite_number, parse_quantity
 
-Vector = NDArray[np.float64]
 View = Sequence[float | str]
 """Elevation and azimuth: numbers in rad, or text with a unit, such as ``"20 deg"``."""
 
@@ -93,13 +92,13 @@ def move_to_the_right(axes: Any) -> None:
     axes.stale = True
 
 
-def box_corners(axes: Any) -> Vector:
+def box_corners(axes: Any) -> Array:
     """Return the corners (8, 3) of the box of 3-D axes."""
     limits = axes.get_xlim(), axes.get_ylim(), axes.get_zlim()
     return np.stack(np.meshgrid(*limits, indexing="ij"), axis=-1).reshape(8, 3)
 
 
-def projected(axes: Any, points: Vector) -> Vector:
+def projected(axes: Any, points: Array) -> Array:
     """Project points (k, 3) to the picture (2, k), in data units of its plane."""
     from mpl_toolkits.mplot3d import proj3d
 

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field, SerializeAsAny, ValidationError, ValidationInfo
 from pydantic_core import InitErrorDetails
 
+from stiffopt.arrays import Array
 from stiffopt.errors import FileError, InputError, dotted
 from stiffopt.files import line_of, read_file
 from stiffopt.model.description import RobotDescription
@@ -282,7 +282,7 @@ def limits_of(description: RigDescription, robot: RobotDescription) -> PressureL
     return PressureLimits(np.array(robot.pressure_min), high)
 
 
-def slew_of(description: RigDescription, robot: RobotDescription) -> NDArray[np.float64] | None:
+def slew_of(description: RigDescription, robot: RobotDescription) -> Array | None:
     """Return the greatest rates of change (n,), in Pa/s, or None if there is no limit."""
     return robot.slew_limits(description.safety.max_slew)
 

@@ -11,12 +11,11 @@ from dataclasses import dataclass, field
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from stiffopt.arrays import Array
 from stiffopt.errors import CommandError, DeviceError, InputError
 from stiffopt.rig.device import Clock, Device, DeviceSettings
-
-Array = NDArray[np.float64]
 
 _FLOAT = np.dtype(float)
 _LOOK = 0.05  # s between checks whether another program commands the device

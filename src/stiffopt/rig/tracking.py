@@ -9,14 +9,13 @@ from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydantic import Field
 
+from stiffopt.arrays import Array
 from stiffopt.registration import Registration
 from stiffopt.rig.device import Clock, Device, DeviceSettings
 from stiffopt.units import Duration, Length
-
-Array = NDArray[np.float64]
 
 _QUEUED = 4096  # samples that a tracker keeps until they are read; the oldest are dropped first
 _NORM_SLACK = 0.05  # by which the norm of a tracker's quaternion may differ from 1

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.daemon.messages import task_of
 from stiffopt.errors import InputError, shown
 from stiffopt.model.manipulator import Manipulator
@@ -15,8 +15,6 @@ from stiffopt.optimise.task import Task
 from stiffopt.paths.trajectory import Trajectory, trajectory_through
 from stiffopt.ros.messages import Header, JointTrajectory, PointStamped, PoseStamped
 from stiffopt.ros.published import channel_names, seconds_of
-
-Array = NDArray[np.float64]
 
 MAX_AGE = 1.0
 """Greatest difference between the stamp of a request and now, in s: no recording moves the arm."""

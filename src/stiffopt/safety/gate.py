@@ -12,8 +12,9 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from stiffopt.arrays import Array
 from stiffopt.errors import CommandError, InputError
 from stiffopt.rig.interface import (
     Clock,
@@ -28,8 +29,6 @@ from stiffopt.rig.settings import Safety
 from stiffopt.safety.claim import Claim
 from stiffopt.safety.settings import COMMANDS
 from stiffopt.safety.vent_line import guards_of
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

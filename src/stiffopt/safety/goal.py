@@ -13,8 +13,9 @@ import threading
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from stiffopt.arrays import Array
 from stiffopt.errors import CommandError, DeviceError
 from stiffopt.rig.interface import (
     Clock,
@@ -30,7 +31,6 @@ from stiffopt.safety.settings import COMMANDS
 if TYPE_CHECKING:
     from stiffopt.safety.guard_client import GuardLink
 
-Array = NDArray[np.float64]
 
 _EXPIRED = (
     "no command came for as long as the last one was valid, so the pressures were let down and "

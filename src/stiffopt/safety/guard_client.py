@@ -20,8 +20,8 @@ from contextlib import suppress
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.errors import DeviceError, GuardTripped, MissingExtraError, warn_slow
 from stiffopt.model.description import RobotDescription
 from stiffopt.rig.config import RigDescription
@@ -46,8 +46,6 @@ from stiffopt.safety.messages import (
 )
 from stiffopt.safety.rescue import GuardWatch
 from stiffopt.safety.settings import CLIENT
-
-Array = NDArray[np.float64]
 
 _START_SLICE = 0.05  # s between checks of a guard that starts
 _SLICE = 0.02  # s; no thread keeps others from receiving for longer

@@ -18,11 +18,9 @@ from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.rig.interface import PoseSample
-
-Array = NDArray[np.float64]
 
 _LARGEST = 1 << 16  # bytes in a packet
 _COMMAND = struct.Struct("<cQddd")

@@ -7,11 +7,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array, Flags
 from stiffopt.safety.settings import MONITOR
-
-Array = NDArray[np.float64]
 
 
 class Shortage:
@@ -48,11 +46,11 @@ class Shortage:
     def leaks(
         self,
         elapsed: float,
-        short: NDArray[np.bool_],
+        short: Flags,
         due: Array,
         reading: Array,
-        at_rest: NDArray[np.bool_],
-    ) -> NDArray[np.bool_]:
+        at_rest: Flags,
+    ) -> Flags:
         """Return which channels (n,) certainly leak.
 
         Parameters
@@ -80,7 +78,7 @@ class Shortage:
         self._for = np.where((follows, nothing), self._for + elapsed, 0.0)
         within = np.array([[self._time], [max(self._time, MONITOR.nothing_time)]])
         follows, nothing = self._for >= within * (1 - 1e-9)
-        leaking: NDArray[np.bool_] = follows | nothing
+        leaking: Flags = follows | nothing
         return leaking
 
 
@@ -108,7 +106,7 @@ class SupplyLine:
     def __init__(self, shortage: Array) -> None:
         self._shortage = shortage
         self._little: Array = 0.5 * shortage
-        self._none: NDArray[np.bool_] = np.zeros(len(shortage), dtype=bool)
+        self._none: Flags = np.zeros(len(shortage), dtype=bool)
         self.pressure = np.inf
 
     @property
@@ -120,7 +118,7 @@ class SupplyLine:
         """Forget the pressure of the line."""
         self.pressure = np.inf
 
-    def look(self, missing: Array, reading: Array, reached: Array) -> NDArray[np.bool_]:
+    def look(self, missing: Array, reading: Array, reached: Array) -> Flags:
         """Return which channels (n,) have the pressure of a sagging line.
 
         `missing`: expected less measured pressures (n,), in Pa. `reading`, `reached`: measured

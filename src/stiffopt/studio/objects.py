@@ -9,15 +9,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from stiffopt.arrays import Array
 from stiffopt.errors import FileError
 from stiffopt.files import save_file
 from stiffopt.model.obstacle import Obstacle
 from stiffopt.model.scene import AllowedContact, Scene, SceneObject, load_scene
 from stiffopt.studio.design import changed
-
-Vector = NDArray[np.float64]
 
 NEW = ("sphere", "box", "capsule", "cylinder", "half_space")
 """Kinds of objects that can be added."""
@@ -41,7 +40,7 @@ def new_object(kind: str, others: Sequence[SceneObject], length: float) -> Scene
     return SceneObject(**{"name": name, kind: shapes[kind]})
 
 
-def place_of(shape: Obstacle) -> Vector:
+def place_of(shape: Obstacle) -> Array:
     """Return the point (3,) of a shape at which its handle is, in m."""
     points = [getattr(shape, key) for key in _PLACES if hasattr(shape, key)]
     return np.asarray(np.mean(points or [shape.points[0]], axis=0))  # type: ignore[attr-defined]

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.daemon.run_log import RecordedRun, log_of_run
 from stiffopt.display import display_units
 from stiffopt.errors import FileError, InputError
@@ -24,8 +25,6 @@ from stiffopt.paths.path import Path
 from stiffopt.paths.solution import PathSolution
 from stiffopt.plots.wording import stiffness_text
 
-Vector = NDArray[np.float64]
-
 _SHOWN = 400  # points of a chart
 _EVENTS = 4  # shown at a time
 
@@ -35,7 +34,7 @@ class TimelineChart(NamedTuple):
 
     title: str  # with the unit
     names: tuple[str, ...]  # of the k lines
-    values: Vector  # (N, k)
+    values: Array  # (N, k)
     shows_pressures: bool = False  # whether they are pressures of channels
 
 
@@ -43,8 +42,8 @@ class TimelineMoment(NamedTuple):
     """The state at one moment of a timeline."""
 
     row: int  # index of the last row until then
-    pressures: Vector  # (n,), in Pa, interpolated
-    seen: Vector | None  # (3,), last measured position of the tip, in m, or None
+    pressures: Array  # (n,), in Pa, interpolated
+    seen: Array | None  # (3,), last measured position of the tip, in m, or None
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,13 +51,13 @@ class Timeline:
     """Pressures over time, with charts, positions and events."""
 
     robot: Manipulator  # the arm, with the load of the path
-    times: Vector  # (N,), in s, from 0, increasing
-    pressures: Vector  # (N, n), in Pa, without gaps
+    times: Array  # (N,), in s, from 0, increasing
+    pressures: Array  # (N, n), in Pa, without gaps
     charts: tuple[TimelineChart, ...] = ()  # quantities to draw over time
     headline: str = ""  # status and message, for the user
-    asked: Vector | None = None  # (N, 3), target positions, in m, or None
+    asked: Array | None = None  # (N, 3), target positions, in m, or None
     # (N, 3), measured positions of the tip, in m, NaN where it was not seen; or None
-    seen: Vector | None = None
+    seen: Array | None = None
     events: tuple[tuple[float, str], ...] = ()  # times and texts
     scene: Scene | None = None  # the objects around the arm, or None
 
@@ -186,14 +185,14 @@ class Timeline:
         return cls.of_log(file, log_of_run(run), description, events)
 
 
-def _check_rows(file: str | os.PathLike[str], times: Vector, pressures: Vector) -> None:
+def _check_rows(file: str | os.PathLike[str], times: Array, pressures: Array) -> None:
     if len(times) < 2:
         raise FileError(file, "has too few rows with pressures to play; expected two or more")
     if not np.isfinite(pressures).all() or not (np.diff(times) > 0).all():
         raise FileError(file, "has pressures that are missing, or times that do not increase")
 
 
-def _pressure_charts(description: RobotDescription, pressures: Vector) -> tuple[TimelineChart, ...]:
+def _pressure_charts(description: RobotDescription, pressures: Array) -> tuple[TimelineChart, ...]:
     """Return a chart of the pressures of each segment."""
     unit = display_units().pressure
     return tuple(

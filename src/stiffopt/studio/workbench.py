@@ -16,6 +16,7 @@ from time import perf_counter
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.errors import InputError
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.stopping import Cancel
@@ -46,7 +47,7 @@ class StudioAnswer:
     is_best: bool
 
     @property
-    def pressures(self) -> NDArray[np.float64]:
+    def pressures(self) -> Array:
         """Pressures (n,), in Pa."""
         assert self.solution.pressures is not None
         return self.solution.pressures
@@ -96,7 +97,7 @@ class Workbench:
         self.kept: list[StudioAnswer] = []
         self.leaning: Leaning | None = None
         self.trouble = ""
-        self._held: NDArray[np.float64] | None = None  # pressures, in Pa
+        self._held: Array | None = None  # pressures, in Pa
         self._past: deque[Design] = deque(maxlen=_STEPS)
         self._step = ""
         self._robot: Manipulator | None = None
@@ -153,7 +154,7 @@ class Workbench:
             self._held = self.answer.pressures if held and self.answer is not None else None
             self.leaning = None
 
-    def _lean(self, design: Design, pressures: NDArray[np.float64]) -> bool:
+    def _lean(self, design: Design, pressures: Array) -> bool:
         self.leaning = None
         self.leaning = Leaning.of(design, self._solver(design).robot, pressures)
         self.trouble = ""

@@ -7,8 +7,9 @@ import casadi as ca
 import numpy as np
 from pydantic import AfterValidator
 
+from stiffopt.arrays import Array
 from stiffopt.model.description import RobotDescription
-from stiffopt.model.obstacle import Array, Obstacle, Point, Radius, from_segment, norm, revolved
+from stiffopt.model.obstacle import Obstacle, Point, Radius, from_segment, norm, revolved
 from stiffopt.schema import BadKeyError, Items
 
 

@@ -2,9 +2,10 @@
 
 import casadi as ca
 
+from stiffopt.arrays import Array
 from stiffopt.directions import Direction
 from stiffopt.model.description import RobotDescription
-from stiffopt.model.obstacle import Array, Obstacle, Point, Radius, norm, revolved
+from stiffopt.model.obstacle import Obstacle, Point, Radius, norm, revolved
 from stiffopt.schema import BadKeyError
 
 

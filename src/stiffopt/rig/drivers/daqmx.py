@@ -16,13 +16,12 @@ from contextlib import contextmanager, suppress
 from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import AfterValidator, Field
 
+from stiffopt.arrays import Array
 from stiffopt.errors import DeviceError, InputError, shown
 from stiffopt.rig.device import library
 
-Array = NDArray[np.float64]
 Terminals = Literal["default", "rse", "nrse", "differential", "pseudo-differential"]
 
 _RESERVED = -50103

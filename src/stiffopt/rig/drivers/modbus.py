@@ -15,9 +15,10 @@ from threading import RLock
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydantic import Field, model_validator
 
+from stiffopt.arrays import Array
 from stiffopt.errors import DeviceError, InputError
 from stiffopt.rig.device import library
 from stiffopt.rig.drivers.modbus_registers import (
@@ -38,7 +39,6 @@ from stiffopt.rig.interface import Clock, PressureLimits, PressureSupply, Supply
 from stiffopt.schema import BadKeyError, Items, Schema
 from stiffopt.units import Duration
 
-Array = NDArray[np.float64]
 Registers = dict[int, tuple[int, ...]]
 
 _WRITE, _READ, _TRIGGER = 24, 20, 23
