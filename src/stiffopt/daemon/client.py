@@ -477,7 +477,7 @@ class ClientStream:
     def state(self, timeout: float = 5.0) -> Snapshot:
         """Return the newest state that was not returned before; wait for it if necessary.
 
-        Raises `CommandError` or `InputError`: a target was refused; `ServiceError`: None came in
+        Raises `CommandError` or `InputError`: a target was refused; `ServiceError`: none came in
         time, or the stream has ended.
         """
         with self._news:

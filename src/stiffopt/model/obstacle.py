@@ -214,6 +214,17 @@ class BetweenEnds(Obstacle):
         return [[*self.start, *self.end, self.radius]]
 
 
+def check_width(opening: Any, width: float, clearance: float) -> None:
+    """Refuse a tube or a ring whose radius leaves an arm's outer radius no clearance, in m."""
+    if opening.radius < width + clearance:
+        asked = f" with {clearance * 1e3:g} mm of clearance" if clearance else ""
+        raise BadKeyError(
+            f"{opening.key}.radius",
+            f"{opening.radius * 1e3:g} mm is too narrow for the arm, whose outer radius is "
+            f"{width * 1e3:g} mm{asked}",
+        )
+
+
 def norm(vector: ca.SX) -> ca.SX:
     """Return the length of a vector, with a gradient at zero too; exact to 1e-12."""
     return ca.sqrt(ca.sumsqr(vector) + _TINY)

@@ -117,7 +117,7 @@ def _load_announced(kind: str, name: str) -> Any:
 def _load_installed(reference: str, owners: Iterable[Distribution]) -> Any:
     """Load a class after checking that one of these packages has installed its module.
 
-    Raises `InputError`: None has, or the class cannot be imported.
+    Raises `InputError`: none has, or the class cannot be imported.
     """
     module, _, name = reference.partition(":")
     owned = list(owners)
