@@ -63,15 +63,26 @@ class Hold(NamedTuple):
 
 @dataclass(frozen=True)
 class BraceApproach:
-    """A motion from rest into contact."""
+    """A motion from rest into contact.
 
-    times: Vector  # (k,), in s
-    pressures: Vector  # (k, n), in Pa, growing in proportion from zero
-    tips: tuple[TipAt, ...]  # of the equilibria on the way, with their Jacobians and compliances
-    forces: Vector  # largest force of a contact (k,), in N
-    contacts: tuple[Contact, ...]  # at the end
-    hold: Hold  # their forces and limits at the end
-    free_tips: Vector  # positions (k, 3), in m, of the tip at these pressures without contact
+    Attributes
+    ----------
+    times : (k,), in s.
+    pressures : (k, n), in Pa, growing in proportion from zero.
+    tips : of the equilibria on the way, with their Jacobians and compliances.
+    forces : largest force of a contact (k,), in N.
+    contacts : at the end.
+    hold : their forces and limits at the end.
+    free_tips : positions (k, 3), in m, of the tip at these pressures without contact.
+    """
+
+    times: Vector
+    pressures: Vector
+    tips: tuple[TipAt, ...]
+    forces: Vector
+    contacts: tuple[Contact, ...]
+    hold: Hold
+    free_tips: Vector
 
 
 def approach_to(
@@ -79,8 +90,15 @@ def approach_to(
 ) -> BraceApproach:
     """Return the motion from rest to a braced solution.
 
-    `solution`: of a task with a brace; it leans on an object. `slew`: largest rates of change, one
-    or (n,), in Pa/s. Raises `Unsolved` as `way_into_contact` does.
+    Parameters
+    ----------
+    solution : of a task with a brace; it leans on an object.
+    slew : largest rates of change, one or (n,), in Pa/s.
+
+    Raises
+    ------
+    Unsolved
+        As `way_into_contact` does.
     """
     states = way_into_contact(robot, solution)
     deviations = BraceUncertainty(robot, states[-1]).forces / BRACE.sure
@@ -99,7 +117,10 @@ def approach_to(
 def way_into_contact(robot: Manipulator, solution: PressureSolution) -> list[ContactEquilibrium]:
     """Return the equilibria from rest to a braced solution.
 
-    Raises `Unsolved` as `way_from_rest` does, or the way ends in another equilibrium.
+    Raises
+    ------
+    Unsolved
+        As `way_from_rest` does, or the way ends in another equilibrium.
     """
     assert solution.tip_pose is not None
     assert solution.pressures is not None
@@ -144,8 +165,11 @@ def touches_at(robot: Manipulator, task: Task, p: Vector) -> bool:
 def way_from_rest(robot: Manipulator, task: Task, p: Vector) -> list[ContactEquilibrium]:
     """Return the equilibria from rest to pressures (n,) among the objects of a task with a brace.
 
-    Raises `Unsolved`: the way is lost, presses an object with more than its largest force, or
-    brings the body too near to an object that must not be touched.
+    Raises
+    ------
+    Unsolved
+        The way is lost, presses an object with more than its largest force, or brings the body too
+        near to an object that must not be touched.
     """
     assert task.brace is not None
     assert task.scene is not None
