@@ -33,9 +33,7 @@ _AHEAD = 0.7
 class LeaningTip:
     """The tip of an arm on its way into contact, from equilibria that were computed before.
 
-    Parameters
-    ----------
-    approach : the way into contact. Other pressures use the model of its nearest equilibrium.
+    `approach`: the way into contact. Other pressures use the model of its nearest equilibrium.
     """
 
     def __init__(self, approach: BraceApproach) -> None:
@@ -57,6 +55,9 @@ class LeaningTip:
 class ArmModel:
     """The model of an arm, for each of the uses that the loop has for its tip.
 
+    Raises `InputError` if the arm is loaded and there is no compiler: the model is too slow for a
+    loop.
+
     Parameters
     ----------
     robot : the arm.
@@ -66,11 +67,6 @@ class ArmModel:
     ----------
     chambers, path : the tip at the effective pressures, and on the reference's path.
     waypoints : the tip at a trajectory's waypoints, and for other rare uses.
-
-    Raises
-    ------
-    InputError
-        If the arm is loaded and there is no compiler: the model is too slow for a loop.
     """
 
     def __init__(self, robot: Manipulator, path_range: float) -> None:

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydantic import (
     BeforeValidator,
     Discriminator,
@@ -27,6 +27,7 @@ from pydantic import (
     model_validator,
 )
 
+from stiffopt.arrays import Array
 from stiffopt.errors import InputError, shown
 from stiffopt.model.calibration import Calibration, ErrorModel
 from stiffopt.model.history import NO_HISTORY, History
@@ -486,7 +487,7 @@ class RobotDescription(Schema):
         """Greatest rate of change of each channel, in Pa/s, or None."""
         return None if self.pressure.slew is None else self._per_channel(self.pressure.slew)
 
-    def slew_limits(self, further: ArrayLike | None = None) -> NDArray[np.float64] | None:
+    def slew_limits(self, further: ArrayLike | None = None) -> Array | None:
         """Return the greatest rates of change (n,), in Pa/s, or None if there is no limit.
 
         They are the smaller of the robot's and further ones, (n,) or one for all.
@@ -495,7 +496,7 @@ class RobotDescription(Schema):
         if not known:
             return None
         rows = [np.broadcast_to(np.asarray(rates, float), self.n_pressures) for rates in known]
-        smallest: NDArray[np.float64] = np.min(rows, axis=0)
+        smallest: Array = np.min(rows, axis=0)
         return smallest
 
     @property
@@ -507,7 +508,7 @@ class RobotDescription(Schema):
             for chambers in segment.channels
         )
 
-    def extrapolation(self, pressures: NDArray[np.float64]) -> str:
+    def extrapolation(self, pressures: Array) -> str:
         """Return a warning if pressures (n,) in Pa are far from the calibration's, otherwise ""."""
         if self.calibration is None:
             return ""

@@ -73,10 +73,7 @@ class ParametricArm:
     def poses(self, pressures: Vector, coordinates: Vector, at: float | None = None) -> Poses:
         """Return poses at pressures (N, n), coordinates (k,), of the tip or at an arc length in m.
 
-        Raises
-        ------
-        EquilibriumError
-            A loaded arm buckles or falls over.
+        Raises `EquilibriumError`: a loaded arm buckles or falls over.
         """
 
         def outputs(shape: Shape) -> list[ca.SX | ca.MX]:

@@ -181,12 +181,9 @@ def _turn_between(q: ca.MX, dq: ca.MX) -> ca.MX:
 class Stretch:
     """One integration step, or a rigid piece, between two arc lengths from the base.
 
-    Attributes
-    ----------
-    towards_base : function of the distance from its distal end towards the base, to quaternion and
-        position (from the tip).
-    notes : (10, 6) quaternion, position and moment at its distal end, and its length times their
-        slopes at the `LOBATTO` points.
+    `towards_base`: function of the distance from its distal end towards the base, to quaternion and
+    position (from the tip). `notes`: (10, 6) quaternion, position and moment at its distal end, and
+    its length times their slopes at the `LOBATTO` points.
     """
 
     proximal: float

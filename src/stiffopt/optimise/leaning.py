@@ -110,10 +110,8 @@ class PlacedProgram:
 class BracedPoint(ProgramPoint):
     """The program's values at an equilibrium in contact.
 
-    Attributes
-    ----------
-    force : sum of the contacts' normal forces, in N.
-    force_gradient : (n,), its derivative, per variable.
+    `force`: sum of the contacts' normal forces, in N. `force_gradient`: (n,), its derivative, per
+    variable.
     """
 
     __slots__ = ("equilibrium", "force", "force_gradient")
@@ -212,10 +210,7 @@ class BracedProblem(PressureProblem):
     def equilibrium(self, x: Vector) -> ContactEquilibrium:
         """Return the equilibrium at pressures x, found from `here`.
 
-        Raises
-        ------
-        EquilibriumError
-            If there is none, or none with contact.
+        Raises `EquilibriumError` if there is none, or none with contact.
         """
         if self._kept is not None and self._kept[0] == x.tobytes():
             return self._kept[1]
@@ -391,10 +386,7 @@ class BracedProblem(PressureProblem):
 
         Objects that come to the arm are taken to leave no friction.
 
-        Raises
-        ------
-        EquilibriumError
-            The way is lost.
+        Raises `EquilibriumError`: the way is lost.
         """
         if self.brace.approach == "objects" or not eq.sticking.own:
             return None
