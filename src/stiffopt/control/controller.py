@@ -310,7 +310,7 @@ class TipController:
         counts = self._arm.observe(now, commanded, reading, samples, course)
         tip, sample = self._arm.modelled, self._arm.tip.sample
         if counts.used and sample and tip and not self._first_motion.is_over:
-            parts = tip.pose[:3, :3] @ tip.jacobian[:3] * self._arm.pressures.effective
+            parts = tip.pose[:3, :3] @ tip.jacobian[:3] * self._arm.tip.captured
             self._first_motion.take(self._arm.tip.predicted, sample.position, parts)
         if self.forecast is not None:
             self.forecast.present = self._present(now)
