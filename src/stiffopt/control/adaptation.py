@@ -293,8 +293,8 @@ class Adaptation:
         are larger in an arm that is softer than its file says.
         """
         t, count = self._tuning, len(self._parameters)
-        k, _, slopes = self._arm.stiffnesses(pressures[None], self.estimate[:count], measure)
-        present, _, _ = self._arm.stiffnesses(pressures[None], applied[:count], measure)
+        k, _, slopes, _ = self._arm.stiffnesses(pressures[None], self.estimate[:count], measure)
+        present, *_ = self._arm.stiffnesses(pressures[None], applied[:count], measure)
         slope, pending = slopes[0] / k[0], math.log(present[0] / k[0])
         variance = max(float(slope @ self.covariance[:count, :count] @ slope), 0.0)
         weights = np.abs(slope[self._moduli])

@@ -278,6 +278,20 @@ class Chain:
         """Return the derivative (k, n) of values (k,) by the pressures, along the equilibrium."""
         return self.per_rest(ca.jacobian(values, self.x))[:, :-6]
 
+    def gravity_jacobian(self, values: ca.MX) -> ca.MX:
+        """Return the derivative (k, 3) of values (k,) by gravity, along the equilibrium."""
+        gravity = self.inputs[2]
+        residual, _ = self._per_x
+        turn = -inverse_3x3(residual[:, :3]) @ ca.jacobian(self.residual, gravity)
+        return ca.jacobian(values, gravity) + ca.jacobian(values, self.x)[:, :3] @ turn
+
+    @property
+    def per_gravity(self) -> ca.MX:
+        """Body twist (6, 3) of the station per m/s^2 of gravity, along the equilibrium."""
+        change = self.gravity_jacobian(ca.vertcat(self.quaternion, self.position))
+        turn = _turn_between(self.quaternion, change[:4, :])
+        return ca.vertcat(self.rotation.T @ change[4:, :], turn)
+
     def per_rest(self, change: ca.MX) -> ca.MX:
         """Reduce a change (k, 3 + n + 6) to equilibrium: (k, n + 6) per pressure and wrench."""
         return change[:, 3:] + change[:, :3] @ self._turn_per_rest

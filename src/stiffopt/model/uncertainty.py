@@ -301,7 +301,7 @@ class Uncertainty:
         """See `TipUncertainty.stiffness_interval`."""
         measure = checked_measure(direction, kind, boundary, frame)
         p = pressures[np.newaxis]
-        k, per_pressure, per_coordinate = self._slopes.arm.stiffnesses(
+        k, per_pressure, per_coordinate, _ = self._slopes.arm.stiffnesses(
             p, self._slopes.rest, measure
         )
         g, h = per_coordinate[0] / k[0], per_pressure[0] / k[0]
@@ -491,6 +491,7 @@ class ReadingSlopes:
         self.arm = ParametricArm(description, parameters, tip_load)
         self.rest = np.zeros(len(parameters))
         self._frames = frames
+        self._gravity = np.array(description.gravity)
         given = description.recordings
         self._sensor = np.zeros(3)
         if given is not None:
@@ -511,7 +512,10 @@ class ReadingSlopes:
         per_number = [moved(found.per_coordinate)]
         if self._frames:
             shifted = np.broadcast_to(np.eye(3), rotation.shape)
-            per_number += [shifted, -_skew(tip + rotation @ self._sensor)]
+            turned = -_skew(tip + rotation @ self._sensor)
+            # the weight keeps its direction in the tracker's frame
+            turned = turned + moved(found.per_gravity @ _skew(self._gravity))
+            per_number += [shifted, turned]
         if self._frames == 12:
             per_number += [rotation, -rotation @ _skew(self._sensor)]
         return tip, np.concatenate(per_number, axis=2), moved(found.per_pressure)
