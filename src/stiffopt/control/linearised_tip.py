@@ -37,14 +37,13 @@ class LeaningTip:
     """
 
     def __init__(self, approach: BraceApproach) -> None:
-        self._approach, end = approach, approach.pressures[-1]
-        self._along = end / float(end @ end)
+        self._approach = approach
 
     def at(self, pressures: Array) -> TipAt:
         """Return the tip at pressures (n,), in Pa, linearised about the nearest equilibrium."""
         approach = self._approach
-        share = min(max(float(self._along @ pressures), 0.0), 1.0)
-        index = round(share * (len(approach.tips) - 1))
+        off = pressures - approach.pressures
+        index = int(np.einsum("ki,ki->k", off, off).argmin())
         tip = approach.tips[index]
         pose = tip.pose.copy()
         change = tip.jacobian[:3] @ (pressures - approach.pressures[index])

@@ -428,12 +428,15 @@ def _rubbed(rubbing: Rubbing | None) -> str:
     """Return what friction does on the way from rest, or ""."""
     if rubbing is None:
         return ""
-    units = display_units()
+    units, past = display_units(), ""
+    if rubbing.past is not None:
+        most = units.pressure.text(float(np.abs(rubbing.past).max()), ".2g")
+        past = f"; the way goes past it by {most} and comes back, which eases the friction"
     return (
         f"when it is reached from rest, friction holds the tip "
         f"{units.length.text(float(np.linalg.norm(rubbing.tip)), '.2g')} away, and changes normal "
         f"forces by {units.force.text(float(np.abs(rubbing.normals).max()), '.2g')}, until that is "
-        "corrected"
+        f"corrected{past}"
     )
 
 

@@ -26,17 +26,17 @@ from stiffopt.model.batch import InterpretedFunction
 from stiffopt.model.clearance import Nearest
 from stiffopt.model.codegen import dense
 from stiffopt.model.contact.equilibrium import ContactEquilibrium, Grip
-from stiffopt.model.contact.way import Rubbing, rubbed, states_from_rest
+from stiffopt.model.contact.way import Rubbing, states_from_rest
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.scene import Scene, SceneObject
 from stiffopt.model.shape import PointOfArm
 from stiffopt.model.stopping import checkpoint
 from stiffopt.optimise.brace import Brace, kept_clear_of, leant_on
 from stiffopt.optimise.brace_uncertainty import BraceUncertainty
+from stiffopt.optimise.easing import allowed_distance, distance_left, eased
 from stiffopt.optimise.measures.directional import StiffnessMeasure
 from stiffopt.optimise.problem import Objective, PressureProblem, ProgramPoint
 from stiffopt.optimise.program import Constraint, Program
-from stiffopt.optimise.quadratic import solve_qp
 from stiffopt.optimise.settings import BRACE, OBSTACLES
 from stiffopt.optimise.solution import Judgement, Preload, are_within
 from stiffopt.optimise.task import Task
@@ -391,10 +391,10 @@ class BracedProblem(PressureProblem):
         if self.brace.approach == "objects" or not eq.sticking.own:
             return None
         states = list(states_from_rest(self.robot, self.scene, eq.pressures))
-        found, apart = rubbed(states), states[-1].tip_pose[:3, 3] - eq.tip_pose[:3, 3]
+        apart = states[-1].tip_pose[:3, 3] - eq.tip_pose[:3, 3]
         if float(np.linalg.norm(apart)) > BRACE.same:
             raise EquilibriumError("in smaller steps the arm comes to another equilibrium")
-        return found
+        return eased(self.robot, self.task, self.scene, states)[1]
 
     def judgement(self, eq: ContactEquilibrium, rubbing: Rubbing | None = None) -> Judgement:
         """Judge an equilibrium by the task, with what friction does on the way to it."""
@@ -464,42 +464,15 @@ class BracedProblem(PressureProblem):
                 )
 
     def _out_of_reach(self, eq: ContactEquilibrium, rubbing: Rubbing) -> Iterator[str]:
-        """Yield that pressures cannot bring the tip back that friction has moved; see `_corrected`.
-
-        Contacts stick meanwhile.
-        """
-        position = self.task.target.position
-        if position is None:
-            return
-        rows = [i for i, each in enumerate(position) if each is not None]
-        R, held = eq.tip_pose[:3, :3], rubbing.sticking
-        jacobian = R @ eq.tip_jacobian[:3] + held.bent()[0][:3] @ held.per_pressure
-        aim = np.array([0.0 if each is None else each for each in position])
-        off = eq.tip_pose[:3, 3] + rubbing.tip - aim
-        left = self._corrected(eq.pressures, off[rows], jacobian[rows])
-        if left > max(self.task.target.tolerance.position, BRACE.missed):
+        """Yield that pressures cannot bring the tip back that friction has moved."""
+        left = distance_left(self.robot, self.task, eq, rubbing)
+        if left > allowed_distance(self.task):
             length, most = display_units().length, display_units().pressure.text(BRACE.corrected)
             away = length.text(float(np.linalg.norm(rubbing.tip)), ".2g")
             yield (
                 f"friction on the way keeps the tip {away} away; pressures that are corrected by "
                 f"{most} leave it {length.text(left, '.2g')} from the target"
             )
-
-    def _corrected(self, pressures: Vector, off: Vector, jacobian: Vector) -> float:
-        """Return how far from its place a tip that is off by so much (k,) stays, in m.
-
-        The pressures (n,) change by at most `BRACE.corrected` each, within their limits; `jacobian`
-        (k, n).
-        """
-        most = BRACE.corrected
-        low = np.maximum(self.lower * self.unit - pressures, -most) / most
-        high = np.minimum(self.upper * self.unit - pressures, most) / most
-        # in mm, with little weight on the changes themselves
-        A, b, n = 1e3 * most * jacobian, 1e3 * off, len(pressures)
-        H, g, none = A.T @ A + 1e-6 * np.eye(n), A.T @ b, np.zeros((0, n))
-        found = solve_qp(H, g, none, np.minimum(low, 0.0), np.maximum(high, 0.0))
-        step = np.zeros(n) if found is None else found[0]
-        return float(np.linalg.norm(off + most * jacobian @ step))
 
     def _held_at_tip(self, eq: ContactEquilibrium) -> bool:
         """Return True if a rigid object holds the tip along a direction that is maximised."""

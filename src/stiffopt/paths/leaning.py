@@ -2,12 +2,16 @@
 
 All pressures grow in proportion, as in the definition of equilibria in contact
 (`Manipulator.contact_equilibrium`). Each equilibrium along the way is found from the one before. If
-they do not end in the wanted one, the motion is refused. Played backwards, it releases the contact.
+they do not end in the wanted one, the motion is refused. Where friction would keep the tip from its
+target, the way goes on past its end, and comes back (`eased`). Played backwards, it releases the
+contact.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -23,6 +27,7 @@ from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.scene import Scene
 from stiffopt.optimise.brace import kept_clear_of, leant_on, quoted
 from stiffopt.optimise.brace_uncertainty import BraceUncertainty
+from stiffopt.optimise.easing import eased
 from stiffopt.optimise.settings import BRACE
 from stiffopt.optimise.solution import PressureSolution
 from stiffopt.optimise.task import Task
@@ -38,6 +43,7 @@ _STATIONS = 41  # of the body
 _AS_STIFF = 0.05  # largest difference of stiffnesses in the same equilibrium
 _PUSH = 2e-3  # N, step of finite differences by a push at the tip
 _FORGIVEN = 1e-4  # m, tolerated lack of clearance from other objects
+_STRAIGHT = 0.9  # least cosine of the angle between steps of a way that does not turn
 
 
 class Hold(NamedTuple):
@@ -68,7 +74,7 @@ class BraceApproach:
     Attributes
     ----------
     times : (k,), in s.
-    pressures : (k, n), in Pa, growing in proportion from zero.
+    pressures : (k, n), in Pa, growing in proportion from zero; then perhaps past this and back.
     tips : of the equilibria on the way, with their Jacobians and compliances.
     forces : largest force of a contact (k,), in N.
     contacts : at the end.
@@ -124,7 +130,7 @@ def way_into_contact(robot: Manipulator, solution: PressureSolution) -> list[Con
     """
     assert solution.tip_pose is not None
     assert solution.pressures is not None
-    states = way_from_rest(robot, solution.task, solution.pressures)
+    states = way_from_rest(robot, solution.task, solution.pressures, is_eased=True)
     end = states[-1]
     names, wanted = ({each.object for each in found.contacts} for found in (end, solution))
     apart = float(np.linalg.norm(end.tip_pose[:3, 3] - solution.tip_pose[:3, 3]))
@@ -162,8 +168,12 @@ def touches_at(robot: Manipulator, task: Task, p: Vector) -> bool:
         return False
 
 
-def way_from_rest(robot: Manipulator, task: Task, p: Vector) -> list[ContactEquilibrium]:
+def way_from_rest(
+    robot: Manipulator, task: Task, p: Vector, *, is_eased: bool = False
+) -> list[ContactEquilibrium]:
     """Return the equilibria from rest to pressures (n,) among the objects of a task with a brace.
+
+    `is_eased`: whether the way may end by easing the friction (`eased`).
 
     Raises
     ------
@@ -180,6 +190,8 @@ def way_from_rest(robot: Manipulator, task: Task, p: Vector) -> list[ContactEqui
     except EquilibriumError as error:
         share = len(states) / (STATES - 1)
         raise Unsolved(f"the way from rest is lost at {share:.0%} of it: {error}") from None
+    if is_eased and states[-1].contacts:
+        states, _ = eased(robot, task, scene, states)
     for number, eq in enumerate(states):
         for own, force in eq.pressed():
             each = eq.contacts[own[0]]
@@ -196,7 +208,10 @@ def way_from_rest(robot: Manipulator, task: Task, p: Vector) -> list[ContactEqui
 def least_times_along(
     robot: Manipulator, states: list[ContactEquilibrium], slew: Vector | float
 ) -> Vector:
-    """Return the times (k,), in s, of equilibria that keep speed, rates of force and pressure."""
+    """Return the times (k,), in s, of equilibria that keep speed, rates of force and pressure.
+
+    Where the way turns, it slows down.
+    """
     lines = np.array([eq.poses(_stations(robot))[:, :3, 3] for eq in states])  # (k, stations, 3)
     moved = np.linalg.norm(np.diff(lines, axis=0), axis=-1).max(axis=1)
     forces = np.array([_largest(eq) for eq in states])
@@ -207,7 +222,21 @@ def least_times_along(
     least = np.maximum.reduce([moved / SPEED, np.abs(np.diff(forces)) / FORCE_RATE, rates])
     # in the step of the first touch, its mean speed is less than that before, or the force's after
     least = np.maximum.reduce([least, np.append(least[1:], 0.0), np.append(0.0, least[:-1])])
-    return np.concatenate([[0.0], np.cumsum(np.maximum(least, 1e-3))])
+    times = np.concatenate([[0.0], np.cumsum(np.maximum(least, 1e-3))])
+    ways = np.diff(pressures, axis=0)
+    ways /= np.maximum(np.linalg.norm(ways, axis=1, keepdims=True), 1e-6)
+    turns = 1 + np.flatnonzero((ways[1:] * ways[:-1]).sum(axis=1) < _STRAIGHT)
+    if not len(turns):
+        return times
+    legs = [np.diff(gradual(leg - leg[0])) for leg in _pieces(times, turns.tolist())]
+    return np.concatenate([[0.0], np.cumsum(np.concatenate(legs))])
+
+
+def _pieces(values: Vector, at: list[int]) -> Iterator[Vector]:
+    """Yield the pieces of values (k,) between indices, with both ends."""
+    ends = [0, *at, len(values) - 1]
+    for begin, end in pairwise(ends):
+        yield values[begin : end + 1]
 
 
 def gradual(times: Vector) -> Vector:

@@ -37,12 +37,14 @@ class Rubbing(NamedTuple):
     tangential : their forces (2k,), components along `Sticking.across`, in N.
     tip : by which these move the tip (3,), base axes, in m.
     normals : by which these change the normal forces of all contacts (contacts,), in N.
+    past : by which the pressures (n,) went past their end and came back, in Pa; None if not.
     """
 
     sticking: Sticking
     tangential: Vector
     tip: Vector
     normals: Vector
+    past: Vector | None = None
 
 
 def states_from_rest(arm: Manipulator, scene: Scene, p: Vector) -> Iterator[ContactEquilibrium]:
@@ -60,21 +62,30 @@ def states_from_rest(arm: Manipulator, scene: Scene, p: Vector) -> Iterator[Cont
 
 
 def rubbed(states: Iterable[ContactEquilibrium]) -> Rubbing:
-    """Return what friction does on a way, at its end.
-
-    A force belongs to the nearest contact with the same object at the next equilibrium.
+    """Return what friction does on a way, at its end; see `rubbings`.
 
     Raises
     ------
     EquilibriumError
         The arm touches nothing at the end.
     """
+    *_, found = None, *rubbings(states)
+    if found is None:
+        raise EquilibriumError("in smaller steps the arm comes to lean on nothing")
+    return found
+
+
+def rubbings(states: Iterable[ContactEquilibrium]) -> Iterator[Rubbing | None]:
+    """Yield what friction does on a way, at each of its equilibria; None without contact.
+
+    A force belongs to the nearest contact with the same object at the next equilibrium.
+    """
     carried: list[tuple[str, float, Vector]] = []  # object, arc length, and tangential force (3,)
     before: Vector | None = None
-    found: Rubbing | None = None
     for eq in states:
         if not eq.contacts:
-            carried, before, found = [], eq.pressures, None
+            carried, before = [], eq.pressures
+            yield None
             continue
         held = eq.sticking.softened(TANGENTIAL)
         own = [eq.contacts[j] for j in held.own]
@@ -92,7 +103,4 @@ def rubbed(states: Iterable[ContactEquilibrium]) -> Rubbing:
         parts = np.einsum("ki,kij->kj", forces.reshape(-1, 2), held.across)
         carried = [(each.object, each.at, part) for each, part in zip(own, parts, strict=True)]
         before = eq.pressures
-        found = Rubbing(held, forces, tip[:3] @ forces, normals @ forces)
-    if found is None:
-        raise EquilibriumError("in smaller steps the arm comes to lean on nothing")
-    return found
+        yield Rubbing(held, forces, tip[:3] @ forces, normals @ forces)
