@@ -83,7 +83,7 @@ class Bench:
         self.controller = TipController(
             so.load_robot(robot), self.limits, self.slew, period=period,
             control=control or ControlSettings(), safety=self.description.safety,
-            vibrates=dynamics == "full",
+            vibrates=dynamics == "full", slow_first_motion=False,
         )  # fmt: skip
         self.controller.check()
         self.rig.open()

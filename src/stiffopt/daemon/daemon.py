@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
-from stiffopt.commissioning.record import commissioned_control, commissioned_robot, is_commissioned
+from stiffopt.commissioning.record import commissioned_control, commissioned_robot
 from stiffopt.control.controller import TipController
 from stiffopt.control.lifecycle import ARMED
 from stiffopt.control.loop import ControlLoop
@@ -117,7 +117,6 @@ class Daemon:
             vibrates=_vibrates(description),
             scene=scene,
             plan_in_process=True,
-            commissioned=is_commissioned(description, self.robot.description),
         )
         self.loop = ControlLoop(
             guarded,
