@@ -11,6 +11,8 @@ import pytest
 from scipy.optimize import lsq_linear
 
 import stiffopt
+from stiffopt.control.bracing import BracePhase, Bracing
+from stiffopt.control.tuning import BracingTuning
 from stiffopt.errors import EquilibriumError
 from stiffopt.model.contact import way
 from stiffopt.model.contact.equilibrium import ContactEquilibrium
@@ -18,7 +20,7 @@ from stiffopt.model.contact.way import Rubbing, rubbed, rubbings, states_from_re
 from stiffopt.optimise import easing
 from stiffopt.optimise.easing import eased
 from stiffopt.optimise.leaning import BracedProblem
-from stiffopt.paths.leaning import least_times_along, way_into_contact
+from stiffopt.paths.leaning import approach_to, least_times_along, way_into_contact
 
 ROBOT = stiffopt.load_robot("stiff-flop-2")
 LIMITS = np.zeros(6), np.full(6, 1.5e5)
@@ -209,12 +211,17 @@ def test_the_turn_is_the_least_change_that_adds_the_forces_within_limits():
     assert T @ change == pytest.approx(found.tangential, abs=0.1 * size)
 
 
-def test_what_is_judged_is_what_is_played():
-    own, eq = problem(True, margin=1e-4), states(True, 0.2)[-1]
-    answer = SimpleNamespace(
+def answered(eq: ContactEquilibrium, own: BracedProblem) -> Any:
+    """The parts of a solution that a way into contact needs."""
+    return SimpleNamespace(
         task=own.task, pressures=eq.pressures, tip_pose=eq.tip_pose, contacts=eq.contacts,
         stiffness=eq.stiffness((1.0, 0.0, 0.0)), stiffness_unit="N/m",
     )  # fmt: skip
+
+
+def test_what_is_judged_is_what_is_played():
+    own, eq = problem(True, margin=1e-4), states(True, 0.2)[-1]
+    answer = answered(eq, own)
     way, judged = way_into_contact(ROBOT, answer), own.rubbing(eq)
     assert judged is not None
     assert rubbed(way).tip == pytest.approx(judged.tip, abs=1e-5)
@@ -226,3 +233,30 @@ def test_what_is_judged_is_what_is_played():
         assert times[turn + 1] - times[turn] > 0.2, "it slows down where it turns"
     middle = straight // 2
     assert np.diff(times)[middle] == pytest.approx(np.diff(before)[middle])
+
+
+@pytest.mark.parametrize("legs", [2.0, 1.5, 0.5], ids=["held", "coming back", "going past"])
+def test_a_release_does_not_go_past_the_end_again(legs):
+    """It goes straight to the end of the way, wherever it begins, and down from there."""
+    own, eq = problem(True, margin=1e-4), states(True, 0.2)[-1]
+    approach = approach_to(ROBOT, answered(eq, own), 2e5)
+    brace = Bracing(own.task, BracingTuning())
+    brace.begin(approach, np.zeros(6))
+    last = len(states(True, 0.2)) - 1
+    leg = approach.times[[last, last + easing.STATES, -1]]
+    brace.phase, brace._time = BracePhase.APPROACHING, float(np.interp(legs, [0, 1, 2], leg))
+    brace._change = np.full(6, 2e3)
+    before = brace.pressures
+    turn = approach.pressures[last + easing.STATES]
+    assert np.abs(turn - approach.pressures[-1]).max() > 1e4
+    brace.release(why="contact lost")
+    assert brace.pressures == pytest.approx(before, abs=50.0)
+    end, taken = approach.pressures[-1], []
+    while brace.phase is BracePhase.RELEASING:
+        brace.advance(0.01, is_there=True)
+        taken.append(brace.pressures)
+    assert taken[-1] == pytest.approx(np.zeros(6), abs=1.0)
+    away = np.linalg.norm(np.array(taken) - 2e3 - end, axis=1)
+    ends = int(np.argmin(away))
+    assert (np.diff(away[: ends + 1]) <= 1.0).all()
+    assert (np.diff(taken[ends:], axis=0) <= 1.0).all()

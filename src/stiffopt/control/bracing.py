@@ -171,7 +171,7 @@ class Bracing:
             return self._left * self._start
         rows = approach.pressures
         on_way = np.array([np.interp(self._time, approach.times, row) for row in rows.T])
-        share = self._time / approach.times[-1]
+        share = min(self._time / approach.time_back(float(approach.times[-1])), 1.0)
         found: Array = on_way + share * self._change
         return found
 
@@ -203,6 +203,8 @@ class Bracing:
         self.next = then or self.next
         if self.phase in (BracePhase.APPROACHING, BracePhase.HELD):
             self.phase, self._why, self._pace = BracePhase.RELEASING, why, 0.0
+            if self.approach is not None:
+                self._time = self.approach.time_back(self._time)
             self._lost = frozenset(lost)
             self.force = self.deviation = self.margin = math.nan
             self.push = self.displacement = np.zeros(3)

@@ -54,6 +54,9 @@ class SlideEstimator:
         deviations = np.full(count, t.noise)  # of slides at first
         deviations[:_FIRST] = np.repeat([*t.error, *t.creep, 0.0], 3)
         self._state, self._covariance = np.zeros(count), np.diag(deviations**2)
+        # silicone creeps mostly as if all pressures grew, or fell, by a share
+        creep = t.creep_share * self._per_pressure @ self._pressures
+        self._covariance[_CREEP, _CREEP] += np.outer(creep, creep)
         self._jumps = 0  # successive samples in which the turn has jumped without the place
         self._drift = np.diag(np.repeat(t.drift, 3) ** 2)
 

@@ -539,6 +539,7 @@ class SlidingTuning:
     # e-fold of the time in contact and of a time before, in s; and by drift in a second
     error: tuple[float, float] = (1e-2, 3e-2)
     creep: tuple[float, float] = (2e-4, 3e-3)
+    creep_share: float = 0.01  # by which pressures seem to grow, or fall, per such e-fold
     creep_time: float = 3.0
     drift: tuple[float, float] = (1e-5, 2e-4)
     push_time: float = 5.0  # in which a push comes or goes, in s

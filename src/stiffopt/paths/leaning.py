@@ -3,8 +3,8 @@
 All pressures grow in proportion, as in the definition of equilibria in contact
 (`Manipulator.contact_equilibrium`). Each equilibrium along the way is found from the one before. If
 they do not end in the wanted one, the motion is refused. Where friction would keep the tip from its
-target, the way goes on past its end, and comes back (`eased`). Played backwards, it releases the
-contact.
+target, the way goes on past its end, and comes back (`eased`). Played backwards from where it first
+reaches its end, it releases the contact.
 """
 
 from __future__ import annotations
@@ -43,6 +43,7 @@ _STATIONS = 41  # of the body
 _AS_STIFF = 0.05  # largest difference of stiffnesses in the same equilibrium
 _PUSH = 2e-3  # N, step of finite differences by a push at the tip
 _FORGIVEN = 1e-4  # m, tolerated lack of clearance from other objects
+_SAME_PRESSURE = 1.0  # Pa
 _STRAIGHT = 0.9  # least cosine of the angle between steps of a way that does not turn
 
 
@@ -89,6 +90,18 @@ class BraceApproach:
     contacts: tuple[Contact, ...]
     hold: Hold
     free_tips: Vector
+
+    def time_back(self, time: float) -> float:
+        """Return when the way first has its pressures of a time, in s.
+
+        From there backwards, a way that went past its end does not do so again.
+        """
+        past = np.linalg.norm(self.pressures - self.pressures[-1], axis=1)
+        reached = int(np.argmax(past < _SAME_PRESSURE))
+        if time <= self.times[reached]:
+            return time
+        leg = slice(reached, reached + int(np.argmax(past[reached:])) + 1)
+        return float(np.interp(np.interp(time, self.times, past), past[leg], self.times[leg]))
 
 
 def approach_to(

@@ -66,8 +66,8 @@ class Brought(NamedTuple):
 class Slopes(NamedTuple):
     """The tasks at k points, linearised; derivatives are per share of a channel's range.
 
-    `residuals`, `jacobians`: of the terms. `costs`, `gradients`: negative logarithms of the
-    stiffnesses; the largest of each point is minimised.
+    `residuals` (k, m), `jacobians` (k, m, n): of the terms. `costs` (k, t), `gradients` (k, t, n):
+    negative logarithms of the stiffnesses; the largest of each point is minimised.
     """
 
     residuals: Array
