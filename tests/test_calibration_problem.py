@@ -218,13 +218,17 @@ def test_the_weight_keeps_its_direction_in_the_trackers_frame() -> None:
     assert not np.allclose(turn[:, 2], [0, 0, 1], atol=0.01)
     assert turn @ problem.robot(x).gravity == pytest.approx([0, 0, 9.81], abs=1e-5)
     assert problem.robot(np.zeros(problem.size)).gravity == problem.description.gravity
-    # a lying arm, with a tracker that may be turned about its axis in any way
-    lying = copy(problem)
-    lying.description = problem.description.model_copy(update={"gravity": (9.81, 0.0, 0.0)})
-    assert lying.robot(x).gravity != (9.81, 0.0, 0.0)
-    lying.scale = problem.scale.copy()
-    lying.scale[base.stop - 1] = np.pi
-    assert lying.robot(x).gravity == (9.81, 0.0, 0.0)
+    # a tracker that may be tilted or, with an inclined arm, turned about its axis in any way
+    other, across = copy(problem), (1.4, 0.0, 9.71)
+    for gravity, known, turns in (
+        (across, {}, True),
+        (across, {"base_turn": np.pi}, False),
+        ((0.0, 0.0, 9.81), {"base_turn": np.pi}, True),
+        ((0.0, 0.0, 9.81), {"base_tilt": 0.3}, False),
+    ):
+        update = {"gravity": gravity, "tolerances": Tolerances(**known)}
+        other.description = problem.description.model_copy(update=update)
+        assert (other.robot(x).gravity != gravity) is turns
     free = problem_of(CASES["one segment"])
     assert free.robot(somewhere(free)).gravity == (0.0, 0.0, 0.0)
 

@@ -174,7 +174,7 @@ def pressing(found: Rubbing | None) -> Rubbing | None:
     return found and found._replace(normals=found.normals + 0.4)
 
 
-@pytest.mark.parametrize("why", ["little", "limits", "force", "rubs", "opens", "lost"])
+@pytest.mark.parametrize("why", ["little", "limits", "force", "rubs", "opens", "lost", "near"])
 def test_a_way_stays_as_it_is_where_it_cannot_be_eased(why, monkeypatch):
     own, straight = problem(why != "little"), states(why != "little", 0.2)
     if why == "limits":
@@ -191,7 +191,15 @@ def test_a_way_stays_as_it_is_where_it_cannot_be_eased(why, monkeypatch):
             raise EquilibriumError("lost")
 
         monkeypatch.setattr(easing, "_past_and_back", is_lost)
-    way, found = eased(ROBOT, own.task, own.scene, straight)
+    task = own.task
+    if why == "near":  # where the tip would be as the way turns
+        turn = eased(ROBOT, task, own.scene, straight)[0][len(straight) - 1 + easing.STATES]
+        place = tuple((turn.tip_pose[:3, 3] + 0.01 * turn.tip_pose[:3, 2]).tolist())
+        ball = {"name": "ball", "sphere": {"centre": place, "radius": 0.005}}
+        task = task.model_copy(
+            update={"scene": stiffopt.Scene(objects=[*own.task.scene.objects, ball])}
+        )
+    way, found = eased(ROBOT, task, own.scene, straight)
     assert way == straight
     assert found.past is None
     assert found.tip == pytest.approx(rubbed(straight).tip)

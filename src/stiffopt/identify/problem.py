@@ -24,7 +24,7 @@ from stiffopt.identify.discrepancy import Systematic, smooth_functions
 from stiffopt.identify.past import Past, Start, pause_between
 from stiffopt.identify.recording import Recording
 from stiffopt.identify.sensing import Readings, gravity_in_base, readings
-from stiffopt.identify.settings import FIT, START
+from stiffopt.identify.settings import FIT
 from stiffopt.identify.unknowns import Unknowns
 from stiffopt.logs import StiffnessTable
 from stiffopt.model.arguments import checked_measure
@@ -233,16 +233,11 @@ class CalibrationProblem:
     def _gravity(self, coordinates: Array) -> tuple[Array, Array] | None:
         """Return gravity (3,) in the axes of the turned base, and its derivatives (3, d).
 
-        None if it does not vary: there is none, the base is known, or it acts across an arm about
-        whose axis nobody knows how the tracker is turned, so that the vertical is not known there.
+        None if it does not vary: there is none, the base is known, or the vertical is not.
         """
         base, *_ = self.unknowns.slices()
         given = np.array(self.description.gravity)
-        if not (self.unknowns.base and given.any()):
-            return None
-        tilt, turned = self.scale[base][4:]
-        across = np.hypot(*given[:2]) / np.linalg.norm(given)
-        if turned > START.unknown_turn and across > 3 * tilt:
+        if not (self.unknowns.base and given.any() and self.description.has_known_vertical):
             return None
         turn, slopes = slice(base.start + 3, base.stop), np.zeros((3, self.size))
         found, slopes[:, turn] = gravity_in_base(given, coordinates[turn])

@@ -473,6 +473,16 @@ class RobotDescription(Schema):
         return sum(segment.length + segment.connector for segment in self.segments)
 
     @property
+    def has_known_vertical(self) -> bool:
+        """Whether the registration tells the vertical in the tracker's frame.
+
+        Its tilt is known to 0.1 rad, and where gravity acts across the arm, its turn to 0.5 rad.
+        """
+        given, gravity = self.tolerances or Tolerances(), np.array(self.gravity)
+        across = float(np.hypot(*gravity[:2])) > 0.02 * float(np.linalg.norm(gravity))
+        return given.base_tilt <= 0.1 and not (across and given.base_turn > 0.5)
+
+    @property
     def pressure_min(self) -> tuple[float, ...]:
         """Lower limit of each channel, in Pa."""
         return self._per_channel(self.pressure.min)

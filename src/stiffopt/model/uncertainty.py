@@ -491,7 +491,7 @@ class ReadingSlopes:
         self.arm = ParametricArm(description, parameters, tip_load)
         self.rest = np.zeros(len(parameters))
         self._frames = frames
-        self._gravity = np.array(description.gravity)
+        self._gravity = np.array(description.gravity) * description.has_known_vertical
         given = description.recordings
         self._sensor = np.zeros(3)
         if given is not None:

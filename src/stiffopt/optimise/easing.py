@@ -18,10 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt.errors import EquilibriumError
+from stiffopt.model.arm_clearance import measured_scene
 from stiffopt.model.contact.equilibrium import ContactEquilibrium
 from stiffopt.model.contact.way import Rubbing, rubbed, rubbings
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.scene import Scene
+from stiffopt.optimise.brace import kept_clear_of
 from stiffopt.optimise.quadratic import solve_qp
 from stiffopt.optimise.settings import BRACE
 from stiffopt.optimise.task import Task
@@ -30,6 +32,8 @@ Vector = NDArray[np.float64]
 
 STATES = 12  # equilibria from the end of a way to where it turns, and as many back
 _ROUNDS = 3
+_STATIONS = 41  # of the body
+_FORGIVEN = 1e-4  # m, tolerated lack of clearance from other objects
 _LESS = 0.05  # share by which contact forces should be smaller where it turns
 _LITTLE = 1e-3  # weight of pressures, in 1 / bar^2
 _BAR = 1e5  # Pa
@@ -40,10 +44,10 @@ def eased(
 ) -> tuple[list[ContactEquilibrium], Rubbing]:
     """Return a way that ends where another one does, with little friction, and what is left of it.
 
-    It is the same way, unless friction keeps the tip from the target. Then it goes
-    past its end and comes back to the same equilibrium, if this leaves less friction, and meanwhile
-    the arm leans, and presses no object with more than its greatest force, or by friction with
-    more than a tenth above it.
+    It is the same way, unless friction keeps the tip from the target. Then it goes past its end and
+    comes back to the same equilibrium, if this leaves less friction, and meanwhile the arm leans,
+    keeps clear of the other objects, and presses none with more than its greatest force, or by
+    friction with more than a tenth above it.
 
     Parameters
     ----------
@@ -60,6 +64,9 @@ def eased(
     limits = task.pressure_bounds(arm.description)
     if distance_left(arm, task, end, found) <= allowed_distance(task):
         return best
+    assert task.scene is not None
+    assert task.brace is not None
+    others = kept_clear_of(task.scene, task.brace)
     for _ in range(_ROUNDS):
         if _away(found) <= BRACE.missed:
             break
@@ -73,10 +80,30 @@ def eased(
         last = followed[-1]
         if last is None or apart > BRACE.same or not all(map(_is_allowed, back[:-1], followed)):
             break
+        if others is not None and missing_clearance(arm, others, back) > 0:
+            break
         found = last
         if _away(found) < least:
             best, least = ([*way, *back], found._replace(past=past)), _away(found)
     return best
+
+
+def missing_clearance(
+    arm: Manipulator, others: Scene, states: Sequence[ContactEquilibrium]
+) -> float:
+    """Return by how much the body comes nearer to objects than their clearance, in m.
+
+    0 if it keeps clear of all within 0.1 mm, in all states.
+    """
+    at = np.linspace(0.0, arm.length, _STATIONS)
+    radii = arm.body_radius(np.zeros(arm.n_pressures), at)
+    lines = np.array([eq.poses(at)[:, :3, 3] for eq in states])  # (k, stations, 3)
+    least = np.inf
+    for item in measured_scene(others, arm.description).items:
+        gaps = item.distances(lines.reshape(-1, 3)).values.reshape(lines.shape[:2]) - radii
+        least = min(least, gaps[:, at >= item.begin].min(initial=np.inf))
+    missing = others.clearance - float(least)
+    return missing if missing > _FORGIVEN else 0.0
 
 
 def allowed_distance(task: Task) -> float:

@@ -19,15 +19,13 @@ from numpy.typing import NDArray
 
 from stiffopt.display import display_units
 from stiffopt.errors import EquilibriumError
-from stiffopt.model.arm_clearance import measured_scene
 from stiffopt.model.contact.equilibrium import Contact, ContactEquilibrium
 from stiffopt.model.contact.sticking import Sticking
 from stiffopt.model.contact.way import STATES, Rubbing, rubbed, states_from_rest
 from stiffopt.model.manipulator import Manipulator
-from stiffopt.model.scene import Scene
 from stiffopt.optimise.brace import kept_clear_of, leant_on, quoted
 from stiffopt.optimise.brace_uncertainty import BraceUncertainty
-from stiffopt.optimise.easing import eased
+from stiffopt.optimise.easing import eased, missing_clearance
 from stiffopt.optimise.settings import BRACE
 from stiffopt.optimise.solution import PressureSolution
 from stiffopt.optimise.task import Task
@@ -42,7 +40,6 @@ GRADUAL = 1.0  # s, in which the way gets its speed or loses it
 _STATIONS = 41  # of the body
 _AS_STIFF = 0.05  # largest difference of stiffnesses in the same equilibrium
 _PUSH = 2e-3  # N, step of finite differences by a push at the tip
-_FORGIVEN = 1e-4  # m, tolerated lack of clearance from other objects
 _SAME_PRESSURE = 1.0  # Pa
 _STRAIGHT = 0.9  # least cosine of the angle between steps of a way that does not turn
 
@@ -213,8 +210,10 @@ def way_from_rest(
                 where = "on the way" if number else "at rest"
                 raise Unsolved(f"{where}, '{each.object}' would be pressed with {text}")
     if others is not None:
-        at = _stations(robot)
-        _check_clear(robot, others, np.array([eq.poses(at)[:, :3, 3] for eq in states]), at)
+        missing = missing_clearance(robot, others, states)
+        if missing:
+            text = display_units().length.text(missing, ".2g")
+            raise Unsolved(f"on the way the body is {text} too near an object")
     return states
 
 
@@ -283,14 +282,3 @@ def _hold(eq: ContactEquilibrium, deviations: Vector, rubbing: Rubbing) -> Hold:
 
 def _largest(eq: ContactEquilibrium) -> float:
     return max((force for _, force in eq.pressed()), default=0.0)
-
-
-def _check_clear(robot: Manipulator, others: Scene, lines: Vector, at: Vector) -> None:
-    """Raise `Unsolved` if on the way (k, stations, 3) the body comes too near to other objects."""
-    radii = robot.body_radius(np.zeros(robot.n_pressures), at)
-    for item in measured_scene(others, robot.description).items:
-        gaps = item.distances(lines.reshape(-1, 3)).values.reshape(lines.shape[:2]) - radii
-        gaps = gaps[:, at >= item.begin]
-        if gaps.size and gaps.min() < others.clearance - _FORGIVEN:
-            missing = display_units().length.text(others.clearance - float(gaps.min()), ".2g")
-            raise Unsolved(f"on the way the body is {missing} too near an object")
