@@ -16,6 +16,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.control.adaptation import Adapted
 from stiffopt.control.bracing import BracePhase, Bracing
 from stiffopt.control.checks import refusing
@@ -48,7 +49,6 @@ from stiffopt.paths.trajectory import Trajectory
 from stiffopt.rig.interface import PoseSample, PressureLimits, PressureReading
 from stiffopt.rig.settings import ControlSettings, Safety
 
-Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 _HELD = 2.5  # periods without `compute`, after which others have commanded the pressures

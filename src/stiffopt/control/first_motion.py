@@ -13,11 +13,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.control.tuning import FirstMotionTuning
-
-Array = NDArray[np.float64]
 
 
 class FirstMotion:

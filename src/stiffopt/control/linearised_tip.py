@@ -13,16 +13,15 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from stiffopt import lie
+from stiffopt.arrays import Array
 from stiffopt.control.formula import Formula
 from stiffopt.errors import EquilibriumError, InputError, PressureError, StiffoptError
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.optimise.tip import TipAt, TipModel
 from stiffopt.paths.leaning import BraceApproach
 
-Array = NDArray[np.float64]
 Symbols = Any  # of CasADi
 
 # share of the range by which an operating point is ahead of pressures that have just left the last

@@ -20,6 +20,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.identify.discrepancy import Systematic, smooth_functions
 from stiffopt.identify.past import Past, Start, pause_between
 from stiffopt.identify.recording import Recording
@@ -35,9 +36,6 @@ from stiffopt.model.description import RobotDescription
 from stiffopt.model.history import NO_HISTORY
 from stiffopt.model.parameters import varied, with_values
 from stiffopt.model.parametric import ParametricArm
-
-Array = NDArray[np.float64]
-
 
 Begin = Literal["rest", "previous", "unknown"]
 """State at a log's beginning: after a rise from zero, as the previous log ended, or unknown."""

@@ -10,14 +10,13 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.display import display_units
 from stiffopt.identify.fit import Fit
 from stiffopt.identify.settings import REPORT
 from stiffopt.identify.unknowns import BASE, SENSOR
 from stiffopt.model.parameters import Parameter
 from stiffopt.model.uncertainty import NORMAL_QUANTILE
-
-Array = NDArray[np.float64]
 
 TIED = "hardly told apart"
 """Beginning of the remark on two numbers that the data cannot distinguish."""

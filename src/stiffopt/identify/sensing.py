@@ -11,13 +11,11 @@ from functools import cache
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from stiffopt import lie
+from stiffopt.arrays import Array
 from stiffopt.model.batch import InterpretedFunction
 from stiffopt.model.codegen import dense
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.model.arguments import DirectionalMeasure
 from stiffopt.model.batch import InterpretedFunction
 from stiffopt.model.codegen import dense
@@ -18,8 +18,6 @@ from stiffopt.model.kinematics import body_jacobian
 from stiffopt.model.parameters import Parameter, parametric
 from stiffopt.model.shape import FreeShape, Shape, stiffness_along
 from stiffopt.model.shooting import Chain, Shooting
-
-Vector = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,10 +32,10 @@ class Poses:
     per_gravity : twists (N, 6, 3) per m/s^2, in base axes; zero for an arm without load.
     """
 
-    transforms: Vector
-    per_pressure: Vector
-    per_coordinate: Vector
-    per_gravity: Vector
+    transforms: Array
+    per_pressure: Array
+    per_coordinate: Array
+    per_gravity: Array
 
 
 class ParametricArm:
@@ -72,11 +70,11 @@ class ParametricArm:
         """Replace the load (12,) on the tip; the arm must have gravity or a load already."""
         self._loads = self._loads._replace(tip=np.array(tip_load))
 
-    def set_gravity(self, gravity: Vector) -> None:
+    def set_gravity(self, gravity: Array) -> None:
         """Replace gravity (3,), in base axes, in m/s^2; the arm must have some already."""
         self._loads = self._loads._replace(gravity=gravity)
 
-    def poses(self, pressures: Vector, coordinates: Vector, at: float | None = None) -> Poses:
+    def poses(self, pressures: Array, coordinates: Array, at: float | None = None) -> Poses:
         """Return poses at pressures (N, n), coordinates (k,), of the tip or at an arc length in m.
 
         Raises `EquilibriumError`: a loaded arm buckles or falls over.
@@ -94,8 +92,8 @@ class ParametricArm:
         return Poses(transforms, twists[..., :n], twists[..., n:], per_gravity)
 
     def stiffnesses(
-        self, pressures: Vector, coordinates: Vector, measure: DirectionalMeasure
-    ) -> tuple[Vector, Vector, Vector, Vector]:
+        self, pressures: Array, coordinates: Array, measure: DirectionalMeasure
+    ) -> tuple[Array, Array, Array, Array]:
         """Return tip stiffness (N,) and its slopes.
 
         They are (N, n) by pressures, (N, k) by coordinates and (N, 3) by gravity.
@@ -122,10 +120,10 @@ class ParametricArm:
         self,
         key: Hashable,
         outputs: Callable[[Shape], list[ca.SX | ca.MX]],
-        pressures: Vector,
-        coordinates: Vector,
+        pressures: Array,
+        coordinates: Array,
         at: float | None,
-    ) -> list[Vector]:
+    ) -> list[Array]:
         if (key, at) not in self._functions:
             shape = self._shape(at)
             found = [ca.densify(value) for value in outputs(shape)]
@@ -147,7 +145,7 @@ class ParametricArm:
             return self._equilibrium.shooting.chain(at)
         return FreeShape.of(self.description, self._actuation, at)
 
-    def _states(self, equilibrium: Equilibrium, variables: Vector) -> list[EquilibriumState]:
+    def _states(self, equilibrium: Equilibrium, variables: Array) -> list[EquilibriumState]:
         """Return equilibria (N,), each found from the last one of the same row."""
         near = self._near.get(len(variables), [])
         states: list[EquilibriumState] = []

@@ -28,17 +28,14 @@ from itertools import pairwise
 from math import ceil, sqrt
 
 import casadi as ca
-import numpy as np
-from numpy.typing import NDArray
 
 from stiffopt import lie
+from stiffopt.arrays import Array
 from stiffopt.model.actuation import SectionGeometry
 from stiffopt.model.compliance import inverse_3x3
 from stiffopt.model.description import RobotDescription, Segment
 from stiffopt.model.kinematics import Actuation
 from stiffopt.model.shape import PointOfArm
-
-Vector = NDArray[np.float64]
 
 _ROOT = sqrt(21)
 _STAGES: tuple[dict[int, float], ...] = (
@@ -114,7 +111,7 @@ def slopes(
     weight: ca.SX,
     strain: ca.SX,
     compliance: ca.SX,
-    centroid: ca.SX | Vector,
+    centroid: ca.SX | Array,
 ) -> tuple[ca.SX, ca.SX, ca.SX]:
     """Return the right-hand sides q', tangent -r', and m' of the rod's equations, per length."""
     R = lie.rotation_from_quaternion(q)
@@ -127,7 +124,7 @@ def slopes(
     return -0.5 * lie.quaternion_product(q, ca.vertcat(0, xi[3:])), tangent, moment
 
 
-def _step_functions(sparsity: ca.Sparsity, centroid: Vector) -> tuple[ca.Function, ca.Function]:
+def _step_functions(sparsity: ca.Sparsity, centroid: Array) -> tuple[ca.Function, ca.Function]:
     """Return one integration step of length h towards the base, (10,) to (10,), and its notes.
 
     See `Stretch` for the notes.

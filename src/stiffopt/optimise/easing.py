@@ -15,8 +15,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.errors import EquilibriumError
 from stiffopt.model.arm_clearance import measured_scene
 from stiffopt.model.contact.equilibrium import ContactEquilibrium
@@ -27,8 +27,6 @@ from stiffopt.optimise.brace import kept_clear_of
 from stiffopt.optimise.quadratic import solve_qp
 from stiffopt.optimise.settings import BRACE
 from stiffopt.optimise.task import Task
-
-Vector = NDArray[np.float64]
 
 STATES = 12  # equilibria from the end of a way to where it turns, and as many back
 _ROUNDS = 3
@@ -128,9 +126,7 @@ def distance_left(arm: Manipulator, task: Task, eq: ContactEquilibrium, rubbing:
     return corrected(eq.pressures, limits, off[rows], jacobian[rows])
 
 
-def corrected(
-    pressures: Vector, limits: tuple[Vector, Vector], off: Vector, jacobian: Vector
-) -> float:
+def corrected(pressures: Array, limits: tuple[Array, Array], off: Array, jacobian: Array) -> float:
     """Return how far from its place a tip that is off by so much (k,) stays, in m.
 
     The pressures (n,) change by at most `BRACE.corrected` each, within their limits (n,);
@@ -163,7 +159,7 @@ def _away(found: Rubbing) -> float:
 
 
 def _past_and_back(
-    arm: Manipulator, scene: Scene, end: ContactEquilibrium, past: Vector
+    arm: Manipulator, scene: Scene, end: ContactEquilibrium, past: Array
 ) -> list[ContactEquilibrium]:
     """Return equilibria from one to pressures that differ by `past` (n,), in Pa, and back."""
     shares, there = np.arange(1, STATES + 1) / STATES, end
@@ -174,7 +170,7 @@ def _past_and_back(
     return found
 
 
-def _going_on(end: ContactEquilibrium, found: Rubbing, low: Vector, high: Vector) -> Vector:
+def _going_on(end: ContactEquilibrium, found: Rubbing, low: Array, high: Array) -> Array:
     """Return the least change dp (n,) of the pressures with T dp = t, as far as limits allow.
 
     Contact forces hardly change by it. `low`, `high`: limits (n,) of the pressures at the end.

@@ -18,8 +18,8 @@ from typing import Any, NamedTuple, cast
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.display import display_units
 from stiffopt.errors import EquilibriumError
 from stiffopt.model.batch import InterpretedFunction
@@ -40,8 +40,6 @@ from stiffopt.optimise.program import Constraint, Program
 from stiffopt.optimise.settings import BRACE, OBSTACLES
 from stiffopt.optimise.solution import Judgement, Preload, are_within
 from stiffopt.optimise.task import Task
-
-Vector = NDArray[np.float64]
 
 FORCE_ON, MARGIN_ON = "force on ", "margin on "
 """Prefixes of the names of constraints of contacts."""
@@ -98,7 +96,7 @@ class PlacedProgram:
         )
         self._parameters = program.parameters
 
-    def __call__(self, eq: ContactEquilibrium, C: Vector) -> tuple[Vector, Vector]:
+    def __call__(self, eq: ContactEquilibrium, C: Array) -> tuple[Array, Array]:
         """Return residuals (m,) of the terms and measures (k,); C is (6, 6), in tip axes."""
         tip = eq.tip_pose
         poses = eq.poses(self.at) if len(self.at) else ()
@@ -118,19 +116,19 @@ class BracedPoint(ProgramPoint):
 
     equilibrium: ContactEquilibrium
     force: float
-    force_gradient: Vector
+    force_gradient: Array
 
 
 class Quantities(NamedTuple):
     """Quantities at one equilibrium from which the program's rows and values are computed."""
 
-    residuals: Vector
-    values: Vector
-    distances: Vector
-    forces: Vector  # along the normals, as large as they may be
-    pushed: Vector
-    slips: Vector
-    foretold: Vector  # slips, by the tangent
+    residuals: Array
+    values: Array
+    distances: Array
+    forces: Array  # along the normals, as large as they may be
+    pushed: Array
+    slips: Array
+    foretold: Array  # slips, by the tangent
 
 
 class BracedProblem(PressureProblem):
@@ -207,7 +205,7 @@ class BracedProblem(PressureProblem):
         """Find the next equilibrium from rest."""
         self.here = self._kept = None
 
-    def equilibrium(self, x: Vector) -> ContactEquilibrium:
+    def equilibrium(self, x: Array) -> ContactEquilibrium:
         """Return the equilibrium at pressures x, found from `here`.
 
         Raises `EquilibriumError` if there is none, or none with contact.
@@ -222,19 +220,19 @@ class BracedProblem(PressureProblem):
         self.here, self._kept = eq, (x.tobytes(), eq)
         return eq
 
-    def pose(self, x: Vector) -> BracedPoint:
+    def pose(self, x: Array) -> BracedPoint:
         """See `PressureProblem.pose`."""
         return self._evaluated(x, full=False)
 
-    def point(self, x: Vector) -> BracedPoint:
+    def point(self, x: Array) -> BracedPoint:
         """See `PressureProblem.point`."""
         return self._evaluated(x, full=True)
 
-    def worth(self, x: Vector) -> BracedPoint:
+    def worth(self, x: Array) -> BracedPoint:
         """See `PressureProblem.worth`."""
         return self._evaluated(x, full=True)
 
-    def _evaluated(self, x: Vector, *, full: bool) -> BracedPoint:
+    def _evaluated(self, x: Array, *, full: bool) -> BracedPoint:
         checkpoint()
         eq = self.equilibrium(x)
         pushes = [] if self.only_target else list(self.pushes(eq))
@@ -262,7 +260,7 @@ class BracedProblem(PressureProblem):
         point.force_gradient = slopes.forces.sum(axis=0)
         return point
 
-    def pushes(self, eq: ContactEquilibrium) -> Iterator[Vector]:
+    def pushes(self, eq: ContactEquilibrium) -> Iterator[Array]:
         """Yield unit vectors (3,) of pushes at the tip, both ways per direction, in base axes."""
         R = eq.tip_pose[:3, :3]
         for measure, sign in product(self.directions, (1.0, -1.0)):
@@ -272,7 +270,7 @@ class BracedProblem(PressureProblem):
     def _seen(
         self,
         eq: ContactEquilibrium,
-        pushes: list[Vector],
+        pushes: list[Array],
         known: BraceUncertainty,
         near: list[Nearest],
         full: bool,
@@ -296,8 +294,8 @@ class BracedProblem(PressureProblem):
         return Quantities(residuals, values, distances, forces, np.array(pushed), slips, foretold)
 
     def _slips(
-        self, eq: ContactEquilibrium, pushes: list[Vector], grip: float, base: Quantities | None
-    ) -> tuple[Vector, Vector]:
+        self, eq: ContactEquilibrium, pushes: list[Array], grip: float, base: Quantities | None
+    ) -> tuple[Array, Array]:
         """Return the pushes at which a contact is lost or the arm snaps, at most twice the margin.
 
         Those of contacts that stick and, as friction is not certain, of contacts that slide; `grip`
@@ -319,7 +317,7 @@ class BracedProblem(PressureProblem):
                 found[k] = base.slips[k] * (share if np.isfinite(share) else 1.0)
         return found, foretold
 
-    def _rows(self, eq: ContactEquilibrium, seen: Quantities, near: list[Nearest]) -> Vector:
+    def _rows(self, eq: ContactEquilibrium, seen: Quantities, near: list[Nearest]) -> Array:
         rows = self.obstacle_rows(near)
         if self.only_target:
             return np.array([*rows, *(0.0 for _ in self._row_names)])
@@ -344,7 +342,7 @@ class BracedProblem(PressureProblem):
         required = self.program.obstacles.scene.clearance
         return [OBSTACLES.margin - (each.distance - required) for each in near]
 
-    def _slopes(self, eq: ContactEquilibrium, base: Quantities, slopes: Quantities) -> Vector:
+    def _slopes(self, eq: ContactEquilibrium, base: Quantities, slopes: Quantities) -> Array:
         """Return derivatives (rows, n) of `_rows`; of several contacts on an object, the worst."""
         rows = list(-slopes.distances)
         none = np.zeros(len(self.unit))
@@ -483,7 +481,7 @@ class BracedProblem(PressureProblem):
         m = measure
         return eq.stiffness(m.direction, m.kind, m.boundary, m.frame, self.brace.contacts)
 
-    def _left_in_doubt(self, eq: ContactEquilibrium, doubt: Vector) -> tuple[float, float]:
+    def _left_in_doubt(self, eq: ContactEquilibrium, doubt: Array) -> tuple[float, float]:
         """Return the force that a push of the margin leaves beyond the doubt, and that, in N."""
         if not doubt.any():
             return np.inf, 0.0
@@ -510,6 +508,6 @@ def _max_force(item: SceneObject) -> float | None:
     return None if item.contact is None else item.contact.max_force
 
 
-def _nothing(n: int) -> tuple[Vector, Vector, Vector, Vector]:
+def _nothing(n: int) -> tuple[Array, Array, Array, Array]:
     none = np.zeros((0, n))
     return none[:, 0], none, none[:, 0], none

@@ -15,8 +15,8 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.display import display_units
 from stiffopt.errors import EquilibriumError
 from stiffopt.model.contact.equilibrium import Contact, ContactEquilibrium
@@ -31,8 +31,6 @@ from stiffopt.optimise.solution import PressureSolution
 from stiffopt.optimise.task import Task
 from stiffopt.optimise.tip import TipAt
 from stiffopt.paths.configurations import Unsolved, maximised
-
-Vector = NDArray[np.float64]
 
 SPEED = 0.02  # m/s, largest, of any part of the body
 FORCE_RATE = 0.1  # N/s, largest change of a contact's force
@@ -57,12 +55,12 @@ class Hold(NamedTuple):
     tangential : the forces of friction that the way leaves, as in `Rubbing`, in N.
     """
 
-    forces: Vector
-    deviations: Vector
-    per_pressure: Vector
-    per_push: Vector
+    forces: Array
+    deviations: Array
+    per_pressure: Array
+    per_push: Array
     sticking: Sticking
-    tangential: Vector
+    tangential: Array
 
 
 @dataclass(frozen=True)
@@ -80,13 +78,13 @@ class BraceApproach:
     free_tips : positions (k, 3), in m, of the tip at these pressures without contact.
     """
 
-    times: Vector
-    pressures: Vector
+    times: Array
+    pressures: Array
     tips: tuple[TipAt, ...]
-    forces: Vector
+    forces: Array
     contacts: tuple[Contact, ...]
     hold: Hold
-    free_tips: Vector
+    free_tips: Array
 
     def time_back(self, time: float) -> float:
         """Return when the way first has its pressures of a time, in s.
@@ -102,7 +100,7 @@ class BraceApproach:
 
 
 def approach_to(
-    robot: Manipulator, solution: PressureSolution, slew: Vector | float = np.inf
+    robot: Manipulator, solution: PressureSolution, slew: Array | float = np.inf
 ) -> BraceApproach:
     """Return the motion from rest to a braced solution.
 
@@ -168,7 +166,7 @@ def stiffness_leaning(eq: ContactEquilibrium, task: Task) -> float:
     )
 
 
-def touches_at(robot: Manipulator, task: Task, p: Vector) -> bool:
+def touches_at(robot: Manipulator, task: Task, p: Array) -> bool:
     """Return whether the arm at pressures (n,) touches an object of a task's brace."""
     assert task.brace is not None
     assert task.scene is not None
@@ -179,7 +177,7 @@ def touches_at(robot: Manipulator, task: Task, p: Vector) -> bool:
 
 
 def way_from_rest(
-    robot: Manipulator, task: Task, p: Vector, *, is_eased: bool = False
+    robot: Manipulator, task: Task, p: Array, *, is_eased: bool = False
 ) -> list[ContactEquilibrium]:
     """Return the equilibria from rest to pressures (n,) among the objects of a task with a brace.
 
@@ -218,8 +216,8 @@ def way_from_rest(
 
 
 def least_times_along(
-    robot: Manipulator, states: list[ContactEquilibrium], slew: Vector | float
-) -> Vector:
+    robot: Manipulator, states: list[ContactEquilibrium], slew: Array | float
+) -> Array:
     """Return the times (k,), in s, of equilibria that keep speed, rates of force and pressure.
 
     Where the way turns, it slows down.
@@ -244,14 +242,14 @@ def least_times_along(
     return np.concatenate([[0.0], np.cumsum(np.concatenate(legs))])
 
 
-def _pieces(values: Vector, at: list[int]) -> Iterator[Vector]:
+def _pieces(values: Array, at: list[int]) -> Iterator[Array]:
     """Yield the pieces of values (k,) between indices, with both ends."""
     ends = [0, *at, len(values) - 1]
     for begin, end in pairwise(ends):
         yield values[begin : end + 1]
 
 
-def gradual(times: Vector) -> Vector:
+def gradual(times: Array) -> Array:
     """Return times (k,), in s, of the same way with a speed that grows and falls uniformly."""
     to_end = times[-1] - times
     after = _begun_gradually(np.minimum(times, to_end))
@@ -259,7 +257,7 @@ def gradual(times: Vector) -> Vector:
     return np.where(times <= to_end, after, whole - after)
 
 
-def _begun_gradually(times: Vector) -> Vector:
+def _begun_gradually(times: Array) -> Array:
     """Return when a way is as far as it would be at times (k,) if it began at full speed.
 
     Its share of the speed grows as t / T with T = `GRADUAL`, so that it is at t^2 / (2 T).
@@ -267,11 +265,11 @@ def _begun_gradually(times: Vector) -> Vector:
     return np.where(times < GRADUAL / 2, np.sqrt(2 * GRADUAL * times), times + GRADUAL / 2)
 
 
-def _stations(robot: Manipulator) -> Vector:
+def _stations(robot: Manipulator) -> Array:
     return np.linspace(0.0, robot.length, _STATIONS)
 
 
-def _hold(eq: ContactEquilibrium, deviations: Vector, rubbing: Rubbing) -> Hold:
+def _hold(eq: ContactEquilibrium, deviations: Array, rubbing: Rubbing) -> Hold:
     pushed = [
         (eq.shifted(push=step).normal_forces - eq.shifted(push=-step).normal_forces) / (2 * _PUSH)
         for step in _PUSH * np.eye(3)

@@ -12,8 +12,8 @@ from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.errors import EquilibriumError
 from stiffopt.model.contact.sticking import Sticking
 from stiffopt.model.scene import Scene
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from stiffopt.model.contact.equilibrium import ContactEquilibrium
     from stiffopt.model.manipulator import Manipulator
 
-Vector = NDArray[np.float64]
 
 STATES = 61  # equilibria along the way
 TANGENTIAL = 1e-4  # m/N, compliance of a contact that sticks; an arm along itself has 40 times it
@@ -41,13 +40,13 @@ class Rubbing(NamedTuple):
     """
 
     sticking: Sticking
-    tangential: Vector
-    tip: Vector
-    normals: Vector
-    past: Vector | None = None
+    tangential: Array
+    tip: Array
+    normals: Array
+    past: Array | None = None
 
 
-def states_from_rest(arm: Manipulator, scene: Scene, p: Vector) -> Iterator[ContactEquilibrium]:
+def states_from_rest(arm: Manipulator, scene: Scene, p: Array) -> Iterator[ContactEquilibrium]:
     """Yield equilibria from rest to pressures (n,), which grow in proportion.
 
     Raises
@@ -80,8 +79,8 @@ def rubbings(states: Iterable[ContactEquilibrium]) -> Iterator[Rubbing | None]:
 
     A force belongs to the nearest contact with the same object at the next equilibrium.
     """
-    carried: list[tuple[str, float, Vector]] = []  # object, arc length, and tangential force (3,)
-    before: Vector | None = None
+    carried: list[tuple[str, float, Array]] = []  # object, arc length, and tangential force (3,)
+    before: Array | None = None
     for eq in states:
         if not eq.contacts:
             carried, before = [], eq.pressures
