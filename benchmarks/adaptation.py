@@ -84,7 +84,7 @@ def run(variant: Variant, seed: int, dynamics: str, adaptation: str) -> list[dic
     controller = TipController(
         load_robot(robot), limits_of(description, robot), slew_of(description, robot),
         period=PERIOD, control=ControlSettings(adaptation=adaptation, tracker_noise=variant.noise),
-        safety=description.safety, vibrates=dynamics == "full",
+        safety=description.safety, vibrates=dynamics == "full", slow_first_motion=False,
     )  # fmt: skip
     controller.check()
     found = []

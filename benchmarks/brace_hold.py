@@ -160,7 +160,7 @@ class Loop:
         self.controller = TipController(
             robot, limits_of(description, believed), slew_of(description, believed),
             period=self.period, control=description.control, safety=description.safety,
-            scene=task.scene,
+            scene=task.scene, slow_first_motion=False,
         )  # fmt: skip
         self.controller.check()
         self.command, self.told, self.most = np.zeros(6), [], 0.0

@@ -161,6 +161,7 @@ def stiffopt_controller(rig: Rig, robot: RobotDescription, dynamics: str) -> Con
     return TipController(
         load_robot(robot), rig.supply.limits, rig.slew, period=PERIOD,
         control=rig.settings.control, safety=rig.settings.safety, vibrates=dynamics == "full",
+        slow_first_motion=False,
     )  # fmt: skip
 
 

@@ -16,8 +16,8 @@ The second is what the loop causes of it: the distance from that way and from th
 fault alone takes the tip, with the commands frozen from its beginning. They differ where a chamber
 bursts or leaks, or something pushes the arm; all that follows from commands after the beginning of
 the fault counts, also before the fault is visible. A push or a payload must not be detected as a
-fault. Below each row on the way, both distances of each run, and what was told. With `--recorded`,
-first motions are fast, as after a commissioning (before the faults of the set-up began). With
+fault. Below each row on the way, both distances of each run, and what was told. With `--in-use`,
+motions are fast from the beginning, as of an arm that has moved since it was armed. With
 `--commission`, `stiffopt commission --quick` looks for the faults of the set-up instead: its first
 finding, whether it permits arming, and how far the tip moved from rest.
 """
@@ -406,12 +406,12 @@ class Outcome:
 
 
 def run_row(
-    case: Case, row: Row, dynamics: str, *, recorded: bool = False, frozen: bool = False
+    case: Case, row: Row, dynamics: str, *, in_use: bool = False, frozen: bool = False
 ) -> Outcome:
     """Run one row on one arm.
 
-    `recorded`: the controller knows of a record of commissioning; `frozen`: without the loop from
-    the beginning of the fault.
+    `in_use`: no channel is slow at first; `frozen`: without the loop from the beginning of the
+    fault.
     """
     plant = case.description.plant.model_copy(update={"faults": True})
     tracker = case.description.tracker.model_copy(update={"noise": row.noise})
@@ -422,7 +422,7 @@ def run_row(
     controller = TipController(
         load_robot(case.believed), rig.supply.limits, rig.slew, period=PERIOD,
         control=rig.settings.control, safety=rig.settings.safety, vibrates=dynamics == "full",
-        commissioned=recorded,
+        slow_first_motion=not in_use,
     )  # fmt: skip
     run = LoopRun(rig, controller, case.point)
     try:
@@ -522,23 +522,23 @@ def _commissioned(cases: list[Case], rows: list[Row]) -> list[list[str]]:
     return lines
 
 
-def _looped(cases: list[Case], rows: list[Row], dynamics: str, recorded: bool) -> list[list[str]]:
+def _looped(cases: list[Case], rows: list[Row], dynamics: str, in_use: bool) -> list[list[str]]:
     """Lines of the table of the control loop."""
     lines = []
-    usual = [run_row(case, ROWS[-1], dynamics, recorded=recorded).tips for case in cases]
+    usual = [run_row(case, ROWS[-1], dynamics, in_use=in_use).tips for case in cases]
     for row in rows:
-        found = [run_row(case, row, dynamics, recorded=recorded) for case in cases]
+        found = [run_row(case, row, dynamics, in_use=in_use) for case in cases]
         ways = usual
         if row.usual is not None:
             alone = replace(ROWS[-1], begin=row.usual)
-            ways = [run_row(case, alone, dynamics, recorded=recorded).tips for case in cases]
+            ways = [run_row(case, alone, dynamics, in_use=in_use).tips for case in cases]
         noticed = [outcome for outcome in found if outcome.kind]
         kinds = Counter(outcome.kind for outcome in noticed)
         ends = Counter(outcome.end for outcome in found)
         off = [
             (
                 _farthest(outcome.tips, way),
-                _farthest(outcome.tips, _with_fault(case, row, dynamics, way, recorded)),
+                _farthest(outcome.tips, _with_fault(case, row, dynamics, way, in_use)),
             )
             for case, way, outcome in zip(cases, ways, found, strict=True)
             if len(outcome.tips)
@@ -559,11 +559,11 @@ def _looped(cases: list[Case], rows: list[Row], dynamics: str, recorded: bool) -
     return lines
 
 
-def _with_fault(case: Case, row: Row, dynamics: str, way: Array, recorded: bool) -> Array:
+def _with_fault(case: Case, row: Row, dynamics: str, way: Array, in_use: bool) -> Array:
     """Return a way (T, 3) and the places to which a fault alone brings the tip."""
     if row.at_once:  # nothing is commanded yet
         return way
-    alone = run_row(case, row, dynamics, recorded=recorded, frozen=True)
+    alone = run_row(case, row, dynamics, in_use=in_use, frozen=True)
     return np.concatenate([way, alone.tips])
 
 
@@ -580,7 +580,7 @@ def main() -> None:
     parser.add_argument("--dynamics", choices=DYNAMICS, nargs="+", default=list(DYNAMICS))
     parser.add_argument("--rows", nargs="+", help="only rows whose name has one of these words")
     parser.add_argument("--commission", action="store_true", help="look for faults of the set-up")
-    parser.add_argument("--recorded", action="store_true", help="with a record of commissioning")
+    parser.add_argument("--in-use", action="store_true", help="fast from the beginning")
     parser.add_argument("--tip-speed", type=float, help="`control.tip_speed` of the rig, in m/s")
     arguments = parser.parse_args()
     seeds = range(arguments.seed, arguments.seed + arguments.cases)
@@ -594,7 +594,7 @@ def main() -> None:
         return
     head = ["what", "noticed", "as", "told, s", "off its way, mm", "by the loop, mm", "ends"]
     for dynamics in arguments.dynamics:
-        lines = _looped(cases, rows, dynamics, arguments.recorded)
+        lines = _looped(cases, rows, dynamics, arguments.in_use)
         print(f"\n### plant: {dynamics}\n", *table(head, lines), sep="\n")
 
 

@@ -94,7 +94,8 @@ def controller_of(
             robot = with_measured_steps(robot, record)
         return TipController(
             load_robot(robot), rig.supply.limits, rig.slew, period=PERIOD, control=control,
-            safety=rig.settings.safety, vibrates=dynamics == DYNAMICS, tuning=tuning,
+            safety=rig.settings.safety, vibrates=dynamics == DYNAMICS, slow_first_motion=False,
+            tuning=tuning,
         )  # fmt: skip
 
     return make

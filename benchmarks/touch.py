@@ -110,7 +110,7 @@ class Arm:
         self.controller = TipController(
             load_robot(robot), limits_of(description, robot), slew_of(description, robot),
             period=PERIOD, control=description.control, safety=description.safety,
-            vibrates=dynamics == "full",
+            vibrates=dynamics == "full", slow_first_motion=False,
         )  # fmt: skip
         self.controller.check()
         self._command = np.zeros(robot.n_pressures)

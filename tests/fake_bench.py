@@ -9,7 +9,8 @@ from threading import Lock
 import numpy as np
 from numpy.typing import ArrayLike
 
-from stiffopt.lab.bench import Array, TrackerFrame
+from stiffopt.arrays import Array
+from stiffopt.lab.bench import TrackerFrame
 
 FRAME_RATE = 40.0  # Hz
 

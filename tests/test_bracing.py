@@ -587,16 +587,22 @@ def moved_tip(approach: BraceApproach, push: Any, slides: Any, error: Any) -> tu
     return tip.pose[:3, 3] + off[:3], lie.quaternion_from_rotation(turn @ R)
 
 
-@pytest.mark.parametrize(("way", "has_turn"), [(0, True), (1, True), (1, False)])
-def test_slides_are_known_apart_from_creep_and_pushes(approach, way, has_turn):
+@pytest.mark.parametrize(
+    ("way", "has_turn", "share"), [(0, True, 0), (1, True, 0), (1, False, 0), (1, True, 0.03)]
+)
+def test_slides_are_known_apart_from_creep_and_pushes(approach, way, has_turn, share):
     """A push that grows and one that jumps, creep of 0.1 mm per e-fold, and then a slide.
 
-    The position alone does not show slides across this arm.
+    It may also creep as if all pressures grew by a share per e-fold. The position alone does not
+    show slides across this arm.
     """
     friction = Friction(approach.hold, approach.pressures[-1])
     usual, rng, dt = 0.05**2 * np.eye(3), np.random.default_rng(way), 0.025
     sliding = SlideEstimator(approach, friction, usual, SlidingTuning())
     error, creep = rng.normal(0, np.repeat([2e-3, 2e-2], 3)), np.repeat([1e-4, 1e-3], 3)
+    tip, p = approach.tips[-1], approach.pressures[-1]
+    by_pressures = lie.rotate_blocks(tip.pose[:3, :3]) @ tip.jacobian
+    creep += share * (by_pressures + friction.tip @ approach.hold.sticking.per_pressure) @ p
     wrong, sure, ways = [], [], rng.normal(size=(2, 3))
     for k in range(1, 2001):
         time = k * dt
@@ -605,7 +611,7 @@ def test_slides_are_known_apart_from_creep_and_pushes(approach, way, has_turn):
         noise = rng.normal(0, np.repeat([5e-5, 1e-3], 3))
         off = error + creep * np.log(1 + time / 3) + noise
         seen, quaternion = moved_tip(approach, push, slide, off)
-        sliding.take(dt, time, seen, quaternion if has_turn else None, approach.pressures[-1])
+        sliding.take(dt, time, seen, quaternion if has_turn else None, p)
         wrong.append(np.linalg.norm(sliding.slides[0] - slide))
         sure.append(sliding.deviations()[0])
     assert max(wrong[400:]) < 2e-4

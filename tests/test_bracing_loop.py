@@ -68,7 +68,7 @@ class Loop:
         self.controller = TipController(
             ROBOT, limits_of(description, ROBOT.description),
             slew_of(description, ROBOT.description), period=PERIOD, control=description.control,
-            safety=description.safety, vibrates=False, scene=scene,
+            safety=description.safety, vibrates=False, scene=scene, slow_first_motion=False,
         )  # fmt: skip
         self.controller.check()
         self.command = np.zeros(6)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from stiffopt import lie
+from stiffopt.identify.calibration import _with_the_same_mass
 from stiffopt.identify.past import Past, Start
 from stiffopt.identify.problem import Begin, CalibrationProblem, Noise, Sample, TrackedPoint
 from stiffopt.identify.recording import Recording, Track
@@ -184,12 +186,13 @@ def test_sides_of_the_first_log_act_on_the_next() -> None:
 # -- what is predicted ----------------------------------------------------------------------
 
 
-def test_prediction_is_that_of_the_robot_behind_a_tracker() -> None:
-    problem = problem_of(CASES["two segments in sequence"])
+@pytest.mark.parametrize("name", ["two segments in sequence", "hanging"])
+def test_prediction_is_that_of_the_robot_behind_a_tracker(name: str) -> None:
+    problem = problem_of(CASES[name])
     x = somewhere(problem)
     coordinates = x * problem.scale
     found = problem.predict(x)
-    robot = problem.robot(x)
+    robot = _with_the_same_mass(problem.robot(x), problem.description)
     base, sensors, zeros, _ = problem.unknowns.slices()
     poses = Manipulator(robot).tip_pose(found.effective)
     assert found.poses[0] == pytest.approx(poses, abs=2e-6)  # the robot's values are rounded
@@ -204,6 +207,30 @@ def test_prediction_is_that_of_the_robot_behind_a_tracker() -> None:
         measured = sample.recording.tracks[0].position[sample.rows]
         assert found.read[0].position[begin:end] == pytest.approx(place, abs=1e-12)
         assert found.errors[0][begin:end] == pytest.approx(measured - place, abs=1e-12, nan_ok=True)
+
+
+def test_the_weight_keeps_its_direction_in_the_trackers_frame() -> None:
+    """Gravity in the file turns with the base; without gravity, the file has none afterwards."""
+    problem = problem_of(CASES["hanging"])
+    x = somewhere(problem)
+    base = problem.unknowns.slices()[0]
+    turn = lie.exp((x * problem.scale)[base])[:3, :3]
+    assert not np.allclose(turn[:, 2], [0, 0, 1], atol=0.01)
+    assert turn @ problem.robot(x).gravity == pytest.approx([0, 0, 9.81], abs=1e-5)
+    assert problem.robot(np.zeros(problem.size)).gravity == problem.description.gravity
+    # a tracker that may be tilted or, with an inclined arm, turned about its axis in any way
+    other, across = copy(problem), (1.4, 0.0, 9.71)
+    for gravity, known, turns in (
+        (across, {}, True),
+        (across, {"base_turn": np.pi}, False),
+        ((0.0, 0.0, 9.81), {"base_turn": np.pi}, True),
+        ((0.0, 0.0, 9.81), {"base_tilt": 0.3}, False),
+    ):
+        update = {"gravity": gravity, "tolerances": Tolerances(**known)}
+        other.description = problem.description.model_copy(update=update)
+        assert (other.robot(x).gravity != gravity) is turns
+    free = problem_of(CASES["one segment"])
+    assert free.robot(somewhere(free)).gravity == (0.0, 0.0, 0.0)
 
 
 def test_effective_pressures_are_those_of_the_robots_history() -> None:

@@ -7,6 +7,7 @@ what the controller reaches is measured by the benchmark.
 from __future__ import annotations
 
 import re
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -82,7 +83,7 @@ class Bench:
         self.controller = TipController(
             so.load_robot(robot), self.limits, self.slew, period=period,
             control=control or ControlSettings(), safety=self.description.safety,
-            vibrates=dynamics == "full",
+            vibrates=dynamics == "full", slow_first_motion=False,
         )  # fmt: skip
         self.controller.check()
         self.rig.open()
@@ -419,6 +420,24 @@ def test_touch_and_creep_get_tip_and_pressures_of_the_same_time():
         take(time, away, pressures, *others)
 
     arm.touch.take = taken
+    bench.run(0.4)
+    assert np.linalg.norm(np.diff(ways, axis=0), axis=1).max() > 1.5e-3
+    assert max(errors) < 2e-4
+
+
+def test_the_first_motion_gets_tip_and_pressures_of_the_same_time():
+    bench = moving(rested=2.0, moved=0.1, dynamics="quasi-static")
+    arm, ways, errors = bench.controller._arm, [], []
+
+    def taken(modelled, seen, parts):
+        motions = arm.modelled.pose[:3, :3] @ arm.modelled.jacobian[:3]
+        pressures = (parts * motions).sum(axis=0) / (motions**2).sum(axis=0)
+        ways.append(modelled)
+        errors.append(np.linalg.norm(arm.at_waypoint(pressures).pose[:3, 3] - modelled))
+
+    bench.controller._first_motion = SimpleNamespace(
+        is_over=False, take=taken, slew_share=np.inf, largest_correction=lambda on_path: np.inf
+    )
     bench.run(0.4)
     assert np.linalg.norm(np.diff(ways, axis=0), axis=1).max() > 1.5e-3
     assert max(errors) < 2e-4

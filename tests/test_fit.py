@@ -493,6 +493,23 @@ def test_a_hanging_arm_from_a_small_log() -> None:
     assert found.learnt > 0.7
 
 
+def test_a_tilted_base_turns_the_weight_of_the_arm() -> None:
+    """The vertical is known in the tracker's frame, so the file's gravity turns with the tilt."""
+    upright = {"gravity": (2.0, 0.0, -9.6), "tip_mass": 0.02}
+    robot = ONE.model_copy(update={**upright, "tolerances": Tolerances(base_tilt=0.1)})
+    base = np.asarray(lie.exp(np.array([1e-3, 0.0, 0.0, 0.06, -0.04, 0.0])))
+    weight = base[:3, :3].T @ robot.gravity
+    true = robot.model_copy(update={"gravity": tuple(weight.tolist())})
+    time, pressures = course(3, 12.0, 6, rate=2.0)
+    log = made_log(true, time, pressures, noise=1e-4, base=base, turns=True)
+    result = calibrate(robot, [("a", log)], settings=settings("static", rows=60))
+    assert result.robot.recordings is not None
+    found = result.robot.recordings.registration.tracker_in_base.inverse()
+    assert found[:3, 2] == pytest.approx(base[:3, 2], abs=8e-3)
+    assert found[:3, :3] @ result.robot.gravity == pytest.approx(robot.gravity, abs=1e-5)
+    assert result.calibrated[0].errors.mean < 0.4e-3
+
+
 def stiffness_table(robot: RobotDescription, sigma: float = 0.02) -> StiffnessTable:
     """Stiffnesses of a robot, each with a relative error."""
     random = np.random.default_rng(7)

@@ -105,7 +105,7 @@ def test_it_is_the_robot_that_is_built_anew(name: str, law: str) -> None:
         size = np.abs(poses.per_pressure).max()
         assert poses.per_pressure == pytest.approx(robot.tip_jacobian(p), abs=1e-7 * size)
         for measure in MEASURES.values():
-            k, _, _ = arm.stiffnesses(p, coordinates, measure)
+            k, *_ = arm.stiffnesses(p, coordinates, measure)
             assert k == pytest.approx(stiffness_of(robot, p, measure), rel=1e-8)
 
 
@@ -150,7 +150,7 @@ def test_poses_by_differences(name: str, at: float | None) -> None:
 def test_stiffnesses_by_differences(name: str, measure: str) -> None:
     arm, p, wanted = arm_of(name), some_pressures(3, 3), MEASURES[measure]
     zero = np.zeros(len(KEYS))
-    _, per_pressure, per_coordinate = arm.stiffnesses(p, zero, wanted)
+    _, per_pressure, per_coordinate, _ = arm.stiffnesses(p, zero, wanted)
     by_coordinate = derivative(lambda c: arm.stiffnesses(p, c * UNITS, wanted)[0], zero, 1e-3)
     by_pressure = derivative(
         lambda change: arm.stiffnesses(p + 1e5 * change, zero, wanted)[0], np.zeros(6), 1e-3

@@ -501,7 +501,7 @@ def test_the_simulated_arm_presses_as_hard_as_it_is_told(dynamics: str) -> None:
     controller = TipController(
         load_robot(robot), limits_of(description, robot), slew_of(description, robot),
         period=0.01, control=description.control, safety=description.safety,
-        vibrates=dynamics == "full",
+        vibrates=dynamics == "full", slow_first_motion=False,
     )  # fmt: skip
     controller.check()
     command, forces, kinds = np.zeros(robot.n_pressures), [], set()

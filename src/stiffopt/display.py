@@ -47,18 +47,11 @@ _EXAMPLE = "'mm, bar, N/mm'"
 
 @dataclass(frozen=True)
 class DisplayUnit:
-    """A unit in which numbers are displayed.
+    """A unit in which numbers are displayed."""
 
-    Attributes
-    ----------
-    name : its readable name: ``mm``, ``N mm/rad``.
-    per_si : its number in one SI unit.
-    more_decimals : additional decimals of numbers, compared to the default unit, for the same
-        resolution.
-    """
-
-    name: str
-    per_si: float = 1.0
+    name: str  # its readable name: ``mm``, ``N mm/rad``
+    per_si: float = 1.0  # its number in one SI unit
+    # additional decimals of numbers, compared to the default unit, for the same resolution
     more_decimals: int = 0
 
     def of(self, value: Any) -> Any:
@@ -72,9 +65,7 @@ class DisplayUnit:
     def number(self, value: float, form: str = ".4g") -> str:
         """Return an SI number in this unit as text.
 
-        Parameters
-        ----------
-        form : its format; decimals, such as ``.3f``, are those in the default unit.
+        `form`: its format; decimals, such as ``.3f``, are those in the default unit.
         """
         if form.endswith("f"):
             form = f".{max(0, int(form[1:-1]) + self.more_decimals)}f"
@@ -99,10 +90,8 @@ PLAIN = DisplayUnit("")
 class DisplayUnits:
     """The units in which answers are displayed, one for each dimension.
 
-    Attributes
-    ----------
-    length, pressure, force, stiffness, rotational_stiffness, angle : by default mm, bar, N, N/m, N
-        m/rad and degrees; `stiffness` is the translational one.
+    `length`, `pressure`, `force`, `stiffness`, `rotational_stiffness`, `angle`: by default mm, bar,
+    N, N/m, N m/rad and degrees; `stiffness` is the translational one.
     """
 
     length: DisplayUnit
@@ -116,10 +105,8 @@ class DisplayUnits:
     def named(cls, text: str = "") -> DisplayUnits:
         """Return the units in a text such as ``mm, bar, N/mm``, and the default ones for the rest.
 
-        Raises
-        ------
-        InputError
-            If a unit is unknown or measures something else, or two measure the same.
+        Raises `InputError` if a unit is unknown or measures something else, or two measure the
+        same.
         """
         return _named(text)
 
@@ -182,15 +169,9 @@ _chosen: DisplayUnits | None = None
 def choose_units(text: str | None) -> None:
     """Display everything in the units of a text such as ``mm, bar, N/mm``, from now on.
 
-    Parameters
-    ----------
-    text : dimensions that are not in it keep their default units. None: the units in the
-        environment variable ``STIFFOPT_UNITS``.
-
-    Raises
-    ------
-    InputError
-        If a unit is unknown or measures something else, or two measure the same.
+    `text`: dimensions that are not in it keep their default units. None: the units in the
+    environment variable ``STIFFOPT_UNITS``. Raises `InputError` if a unit is unknown or measures
+    something else, or two measure the same.
     """
     global _chosen
     _chosen = None if text is None else DisplayUnits.named(text)
@@ -199,10 +180,7 @@ def choose_units(text: str | None) -> None:
 def display_units() -> DisplayUnits:
     """Return the units in which to display values.
 
-    Raises
-    ------
-    InputError
-        If the environment variable ``STIFFOPT_UNITS`` does not name units.
+    Raises `InputError` if the environment variable ``STIFFOPT_UNITS`` does not name units.
     """
     if _chosen is not None:
         return _chosen

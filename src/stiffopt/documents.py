@@ -49,10 +49,7 @@ def read_document(path: str | os.PathLike[str]) -> Document:
 def document_of(text: str, name: str) -> Document:
     """Parse a YAML text as plain data with line numbers, as `read_document` does for a file.
 
-    Parameters
-    ----------
-    text : content of the file.
-    name : name of the file in errors.
+    `text`: content of the file. `name`: name of the file in errors.
     """
     return _Composer(name, text).document()
 
@@ -84,10 +81,7 @@ def write_file(
 def write_whole(path: str | os.PathLike[str], content: bytes) -> None:
     """Write a file that appears complete or not at all, by moving a temporary file to its place.
 
-    Raises
-    ------
-    FileError
-        It cannot be written; an existing file is unchanged.
+    Raises `FileError`: it cannot be written; an existing file is unchanged.
     """
     target = Path(path)
     try:

@@ -147,10 +147,8 @@ class MissingExtraError(StiffoptError):
 def require_package(package: str, extra: str, module: str | None = None) -> None:
     """Raise `MissingExtraError` if an optional package is not installed; it is not imported.
 
-    Parameters
-    ----------
-    package, extra : as for `MissingExtraError`.
-    module : name under which it is imported, if that differs from `package`.
+    `package`, `extra`: as for `MissingExtraError`. `module`: name under which it is imported, if
+    that differs from `package`.
     """
     try:
         found = find_spec(module or package) is not None

@@ -41,16 +41,14 @@ SourceFile = Annotated[Path | None, Field(exclude=True), BeforeValidator(_not_in
 def read_file(path: str | os.PathLike[str], kind: str, model: type[ModelT]) -> ModelT:
     """Read a file and validate it.
 
+    Raises `FileError` with the line and the key of the first mistake; all others are listed after
+    it.
+
     Parameters
     ----------
     path : the file.
     kind : its required kind, for example ``"robot"`` for files with ``format: stiffopt-robot/1``.
     model : its schema.
-
-    Raises
-    ------
-    FileError
-        With the line and the key of the first mistake; all others are listed after it.
     """
     return from_document(read_document(path), kind, model)
 

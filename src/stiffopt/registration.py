@@ -9,14 +9,12 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stiffopt import lie
+from stiffopt.arrays import Array
 from stiffopt.directions import Quaternion
 from stiffopt.schema import Schema, Vector
 from stiffopt.units import Length
-
-Array = NDArray[np.float64]
 
 
 @lru_cache(maxsize=64)
@@ -101,10 +99,8 @@ class Registration(Schema):
     def tip_in_base(self, position: Array, quaternion: Array | None) -> tuple[Array, Array | None]:
         """Return position (3,) and quaternion (4,) or None of the tip in the base frame.
 
-        Parameters
-        ----------
-        position, quaternion : of the sensor in the tracker's frame, in m and w first; without a
-            quaternion the sensor's position is used for the tip.
+        `position`, `quaternion`: of the sensor in the tracker's frame, in m and w first; without a
+        quaternion the sensor's position is used for the tip.
         """
         T = self.tracker_in_base.transform()
         if quaternion is None:

@@ -63,10 +63,7 @@ class Schema(BaseModel):
 class JsonSchemaOfFile:
     """Annotation of a type whose values have another form in a file.
 
-    Parameters
-    ----------
-    change :
-        Function from the JSON Schema of the type to that of its form in the file.
+    `change`: function from the JSON Schema of the type to that of its form in the file.
     """
 
     change: Callable[[dict[str, Any]], dict[str, Any]]

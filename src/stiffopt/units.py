@@ -147,21 +147,14 @@ _COMMON = {
 def parse_quantity(text: str, unit: str, what: str = "quantity") -> float:
     """Return the value in SI of a number with a unit.
 
+    Returns the float nearest to the exact value: ``"90 mm"`` gives ``0.09``. Raises `InputError`:
+    not a string, no unit, a unit of another quantity, or not a finite number.
+
     Parameters
     ----------
     text : for example ``"90 mm"``.
     unit : the SI unit of the result, for example ``"m"``; ``""`` for a ratio such as ``"1 %"``.
     what : name of the quantity, for the error message, for example ``"length"``.
-
-    Returns
-    -------
-    float
-        The float nearest to the exact value: ``"90 mm"`` gives ``0.09``.
-
-    Raises
-    ------
-    InputError
-        Not a string, no unit, a unit of another quantity, or not a finite number.
     """
     expected = f"expected {_article(what)} such as '{_EXAMPLES.get(unit, f'1 {unit}'.strip())}'"
     if isinstance(text, Real) and not isinstance(text, bool):

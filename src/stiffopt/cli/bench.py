@@ -18,14 +18,6 @@ if TYPE_CHECKING:
 
 bench_app = command_group(help="Measure methods on recordings of real arms.")
 
-BENCH_HELP = """\
-Fit methods to some recordings of real arms, and measure how well they predict others.
-
-DIR is the folder of the recordings, which do not come with stiffopt. A file (--splits) states which
-of them are for training and which for testing. Rows are thinned, and stiffopt fits one model
-quickly unless --full is given.
-"""
-
 _EPILOG = """\
 \b
 Examples:
@@ -45,10 +37,7 @@ def _bench() -> None:
 
 
 @bench_app.command(
-    "recordings",
-    short_help="Fit methods to recordings, and compare them.",
-    help=BENCH_HELP,
-    epilog=_EPILOG,
+    "recordings", short_help="Fit methods to recordings, and compare them.", epilog=_EPILOG
 )
 @with_exit_code
 def recordings(
@@ -73,7 +62,12 @@ def recordings(
     as_json: Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """Run the bench."""
+    """Fit methods to some recordings of real arms, and measure how well they predict others.
+
+    DIR is the folder of the recordings, which do not come with stiffopt. A file (--splits) states
+    which of them are for training and which for testing. Rows are thinned, and stiffopt fits one
+    model quickly unless --full is given.
+    """
     from stiffopt.cli.console import show, write_json
     from stiffopt.cli.exits import interruptible_work
     from stiffopt.identify.bench import METHODS, load_bench, run_bench

@@ -7,22 +7,6 @@ import typer
 from stiffopt.cli.exits import with_exit_code
 from stiffopt.cli.options import Json, Quiet, Units, option
 
-CALIBRATE_HELP = """\
-Fit a robot file to recordings of the arm, and report how well each number in it is known.
-
-The fit begins at the values of the robot file; its tolerances are their expected errors. Several
-models are fitted. The one that predicts held-back data best is taken; of equally good ones, the
-simplest. Each LOG is a recording, log v1 (.csv) or MCAP (.mcap); give them in the order in which
-they were made.
-"""
-
-VALIDATE_HELP = """\
-Measure how well a robot file predicts recordings that it was not fitted to.
-
-The model is run along the commanded pressures of each LOG, a recording, log v1 (.csv) or MCAP
-(.mcap), and compared with the measured tip. Nothing of the robot is fitted.
-"""
-
 _CODES = """
 \b
 Exit codes:
@@ -178,7 +162,13 @@ def calibrate(
     units: Units = None,
     quiet: Quiet = False,
 ) -> int:
-    """Fit a robot file."""
+    """Fit a robot file to recordings of the arm, and report how well each number in it is known.
+
+    The fit begins at the values of the robot file; its tolerances are their expected errors.
+    Several models are fitted. The one that predicts held-back data best is taken; of equally good
+    ones, the simplest. Each LOG is a recording, log v1 (.csv) or MCAP (.mcap); give them in the
+    order in which they were made.
+    """
     from stiffopt.cli import calibrate_run  # here, so that --help waits for no numerics
 
     recordings = calibrate_run.RecordingOptions(
@@ -207,7 +197,11 @@ def validate(
     units: Units = None,
     quiet: Quiet = False,
 ) -> None:
-    """Compare a robot file with recordings."""
+    """Measure how well a robot file predicts recordings that it was not fitted to.
+
+    The model is run along the commanded pressures of each LOG, a recording, log v1 (.csv) or MCAP
+    (.mcap), and compared with the measured tip. Nothing of the robot is fitted.
+    """
     from stiffopt.cli import calibrate_run
 
     recordings = calibrate_run.RecordingOptions(

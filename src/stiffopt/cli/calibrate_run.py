@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
 import stiffopt
+from stiffopt.arrays import Array
 from stiffopt.cli import quantities
 from stiffopt.cli.console import report_error, show, write_json, write_line
 from stiffopt.cli.exits import (
@@ -165,9 +165,9 @@ def run_calibrate(
 class _RigLimits:
     """The pressures that a rig accepts."""
 
-    low: NDArray[np.float64]
-    high: NDArray[np.float64]
-    allows: Callable[[NDArray[np.float64]], bool]
+    low: Array
+    high: Array
+    allows: Callable[[Array], bool]
 
     @property
     def channels(self) -> int:

@@ -7,15 +7,6 @@ import typer
 from stiffopt.cli.exits import with_exit_code
 from stiffopt.cli.options import Quiet
 
-CHECK_HELP = """\
-Check files without using them: all mistakes at once, one per line, with file, line and key.
-
-Robot, task, path, scene and rig files are checked together with the files that they name; logs
-(.csv, .mcap) are read. It is a mistake if a rig with a tracker could never be armed by 'stiffopt
-run'. Beside one rig file, tasks for its robot are compared with its scene too. Nothing is solved
-and no device is touched.
-"""
-
 CHECK_EPILOG = """\
 \b
 Examples:
@@ -38,7 +29,13 @@ def check(
     ] = False,
     quiet: Quiet = False,
 ) -> int:
-    """Check files."""
+    """Check files without using them: all mistakes at once, one per line, with file, line and key.
+
+    Robot, task, path, scene and rig files are checked together with the files that they name; logs
+    (.csv, .mcap) are read. It is a mistake if a rig with a tracker could never be armed by
+    'stiffopt run'. Beside one rig file, tasks for its robot are compared with its scene too.
+    Nothing is solved and no device is touched.
+    """
     from stiffopt.cli.check_run import check_files  # here, so that --help waits for no numerics
 
     return check_files(files, as_json=as_json, quiet=quiet)

@@ -7,15 +7,6 @@ import typer
 from stiffopt.cli.exits import with_exit_code
 from stiffopt.cli.options import Json, Quiet, RigArgument, Units, option
 
-COMMISSION_HELP = """\
-Check by small steps from rest whether a rig matches its files: the first hour with a rig.
-
-One channel after another moves the tip by a few mm. This shows which chambers each channel fills,
-where the tracker's frame and its sensor are, the gain, delay and leaks of the channels, errors of
-the gauges, and the swing of the tip. The report says what is wrong and what to change. The command
-also writes a record that 'stiffopt run' checks before it arms, and draws a page. RIG is a rig file.
-"""
-
 COMMISSION_EPILOG = """\
 \b
 Examples:
@@ -61,7 +52,14 @@ def commission(
     units: Units = None,
     quiet: Quiet = False,
 ) -> int:
-    """Commission a rig."""
+    """Check by small steps from rest whether a rig matches its files: the first hour with a rig.
+
+    One channel after another moves the tip by a few mm. This shows which chambers each channel
+    fills, where the tracker's frame and its sensor are, the gain, delay and leaks of the channels,
+    errors of the gauges, and the swing of the tip. The report says what is wrong and what to
+    change. The command also writes a record that 'stiffopt run' checks before it arms, and draws a
+    page. RIG is a rig file.
+    """
     from stiffopt.cli import commission_run  # here, so that --help waits for no numerics
 
     return commission_run.run(

@@ -18,14 +18,6 @@ Exit codes:
   130  interrupted (Ctrl-C); the arm is vented, what was recorded is kept
 """
 
-KINEMATICS_HELP = """\
-Ramp each channel in turn up and down and record the tip, as in Experiment 1 of the paper.
-
-Each channel has a tooth for each pressure; the whole sequence is repeated. Then come poses in which
-all channels are pressurised together, for a calibration. Recordings (log v1 as CSV, and MCAP), a
-report and figures against the model go into a folder. RIG is a rig file.
-"""
-
 _KINEMATICS_EPILOG = f"""\
 \b
 Examples:
@@ -34,14 +26,6 @@ Examples:
   stiffopt experiment kinematics rig/sim.yaml --poses 48 --max '1.2 bar'
   stiffopt experiment kinematics rig/sim.yaml --resume first
 {_CODES}"""
-
-STIFFNESS_HELP = """\
-Push the tip with a probe at several pressures, as in Experiment 2 of the paper.
-
-At each pressure of one channel the probe displaces the tip along each direction in steps, there and
-back; the slope of the force is the stiffness. Recordings, all points, a table of stiffness with its
-uncertainty, a report and a figure against the model go into a folder. RIG is a rig file.
-"""
 
 _STIFFNESS_EPILOG = f"""\
 \b
@@ -73,7 +57,6 @@ NoPlot = Annotated[bool, typer.Option("--no-plot", help="Draw no figure.")]
 @experiment_app.command(
     "kinematics",
     short_help="Press each channel in turn, and record the tip.",
-    help=KINEMATICS_HELP,
     epilog=_KINEMATICS_EPILOG,
 )
 @with_exit_code
@@ -116,7 +99,12 @@ def kinematics(
     units: Units = None,
     quiet: Quiet = False,
 ) -> None:
-    """Do Experiment 1."""
+    """Ramp each channel in turn up and down and record the tip, as in Experiment 1 of the paper.
+
+    Each channel has a tooth for each pressure; the whole sequence is repeated. Then come poses in
+    which all channels are pressurised together, for a calibration. Recordings (log v1 as CSV, and
+    MCAP), a report and figures against the model go into a folder. RIG is a rig file.
+    """
     from stiffopt.cli import experiment_run  # here, so that --help waits for no numerics
 
     given = {
@@ -132,7 +120,6 @@ def kinematics(
 @experiment_app.command(
     "stiffness",
     short_help="Push the tip with a probe at several pressures.",
-    help=STIFFNESS_HELP,
     epilog=_STIFFNESS_EPILOG,
 )
 @with_exit_code
@@ -175,7 +162,13 @@ def stiffness(
     units: Units = None,
     quiet: Quiet = False,
 ) -> None:
-    """Do Experiment 2."""
+    """Push the tip with a probe at several pressures, as in Experiment 2 of the paper.
+
+    At each pressure of one channel the probe displaces the tip along each direction in steps, there
+    and back; the slope of the force is the stiffness. Recordings, all points, a table of stiffness
+    with its uncertainty, a report and a figure against the model go into a folder. RIG is a rig
+    file.
+    """
     from stiffopt.cli import experiment_run
 
     given = {
@@ -188,14 +181,6 @@ def stiffness(
     )
 
 
-POSES_HELP = """\
-Go through the pressures of a file on a rig, hold each, and record the tip.
-
-FILE (format: stiffopt-experiment/1) has the keys rig, a rig file relative to it; hold, a time; and
-pressures, one value per channel for each pose. The arm moves gently, through the safety gate, and
-begins and ends at zero pressure. The recording (log v1 as CSV, and MCAP) serves for a calibration.
-"""
-
 _POSES_EPILOG = f"""\
 \b
 Examples:
@@ -205,10 +190,7 @@ Examples:
 
 
 @experiment_app.command(
-    "poses",
-    short_help="Hold the pressures of a file, and record the tip.",
-    help=POSES_HELP,
-    epilog=_POSES_EPILOG,
+    "poses", short_help="Hold the pressures of a file, and record the tip.", epilog=_POSES_EPILOG
 )
 @with_exit_code
 def poses(
@@ -216,7 +198,13 @@ def poses(
     out: Out = None,
     quiet: Quiet = False,
 ) -> None:
-    """Go through poses."""
+    """Go through the pressures of a file on a rig, hold each, and record the tip.
+
+    FILE (format: stiffopt-experiment/1) has the keys rig, a rig file relative to it; hold, a time;
+    and pressures, one value per channel for each pose. The arm moves gently, through the safety
+    gate, and begins and ends at zero pressure. The recording (log v1 as CSV, and MCAP) serves for a
+    calibration.
+    """
     from stiffopt.cli import experiment_run
 
     experiment_run.run_poses_file(file, out=out, quiet=quiet)

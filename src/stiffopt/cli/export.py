@@ -17,14 +17,6 @@ Exit codes:
   130  interrupted (Ctrl-C)
 """
 
-MJCF_HELP = """\
-Write an arm under pressure as a model for MuJoCo.
-
-The model is a rod of hinges and slides with the shape and the stiffness of the sections at the
-given pressures, and the masses, the tip's mass and the gravity of the robot file. MuJoCo computes
-the sag itself. The site 'tip' has the pose of the tip. For other pressures, export again. ROBOT is
-the name of a built-in robot or a robot file.
-"""
 _MJCF_EPILOG = f"""\
 \b
 Examples:
@@ -32,13 +24,6 @@ Examples:
   python -m mujoco.viewer --mjcf=arm.xml
 {_CODES}"""
 
-MESH_HELP = """\
-Write the surface of an arm under pressure as a mesh, in metres.
-
-It is the body that stiffopt keeps clear of obstacles: a tube of the outer radius with a hemisphere
-at the tip, sagging under the gravity and the tip's mass of the robot file. ROBOT is the name of a
-built-in robot or a robot file.
-"""
 _MESH_EPILOG = f"""\
 \b
 Examples:
@@ -57,7 +42,7 @@ def _arm(robot: str, pressures: str) -> tuple[Any, Any]:
     return load_robot(robot), quantities.listed("--pressures", pressures, "Pa", "pressure")
 
 
-@export_app.command("mjcf", help=MJCF_HELP, epilog=_MJCF_EPILOG)
+@export_app.command("mjcf", epilog=_MJCF_EPILOG)
 @with_exit_code
 def export_mjcf(
     robot: RobotArgument,
@@ -70,7 +55,13 @@ def export_mjcf(
     ] = None,
     quiet: Quiet = False,
 ) -> None:
-    """Write an arm under pressure as a model for MuJoCo."""
+    """Write an arm under pressure as a model for MuJoCo.
+
+    The model is a rod of hinges and slides with the shape and the stiffness of the sections at the
+    given pressures, and the masses, the tip's mass and the gravity of the robot file. MuJoCo
+    computes the sag itself. The site 'tip' has the pose of the tip. For other pressures, export
+    again. ROBOT is the name of a built-in robot or a robot file.
+    """
     if out is not None:
         check_ending(out, (".xml",))
         check_writable(out)
@@ -87,7 +78,7 @@ def export_mjcf(
         write_whole(out, text.encode())
 
 
-@export_app.command("mesh", help=MESH_HELP, epilog=_MESH_EPILOG)
+@export_app.command("mesh", epilog=_MESH_EPILOG)
 @with_exit_code
 def export_mesh(
     robot: RobotArgument,
@@ -95,7 +86,12 @@ def export_mesh(
     out: Annotated[str, option("FILE.stl", "Or .obj or .ply.")],
     quiet: Quiet = False,
 ) -> None:
-    """Write the surface of an arm under pressure as a mesh."""
+    """Write the surface of an arm under pressure as a mesh, in metres.
+
+    It is the body that stiffopt keeps clear of obstacles: a tube of the outer radius with a
+    hemisphere at the tip, sagging under the gravity and the tip's mass of the robot file. ROBOT is
+    the name of a built-in robot or a robot file.
+    """
     from stiffopt.errors import require_package
     from stiffopt.export.mesh import MESH_ENDINGS, save_mesh
 

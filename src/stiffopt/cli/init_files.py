@@ -49,17 +49,14 @@ def write_first_file(
 ) -> None:
     """Write a minimal file of a kind, and print what to do next.
 
+    Raises `InputError`: an answer is invalid; nothing was written.
+
     Parameters
     ----------
     kind : robot, task, path, scene or rig.
     path : of the file, which must not exist unless `force`.
     given : answers by the names of the options; None for those to ask for.
     ask : function that asks a question; None to take the defaults.
-
-    Raises
-    ------
-    InputError
-        An answer is invalid; nothing was written.
     """
     check_ending(path, (".yaml", ".yml"))
     check_writable(path)
@@ -448,9 +445,7 @@ _TEXTS: dict[str, Callable[[_Answers, str], tuple[str, list[str]]]] = {
 def _middle(robot: Any, aside: float = 0.0) -> str:
     """Return a position in the middle of the workspace, in mm, shifted along y.
 
-    Parameters
-    ----------
-    aside : the shift, as a share of the arm's length.
+    `aside`: the shift, as a share of the arm's length.
     """
     lower, upper = (np.array(limit) for limit in (robot.pressure_min, robot.pressure_max))
     share = np.resize([0.5, 0.25, 0.15], robot.n_pressures)

@@ -23,18 +23,6 @@ if TYPE_CHECKING:
 
 _TICK = 0.2  # s, period of checks whether the simulation still runs
 
-LAB_HELP = """\
-Start a simulated arm in real time behind the protocols of a rig file's devices.
-
-The devices of RIG are emulated on this machine: a Modbus server, an NDI Aurora on a
-pseudo-terminal, an OpenIGTLink server, an NI-DAQ gRPC server, a Zaber stage on TCP, the firmware of
-an open regulator in a simulated microcontroller. The printed rig file has the real drivers for
-them. Simulated devices of RIG are replaced by real ones (--supply, --tracker). Ends with Ctrl-C.
-
-While it runs it accepts commands, one per line: 'fault DEVICE NAME [CHANNEL]' (if the rig file
-enables faults), 'mount X Y Z' (turns the probe's rail), 'status', 'quit'.
-"""
-
 LAB_EPILOG = """\
 \b
 Examples:
@@ -73,7 +61,17 @@ def lab(
         bool, typer.Option("--quiet", "-q", help="Print no notes; the rig file and errors only.")
     ] = False,
 ) -> int:
-    """Run the virtual lab."""
+    """Start a simulated arm in real time behind the protocols of a rig file's devices.
+
+    The devices of RIG are emulated on this machine: a Modbus server, an NDI Aurora on a
+    pseudo-terminal, an OpenIGTLink server, an NI-DAQ gRPC server, a Zaber stage on TCP, the
+    firmware of an open regulator in a simulated microcontroller. The printed rig file has the real
+    drivers for them. Simulated devices of RIG are replaced by real ones (--supply, --tracker). Ends
+    with Ctrl-C.
+
+    While it runs it accepts commands, one per line: 'fault DEVICE NAME [CHANNEL]' (if the rig file
+    enables faults), 'mount X Y Z' (turns the probe's rail), 'status', 'quit'.
+    """
     # here, so that --help waits for no numerics; the lab needs numba
     from stiffopt.files import file_text, save_file
     from stiffopt.lab.virtual import VirtualLab

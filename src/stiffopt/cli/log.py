@@ -21,16 +21,6 @@ Exit codes:
   130  interrupted (Ctrl-C)
 """
 
-EXPORT_HELP = """\
-Write a recording as CSV (log v1), for 'stiffopt calibrate', or as a bag of ROS 2.
-
-In CSV each row is a frame of the tracker, at the time of its capture, with the commanded and
-measured pressures of that moment; nothing is estimated. Rows without a tip are from times in which
-the tracker gave no credible reading. A bag (--bag, rosbag2 with MCAP) has the topics that 'stiffopt
-ros' publishes, and needs the extra 'ros'. RUN is a recording (.mcap), complete or truncated; for
-CSV it may also be that of an experiment.
-"""
-
 _EXPORT_EPILOG = f"""\
 \b
 Examples:
@@ -38,15 +28,6 @@ Examples:
   stiffopt log export run.mcap --csv --out run.csv
   stiffopt log export run.mcap --bag --out run_bag
 {_CODES}"""
-
-PLOT_HELP = """\
-Draw a run on a page: target and tip, error, pressures, stiffness, states, alarms and events.
-
-Errors on the way to a target and errors at it are reported separately: the tip is at the target
-once it has come within 1 mm and 1 deg.
-
-RUN is a recording (.mcap) of 'stiffopt run', complete or truncated.
-"""
 
 _PLOT_EPILOG = f"""\
 \b
@@ -60,10 +41,7 @@ Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")
 
 
 @log_app.command(
-    "export",
-    short_help="Write a recording as CSV or as a bag of ROS 2.",
-    help=EXPORT_HELP,
-    epilog=_EXPORT_EPILOG,
+    "export", short_help="Write a recording as CSV or as a bag of ROS 2.", epilog=_EXPORT_EPILOG
 )
 @with_exit_code
 def export(
@@ -78,7 +56,14 @@ def export(
     ] = None,
     quiet: Quiet = False,
 ) -> None:
-    """Write a recording as log v1, or as a bag."""
+    """Write a recording as CSV (log v1), for 'stiffopt calibrate', or as a bag of ROS 2.
+
+    In CSV each row is a frame of the tracker, at the time of its capture, with the commanded and
+    measured pressures of that moment; nothing is estimated. Rows without a tip are from times in
+    which the tracker gave no credible reading. A bag (--bag, rosbag2 with MCAP) has the topics that
+    'stiffopt ros' publishes, and needs the extra 'ros'. RUN is a recording (.mcap), complete or
+    truncated; for CSV it may also be that of an experiment.
+    """
     if csv and bag:
         raise typer.BadParameter("give --csv or --bag, not both")
     if bag:
@@ -126,7 +111,7 @@ def _export_bag(run: str, out: str | None, *, quiet: bool) -> None:
     write_line(f"{path}: {count} messages, {recorded.time[-1] - recorded.time[0]:.1f} s")
 
 
-@log_app.command("plot", short_help="Draw a run on a page.", help=PLOT_HELP, epilog=_PLOT_EPILOG)
+@log_app.command("plot", short_help="Draw a run on a page.", epilog=_PLOT_EPILOG)
 @with_exit_code
 def plot(
     run: Recorded,
@@ -139,7 +124,13 @@ def plot(
     units: Units = None,
     quiet: Quiet = False,
 ) -> None:
-    """Draw a recording."""
+    """Draw a run on a page: target and tip, error, pressures, stiffness, states, alarms and events.
+
+    Errors on the way to a target and errors at it are reported separately: the tip is at the target
+    once it has come within 1 mm and 1 deg.
+
+    RUN is a recording (.mcap) of 'stiffopt run', complete or truncated.
+    """
     with interruptible() as check:
         from stiffopt.daemon.run_log import read_run
         from stiffopt.plots import save_figure

@@ -38,15 +38,6 @@ Exit codes:
   130  interrupted (Ctrl-C{or_late})
 """
 
-HELP = """\
-Sample the pressures of an arm and map its workspace.
-
-Space is divided into cells. For each cell that the tip reaches, the map contains the number of
-samples and, for each direction, their largest and smallest stiffness with the pressures.
-ROBOT is the name of a built-in robot or a robot file. With --out, the map is kept as a Zarr group;
-the same command continues a run that was interrupted, or ended by --timeout.
-"""
-
 _EPILOG = f"""\
 \b
 Examples:
@@ -56,9 +47,7 @@ Examples:
 {_CODES.format(or_late=", or --timeout is over")}"""
 
 
-@map_app.command(
-    "workspace", short_help="Where the tip can be, and how stiff.", help=HELP, epilog=_EPILOG
-)
+@map_app.command("workspace", short_help="Where the tip can be, and how stiff.", epilog=_EPILOG)
 @with_exit_code
 def workspace(
     robot: RobotArgument,
@@ -101,7 +90,13 @@ def workspace(
     units: Units = None,
     quiet: Quiet = False,
 ) -> int:
-    """Make a map of a workspace, or continue one; print and draw it."""
+    """Sample the pressures of an arm and map its workspace.
+
+    Space is divided into cells. For each cell that the tip reaches, the map contains the number of
+    samples and, for each direction, their largest and smallest stiffness with the pressures. ROBOT
+    is the name of a built-in robot or a robot file. With --out, the map is kept as a Zarr group;
+    the same command continues a run that was interrupted, or ended by --timeout.
+    """
     check_picture(plot)
     from stiffopt.cli import map_report, quantities  # here, so that --help waits for no numerics
     from stiffopt.model.manipulator import load_robot
@@ -160,15 +155,6 @@ def workspace(
     return 0
 
 
-CONTACT_HELP = """\
-Lean an arm on the objects of a scene that allow contact, and report its stiffness.
-
-Prints the contacts with their forces, the stiffness of the tip free and braced, with contacts that
-slide and that stick, and the pushes that lose the first contact. The equilibrium is the one reached
-from rest as all pressures grow in proportion. ROBOT is the name of a built-in robot or a robot
-file.
-"""
-
 _CONTACT_EPILOG = f"""\
 \b
 Examples:
@@ -178,10 +164,7 @@ Examples:
 
 
 @map_app.command(
-    "contact",
-    short_help="How an arm rests against objects of a scene.",
-    help=CONTACT_HELP,
-    epilog=_CONTACT_EPILOG,
+    "contact", short_help="How an arm rests against objects of a scene.", epilog=_CONTACT_EPILOG
 )
 @with_exit_code
 def contact(
@@ -195,7 +178,13 @@ def contact(
     units: Units = None,
     quiet: Quiet = False,
 ) -> None:
-    """Find the equilibrium of an arm that leans on objects; print and draw it."""
+    """Lean an arm on the objects of a scene that allow contact, and report its stiffness.
+
+    Prints the contacts with their forces, the stiffness of the tip free and braced, with contacts
+    that slide and that stick, and the pushes that lose the first contact. The equilibrium is the
+    one reached from rest as all pressures grow in proportion. ROBOT is the name of a built-in robot
+    or a robot file.
+    """
     check_picture(plot)
     from stiffopt.cli import contact_report, quantities
     from stiffopt.model.manipulator import load_robot
@@ -217,14 +206,6 @@ def contact(
         show(contact_report.summary(arm, found))
 
 
-ARM_HELP = """\
-Map the stiffness along an arm, from near its base to its tip, as in figure 6 of the paper.
-
-Groups of channels are pressurised to several pressures: by default the first pair of each segment,
-then the first two. With --over 1,2 the map is that of the tip's stiffness over the pressures of
-these two channels. ROBOT is the name of a built-in robot or a robot file.
-"""
-
 _ARM_EPILOG = f"""\
 \b
 Examples:
@@ -234,9 +215,7 @@ Examples:
 {_CODES.format(or_late="")}"""
 
 
-@map_app.command(
-    "arm", short_help="How stiff an arm is along its length.", help=ARM_HELP, epilog=_ARM_EPILOG
-)
+@map_app.command("arm", short_help="How stiff an arm is along its length.", epilog=_ARM_EPILOG)
 @with_exit_code
 def arm(
     robot: RobotArgument,
@@ -271,7 +250,12 @@ def arm(
     units: Units = None,
     quiet: Quiet = False,
 ) -> None:
-    """Map the stiffness along an arm, or of its tip over two pressures; print, write, draw it."""
+    """Map the stiffness along an arm, from near its base to its tip, as in figure 6 of the paper.
+
+    Groups of channels are pressurised to several pressures: by default the first pair of each
+    segment, then the first two. With --over 1,2 the map is that of the tip's stiffness over the
+    pressures of these two channels. ROBOT is the name of a built-in robot or a robot file.
+    """
     check_picture(plot)
     if csv is not None:
         check_ending(csv, (".csv",))

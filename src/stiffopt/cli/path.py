@@ -7,13 +7,6 @@ import typer
 from stiffopt.cli.exits import with_exit_code
 from stiffopt.cli.options import Quiet, Units, ViewOption, option
 
-PATH_HELP = """\
-Find the pressures with which the tip follows a path, as stiff as possible along it.
-
-Each PATH is a path file. The pressures change no faster than their rates allow, and the whole body
-keeps clear of the scene. An invalid file is reported on stderr, and the others are still solved.
-"""
-
 PATH_EPILOG = """\
 \b
 Examples:
@@ -74,7 +67,12 @@ def path(
     units: Units = None,
     quiet: Quiet = False,
 ) -> int:
-    """Solve path files."""
+    """Find the pressures with which the tip follows a path, as stiff as possible along it.
+
+    Each PATH is a path file. The pressures change no faster than their rates allow, and the whole
+    body keeps clear of the scene. An invalid file is reported on stderr, and the others are still
+    solved.
+    """
     from stiffopt.cli.path_run import PathBatch  # here, so that --help waits for no numerics
 
     return PathBatch(as_json, tuple(out or ()), plot, seed, quiet, view).run(paths)

@@ -7,11 +7,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from stiffopt.arrays import Array
 from stiffopt.cli.console import plain_data
 from stiffopt.paths.motion_file import LEANING, POSITION_ERROR
 from stiffopt.paths.path import Path
 from stiffopt.paths.rates import step_limits
-from stiffopt.paths.solution import PathSolution, Vector
+from stiffopt.paths.solution import PathSolution
 from stiffopt.units import unit_suffix
 
 
@@ -23,7 +24,7 @@ class SolvedPath(NamedTuple):
     solution: PathSolution
 
 
-def rate_margins(solution: PathSolution) -> Vector | None:
+def rate_margins(solution: PathSolution) -> Array | None:
     """Return the unused share of the rate of the fastest channel on the way to each point.
 
     Returns
@@ -125,7 +126,7 @@ def solution_quantities(solution: PathSolution) -> dict[str, Any]:
     return {key: value for key, value in record.items() if value not in (None, [], {})}
 
 
-def _quantities(values: Vector | None, unit: str, per_si: float = 1.0) -> list[str | None] | None:
+def _quantities(values: Array | None, unit: str, per_si: float = 1.0) -> list[str | None] | None:
     """Return quantities as text in a unit; an SI unit has `per_si` of it. None: no number."""
     if values is None:
         return None

@@ -5,14 +5,6 @@ from typing import Annotated
 from stiffopt.cli.exits import with_exit_code
 from stiffopt.cli.options import Json, Quiet, Units, ViewOption, option
 
-PLAN_HELP = """\
-Find a motion from one configuration to another with the whole body clear of a scene all the way.
-
-The ends are pressures, proximal segment first, or task files; a task as a goal stands for any
-configuration that solves it. The motion reaches one of several goals. The pressures change no
-faster than the rates allow. A way that is not straight needs the extra 'plan'.
-"""
-
 PLAN_EPILOG = """\
 \b
 Examples:
@@ -69,7 +61,13 @@ def plan(
     units: Units = None,
     quiet: Quiet = False,
 ) -> int:
-    """Plan a motion."""
+    """Find a motion from one configuration to another with the whole body clear of a scene all
+    the way.
+
+    The ends are pressures, proximal segment first, or task files; a task as a goal stands for any
+    configuration that solves it. The motion reaches one of several goals. The pressures change no
+    faster than the rates allow. A way that is not straight needs the extra 'plan'.
+    """  # noqa: D205
     from stiffopt.cli.plan_run import PlanCommand  # here, so that --help waits for no numerics
 
     command = PlanCommand(robot, start, tuple(goals), scene, clearance, slew, seed, timeout)

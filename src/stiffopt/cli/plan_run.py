@@ -8,8 +8,8 @@ from pathlib import Path as FilePath
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.cli import exits
 from stiffopt.cli.console import report_error, show, write_json
 from stiffopt.cli.exits import interruptible_work
@@ -112,7 +112,7 @@ class PlanCommand:
             raise InputError("--robot: the tasks name different robots; name the one that is meant")
         return load_robot(descriptions[0])
 
-    def _slew(self, robot: Manipulator) -> NDArray[np.float64] | None:
+    def _slew(self, robot: Manipulator) -> Array | None:
         if self.slew is None:
             return None
         if "," in self.slew:
@@ -185,9 +185,7 @@ class PlanCommand:
             yield "search", Text(solution.confidence)
 
 
-def _of_channels(
-    robot: Manipulator, option: str, text: str, unit: str, what: str
-) -> NDArray[np.float64]:
+def _of_channels(robot: Manipulator, option: str, text: str, unit: str, what: str) -> Array:
     """Return the values of an option, one for each channel."""
     values = np.array(listed(option, text, unit, what))
     if len(values) != robot.n_pressures:
@@ -198,7 +196,7 @@ def _of_channels(
     return values
 
 
-def _pressures(robot: Manipulator, option: str, text: str) -> NDArray[np.float64]:
+def _pressures(robot: Manipulator, option: str, text: str) -> Array:
     """Return the pressures of an option, within the limits of the robot."""
     return checked_pressures(option, robot, _of_channels(robot, option, text, "Pa", "pressure"))
 

@@ -71,10 +71,7 @@ def listed(option: str, text: str, unit: str, what: str) -> tuple[float, ...]:
 def view(text: str | None) -> tuple[float, ...] | None:
     """Return the elevation and the azimuth in rad of ``--view '20 deg, -60 deg'``, if it is given.
 
-    Raises
-    ------
-    InputError
-        The text is not two angles, or the elevation exceeds 90 deg.
+    Raises `InputError`: the text is not two angles, or the elevation exceeds 90 deg.
     """
     if text is None:
         return None

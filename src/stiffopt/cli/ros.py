@@ -5,15 +5,6 @@ from typing import Annotated
 from stiffopt.cli.exits import with_exit_code
 from stiffopt.cli.options import RigArgument, option
 
-ROS_HELP = """\
-Put the arm of RIG on a ROS 2 graph, as a node. ROS need not be installed. Needs the extra 'ros'.
-
-Publishes pressures, tip, target, force, frames, markers and diagnostics. If no daemon of RIG runs,
-one is started, and ended with this command. Unless the rig file permits more ('ros: {commands:
-true, interface: eth0}'), the node is reached from this machine alone and accepts only the command
-to vent, because DDS has no token.
-"""
-
 ROS_EPILOG = """\
 \b
 Examples:
@@ -47,7 +38,14 @@ def ros(
         str | None, option("FILE", "The daemon's token, if not where the rig file says.")
     ] = None,
 ) -> int:
-    """Run the node."""
+    """Put the arm of RIG on a ROS 2 graph, as a node. ROS need not be installed. Needs the extra
+    'ros'.
+
+    Publishes pressures, tip, target, force, frames, markers and diagnostics. If no daemon of RIG
+    runs, one is started, and ended with this command. Unless the rig file permits more ('ros:
+    {commands: true, interface: eth0}'), the node is reached from this machine alone and accepts
+    only the command to vent, because DDS has no token.
+    """  # noqa: D205
     from stiffopt.cli.ros_run import run  # here, so that --help waits for no numerics
 
     given = {"distro": distro, "domain": domain, "namespace": namespace, "node": node}

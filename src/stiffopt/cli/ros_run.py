@@ -122,10 +122,8 @@ class _Daemon:
     def find(self, over: threading.Event) -> tuple[str, str]:
         """Return the URL and the token of the daemon; start one if none runs.
 
-        Raises
-        ------
-        StiffoptError
-            It belongs to another arm, does not start, or its token cannot be read.
+        Raises `StiffoptError`: it belongs to another arm, does not start, or its token cannot be
+        read.
         """
         service = self._description.service
         url = daemon_url(service)

@@ -8,18 +8,6 @@ import typer
 from stiffopt.cli.exits import with_exit_code
 from stiffopt.cli.options import Units, option
 
-RUN_HELP = """\
-Hold an arm at its task in closed loop: run the daemon of a rig in the foreground.
-
-It connects to the devices of RIG, vents, checks everything and waits, vented, for a client
-('stiffopt.Client', or HTTP). With --arm it arms by itself and pursues TASK, or plays a motion: the
-arm goes to its first point, follows it and stays at its end. A separate process, the guard, owns
-the supply, and vents when the daemon is killed, stopped or hangs.
-
-On a terminal it shows a live status; otherwise it prints one JSON object per line. Ctrl-C, SIGTERM
-or closing the terminal lower the pressures and vent; a second Ctrl-C vents at once.
-"""
-
 RUN_EPILOG = """\
 \b
 Examples:
@@ -74,7 +62,16 @@ def run(
         bool, typer.Option("--json-lines", help="Print JSON lines on a terminal too.")
     ] = False,
 ) -> int:
-    """Run the daemon."""
+    """Hold an arm at its task in closed loop: run the daemon of a rig in the foreground.
+
+    It connects to the devices of RIG, vents, checks everything and waits, vented, for a client
+    ('stiffopt.Client', or HTTP). With --arm it arms by itself and pursues TASK, or plays a motion:
+    the arm goes to its first point, follows it and stays at its end. A separate process, the guard,
+    owns the supply, and vents when the daemon is killed, stopped or hangs.
+
+    On a terminal it shows a live status; otherwise it prints one JSON object per line. Ctrl-C,
+    SIGTERM or closing the terminal lower the pressures and vent; a second Ctrl-C vents at once.
+    """
     if plain and json_lines:
         raise typer.BadParameter("give --plain or --json-lines, not both")
     from stiffopt.cli.run_daemon import run  # here, so that --help waits for no numerics

@@ -65,13 +65,8 @@ class Lines:
     Writing never blocks and never fails: a line is dropped if its reader is slow or gone, since the
     arm is more important.
 
-    Parameters
-    ----------
-    as_json :
-        Whether lines are JSON objects with ``time`` (of day, UTC), ``level``, ``kind`` and
-        ``text``, rather than text for people.
-    now :
-        Returns the time on the rig's clock, in s.
+    `as_json`: whether lines are JSON objects with ``time`` (of day, UTC), ``level``, ``kind`` and
+    ``text``, rather than text for people. `now`: returns the time on the rig's clock, in s.
     """
 
     period = 0.05  # s, between two updates

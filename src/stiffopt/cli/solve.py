@@ -7,14 +7,6 @@ import typer
 from stiffopt.cli.exits import with_exit_code
 from stiffopt.cli.options import Quiet, Units, Version, ViewOption, option
 
-HELP = """\
-Find the chamber pressures that reach a tip pose and meet its stiffness goal best.
-
-Each TASK is a task file, or a folder whose task files (*.yaml) are solved in the order of their
-names. Subfolders are ignored; files in a folder whose format is another, such as robot files, are
-skipped with a note. An invalid file is reported on stderr, and the others are still solved.
-"""
-
 EXAMPLES = """\
 \b
 Examples:
@@ -96,7 +88,12 @@ def solve(
     quiet: Quiet = False,
     version: Version = False,
 ) -> int:
-    """Solve task files."""
+    """Find the chamber pressures that reach a tip pose and meet its stiffness goal best.
+
+    Each TASK is a task file, or a folder whose task files (*.yaml) are solved in the order of their
+    names. Subfolders are ignored; files in a folder whose format is another, such as robot files,
+    are skipped with a note. An invalid file is reported on stderr, and the others are still solved.
+    """
     from stiffopt.cli.solve_run import TaskBatch  # here, so that --help waits for no numerics
 
     return TaskBatch(as_json, out, plot, pareto, seed, quiet, view, suggest_post, post_force).run(

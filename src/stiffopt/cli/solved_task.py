@@ -17,33 +17,24 @@ from stiffopt.optimise.task import load_task
 
 @dataclass(frozen=True)
 class SolvedTask:
-    """A task file with its solution, found or not.
+    """A task file with its solution, found or not."""
 
-    Attributes
-    ----------
-    file : the task file as the user named it.
-    robot : the arm under the task's load.
-    solution : of the task.
-    plain : the task's stiffnesses at the plain solution, which ignores stiffness; empty if unknown.
-    uncertainty : of the tip; None for a robot without calibration, and for an arm that leans.
-    intervals : 95 % intervals of the task's stiffnesses, None for those that are not along a
-        direction; empty for a robot without calibration.
-    front : the trade-off between tip error and stiffness; None without --pareto or if it failed.
-    no_front : why --pareto failed; else empty.
-    supports : where a post or a wall would help; None without --suggest-post or if it failed.
-    no_supports : why --suggest-post failed; else empty.
-    """
-
-    file: str
-    robot: Manipulator
-    solution: PressureSolution
+    file: str  # the task file as the user named it
+    robot: Manipulator  # the arm under the task's load
+    solution: PressureSolution  # of the task
+    # the task's stiffnesses at the plain solution, which ignores stiffness; empty if unknown
     plain: tuple[float, ...] = ()
+    # of the tip; None for a robot without calibration, and for an arm that leans
     uncertainty: TipUncertainty | None = None
+    # 95 % intervals of the task's stiffnesses, None for those that are not along a direction; empty
+    # for a robot without calibration
     intervals: tuple[tuple[float, float] | None, ...] = ()
+    # the trade-off between tip error and stiffness; None without --pareto or if it failed
     front: tuple[PressureSolution, ...] | None = None
-    no_front: str = ""
+    no_front: str = ""  # why --pareto failed; else empty
+    # where a post or a wall would help; None without --suggest-post or if it failed
     supports: SupportMap | None = None
-    no_supports: str = ""
+    no_supports: str = ""  # why --suggest-post failed; else empty
 
 
 def solve_file(
@@ -53,10 +44,7 @@ def solve_file(
 
     With `post_force`, the largest contact force in N, also suggest where to lean on a new object.
 
-    Raises
-    ------
-    InputError
-        The task file or its robot is invalid; the message names the file.
+    Raises `InputError`: the task file or its robot is invalid; the message names the file.
     """
     task = load_task(file)
     try:

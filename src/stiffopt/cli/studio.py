@@ -1,21 +1,20 @@
-"""Options and help of the command `stiffopt studio`."""
+"""The command `stiffopt studio`: open the page, and wait until a signal ends it."""
 
+import os
+import threading
+import webbrowser
+from contextlib import ExitStack, closing
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from stiffopt.cli.exits import with_exit_code
+from stiffopt.cli.console import report_note, warnings_as_notes, write_line
+from stiffopt.cli.exits import ENDING_SIGNALS, handled, with_exit_code
 from stiffopt.cli.options import Units, option
+from stiffopt.errors import require_package
 
-STUDIO_HELP = """\
-Open a page in the browser that shows a robot and a task, to be changed by hand.
-
-FILE is a built-in robot, or a robot, task or scene file: drag the target and the arm follows, with
-its pressures and its stiffness. A path file, a motion (.csv of 'stiffopt plan') and a recording
-(.csv, .mcap) are played. A rig file shows the arm of its running daemon; with the daemon's token
-the page can also command it. The page is for this machine, and only the printed address opens it.
-Needs the extra 'studio'.
-"""
+_TOKEN = "STIFFOPT_TOKEN"  # `stiffopt.Client` reads it too
 
 STUDIO_EPILOG = """\
 \b
@@ -52,15 +51,32 @@ def studio(
         bool, typer.Option("--no-browser", help="Only print the address.")
     ] = False,
 ) -> None:
-    """Open the studio."""
-    from stiffopt.cli.studio_run import run  # here, so that --help waits for no numerics
+    """Open a page in the browser that shows a robot and a task, to be changed by hand.
 
-    run(
-        file,
-        robot=robot,
-        map_file=map_file,
-        token_file=token_file,
-        host=host,
-        port=port,
-        browser=not no_browser,
-    )
+    FILE is a built-in robot, or a robot, task or scene file: drag the target and the arm follows,
+    with its pressures and its stiffness. A path file, a motion (.csv of 'stiffopt plan') and a
+    recording (.csv, .mcap) are played. A rig file shows the arm of its running daemon; with the
+    daemon's token the page can also command it. The page is for this machine, and only the printed
+    address opens it. Needs the extra 'studio'.
+    """
+    require_package("viser", "studio")
+    from stiffopt.daemon.address import is_loopback  # here, so that --help waits for no numerics
+    from stiffopt.studio.opening import open_studio
+
+    token = Path(token_file) if token_file else os.environ.get(_TOKEN) or None
+    over = threading.Event()
+    end = dict.fromkeys(ENDING_SIGNALS, lambda number, frame: over.set())
+    with warnings_as_notes(quiet=False), ExitStack() as stack:
+        shown = open_studio(file, robot=robot, map_file=map_file, token=token, host=host, port=port)
+        stack.enter_context(closing(shown))
+        stack.enter_context(handled(end))  # only now: what takes long before is ended by Ctrl-C
+        write_line(f"the studio is open at {shown.url}")
+        write_line("Ctrl-C ends it")
+        if not is_loopback(host):
+            report_note(
+                f"other machines can reach {host}, unencrypted: who can listen in on the network "
+                "can open the page too"
+            )
+        if not no_browser:
+            webbrowser.open(shown.url)
+        over.wait()

@@ -9,15 +9,6 @@ from stiffopt.cli.exits import BAD_INPUT, FAULT, SOLVED, with_exit_code
 from stiffopt.cli.options import RigArgument
 from stiffopt.errors import DeviceError, StiffoptError
 
-VENT_HELP = """\
-Let all pressure out of the arm of RIG at once.
-
-If a program commands it, that program's guard vents and accepts no command until somebody arms
-again. If none does, the supply is vented directly. A guard that does not answer is ended first.
-This needs no network, no token and no control interface. It works for the user who started the
-program, and for root.
-"""
-
 VENT_EPILOG = """\
 \b
 Examples:
@@ -39,7 +30,13 @@ def vent(
         bool, typer.Option("--json", help="Print one JSON object: vented, text.")
     ] = False,
 ) -> int:
-    """Vent a rig."""
+    """Let all pressure out of the arm of RIG at once.
+
+    If a program commands it, that program's guard vents and accepts no command until somebody arms
+    again. If none does, the supply is vented directly. A guard that does not answer is ended first.
+    This needs no network, no token and no control interface. It works for the user who started the
+    program, and for root.
+    """
     from stiffopt.safety.vent import vent_rig  # here, so that --help waits for no numerics
 
     vented, code = False, SOLVED

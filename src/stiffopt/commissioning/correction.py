@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stiffopt import lie
 from stiffopt.commissioning.explanation import MOVE, SENSOR, SENSOR_TURN, TURN, SetupExplanation
@@ -21,8 +20,6 @@ from stiffopt.registration import Placement, Registration
 from stiffopt.rig.config import load_rig_description
 from stiffopt.rig.interface import Rig
 from stiffopt.units import format_quantity
-
-Array = NDArray[np.float64]
 
 _INPUTS = ("reading", "input")
 """Keys of a channel in a rig file that name its gauge's input."""
@@ -76,10 +73,8 @@ def write_corrected(
 ) -> None:
     """Write the corrected rig file into the folder of the old one, and check it.
 
-    Raises
-    ------
-    FileError
-        It is in another folder, where its relative paths would be wrong, or it is invalid.
+    Raises `FileError`: it is in another folder, where its relative paths would be wrong, or it is
+    invalid.
     """
     check_place(out, path)
     comment = [

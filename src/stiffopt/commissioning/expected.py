@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.commissioning.settings import BELIEF, PROCEDURE
 from stiffopt.errors import InputError
 from stiffopt.model.actuation import SectionGeometry
@@ -19,7 +19,6 @@ from stiffopt.model.parameters import Parameter
 from stiffopt.model.parametric import ParametricArm
 from stiffopt.rig.interface import PressureLimits
 
-Array = NDArray[np.float64]
 Source = tuple[int, ...]
 """Channels (from 0) whose chambers one line fills: one, none, or two that share it."""
 
@@ -33,36 +32,26 @@ class ExpectedSteps:
     All in the base's axes and in SI. The k uncertain numbers of the arm are, in this order, the
     force on the tip (3), the lengths and the moduli of the segments, and the gains of the channels;
     all but the force as coordinates (see `Parameter`).
-
-    Attributes
-    ----------
-    description : the robot.
-    size : of the steps, in Pa.
-    rest : pose of the tip (4, 4).
-    rest_slope : twist (6, k) of the tip at rest per number, in the base's axes.
-    sources : the channels of each of the N steps; the first has none.
-    shift, turn : displacement and rotation vector (N, 3) of the tip from rest.
-    shift_slope, turn_slope : derivatives (N, 3, k) of these by the numbers.
-    lever : (N, 3, 3), change of the tip's axes; times the sensor's offset on the tip, it is the
-        displacement that this offset adds.
-    tilt_force : lateral force on the tip that bends the arm as far as a tilt of the base by 1 rad.
-    compliance : displacement of the tip per lateral force.
-    believed : prior standard deviations (k,) of the numbers.
     """
 
-    description: RobotDescription
-    size: float
-    rest: Array
-    rest_slope: Array
-    sources: tuple[Source, ...]
+    description: RobotDescription  # the robot
+    size: float  # of the steps, in Pa
+    rest: Array  # pose of the tip (4, 4)
+    rest_slope: Array  # twist (6, k) of the tip at rest per number, in the base's axes
+    sources: tuple[Source, ...]  # the channels of each of the N steps; the first has none
+    # shift, turn: displacement and rotation vector (N, 3) of the tip from rest
     shift: Array
     turn: Array
+    # shift_slope, turn_slope: derivatives (N, 3, k) of these by the numbers
     shift_slope: Array
     turn_slope: Array
+    # (N, 3, 3), change of the tip's axes; times the sensor's offset on the tip, it is the
+    # displacement that this offset adds
     lever: Array
+    # lateral force on the tip that bends the arm as far as a tilt of the base by 1 rad
     tilt_force: float
-    compliance: float
-    believed: Array
+    compliance: float  # displacement of the tip per lateral force
+    believed: Array  # prior standard deviations (k,) of the numbers
 
     @property
     def n(self) -> int:
@@ -82,10 +71,7 @@ class ExpectedSteps:
 def expected_steps(description: RobotDescription, limits: PressureLimits) -> ExpectedSteps:
     """Choose the size of the steps and predict their effect.
 
-    Raises
-    ------
-    InputError
-        The limits leave no pressure for steps.
+    Raises `InputError`: the limits leave no pressure for steps.
     """
     n, segments = description.n_pressures, range(description.n_segments)
     parameters = [

@@ -23,13 +23,12 @@ from functools import cached_property
 from itertools import combinations, permutations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.commissioning.expected import ExpectedSteps, Source, rotation_vectors
 from stiffopt.commissioning.responses import Responses
 from stiffopt.commissioning.settings import BELIEF, LIMITS
 
-Array = NDArray[np.float64]
 Wiring = tuple[Source, ...]
 """For each command line, the channels whose chambers it fills."""
 
@@ -54,40 +53,27 @@ _WIDE = {  # prior standard deviations of a cause, in rad, m, or relative
 
 @dataclass(frozen=True, eq=False)
 class Cause:
-    """One possible large error of the set-up.
+    """One possible large error of the set-up."""
 
-    Attributes
-    ----------
-    name : see `causes_of`.
-    directions : (k, d), in the space of all unknowns; each column is one prior standard deviation.
-    about : index of the segment or channel concerned, from 0; -1 for the whole set-up.
-    prior : logarithm of its prior probability, relative to other causes.
-    """
-
-    name: str
+    name: str  # see `causes_of`
+    # (k, d), in the space of all unknowns; each column is one prior standard deviation
     directions: Array
-    about: int = -1
-    prior: float = 0.0
+    about: int = -1  # index of the segment or channel concerned, from 0; -1 for the whole set-up
+    prior: float = 0.0  # logarithm of its prior probability, relative to other causes
 
 
 @dataclass(frozen=True, eq=False)
 class SetupExplanation:
-    """A hypothesis with its most probable values and its evidence.
+    """A hypothesis with its most probable values and its evidence."""
 
-    Attributes
-    ----------
-    wiring, causes : the hypothesis.
-    evidence : logarithm of its probability, up to a constant that all hypotheses share.
-    values, covariance : of the unknowns, (k,) and (k, k); the first three are a rotation vector.
-    missed : unexplained displacements (n, 3), in m.
-    """
-
+    # wiring, causes: the hypothesis
     wiring: Wiring
     causes: tuple[Cause, ...]
-    evidence: float
+    evidence: float  # logarithm of its probability, up to a constant that all hypotheses share
+    # values, covariance: of the unknowns, (k,) and (k, k); the first three are a rotation vector
     values: Array
     covariance: Array
-    missed: Array
+    missed: Array  # unexplained displacements (n, 3), in m
 
 
 def causes_of(expected: ExpectedSteps) -> list[Cause]:

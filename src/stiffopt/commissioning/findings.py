@@ -6,8 +6,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.commissioning.expected import ExpectedSteps
 from stiffopt.commissioning.explanation import (
     FORCE,
@@ -25,8 +25,6 @@ from stiffopt.commissioning.responses import Responses
 from stiffopt.commissioning.settings import LIMITS
 from stiffopt.rig.interface import Rig
 from stiffopt.rig.settings import ControlSettings
-
-Array = NDArray[np.float64]
 
 _AXES = "xyz"
 _BASE = "tracker.registration.tracker_in_base"
@@ -56,9 +54,7 @@ _WORST = 3.0  # standard deviations from the files' value from which a number do
 class Finding:
     """A finding; see `stiffopt.commissioning.record.RecordedFinding` for the other fields.
 
-    Attributes
-    ----------
-    cause : name of the cause (`Cause`), or ``wiring``, ``gauge``, ``tracker``, ``timing`` ...
+    `cause`: name of the cause (`Cause`), or ``wiring``, ``gauge``, ``tracker``, ``timing`` ...
     """
 
     cause: str

@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.commissioning.expected import ExpectedSteps
 from stiffopt.commissioning.settings import PROCEDURE
 from stiffopt.errors import DeviceError
@@ -20,8 +20,6 @@ from stiffopt.experiments.conductor import Conductor, TickRecord, TrackedFrame
 from stiffopt.experiments.folder import Progress, recorded
 from stiffopt.rig.interface import Rig
 from stiffopt.rig.settings import Safety
-
-Array = NDArray[np.float64]
 
 LOG = "commissioning"
 """Name of the recording, without ending."""
@@ -44,28 +42,21 @@ class ChannelStep:
 
 @dataclass(frozen=True, eq=False)
 class StepReadings:
-    """All measurements during the steps, in SI; times are those of the rig's clock.
+    """All measurements during the steps, in SI; times are those of the rig's clock."""
 
-    Attributes
-    ----------
-    time, position, quaternion, age : of the tracker's frames, (N,), (N, 3), (N, 4), (N,). `age` is
-        the time from capture to arrival. NaN where the tip was not seen.
-    tick, commanded, measured : times (M,), and pressures (M, n).
-    rest : begin and end of the rest before the steps.
-    steps : one for each channel.
-    size : of the steps, in Pa.
-    """
-
+    # time, position, quaternion, age: of the tracker's frames, (N,), (N, 3), (N, 4), (N,). `age` is
+    # the time from capture to arrival. NaN where the tip was not seen
     time: Array
     position: Array
     quaternion: Array | None
     age: Array
+    # tick, commanded, measured: times (M,), and pressures (M, n)
     tick: Array
     commanded: Array
     measured: Array
-    rest: tuple[float, float]
-    steps: tuple[ChannelStep, ...]
-    size: float
+    rest: tuple[float, float]  # begin and end of the rest before the steps
+    steps: tuple[ChannelStep, ...]  # one for each channel
+    size: float  # of the steps, in Pa
 
 
 @dataclass
@@ -139,6 +130,8 @@ def run_steps(
 ) -> StepReadings:
     """Move the channels one after another, and return all measurements.
 
+    Raises `DangerError`: the tip moves as no sound arm can; `DeviceError`: a device fails.
+
     Parameters
     ----------
     rig : open.
@@ -147,13 +140,6 @@ def run_steps(
     rate : rate of the commands, in Hz.
     quick : whether to hold the steps only briefly; slow leaks then go unnoticed.
     progress, check : as in `stiffopt.experiments.poses.run_poses`.
-
-    Raises
-    ------
-    DangerError
-        The tip moves as no sound arm can.
-    DeviceError
-        A device fails.
     """
     conductor = Conductor(rig, rate, check)
     watch = _StepWatch(conductor, Safety() if rig.settings is None else rig.settings.safety)

@@ -197,9 +197,7 @@ def save_record(path: str | os.PathLike[str], record: CommissioningRecord) -> No
 def fingerprints(robot: RobotDescription, rig: Any) -> tuple[str, str]:
     """Return hashes of a rig (its supply, tracker and registration) and of its robot.
 
-    Parameters
-    ----------
-    rig : None for a rig that was not made from a file.
+    `rig`: None for a rig that was not made from a file.
     """
     parts = None if rig is None else [_content(rig.supply), _content(rig.tracker)]
     return _hash(parts), _hash(_content(robot))

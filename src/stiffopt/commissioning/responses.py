@@ -5,63 +5,51 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.commissioning.expected import rotation_vectors
 from stiffopt.commissioning.procedure import ChannelStep, StepReadings
 from stiffopt.commissioning.timing import Delays, Swing, delays_of, fit_swing, settled, tip_delay
-
-Array = NDArray[np.float64]
 
 _BEGIN = 0.25  # s after a step, in which the regulators still follow
 
 
 @dataclass(frozen=True, eq=False)
 class Responses:
-    """Responses to one step of each of n lines, in SI and in the base's axes.
+    """Responses to one step of each of n lines, in SI and in the base's axes."""
 
-    Attributes
-    ----------
-    rest_position, rest_rotation : of the tip at rest (3,), and (3, 3) or None.
-    rest_noise : standard deviation of `rest_position` in each axis.
-    shift, turn : displacement and rotation vector (n, 3) in each step; `turn` is None without
-        orientations.
-    shift_noise, turn_noise : their standard deviations (n,) in each axis due to tracker noise.
-    drift : share (n,) of the displacement that the tip lost during the hold; NaN after short holds.
-    noise, angular_noise : standard deviation of the tracker's samples at rest in each axis.
-    rate, latency, missing : of the tracker: samples per s, median age on arrival in s, share of
-        the samples in which the tip was not seen.
-    gauge_offset, gauge_noise : mean and standard deviation of each gauge at rest (n,), in Pa; NaN
-        for a gauge without readings.
-    gauge : (n, n), rise of gauge j (column) in the step of channel k (row), as a share of the step.
-    gauge_deviation : standard deviation of these.
-    size : of the steps, in Pa.
-    delays : of the regulators, by channel.
-    tip_delay : of the tip behind the gauges, beyond that of the arm's dynamics, in s.
-    swing : of the tip, or None.
-    """
-
+    # rest_position, rest_rotation: of the tip at rest (3,), and (3, 3) or None
     rest_position: Array
     rest_rotation: Array | None
-    rest_noise: float
+    rest_noise: float  # standard deviation of `rest_position` in each axis
+    # shift, turn: displacement and rotation vector (n, 3) in each step; `turn` is None without
+    # orientations
     shift: Array
     turn: Array | None
+    # shift_noise, turn_noise: their standard deviations (n,) in each axis due to tracker noise
     shift_noise: Array
     turn_noise: Array
+    # share (n,) of the displacement that the tip lost during the hold; NaN after short holds
     drift: Array
+    # noise, angular_noise: standard deviation of the tracker's samples at rest in each axis
     noise: float
     angular_noise: float
+    # rate, latency, missing: of the tracker: samples per s, median age on arrival in s, share of
+    # the samples in which the tip was not seen
     rate: float
     latency: float
     missing: float
+    # gauge_offset, gauge_noise: mean and standard deviation of each gauge at rest (n,), in Pa; NaN
+    # for a gauge without readings
     gauge_offset: Array
     gauge_noise: Array
+    # (n, n), rise of gauge j (column) in the step of channel k (row), as a share of the step
     gauge: Array
-    gauge_deviation: float
-    size: float
-    delays: Delays
-    tip_delay: float
-    swing: Swing | None
+    gauge_deviation: float  # standard deviation of these
+    size: float  # of the steps, in Pa
+    delays: Delays  # of the regulators, by channel
+    tip_delay: float  # of the tip behind the gauges, beyond that of the arm's dynamics, in s
+    swing: Swing | None  # of the tip, or None
 
 
 def responses_of(readings: StepReadings) -> Responses:

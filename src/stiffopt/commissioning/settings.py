@@ -9,65 +9,52 @@ import numpy as np
 
 @dataclass(frozen=True)
 class ProcedureTuning:
-    """How the arm is moved.
+    """How the arm is moved."""
 
-    Attributes
-    ----------
-    motion : predicted displacement of the tip by the most effective channel, in m.
-    share : largest step, as a share of a channel's range.
-    first : share of the step that is commanded first, to reveal danger early.
-    rest, first_hold, up, down : duration of the initial rest, of the first part of a step, of a
-        step and of the rest after it, in s.
-    long, long_down : duration of a step and of the rest after it in a full commissioning, which
-        reveals leaks and creep, in s.
-    danger, slack : the arm is vented if the tip moves farther than `danger` times the largest
-        prediction for any channel or pair, plus `slack` in m.
-    restless : largest motion of the vented arm, in m, with which the steps may begin.
-    """
-
-    motion: float = 4e-3
-    share: float = 0.15
-    first: float = 0.35
+    motion: float = 4e-3  # predicted displacement of the tip by the most effective channel, in m
+    share: float = 0.15  # largest step, as a share of a channel's range
+    first: float = 0.35  # share of the step that is commanded first, to reveal danger early
+    # rest, first_hold, up, down: duration of the initial rest, of the first part of a step, of a
+    # step and of the rest after it, in s
     rest: float = 3.0
     first_hold: float = 0.7
     up: float = 3.0
     down: float = 2.6
+    # long, long_down: duration of a step and of the rest after it in a full commissioning, which
+    # reveals leaks and creep, in s
     long: float = 15.0
     long_down: float = 5.0
+    # danger, slack: the arm is vented if the tip moves farther than `danger` times the largest
+    # prediction for any channel or pair, plus `slack` in m
     danger: float = 2.0
     slack: float = 5e-4
-    restless: float = 8e-3
+    restless: float = 8e-3  # largest motion of the vented arm, in m, with which the steps may begin
 
 
 @dataclass(frozen=True)
 class Belief:
-    """Priors of a sound set-up: standard deviations, in SI.
+    """Priors of a sound set-up: standard deviations, in SI."""
 
-    Attributes
-    ----------
-    tilt, turn : of the tracker's frame about the base's x and y, and about its z.
-    move : of the tracker's frame.
-    sensor, sensor_angle : of the sensor on the tip.
-    base_tilt : of the base against gravity; covers a load of the same effect.
-    sag : displacement of the tip at rest due to an unknown load or the arm's own shape.
-    length, modulus, gain : of segments and channels, relative; less after a calibration.
-    model_share, model_floor : remaining model error, as a share of the step's own displacement and
-        of the largest of all steps.
-    rest_position, rest_angle : remaining model error at rest.
-    """
-
+    # tilt, turn: of the tracker's frame about the base's x and y, and about its z
     tilt: float = float(np.radians(0.5))
     turn: float = float(np.radians(1.0))
-    move: float = 1e-3
+    move: float = 1e-3  # of the tracker's frame
+    # sensor, sensor_angle: of the sensor on the tip
     sensor: float = 6e-4
     sensor_angle: float = float(np.radians(0.8))
+    # of the base against gravity; covers a load of the same effect
     base_tilt: float = float(np.radians(0.5))
+    # displacement of the tip at rest due to an unknown load or the arm's own shape
     sag: float = 3e-4
+    # length, modulus, gain: of segments and channels, relative; less after a calibration
     length: float = 0.008
     modulus: float = 0.17
     gain: float = 0.05
+    # model_share, model_floor: remaining model error, as a share of the step's own displacement and
+    # of the largest of all steps
     model_share: float = 0.04
     model_floor: float = 0.015
+    # rest_position, rest_angle: remaining model error at rest
     rest_position: float = 5e-4
     rest_angle: float = float(np.radians(0.4))
 

@@ -6,12 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.commissioning.procedure import StepReadings
 from stiffopt.model.history import lagged
-
-Array = NDArray[np.float64]
 
 _CREEP = 1.5  # s, time constant of creep
 _FREQUENCIES = np.geomspace(0.4, 12.0, 70)  # Hz, initial values of the search, as the next three
@@ -47,10 +45,8 @@ class Swing:
 class Delays:
     """Delays of the regulators by their gauges, (n,) each; NaN without a measurement.
 
-    Attributes
-    ----------
-    dead_time, lag_up, lag_down : in s.
-    rate_up, rate_down : mean rates between a tenth and nine tenths of a step, in Pa/s.
+    `dead_time`, `lag_up`, `lag_down`: in s. `rate_up`, `rate_down`: mean rates between a tenth and
+    nine tenths of a step, in Pa/s.
     """
 
     dead_time: Array
@@ -79,14 +75,8 @@ def _shapes(time: Array, frequency: float, damping: float) -> Array:
 def fit_swing(windows: Sequence[tuple[Array, Array]], noise: float) -> Swing | None:
     """Fit one damped swing to the motions after all steps.
 
-    Parameters
-    ----------
-    windows : times (m,) since a step in s, and positions (m, 3) in m.
-    noise : of a position, in m.
-
-    Returns
-    -------
-    None if no swing stands out from the noise, in neither a long nor a short window.
+    `windows`: times (m,) since a step in s, and positions (m, 3) in m. `noise`: of a position, in
+    m. Returns None if no swing stands out from the noise, in neither a long nor a short window.
     """
     for duration in _SWINGS_FOR:
         used = [(t[t < duration], x[t < duration]) for t, x in windows]
@@ -211,10 +201,7 @@ def tip_delay(readings: StepReadings, shift: Array, swing: Swing | None) -> floa
     The tip's motion is regressed on the measured pressure, its creep and, if the arm swings, the
     response of a damped oscillator to it, all delayed by the same time. NaN without gauges.
 
-    Parameters
-    ----------
-    shift : displacements (n, 3) in the steps, in m.
-    swing : of the tip, or None.
+    `shift`: displacements (n, 3) in the steps, in m. `swing`: of the tip, or None.
     """
     r, total = readings, np.zeros(len(_TIP_DELAYS))
     for step in r.steps:

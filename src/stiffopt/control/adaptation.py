@@ -30,9 +30,9 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.linalg import LinAlgError
-from numpy.typing import NDArray
 
 from stiffopt import lie
+from stiffopt.arrays import Array
 from stiffopt.control.state import AdaptedNumber
 from stiffopt.control.tuning import AdaptationTuning
 from stiffopt.errors import EquilibriumError, StiffoptError
@@ -43,8 +43,6 @@ from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.parameters import Parameter, with_values
 from stiffopt.model.parametric import ParametricArm
 from stiffopt.optimise.tip import TipModel
-
-Array = NDArray[np.float64]
 
 _MASS = "tip_mass"
 _APPLIED = ("material.youngs_modulus", "corrections.gain")
@@ -293,8 +291,8 @@ class Adaptation:
         are larger in an arm that is softer than its file says.
         """
         t, count = self._tuning, len(self._parameters)
-        k, _, slopes = self._arm.stiffnesses(pressures[None], self.estimate[:count], measure)
-        present, _, _ = self._arm.stiffnesses(pressures[None], applied[:count], measure)
+        k, _, slopes, _ = self._arm.stiffnesses(pressures[None], self.estimate[:count], measure)
+        present, *_ = self._arm.stiffnesses(pressures[None], applied[:count], measure)
         slope, pending = slopes[0] / k[0], math.log(present[0] / k[0])
         variance = max(float(slope @ self.covariance[:count, :count] @ slope), 0.0)
         weights = np.abs(slope[self._moduli])

@@ -33,13 +33,13 @@ from typing import Any
 import casadi as ca
 import daqp
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from stiffopt.arrays import Array, Flags
 from stiffopt.control.feedback import TrackingRows
 from stiffopt.control.formula import Formula
 from stiffopt.control.tuning import FeedbackTuning
 
-Array = NDArray[np.float64]
 Symbols = Any  # of CasADi
 
 _BAR = 1e5
@@ -151,7 +151,7 @@ class Allocation:
 
     def solve(
         self, inputs: Sequence[ArrayLike], reference: Array, last: Array
-    ) -> tuple[Array | None, NDArray[np.bool_], float]:
+    ) -> tuple[Array | None, Flags, float]:
         """Solve the program for inputs of the feedback law, r and the last pressures (n,), in Pa.
 
         Returns

@@ -7,8 +7,8 @@ import os
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.commissioning.record import (
     CommissioningRecord,
     is_commissioned,
@@ -113,7 +113,7 @@ def check_vented_arm(
         )
 
 
-def _modelled(now: float, controller: Controller) -> NDArray[np.float64]:
+def _modelled(now: float, controller: Controller) -> Array:
     """Return where the model has the tip (3,), in m."""
     status = controller.status(now)
     if status.model_position is not None:

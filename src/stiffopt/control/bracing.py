@@ -35,8 +35,8 @@ from enum import StrEnum
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.control.friction import Friction
 from stiffopt.control.interface import Notice
 from stiffopt.control.sliding import SlideEstimator
@@ -47,9 +47,6 @@ from stiffopt.optimise.task import Task
 from stiffopt.optimise.tip import TipAt
 from stiffopt.paths.configurations import maximised
 from stiffopt.paths.leaning import BraceApproach
-
-Array = NDArray[np.float64]
-
 
 _UNCERTAIN, _SLIPS = "brace-uncertain", "brace-slips"
 
@@ -66,18 +63,11 @@ class BracePhase(StrEnum):
 
 
 class Concern(NamedTuple):
-    """A reason to report a contact.
+    """A reason to report a contact."""
 
-    Attributes
-    ----------
-    kind : `brace-uncertain` or `brace-slips`.
-    contact : its index.
-    cause : `slide` or `lift` under a push, or `drift` of b.
-    """
-
-    kind: str
-    contact: int
-    cause: str
+    kind: str  # `brace-uncertain` or `brace-slips`
+    contact: int  # its index
+    cause: str  # `slide` or `lift` under a push, or `drift` of b
 
 
 class Bracing:
@@ -85,10 +75,8 @@ class Bracing:
 
     Parameters
     ----------
-    task :
-        The task with the brace.
-    tuning :
-        Times and limits.
+    task : the task with the brace.
+    tuning : times and limits.
 
     Attributes
     ----------
@@ -183,7 +171,7 @@ class Bracing:
             return self._left * self._start
         rows = approach.pressures
         on_way = np.array([np.interp(self._time, approach.times, row) for row in rows.T])
-        share = self._time / approach.times[-1]
+        share = min(self._time / approach.time_back(float(approach.times[-1])), 1.0)
         found: Array = on_way + share * self._change
         return found
 
@@ -215,6 +203,8 @@ class Bracing:
         self.next = then or self.next
         if self.phase in (BracePhase.APPROACHING, BracePhase.HELD):
             self.phase, self._why, self._pace = BracePhase.RELEASING, why, 0.0
+            if self.approach is not None:
+                self._time = self.approach.time_back(self._time)
             self._lost = frozenset(lost)
             self.force = self.deviation = self.margin = math.nan
             self.push = self.displacement = np.zeros(3)
@@ -282,16 +272,11 @@ class Bracing:
 
         Parameters
         ----------
-        elapsed :
-            Time since the last sample, in s.
-        seen :
-            Measured position (3,) of the tip, in m.
-        tip :
-            Model of the braced tip at the present pressures.
-        pressures :
-            Effective pressures (n,), in Pa.
-        quaternion :
-            Measured orientation (4,) of the tip, w first; None if it is not measured.
+        elapsed : time since the last sample, in s.
+        seen : measured position (3,) of the tip, in m.
+        tip : model of the braced tip at the present pressures.
+        pressures : effective pressures (n,), in Pa.
+        quaternion : measured orientation (4,) of the tip, w first; None if it is not measured.
         """
         t, held, friction = self._tuning, self.phase is BracePhase.HELD, self._friction
         if self.approach is None or friction is None:
@@ -636,14 +621,10 @@ class Bracing:
 
         Parameters
         ----------
-        elapsed :
-            Time since the last call, in s.
-        error :
-            Of the tip (3,), in m; zero in components that the target leaves open.
-        jacobian :
-            Of the position of a tip whose contacts slide, base axes (3, n), in m/Pa.
-        limits :
-            Smallest and largest pressures (n,), in Pa.
+        elapsed : time since the last call, in s.
+        error : of the tip (3,), in m; zero in components that the target leaves open.
+        jacobian : of the position of a tip whose contacts slide, base axes (3, n), in m/Pa.
+        limits : smallest and largest pressures (n,), in Pa.
         """
         if self.displacement.any() or self.approach is None or self._friction is None:
             return  # a push is not compensated

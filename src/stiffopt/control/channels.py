@@ -27,17 +27,14 @@ from collections.abc import Iterable, Iterator
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array, Flags
 from stiffopt.control.formula import Formula
 from stiffopt.control.interface import Notice
 from stiffopt.control.state import Severity
 from stiffopt.control.tuning import RegulatorTuning
 from stiffopt.errors import InputError
 from stiffopt.rig.interface import PressureLimits
-
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 
 class Channels:
@@ -334,9 +331,7 @@ def _look(n: int, tuning: RegulatorTuning) -> Formula:
 class _Rest:
     """Finds shortfalls of n channels that grow in size while their commands rest.
 
-    Attributes
-    ----------
-    changed : flags (n,) of these channels.
+    `changed`: flags (n,) of these channels.
     """
 
     def __init__(self, n: int, tuning: RegulatorTuning) -> None:

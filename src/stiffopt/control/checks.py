@@ -12,9 +12,9 @@ from contextlib import contextmanager
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import BaseModel
 
+from stiffopt.arrays import Array
 from stiffopt.errors import CommandError, InputError, StiffoptError
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.scene import Scene, SceneObject
@@ -25,7 +25,6 @@ from stiffopt.paths.trajectory import Trajectory, Waypoint
 from stiffopt.rig.interface import PressureLimits
 from stiffopt.schema import BadKeyError, Schema
 
-Array = NDArray[np.float64]
 ModelT = TypeVar("ModelT", bound=Schema)
 
 _IGNORED_FIELDS = frozenset({"source"})  # the file that a description was read from
@@ -179,10 +178,7 @@ def highest_pressures(task: Task, limits: PressureLimits) -> Array:
 def check_press(robot: Manipulator, limits: PressureLimits, task: Task) -> None:
     """Refuse a press that the arm cannot exert within the rig's limits, or cannot feel.
 
-    Raises
-    ------
-    InputError
-        With the reason.
+    Raises `InputError` with the reason.
     """
     if task.press is None:
         return

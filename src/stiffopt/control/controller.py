@@ -16,6 +16,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.control.adaptation import Adapted
 from stiffopt.control.bracing import BracePhase, Bracing
 from stiffopt.control.checks import refusing
@@ -48,7 +49,6 @@ from stiffopt.paths.trajectory import Trajectory
 from stiffopt.rig.interface import PoseSample, PressureLimits, PressureReading
 from stiffopt.rig.settings import ControlSettings, Safety
 
-Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 _HELD = 2.5  # periods without `compute`, after which others have commanded the pressures
@@ -67,8 +67,7 @@ class TipController:
     vibrates : whether to model a vibration, if the settings leave that open.
     scene : objects that the arm has to keep clear of; None: nothing is checked.
     plan_in_process : whether to plan in a separate process; otherwise inline, for simulated time.
-    commissioned : whether the arm is known to respond as modelled; otherwise its first motion is
-        slow.
+    slow_first_motion : whether each channel is slow until the tip has followed it (`FirstMotion`).
     tuning : tuning of the parts.
 
     Attributes
@@ -88,7 +87,7 @@ class TipController:
         vibrates: bool = True,
         scene: Scene | None = None,
         plan_in_process: bool = False,
-        commissioned: bool = True,
+        slow_first_motion: bool = True,
         tuning: ControlTuning | None = None,
     ) -> None:
         self.robot, self.limits = robot, limits
@@ -127,7 +126,7 @@ class TipController:
         self._ways: deque[tuple[Array, Array]] = deque(
             maxlen=max(1, round(tuning.reference.taken_back / period))
         )
-        self._first_motion = FirstMotion(commissioned, tuning.first_motion)
+        self._first_motion = FirstMotion(tuning.first_motion if slow_first_motion else None)
         sliding = replace(tuning.bracing.sliding, noise=control.tracker_noise)
         bracing = replace(tuning.bracing, sliding=sliding)
         own = replace(tuning, bracing=bracing)
@@ -310,7 +309,7 @@ class TipController:
         counts = self._arm.observe(now, commanded, reading, samples, course)
         tip, sample = self._arm.modelled, self._arm.tip.sample
         if counts.used and sample and tip and not self._first_motion.is_over:
-            parts = tip.pose[:3, :3] @ tip.jacobian[:3] * self._arm.pressures.effective
+            parts = tip.pose[:3, :3] @ tip.jacobian[:3] * self._arm.tip.captured
             self._first_motion.take(self._arm.tip.predicted, sample.position, parts)
         if self.forecast is not None:
             self.forecast.present = self._present(now)

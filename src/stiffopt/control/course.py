@@ -7,15 +7,13 @@ import math
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from stiffopt import lie
+from stiffopt.arrays import Array
 from stiffopt.errors import InputError
 from stiffopt.optimise.target import Target
 from stiffopt.paths.trajectory import Trajectory, check_times
-
-Array = NDArray[np.float64]
 
 _OPPOSITE = -0.99  # cosine below which directions count as opposite: no unique way between them
 _SHORT = 0.05  # length below which an interpolated direction is undefined
@@ -33,17 +31,15 @@ class Course:
     Positions, directions and quaternions follow cubic splines through the waypoints; directions and
     quaternions are normalised. The splines begin and end at rest, and stay at their ends.
 
+    Raises `InputError`: successive waypoints have opposite directions, or no finite spline passes
+    through them.
+
     Parameters
     ----------
     trajectory : the waypoints.
     begin : time at which it begins, in s.
     position, rotation : of the tip at that time, (3,) and (3, 3): the start if the first waypoint
         is later.
-
-    Raises
-    ------
-    InputError
-        Successive waypoints have opposite directions, or no finite spline passes through them.
     """
 
     def __init__(

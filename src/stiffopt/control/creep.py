@@ -26,11 +26,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.control.tuning import CreepTuning
-
-Array = NDArray[np.float64]
 
 _FAR = 25.0  # squared distance in deviations of a sample that is no creep
 _UNLIKELY = 3.0  # deviations of a share from what is believed that no arm has

@@ -36,6 +36,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt import lie
+from stiffopt.arrays import Array
 from stiffopt.control.formula import Formula
 from stiffopt.control.interface import SampleCounts
 from stiffopt.control.principal import principal_axes
@@ -44,7 +45,6 @@ from stiffopt.control.vibration import BendingMode, lateral_stiffness, transitio
 from stiffopt.optimise.tip import TipAt
 from stiffopt.rig.interface import PoseSample
 
-Array = NDArray[np.float64]
 Symbols = Any  # of CasADi
 
 _MODE_EVERY = 8  # steps between updates of frequency and soft plane, which change slowly

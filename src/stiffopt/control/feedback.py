@@ -23,14 +23,13 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import expm, solve_discrete_are
 
+from stiffopt.arrays import Array
 from stiffopt.control.tuning import FeedbackTuning
 from stiffopt.control.vibration import transition
 from stiffopt.optimise.target import Target
 
-Array = NDArray[np.float64]
 Symbols = Any  # of CasADi
 
 _FREQUENCIES = np.geomspace(2.0, 200.0, 60).tolist()  # rad/s, of the table of gains

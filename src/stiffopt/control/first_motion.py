@@ -1,9 +1,10 @@
 """The first motion of each channel: slow until the tip has been seen to go where the model goes.
 
-On a rig that nobody has commissioned, channels may be swapped or the tracker's frame turned. The
-watch of the motion (`MotionWatch`) finds that after a few millimetres, but until the chambers obey
-its hold, a fast arm moves much farther than that. Meanwhile feedback corrects no more than an error
-of the model explains: with swapped channels it drives the tip away, the faster the farther it is.
+Channels may have been swapped since the arm was last used, or the tracker's frame turned, also on a
+rig that was commissioned. The watch of the motion (`MotionWatch`) finds that after a few
+millimetres, but until the chambers obey its hold, a fast arm moves much farther than that.
+Meanwhile feedback corrects no more than a usual error of the model: with swapped channels it drives
+the tip away, the faster the farther it is.
 A channel without a part in the first motion is slow when it first has one: its effect is unknown.
 """
 
@@ -12,11 +13,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.control.tuning import FirstMotionTuning
-
-Array = NDArray[np.float64]
 
 
 class FirstMotion:
@@ -24,18 +23,16 @@ class FirstMotion:
 
     Parameters
     ----------
-    is_known : whether the arm is known to respond as modelled, so that its first motion may be
-        fast.
-    tuning : speed of the first motion, and when it ends.
+    tuning : speed of the first motion, and when it ends; None: it may be fast.
     """
 
-    def __init__(self, is_known: bool, tuning: FirstMotionTuning) -> None:
-        self._is_known, self._tuning = is_known, tuning
+    def __init__(self, tuning: FirstMotionTuning | None) -> None:
+        self._may_be_fast, self._tuning = tuning is None, tuning or FirstMotionTuning()
         self.begin()
 
     def begin(self) -> None:
         """Restart with a vented arm."""
-        self._responds = np.array(self._is_known)  # of each channel (n,), once the tip is seen
+        self._responds = np.array(self._may_be_fast)  # of each channel (n,), once the tip is seen
         # positions (n, 2, 3) of model and tip when each channel began to have a part in the motion
         self._starts: Array | None = None
         self._on_path: Array | None = None  # position (3,) of the model on the reference's path
@@ -50,7 +47,7 @@ class FirstMotion:
 
         `parts` (3, n) are the parts that the channels' pressures have in the model's way, in m.
         """
-        if self._is_known:
+        if self._may_be_fast:
             return
         now, sizes = np.stack([modelled, seen]), np.sqrt((parts**2).sum(axis=0))
         if self._starts is None:
@@ -70,7 +67,7 @@ class FirstMotion:
         if self._on_path is None:
             self._on_path = on_path.copy()
         way = float(np.linalg.norm(on_path - self._on_path))
-        return self._tuning.correction + self._tuning.error * way
+        return self._tuning.correction + self._tuning.correction_share * way
 
     @property
     def slew_share(self) -> Array:

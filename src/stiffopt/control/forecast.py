@@ -12,8 +12,8 @@ import time
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.control.adaptation import Adapted
 from stiffopt.control.course import Course
 from stiffopt.control.planner import InlinePlanner, ProcessPlanner
@@ -24,8 +24,6 @@ from stiffopt.control.tuning import ForecastTuning, ReplanningTuning
 from stiffopt.errors import CommandError
 from stiffopt.optimise.target import Target
 from stiffopt.paths.trajectory import Trajectory
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

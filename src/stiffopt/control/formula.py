@@ -10,12 +10,9 @@ from collections.abc import Sequence
 from typing import Any
 
 import casadi as ca
-import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.model.batch import Buffer
-
-Array = NDArray[np.float64]
 
 
 def are_within(bound: float, values: Array) -> bool:

@@ -11,12 +11,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.model.contact.push import until_equal
 from stiffopt.paths.leaning import Hold
-
-Array = NDArray[np.float64]
 
 _SAME = 1e-3  # share of the cone within which a force is on it
 
@@ -26,9 +24,8 @@ class Friction:
 
     Parameters
     ----------
-    hold, planned :
-        The contacts, linearised about their equilibrium without friction at the end of the way, and
-        its pressures (n,).
+    hold, planned : the contacts, linearised about their equilibrium without friction at the end of
+        the way, and its pressures (n,).
 
     Attributes
     ----------

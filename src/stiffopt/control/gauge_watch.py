@@ -6,11 +6,9 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array, Flags
 from stiffopt.rig.interface import PressureReading
-
-Array = NDArray[np.float64]
 
 _WINDOW = 200  # readings
 _ENOUGH = 30  # readings, before the gauges are judged
@@ -41,10 +39,8 @@ class GaugeWatch:
     def dead(self, measured: Sequence[bool], noisy: Sequence[bool]) -> Iterator[str]:
         """Yield the problems of the gauges.
 
-        Parameters
-        ----------
-        measured : whether each channel has a gauge.
-        noisy : whether that gauge had noise when it was commissioned.
+        `measured`: whether each channel has a gauge. `noisy`: whether that gauge had noise when it
+        was commissioned.
         """
         if len(self._readings) < _ENOUGH:
             if any(measured):
@@ -66,5 +62,5 @@ class GaugeWatch:
             )
 
 
-def _names(channels: NDArray[np.bool_]) -> str:
+def _names(channels: Flags) -> str:
     return ", ".join(str(k + 1) for k in np.flatnonzero(channels))

@@ -11,16 +11,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
+from stiffopt.arrays import Array, Flags
 from stiffopt.control.state import ControllerStatus, Severity
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import Task
 from stiffopt.paths.trajectory import Trajectory
 from stiffopt.rig.interface import PoseSample, PressureReading
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -38,7 +34,7 @@ class ControlOutput:
 
     pressures: Array  # (n,), in Pa
     valid: bool  # False: the solver failed, and the pressures are the last ones
-    saturated: NDArray[np.bool_]  # channels (n,) at a limit that keeps the tip from its target
+    saturated: Flags  # channels (n,) at a limit that keeps the tip from its target
     # effective pressures (n,) to which the command leads, in Pa; None: the command
     posture: Array | None = None
     leans: bool = False  # whether the arm may touch objects: then the brace checks its contacts

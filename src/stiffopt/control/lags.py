@@ -11,12 +11,10 @@ from __future__ import annotations
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array, Flags
 from stiffopt.control.formula import Formula
 from stiffopt.control.tuning import LagTuning
-
-Array = NDArray[np.float64]
 
 _Z, _ZZ, _BB = 2, 4, 6  # rows of the state
 
@@ -47,7 +45,7 @@ class LagEstimator:
         self._state[[_Z, _ZZ]] = lasting
         self._state[_BB] = self._tuning.offset**2
 
-    def advance(self, commanded: Array, reading: Array, lost: NDArray[np.bool_]) -> None:
+    def advance(self, commanded: Array, reading: Array, lost: Flags) -> None:
         """Take a step with commands (n,) and, at its end, readings (n,); NaN: not measured.
 
         Channels that are `lost` (n,) do not follow their commands, and tell nothing.

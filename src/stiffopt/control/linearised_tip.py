@@ -13,16 +13,15 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from stiffopt import lie
+from stiffopt.arrays import Array
 from stiffopt.control.formula import Formula
 from stiffopt.errors import EquilibriumError, InputError, PressureError, StiffoptError
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.optimise.tip import TipAt, TipModel
 from stiffopt.paths.leaning import BraceApproach
 
-Array = NDArray[np.float64]
 Symbols = Any  # of CasADi
 
 # share of the range by which an operating point is ahead of pressures that have just left the last
@@ -33,20 +32,17 @@ _AHEAD = 0.7
 class LeaningTip:
     """The tip of an arm on its way into contact, from equilibria that were computed before.
 
-    Parameters
-    ----------
-    approach : the way into contact. Other pressures use the model of its nearest equilibrium.
+    `approach`: the way into contact. Other pressures use the model of its nearest equilibrium.
     """
 
     def __init__(self, approach: BraceApproach) -> None:
-        self._approach, end = approach, approach.pressures[-1]
-        self._along = end / float(end @ end)
+        self._approach = approach
 
     def at(self, pressures: Array) -> TipAt:
         """Return the tip at pressures (n,), in Pa, linearised about the nearest equilibrium."""
         approach = self._approach
-        share = min(max(float(self._along @ pressures), 0.0), 1.0)
-        index = round(share * (len(approach.tips) - 1))
+        off = pressures - approach.pressures
+        index = int(np.einsum("ki,ki->k", off, off).argmin())
         tip = approach.tips[index]
         pose = tip.pose.copy()
         change = tip.jacobian[:3] @ (pressures - approach.pressures[index])
@@ -57,6 +53,9 @@ class LeaningTip:
 class ArmModel:
     """The model of an arm, for each of the uses that the loop has for its tip.
 
+    Raises `InputError` if the arm is loaded and there is no compiler: the model is too slow for a
+    loop.
+
     Parameters
     ----------
     robot : the arm.
@@ -66,11 +65,6 @@ class ArmModel:
     ----------
     chambers, path : the tip at the effective pressures, and on the reference's path.
     waypoints : the tip at a trajectory's waypoints, and for other rare uses.
-
-    Raises
-    ------
-    InputError
-        If the arm is loaded and there is no compiler: the model is too slow for a loop.
     """
 
     def __init__(self, robot: Manipulator, path_range: float) -> None:

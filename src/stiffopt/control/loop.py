@@ -49,20 +49,13 @@ class ControlLoop:
 
     Parameters
     ----------
-    rig :
-        Robot, tracker and clock. Only the limits of its supply are used.
-    controller :
-        The controller.
-    outlet :
-        The only way to the supply.
-    safety :
-        Limits and timeouts beyond which there is a fault.
-    period :
-        Time between ticks, in s.
-    tuning :
-        Tuning of the supervision.
-    clearance :
-        Keeps commands clear of the rig's scene; None without a scene.
+    rig : robot, tracker and clock. Only the limits of its supply are used.
+    controller : the controller.
+    outlet : the only way to the supply.
+    safety : limits and timeouts beyond which there is a fault.
+    period : time between ticks, in s.
+    tuning : tuning of the supervision.
+    clearance : keeps commands clear of the rig's scene; None without a scene.
     """
 
     def __init__(

@@ -15,20 +15,16 @@ from __future__ import annotations
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.control.formula import Formula
 from stiffopt.control.tuning import MotionErrorTuning
-
-Array = NDArray[np.float64]
 
 
 class MotionErrorEstimator:
     """Estimates the change of the tip's offset with the motion of the model.
 
-    Attributes
-    ----------
-    slope : A (3, 3), displacement of the tip per displacement of the model's; zero before `learn`.
+    `slope`: A (3, 3), displacement of the tip per displacement of the model's; zero before `learn`.
     """
 
     def __init__(self, tuning: MotionErrorTuning) -> None:

@@ -27,14 +27,12 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.control.tip_errors import turn_of_a_push
 from stiffopt.control.tuning import DriftScale, MotionTuning
 from stiffopt.model.description import RobotDescription
 from stiffopt.optimise.tip import TipAt
-
-Array = NDArray[np.float64]
 
 _TIME, _SEEN, _PREDICTED, _INTENDED = 0, slice(1, 4), slice(4, 7), slice(7, 10)  # columns of a row
 _OFFSET, _TURN, _TURNED = slice(10, 13), slice(13, 16), slice(16, 19)

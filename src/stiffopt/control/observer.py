@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.control.bracing import Bracing
 from stiffopt.control.channels import Channels
 from stiffopt.control.creep import CreepEstimator
@@ -29,8 +29,6 @@ from stiffopt.model.manipulator import Manipulator
 from stiffopt.optimise.tip import TipAt, TipModel
 from stiffopt.rig.interface import PoseSample, PressureLimits, PressureReading
 from stiffopt.rig.settings import ControlSettings, Safety
-
-Array = NDArray[np.float64]
 
 _MAX_STEPS = 50  # of the estimators in one tick, after a pause
 

@@ -11,20 +11,16 @@ creep by a share of the way before.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.control.tuning import ObstructionTuning
-
-Array = NDArray[np.float64]
 
 
 class ObstructionWatch:
     """Watches the tip on its way to a target, and there.
 
-    Attributes
-    ----------
-    withheld : displacement (3,) by which the tip has not followed since it stopped, in m.
-    allowed : the largest such displacement of an arm that nothing holds back, in m.
+    `withheld`: displacement (3,) by which the tip has not followed since it stopped, in m.
+    `allowed`: the largest such displacement of an arm that nothing holds back, in m.
     """
 
     def __init__(self, tuning: ObstructionTuning) -> None:
@@ -48,10 +44,8 @@ class ObstructionWatch:
     def take(self, tip: Array, offset: Array, target: Array) -> bool:
         """Return whether something holds the tip back.
 
-        Parameters
-        ----------
-        tip, offset : position (3,) of the tip, in m, and its offset (6,) from the model.
-        target : position (3,) of the target; NaN along free axes.
+        `tip`, `offset`: position (3,) of the tip, in m, and its offset (6,) from the model.
+        `target`: position (3,) of the target; NaN along free axes.
         """
         t, modelled = self._tuning, tip - offset[:3]
         left = float(np.linalg.norm(np.nan_to_num(target - tip)))

@@ -21,8 +21,8 @@ from dataclasses import dataclass, field, replace
 
 import daqp
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.control.adaptation import Adapted, Estimate, Learning, Window
 from stiffopt.control.tip_errors import TipErrors, stiffness_function
 from stiffopt.control.tuning import AdaptationTuning, FeedbackTuning, NearestTuning, PlanningTuning
@@ -40,8 +40,6 @@ from stiffopt.optimise.task import PressureRange, Task
 from stiffopt.optimise.tip import TipModel
 from stiffopt.paths.configurations import Unsolved
 from stiffopt.paths.leaning import BraceApproach, approach_to
-
-Array = NDArray[np.float64]
 
 _BAR = 1e5
 _SLACK = 100.0  # Pa, by which an answer may exceed its limits

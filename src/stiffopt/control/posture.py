@@ -6,14 +6,12 @@ import math
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stiffopt import lie
+from stiffopt.arrays import Array
 from stiffopt.errors import InputError
 from stiffopt.optimise.target import Target
 from stiffopt.paths.trajectory import Trajectory
-
-Array = NDArray[np.float64]
 
 
 class PostureCourse:

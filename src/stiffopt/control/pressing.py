@@ -20,8 +20,8 @@ import math
 from enum import StrEnum
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.control.creep import CreepEstimator
 from stiffopt.control.interface import Notice
 from stiffopt.control.obstruction import ObstructionWatch
@@ -30,8 +30,6 @@ from stiffopt.control.touch import TipForce
 from stiffopt.control.tuning import PressingTuning
 from stiffopt.optimise.press import FELT_FORCE, FELT_SHARE, Feeling, Press
 from stiffopt.optimise.target import Target
-
-Array = NDArray[np.float64]
 
 
 class Phase(StrEnum):

@@ -18,11 +18,10 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.control.formula import Formula
 
-Array = NDArray[np.float64]
 Symbols = Any  # of CasADi
 
 _LAGS = 4
@@ -111,9 +110,7 @@ class VibrationFilter:
     vibration: the average is two steps of half the height, T / 2 apart (zero-vibration shaping), of
     the mean of two values that are T / 4 apart. It is late by 3 / 8 T.
 
-    Attributes
-    ----------
-    averages : the average, and path and speed of the mode (3, m).
+    `averages`: the average, and path and speed of the mode (3, m).
     """
 
     def __init__(self, period: float, damping: float, m: int) -> None:

@@ -21,8 +21,9 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from stiffopt.arrays import Array
 from stiffopt.control.channels import Channels
 from stiffopt.control.formula import Formula
 from stiffopt.control.lags import LagEstimator
@@ -30,8 +31,6 @@ from stiffopt.control.tuning import LagTuning, RegulatorTuning
 from stiffopt.model.description import RobotDescription
 from stiffopt.model.history import History, Memory
 from stiffopt.rig.settings import ControlSettings
-
-Array = NDArray[np.float64]
 
 
 class RegulatorModel:

@@ -7,8 +7,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.control.adaptation import Adapted, Estimate, Window
 from stiffopt.control.bracing import Bracing
 from stiffopt.control.course import Course
@@ -26,7 +26,6 @@ from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import Task
 from stiffopt.paths.trajectory import Trajectory, Waypoint
 
-Array = NDArray[np.float64]
 AnyCourse = Course | PostureCourse | Pressing | Bracing
 
 _TOO_SOFT = (
@@ -183,6 +182,8 @@ class Replanner:
     ) -> Array | None:
         """Request a plan when it is time; return the newest.
 
+        Returns effective pressures and offset of the plan (n + 6,); None without a plan.
+
         Parameters
         ----------
         now : time, in s.
@@ -193,10 +194,6 @@ class Replanner:
             more than a little starts a search of all configurations.
         way : see `PlanRequest`; None without a scene.
         windows, here : see `PlanRequest`; `here` is None for an arm that does not vibrate.
-
-        Returns
-        -------
-        Effective pressures and offset of the plan (n + 6,); None without a plan.
         """
         task, target = self.pursuit.task, self.pursuit.target
         interval = self._tuning.interval

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.control.bracing import Bracing
 from stiffopt.control.interface import Notice
 from stiffopt.control.observer import ArmObserver
@@ -17,8 +17,6 @@ from stiffopt.control.tip_errors import TipErrors, target_arrays
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.uncertainty import NORMAL_QUANTILE
 from stiffopt.optimise.target import Target
-
-Array = NDArray[np.float64]
 
 _WELL_WITHIN = 0.8  # share of the bound on the frequency's error below which its alarm ends
 
@@ -51,10 +49,8 @@ class Report:
     def status(self, now: float, led: tuple[Target, Array] | None) -> ControllerStatus:
         """Return the controller's part of the state.
 
-        Parameters
-        ----------
-        now : time, in s.
-        led : on a trajectory of pressures, its present target and effective pressures (n,), in Pa.
+        `now`: time, in s. `led`: on a trajectory of pressures, its present target and effective
+        pressures (n,), in Pa.
         """
         n, arm, pursuit = self._robot.n_pressures, self._arm, self._replanner.pursuit
         if arm.modelled is None:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.control.adaptation import Adapted
 from stiffopt.control.bracing import Bracing
 from stiffopt.control.checks import check_press, check_rates, check_scene, limited_range
@@ -25,8 +25,6 @@ from stiffopt.optimise.tip import TipModel
 from stiffopt.paths.trajectory import Trajectory
 from stiffopt.rig.interface import PressureLimits
 
-Array = NDArray[np.float64]
-
 _SLACK = 1e-3  # Pa, for rounding at limits
 _ROUNDING = 1e-6  # share of a speed
 
@@ -36,10 +34,8 @@ class Requests:
 
     All methods raise `InputError` with the reason of a refusal, and change nothing.
 
-    Parameters
-    ----------
-    robot, limits, slew, scene, tuning : see `TipController`; slew (n,), in Pa/s.
-    tip_speed : see `ControlSettings`.
+    `robot`, `limits`, `slew`, `scene`, `tuning`: see `TipController`; slew (n,), in Pa/s.
+    `tip_speed`: see `ControlSettings`.
     """
 
     def __init__(

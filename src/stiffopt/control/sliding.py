@@ -17,14 +17,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stiffopt import lie
+from stiffopt.arrays import Array
 from stiffopt.control.friction import Friction
 from stiffopt.control.tuning import SlidingTuning
 from stiffopt.paths.leaning import BraceApproach
-
-Array = NDArray[np.float64]
 
 _ERROR, _CREEP, _PUSH, _FIRST = slice(0, 6), slice(6, 12), slice(12, 15), 15  # in the state
 
@@ -34,14 +32,10 @@ class SlideEstimator:
 
     Parameters
     ----------
-    approach :
-        The way into contact.
-    friction :
-        Of the contacts, linear about its end.
-    usual :
-        Covariance (3, 3) of pushes, base axes, in N^2.
-    tuning :
-        What is expected of errors, pushes and slides.
+    approach : the way into contact.
+    friction : of the contacts, linear about its end.
+    usual : covariance (3, 3) of pushes, base axes, in N^2.
+    tuning : what is expected of errors, pushes and slides.
     """
 
     def __init__(
@@ -60,6 +54,9 @@ class SlideEstimator:
         deviations = np.full(count, t.noise)  # of slides at first
         deviations[:_FIRST] = np.repeat([*t.error, *t.creep, 0.0], 3)
         self._state, self._covariance = np.zeros(count), np.diag(deviations**2)
+        # silicone creeps mostly as if all pressures grew, or fell, by a share
+        creep = t.creep_share * self._per_pressure @ self._pressures
+        self._covariance[_CREEP, _CREEP] += np.outer(creep, creep)
         self._jumps = 0  # successive samples in which the turn has jumped without the place
         self._drift = np.diag(np.repeat(t.drift, 3) ** 2)
 
@@ -70,12 +67,10 @@ class SlideEstimator:
 
         Parameters
         ----------
-        elapsed, held :
-            Time since the last sample, and in contact, in s.
-        seen, quaternion :
-            Measured position (3,), in m, and orientation (4,), w first; None if it is not measured.
-        pressures :
-            Effective pressures (n,), in Pa.
+        elapsed, held : time since the last sample, and in contact, in s.
+        seen, quaternion : measured position (3,), in m, and orientation (4,), w first; None if it
+            is not measured.
+        pressures : effective pressures (n,), in Pa.
         """
         off = np.concatenate([seen - self._pose[:3, 3], np.zeros(3)])
         if quaternion is not None:

@@ -15,14 +15,10 @@ from functools import partial
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array, Flags
 from stiffopt.control.state_fields import Shown
 from stiffopt.rig.interface import PoseSample
-
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
-
 
 # `Shown` for fields that share a topic or a unit
 _event, _tracker, _timing, _tip, _state = (

@@ -13,8 +13,8 @@ from types import UnionType
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Flags
 from stiffopt.units import unit_suffix
 
 _DECIMALS = {"s": 6, "Pa": 1, "m": 7, "rad": 7, "": 7, "N/m": 4, "N": 5}
@@ -134,7 +134,7 @@ def _kind(hint: Any) -> tuple[Kind, Any]:
         many = {float: Kind.NUMBERS, int: Kind.COUNTS, bool: Kind.FLAGS}
         return many.get(item, Kind.RECORDS), item
     if get_origin(hint) is np.ndarray:
-        return (Kind.FLAGS, np.bool_) if hint == NDArray[np.bool_] else (Kind.NUMBERS, np.float64)
+        return (Kind.FLAGS, np.bool_) if hint == Flags else (Kind.NUMBERS, np.float64)
     if dataclasses.is_dataclass(hint):
         return Kind.RECORD, hint
     if issubclass(hint, str):

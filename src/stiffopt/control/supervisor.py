@@ -10,8 +10,8 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array, Flags
 from stiffopt.control.arming import (
     check_commissioned,
     check_rig,
@@ -37,8 +37,6 @@ from stiffopt.safety.expected_pressure import Regulation
 from stiffopt.safety.gate import Outlet, let_down
 from stiffopt.safety.monitors import PressureMonitor, Trouble
 from stiffopt.safety.realtime import load_of_processors
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -114,7 +112,7 @@ class Supervisor:
         self._monitor = PressureMonitor(outlet.limits, safety, regulation, rig.slew)
         self._tracker = TrackerWatch(safety, period)
         self._gauges = GaugeWatch()
-        self._no_channels: NDArray[np.bool_] = np.zeros(n, dtype=bool)
+        self._no_channels: Flags = np.zeros(n, dtype=bool)
         self._reported_saturated = self._monitor.saturated
         self._reported_unsupervised: tuple[int, ...] = ()
         self._zero: Array = np.zeros(n)

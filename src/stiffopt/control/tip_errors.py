@@ -11,9 +11,9 @@ from collections.abc import Callable, Hashable
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from stiffopt import lie
+from stiffopt.arrays import Array
 from stiffopt.control.formula import Formula
 from stiffopt.model.compliance import directional_stiffness
 from stiffopt.model.shape import PointOfArm
@@ -22,8 +22,6 @@ from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import Task
 from stiffopt.optimise.term import Term
 from stiffopt.optimise.tip import TipAt
-
-Array = NDArray[np.float64]
 
 _INEQUALITY_WEIGHT = 30.0
 """Weight of an inequality in least squares; it may be violated by a thousandth of the error."""

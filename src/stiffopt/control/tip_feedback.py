@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from stiffopt.arrays import Array
 from stiffopt.control.allocation import Allocation
 from stiffopt.control.feedback import (
     GainSchedule,
@@ -23,8 +24,6 @@ from stiffopt.control.vibration import BendingMode, BentMode
 from stiffopt.optimise.tip import TipAt
 from stiffopt.rig.interface import PressureLimits
 from stiffopt.rig.settings import ControlSettings, Safety
-
-Array = NDArray[np.float64]
 
 
 class TipFeedback:

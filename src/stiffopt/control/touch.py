@@ -34,14 +34,13 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.control.creep import CreepEstimator
 from stiffopt.control.formula import Formula
 from stiffopt.control.principal import principal_axes
 from stiffopt.control.tuning import CreepTuning, TouchTuning
 from stiffopt.optimise.press import SOFT_SHARE
 from stiffopt.optimise.tip import TipAt
-
-Array = NDArray[np.float64]
 
 _U, _R, _E, _B, _G, _XI, _ETA = range(7)  # indices of the state
 

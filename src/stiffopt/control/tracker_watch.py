@@ -7,14 +7,12 @@ from collections.abc import Sequence
 from enum import Enum
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.control.interface import SampleCounts
 from stiffopt.control.tuning import TrackerTuning
 from stiffopt.rig.interface import PoseSample
 from stiffopt.rig.settings import Safety
-
-Array = NDArray[np.float64]
 
 
 class Sight(Enum):

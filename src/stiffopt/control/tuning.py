@@ -133,16 +133,17 @@ class ReferenceTuning:
 
 @dataclass(frozen=True)
 class FirstMotionTuning:
-    """The first motion of an arm that is not known to respond as modelled (`FirstMotion`)."""
+    """The first motion after arming (`FirstMotion`)."""
 
     slew_share: float = 0.1  # share of the slew that the reference may take
     # way of the model's tip, and part of a channel in it, after which it ends, in m, if the tip has
     # followed with an error of at most a share of that way; it begins with a smaller part
-    way: float = 8e-3
+    way: float = 5e-3
     error: float = 0.5
     part: float = 1e-3
-    # largest correction by feedback at first, in m; it grows with the reference's way by `error`
-    correction: float = 2e-3
+    # largest correction by feedback at first, in m, and its growth with the reference's way
+    correction: float = 0.5e-3
+    correction_share: float = 0.2
 
 
 @dataclass(frozen=True)
@@ -538,6 +539,7 @@ class SlidingTuning:
     # e-fold of the time in contact and of a time before, in s; and by drift in a second
     error: tuple[float, float] = (1e-2, 3e-2)
     creep: tuple[float, float] = (2e-4, 3e-3)
+    creep_share: float = 0.01  # by which pressures seem to grow, or fall, per such e-fold
     creep_time: float = 3.0
     drift: tuple[float, float] = (1e-5, 2e-4)
     push_time: float = 5.0  # in which a push comes or goes, in s

@@ -31,11 +31,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import eigh
 
+from stiffopt.arrays import Array
 from stiffopt.model.actuation import SectionGeometry
 from stiffopt.model.description import RobotDescription
 from stiffopt.model.manipulator import Manipulator
 
-Array = NDArray[np.float64]
 Symbols = Any  # of CasADi
 
 _PIECES = 30  # per segment

@@ -12,13 +12,12 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.errors import StiffoptError
 from stiffopt.model.body import COMPILED_FREE_FROM
 from stiffopt.model.compiled import compiling_at_once
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.scene import Scene
-
-Array = NDArray[np.float64]
 
 _PIECE = 1e4  # Pa, longest initial piece of a way, over which points of the body go straight
 _CURVED = 1.1  # bound of the length of a point's way over the straight distance between two states
@@ -46,10 +45,8 @@ class Ways:
         The way is divided until the body cannot come nearer between two states by more than 0.2 mm
         than is accepted.
 
-        Parameters
-        ----------
-        way : its corners.
-        waypoints : whether all corners but the first are waypoints, to be named in the reason.
+        `way`: its corners. `waypoints`: whether all corners but the first are waypoints, to be
+        named in the reason.
         """
         robot = self._robot
         states, legs = _divided(np.clip(way, robot.pressure_min, robot.pressure_max))

@@ -5,22 +5,18 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.control.adaptation import Window
 from stiffopt.control.estimator import TipEstimator
 from stiffopt.control.formula import are_within
 from stiffopt.control.tuning import WindowTuning
 
-Array = NDArray[np.float64]
-
 
 class WindowWatch:
     """Collects windows while the arm rests: the newest one of each posture.
 
-    Attributes
-    ----------
-    windows : the present windows; a new tuple when they change.
+    `windows`: the present windows; a new tuple when they change.
     """
 
     def __init__(self, tuning: WindowTuning) -> None:

@@ -463,12 +463,8 @@ class ClientStream:
     ) -> None:
         """Go to a target, or to a position in m, from now on.
 
-        Raises
-        ------
-        CommandError, InputError
-            An earlier target was refused.
-        ServiceError
-            The stream has ended.
+        Raises `CommandError` or `InputError`: an earlier target was refused; `ServiceError`: the
+        stream has ended.
         """
         self._raise_refusal()
         message = TargetMessage.of(target or Target(position=position)).model_dump()
@@ -481,12 +477,8 @@ class ClientStream:
     def state(self, timeout: float = 5.0) -> Snapshot:
         """Return the newest state that was not returned before; wait for it if necessary.
 
-        Raises
-        ------
-        CommandError, InputError
-            A target was refused.
-        ServiceError
-            None came in time, or the stream has ended.
+        Raises `CommandError` or `InputError`: a target was refused; `ServiceError`: none came in
+        time, or the stream has ended.
         """
         with self._news:
             is_there = self._news.wait_for(

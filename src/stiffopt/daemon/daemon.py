@@ -12,9 +12,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
-from stiffopt.commissioning.record import commissioned_control, commissioned_robot, is_commissioned
+from stiffopt.commissioning.record import commissioned_control, commissioned_robot
 from stiffopt.control.controller import TipController
 from stiffopt.control.lifecycle import ARMED
 from stiffopt.control.loop import ControlLoop
@@ -40,38 +39,26 @@ if TYPE_CHECKING:
     from stiffopt.daemon.telemetry import Telemetry
 
 
-Array = NDArray[np.float64]
-
-
 @dataclass(frozen=True)
 class DaemonTimes:
-    """Time limits of the parts of a daemon, in s.
+    """Time limits of the parts of a daemon, in s."""
 
-    Attributes
-    ----------
-    arming : for an arm that was just connected to become ready to be armed.
-    arming_again : between attempts to arm; the tracker sees the tip some times meanwhile.
-    telemetry : for telemetry to start.
-    tidy : between garbage collections.
-    stop : beyond `Safety.ramp_time`, for a daemon to end, whatever hangs. The limits below add up
-        to less, so that the command can still report the outcome.
-    control : beyond the ramp, for the control thread to end.
-    to_first_point : minimum for the way to a motion's first point.
-    keeper, vent, supply, rest : for the end of the keeper, of a direct command to vent, of the
-        supply, and of all other parts.
-    """
-
-    arming: float = 10.0
+    arming: float = 10.0  # for an arm that was just connected to become ready to be armed
+    # between attempts to arm; the tracker sees the tip some times meanwhile
     arming_again: float = 0.2
-    telemetry: float = 5.0
-    tidy: float = 10.0
+    telemetry: float = 5.0  # for telemetry to start
+    tidy: float = 10.0  # between garbage collections
+    # beyond `Safety.ramp_time`, for a daemon to end, whatever hangs. The limits below add up to
+    # less, so that the command can still report the outcome
     stop: float = 15.0
-    control: float = 6.0
+    control: float = 6.0  # beyond the ramp, for the control thread to end
+    # keeper, vent, supply, rest: for the end of the keeper, of a direct command to vent, of the
+    # supply, and of all other parts
     keeper: float = 0.5
     vent: float = 1.0
     supply: float = 3.0
     rest: float = 2.5
-    to_first_point: float = 2.0
+    to_first_point: float = 2.0  # minimum for the way to a motion's first point
 
 
 TIMES = DaemonTimes()
@@ -84,29 +71,20 @@ class Daemon:
     here or by a client. `stop`, or the end of a `with` block, lets the pressures down, vents, and
     ends everything.
 
+    Raises `FileError`: a file is wrong; `MissingExtraError`: a library is not installed.
+
     Parameters
     ----------
-    rig :
-        The rig file.
-    service :
-        Whether to open ports: the control interface, and Foxglove.
-    log_folder :
-        Folder of the recordings; None: the rig file's.
-    json_lines :
-        Whether the guard writes JSON on stderr.
+    rig : the rig file.
+    service : whether to open ports: the control interface, and Foxglove.
+    log_folder : folder of the recordings; None: the rig file's.
+    json_lines : whether the guard writes JSON on stderr.
 
     Attributes
     ----------
     trouble : after `stop`, why the arm may not be vented; empty if it is vented for certain.
     hung : parts that had not ended when `stop` did. Their threads do not keep the process from
         ending, but a library in them may: see `os._exit`.
-
-    Raises
-    ------
-    FileError
-        A file is wrong.
-    MissingExtraError
-        A library is not installed.
     """
 
     def __init__(
@@ -139,7 +117,6 @@ class Daemon:
             vibrates=_vibrates(description),
             scene=scene,
             plan_in_process=True,
-            commissioned=is_commissioned(description, self.robot.description),
         )
         self.loop = ControlLoop(
             guarded,
@@ -211,15 +188,9 @@ class Daemon:
 
         The arm stays vented.
 
-        Raises
-        ------
-        InputError
-            A port is not free, the token is too short for others to reach it, a device does not
-            answer, or a check failed.
-        MissingExtraError
-            A library is not installed.
-        DeviceError
-            The guard does not start.
+        Raises `InputError`: a port is not free, the token is too short for others to reach it, a
+        device does not answer, or a check failed; `MissingExtraError`: a library is not installed;
+        `DeviceError`: the guard does not start.
         """
         if self._started:
             raise InputError("a daemon can be started only once; make another one")

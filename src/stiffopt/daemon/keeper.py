@@ -26,10 +26,8 @@ class ServiceManager:
     signs of life. Nothing here waits: messages that the manager does not accept at once are lost.
     Raises `MissingExtraError` if there is a manager and sdnotify is not installed.
 
-    Attributes
-    ----------
-    watchdog_interval : time in s without `watchdog` after which the manager ends the process;
-        None: it does not.
+    `watchdog_interval`: time in s without `watchdog` after which the manager ends the process;
+    None: it does not.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:

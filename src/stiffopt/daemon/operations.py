@@ -12,9 +12,9 @@ from math import isfinite
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stiffopt import units
+from stiffopt.arrays import Array
 from stiffopt.control.loop import ControlLoop
 from stiffopt.control.request_queue import Requester, requested_by
 from stiffopt.control.state import Snapshot, State
@@ -202,10 +202,7 @@ class Operations:
 
         With `lasting`, the loop carries it out even after the patience has ended.
 
-        Raises
-        ------
-        RefusalError
-            It fails, does not return in time, or too many calls are waiting.
+        Raises `RefusalError`: it fails, does not return in time, or too many calls are waiting.
         """
         if self._running >= _MAX_CALLS and not urgent:
             raise RefusalError(503, "busy", "the control loop has too much to do; try again")
@@ -253,6 +250,6 @@ async def _ended(call: Future[Any]) -> None:
     await ended.wait()
 
 
-def _whole(values: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
+def _whole(values: Array | None) -> Array | None:
     """Return the values if all are known."""
     return values if values is not None and np.isfinite(values).all() else None

@@ -23,22 +23,14 @@ _NEW = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
 
 @dataclass(frozen=True)
 class RecordingLimits:
-    """Limits of a recording, and intervals of its checks.
+    """Limits of a recording, and intervals of its checks."""
 
-    Attributes
-    ----------
-    min_free : bytes to leave free on the disk; a recording that would need them ends.
-    margin : factor on `min_free` for the free bytes that a recording needs to begin.
-    largest : bytes of a file after which the next one begins.
-    look : interval between checks of the free space, in s.
-    retry : time from a failure to the next attempt, in s.
-    """
-
+    # bytes to leave free on the disk; a recording that would need them ends
     min_free: float = 200e6
-    margin: float = 1.25
-    largest: float = 1e9
-    look: float = 1.0
-    retry: float = 10.0
+    margin: float = 1.25  # factor on `min_free` for the free bytes that a recording needs to begin
+    largest: float = 1e9  # bytes of a file after which the next one begins
+    look: float = 1.0  # interval between checks of the free space, in s
+    retry: float = 10.0  # time from a failure to the next attempt, in s
 
 
 class RunRecording:

@@ -7,12 +7,9 @@ from math import radians
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array, Flags
 from stiffopt.daemon.run_log import RecordedRun
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 ARRIVED = 1e-3
 """A target is held from when the tip first comes this near to it, in m, ..."""
@@ -23,10 +20,8 @@ ARRIVED_ANGLE = radians(1.0)
 class ErrorStatistics(NamedTuple):
     """Statistics of errors in some ticks of a run, in the unit of the errors.
 
-    Attributes
-    ----------
-    mean, p95, largest : the mean, the 95th percentile and the largest error.
-    ticks : number of errors.
+    `mean`, `p95`, `largest`: the mean, the 95th percentile and the largest error. `ticks`: number
+    of errors.
     """
 
     mean: float
@@ -52,8 +47,8 @@ class RunStages(NamedTuple):
     Ticks without control, or without a target, are neither.
     """
 
-    approach: Mask
-    hold: Mask
+    approach: Flags
+    hold: Flags
 
     @classmethod
     def of(cls, run: RecordedRun) -> RunStages:
@@ -68,7 +63,7 @@ class RunStages(NamedTuple):
         return cls(steers & ~hold, hold)
 
 
-def _steers(run: RecordedRun) -> Mask:
+def _steers(run: RecordedRun) -> Flags:
     """Return flags of the ticks in which the loop is active and has a target."""
     active = np.zeros(len(run), dtype=bool)
     for span in run.states:
@@ -77,11 +72,11 @@ def _steers(run: RecordedRun) -> Mask:
     return active & (np.isfinite(run.position_error) | np.isfinite(run.angle_error))
 
 
-def _within(error: Array, limit: float) -> Mask:
+def _within(error: Array, limit: float) -> Flags:
     return np.isnan(error) | (error <= limit)
 
 
-def _targets(run: RecordedRun, steers: Mask) -> Iterator[slice]:
+def _targets(run: RecordedRun, steers: Flags) -> Iterator[slice]:
     """Yield the ticks of each target in turn."""
     begins = np.flatnonzero(steers & ~np.concatenate([[False], steers[:-1] & ~_jumps(run)]))
     breaks = np.union1d(np.append(begins, len(run)), np.flatnonzero(~steers))
@@ -89,7 +84,7 @@ def _targets(run: RecordedRun, steers: Mask) -> Iterator[slice]:
         yield slice(int(begin), int(end))
 
 
-def _jumps(run: RecordedRun) -> Mask:
+def _jumps(run: RecordedRun) -> Flags:
     """Return whether the next tick has a new target (N - 1,)."""
     moved = _change(run.target_position) > ARRIVED
     for name in ("target_pointing", "target_quaternion"):

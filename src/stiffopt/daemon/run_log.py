@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.arrays import Array, Flags
 from stiffopt.control.state import Event, SeenPose, Severity, Snapshot, State
 from stiffopt.control.state_fields import Entry, Kind, entries
 from stiffopt.daemon.topics import FORMAT, METADATA, STATES
@@ -17,8 +18,6 @@ from stiffopt.errors import FileError
 from stiffopt.logs.log import Log
 from stiffopt.logs.mcap_file import McapContents, read_mcap
 from stiffopt.logs.mcap_log import LOG_METADATA, log_of_contents
-
-Array = NDArray[np.float64]
 
 _HELD = ("/limits",)  # topics that are logged only when they change
 
@@ -63,7 +62,7 @@ class RecordedRun:
     captured: Array
     seen_position: Array
     seen_quaternion: Array
-    doubted: NDArray[np.bool_]
+    doubted: Flags
     states: tuple[RunSpan, ...] = ()
     alarms: tuple[RunSpan, ...] = ()
     events: tuple[Event, ...] = ()
@@ -107,12 +106,8 @@ class RecordedRun:
 def read_run(path: str | os.PathLike[str]) -> RecordedRun:
     """Read a recording of the daemon, even if it was cut short by a kill.
 
-    Raises
-    ------
-    FileError
-        It cannot be read, is no recording of a run, or has no whole message left.
-    MissingExtraError
-        mcap is not installed.
+    Raises `FileError`: it cannot be read, is no recording of a run, or has no whole message left;
+    `MissingExtraError`: mcap is not installed.
     """
     found = read_mcap(path)
     if LOG_METADATA in found.metadata:

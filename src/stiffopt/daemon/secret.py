@@ -110,11 +110,8 @@ class Secret:
     def write(self) -> None:
         """Write the file, replacing an old one; no other user can ever read it.
 
-        Raises
-        ------
-        FileError
-            It cannot be written, belongs to another running daemon, or is not a regular file of
-            this user in a folder that others cannot change.
+        Raises `FileError`: it cannot be written, belongs to another running daemon, or is not a
+        regular file of this user in a folder that others cannot change.
         """
         if self.path is None:
             return

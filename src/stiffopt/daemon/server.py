@@ -79,12 +79,8 @@ class Server:
     def start(self) -> None:
         """Listen; return when clients are answered.
 
-        Raises
-        ------
-        InputError
-            It cannot listen on the address.
-        ServiceError
-            The server does not start.
+        Raises `InputError`: it cannot listen on the address; `ServiceError`: the server does not
+        start.
         """
         limiter = getattr(getattr(self._app, "state", None), "limiter", None) or ConnectionLimiter()
         listening = bound_socket(self._host, self.port, _CONNECTIONS)

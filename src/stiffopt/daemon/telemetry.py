@@ -15,8 +15,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.control.loop import ControlLoop
 from stiffopt.control.state import Snapshot
 from stiffopt.daemon.recording import RunRecording
@@ -28,35 +28,23 @@ from stiffopt.model.manipulator import Manipulator
 from stiffopt.rig.device import Clock
 from stiffopt.rig.settings import ServiceSettings
 
-Array = NDArray[np.float64]
-
 
 @dataclass(frozen=True)
 class TelemetryRates:
-    """Intervals of the kinds of messages, in s, and sizes.
+    """Intervals of the kinds of messages, in s, and sizes."""
 
-    Attributes
-    ----------
-    wake : between checks for new snapshots.
-    commit : between writes to the disk; a killed process loses this much.
-    queue : snapshots that may wait; the oldest are dropped first.
-    tick : between logged snapshots; more of them would delay the loop.
-    frames, shape, state : between messages of the frames, of the arm's shape and the timing, and
-        of the state while it does not change.
-    calm : without a loss or failure, after which its alarm is cleared.
-    shape_poses : poses along the arm for Foxglove.
-    shape_share : share of the interpreter's time for the shape; the control thread needs it too.
-    """
-
-    wake: float = 0.02
-    commit: float = 0.1
-    queue: int = 4096
-    tick: float = 0.01
+    wake: float = 0.02  # between checks for new snapshots
+    commit: float = 0.1  # between writes to the disk; a killed process loses this much
+    queue: int = 4096  # snapshots that may wait; the oldest are dropped first
+    tick: float = 0.01  # between logged snapshots; more of them would delay the loop
+    # frames, shape, state: between messages of the frames, of the arm's shape and the timing, and
+    # of the state while it does not change
     frames: float = 0.04
     shape: float = 0.1
     state: float = 1.0
-    calm: float = 10.0
-    shape_poses: int = 12
+    calm: float = 10.0  # without a loss or failure, after which its alarm is cleared
+    shape_poses: int = 12  # poses along the arm for Foxglove
+    # share of the interpreter's time for the shape; the control thread needs it too
     shape_share: float = 0.02
 
 
@@ -65,6 +53,8 @@ RATES = TelemetryRates()
 
 class Telemetry:
     """Logs what a loop does, to Foxglove and to a recording.
+
+    Raises `MissingExtraError`: foxglove-sdk is not installed.
 
     Parameters
     ----------
@@ -75,11 +65,6 @@ class Telemetry:
     backbone : returns poses (m, 4, 4) along the arm for pressures (n,), in Pa.
     about : further metadata for the recording, such as the text of the rig file.
     wall : nanoseconds since 1970; read once, so that messages do not jump with the wall clock.
-
-    Raises
-    ------
-    MissingExtraError
-        foxglove-sdk is not installed.
     """
 
     def __init__(

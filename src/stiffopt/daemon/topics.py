@@ -14,9 +14,9 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stiffopt import lie
+from stiffopt.arrays import Array
 from stiffopt.control.state import Event, SeenPose, Severity, Snapshot, State, Timing
 from stiffopt.control.state_fields import Entry, Kind, entries
 from stiffopt.daemon.state_json import plain
@@ -92,8 +92,6 @@ def _schema(entry: Entry) -> dict[str, Any]:
         item = {"type": "object", "properties": fields}
     return {"type": entry.kind.value} if item is None else {"type": "array", "items": item}
 
-
-Array = NDArray[np.float64]
 
 BASE, TIP, TARGET, SEEN = "base", "tip", "target", "tip_seen"
 """Names of the frames; all are children of the base."""

@@ -6,14 +6,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from stiffopt.arrays import Array
 from stiffopt.errors import InputError
 from stiffopt.model.arguments import checked_integer
 from stiffopt.model.compliance import Boundary, Frame
 from stiffopt.model.manipulator import Manipulator
-
-Array = NDArray[np.float64]
 
 NEAREST_BASE = 0.2
 """Share of the length from which stiffness is mapped; at the base it is infinite."""
@@ -22,35 +21,22 @@ Progress = Callable[[float, float], None]
 
 @dataclass(frozen=True, eq=False)
 class ArmMap:
-    """Stiffness at points along an arm.
+    """Stiffness at points along an arm."""
 
-    Attributes
-    ----------
-    robot : name.
-    length : at rest, in m.
-    groups : G groups of channels (from 1); the channels of a group are pressurised together.
-    pressures : of the group's channels, (P,), in Pa.
-    at : arc lengths of the points at rest (S,), in m.
-    directions : unit vectors (d, 3).
-    boundary, frame : of the stiffness.
-    stiffness : (G, P, S, d), in N/m.
-    positions : of the points in the base frame (G, P, S, 3), in m.
-    backbones : shapes of the arm (G, P, B, 3), from its base, in m.
-    hangs : whether z points down.
-    """
-
-    robot: str
-    length: float
+    robot: str  # name
+    length: float  # at rest, in m
+    # G groups of channels (from 1); the channels of a group are pressurised together
     groups: tuple[tuple[int, ...], ...]
-    pressures: Array
-    at: Array
-    directions: Array
+    pressures: Array  # of the group's channels, (P,), in Pa
+    at: Array  # arc lengths of the points at rest (S,), in m
+    directions: Array  # unit vectors (d, 3)
+    # boundary, frame: of the stiffness
     boundary: str
     frame: str
-    stiffness: Array
-    positions: Array
-    backbones: Array
-    hangs: bool
+    stiffness: Array  # (G, P, S, d), in N/m
+    positions: Array  # of the points in the base frame (G, P, S, 3), in m
+    backbones: Array  # shapes of the arm (G, P, B, 3), from its base, in m
+    hangs: bool  # whether z points down
 
     @property
     def middle(self) -> int:
@@ -60,28 +46,19 @@ class ArmMap:
 
 @dataclass(frozen=True, eq=False)
 class TipMap:
-    """Stiffness of the tip over the pressures of two channels.
+    """Stiffness of the tip over the pressures of two channels."""
 
-    Attributes
-    ----------
-    robot : name.
-    channels : the two, counted from 1.
-    first, second : their pressures (A,) and (B,), in Pa.
-    others : pressures (n,) of the other channels, in Pa.
-    directions : unit vectors (d, 3).
-    boundary, frame : of the stiffness.
-    stiffness : (A, B, d), in N/m; NaN where the arm has no equilibrium.
-    """
-
-    robot: str
-    channels: tuple[int, int]
+    robot: str  # name
+    channels: tuple[int, int]  # the two, counted from 1
+    # first, second: their pressures (A,) and (B,), in Pa
     first: Array
     second: Array
-    others: Array
-    directions: Array
+    others: Array  # pressures (n,) of the other channels, in Pa
+    directions: Array  # unit vectors (d, 3)
+    # boundary, frame: of the stiffness
     boundary: str
     frame: str
-    stiffness: Array
+    stiffness: Array  # (A, B, d), in N/m; NaN where the arm has no equilibrium
 
 
 def first_channels(robot: Manipulator, count: int) -> tuple[int, ...]:
@@ -102,6 +79,9 @@ def map_arm(
 ) -> ArmMap:
     """Map the stiffness along an arm.
 
+    Raises `InputError`: the robot lacks a channel, or does not allow a pressure;
+    `EquilibriumError`: the arm has no stable equilibrium at one of the pressures.
+
     Parameters
     ----------
     groups : groups of channels (from 1) that are pressurised together; by default the first channel
@@ -112,13 +92,6 @@ def map_arm(
     directions : (d, 3)
     boundary, frame : of the stiffness; see `Manipulator.stiffness`.
     progress : called with the number of points done and the total.
-
-    Raises
-    ------
-    InputError
-        The robot lacks a channel, or does not allow a pressure.
-    EquilibriumError
-        The arm has no stable equilibrium at one of the pressures.
     """
     points = checked_integer("points, the number of points along the arm,", points, 2)
     if groups is None:
@@ -173,19 +146,15 @@ def map_tip(
 ) -> TipMap:
     """Map the stiffness of the tip over the pressures of two channels.
 
+    Raises `InputError`: these are not two channels of the robot; `EquilibriumError`: the arm has no
+    stable equilibrium at one of the pressures.
+
     Parameters
     ----------
     channels : the two, counted from 1.
     levels : number of pressures of each, from its lowest to its highest.
     others : (n,), pressures of the other channels, in Pa; by default their lowest.
     directions, boundary, frame, progress : see `map_arm`.
-
-    Raises
-    ------
-    InputError
-        These are not two channels of the robot.
-    EquilibriumError
-        The arm has no stable equilibrium at one of the pressures.
     """
     levels = checked_integer("levels, the number of pressures of a channel,", levels, 2)
     pair = _checked_channels(robot, channels)

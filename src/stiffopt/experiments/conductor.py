@@ -13,8 +13,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from stiffopt.arrays import Array
 from stiffopt.errors import DeviceError, InputError
 from stiffopt.logs import LogRow
 from stiffopt.rig.interface import PoseSample, PressureCommand, PressureReading, Rig
@@ -22,8 +23,6 @@ from stiffopt.rig.settings import ControlSettings, Safety
 from stiffopt.safety.expected_pressure import Regulation
 from stiffopt.safety.goal import GoalSupply
 from stiffopt.safety.monitors import PressureMonitor
-
-Array = NDArray[np.float64]
 
 _KEPT = 4096  # number of frames and ticks in memory
 _RECENT = 200  # number of ticks searched for that of a frame

@@ -13,8 +13,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
+from stiffopt.arrays import Array
 from stiffopt.errors import InputError
-from stiffopt.experiments.conductor import CONDUCTOR, Array, Conductor, at_rest
+from stiffopt.experiments.conductor import CONDUCTOR, Conductor, at_rest
 from stiffopt.experiments.folder import recorded
 from stiffopt.rig.interface import Rig
 from stiffopt.safety.gate import effective_slew
@@ -33,10 +34,7 @@ def spread_pressures(count: int, low: ArrayLike, high: ArrayLike) -> Array:
     one pose to the next, about half of the channels rise and half fall. The result is
     deterministic.
 
-    Parameters
-    ----------
-    count : number of poses.
-    low, high : (n,), ends of each channel's range, in Pa.
+    `count`: number of poses. `low`, `high`: (n,), ends of each channel's range, in Pa.
     """
     low, high = np.array(low, dtype=float), np.array(high, dtype=float)
     if count == 1:
@@ -85,16 +83,14 @@ class Coverage:
     ) -> int:
         """Record a round, from `base` through its poses and back.
 
+        Returns the number of poses in which the arm did not settle in time.
+
         Parameters
         ----------
         conductor : has seen the tip; the arm is at `base`.
         folder, about : as for `recorded`; the files are named by `round_name`.
         number : of the round, from 1.
         report : called with the seconds done and a description.
-
-        Returns
-        -------
-        The number of poses in which the arm did not settle in time.
         """
         poses, before = self.rounds[number - 1], sum(map(len, self.rounds[: number - 1]))
         durations = self._durations(poses)

@@ -116,12 +116,9 @@ def recorded(
     ----------
     conductor : Conductor
         Source of the frames; it has seen the tip.
-    folder, name :
-        Folder, and name of the files without ending.
-    about :
-        Metadata for the MCAP file.
-    longest :
-        Time in s after which frames are left out.
+    folder, name : folder, and name of the files without ending.
+    about : metadata for the MCAP file.
+    longest : time in s after which frames are left out.
 
     Yields
     ------

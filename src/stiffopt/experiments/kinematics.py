@@ -17,8 +17,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Field
 
+from stiffopt.arrays import Array
 from stiffopt.errors import FileError
-from stiffopt.experiments.conductor import Array, Conductor, at_rest, check_pressures
+from stiffopt.experiments.conductor import Conductor, at_rest, check_pressures
 from stiffopt.experiments.coverage import coverage_for, round_count, round_name
 from stiffopt.experiments.folder import ExperimentSettings, Progress, recorded
 from stiffopt.logs import read_log
@@ -62,10 +63,7 @@ class KinematicsSettings(ExperimentSettings):
 class PressureSequence:
     """Pressures that change linearly between given times.
 
-    Attributes
-    ----------
-    times : (K,), in s, increasing from 0.
-    pressures : (K, n), in Pa.
+    `times`: (K,), in s, increasing from 0. `pressures`: (K, n), in Pa.
     """
 
     times: Array
@@ -152,6 +150,8 @@ def run_kinematics(
 ) -> list[str]:
     """Record the repetitions and the rounds of combined poses that are missing in a folder.
 
+    Returns notes for the user.
+
     Parameters
     ----------
     rig : open.
@@ -160,11 +160,6 @@ def run_kinematics(
     rate : rate of the commands, in Hz.
     progress : called with the seconds done, the total and a description.
     check : called often; it may raise to stop.
-
-    Returns
-    -------
-    list of str
-        Notes for the user.
 
     Raises
     ------

@@ -14,8 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
+from stiffopt.arrays import Array
 from stiffopt.errors import InputError
-from stiffopt.experiments.conductor import Array
 from stiffopt.experiments.coverage import round_name
 from stiffopt.experiments.kinematics import KinematicsSettings, recording_name
 from stiffopt.logs import Log, read_log
@@ -113,10 +113,7 @@ def evaluate_kinematics(logs: Sequence[Log], model: Manipulator) -> KinematicsRe
     the arm's model and not of the regulators. For an arm under gravity, whose poses take
     milliseconds each, their mean over the repetitions is used.
 
-    Raises
-    ------
-    InputError
-        There is nothing to compare, or the model has another number of channels.
+    Raises `InputError`: there is nothing to compare, or the model has another number of channels.
     """
     logs = [log for log in logs if np.isfinite(log.tip_position).all(axis=1).any()]
     if not logs:
@@ -228,15 +225,8 @@ def read_rounds(folder: Path, count: int) -> list[Log]:
 def evaluate_coverage(logs: Sequence[Log], model: Manipulator) -> CoverageResult | None:
     """Compare the poses in which the arm was held with a model, at the measured pressures.
 
-    Returns
-    -------
-    CoverageResult or None
-        None if there is no pose in which the tip was seen.
-
-    Raises
-    ------
-    InputError
-        The model has another number of channels.
+    Returns None if there is no pose in which the tip was seen. Raises `InputError`: the model has
+    another number of channels.
     """
     if any(log.n != model.n_pressures for log in logs):
         raise InputError(

@@ -11,9 +11,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Field
 
+from stiffopt.arrays import Array
 from stiffopt.display import display_units
 from stiffopt.errors import InputError
-from stiffopt.experiments.conductor import Array, Conductor, check_pressures
+from stiffopt.experiments.conductor import Conductor, check_pressures
 from stiffopt.experiments.folder import Progress, recorded
 from stiffopt.files import read_file, save_file
 from stiffopt.rig.interface import Rig

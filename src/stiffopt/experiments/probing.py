@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array, Flags
 from stiffopt.errors import DeviceError, FileError, InputError
-from stiffopt.experiments.conductor import Array, Conductor, TrackedFrame, split_window
+from stiffopt.experiments.conductor import Conductor, TrackedFrame, split_window
 from stiffopt.logs.table import cut_torn_end, read_table, writing
 from stiffopt.rig.interface import ForceProbe
 
@@ -218,8 +218,8 @@ class SeriesPoints:
     force: Array
     displacement: Array
     stage: Array
-    touching: NDArray[np.bool_]
-    settled: NDArray[np.bool_]
+    touching: Flags
+    settled: Flags
     measured: Array
 
 

@@ -13,9 +13,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from stiffopt.arrays import Array
 
 _FEWEST = 3  # points; a line through two has no residual
 _BEND = 3.0  # significance of a curvature, in standard errors, from which a parabola is fitted

@@ -16,9 +16,10 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field
 
+from stiffopt.arrays import Array
 from stiffopt.directions import Direction, direction_name
 from stiffopt.errors import InputError
-from stiffopt.experiments.conductor import Array, Conductor, at_rest, check_pressures
+from stiffopt.experiments.conductor import Conductor, at_rest, check_pressures
 from stiffopt.experiments.folder import ExperimentSettings, Progress, RawRecording
 from stiffopt.experiments.probing import PointsFile, Probing, Series, SeriesKey
 from stiffopt.model.manipulator import Manipulator
@@ -118,6 +119,8 @@ def run_stiffness(
 ) -> list[str]:
     """Do the series of the experiment that are missing in a folder.
 
+    Returns notes for the user.
+
     Parameters
     ----------
     rig : open, with a tracker and a probe.
@@ -128,11 +131,6 @@ def run_stiffness(
     progress : called with the number of series done, the total and a description.
     check : called often; it may raise to stop.
     aside : returns the context in which the probe is aligned, perhaps by a person.
-
-    Returns
-    -------
-    list of str
-        Notes for the user.
 
     Raises
     ------

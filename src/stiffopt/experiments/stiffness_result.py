@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from stiffopt.experiments.conductor import Array
+from stiffopt.arrays import Array
 from stiffopt.experiments.probing import PointsFile, SeriesPoints
 from stiffopt.experiments.slope import LineFit, SlopeEstimate, combine, fit_lines
 from stiffopt.experiments.stiffness import StiffnessSettings
@@ -22,26 +22,17 @@ _UNKNOWN = SlopeEstimate(math.nan, math.nan, math.nan, math.nan, 0)
 
 @dataclass(frozen=True)
 class StiffnessCell:
-    """Stiffness at one pressure in one direction.
+    """Stiffness at one pressure in one direction."""
 
-    Attributes
-    ----------
-    pressure : of the channel, in Pa.
-    direction : unit vector in the base frame.
-    estimate : from the displacement of the tip, in N/m; None if no repetition gave a slope.
-    by_stage : the same from the position of the stage; lower, since contact and sensor yield too.
-    slopes : of the repetitions, in N/m.
-    points : number of points in contact, in all repetitions.
-    model : stiffness of the model, in N/m.
-    """
-
-    pressure: float
-    direction: tuple[float, float, float]
+    pressure: float  # of the channel, in Pa
+    direction: tuple[float, float, float]  # unit vector in the base frame
+    # from the displacement of the tip, in N/m; None if no repetition gave a slope
     estimate: SlopeEstimate | None
+    # the same from the position of the stage; lower, since contact and sensor yield too
     by_stage: SlopeEstimate | None
-    slopes: tuple[float, ...]
-    points: int
-    model: float
+    slopes: tuple[float, ...]  # of the repetitions, in N/m
+    points: int  # number of points in contact, in all repetitions
+    model: float  # stiffness of the model, in N/m
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,14 +95,7 @@ def evaluate_stiffness(
 ) -> StiffnessResult:
     """Fit the stiffness of all series in a folder, and compare it with a model.
 
-    Parameters
-    ----------
-    folder : of an experiment, complete or not.
-
-    Raises
-    ------
-    FileError
-        The points cannot be read.
+    `folder`: of an experiment, complete or not. Raises `FileError`: the points cannot be read.
     """
     series = PointsFile(folder, settings.channels).read()
     top = max(settings.pressures)

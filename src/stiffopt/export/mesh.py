@@ -4,13 +4,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from stiffopt.arrays import Array
 from stiffopt.documents import write_whole
 from stiffopt.errors import FileError, InputError, require_package
 from stiffopt.model.manipulator import Manipulator
-
-Vector = NDArray[np.float64]
 
 MESH_ENDINGS = (".stl", ".obj", ".ply")
 SPACING = 1e-3
@@ -63,7 +62,7 @@ def surface_mesh(robot: Manipulator, pressures: ArrayLike, spacing: float = SPAC
     return trimesh.Trimesh(vertices, np.concatenate([sides.reshape(-1, 3), *lids]), process=False)
 
 
-def _rings(robot: Manipulator, p: Vector, spacing: float) -> Vector:
+def _rings(robot: Manipulator, p: Array, spacing: float) -> Array:
     """Return vertices (rings, around, 3) of the tube and of the hemisphere without its pole."""
     at = np.linspace(0, robot.length, int(np.ceil(robot.length / spacing)) + 1)[1:]
     poses = np.concatenate([np.eye(4)[None], robot.pose(p, at)])
@@ -84,7 +83,7 @@ def _rings(robot: Manipulator, p: Vector, spacing: float) -> Vector:
     return np.asarray(local @ poses[:, :3, :3].swapaxes(1, 2) + poses[:, None, :3, 3])
 
 
-def _end(robot: Manipulator, p: Vector) -> Vector:
+def _end(robot: Manipulator, p: Array) -> Array:
     """Return the pole of the hemisphere, (3,)."""
     tip = robot.tip_pose(p)
     return np.asarray(tip[:3, 3] + robot.body_radius(p, robot.length) * tip[:3, 2])

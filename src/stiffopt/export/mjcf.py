@@ -13,16 +13,15 @@ from typing import Any, NamedTuple
 from xml.etree import ElementTree as ET
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from stiffopt import lie
+from stiffopt.arrays import Array
 from stiffopt.errors import InputError
 from stiffopt.model.actuation import SectionGeometry
 from stiffopt.model.description import Segment
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.shooting import mass_per_length
-
-Vector = NDArray[np.float64]
 
 PIECES = 12
 """Joints per segment."""
@@ -38,28 +37,21 @@ _TIP_RADIUS = 2e-3  # of the site, and of the ball for the tip's mass, in m
 class _Part(NamedTuple):
     """A straight piece of a link: its ends and centroid in the link's axes, (3,) each."""
 
-    start: Vector
-    end: Vector
-    centroid: Vector
+    start: Array
+    end: Array
+    centroid: Array
     radius: float
     mass: float
 
 
 @dataclass
 class _Link:
-    """A rigid body and the joint that connects it to the link before.
-
-    Attributes
-    ----------
-    placed : pose (4, 4) of the joint in the axes of the link before.
-    stiffness : (6, 6) of the joint, linear first; None: it is fixed.
-    parts : its pieces, from the joint on.
-    """
+    """A rigid body and the joint that connects it to the link before."""
 
     name: str
-    placed: Vector
-    stiffness: Vector | None
-    parts: list[_Part] = field(default_factory=list)
+    placed: Array  # pose (4, 4) of the joint in the axes of the link before
+    stiffness: Array | None  # (6, 6) of the joint, linear first; None: it is fixed
+    parts: list[_Part] = field(default_factory=list)  # its pieces, from the joint on
 
 
 def mjcf(
@@ -101,13 +93,13 @@ def mjcf(
     return _document(robot, links, tip, delay)
 
 
-def _links(robot: Manipulator, p: Vector, pieces: int) -> tuple[list[_Link], Vector]:
+def _links(robot: Manipulator, p: Array, pieces: int) -> tuple[list[_Link], Array]:
     """Return the links from the base to the tip, and the tip's pose in the last one."""
     sections = [np.array(part) for part in robot._section_parts(p)]
     strains, compliances = sections[: robot.n_segments], sections[robot.n_segments :]
     links, here = [_Link("base", np.eye(4), None)], np.eye(4)
 
-    def go(step: Vector, segment: Segment, mass: float = 0.0) -> None:
+    def go(step: Array, segment: Segment, mass: float = 0.0) -> None:
         nonlocal here
         there = here @ step
         off_axis = here[:3, :3] @ [*SectionGeometry.of(segment).centroid, 0.0]
@@ -137,7 +129,7 @@ def _mass_per_length(segment: Segment) -> float:
     return mass_per_length(segment) or _SILICONE * float(SectionGeometry.of(segment).area)
 
 
-def _slowest_swing(robot: Manipulator, p: Vector, pieces: int) -> float:
+def _slowest_swing(robot: Manipulator, p: Array, pieces: int) -> float:
     """Return the lowest natural frequency, in rad/s, of point masses on the arm's compliance."""
     at, masses, start = [], [], 0.0
     for segment in robot.description.segments:
@@ -154,7 +146,7 @@ def _slowest_swing(robot: Manipulator, p: Vector, pieces: int) -> float:
     return float(np.linalg.eigvalsh(weighted.reshape(3 * n, 3 * n))[-1] ** -0.5)
 
 
-def _document(robot: Manipulator, links: list[_Link], tip: Vector, delay: float) -> str:
+def _document(robot: Manipulator, links: list[_Link], tip: Array, delay: float) -> str:
     root = ET.Element("mujoco", model=robot.description.name)
     _add(root, "compiler", angle="radian")
     step = min(_LONGEST_STEP, delay)  # with a longer one the fast vibrations might grow
@@ -186,7 +178,7 @@ def _add_joint(
     body: ET.Element,
     tendons: ET.Element,
     name: str,
-    stiffness: Vector,
+    stiffness: Array,
     delay: float,
     order: Sequence[int],
 ) -> None:
@@ -207,7 +199,7 @@ def _add_joint(
                     _add(tendon, "joint", joint=joint, coef=share)
 
 
-def _eigenvectors(K: Vector, scale: Vector) -> Iterator[tuple[float, Vector]]:
+def _eigenvectors(K: Array, scale: Array) -> Iterator[tuple[float, Array]]:
     """Yield stiffnesses k and vectors c with K = sum k c c', with axes in units of their scale."""
     values, vectors = np.linalg.eigh(K / np.outer(scale, scale))
     for value, vector in zip(values, vectors.T, strict=True):
@@ -242,5 +234,5 @@ def _add(parent: ET.Element, tag: str, **values: Any) -> ET.Element:
     return ET.SubElement(parent, tag, texts)
 
 
-def _pose(T: Vector) -> dict[str, Vector]:
+def _pose(T: Array) -> dict[str, Array]:
     return {"pos": T[:3, 3], "quat": lie.quaternion_from_rotation(T[:3, :3])}

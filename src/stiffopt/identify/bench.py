@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from stiffopt.arrays import Array
 from stiffopt.errors import InputError, require_package
 from stiffopt.files import read_file
 from stiffopt.identify.calibration import calibrate
@@ -36,7 +37,6 @@ from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.robot_files import load_description
 from stiffopt.schema import Items, Schema
 
-Array = NDArray[np.float64]
 Progress = Callable[[float, float, str], None]
 
 _LAG = 0.3  # s, of the baselines' input

@@ -11,9 +11,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stiffopt import lie
+from stiffopt.arrays import Array
 from stiffopt.errors import InputError, PressureError, StoppedError
 from stiffopt.identify.detection import Comparer, Hypothesis, found_wrong, without_drift
 from stiffopt.identify.error_model import covariance_with, error_model, kept_unknowns
@@ -59,7 +59,6 @@ from stiffopt.model.parameters import Parameter, with_values
 from stiffopt.model.stopping import Cancel, checkpoint, giving_up
 from stiffopt.registration import Placement, Registration
 
-Array = NDArray[np.float64]
 Progress = Callable[[float, float, str], None]
 
 

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt import lie
+from stiffopt.arrays import Array
 from stiffopt.errors import PressureError
 from stiffopt.identify.discrepancy import smooth_functions
 from stiffopt.identify.recording import Recording, Track
@@ -26,9 +27,6 @@ from stiffopt.model.calibration import distances_from
 from stiffopt.model.description import RobotDescription, Tolerances
 from stiffopt.model.history import lagged
 from stiffopt.model.manipulator import Manipulator
-
-Array = NDArray[np.float64]
-
 
 # -- clocks ----------------------------------------------------------------------------------------
 

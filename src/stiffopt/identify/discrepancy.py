@@ -14,11 +14,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.identify.settings import FIT
-
-Array = NDArray[np.float64]
 
 _JITTER = 1e-6  # added to the diagonal of the centres' correlation, so that it stays regular
 

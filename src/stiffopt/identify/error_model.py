@@ -35,6 +35,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.identify.discrepancy import centres
 from stiffopt.identify.fit import Fit
 from stiffopt.identify.past import pause_between
@@ -53,7 +54,6 @@ from stiffopt.model.calibration import (
 )
 from stiffopt.model.history import NO_HISTORY
 
-Array = NDArray[np.float64]
 Rows = NDArray[np.bool_]
 
 _MIN_FREEDOM = 4.0  # of a t-distribution; below, its covariance says little

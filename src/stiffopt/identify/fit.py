@@ -16,14 +16,12 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.errors import EquilibriumError, InputError
 from stiffopt.identify.problem import CalibrationProblem, Noise, Predicted, Sample
 from stiffopt.identify.settings import FIT
 from stiffopt.model.description import RobotDescription
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,6 +12,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.errors import InputError
 from stiffopt.identify.discrepancy import centres
 from stiffopt.identify.error_model import HeldBack
@@ -20,7 +21,6 @@ from stiffopt.identify.problem import CalibrationProblem
 from stiffopt.identify.results import Errors
 from stiffopt.identify.settings import CHOICE
 
-Array = NDArray[np.float64]
 Rows = NDArray[np.bool_]
 
 

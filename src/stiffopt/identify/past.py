@@ -18,13 +18,12 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.identify.settings import FIT
 from stiffopt.model.batch import CompiledFunction, InterpretedFunction
 from stiffopt.model.codegen import dense
 from stiffopt.model.compiled import compiling_at_once, library
 from stiffopt.model.history import NO_HISTORY, History, part_of
-
-Array = NDArray[np.float64]
 
 _CHUNKS = (1, 8, 32, 128, 512, 2048)  # rows per call; shorter blocks are padded
 _MAX_PADDING = 0.25  # largest padded share of a chunk; beyond it, a smaller chunk is run

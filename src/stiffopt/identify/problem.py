@@ -20,10 +20,11 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.identify.discrepancy import Systematic, smooth_functions
 from stiffopt.identify.past import Past, Start, pause_between
 from stiffopt.identify.recording import Recording
-from stiffopt.identify.sensing import Readings, readings
+from stiffopt.identify.sensing import Readings, gravity_in_base, readings
 from stiffopt.identify.settings import FIT
 from stiffopt.identify.unknowns import Unknowns
 from stiffopt.logs import StiffnessTable
@@ -35,9 +36,6 @@ from stiffopt.model.description import RobotDescription
 from stiffopt.model.history import NO_HISTORY
 from stiffopt.model.parameters import varied, with_values
 from stiffopt.model.parametric import ParametricArm
-
-Array = NDArray[np.float64]
-
 
 Begin = Literal["rest", "previous", "unknown"]
 """State at a log's beginning: after a rise from zero, as the previous log ended, or unknown."""
@@ -218,13 +216,38 @@ class CalibrationProblem:
     def robot(self, x: Array) -> RobotDescription:
         """Return the robot at scaled coordinates x (d,), its numbers rounded to seven digits."""
         coordinates = x * self.scale
-        return with_values(
+        robot = with_values(
             self.description,
             {
                 parameter: _rounded(parameter.at(parameter.value(self.description), coordinates[i]))
                 for i, parameter in enumerate(self._parameters)
             },
         )
+        found = self._gravity(coordinates)
+        if found is None:
+            return robot
+        return robot.model_copy(update={"gravity": tuple(map(_rounded, found[0].tolist()))})
+
+    def _gravity(self, coordinates: Array) -> tuple[Array, Array] | None:
+        """Return gravity (3,) in the axes of the turned base, and its derivatives (3, d).
+
+        None if it does not vary: there is none, the base is known, or the vertical is not.
+        """
+        base, *_ = self.unknowns.slices()
+        given = np.array(self.description.gravity)
+        if not (self.unknowns.base and given.any() and self.description.has_known_vertical):
+            return None
+        turn, slopes = slice(base.start + 3, base.stop), np.zeros((3, self.size))
+        found, slopes[:, turn] = gravity_in_base(given, coordinates[turn])
+        return found, slopes
+
+    def _turn_gravity(self, coordinates: Array) -> Array | None:
+        """Set the arm's gravity; return its derivatives (3, d), or None if it does not vary."""
+        found = self._gravity(coordinates)
+        if found is None:
+            return None
+        self._arm.set_gravity(found[0])
+        return found[1]
 
     def residuals(self, x: Array) -> tuple[Array, Array]:
         """Return residuals (m,) of samples and tables at scaled coordinates, and Jacobian (m, d).
@@ -364,6 +387,7 @@ class CalibrationProblem:
         coordinates = x * self.scale
         base, sensors, zeros, sides = self.unknowns.slices()
         effective, rates, by_history = self._effective(coordinates, sides)
+        by_gravity = self._turn_gravity(coordinates)
         k = len(self._parameters)
         starts = self.starts
         poses, read, errors, acting, slopes = [], [], [], [], []
@@ -382,6 +406,8 @@ class CalibrationProblem:
             twist = np.zeros((len(effective), 6, self.size))  # of the point, in its axes
             twist[:, :, :k] = found.per_coordinate
             twist += found.per_pressure @ by_history
+            if by_gravity is not None:
+                twist += found.per_gravity @ by_gravity
 
             def slope(per: Array, twist: Array = twist, sensor: slice = sensor) -> Array:
                 total: Array = per[:, :, :6] @ twist
@@ -466,18 +492,21 @@ class CalibrationProblem:
     def of_table(self, table: StiffnessTable, x: Array) -> tuple[Array, Array]:
         """Return a table's residuals (r,), divided by its sigmas, and their derivatives (r, d)."""
         _, _, coordinates, by_history = self._of_parameters(x)
+        by_gravity = self._turn_gravity(x * self.scale)
         value, slope = np.zeros(len(table)), np.zeros((len(table), self.size))
         known = np.isfinite(table.stiffness) & np.isfinite(table.sigma) & (table.sigma > 0)
         kinds = list(zip(map(tuple, table.directions.tolist()), table.boundaries, strict=True))
         for direction, boundary in sorted({kinds[row] for row in np.flatnonzero(known)}):
             rows = known & np.array([kind == (direction, boundary) for kind in kinds])
             measure = checked_measure(direction, "translation", cast(Boundary, boundary), "base")
-            k, _, per_coordinate = self._arm.stiffnesses(
+            k, _, per_coordinate, per_gravity = self._arm.stiffnesses(
                 table.pressures[rows], coordinates[:, 0], measure
             )
             value[rows] = (table.stiffness[rows] - k) / table.sigma[rows]
             change = per_coordinate @ by_history
             slope[rows, : len(coordinates)] = -change / table.sigma[rows, np.newaxis]
+            if by_gravity is not None:
+                slope[rows] -= per_gravity @ by_gravity / table.sigma[rows, np.newaxis]
         return value, slope
 
 

@@ -13,6 +13,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.errors import FileError, InputError, shown
 from stiffopt.identify.settings import DETECTION, PLAUSIBLE
 from stiffopt.identify.tracker_faults import (
@@ -32,7 +33,6 @@ from stiffopt.logs import Body, Log
 from stiffopt.model.description import RobotDescription
 from stiffopt.model.manipulator import Manipulator
 
-Array = NDArray[np.float64]
 Rows = NDArray[np.bool_]
 
 _PRESSURE_UNITS = {"MPa": 1e6, "bar": 1e5, "psi": 6894.757, "kPa": 1e3, "mbar": 1e2}

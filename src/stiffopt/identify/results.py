@@ -10,14 +10,13 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.display import display_units
 from stiffopt.identify.fit import Fit
 from stiffopt.identify.settings import REPORT
 from stiffopt.identify.unknowns import BASE, SENSOR
 from stiffopt.model.parameters import Parameter
 from stiffopt.model.uncertainty import NORMAL_QUANTILE
-
-Array = NDArray[np.float64]
 
 TIED = "hardly told apart"
 """Beginning of the remark on two numbers that the data cannot distinguish."""
@@ -26,6 +25,7 @@ _PLACED = {
     SENSOR: "the tip's orientation recorded while it bends in all directions",
 }
 """Experiments that would determine these frames."""
+_LEVEL = "; gravity turned with it: if the tracker is not level, say so in its registration"
 
 
 @dataclass(frozen=True)
@@ -266,7 +266,7 @@ def doubts(found: Fit, listed: Sequence[FittedEstimate]) -> list[str]:
     for experiment, names in unlearnt.items():
         tell = f"; what would tell: {experiment}" if experiment else ""
         remarks.append(f"not learnt from these data: {'; '.join(names)}{tell}")
-    deviation = np.sqrt(np.diag(found.covariance))
+    robot, deviation = found.problem.description, np.sqrt(np.diag(found.covariance))
     correlation = found.covariance / np.outer(deviation, deviation)
     for i, one in enumerate(listed):
         for j in range(i):
@@ -281,6 +281,8 @@ def doubts(found: Fit, listed: Sequence[FittedEstimate]) -> list[str]:
                 f"far from the robot file: {estimate.name}, by {abs(estimate.far):.1f} of its "
                 "tolerances; look for a reason before you trust it"
             )
+            if turned and estimate.name.startswith(BASE) and any(robot.gravity):
+                remarks[-1] += _LEVEL
     return remarks
 
 

@@ -1,4 +1,8 @@
-"""Measurement model of a tracker: the pose of a sensor on the arm, with its Jacobian."""
+"""Measurement model of a tracker: the pose of a sensor on the arm, with its Jacobian.
+
+The tracker's frame does not move with the base, so the vertical is known there: a base that turns
+by R in it turns the arm's weight by R' in its own axes.
+"""
 
 from __future__ import annotations
 
@@ -7,13 +11,11 @@ from functools import cache
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from stiffopt import lie
+from stiffopt.arrays import Array
 from stiffopt.model.batch import InterpretedFunction
 from stiffopt.model.codegen import dense
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,6 +74,18 @@ def readings(
     return Readings(position[..., 0], per_twist, turn[..., 0], turn_per_twist)
 
 
+def gravity_in_base(gravity: Array, turn: Array) -> tuple[Array, Array]:
+    """Return gravity (3,) in the axes of a turned base, ``exp(turn)' gravity``, and slopes (3, 3).
+
+    Parameters
+    ----------
+    gravity : (3,), in the axes of the base if its unknown twist is zero.
+    turn : (3,), the rotation part of that twist, by which the slopes are.
+    """
+    found, slopes = _gravity_function()(gravity, turn)
+    return found[:, 0], slopes
+
+
 def _flat(matrices: Array) -> Array:
     """Return matrices (N, r, c) in CasADi's column order, (N, r c)."""
     return np.ascontiguousarray(np.swapaxes(matrices, 1, 2)).reshape(len(matrices), -1)
@@ -98,3 +112,11 @@ def _function() -> InterpretedFunction:
     outputs = [T[:3, 3], ca.jacobian(T[:3, 3], twists), turn, ca.jacobian(turn, twists)]
     still = ca.substitute(outputs, [moved], [ca.SX.zeros(6)])
     return InterpretedFunction(dense(ca.Function("readings", inputs, ca.cse(still))))
+
+
+@cache
+def _gravity_function() -> InterpretedFunction:
+    gravity, turn = ca.SX.sym("g", 3), ca.SX.sym("w", 3)
+    found = lie.exp(ca.vertcat(ca.SX.zeros(3), turn))[:3, :3].T @ gravity
+    outputs = [found, ca.jacobian(found, turn)]
+    return InterpretedFunction(dense(ca.Function("gravity", [gravity, turn], outputs)))

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.errors import InputError
 from stiffopt.identify.detection import begun, on_one_clock
 from stiffopt.identify.problem import Begin, CalibrationProblem, Noise, Sample, TrackedPoint
@@ -36,7 +37,6 @@ from stiffopt.model.description import Recordings, RobotDescription, Tolerances
 from stiffopt.model.robot_files import load_description
 from stiffopt.registration import Placement
 
-Array = NDArray[np.float64]
 Rows = NDArray[np.intp]
 
 NOISE = Noise(1e-3, np.radians(2.0))

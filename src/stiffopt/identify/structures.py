@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.errors import InputError
 from stiffopt.identify.error_model import HeldBack
 from stiffopt.identify.fit import Fit
@@ -22,8 +22,6 @@ from stiffopt.model.actuation import StrainLaw
 from stiffopt.model.description import Compensation, Corrections, RobotDescription, Segment
 from stiffopt.model.history import Creep, History, Play
 from stiffopt.model.laws import law_class, strain_laws
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -19,16 +19,15 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from stiffopt.arrays import Array
 from stiffopt.errors import InputError
 from stiffopt.identify.settings import SUGGESTION
 from stiffopt.model.calibration import Calibration, ErrorModel, RelativeErrors, growth
 from stiffopt.model.description import RobotDescription
 from stiffopt.model.parameters import Parameter
 from stiffopt.model.uncertainty import ReadingSlopes
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

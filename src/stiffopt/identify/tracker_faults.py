@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt import lie
+from stiffopt.arrays import Array
 from stiffopt.identify.settings import TRACKER
 
-Array = NDArray[np.float64]
 Rows = NDArray[np.bool_]
 
 MEDIAN_NORM = 1.538

@@ -10,15 +10,11 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
+from stiffopt.arrays import Array
 from stiffopt.identify.settings import FIT
 from stiffopt.model.description import RobotDescription, Tolerances
 from stiffopt.model.laws import law_class
 from stiffopt.model.parameters import Parameter
-
-Array = NDArray[np.float64]
 
 _AXES = ("x", "y", "z")
 BASE = "base in the tracker's frame"

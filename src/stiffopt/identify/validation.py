@@ -10,6 +10,7 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.errors import StiffoptError
 from stiffopt.identify.detection import replaced
 from stiffopt.identify.error_model import held_for, in_turn, is_moving
@@ -35,8 +36,6 @@ from stiffopt.model.compliance import Boundary
 from stiffopt.model.description import RobotDescription
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.uncertainty import Uncertainty
-
-Array = NDArray[np.float64]
 
 
 def validate(

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from stiffopt.arrays import Array
 from stiffopt.errors import DeviceError, InputError
 from stiffopt.rig.device import DeviceSettings
 
@@ -22,7 +22,6 @@ if TYPE_CHECKING:  # importing numba is slow, and peers do not need it
     from stiffopt.plant.hardware import Frame
     from stiffopt.plant.world import World
 
-Array = NDArray[np.float64]
 SettingsT = TypeVar("SettingsT", bound=DeviceSettings)
 
 FULL_SCALE = 10e5
@@ -34,20 +33,12 @@ _START = 5.0  # s for a device to start listening, and for it to stop
 
 @dataclass(frozen=True)
 class TrackerFrame:
-    """One frame of the tracker's hardware.
+    """One frame of the tracker's hardware."""
 
-    Attributes
-    ----------
-    number : of the frame.
-    time : of its capture, on `time.monotonic`.
-    position : of the sensor in the tracker's frame (3,), in m; NaN if it is not seen.
-    quaternion : (4,), w first, of any sign, with the tracker's noise.
-    """
-
-    number: int
-    time: float
-    position: Array
-    quaternion: Array
+    number: int  # of the frame
+    time: float  # of its capture, on `time.monotonic`
+    position: Array  # of the sensor in the tracker's frame (3,), in m; NaN if it is not seen
+    quaternion: Array  # (4,), w first, of any sign, with the tracker's noise
 
 
 class Bench:
@@ -174,11 +165,9 @@ class DevicePeer(ABC, Generic[SettingsT]):
 
     Parameters
     ----------
-    settings :
-        Settings of the real driver, as in the rig file. The peer follows them (register map,
+    settings : settings of the real driver, as in the rig file. The peer follows them (register map,
         scales, channels), so that a lab can rehearse with its own file.
-    bench :
-        The bench behind it.
+    bench : the bench behind it.
 
     Attributes
     ----------
@@ -195,17 +184,8 @@ class DevicePeer(ABC, Generic[SettingsT]):
     def stand_in(cls, simulated: Any, n: int) -> SettingsT:
         """Return settings with which this device replaces a simulated one.
 
-        Parameters
-        ----------
-        simulated :
-            Settings of the simulated device.
-        n :
-            Number of the arm's channels.
-
-        Raises
-        ------
-        InputError
-            It has no default settings.
+        `simulated`: settings of the simulated device. `n`: number of the arm's channels. Raises
+        `InputError`: it has no default settings.
         """
         raise InputError(f"{cls.__name__} needs settings in the rig file")
 
@@ -218,16 +198,9 @@ class DevicePeer(ABC, Generic[SettingsT]):
     def start(self) -> SettingsT:
         """Listen on loopback, on a free port or pseudo-terminal.
 
-        Returns
-        -------
-        The settings, with the address at which the real driver reaches this peer.
-
-        Raises
-        ------
-        DeviceError
-            The address in the settings is in use.
-        MissingExtraError
-            The library of the protocol is not installed.
+        Returns the settings, with the address at which the real driver reaches this peer. Raises
+        `DeviceError`: the address in the settings is in use; `MissingExtraError`: the library of
+        the protocol is not installed.
         """
 
     @abstractmethod

@@ -24,10 +24,7 @@ _HEADER = Path("/usr/include/simavr/sim_avr.h")
 def firmware_directory() -> Path:
     """Return the folder of the firmware's source, in the package or in the checkout around it.
 
-    Raises
-    ------
-    InputError
-        It is in neither.
+    Raises `InputError`: it is in neither.
     """
     package = Path(__file__).resolve().parent.parent
     for place in (package / "firmware", package.parent.parent / "firmware"):
@@ -48,15 +45,9 @@ def missing_tools() -> str:
 def built_firmware(**settings: int) -> Path:
     """Return a folder with ``regulator.elf`` and ``board``, built once and then kept.
 
-    Parameters
-    ----------
-    settings : settings of the Makefile, such as ``PAIRS=0``. The environment variable
-        ``STIFFOPT_FIRMWARE`` has precedence over them, in the same form.
-
-    Raises
-    ------
-    DeviceError
-        A tool is missing, or the build fails.
+    `settings`: settings of the Makefile, such as ``PAIRS=0``. The environment variable
+    ``STIFFOPT_FIRMWARE`` has precedence over them, in the same form. Raises `DeviceError`: a tool
+    is missing, or the build fails.
     """
     if missing := missing_tools():
         raise DeviceError(missing)

@@ -21,15 +21,9 @@ def with_real_devices(
 ) -> RigDescription:
     """Return a rig whose simulated devices are replaced by real ones on this machine.
 
-    Parameters
-    ----------
-    description, robot : the rig and its robot.
-    drivers : drivers that replace a simulated `supply`, `tracker` and `probe`.
-
-    Raises
-    ------
-    InputError
-        There is no such driver, or no peer for it.
+    `description`, `robot`: the rig and its robot. `drivers`: drivers that replace a simulated
+    `supply`, `tracker` and `probe`. Raises `InputError`: there is no such driver, or no peer for
+    it.
     """
     real: dict[str, Any] = {}
     lab: dict[str, Any] = {}
@@ -99,18 +93,9 @@ class VirtualLab:
     def start(self) -> RigDescription:
         """Start time and all peers.
 
-        Returns
-        -------
-        The rig file's content with the peers' addresses, for the real drivers.
-
-        Raises
-        ------
-        DeviceError
-            An address is in use.
-        MissingExtraError
-            A library is not installed.
-        InputError
-            There is no peer for a driver.
+        Returns the rig file's content with the peers' addresses, for the real drivers. Raises
+        `DeviceError`: an address is in use; `MissingExtraError`: a library is not installed;
+        `InputError`: there is no peer for a driver.
         """
         # a simulated arm needs no commissioning
         free = CommissioningSettings(required=False)

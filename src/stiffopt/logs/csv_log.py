@@ -17,6 +17,8 @@ class LogWriter:
 
     An existing file with the same columns is continued after `last_time`.
 
+    Raises `FileError`: it cannot be written, now or later, or it exists and has other columns.
+
     Parameters
     ----------
     path, layout : the file, whose folder must exist, and its columns.
@@ -25,11 +27,6 @@ class LogWriter:
     ----------
     last_time : time of the last row, in s; None before the first.
     was_torn : whether an incomplete last line was found and cut off.
-
-    Raises
-    ------
-    FileError
-        It cannot be written, now or later, or it exists and has other columns.
     """
 
     def __init__(self, path: str | os.PathLike[str], layout: LogLayout) -> None:

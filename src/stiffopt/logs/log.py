@@ -12,9 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.errors import FileError, InputError, shown
-
-Array = NDArray[np.float64]
 
 _TIME = "time_s"
 _AXES = ("x", "y", "z")
@@ -115,10 +114,8 @@ class LogLayout:
 class Body:
     """The poses of a tracked body over time.
 
-    Attributes
-    ----------
-    position : (N, 3), in m; NaN where missing.
-    quaternion : (N, 4), w first; None if no orientation was recorded.
+    `position`: (N, 3), in m; NaN where missing. `quaternion`: (N, 4), w first; None if no
+    orientation was recorded.
     """
 
     position: Array
@@ -229,10 +226,8 @@ class LogRow:
     def values(self, layout: LogLayout, after: float | None = None) -> Array:
         """Return the row as numbers (m,) in the order of the columns of a layout.
 
-        Raises
-        ------
-        InputError
-            It does not fit the layout, has no time, or is not later than `after`, to 1 us.
+        Raises `InputError`: it does not fit the layout, has no time, or is not later than `after`,
+        to 1 us.
         """
         if not np.isfinite(self.time) or (after is not None and round(self.time, 6) <= after):
             raise InputError(f"a row at {self.time:g} s cannot follow one at {after} s")

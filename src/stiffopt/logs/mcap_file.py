@@ -29,6 +29,8 @@ class McapWriter:
     memory, and `commit` copies that to the disk. If a write fails, the file is cut back to its last
     complete chunk and closed; nothing more is written to it.
 
+    Raises `OSError`: the file cannot be written.
+
     Parameters
     ----------
     file : descriptor of an empty file, open for writing; this object closes it.
@@ -39,11 +41,6 @@ class McapWriter:
     Attributes
     ----------
     size : bytes on the disk.
-
-    Raises
-    ------
-    OSError
-        The file cannot be written.
     """
 
     def __init__(
@@ -158,18 +155,13 @@ class _Memory:
 
 @dataclass
 class McapContents:
-    """The contents of an MCAP file.
+    """The contents of an MCAP file."""
 
-    Attributes
-    ----------
-    metadata : records of metadata, by name.
-    messages : topics and contents of the JSON messages, in the order of writing.
-    complete : whether the recording was ended properly and is undamaged.
-    """
-
+    # records of metadata, by name
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
+    # topics and contents of the JSON messages, in the order of writing
     messages: list[tuple[str, Any]] = field(default_factory=list)
-    complete: bool = False
+    complete: bool = False  # whether the recording was ended properly and is undamaged
 
     def of_topic(self, topic: str) -> list[Any]:
         """Return the messages of a topic."""
@@ -179,12 +171,8 @@ class McapContents:
 def read_mcap(path: str | os.PathLike[str]) -> McapContents:
     """Read the intact part of a recording, even if a kill has cut it short.
 
-    Raises
-    ------
-    FileError
-        It cannot be read, or a message in its middle is no JSON.
-    MissingExtraError
-        mcap is not installed.
+    Raises `FileError`: it cannot be read, or a message in its middle is no JSON;
+    `MissingExtraError`: mcap is not installed.
     """
     require_package("mcap", "log")
     with reading(path, "a recording (.mcap)"), open(path, "rb") as stream:

@@ -21,8 +21,9 @@ from typing import Any, Self
 
 import numpy as np
 
+from stiffopt.arrays import Array
 from stiffopt.errors import FileError, require_package
-from stiffopt.logs.log import Array, Log, LogLayout, LogRow, log_of_values, numbers_of
+from stiffopt.logs.log import Log, LogLayout, LogRow, log_of_values, numbers_of
 from stiffopt.logs.mcap_file import McapContents, McapWriter, read_mcap
 from stiffopt.logs.table import writing
 
@@ -35,18 +36,14 @@ _SCALARS = ("time_s", "force_n", "stage_m")
 class McapLogWriter:
     """Writes the rows of a log to an MCAP file, replacing an existing one.
 
+    Raises `FileError`: it cannot be written, now or later; `MissingExtraError`: foxglove-sdk is not
+    installed.
+
     Parameters
     ----------
     path, layout : the file, whose folder must exist, and its columns.
     about : metadata to keep in the file.
     now : present time of the log, in s.
-
-    Raises
-    ------
-    FileError
-        It cannot be written, now or later.
-    MissingExtraError
-        foxglove-sdk is not installed.
     """
 
     def __init__(

@@ -12,8 +12,9 @@ from math import isfinite, nan
 
 import numpy as np
 
+from stiffopt.arrays import Array
 from stiffopt.errors import FileError, InputError, shown
-from stiffopt.logs.log import Array, check_shapes
+from stiffopt.logs.log import check_shapes
 from stiffopt.logs.table import read_bytes, replacing
 
 BOUNDARIES = ("free", "guided", "clamped")

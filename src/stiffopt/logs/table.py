@@ -11,8 +11,8 @@ from io import BytesIO
 
 import numpy as np
 
+from stiffopt.arrays import Array
 from stiffopt.errors import FileError, os_reason, shown
-from stiffopt.logs.log import Array
 
 _OTHER = re.compile(rb"^format: *stiffopt-(\w+)/", re.MULTILINE)
 _HEAD = 10_000  # bytes in which a file of another kind says so

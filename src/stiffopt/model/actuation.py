@@ -14,9 +14,9 @@ from typing import Any, ClassVar
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from stiffopt import lie
+from stiffopt.arrays import Array
 from stiffopt.model.calibration import FittedNumber
 from stiffopt.model.description import Compensation, Segment
 from stiffopt.schema import BadKeyError, Schema
@@ -29,10 +29,8 @@ NORM_SMOOTHING = 0.01
 class Section:
     """Free strain and compliance of the section of one segment, per length at rest.
 
-    Attributes
-    ----------
-    strain : backbone strain (6,), linear part first: the pose obeys ``dT/dS = T strain^``.
-    compliance : section compliance (6, 6): extra strain per internal wrench, in section axes.
+    `strain`: backbone strain (6,), linear part first: the pose obeys ``dT/dS = T strain^``.
+    `compliance`: section compliance (6, 6): extra strain per internal wrench, in section axes.
     """
 
     strain: ca.SX
@@ -43,35 +41,25 @@ class Section:
 class SectionGeometry:
     """Area properties of the silicone of a section and the lever arms of its channels.
 
-    Attributes
-    ----------
-    area : silicone area A, without core and chambers, in m^2.
-    centroid : centroid (2,) in section axes, in m; zero for symmetric layouts.
-    second_moment : ``int r r^T dA`` (2, 2) about the centroid, in m^4; its [1, 1] entry is I_x of
-        eq. 10.
-    channel_force : chamber area of each channel (c,), in m^2: axial force per unit pressure.
-    channel_moment : ``int r dA`` over each channel's chambers (c, 2), in m^3.
-
     All may also be symbols, see `stiffopt.model.layout`.
     """
 
-    area: Any
-    centroid: Any
+    area: Any  # silicone area A, without core and chambers, in m^2
+    centroid: Any  # centroid (2,) in section axes, in m; zero for symmetric layouts
+    # ``int r r^T dA`` (2, 2) about the centroid, in m^4; its [1, 1] entry is I_x of eq. 10
     second_moment: Any
-    channel_force: Any
-    channel_moment: Any
+    channel_force: Any  # chamber area of each channel (c,), in m^2: axial force per unit pressure
+    channel_moment: Any  # ``int r dA`` over each channel's chambers (c, 2), in m^3
 
     @property
     def is_eccentric(self) -> bool:
         """Whether the centroid may lie off the axis."""
         return not ca.SX(self.centroid).is_zero()
 
-    def turned(self, azimuth: NDArray[np.float64]) -> SectionGeometry:
+    def turned(self, azimuth: Array) -> SectionGeometry:
         """Return the same section with the lever arms of its channels turned about the axis.
 
-        Parameters
-        ----------
-        azimuth : of each channel (c,), from x towards y, in rad; empty for none.
+        `azimuth`: of each channel (c,), from x towards y, in rad; empty for none.
         """
         if not azimuth.any():
             return self
@@ -102,7 +90,7 @@ class SectionGeometry:
         )
 
 
-def _without_rounding(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+def _without_rounding(matrix: Array) -> Array:
     """Drop off-diagonal entries that are only rounding, to keep the model's graph sparse."""
     return np.where(np.abs(matrix) < 1e-12 * np.abs(matrix).max(), 0.0, matrix)
 

@@ -4,12 +4,11 @@ import operator
 from typing import Any, NamedTuple, get_args
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from stiffopt.arrays import Array
 from stiffopt.errors import InputError
 from stiffopt.model.compliance import Boundary, Frame, Kind
-
-Vector = NDArray[np.float64]
 
 
 class DirectionalMeasure(NamedTuple):
@@ -40,13 +39,10 @@ def check_choice(name: str, value: object, choices: tuple[str, ...]) -> None:
         raise InputError(f"unknown {name} {value!r}; choose one of {', '.join(choices)}")
 
 
-def real_numbers(value: ArrayLike) -> Vector:
+def real_numbers(value: ArrayLike) -> Array:
     """Return an array of real numbers; reject text, booleans and complex numbers.
 
-    Raises
-    ------
-    ValueError
-        If there is anything but real numbers, or rows differ in length.
+    Raises `ValueError` if there is anything but real numbers, or rows differ in length.
     """
     numbers = np.asarray(value)
     if numbers.dtype.kind not in "iuf":
@@ -76,7 +72,7 @@ def checked_integer(name: str, value: Any, least: int) -> int:
     return number
 
 
-def checked_vector(name: str, value: ArrayLike, size: int = 3) -> Vector:
+def checked_vector(name: str, value: ArrayLike, size: int = 3) -> Array:
     """Return an argument as a finite vector (size,)."""
     try:
         vector = real_numbers(value)
@@ -87,7 +83,7 @@ def checked_vector(name: str, value: ArrayLike, size: int = 3) -> Vector:
     return vector
 
 
-def checked_motion(name: str, value: ArrayLike) -> Vector:
+def checked_motion(name: str, value: ArrayLike) -> Array:
     """Return an argument as a rigid motion (4, 4)."""
     problem = f"{name} must be a rigid motion (4, 4), a rotation and a position over 0 0 0 1"
     try:
@@ -104,7 +100,7 @@ def checked_motion(name: str, value: ArrayLike) -> Vector:
     raise InputError(f"{problem}; got {value!r}")
 
 
-def length_and_unit(vector: Vector) -> tuple[float, Vector]:
+def length_and_unit(vector: Array) -> tuple[float, Array]:
     """Return the length of a vector and the unit vector along it; zero for zero."""
     largest = float(np.abs(vector).max())
     if largest == 0:

@@ -11,8 +11,9 @@ from typing import Any, Self, TypeVar
 
 import casadi as ca
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from stiffopt.arrays import Array
 from stiffopt.errors import EquilibriumError, InputError, PressureError, shown
 from stiffopt.model.arguments import (
     checked_integer,
@@ -34,7 +35,6 @@ from stiffopt.model.shape import FreeShape, Shape
 from stiffopt.model.shooting import SAME_STATION, Shooting
 from stiffopt.model.tip_functions import TipFunctions
 
-Vector = NDArray[np.float64]
 Values = Callable[[Shape], Any]
 Kept = TypeVar("Kept")
 
@@ -81,12 +81,12 @@ class Arm:
         return self.description.length
 
     @property
-    def pressure_min(self) -> Vector:
+    def pressure_min(self) -> Array:
         """Lower limits (n,) in Pa."""
         return np.array(self.description.pressure_min)
 
     @property
-    def pressure_max(self) -> Vector:
+    def pressure_max(self) -> Array:
         """Upper limits (n,) in Pa."""
         return np.array(self.description.pressure_max)
 
@@ -147,7 +147,7 @@ class Arm:
         found = [ca.densify(output) for output in outputs(tip, own)]
         return dense(ca.Function(name, [*tip.inputs, parameters], found))
 
-    def parameters(self, own: ArrayLike = ()) -> Vector:
+    def parameters(self, own: ArrayLike = ()) -> Array:
         """Return the parameters of a `tip_function`: the arm's numbers, then the caller's own."""
         return np.concatenate([self.numbers, np.asarray(own, dtype=float)])
 
@@ -218,7 +218,7 @@ class Arm:
 
     def _evaluate(
         self, key: Hashable, value: Values, p: ArrayLike, at: float | None = None
-    ) -> Vector:
+    ) -> Array:
         """Evaluate a value of a shape for one or many pressures, as (..., rows, columns)."""
         batch, single = self._pressures(p)
         function = self._function(key, lambda shape: [value(shape)], at)
@@ -230,7 +230,7 @@ class Arm:
             results = _stacked(rows, function.signature.outputs[0])
         return results[0] if single else results
 
-    def _checked_tip(self, evaluate: Callable[[Vector], list[Vector]], p: ArrayLike) -> Vector:
+    def _checked_tip(self, evaluate: Callable[[Array], list[Array]], p: ArrayLike) -> Array:
         """Evaluate a quantity (..., rows, columns) of the arm without loads, and check margins.
 
         `evaluate` returns the quantity and the margins of the strain laws.
@@ -246,15 +246,12 @@ class Arm:
             self._check_margin(np.atleast_2d(values), "")
         return result
 
-    def settle(self, p: Vector, nearby: EquilibriumState | None = None) -> EquilibriumState:
+    def settle(self, p: Array, nearby: EquilibriumState | None = None) -> EquilibriumState:
         """Find the equilibrium of the loaded arm at pressures (n,), from rest or from a nearby one.
 
         Stability is not checked when starting from a nearby one.
 
-        Raises
-        ------
-        EquilibriumError
-            If none is reached continuously (and, from rest, stable).
+        Raises `EquilibriumError` if none is reached continuously (and, from rest, stable).
         """
         if nearby is None:
             return self._equilibrium().settle(p, self._loads)
@@ -269,8 +266,8 @@ class Arm:
         return BodyShape(self)
 
     def _at_stations(
-        self, of_body: Callable[[Vector, Vector], Vector], p: ArrayLike, at: Vector
-    ) -> Vector:
+        self, of_body: Callable[[Array, Array], Array], p: ArrayLike, at: Array
+    ) -> Array:
         """Evaluate a quantity at arc lengths () or (k,), for one or many pressures.
 
         Results have leading axes for pressures (N,) and stations (k,) if there are several.
@@ -284,14 +281,14 @@ class Arm:
 
     # -- checks -----------------------------------------------------------------------------
 
-    def _pressures(self, p: ArrayLike) -> tuple[Vector, bool]:
+    def _pressures(self, p: ArrayLike) -> tuple[Array, bool]:
         """Return checked pressures (N, n), and whether a single set was given."""
         values = self._checked(p)
         batch = np.atleast_2d(values)
         self._check_margin(batch, "")
         return batch, values.ndim == 1
 
-    def _checked(self, p: ArrayLike) -> Vector:
+    def _checked(self, p: ArrayLike) -> Array:
         """Return finite pressures (n,) or (N, n); the strain law's limits are not checked.
 
         An array of the right kind is returned as it is.
@@ -319,25 +316,22 @@ class Arm:
             raise PressureError("pressures must be finite; got NaN or an infinity")
         return values
 
-    def checked_pressures(self, p: ArrayLike) -> Vector:
+    def checked_pressures(self, p: ArrayLike) -> Array:
         """Return one set of finite pressures (n,); the strain law's limits are not checked.
 
-        Raises
-        ------
-        PressureError
-            If they are anything else.
+        Raises `PressureError` if they are anything else.
         """
         values = self._checked(p)
         if values.ndim != 1:
             raise PressureError(f"expected one set of pressures ({self.n_pressures},), not a batch")
         return values
 
-    def _single(self, p: ArrayLike) -> Vector:
+    def _single(self, p: ArrayLike) -> Array:
         values = self.checked_pressures(p)
         self._check_margin(values[np.newaxis], "")
         return values
 
-    def _check_margin(self, batch: Vector, where: str) -> None:
+    def _check_margin(self, batch: Array, where: str) -> None:
         """Raise where the strain law of a segment breaks down."""
         if not len(batch):
             return
@@ -359,7 +353,7 @@ class Arm:
         value = self._arc_length(at)
         return None if value == self.length else value
 
-    def _arc_lengths(self, at: ArrayLike, base_too: bool = False) -> Vector:
+    def _arc_lengths(self, at: ArrayLike, base_too: bool = False) -> Array:
         """Return arc lengths (), or (k,) of several stations."""
         try:
             values = real_numbers(at)
@@ -404,11 +398,11 @@ class Evaluator:
         """Equilibrium at the last evaluation; None for an arm without loads."""
         return self._state
 
-    def many(self, batch: Vector, *parameters: Vector) -> list[Vector]:
+    def many(self, batch: Array, *parameters: Array) -> list[Array]:
         """Return outputs at checked pressures (N, n), without loads, each (N, rows, columns)."""
         return self._function.many(batch, *(parameters or (self._arm.numbers,)))
 
-    def __call__(self, p: Vector, *parameters: Vector) -> list[Vector]:
+    def __call__(self, p: Array, *parameters: Array) -> list[Array]:
         """Return outputs at checked pressures (n,) and parameters, as 2-D arrays."""
         checkpoint()
         parameters = parameters or (self._arm.numbers,)
@@ -420,12 +414,12 @@ class Evaluator:
         return self._function(*inputs, *parameters)
 
 
-def _stacked(results: list[Vector], shape: tuple[int, ...]) -> Vector:
+def _stacked(results: list[Array], shape: tuple[int, ...]) -> Array:
     """Stack results of this shape into one array (N, ...); N may be 0."""
     return np.array(results).reshape(len(results), *shape)
 
 
-def _tip_load(force: ArrayLike, moment: ArrayLike, frame: Frame) -> Vector:
+def _tip_load(force: ArrayLike, moment: ArrayLike, frame: Frame) -> Array:
     wrench = [checked_vector("force", force), checked_vector("moment", moment)]
     return dead_and_follower(np.concatenate(wrench), frame)
 

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.model.batch import in_parallel
 from stiffopt.model.body import NativeBody
 from stiffopt.model.clearance import Nearest, nearest_point, range_ends, survey
@@ -23,7 +24,6 @@ from stiffopt.model.scene import Scene
 if TYPE_CHECKING:
     from stiffopt.model.manipulator import Manipulator
 
-Array = NDArray[np.float64]
 
 _CHUNK = 64  # poses that a thread takes at a time
 _DEGREE = 22  # of polynomials along a range; their error is a nanometre
@@ -34,24 +34,16 @@ _integer, _pointer = ctypes.c_int64, ctypes.c_void_p
 
 @dataclass(frozen=True)
 class Clearances:
-    """Distances of an arm's body from each of k objects, for one pose or N.
+    """Distances of an arm's body from each of k objects, for one pose or N."""
 
-    Attributes
-    ----------
-    names : of the objects, (k,).
-    distances : of the body's surface, negative where it is within an object, (k,) or (N, k), in m.
-    at : arc lengths at rest of the nearest points of the body, same shape, in m.
-    positions : these points of the centre line, (k, 3) or (N, k, 3), in m.
-    normals : unit vectors that point away from the object, same shape.
-    gradients : of the distances by the pressures, (k, n) or (N, k, n), in m/Pa; where a distance
-        has a kink, of one side.
-    """
-
-    names: tuple[str, ...]
+    names: tuple[str, ...]  # of the objects, (k,)
+    # of the body's surface, negative where it is within an object, (k,) or (N, k), in m
     distances: Array
-    at: Array
-    positions: Array
-    normals: Array
+    at: Array  # arc lengths at rest of the nearest points of the body, same shape, in m
+    positions: Array  # these points of the centre line, (k, 3) or (N, k, 3), in m
+    normals: Array  # unit vectors that point away from the object, same shape
+    # of the distances by the pressures, (k, n) or (N, k, n), in m/Pa; where a distance has a kink,
+    # of one side
     gradients: Array
 
     @property

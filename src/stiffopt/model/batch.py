@@ -12,11 +12,9 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.model.codegen import Signature
-
-Array = NDArray[np.float64]
 
 _CHUNK = 4096  # rows that a thread takes at a time
 _BLOCK = 256  # rows that the VM evaluates at a time

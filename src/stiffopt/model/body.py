@@ -23,6 +23,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.errors import EquilibriumError
 from stiffopt.model.batch import in_parallel
 from stiffopt.model.body_functions import free_body_functions, loaded_body_functions, strain_rows
@@ -36,7 +37,6 @@ from stiffopt.model.stations import FreeStations, LoadedStations, Pieces, respon
 if TYPE_CHECKING:
     from stiffopt.model.arm import Arm
 
-Vector = NDArray[np.float64]
 
 LOOKED_UP_FROM = 8
 """Number of poses of one arm after which machine code is used, if it is in the cache."""
@@ -69,19 +69,19 @@ class BodyShape:
         self._count, self._next_look = 0, LOOKED_UP_FROM
         self._lock = threading.Lock()
 
-    def poses(self, p: Vector, at: Vector) -> Vector:
+    def poses(self, p: Array, at: Array) -> Array:
         """Return poses (N, k, 4, 4) in the base frame."""
         return self._evaluate(_POSES, p, at).reshape(len(p), len(at), 4, 4)
 
-    def jacobians(self, p: Vector, at: Vector) -> Vector:
+    def jacobians(self, p: Array, at: Array) -> Array:
         """Return twists per Pa (N, k, 6, n), each in the axes of its station."""
         return self._evaluate(_JACOBIANS, p, at).reshape(len(p), len(at), 6, p.shape[1])
 
-    def line(self, p: Vector, at: Vector) -> Vector:
+    def line(self, p: Array, at: Array) -> Array:
         """Return positions, unit tangents of the centre line and outer radii, (N, k, 7)."""
         return self._evaluate(_LINE, p, at).reshape(len(p), len(at), 7)
 
-    def compliances(self, p: Vector, s: Vector, t: Vector) -> Vector:
+    def compliances(self, p: Array, s: Array, t: Array) -> Array:
         """Return twists at s (k,) per wrench at t (k,), (N, k, 6, 6), in base axes."""
         at, place = np.unique(np.concatenate([[0.0], s, t]), return_inverse=True)
         first, second = place[1 : 1 + len(s)], place[1 + len(s) :]
@@ -94,17 +94,17 @@ class BodyShape:
         carried = found[:, :-27].reshape(len(p), len(at), 3, 3, 9)
         return response(carried, found[:, -27:].reshape(-1, 9, 3).swapaxes(1, 2), first, second)
 
-    def radii(self, p: Vector, at: Vector) -> Vector:
+    def radii(self, p: Array, at: Array) -> Array:
         """Return outer radii (N, k) of the free sections, in m."""
         self._arm._check_margin(p, "")
         return self._radii(p, at)
 
-    def _radii(self, p: Vector, at: Vector) -> Vector:
+    def _radii(self, p: Array, at: Array) -> Array:
         piece, _ = self._pieces.find(at)
-        found: Vector = self._stations.radii(p)[:, self._pieces.section[piece]]
+        found: Array = self._stations.radii(p)[:, self._pieces.section[piece]]
         return found
 
-    def _evaluate(self, what: int, p: Vector, at: Vector) -> Vector:
+    def _evaluate(self, what: int, p: Array, at: Array) -> Array:
         """Return numbers (N, ...) of stations, by machine code if there is any."""
         checkpoint()
         native = self.machine_code(len(p))
@@ -117,7 +117,7 @@ class BodyShape:
                 found[row] = self._interpreted(what, p[row : row + 1], at).ravel()
         return found
 
-    def _interpreted(self, what: int, p: Vector, at: Vector) -> Vector:
+    def _interpreted(self, what: int, p: Array, at: Array) -> Array:
         self._arm._check_margin(p, "")
         if what == _POSES:
             return self._stations.poses(p, at)
@@ -199,6 +199,8 @@ class ModelInC:
 class NativeBody:
     """The body of an arm in machine code.
 
+    Raises `EquilibriumError` if the unpressurised arm falls over.
+
     Parameters
     ----------
     code : library of the functions of `stiffopt.model.body_functions` with clearance.c.
@@ -207,11 +209,6 @@ class NativeBody:
     ----------
     address : of the `BodyModel`.
     code : the library, with the functions of clearance.c.
-
-    Raises
-    ------
-    EquilibriumError
-        If the unpressurised arm falls over.
     """
 
     def __init__(self, code: Library, arm: Arm) -> None:
@@ -229,7 +226,7 @@ class NativeBody:
         self._one_at_a_time = threading.Lock()
         self._kept: dict[tuple[int, int], Any] = {}
 
-    def stations(self, what: int, p: Vector, at: Vector) -> tuple[Vector, NDArray[np.int64]]:
+    def stations(self, what: int, p: Array, at: Array) -> tuple[Array, NDArray[np.int64]]:
         """Return numbers (N, ...) of stations (k,) at (N, n), and outcomes (N,): 0 is good."""
         if len(p) == 1:
             with self._one_at_a_time:
@@ -245,7 +242,7 @@ class NativeBody:
         in_parallel(work, range(0, len(p), _CHUNK))
         return found, outcome
 
-    def _of_one(self, what: int, p: Vector, at: Vector) -> tuple[Vector, NDArray[np.int64]]:
+    def _of_one(self, what: int, p: Array, at: Array) -> tuple[Array, NDArray[np.int64]]:
         """Do the same for one row, in reused memory."""
         kept = self._kept.get((what, len(at)))
         if kept is None:
@@ -258,7 +255,7 @@ class NativeBody:
         self._run(call, 0, 1)
         return found.copy(), outcome.copy()
 
-    def _results(self, what: int, rows: int, count: int) -> tuple[Vector, NDArray[np.int64]]:
+    def _results(self, what: int, rows: int, count: int) -> tuple[Array, NDArray[np.int64]]:
         width = count * (16, 6 * self._n, 81, 7)[what] + (27 if what == _RESPONSES else 0)
         return np.empty((rows, width)), np.empty(rows, dtype=np.int64)
 

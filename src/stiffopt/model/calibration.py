@@ -12,12 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from stiffopt.arrays import Array, Flags
 from stiffopt.errors import shown
 from stiffopt.model.history import lagged
 from stiffopt.schema import BadKeyError, Items, Schema
 from stiffopt.units import Angle, Duration, Length, Number, Pressure, Ratio
 
-Array = NDArray[np.float64]
 _POSITIVE = Field(ge=0)
 _ROUNDING = 1e-3  # of correlations, which are written with few digits
 _MORE_MEMORY = 0.07  # of the pressure acts through hysteresis that no model has
@@ -116,10 +116,7 @@ class ErrorModel(Schema):
     def distances(self, channels: Sequence[int], pressures: Array) -> Array:
         """Return the distance (N, segments) of pressures from the nearest recorded ones, in Pa.
 
-        Parameters
-        ----------
-        channels : number of channels of each segment.
-        pressures : (N, n), in Pa.
+        `channels`: number of channels of each segment. `pressures`: (N, n), in Pa.
         """
         found = distances_from(channels, pressures, np.array(self.recorded))
         return np.asarray(np.maximum(found - self.spacing, 0.0))
@@ -152,10 +149,7 @@ class RelativeErrors:
 
     Before the recording their covariance is ``|p| |q| cos(p, q)^4``.
 
-    Parameters
-    ----------
-    recorded : pressures (K, c), in Pa.
-    scale : R, in Pa, see `ErrorModel`.
+    `recorded`: pressures (K, c), in Pa. `scale`: R, in Pa, see `ErrorModel`.
     """
 
     def __init__(self, recorded: Array, scale: float) -> None:
@@ -199,10 +193,8 @@ def growth(distances: Array, reach: float | Array) -> Array:
 def squared_moves(per_pressure: Array, variances: Array) -> Array:
     """Return mean squares (..., N, n), in m^2, by which discrepancies of pressures move the tip.
 
-    Parameters
-    ----------
-    per_pressure : derivatives (N, 3, n) of the tip's position, in m/Pa.
-    variances : of the channels' discrepancies (..., N, n), in Pa^2.
+    `per_pressure`: derivatives (N, 3, n) of the tip's position, in m/Pa. `variances`: of the
+    channels' discrepancies (..., N, n), in Pa^2.
     """
     return np.asarray(variances * (per_pressure**2).sum(axis=1))
 
@@ -241,14 +233,8 @@ def nearest_recorded(
 ) -> tuple[NDArray[np.intp], list[Array]]:
     """Return each segment's nearest recorded pressures, and the displacements from them, in Pa.
 
-    Parameters
-    ----------
-    channels : number of channels of each segment.
-    pressures, recorded : (N, n) and (K, n)
-
-    Returns
-    -------
-    Indices (N, segments) of recorded rows, and for each segment displacements (N, c).
+    `channels`: number of channels of each segment. `pressures`, `recorded`: (N, n) and (K, n).
+    Returns indices (N, segments) of recorded rows, and for each segment displacements (N, c).
     """
     ends = np.cumsum([0, *channels])
     nearest = np.zeros((len(pressures), len(channels)), dtype=np.intp)
@@ -306,14 +292,10 @@ class Calibration(Schema):
         root = deviations[:, np.newaxis] * vectors * np.sqrt(np.maximum(values, 0.0))
         return np.asarray(root @ root.T)
 
-    def covers(self, channels: Sequence[int], pressures: Array) -> NDArray[np.bool_]:
+    def covers(self, channels: Sequence[int], pressures: Array) -> Flags:
         """Return which pressures (N, n) count as recorded.
 
-        Parameters
-        ----------
-        channels : number of channels of each segment.
-        pressures : (N, n)
-            In Pa.
+        `channels`: number of channels of each segment. `pressures`: (N, n), in Pa.
         """
         if self.errors is not None:
             distances = self.errors.distances(channels, pressures)

@@ -14,12 +14,10 @@ from math import asin, inf, isfinite, sqrt
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.model.description import RobotDescription
 from stiffopt.model.distances import MeasuredObject
-
-Array = NDArray[np.float64]
 
 CLEARANCE_ERROR = 4e-6  # m, largest error of a least distance
 _SHORTEST = 1e-6  # m of arc length; shorter intervals are not divided
@@ -45,22 +43,13 @@ class BodyPoint(NamedTuple):
 
 
 class Nearest(NamedTuple):
-    """The point of a body that is nearest to an object.
+    """The point of a body that is nearest to an object."""
 
-    Attributes
-    ----------
-    distance : of the body's surface, in m.
-    s : arc length at rest, in m.
-    radius_share : 1 if the body's radius was subtracted from the distance, otherwise 0.
-    position : of the centre line (3,), in m.
-    normal : gradient (3,) of the distance by this position.
-    """
-
-    distance: float
-    s: float
-    radius_share: float
-    position: Array
-    normal: Array
+    distance: float  # of the body's surface, in m
+    s: float  # arc length at rest, in m
+    radius_share: float  # 1 if the body's radius was subtracted from the distance, otherwise 0
+    position: Array  # of the centre line (3,), in m
+    normal: Array  # gradient (3,) of the distance by this position
 
 
 class Probe(NamedTuple):
@@ -75,18 +64,11 @@ class Probe(NamedTuple):
 
 @dataclass(frozen=True)
 class BodyRange:
-    """A range of the body on which the radius is constant and the tangent smooth.
+    """A range of the body on which the radius is constant and the tangent smooth."""
 
-    Attributes
-    ----------
-    points : coarse stations, from one end to the other.
-    speed : largest arc length per arc length at rest.
-    turn : largest change of the tangent per arc length at rest, in rad/m.
-    """
-
-    points: tuple[BodyPoint, ...]
-    speed: float
-    turn: float
+    points: tuple[BodyPoint, ...]  # coarse stations, from one end to the other
+    speed: float  # largest arc length per arc length at rest
+    turn: float  # largest change of the tangent per arc length at rest, in rad/m
 
 
 def range_ends(
@@ -130,10 +112,7 @@ def survey(station: StationOf, ends: Sequence[tuple[float, float, int]]) -> list
 def nearest_point(station: StationOf, item: MeasuredObject, ranges: Sequence[BodyRange]) -> Nearest:
     """Return the point of a body that is nearest to an object.
 
-    Parameters
-    ----------
-    station : the body.
-    ranges : all of it; for objects other than rings, a part of it is allowed.
+    `station`: the body. `ranges`: all of it; for objects other than rings, a part of it is allowed.
     """
     search = _Search(station, item)
     first, *others = ranges

@@ -42,10 +42,8 @@ _TRIED_AGAIN_AFTER = 600.0  # s after a failed compilation in the background
 class Library:
     """A loaded shared library.
 
-    Attributes
-    ----------
-    path : its file, for messages.
-    cdll : gives access to functions of hand-written sources; calls release the interpreter lock.
+    `path`: its file, for messages. `cdll`: gives access to functions of hand-written sources; calls
+    release the interpreter lock.
     """
 
     def __init__(self, path: Path, signatures: dict[str, Signature]) -> None:
@@ -189,6 +187,9 @@ def library(
     (`make_in_background`), and None is returned until it is ready.  The process outlives
     this one, and there is one for each library, however many processes request it.
 
+    Returns None if code is not ready or cannot be made; a `SlowWarning` gives the reason, once for
+    each process.
+
     Parameters
     ----------
     content : str or sequence
@@ -201,12 +202,6 @@ def library(
         ``functions.h`` (see `codegen.header`) and headers in their own folders and in ``native``.
     daqp : whether the sources need the DAQP that comes with CasADi.
     build_missing : False: only look into the cache.
-
-    Returns
-    -------
-    Library or None
-        None if code is not ready or cannot be made; a `SlowWarning` gives the reason, once for each
-        process.
     """
     text = content if isinstance(content, str) else repr(tuple(content))
     build_missing = build_missing and not _only_cached.get()

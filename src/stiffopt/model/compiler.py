@@ -51,10 +51,7 @@ class Compiler:
 def cache_directory() -> Path:
     """Return the directory of compiled code; it may not exist yet.
 
-    Raises
-    ------
-    BuildError
-        If it would be in a home directory, and there is none.
+    Raises `BuildError` if it would be in a home directory, and there is none.
     """
     if given := os.environ.get("STIFFOPT_CACHE_DIR"):
         place = given

@@ -10,12 +10,10 @@ from typing import Literal
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from stiffopt import lie
+from stiffopt.arrays import Array
 from stiffopt.model.actuation import Section
-
-Vector = NDArray[np.float64]
 
 Frame = Literal["base", "tip"]
 Kind = Literal["translation", "rotation"]
@@ -133,12 +131,9 @@ def directional_stiffness(
 
     Parameters
     ----------
-    compliance : (6, 6)
-        Compliance in the frame of the loaded point.
-    rotation : (3, 3)
-        Axes of that frame in the base frame.
-    direction : (3,)
-        Unit vector in base axes (`frame` "base") or in the point's own ("tip").
+    compliance : (6, 6), compliance in the frame of the loaded point.
+    rotation : (3, 3), axes of that frame in the base frame.
+    direction : (3,), unit vector in base axes (`frame` "base") or in the point's own ("tip").
     frame, kind, boundary
         ``free``: ``1 / (d'C_vv d)``; ``guided``: the other two translations are held,
         ``d'C_vv^-1 d``; ``clamped``: rotation is held too, ``d'(C^-1)_vv d``.  With `kind`
@@ -151,7 +146,7 @@ def directional_stiffness(
     return d.T @ stiffness_block(compliance, kind, boundary) @ d
 
 
-def stiffness_of(C: Vector, d: Vector, kind: Kind, boundary: Boundary) -> Vector:
+def stiffness_of(C: Array, d: Array, kind: Kind, boundary: Boundary) -> Array:
     """Return `directional_stiffness` (...) of compliances (..., 6, 6) that are known as numbers.
 
     The unit directions d (..., 3) are in the axes of the compliances.
@@ -161,12 +156,12 @@ def stiffness_of(C: Vector, d: Vector, kind: Kind, boundary: Boundary) -> Vector
         own, other = other, own
     block, d = C[..., own, own], d[..., None]
     if boundary == "free":
-        flexibility: Vector = np.sum(d * (block @ d), axis=(-2, -1))
+        flexibility: Array = np.sum(d * (block @ d), axis=(-2, -1))
         return 1 / flexibility
     if boundary == "clamped":
         reaction = np.linalg.solve(C[..., other, other], C[..., other, own])
         block = block - C[..., own, other] @ reaction
-    found: Vector = np.sum(d * np.linalg.solve(block, d), axis=(-2, -1))
+    found: Array = np.sum(d * np.linalg.solve(block, d), axis=(-2, -1))
     return found
 
 

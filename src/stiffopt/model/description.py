@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydantic import (
     BeforeValidator,
     Discriminator,
@@ -27,6 +27,7 @@ from pydantic import (
     model_validator,
 )
 
+from stiffopt.arrays import Array
 from stiffopt.errors import InputError, shown
 from stiffopt.model.calibration import Calibration, ErrorModel
 from stiffopt.model.history import NO_HISTORY, History
@@ -472,6 +473,16 @@ class RobotDescription(Schema):
         return sum(segment.length + segment.connector for segment in self.segments)
 
     @property
+    def has_known_vertical(self) -> bool:
+        """Whether the registration tells the vertical in the tracker's frame.
+
+        Its tilt is known to 0.1 rad, and where gravity acts across the arm, its turn to 0.5 rad.
+        """
+        given, gravity = self.tolerances or Tolerances(), np.array(self.gravity)
+        across = float(np.hypot(*gravity[:2])) > 0.02 * float(np.linalg.norm(gravity))
+        return given.base_tilt <= 0.1 and not (across and given.base_turn > 0.5)
+
+    @property
     def pressure_min(self) -> tuple[float, ...]:
         """Lower limit of each channel, in Pa."""
         return self._per_channel(self.pressure.min)
@@ -486,7 +497,7 @@ class RobotDescription(Schema):
         """Greatest rate of change of each channel, in Pa/s, or None."""
         return None if self.pressure.slew is None else self._per_channel(self.pressure.slew)
 
-    def slew_limits(self, further: ArrayLike | None = None) -> NDArray[np.float64] | None:
+    def slew_limits(self, further: ArrayLike | None = None) -> Array | None:
         """Return the greatest rates of change (n,), in Pa/s, or None if there is no limit.
 
         They are the smaller of the robot's and further ones, (n,) or one for all.
@@ -495,7 +506,7 @@ class RobotDescription(Schema):
         if not known:
             return None
         rows = [np.broadcast_to(np.asarray(rates, float), self.n_pressures) for rates in known]
-        smallest: NDArray[np.float64] = np.min(rows, axis=0)
+        smallest: Array = np.min(rows, axis=0)
         return smallest
 
     @property
@@ -507,7 +518,7 @@ class RobotDescription(Schema):
             for chambers in segment.channels
         )
 
-    def extrapolation(self, pressures: NDArray[np.float64]) -> str:
+    def extrapolation(self, pressures: Array) -> str:
         """Return a warning if pressures (n,) in Pa are far from the calibration's, otherwise ""."""
         if self.calibration is None:
             return ""

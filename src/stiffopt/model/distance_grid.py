@@ -16,10 +16,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.errors import InputError, os_reason, require_package
 from stiffopt.model.compiler import BuildError, cache_directory, write_atomically
-
-Array = NDArray[np.float64]
 
 _NEAR = 0.025  # m, margin of the fine grid about the surface
 _FAR = 0.15  # m, least margin of the coarse grid; at least the largest extent
@@ -31,10 +30,7 @@ _MOST_POINTS = 4_000_000
 class Surface:
     """A closed surface of triangles, wound so that their normals point outwards.
 
-    Attributes
-    ----------
-    vertices : (k, 3), in m.
-    faces : indices (m, 3) of vertices.
+    `vertices`: (k, 3), in m. `faces`: indices (m, 3) of vertices.
     """
 
     vertices: Array
@@ -63,18 +59,11 @@ def distance_of(surface: Surface, point: tuple[float, ...]) -> float:
 
 @dataclass(frozen=True)
 class DistanceGrid:
-    """Signed distances at the corners of cubes.
+    """Signed distances at the corners of cubes."""
 
-    Attributes
-    ----------
-    origin : first corner (3,), in m.
-    spacing : edge of a cube, in m.
-    values : (nx, ny, nz), in m.
-    """
-
-    origin: Array
-    spacing: float
-    values: NDArray[np.float32]
+    origin: Array  # first corner (3,), in m
+    spacing: float  # edge of a cube, in m
+    values: NDArray[np.float32]  # (nx, ny, nz), in m
 
     @property
     def cells(self) -> tuple[int, ...]:
@@ -86,16 +75,9 @@ class DistanceGrid:
 def read_surface(path: Path, changed: int, scale: float) -> Surface:
     """Read an STL or OBJ file.
 
-    Parameters
-    ----------
-    changed : modification time of the file; part of the cache key.
-    scale : length of one unit of the file, in m.
-
-    Raises
-    ------
-    InputError
-        It cannot be read, is empty or not closed.
-    MissingExtraError
+    `changed`: modification time of the file; part of the cache key. `scale`: length of one unit of
+    the file, in m. Raises `InputError`: it cannot be read, is empty or not closed;
+    `MissingExtraError`.
     """
     require_package("trimesh", "mesh")
     require_package("libigl", "mesh", "igl")

@@ -21,13 +21,12 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.model.batch import BatchFunction
 from stiffopt.model.codegen import dense
 from stiffopt.model.compiled import Library, interpreted, library
 from stiffopt.model.obstacle import Obstacle
 from stiffopt.model.obstacles import OBSTACLES
-
-Array = NDArray[np.float64]
 
 _SOURCES = (str(Path(__file__).with_name("native") / "scene.c"),)
 _COURSES = {"convex": 0, "concave": 1, "any": 2}  # as in scene.h
@@ -78,35 +77,20 @@ def _interpreted() -> dict[str, BatchFunction]:
 
 
 class Distances(NamedTuple):
-    """Distances of points from an object.
+    """Distances of points from an object."""
 
-    Attributes
-    ----------
-    values : (k,), in m.
-    normals : their gradients (k, 3).
-    pieces : index of the nearest piece of the object, (k,).
-    """
-
-    values: Array
-    normals: Array
-    pieces: NDArray[np.int64]
+    values: Array  # (k,), in m
+    normals: Array  # their gradients (k, 3)
+    pieces: NDArray[np.int64]  # index of the nearest piece of the object, (k,)
 
 
 class Passages(NamedTuple):
-    """Positions of points relative to a ring.
+    """Positions of points relative to a ring."""
 
-    Attributes
-    ----------
-    heights : above its plane, (k,), in m.
-    beyond : distances beyond its circle, (k,), in m.
-    from_disc : distances of the disc (k,), in m.
-    normals : their gradients (k, 3).
-    """
-
-    heights: Array
-    beyond: Array
-    from_disc: Array
-    normals: Array
+    heights: Array  # above its plane, (k,), in m
+    beyond: Array  # distances beyond its circle, (k,), in m
+    from_disc: Array  # distances of the disc (k,), in m
+    normals: Array  # their gradients (k, 3)
 
 
 class SceneObjectInC(ctypes.Structure):

@@ -18,15 +18,13 @@ from typing import NamedTuple, get_args
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from stiffopt import lie
+from stiffopt.arrays import Array
 from stiffopt.errors import EquilibriumError
 from stiffopt.model.arguments import check_choice
 from stiffopt.model.compliance import Frame, inverse_3x3
 from stiffopt.model.shooting import SAME_STATION, Shooting
-
-Vector = NDArray[np.float64]
 
 _LARGEST_TURN = 1.0  # rad of tip rotation in one continuation step; a longer one is halved
 _SHORTEST_STEP = 1e-3  # share of the path from rest; below it the path has ended
@@ -41,9 +39,9 @@ class Loads(NamedTuple):
     of the loaded point (6,); `gravity` (3,) is in base axes.
     """
 
-    gravity: Vector
-    tip: Vector
-    station: Vector
+    gravity: Array
+    tip: Array
+    station: Array
 
     @property
     def are_conservative(self) -> bool:
@@ -51,7 +49,7 @@ class Loads(NamedTuple):
         return not (self.tip[3:].any() or self.station[3:].any())
 
 
-def dead_and_follower(wrench: Vector, frame: Frame) -> Vector:
+def dead_and_follower(wrench: Array, frame: Frame) -> Array:
     """Return a wrench (6,) as `Loads` has it (12,): dead in frame "base", otherwise follower."""
     check_choice("frame", frame, get_args(Frame))
     none = np.zeros(6)
@@ -65,34 +63,25 @@ class EquilibriumState(NamedTuple):
     method.
     """
 
-    pressures: Vector
-    quaternion: Vector
-    states: Vector
+    pressures: Array
+    quaternion: Array
+    states: Array
     loads: Loads
 
 
 class Continuation(NamedTuple):
-    """The end of a path of equilibria.
+    """The end of a path of equilibria."""
 
-    Attributes
-    ----------
-    state : the last equilibrium that was found.
-    share : share of the path at which it is; 1.0 is the end.
-    unstable : whether the path ends because stability is lost there.
-    """
-
-    state: EquilibriumState
-    share: float
-    unstable: bool
+    state: EquilibriumState  # the last equilibrium that was found
+    share: float  # share of the path at which it is; 1.0 is the end
+    unstable: bool  # whether the path ends because stability is lost there
 
 
 class Equilibrium:
     """Numerical equilibria of one shooting problem.
 
-    Parameters
-    ----------
-    shooting : the arm.
-    at : arc length of the station on which `Loads.station` acts; None is the tip.
+    `shooting`: the arm. `at`: arc length of the station on which `Loads.station` acts; None is the
+    tip.
     """
 
     def __init__(self, shooting: Shooting, at: float | None = None) -> None:
@@ -100,7 +89,7 @@ class Equilibrium:
         self.at = at
         self._rest: dict[bytes, Continuation] = {}
 
-    def arguments(self, state: EquilibriumState) -> tuple[Vector, ...]:
+    def arguments(self, state: EquilibriumState) -> tuple[Array, ...]:
         """Return the numerical inputs of a `Chain` at an equilibrium."""
         x = np.concatenate([np.zeros(3), state.pressures, np.zeros(6)])
         return (state.quaternion, x, *state.loads)
@@ -182,13 +171,11 @@ class Equilibrium:
                 step, halved = step if halved else 2 * step, False
         return Continuation(state, 1.0, False)
 
-    def settle(self, pressures: Vector, loads: Loads) -> EquilibriumState:
+    def settle(self, pressures: Array, loads: Loads) -> EquilibriumState:
         """Find the equilibrium reached from rest: first the arm's weight, then pressures and loads.
 
-        Raises
-        ------
-        EquilibriumError
-            If the arm buckles or falls over on the way; the message says where.
+        Raises `EquilibriumError` if the arm buckles or falls over on the way; the message says
+        where.
         """
         hanging = self._at_rest(loads.gravity)
         end = hanging._replace(pressures=pressures, loads=loads)
@@ -205,7 +192,7 @@ class Equilibrium:
             raise EquilibriumError(_lost(share, what))
         return state
 
-    def _at_rest(self, gravity: Vector) -> EquilibriumState:
+    def _at_rest(self, gravity: Array) -> EquilibriumState:
         """Return the unpressurised arm under its own weight and payload."""
         key = gravity.tobytes()
         if key not in self._rest:
@@ -228,7 +215,7 @@ class Equilibrium:
             raise EquilibriumError(_lost(path.share, "its own weight and payload"))
         return path.state
 
-    def shape(self, state: EquilibriumState, stations: Vector) -> Vector:
+    def shape(self, state: EquilibriumState, stations: Array) -> Array:
         """Return the poses (k, 4, 4) at arc lengths (k,) of an equilibrium."""
         sections = [np.asarray(part) for part in self.shooting.sections(state.pressures)]
         length = self.shooting.description.length
@@ -279,10 +266,10 @@ def _lost(share: float, what: str) -> str:
     )
 
 
-def _between(start: EquilibriumState, end: EquilibriumState, share: float) -> tuple[Vector, Loads]:
+def _between(start: EquilibriumState, end: EquilibriumState, share: float) -> tuple[Array, Loads]:
     """Return the pressures and loads at a share of the straight path between two states."""
 
-    def mix(a: Vector, b: Vector) -> Vector:
+    def mix(a: Array, b: Array) -> Array:
         return (1 - share) * a + share * b
 
     loads = Loads(*(mix(a, b) for a, b in zip(start.loads, end.loads, strict=True)))

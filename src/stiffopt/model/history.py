@@ -54,14 +54,13 @@ from typing import Annotated, Any, Literal
 
 import casadi as ca
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydantic import Field, model_validator
 
+from stiffopt.arrays import Array
 from stiffopt.errors import InputError
 from stiffopt.schema import BadKeyError, Items, Schema
 from stiffopt.units import Duration, Number, Pressure, Ratio
-
-Array = NDArray[np.float64]
 
 Part = Literal["pressure", "elongation", "bending", "opposite"]
 """The pressures on which an operator acts.

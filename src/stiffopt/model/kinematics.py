@@ -17,20 +17,12 @@ from stiffopt.model.laws import strain_law
 
 @dataclass(frozen=True)
 class Actuation:
-    """Sections of an arm's segments as symbolic functions of its pressures.
+    """Sections of an arm's segments as symbolic functions of its pressures."""
 
-    Attributes
-    ----------
-    pressures : all channel pressures (n,), proximal segment first, in Pa.
-    sections : one per segment, proximal first.
-    margin : a number per segment, positive while its strain law holds.
-    radii : outer radius of each segment's section, in m.
-    """
-
-    pressures: ca.SX
-    sections: tuple[Section, ...]
-    margin: ca.SX
-    radii: ca.SX
+    pressures: ca.SX  # all channel pressures (n,), proximal segment first, in Pa
+    sections: tuple[Section, ...]  # one per segment, proximal first
+    margin: ca.SX  # a number per segment, positive while its strain law holds
+    radii: ca.SX  # outer radius of each segment's section, in m
 
     @classmethod
     def of(

@@ -20,8 +20,8 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.model.actuation import SectionGeometry, StrainLaw
 from stiffopt.model.codegen import dense
 from stiffopt.model.description import Compensation, Corrections, RobotDescription, Segment
@@ -30,8 +30,6 @@ from stiffopt.model.laws import strain_law
 from stiffopt.model.parameters import explicit
 from stiffopt.model.shape import FreeShape
 from stiffopt.schema import Schema
-
-Vector = NDArray[np.float64]
 
 _NOT_IN_FORMULAS = {"chambers", "channels", "density", "history", "inner_radius"}
 """Keys of a segment that act through its section's geometry, or do not affect statics."""
@@ -43,10 +41,8 @@ _SWITCHES = {"connector", "dead_band"}
 class Layout:
     """What formulas and machine code of an arm are made for.
 
-    Attributes
-    ----------
-    skeleton : the arm's segments without their numbers; equal for arms of the same layout.
-    example : some arm of this layout.
+    `skeleton`: the arm's segments without their numbers; equal for arms of the same layout.
+    `example`: some arm of this layout.
     """
 
     skeleton: str
@@ -55,20 +51,13 @@ class Layout:
 
 @dataclass(frozen=True)
 class SymbolicArm:
-    """The formulas of all arms of a layout.
+    """The formulas of all arms of a layout."""
 
-    Attributes
-    ----------
-    numbers : the arm's numbers (k,), see `numbers_of`.
-    actuation : sections and margins as functions of the pressures and these numbers.
-    centroids : centroid (2,) of each segment's section, in m; sparse if it lies on the axis.
-    tip : the unloaded arm up to its tip.
-    """
-
-    numbers: ca.SX
-    actuation: Actuation
+    numbers: ca.SX  # the arm's numbers (k,), see `numbers_of`
+    actuation: Actuation  # sections and margins as functions of the pressures and these numbers
+    # centroid (2,) of each segment's section, in m; sparse if it lies on the axis
     centroids: tuple[ca.SX, ...]
-    tip: FreeShape
+    tip: FreeShape  # the unloaded arm up to its tip
 
 
 def layout_of(description: RobotDescription) -> Layout:
@@ -88,7 +77,7 @@ def layout_of(description: RobotDescription) -> Layout:
     return Layout(json.dumps(segments, sort_keys=True), description)
 
 
-def numbers_of(description: RobotDescription) -> Vector:
+def numbers_of(description: RobotDescription) -> Array:
     """Return the numbers (k,) of an arm, in SI, in the order of its layout."""
     found: list[float] = []
     drawn = is_as_drawn(description)
@@ -129,9 +118,7 @@ def free_tip_function(
 ) -> ca.Function:
     """Return a function of pressures (n,) and parameters: the arm's numbers, then a caller's own.
 
-    Parameters
-    ----------
-    outputs : function from the tip's shape and the symbols of the caller's parameters to outputs.
+    `outputs`: function from the tip's shape and the symbols of the caller's parameters to outputs.
     """
     arm = symbolic_arm(layout)
     own = ca.SX.sym("own", n_parameters)

@@ -10,8 +10,8 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array, Flags
 from stiffopt.errors import EquilibriumError
 from stiffopt.model.batch import in_parallel
 from stiffopt.model.compiled import Library
@@ -20,7 +20,6 @@ from stiffopt.model.rod import rod_functions, rod_pieces
 if TYPE_CHECKING:
     from stiffopt.model.arm import Arm
 
-Vector = NDArray[np.float64]
 
 _CHUNK = 8  # equilibria that a thread takes at a time
 
@@ -54,15 +53,8 @@ class _Rod(ctypes.Structure):
 class LoadedArm:
     """An arm under gravity or a load in machine code: its rod, and equilibria from rest.
 
-    Attributes
-    ----------
-    address : of its `Rod`.
-    state_size : number of doubles of an equilibrium's state.
-
-    Raises
-    ------
-    EquilibriumError
-        If the unpressurised arm falls over.
+    `address`: of its `Rod`. `state_size`: number of doubles of an equilibrium's state. Raises
+    `EquilibriumError` if the unpressurised arm falls over.
     """
 
     def __init__(self, code: Library, robot: Arm) -> None:
@@ -107,7 +99,7 @@ class LoadedArm:
         self._rod.tip_mass = robot.description.tip_mass
         self._rest()
 
-    def settled(self, pressures: Vector) -> tuple[NDArray[np.bool_], Vector, Vector]:
+    def settled(self, pressures: Array) -> tuple[Flags, Array, Array]:
         """Return which pressures (N, n) have an equilibrium, their states and poses (N, 12)."""
         pressures = np.ascontiguousarray(pressures)
         count = len(pressures)

@@ -7,9 +7,10 @@ from typing import Any, Literal, TypeGuard, get_args
 
 import casadi as ca
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from stiffopt import lie
+from stiffopt.arrays import Array
 from stiffopt.errors import InputError, shown
 from stiffopt.model.arguments import (
     DirectionalMeasure,
@@ -36,7 +37,6 @@ from stiffopt.model.shape import Shape, stiffness_along
 from stiffopt.model.uncertainty import TipUncertainty, Uncertainty
 from stiffopt.notebook import ShownInNotebook
 
-Vector = NDArray[np.float64]
 Method = Literal["equilibrium", "first-order", "elementwise"]
 
 _ELEMENTS_PER_SEGMENT = 64  # of eq. 19
@@ -72,19 +72,19 @@ class Manipulator(Arm, ShownInNotebook):
 
     # -- shape ------------------------------------------------------------------------------
 
-    def tip_pose(self, p: ArrayLike) -> Vector:
+    def tip_pose(self, p: ArrayLike) -> Array:
         """Return the pose of the tip in the base frame (eq. 7), (4, 4) or (N, 4, 4)."""
         if not self.is_loaded:
             return self._checked_tip(lambda q: self._tip.evaluate("tip_pose", q), p)
         return self._evaluate("pose", lambda tip: tip.transform, p)
 
-    def tip_jacobian(self, p: ArrayLike) -> Vector:
+    def tip_jacobian(self, p: ArrayLike) -> Array:
         """Return the tip's twist in tip axes per pressure, (6, n): in m/Pa, then in rad/Pa."""
         if not self.is_loaded:
             return self._checked_tip(lambda q: self._tip.evaluate("tip_jacobian", q), p)
         return self._evaluate("jacobian", lambda tip: tip.jacobian, p)
 
-    def tip_jacobian_derivative(self, p: ArrayLike) -> Vector:
+    def tip_jacobian_derivative(self, p: ArrayLike) -> Array:
         """Return the derivative of `tip_jacobian` by the pressures, (6, n, n), on the last axis.
 
         With the paper's compensation it does not exist at exactly p = 0, where the norm of the
@@ -96,20 +96,20 @@ class Manipulator(Arm, ShownInNotebook):
         )
         return np.swapaxes(flat.reshape(*flat.shape[:-2], n, 6, n), -3, -2)
 
-    def backbone(self, p: ArrayLike, n: int = 50) -> Vector:
+    def backbone(self, p: ArrayLike, n: int = 50) -> Array:
         """Return poses (n, 4, 4) along the arm, equally spaced at rest from base to tip."""
         n = checked_integer("n, the number of poses of a backbone,", n, 2)
         stations = self.kept(("backbone", n), lambda: np.linspace(0.0, self.length, n))
         return self._at_stations(self._body.poses, p, stations)
 
-    def pose(self, p: ArrayLike, at: ArrayLike) -> Vector:
+    def pose(self, p: ArrayLike, at: ArrayLike) -> Array:
         """Return the pose (4, 4) or (N, 4, 4) at arc length `at` (m, at rest), above 0.
 
         Several arc lengths (k,) give poses (k, 4, 4) or (N, k, 4, 4).
         """
         return self._at_stations(self._body.poses, p, self._arc_lengths(at))
 
-    def body_jacobian(self, p: ArrayLike, at: ArrayLike) -> Vector:
+    def body_jacobian(self, p: ArrayLike, at: ArrayLike) -> Array:
         """Return the twist of a station in its own axes per pressure, (6, n) or (N, 6, n).
 
         Linear first: three rows in m/Pa, then three in rad/Pa.  `at` is an arc length in m at rest,
@@ -194,11 +194,11 @@ class Manipulator(Arm, ShownInNotebook):
 
     # -- compliance -------------------------------------------------------------------------
 
-    def tip_compliance(self, p: ArrayLike) -> Vector:
+    def tip_compliance(self, p: ArrayLike) -> Array:
         """Return the tip's compliance in tip axes (eq. 17, or tangent), (6, 6), linear first."""
         return self._compliance(p, None)
 
-    def _compliance(self, p: ArrayLike, at: float | None) -> Vector:
+    def _compliance(self, p: ArrayLike, at: float | None) -> Array:
         if not self.is_loaded and at is None:
             return self._checked_tip(lambda q: self._tip.evaluate("tip_compliance", q), p)
         C = self._evaluate("compliance", lambda point: point.compliance, p, at=at)
@@ -207,11 +207,11 @@ class Manipulator(Arm, ShownInNotebook):
             C = (C + np.swapaxes(C, -1, -2)) / 2
         return C
 
-    def compliance(self, p: ArrayLike, at: float) -> Vector:
+    def compliance(self, p: ArrayLike, at: float) -> Array:
         """Return the compliance (6, 6) at arc length `at` (m, at rest), in that point's axes."""
         return self._compliance(p, self._station(self._arc_length(at)))
 
-    def compliance_between(self, p: ArrayLike, s: ArrayLike, t: ArrayLike) -> Vector:
+    def compliance_between(self, p: ArrayLike, s: ArrayLike, t: ArrayLike) -> Array:
         """Return the twist at s per wrench at t, (6, 6) or (N, 6, 6), in base axes.
 
         The twist is the motion of the centre of the section at s, and its rotation; the wrench is a
@@ -318,7 +318,7 @@ class Manipulator(Arm, ShownInNotebook):
         kind: Kind = "translation",
         boundary: Boundary = "free",
         frame: Frame = "base",
-    ) -> Vector:
+    ) -> Array:
         """Return the derivative of `stiffness` at the tip by the pressures, (n,) or (N, n)."""
         measure = _measure(direction, kind, boundary, frame)
         if not self.is_loaded:
@@ -389,7 +389,7 @@ class Manipulator(Arm, ShownInNotebook):
         at: float | None = None,
         frame: Frame = "base",
         method: Method = "equilibrium",
-    ) -> Vector:
+    ) -> Array:
         """Return the pose (4, 4) of the tip with one more load on the arm.
 
         Parameters
@@ -417,7 +417,7 @@ class Manipulator(Arm, ShownInNotebook):
         local = _in_local_axes(wrench, T_at, frame)
         if method == "first-order":
             C = self.tip_compliance(p) if at is None else self.compliance(p, at)
-            T: Vector = T_at @ lie.exp(C @ local) @ lie.inverse(T_at) @ self.tip_pose(p)
+            T: Array = T_at @ lie.exp(C @ local) @ lie.inverse(T_at) @ self.tip_pose(p)
             return T
         if method == "elementwise":
             if self.is_loaded:
@@ -430,15 +430,13 @@ class Manipulator(Arm, ShownInNotebook):
             f"unknown method {method!r}; choose 'equilibrium', 'first-order' or 'elementwise'"
         )
 
-    def _loaded_equilibrium(
-        self, p: Vector, wrench: Vector, at: float | None, frame: Frame
-    ) -> Vector:
+    def _loaded_equilibrium(self, p: Array, wrench: Array, at: float | None, frame: Frame) -> Array:
         loads = self._loads._replace(station=dead_and_follower(wrench, frame))
         equilibrium = self._equilibrium(at)
         (tip,) = equilibrium.shape(equilibrium.settle(p, loads), np.array([self.length]))
         return np.asarray(tip)
 
-    def _elementwise(self, p: Vector, local: Vector, at: float) -> Vector:
+    def _elementwise(self, p: Array, local: Array, at: float) -> Array:
         """Evaluate eq. 19, with wrench and compliance taken at the middle of each element."""
         ends = [0.0]
         soft: list[int | None] = []
@@ -540,7 +538,7 @@ def _stiffness_of(measure: DirectionalMeasure) -> Values:
     return value
 
 
-def _in_local_axes(wrench: "ArrayLike | Wrench", T: Vector, frame: Frame) -> Vector:
+def _in_local_axes(wrench: "ArrayLike | Wrench", T: Array, frame: Frame) -> Array:
     """Return a wrench (6,) in the axes of the pose T at which it acts."""
     check_choice("frame", frame, get_args(Frame))
     values = checked_wrench(wrench)

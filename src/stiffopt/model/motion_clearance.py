@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.errors import EquilibriumError, PressureError
 from stiffopt.model.arm_clearance import ArmClearance, Ranges
 from stiffopt.model.clearance import range_ends
@@ -29,7 +30,6 @@ from stiffopt.model.stopping import checkpoint
 if TYPE_CHECKING:
     from stiffopt.model.manipulator import Manipulator
 
-Array = NDArray[np.float64]
 
 MOTION_ERROR = 3e-5
 """Largest amount by which a clear motion may fall short of the clearance asked for, in m."""
@@ -49,47 +49,31 @@ _integer, _double, _pointer = ctypes.c_int64, ctypes.c_double, ctypes.c_void_p
 
 
 class MotionBounds(NamedTuple):
-    """Bounds on the motion of an arm's body over the range of its pressures.
+    """Bounds on the motion of an arm's body over the range of its pressures."""
 
-    Attributes
-    ----------
-    ranges : parts of the body, to which these belong.
-    speeds : (ranges, pieces), largest motion of a point of a range per (Euclidean) change of a
-        piece's pressures, in m/Pa.
-    bends : (ranges,), in m; on a straight line in pressures, second derivatives of positions are
-        at most the square of the speed, by `speeds`, over this.
-    """
-
-    ranges: Ranges
+    ranges: Ranges  # parts of the body, to which these belong
+    # (ranges, pieces), largest motion of a point of a range per (Euclidean) change of a piece's
+    # pressures, in m/Pa
     speeds: Array
+    # (ranges,), in m; on a straight line in pressures, second derivatives of positions are at most
+    # the square of the speed, by `speeds`, over this
     bends: Array
 
 
 @dataclass(frozen=True)
 class MotionClearance:
-    """Result of a check of a motion.
+    """Result of a check of a motion."""
 
-    Attributes
-    ----------
-    clear : whether the body keeps the clearance asked for, to `MOTION_ERROR`.
-    least : least distance of the evaluated poses, in m.
-    poses : their number.
-    blocked_at : pressures (n,) at which the motion is blocked, or None.
-    """
-
-    clear: bool
-    least: float
-    poses: int
-    blocked_at: Array | None = None
+    clear: bool  # whether the body keeps the clearance asked for, to `MOTION_ERROR`
+    least: float  # least distance of the evaluated poses, in m
+    poses: int  # their number
+    blocked_at: Array | None = None  # pressures (n,) at which the motion is blocked, or None
 
 
 class ClearMotions:
     """Check motions of one arm in one scene; for one thread at a time.
 
-    Parameters
-    ----------
-    arm : with its load.
-    scene : its own `clearance` is ignored.
+    `arm`: with its load. `scene`: its own `clearance` is ignored.
     """
 
     def __init__(self, arm: Manipulator, scene: Scene) -> None:

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, model_validator
 
+from stiffopt.arrays import Array
 from stiffopt.model.batch import InterpretedFunction
 from stiffopt.schema import BadKeyError, Schema, Vector
 from stiffopt.units import Length, within
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from stiffopt.model.description import RobotDescription
     from stiffopt.model.distance_grid import DistanceGrid
 
-Array = NDArray[np.float64]
 Along = Literal["convex", "concave", "any"]
 
 Point = Vector[Annotated[Length, within(1e3, "m")]]
@@ -213,6 +212,17 @@ class BetweenEnds(Obstacle):
     def pieces(self) -> list[list[float]]:
         """Both ends, radius."""
         return [[*self.start, *self.end, self.radius]]
+
+
+def check_width(opening: Any, width: float, clearance: float) -> None:
+    """Refuse a tube or a ring whose radius leaves an arm's outer radius no clearance, in m."""
+    if opening.radius < width + clearance:
+        asked = f" with {clearance * 1e3:g} mm of clearance" if clearance else ""
+        raise BadKeyError(
+            f"{opening.key}.radius",
+            f"{opening.radius * 1e3:g} mm is too narrow for the arm, whose outer radius is "
+            f"{width * 1e3:g} mm{asked}",
+        )
 
 
 def norm(vector: ca.SX) -> ca.SX:

@@ -15,8 +15,6 @@ from functools import cached_property
 from typing import Any, TypeVar
 
 import casadi as ca
-import numpy as np
-from numpy.typing import NDArray
 
 from stiffopt.errors import InputError, shown
 from stiffopt.model.actuation import Section
@@ -32,7 +30,6 @@ from stiffopt.model.kinematics import Actuation
 from stiffopt.model.laws import law_class, strain_laws
 from stiffopt.schema import Schema
 
-Vector = NDArray[np.float64]
 _SchemaT = TypeVar("_SchemaT", bound=Schema)
 _Path = tuple[str | int, ...]
 
@@ -115,9 +112,7 @@ def fitted_numbers() -> dict[str, FittedNumber]:
 class Parameter:
     """A number of a robot file.
 
-    Attributes
-    ----------
-    key : its place in the file, for example ``segments[0].corrections.gain[2]``.
+    `key`: its place in the file, for example ``segments[0].corrections.gain[2]``.
     """
 
     key: str
@@ -171,13 +166,7 @@ class Parameter:
         return f"{self.number.words}, {place}"
 
     def value(self, description: RobotDescription) -> float:
-        """Return its value in SI.
-
-        Raises
-        ------
-        InputError
-            The robot has no such number.
-        """
+        """Return its value in SI. Raises `InputError`: the robot has no such number."""
         return self._read(explicit(description))
 
     def _read(self, robot: RobotDescription) -> float:
@@ -202,10 +191,7 @@ class Parameter:
     def coordinate(self, nominal: float, value: float) -> float:
         """Return the coordinate of a value.
 
-        Raises
-        ------
-        InputError
-            If a value whose coordinate is a logarithm is not positive.
+        Raises `InputError` if a value whose coordinate is a logarithm is not positive.
         """
         if not self.number.positive:
             return value - nominal
@@ -255,10 +241,7 @@ def with_values(
 ) -> RobotDescription:
     """Return the robot with other values of some parameters, validated like a file.
 
-    Raises
-    ------
-    InputError
-        The robot has no such number, or the value is not allowed.
+    Raises `InputError`: the robot has no such number, or the value is not allowed.
     """
     changed = _replaced(explicit(description), {p._path: value for p, value in values.items()})
     return RobotDescription(**changed.model_dump())
@@ -269,10 +252,8 @@ def varied(
 ) -> RobotDescription:
     """Return the robot, not validated, with parameters at coordinates (k,), numbers or symbols.
 
-    Raises
-    ------
-    InputError
-        The robot has no such number, or one that is zero where it must be positive to be varied.
+    Raises `InputError`: the robot has no such number, or one that is zero where it must be positive
+    to be varied.
     """
     robot = explicit(description)
     changes: dict[_Path, Any] = {}

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.model.arguments import DirectionalMeasure
 from stiffopt.model.batch import InterpretedFunction
 from stiffopt.model.codegen import dense
@@ -17,9 +17,7 @@ from stiffopt.model.equilibrium import Equilibrium, EquilibriumState, Loads
 from stiffopt.model.kinematics import body_jacobian
 from stiffopt.model.parameters import Parameter, parametric
 from stiffopt.model.shape import FreeShape, Shape, stiffness_along
-from stiffopt.model.shooting import Shooting
-
-Vector = NDArray[np.float64]
+from stiffopt.model.shooting import Chain, Shooting
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,11 +29,13 @@ class Poses:
     transforms : (N, 4, 4), in the base frame.
     per_pressure : twists (N, 6, n) per Pa.
     per_coordinate : twists (N, 6, k) per unit of a parameter's coordinate.
+    per_gravity : twists (N, 6, 3) per m/s^2, in base axes; zero for an arm without load.
     """
 
-    transforms: Vector
-    per_pressure: Vector
-    per_coordinate: Vector
+    transforms: Array
+    per_pressure: Array
+    per_coordinate: Array
+    per_gravity: Array
 
 
 class ParametricArm:
@@ -70,28 +70,34 @@ class ParametricArm:
         """Replace the load (12,) on the tip; the arm must have gravity or a load already."""
         self._loads = self._loads._replace(tip=np.array(tip_load))
 
-    def poses(self, pressures: Vector, coordinates: Vector, at: float | None = None) -> Poses:
+    def set_gravity(self, gravity: Array) -> None:
+        """Replace gravity (3,), in base axes, in m/s^2; the arm must have some already."""
+        self._loads = self._loads._replace(gravity=gravity)
+
+    def poses(self, pressures: Array, coordinates: Array, at: float | None = None) -> Poses:
         """Return poses at pressures (N, n), coordinates (k,), of the tip or at an arc length in m.
 
-        Raises
-        ------
-        EquilibriumError
-            A loaded arm buckles or falls over.
+        Raises `EquilibriumError`: a loaded arm buckles or falls over.
         """
 
         def outputs(shape: Shape) -> list[ca.SX | ca.MX]:
-            if isinstance(shape, FreeShape):
-                return [shape.transform, body_jacobian(shape.transform, shape.pressures)]
-            return [shape.transform, shape.jacobian]
+            if isinstance(shape, Chain):
+                return [shape.transform, shape.jacobian, shape.per_gravity]
+            twists = body_jacobian(shape.transform, shape.pressures)
+            return [shape.transform, twists, ca.SX(6, 3)]
 
-        transforms, twists = self._evaluate("pose", outputs, pressures, coordinates, at)
+        found = self._evaluate("pose", outputs, pressures, coordinates, at)
+        transforms, twists, per_gravity = found
         n = self.description.n_pressures
-        return Poses(transforms, twists[..., :n], twists[..., n:])
+        return Poses(transforms, twists[..., :n], twists[..., n:], per_gravity)
 
     def stiffnesses(
-        self, pressures: Vector, coordinates: Vector, measure: DirectionalMeasure
-    ) -> tuple[Vector, Vector, Vector]:
-        """Return tip stiffness (N,), its slopes by pressures (N, n) and coordinates (N, k)."""
+        self, pressures: Array, coordinates: Array, measure: DirectionalMeasure
+    ) -> tuple[Array, Array, Array, Array]:
+        """Return tip stiffness (N,) and its slopes.
+
+        They are (N, n) by pressures, (N, k) by coordinates and (N, 3) by gravity.
+        """
 
         def outputs(shape: Shape) -> list[ca.SX | ca.MX]:
             k = stiffness_along(
@@ -101,21 +107,23 @@ class ParametricArm:
                 kind=measure.kind,
                 boundary=measure.boundary,
             )
-            return [k, shape.total_jacobian(k)]
+            by_gravity = shape.gravity_jacobian(k) if isinstance(shape, Chain) else ca.SX(1, 3)
+            return [k, shape.total_jacobian(k), by_gravity]
 
         key = ("stiffness", measure)
-        values, gradient = self._evaluate(key, outputs, pressures, coordinates, None)
+        found = self._evaluate(key, outputs, pressures, coordinates, None)
+        values, gradient, by_gravity = (each[:, 0] for each in found)
         n = self.description.n_pressures
-        return values[:, 0, 0], gradient[:, 0, :n], gradient[:, 0, n:]
+        return values[:, 0], gradient[:, :n], gradient[:, n:], by_gravity
 
     def _evaluate(
         self,
         key: Hashable,
         outputs: Callable[[Shape], list[ca.SX | ca.MX]],
-        pressures: Vector,
-        coordinates: Vector,
+        pressures: Array,
+        coordinates: Array,
         at: float | None,
-    ) -> list[Vector]:
+    ) -> list[Array]:
         if (key, at) not in self._functions:
             shape = self._shape(at)
             found = [ca.densify(value) for value in outputs(shape)]
@@ -137,7 +145,7 @@ class ParametricArm:
             return self._equilibrium.shooting.chain(at)
         return FreeShape.of(self.description, self._actuation, at)
 
-    def _states(self, equilibrium: Equilibrium, variables: Vector) -> list[EquilibriumState]:
+    def _states(self, equilibrium: Equilibrium, variables: Array) -> list[EquilibriumState]:
         """Return equilibria (N,), each found from the last one of the same row."""
         near = self._near.get(len(variables), [])
         states: list[EquilibriumState] = []

@@ -27,18 +27,10 @@ def load_description(
 ) -> RobotDescription:
     """Return a built-in robot or read a robot file.
 
-    Parameters
-    ----------
-    name_or_path : text that ends in ``.yaml`` or ``.yml`` or has a path separator is a path, as is
-        a `Path`; any other is the name of a built-in robot.
-    base : folder from which a relative path starts; by default the current one.
-
-    Raises
-    ------
-    InputError
-        There is no such built-in robot.
-    FileError
-        The file cannot be read or is wrong.
+    `name_or_path`: text that ends in ``.yaml`` or ``.yml`` or has a path separator is a path, as is
+    a `Path`; any other is the name of a built-in robot. `base`: folder from which a relative path
+    starts; by default the current one. Raises `InputError`: there is no such built-in robot;
+    `FileError`: the file cannot be read or is wrong.
 
     Warns
     -----

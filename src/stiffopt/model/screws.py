@@ -5,9 +5,10 @@ from math import inf
 from typing import Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from stiffopt import lie
+from stiffopt.arrays import Array
 from stiffopt.errors import InputError, shown
 from stiffopt.model.arguments import (
     checked_motion,
@@ -16,14 +17,12 @@ from stiffopt.model.arguments import (
     length_and_unit,
 )
 
-Vector = NDArray[np.float64]
-
 
 @dataclass(frozen=True, eq=False)
 class _Screw:
     """Six coordinates in some frame; subclasses define which half is along the axis."""
 
-    coordinates: Vector
+    coordinates: Array
 
     def __post_init__(self) -> None:
         try:
@@ -44,7 +43,7 @@ class _Screw:
     def __hash__(self) -> int:
         return hash((type(self), *self.coordinates.tolist()))
 
-    def _along_and_about(self) -> tuple[Vector, Vector]:
+    def _along_and_about(self) -> tuple[Array, Array]:
         """Return the vector along the axis, and the other half of the coordinates."""
         raise NotImplementedError
 
@@ -56,13 +55,13 @@ class _Screw:
         return float(unit @ other / length) if length > 0 else inf
 
     @property
-    def axis_direction(self) -> Vector:
+    def axis_direction(self) -> Array:
         """Unit vector (3,) along the axis; zero for the zero screw."""
         along, other = self._along_and_about()
         return length_and_unit(along if along.any() else other)[1]
 
     @property
-    def axis_point(self) -> Vector:
+    def axis_point(self) -> Array:
         """Point (3,) of the axis nearest to the frame's origin, in m."""
         along, other = self._along_and_about()
         length, unit = length_and_unit(along)
@@ -77,7 +76,7 @@ class _Screw:
     @classmethod
     def _from_axis(
         cls, point: ArrayLike, direction: ArrayLike, pitch: float
-    ) -> tuple[Vector, Vector]:
+    ) -> tuple[Array, Array]:
         along = checked_vector("direction", direction)
         moment = np.cross(checked_vector("point", point), along)
         return along, moment + checked_number("pitch", pitch) * along
@@ -87,12 +86,12 @@ class Twist(_Screw):
     """Infinitesimal motion (v, omega) of eq. (1): ``v = -omega x S0 + h omega``."""
 
     @property
-    def linear(self) -> Vector:
+    def linear(self) -> Array:
         """Velocity or displacement v (3,) of the point at the frame's origin."""
         return self.coordinates[:3]
 
     @property
-    def angular(self) -> Vector:
+    def angular(self) -> Array:
         """Rotation omega (3,)."""
         return self.coordinates[3:]
 
@@ -102,11 +101,11 @@ class Twist(_Screw):
         omega, v = cls._from_axis(point, direction, pitch)
         return cls(np.concatenate([v, omega]))
 
-    def transformed(self, T_ab: Vector) -> Self:
+    def transformed(self, T_ab: Array) -> Self:
         """Return the same motion with coordinates in frame a, given in frame b (eq. 15)."""
         return type(self)(lie.adjoint(checked_motion("T_ab", T_ab)) @ self.coordinates)
 
-    def _along_and_about(self) -> tuple[Vector, Vector]:
+    def _along_and_about(self) -> tuple[Array, Array]:
         return self.angular, self.linear
 
 
@@ -114,12 +113,12 @@ class Wrench(_Screw):
     """Force and moment (F, M) of eq. (4): ``M = S0 x F + h F``."""
 
     @property
-    def force(self) -> Vector:
+    def force(self) -> Array:
         """Force F (3,) in N."""
         return self.coordinates[:3]
 
     @property
-    def moment(self) -> Vector:
+    def moment(self) -> Array:
         """Moment M (3,) in N m about the frame's origin."""
         return self.coordinates[3:]
 
@@ -129,7 +128,7 @@ class Wrench(_Screw):
         force, moment = cls._from_axis(point, direction, pitch)
         return cls(np.concatenate([force, moment]))
 
-    def transformed(self, T_ab: Vector) -> Self:
+    def transformed(self, T_ab: Array) -> Self:
         """Return the same wrench with coordinates in frame a, given in frame b (eq. 5)."""
         return type(self)(lie.coadjoint(checked_motion("T_ab", T_ab)) @ self.coordinates)
 
@@ -139,10 +138,10 @@ class Wrench(_Screw):
             raise InputError(f"a wrench does work on a Twist, not on {shown(twist)}")
         return float(self.coordinates @ twist.coordinates)
 
-    def _along_and_about(self) -> tuple[Vector, Vector]:
+    def _along_and_about(self) -> tuple[Array, Array]:
         return self.force, self.moment
 
 
-def checked_wrench(value: ArrayLike | Wrench) -> Vector:
+def checked_wrench(value: ArrayLike | Wrench) -> Array:
     """Return the coordinates (6,) of a wrench, force first."""
     return checked_vector("wrench", value.coordinates if isinstance(value, Wrench) else value, 6)

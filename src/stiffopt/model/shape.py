@@ -70,10 +70,7 @@ class Shape(Protocol):
 class PointOfArm:
     """Position and axes of a point of the arm.
 
-    Attributes
-    ----------
-    position : in the base frame, (3,).
-    rotation : axes (3, 3) of the section in the base frame.
+    `position`: in the base frame, (3,). `rotation`: axes (3, 3) of the section in the base frame.
     """
 
     position: ca.SX | ca.MX
@@ -82,32 +79,20 @@ class PointOfArm:
 
 @dataclass(frozen=True)
 class ShapePiece:
-    """A soft piece of constant strain, or a rigid one.
+    """A soft piece of constant strain, or a rigid one."""
 
-    Attributes
-    ----------
-    motion : pose (4, 4) of its far end in its near end.
-    half : pose of its far end in its middle.
-    pressures : pressures (c,) that it depends on.
-    section : None if it is rigid.
-    length : at rest, in m.
-    """
-
-    motion: ca.SX
-    half: ca.SX
-    pressures: ca.SX
-    section: Section | None
-    length: ca.SX | float
+    motion: ca.SX  # pose (4, 4) of its far end in its near end
+    half: ca.SX  # pose of its far end in its middle
+    pressures: ca.SX  # pressures (c,) that it depends on
+    section: Section | None  # None if it is rigid
+    length: ca.SX | float  # at rest, in m
 
 
 @dataclass(frozen=True)
 class FreeShape:
     """The unloaded arm: a product of exponentials (eq. 7) and its compliance (eq. 17).
 
-    Attributes
-    ----------
-    pressures : pressures (n,) of the whole arm.
-    pieces : from the base to the station.
+    `pressures`: pressures (n,) of the whole arm. `pieces`: from the base to the station.
     """
 
     pressures: ca.SX

@@ -28,17 +28,14 @@ from itertools import pairwise
 from math import ceil, sqrt
 
 import casadi as ca
-import numpy as np
-from numpy.typing import NDArray
 
 from stiffopt import lie
+from stiffopt.arrays import Array
 from stiffopt.model.actuation import SectionGeometry
 from stiffopt.model.compliance import inverse_3x3
 from stiffopt.model.description import RobotDescription, Segment
 from stiffopt.model.kinematics import Actuation
 from stiffopt.model.shape import PointOfArm
-
-Vector = NDArray[np.float64]
 
 _ROOT = sqrt(21)
 _STAGES: tuple[dict[int, float], ...] = (
@@ -114,7 +111,7 @@ def slopes(
     weight: ca.SX,
     strain: ca.SX,
     compliance: ca.SX,
-    centroid: ca.SX | Vector,
+    centroid: ca.SX | Array,
 ) -> tuple[ca.SX, ca.SX, ca.SX]:
     """Return the right-hand sides q', tangent -r', and m' of the rod's equations, per length."""
     R = lie.rotation_from_quaternion(q)
@@ -127,7 +124,7 @@ def slopes(
     return -0.5 * lie.quaternion_product(q, ca.vertcat(0, xi[3:])), tangent, moment
 
 
-def _step_functions(sparsity: ca.Sparsity, centroid: Vector) -> tuple[ca.Function, ca.Function]:
+def _step_functions(sparsity: ca.Sparsity, centroid: Array) -> tuple[ca.Function, ca.Function]:
     """Return one integration step of length h towards the base, (10,) to (10,), and its notes.
 
     See `Stretch` for the notes.
@@ -181,12 +178,9 @@ def _turn_between(q: ca.MX, dq: ca.MX) -> ca.MX:
 class Stretch:
     """One integration step, or a rigid piece, between two arc lengths from the base.
 
-    Attributes
-    ----------
-    towards_base : function of the distance from its distal end towards the base, to quaternion and
-        position (from the tip).
-    notes : (10, 6) quaternion, position and moment at its distal end, and its length times their
-        slopes at the `LOBATTO` points.
+    `towards_base`: function of the distance from its distal end towards the base, to quaternion and
+    position (from the tip). `notes`: (10, 6) quaternion, position and moment at its distal end, and
+    its length times their slopes at the `LOBATTO` points.
     """
 
     proximal: float
@@ -280,6 +274,20 @@ class Chain:
     def total_jacobian(self, values: ca.MX) -> ca.MX:
         """Return the derivative (k, n) of values (k,) by the pressures, along the equilibrium."""
         return self.per_rest(ca.jacobian(values, self.x))[:, :-6]
+
+    def gravity_jacobian(self, values: ca.MX) -> ca.MX:
+        """Return the derivative (k, 3) of values (k,) by gravity, along the equilibrium."""
+        gravity = self.inputs[2]
+        residual, _ = self._per_x
+        turn = -inverse_3x3(residual[:, :3]) @ ca.jacobian(self.residual, gravity)
+        return ca.jacobian(values, gravity) + ca.jacobian(values, self.x)[:, :3] @ turn
+
+    @property
+    def per_gravity(self) -> ca.MX:
+        """Body twist (6, 3) of the station per m/s^2 of gravity, along the equilibrium."""
+        change = self.gravity_jacobian(ca.vertcat(self.quaternion, self.position))
+        turn = _turn_between(self.quaternion, change[:4, :])
+        return ca.vertcat(self.rotation.T @ change[4:, :], turn)
 
     def per_rest(self, change: ca.MX) -> ca.MX:
         """Reduce a change (k, 3 + n + 6) to equilibrium: (k, n + 6) per pressure and wrench."""

@@ -13,6 +13,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.model.batch import BatchFunction, InterpretedFunction
 from stiffopt.model.body_functions import DENSE, free_body_functions, loaded_body_functions
 from stiffopt.model.codegen import dense
@@ -21,7 +22,6 @@ from stiffopt.model.layout import Layout
 if TYPE_CHECKING:
     from stiffopt.model.arm import Arm
 
-Vector = NDArray[np.float64]
 Places = NDArray[np.intp]
 Functions = Callable[[str], BatchFunction]
 
@@ -51,7 +51,7 @@ class Pieces:
         self.section = np.array(section, dtype=np.int64)
         self.piece_of = np.array(piece_of, dtype=np.int64)
 
-    def find(self, at: Vector) -> tuple[Places, Vector]:
+    def find(self, at: Array) -> tuple[Places, Array]:
         """Return the pieces (k,) of stations, and arc lengths from the pieces' starts."""
         piece = np.minimum(np.searchsorted(self.ends, at), len(self.ends) - 1)
         return piece, at - np.concatenate([[0.0], self.ends])[piece]
@@ -64,19 +64,19 @@ class FreeStations:
         self._numbers, self._pieces = arm.numbers, pieces
         self.interpreted: Functions = _free_functions(arm.layout).__getitem__
 
-    def poses(self, p: Vector, at: Vector) -> Vector:
+    def poses(self, p: Array, at: Array) -> Array:
         """See `stiffopt.model.body.BodyShape`, also for the other methods."""
         _, strains, starts, _ = self.interpreted("frames").many(p, self._numbers)
         pose = self._along(self.interpreted("along"), strains, starts, at)[0]
         return _transforms(pose[..., 3:12], pose[..., :3])
 
-    def line(self, p: Vector, at: Vector) -> Vector:
+    def line(self, p: Array, at: Array) -> Array:
         """Return positions and tangents (N, k, 6)."""
         _, strains, starts, _ = self.interpreted("frames").many(p, self._numbers)
         pose = self._along(self.interpreted("along"), strains, starts, at)[0]
         return np.concatenate([pose[..., :3], pose[..., 12:]], -1)
 
-    def jacobians(self, p: Vector, at: Vector) -> Vector:
+    def jacobians(self, p: Array, at: Array) -> Array:
         """Return the Jacobians; twists grow along a pressure's piece and are constant beyond it."""
         _, strains, starts, _, slopes, twists, _ = self.interpreted("moving_frames").many(
             p, self._numbers
@@ -91,9 +91,7 @@ class FreeStations:
         of = self._pieces.piece_of
         return in_axes(pose[..., 3:12], np.where(of < piece, beyond, np.where(of == piece, own, 0)))
 
-    def compliances(
-        self, function: Functions, p: Vector, at: Vector, s: Places, t: Places
-    ) -> Vector:
+    def compliances(self, function: Functions, p: Array, at: Array, s: Places, t: Places) -> Array:
         """Return ``X_s A(min(s, t)) X_t'``; s and t are indices (k,) into the ascending `at`."""
         count = len(p)
         _, strains, starts, _ = function("frames").many(p, self._numbers)
@@ -108,16 +106,16 @@ class FreeStations:
         A = (own + _at_pieces(before, piece).reshape(-1, 6, 6)).reshape(count, len(at), 6, 6)
         X = np.tile(np.eye(6), (count, len(at), 1, 1))
         X[..., :3, 3:] = -_hat(self._along(function("along"), strains, starts, at)[0][..., :3])
-        found: Vector = X[:, s] @ A[:, np.minimum(s, t)] @ np.swapaxes(X[:, t], -1, -2)
+        found: Array = X[:, s] @ A[:, np.minimum(s, t)] @ np.swapaxes(X[:, t], -1, -2)
         return found
 
-    def radii(self, p: Vector) -> Vector:
+    def radii(self, p: Array) -> Array:
         """Return the radius of each piece, (N, pieces)."""
         return self.interpreted("frames").many(p, self._numbers)[3][..., 0]
 
     def _along(
-        self, function: BatchFunction, strains: Vector, starts: Vector, at: Vector
-    ) -> list[Vector]:
+        self, function: BatchFunction, strains: Array, starts: Array, at: Array
+    ) -> list[Array]:
         """Return poses (N, k, 15), and for ``moving_along`` twists per strain (N, k, 6, m)."""
         count = len(strains)
         piece, local = self._pieces.find(at)
@@ -128,21 +126,14 @@ class FreeStations:
 
 
 class Carried(NamedTuple):
-    """States at stations, and their changes along directions, propagated from the tip.
+    """States at stations, and their changes along directions, propagated from the tip."""
 
-    Attributes
-    ----------
-    axes : (k, 9) by columns.
-    positions, tangents : (k, 3)
-    changes : (k, 3, 3, d) of rotation, moment and vector to the tip, in base axes.
-    force : (3, d) change of the force, the same along the whole arm.
-    """
-
-    axes: Vector
-    positions: Vector
-    tangents: Vector
-    changes: Vector
-    force: Vector
+    axes: Array  # (k, 9) by columns
+    # positions, tangents: (k, 3)
+    positions: Array
+    tangents: Array
+    changes: Array  # (k, 3, 3, d) of rotation, moment and vector to the tip, in base axes
+    force: Array  # (3, d) change of the force, the same along the whole arm
 
 
 class LoadedStations:
@@ -155,19 +146,19 @@ class LoadedStations:
         self._arm = arm
         self._functions = _loaded_functions(arm.layout)
 
-    def poses(self, p: Vector, at: Vector) -> Vector:
+    def poses(self, p: Array, at: Array) -> Array:
         """See `stiffopt.model.body.BodyShape`, also for the other methods."""
         rows = [self._carried(row, at, moving=False) for row in p]
         found = [_transforms(row.axes, row.positions) for row in rows]
         return np.array(found).reshape(len(p), len(at), 4, 4)
 
-    def line(self, p: Vector, at: Vector) -> Vector:
+    def line(self, p: Array, at: Array) -> Array:
         """Return positions and tangents (N, k, 6)."""
         rows = [self._carried(row, at, moving=False) for row in p]
         found = [np.hstack([row.positions, row.tangents]) for row in rows]
         return np.array(found).reshape(len(p), len(at), 6)
 
-    def jacobians(self, p: Vector, at: Vector) -> Vector:
+    def jacobians(self, p: Array, at: Array) -> Array:
         """Return the Jacobians, with the turn of the tip for which the base does not rotate."""
         n = self._arm.n_pressures
         found = []
@@ -181,7 +172,7 @@ class LoadedStations:
             found.append(in_axes(carried.axes, np.concatenate([moved, turned], 1)))
         return np.array(found).reshape(len(p), len(at), 6, n)
 
-    def responses(self, p: Vector, at: Vector) -> Vector:
+    def responses(self, p: Array, at: Array) -> Array:
         """Return the changes along turns and wrenches in the layout of the machine code."""
         first = np.r_[:3, -6:0]
         found = []
@@ -191,11 +182,11 @@ class LoadedStations:
             found.append(np.concatenate([changes.ravel(), force.T.ravel()]))
         return np.array(found).reshape(len(p), 81 * len(at) + 27)
 
-    def radii(self, p: Vector) -> Vector:
+    def radii(self, p: Array) -> Array:
         """Return the radius of each piece, (N, pieces)."""
         return self._functions["radii"].many(p, self._arm.numbers)[0][..., 0]
 
-    def _carried(self, p: Vector, at: Vector, *, moving: bool) -> Carried:
+    def _carried(self, p: Array, at: Array, *, moving: bool) -> Carried:
         """Evaluate the equilibrium from rest; if `moving`, changes begin with those at the base."""
         function, distal = self._notes(moving)
         notes, *changes = function(*self._arm._equilibrium().arguments(self._arm.settle(p)))
@@ -220,11 +211,11 @@ class LoadedStations:
         carried = np.stack([turning @ change[:, :4], change[:, 7:], -change[:, 4:7]], 1)
         return Carried(*places, carried, force)
 
-    def _notes(self, moving: bool) -> tuple[InterpretedFunction, Vector]:
+    def _notes(self, moving: bool) -> tuple[InterpretedFunction, Array]:
         """Return the function of notes (10, 6 stretches) and their changes; starts of stretches."""
         arm = self._arm
 
-        def make() -> tuple[InterpretedFunction, Vector]:
+        def make() -> tuple[InterpretedFunction, Array]:
             chain = arm._equilibrium().shooting.chain()
             notes = ca.horzcat(*(stretch.notes for stretch in chain.stretches))
             outputs = [notes]
@@ -247,7 +238,7 @@ def _loaded_functions(layout: Layout) -> dict[str, InterpretedFunction]:
     return {f.name(): InterpretedFunction(f) for f in loaded_body_functions(layout)}
 
 
-def response(carried: Vector, force: Vector, s: Places, t: Places) -> Vector:
+def response(carried: Array, force: Array, s: Places, t: Places) -> Array:
     """Return twists at s per wrench at t of a loaded arm, (N, k, 6, 6), in base axes.
 
     Parameters
@@ -271,13 +262,13 @@ def response(carried: Vector, force: Vector, s: Places, t: Places) -> Vector:
     return np.concatenate([moved, turned], -2)
 
 
-def in_axes(axes: Vector, twists: Vector) -> Vector:
+def in_axes(axes: Array, twists: Array) -> Array:
     """Transform twists (..., 6, n) from base axes to axes given by columns (..., 9)."""
     rows = axes.reshape(*axes.shape[:-1], 3, 3)  # R'
     return np.concatenate([rows @ twists[..., :3, :], rows @ twists[..., 3:, :]], -2)
 
 
-def _transforms(axes: Vector, positions: Vector) -> Vector:
+def _transforms(axes: Array, positions: Array) -> Array:
     T = np.zeros((*positions.shape[:-1], 4, 4))
     T[..., :3, :3] = np.swapaxes(axes.reshape(*axes.shape[:-1], 3, 3), -1, -2)
     T[..., :3, 3] = positions
@@ -285,12 +276,12 @@ def _transforms(axes: Vector, positions: Vector) -> Vector:
     return T
 
 
-def _at_pieces(values: Vector, piece: Places) -> Vector:
+def _at_pieces(values: Array, piece: Places) -> Array:
     """Return columns (N k, r) of values (N, r, pieces)."""
-    found: Vector = np.swapaxes(values[:, :, piece], 1, 2).reshape(-1, values.shape[1])
+    found: Array = np.swapaxes(values[:, :, piece], 1, 2).reshape(-1, values.shape[1])
     return found
 
 
-def _hat(v: Vector) -> Vector:
+def _hat(v: Array) -> Array:
     """Return skew matrices (..., 3, 3) of vectors (..., 3)."""
     return np.cross(v[..., None, :], np.eye(3), axisa=-1, axisb=-1, axisc=-1).swapaxes(-1, -2)

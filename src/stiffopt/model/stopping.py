@@ -65,10 +65,8 @@ def giving_up(
 
     An outer context of this kind remains in force.
 
-    Raises
-    ------
-    InputError
-        If the timeout is not a positive number, or `cancel` neither an event nor callable.
+    Raises `InputError` if the timeout is not a positive number, or `cancel` neither an event nor
+    callable.
     """
     return _NO_LIMITS if timeout is None and cancel is None else _giving_up(timeout, cancel)
 
@@ -94,12 +92,7 @@ def _giving_up(timeout: float | None, cancel: Cancel | None) -> Iterator[None]:
 
 
 def checkpoint() -> None:
-    """Raise an error if the limits are exceeded.
-
-    Raises
-    ------
-    OutOfTimeError, CancelledError
-    """
+    """Raise `OutOfTimeError` or `CancelledError` if the limits are exceeded."""
     limits = _limits.get()
     if limits is not None:
         limits.check()

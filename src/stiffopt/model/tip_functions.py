@@ -12,16 +12,14 @@ from functools import cached_property, lru_cache, partial
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.model.arguments import DirectionalMeasure
 from stiffopt.model.batch import BatchFunction, InterpretedFunction
 from stiffopt.model.codegen import dense
 from stiffopt.model.compiled import Library, library
 from stiffopt.model.compliance import held_stiffness
 from stiffopt.model.layout import Layout, symbolic_arm
-
-Vector = NDArray[np.float64]
 
 LOOKED_UP_FROM = 64
 """Number of rows of a batch from which compiled code is used, if it is in the cache."""
@@ -32,7 +30,7 @@ long as these rows take in the VM."""
 
 _BLOCK = 65_536  # rows
 
-_Call = Callable[..., list[Vector]]
+_Call = Callable[..., list[Array]]
 _Ends = tuple[list[ca.SX], list[ca.SX]]  # symbols and expressions
 
 
@@ -42,7 +40,7 @@ class TipFunctions:
     Values from machine code and from the VM are equal to the last bit.
     """
 
-    def __init__(self, layout: Layout, numbers: Vector) -> None:
+    def __init__(self, layout: Layout, numbers: Array) -> None:
         self._layout, self._numbers = layout, numbers
         self.interpreted = tip_formulas(layout).interpreted
         self._library: Library | None = None
@@ -50,29 +48,29 @@ class TipFunctions:
         self._rows = 0
         self._lock = threading.Lock()
 
-    def evaluate(self, name: str, p: Vector, *parameters: Vector) -> list[Vector]:
+    def evaluate(self, name: str, p: Array, *parameters: Array) -> list[Array]:
         """Return value (..., r, c) and margins (..., segments, 1) at pressures (n,) or (N, n)."""
         return self._in_blocks(lambda call, q: call(name, q, self._numbers, *parameters), p)
 
-    def stiffness(self, p: Vector, measure: DirectionalMeasure) -> list[Vector]:
+    def stiffness(self, p: Array, measure: DirectionalMeasure) -> list[Array]:
         """Return a directional stiffness (..., 1, 1), and margins (..., segments, 1)."""
         if measure.boundary == "free":
             return self.evaluate("stiffness", p, _load(measure))
         return self._in_blocks(lambda call, q: self._held(call, q, measure), p)
 
-    def stiffness_gradient(self, p: Vector, measure: DirectionalMeasure) -> list[Vector]:
+    def stiffness_gradient(self, p: Array, measure: DirectionalMeasure) -> list[Array]:
         """Return its derivative (..., 1, n) by the pressures, and margins (..., segments, 1)."""
         if measure.boundary == "free":
             return self.evaluate("stiffness_gradient", p, _load(measure), np.ones(1))
         return self._in_blocks(lambda call, q: self._held_gradient(call, q, measure), p)
 
-    def _held(self, call: _Call, p: Vector, measure: DirectionalMeasure) -> list[Vector]:
+    def _held(self, call: _Call, p: Array, measure: DirectionalMeasure) -> list[Array]:
         compliance, margins = call("tip_compliance", p, self._numbers)
         pose, _ = call("tip_pose", p, self._numbers)
         value, _ = call("held_stiffness", compliance, pose, _held(measure))
         return [value, margins]
 
-    def _held_gradient(self, call: _Call, p: Vector, measure: DirectionalMeasure) -> list[Vector]:
+    def _held_gradient(self, call: _Call, p: Array, measure: DirectionalMeasure) -> list[Array]:
         """Return the gradient of ``k = D' C_held^-1 D``.
 
         With the wrench ``W`` that moves the held tip by ``D``: ``dk = -W' dC W + 2 W' dD``, where
@@ -87,9 +85,7 @@ class TipFunctions:
         (gradient,) = call("held_stiffness_gradient", slope, jacobian, pose, load[..., 0], held)
         return [gradient, margins]
 
-    def _in_blocks(
-        self, formula: Callable[[_Call, Vector], list[Vector]], p: Vector
-    ) -> list[Vector]:
+    def _in_blocks(self, formula: Callable[[_Call, Array], list[Array]], p: Array) -> list[Array]:
         """Evaluate a formula of several functions, for pressures (n,) or blocks of rows (N, n).
 
         Blocks need little memory for intermediate results, and machine code that becomes ready
@@ -103,12 +99,12 @@ class TipFunctions:
             return blocks[0]
         return [np.concatenate(parts) for parts in zip(*blocks, strict=True)]
 
-    def _one(self, name: str, *arguments: Vector) -> list[Vector]:
+    def _one(self, name: str, *arguments: Array) -> list[Array]:
         if self._library is not None:
             return self._library.function(name)(*arguments)
         return self.interpreted(name)(*arguments)
 
-    def _many(self, name: str, *arguments: Vector) -> list[Vector]:
+    def _many(self, name: str, *arguments: Array) -> list[Array]:
         return self._best(name, len(arguments[0])).many(*arguments)
 
     def _best(self, name: str, rows: int) -> BatchFunction:
@@ -130,7 +126,7 @@ class TipFunctions:
 
 
 @lru_cache(maxsize=256)
-def _load(measure: DirectionalMeasure) -> Vector:
+def _load(measure: DirectionalMeasure) -> Array:
     """Return a unit load (12,): a wrench in base axes and one in tip axes; one of them is zero."""
     start = (0 if measure.frame == "base" else 6) + (0 if measure.kind == "translation" else 3)
     load = np.zeros(12)
@@ -140,7 +136,7 @@ def _load(measure: DirectionalMeasure) -> Vector:
 
 
 @lru_cache(maxsize=256)
-def _held(measure: DirectionalMeasure) -> Vector:
+def _held(measure: DirectionalMeasure) -> Array:
     """Return a unit direction (3,) in base or tip axes, the other zero, and two conditions."""
     own, none = measure.direction, (0.0, 0.0, 0.0)
     axes = (*own, *none) if measure.frame == "base" else (*none, *own)

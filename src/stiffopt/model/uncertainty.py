@@ -41,8 +41,9 @@ from itertools import pairwise, product
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from stiffopt.arrays import Array, Flags
 from stiffopt.errors import InputError
 from stiffopt.model.arguments import checked_measure
 from stiffopt.model.calibration import Calibration, even_variance, fading_mean, squared_moves
@@ -52,7 +53,6 @@ from stiffopt.model.history import NO_HISTORY, part_of
 from stiffopt.model.parameters import Parameter
 from stiffopt.model.parametric import ParametricArm
 
-Vector = NDArray[np.float64]
 Part = Literal["parameters", "hysteresis", "discrepancy", "residual"]
 
 _LEVEL = 0.95  # probability of the reported regions
@@ -86,28 +86,28 @@ class TipUncertainty:
         A sentence about that, with the distance to the nearest recorded pressures, or "".
     """
 
-    parameters: Vector
-    hysteresis: Vector
-    discrepancy: Vector
-    residual: Vector
+    parameters: Array
+    hysteresis: Array
+    discrepancy: Array
+    residual: Array
     inside: bool
     extrapolation: str
     _source: Uncertainty
-    _pressures: Vector
+    _pressures: Array
     _shape: float
     _tail: float
 
     @property
-    def covariance(self) -> Vector:
+    def covariance(self) -> Array:
         """Mean square (3, 3) of the position's error in base axes, in m^2."""
         return np.asarray(self.parameters + self.hysteresis + self.discrepancy + self.residual)
 
     @cached_property
-    def semi_axes(self) -> Vector:
+    def semi_axes(self) -> Array:
         """Half lengths (3,) of the 95 % ellipsoid about `tip_pose` in m, the longest first."""
         return self.semi_axes_at(_LEVEL)
 
-    def semi_axes_at(self, level: float) -> Vector:
+    def semi_axes_at(self, level: float) -> Array:
         """Return half lengths (3,) in m of the ellipsoid that holds the tip with a probability."""
         if not 0 < level < 1:
             raise InputError(f"a probability lies between 0 and 1, both excluded; got {level!r}")
@@ -116,7 +116,7 @@ class TipUncertainty:
         return np.asarray(np.sqrt(factor * np.maximum(values, 0.0)))
 
     @cached_property
-    def axes(self) -> Vector:
+    def axes(self) -> Array:
         """Unit vectors (3, 3) of the ellipsoid as columns, in base axes, as in `semi_axes`."""
         return np.asarray(np.linalg.eigh(self.covariance)[1][:, ::-1])
 
@@ -148,28 +148,23 @@ class TipUncertainty:
 
 @dataclass(frozen=True, eq=False)
 class PositionErrors:
-    """Errors of predictions of the tip's position.
+    """Errors of predictions of the tip's position."""
 
-    Attributes
-    ----------
-    position : predicted (N, 3), in base axes and m.
-    parameters, hysteresis, discrepancy, residual : mean squares (N, 3, 3) of its error by source,
-        as in `TipUncertainty`; hysteresis includes that of the time at which the tip moves. After a
-        known history it is this, and with creep in the model the error of what is remembered.
-    shape, tail : degrees of freedom k and v (N,) of the error's squared distance. Unless the
-        history is unknown, k is 3 and v that of the calibration, which is infinite without a tail.
-    """
-
-    position: Vector
-    parameters: Vector
-    hysteresis: Vector
-    discrepancy: Vector
-    residual: Vector
-    shape: Vector
-    tail: Vector
+    position: Array  # predicted (N, 3), in base axes and m
+    # parameters, hysteresis, discrepancy, residual: mean squares (N, 3, 3) of its error by source,
+    # as in `TipUncertainty`; hysteresis includes that of the time at which the tip moves. After a
+    # known history it is this, and with creep in the model the error of what is remembered
+    parameters: Array
+    hysteresis: Array
+    discrepancy: Array
+    residual: Array
+    # shape, tail: degrees of freedom k and v (N,) of the error's squared distance. Unless the
+    # history is unknown, k is 3 and v that of the calibration, which is infinite without a tail
+    shape: Array
+    tail: Array
 
     @property
-    def covariance(self) -> Vector:
+    def covariance(self) -> Array:
         """Sum of all sources (N, 3, 3)."""
         return np.asarray(self.parameters + self.hysteresis + self.discrepancy + self.residual)
 
@@ -177,15 +172,8 @@ class PositionErrors:
 class Uncertainty:
     """Uncertainties of a calibrated robot.
 
-    Parameters
-    ----------
-    description : with a calibration.
-    tip_load : load on the tip, as in `Manipulator.tip_load`.
-
-    Raises
-    ------
-    InputError
-        The robot was not calibrated.
+    `description`: with a calibration. `tip_load`: load on the tip, as in `Manipulator.tip_load`.
+    Raises `InputError`: the robot was not calibrated.
     """
 
     def __init__(
@@ -208,7 +196,7 @@ class Uncertainty:
         self._covariance = self._calibration.covariance
 
     def at(
-        self, pressures: Vector, *, moving: bool = False, held: float | None = None
+        self, pressures: Array, *, moving: bool = False, held: float | None = None
     ) -> TipUncertainty:
         """Return the uncertainty at commanded pressures (n,), history unknown.
 
@@ -238,13 +226,13 @@ class Uncertainty:
 
     def errors(
         self,
-        pressures: Vector,
+        pressures: Array,
         *,
-        effective: Vector | None = None,
-        rates: Vector | None = None,
-        time: Vector | None = None,
-        moving: NDArray[np.bool_] | None = None,
-        held: Vector | None = None,
+        effective: Array | None = None,
+        rates: Array | None = None,
+        time: Array | None = None,
+        moving: Flags | None = None,
+        held: Array | None = None,
     ) -> PositionErrors:
         """Return the errors of predictions.
 
@@ -303,17 +291,17 @@ class Uncertainty:
             tail = tail + np.maximum(tail - 4, 0.0) * (1 / np.maximum(unbounded, 1e-3) - 1)
         return replace(found, shape=shape, tail=tail)
 
-    def levels(self, errors: Vector, known: PositionErrors) -> Vector:
+    def levels(self, errors: Array, known: PositionErrors) -> Array:
         """Return the probability (N,) of the smallest regions that hold errors (N, 3)."""
         return levels(errors, known.covariance, known.tail, known.shape)
 
     def stiffness_interval(
-        self, pressures: Vector, direction: ArrayLike, kind: Kind, boundary: Boundary, frame: Frame
+        self, pressures: Array, direction: ArrayLike, kind: Kind, boundary: Boundary, frame: Frame
     ) -> tuple[float, float]:
         """See `TipUncertainty.stiffness_interval`."""
         measure = checked_measure(direction, kind, boundary, frame)
         p = pressures[np.newaxis]
-        k, per_pressure, per_coordinate = self._slopes.arm.stiffnesses(
+        k, per_pressure, per_coordinate, _ = self._slopes.arm.stiffnesses(
             p, self._slopes.rest, measure
         )
         g, h = per_coordinate[0] / k[0], per_pressure[0] / k[0]
@@ -327,7 +315,7 @@ class Uncertainty:
             k[0] * np.exp(NORMAL_QUANTILE * deviation)
         )
 
-    def _discrepancy(self, pressures: Vector) -> Vector:
+    def _discrepancy(self, pressures: Array) -> Array:
         """Return variances (N, n) of the effective pressures due to the discrepancy, in Pa^2."""
         errors = self._calibration.errors
         if errors is None:
@@ -335,7 +323,7 @@ class Uncertainty:
         return errors.variances(self._channels, pressures)
 
     @cached_property
-    def _memory(self) -> Vector:
+    def _memory(self) -> Array:
         """Shares (n,) of the channels' pressures that act through hysteresis."""
         shares = [
             (segment.history or NO_HISTORY).remembered_shares(segment.n_channels)
@@ -344,13 +332,13 @@ class Uncertainty:
         return np.concatenate(shares)
 
     @cached_property
-    def _delays(self) -> Vector:
+    def _delays(self) -> Array:
         """Times (n,) in s by which the channels' pressures act late, at an even speed."""
         histories = [segment.history or NO_HISTORY for segment in self._description.segments]
         return np.repeat([each.dead_time + each.lag for each in histories], self._channels)
 
     @cached_property
-    def _typical_moves(self) -> Vector:
+    def _typical_moves(self) -> Array:
         """Mean squares (n,) by which the discrepancy moves the tip within the limits, in m^2."""
         low, high = np.array([self._description.pressure_min, self._description.pressure_max])
         shares = np.array(list(product((0.25, 0.75), repeat=max(self._channels))))
@@ -360,7 +348,7 @@ class Uncertainty:
         moves = squared_moves(per_pressure, self._discrepancy(pressures))
         return np.asarray(moves.mean(axis=0))
 
-    def _hysteresis(self, ways: Vector, moving: NDArray[np.bool_]) -> Vector:
+    def _hysteresis(self, ways: Array, moving: Flags) -> Array:
         """Return mean squares (N, n, n), in Pa^2, of effective minus commanded pressures.
 
         `ways` are these after each way (N, W, n), if pressures are held.
@@ -373,8 +361,8 @@ class Uncertainty:
         return np.asarray(found)
 
     def _remembered(
-        self, pressures: Vector, per_pressure: Vector, held: Vector | None = None
-    ) -> Vector:
+        self, pressures: Array, per_pressure: Array, held: Array | None = None
+    ) -> Array:
         """Return effective minus commanded pressures (N, W, n) in Pa after W ways to (N, n).
 
         `per_pressure` are the tip's slopes (N, 3, n) there. Without creep in the model, the ways
@@ -390,7 +378,7 @@ class Uncertainty:
         found *= np.sqrt(_HELD / np.maximum(softness, _STIFFEST))[:, np.newaxis]
         return found
 
-    def _ways(self, pressures: Vector, held: Vector | None = None) -> tuple[Vector, Vector]:
+    def _ways(self, pressures: Array, held: Array | None = None) -> tuple[Array, Array]:
         """Return what plays and what creep leave after W ways to pressures (N, n): (N, W, n).
 
         They have been held for the given times (N,) in s; for drawn ones where that is NaN.
@@ -429,7 +417,7 @@ class Uncertainty:
         return found, crept
 
     @cached_property
-    def _creep_left(self) -> Vector:
+    def _creep_left(self) -> Array:
         """Share (n,) of the ways' creep that was left at held pressures, as recorded; at most 1.
 
         With it, plays and creep have the mean square of `ErrorModel.settled` at recorded pressures:
@@ -443,14 +431,14 @@ class Uncertainty:
         share = (np.sqrt(b**2 + a * missing) - b) / np.maximum(a, 1e-9)
         return np.asarray(np.clip(share, 0.0, 1.0))
 
-    def _softness(self, per_pressure: Vector) -> Vector:
+    def _softness(self, per_pressure: Array) -> Array:
         """Return the squared slopes (N, n) of the tip by all pressures of a channel's segment."""
         ends = np.cumsum([0, *self._channels])
         squares = [(per_pressure[..., a:b] ** 2).sum(axis=(1, 2)) for a, b in pairwise(ends)]
         return np.repeat(np.stack(squares, axis=1), self._channels, axis=1)
 
     @cached_property
-    def _recorded_softness(self) -> Vector:
+    def _recorded_softness(self) -> Array:
         """Median (n,) of `_softness` over the recorded pressures."""
         errors = self._calibration.errors
         assert errors is not None  # a caller's condition
@@ -464,13 +452,13 @@ class Uncertainty:
         return errors is not None and bool(errors.settled) and self._description.creeps
 
     @cached_property
-    def _ages(self) -> Vector:
+    def _ages(self) -> Array:
         """Times (W,) in s for which pressures are held at the ends of the ways, if unknown."""
         strata = (np.arange(_WAYS) + 0.5) / _WAYS
         return np.asarray(np.interp(np.random.default_rng(1).permuted(strata), (0, 1), _AGES))
 
     @cached_property
-    def _visited(self) -> Vector:
+    def _visited(self) -> Array:
         """Pressures (_VISITS, W, n) in Pa that the ways visit in turn."""
         known, robot = self._calibration, self._description
         low, high = (
@@ -503,12 +491,13 @@ class ReadingSlopes:
         self.arm = ParametricArm(description, parameters, tip_load)
         self.rest = np.zeros(len(parameters))
         self._frames = frames
+        self._gravity = np.array(description.gravity) * description.has_known_vertical
         given = description.recordings
         self._sensor = np.zeros(3)
         if given is not None:
             self._sensor = given.registration.tip_in_sensor.inverse()[:3, 3]
 
-    def at(self, pressures: Vector) -> tuple[Vector, Vector, Vector]:
+    def at(self, pressures: Array) -> tuple[Array, Array, Array]:
         """Return tip positions (N, 3) at effective pressures (N, n), and slopes of the sensor's.
 
         The slopes are (N, 3, k + frames) by the numbers and (N, 3, n) per Pa; all in base axes and
@@ -517,19 +506,22 @@ class ReadingSlopes:
         found = self.arm.poses(pressures, self.rest)
         rotation, tip = found.transforms[:, :3, :3], found.transforms[:, :3, 3]
 
-        def moved(twists: Vector) -> Vector:  # of the sensor, in base axes
+        def moved(twists: Array) -> Array:  # of the sensor, in base axes
             return np.asarray(rotation @ (twists[:, :3] - _skew(self._sensor) @ twists[:, 3:]))
 
         per_number = [moved(found.per_coordinate)]
         if self._frames:
             shifted = np.broadcast_to(np.eye(3), rotation.shape)
-            per_number += [shifted, -_skew(tip + rotation @ self._sensor)]
+            turned = -_skew(tip + rotation @ self._sensor)
+            # the weight keeps its direction in the tracker's frame
+            turned = turned + moved(found.per_gravity @ _skew(self._gravity))
+            per_number += [shifted, turned]
         if self._frames == 12:
             per_number += [rotation, -rotation @ _skew(self._sensor)]
         return tip, np.concatenate(per_number, axis=2), moved(found.per_pressure)
 
 
-def _skew(vectors: Vector) -> Vector:
+def _skew(vectors: Array) -> Array:
     """Return matrices (..., 3, 3) of the cross products with vectors (..., 3)."""
     x, y, z = np.moveaxis(vectors, -1, 0)
     o = np.zeros_like(x)
@@ -537,7 +529,7 @@ def _skew(vectors: Vector) -> Vector:
     return np.stack(rows, axis=-2)
 
 
-def _shape(moves: Vector, covariance: Vector) -> tuple[Vector, Vector]:
+def _shape(moves: Array, covariance: Array) -> tuple[Array, Array]:
     """Return k (N,) for which 3 chi^2(k) / k has the variance of the squared distances of errors.
 
     An error is one of the moves (N, W, 3), equally likely, and an independent normal error; both
@@ -572,11 +564,11 @@ def squared_radius(level: float, degrees_of_freedom: float, shape: float = 3.0) 
 
 
 def levels(
-    errors: Vector,
-    covariance: Vector,
-    degrees_of_freedom: float | Vector,
-    shape: float | Vector = 3.0,
-) -> Vector:
+    errors: Array,
+    covariance: Array,
+    degrees_of_freedom: float | Array,
+    shape: float | Array = 3.0,
+) -> Array:
     """Return the probability (N,) of the smallest regions that hold errors (N, 3).
 
     Regions are ellipsoids of the covariances (N, 3, 3); for the others see `squared_radius`.

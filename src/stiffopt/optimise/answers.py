@@ -4,8 +4,8 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.optimise import diagnosis
 from stiffopt.optimise.fast import CompiledAnswer
@@ -26,18 +26,12 @@ from stiffopt.optimise.solution import (
 )
 from stiffopt.optimise.task import Task
 
-Vector = NDArray[np.float64]
-
 
 class Answers:
     """Factory of one solver's solutions.
 
-    Parameters
-    ----------
-    prepared :
-        Limits, samples and compiled solvers for the kind of task.
-    solve_at_once :
-        Solves another task on the arm; see `PressureSolver.solve_at_once`.
+    `prepared`: limits, samples and compiled solvers for the kind of task. `solve_at_once`: solves
+    another task on the arm; see `PressureSolver.solve_at_once`.
     """
 
     def __init__(
@@ -109,7 +103,7 @@ class Answers:
         problem: PressureProblem,
         result: LocalResult,
         judgement: Judgement,
-        pressures: Vector,
+        pressures: Array,
         message: str = "",
     ) -> Explanation:
         """Explain a judged result; a given message is kept."""
@@ -150,7 +144,7 @@ class Answers:
         self,
         problem: PressureProblem,
         result: LocalResult,
-        pressures: Vector,
+        pressures: Array,
         active: dict[str, tuple[int, int]],
     ) -> Sensitivities | None:
         prices = result.multipliers
@@ -179,7 +173,7 @@ class Answers:
         )
 
 
-def pressed(active: dict[str, tuple[int, int]], multipliers: Vector) -> list[str]:
+def pressed(active: dict[str, tuple[int, int]], multipliers: Array) -> list[str]:
     """Return the active limits that have a multiplier; (n,), positive towards larger pressure."""
     rounding = 1e-6 * float(np.abs(multipliers).max())
     return [n for n, (index, side) in active.items() if side * multipliers[index] > rounding]

@@ -16,8 +16,8 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.errors import EquilibriumError
 from stiffopt.model.contact.equilibrium import ContactEquilibrium
 from stiffopt.model.manipulator import Manipulator
@@ -27,8 +27,6 @@ from stiffopt.optimise.brace import leant_on
 from stiffopt.optimise.goal import StiffnessMeasure
 from stiffopt.optimise.settings import BRACE
 from stiffopt.optimise.task import Task
-
-Vector = NDArray[np.float64]
 
 _LEAST_GRIP = 0.05  # where the contact itself is in doubt; its normal force is a demand of its own
 _STEP = 0.3  # standard deviations, of differences by parameters
@@ -55,18 +53,18 @@ class BraceUncertainty:
         return self._robot.tip_uncertainty(self._eq.pressures)
 
     @cached_property
-    def _per_tip(self) -> Vector:
+    def _per_tip(self) -> Array:
         """The pressures (n, 3) of least norm that move the free tip, in Pa/m."""
         robot, p = self._robot, self._eq.pressures
         R = robot.tip_pose(p)[:3, :3]
         return np.asarray(np.linalg.pinv(R @ robot.tip_jacobian(p)[:3]))
 
-    def _pressures(self, squares: Vector) -> Vector:
+    def _pressures(self, squares: Array) -> Array:
         """Return the mean square (n, n) of pressures that move the free tip with one (3, 3)."""
         return np.asarray(self._per_tip @ squares @ self._per_tip.T)
 
     @cached_property
-    def forces(self) -> Vector:
+    def forces(self) -> Array:
         """By how much normal forces (contacts,) may be smaller or larger, in N.
 
         That is `BRACE.sure` standard deviations.
@@ -131,10 +129,7 @@ class BraceUncertainty:
     def _varied(self, task: Task, parameter: Parameter, coordinate: float) -> ContactEquilibrium:
         """Return the equilibrium with another parameter, or the known one if nothing is touched.
 
-        Raises
-        ------
-        EquilibriumError
-            There is none.
+        Raises `EquilibriumError`: there is none.
         """
         assert task.scene is not None
         assert task.brace is not None

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt import lie
+from stiffopt.arrays import Array
 from stiffopt.display import display_units
 from stiffopt.errors import EquilibriumError, StoppedError
 from stiffopt.model.arm_clearance import measured_scene
@@ -40,12 +41,10 @@ from stiffopt.optimise.settings import BRACE, Effort
 from stiffopt.optimise.solution import Confidence, Judgement, PressureSolution, active_bounds
 from stiffopt.optimise.task import Task
 
-Vector = NDArray[np.float64]
-
 _LEAST_YIELDING = 1e-9  # m/N, of a contact, so that one at the base, which cannot yield, ranks last
 
 
-def candidates(problem: BracedProblem, table: SampleTable) -> Iterator[Vector]:
+def candidates(problem: BracedProblem, table: SampleTable) -> Iterator[Array]:
     """Yield variables (n,) at which the arm would lean on an object, the most promising first.
 
     Objects take turns, and promising starts alternate with arbitrary ones, since the estimate is
@@ -83,8 +82,8 @@ def candidates(problem: BracedProblem, table: SampleTable) -> Iterator[Vector]:
 
 
 def _moved_by_contact(
-    robot: Manipulator, p: Vector, at: Vector, station: NDArray[np.intp], n: Vector, depth: Vector
-) -> Vector:
+    robot: Manipulator, p: Array, at: Array, station: NDArray[np.intp], n: Array, depth: Array
+) -> Array:
     """Return twists (N, 6) of the tip, in base axes, due to a contact at a station of each row."""
     ends = np.full(len(at), robot.length)
     C = robot.compliance_between(p, np.concatenate([at, ends]), np.concatenate([at, at]))
@@ -92,11 +91,11 @@ def _moved_by_contact(
     at_contact, to_tip = C[rows, station, :3, :3], C[rows, len(at) + station, :, :3]
     yielding = np.einsum("ni,nij,nj->n", n, at_contact, n)
     force = depth / np.maximum(yielding, _LEAST_YIELDING)
-    moved: Vector = np.einsum("nij,nj,n->ni", to_tip, n, force)
+    moved: Array = np.einsum("nij,nj,n->ni", to_tip, n, force)
     return moved
 
 
-def _displaced(poses: Vector, twists: Vector) -> Vector:
+def _displaced(poses: Array, twists: Array) -> Array:
     """Move poses (N, 4, 4) by twists (N, 6) in base axes."""
     found = poses.copy()
     found[:, :3, 3] += twists[:, :3]
@@ -106,7 +105,7 @@ def _displaced(poses: Vector, twists: Vector) -> Vector:
 
 
 def _places(
-    problem: BracedProblem, starts: Iterable[Vector]
+    problem: BracedProblem, starts: Iterable[Array]
 ) -> Iterator[tuple[int, ProgramPoint | None]]:
     """Yield points at the target in contact to descend from; see `search`.
 
@@ -136,7 +135,7 @@ def _places(
             yield tried, point
 
 
-def _brought(problem: BracedProblem, x: Vector) -> list[tuple[float, BracedPoint]]:
+def _brought(problem: BracedProblem, x: Array) -> list[tuple[float, BracedPoint]]:
     """Bring a start to the target in contact; return its objective and point.
 
     The list is empty if it does not arrive.
@@ -159,7 +158,7 @@ def _brought(problem: BracedProblem, x: Vector) -> list[tuple[float, BracedPoint
 
 
 def braced_answers(
-    problem: BracedProblem, samples: Callable[[], SampleTable], guess: Vector | None
+    problem: BracedProblem, samples: Callable[[], SampleTable], guess: Array | None
 ) -> Search:
     """Return local optima in contact, best first; only those near a guess, (n,) in Pa, if any."""
     if guess is not None:
@@ -232,7 +231,7 @@ def lean(
     problem: BracedProblem,
     samples: Callable[[], SampleTable],
     free: PressureSolution,
-    guess: Vector | None,
+    guess: Array | None,
 ) -> PressureSolution:
     """Return the stiffer of the best answer that leans on objects and the free one.
 
@@ -429,12 +428,15 @@ def _rubbed(rubbing: Rubbing | None) -> str:
     """Return what friction does on the way from rest, or ""."""
     if rubbing is None:
         return ""
-    units = display_units()
+    units, past = display_units(), ""
+    if rubbing.past is not None:
+        most = units.pressure.text(float(np.abs(rubbing.past).max()), ".2g")
+        past = f"; the way goes past it by {most} and comes back, which eases the friction"
     return (
         f"when it is reached from rest, friction holds the tip "
         f"{units.length.text(float(np.linalg.norm(rubbing.tip)), '.2g')} away, and changes normal "
         f"forces by {units.force.text(float(np.abs(rubbing.normals).max()), '.2g')}, until that is "
-        "corrected"
+        f"corrected{past}"
     )
 
 

@@ -3,8 +3,8 @@
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.errors import EquilibriumError
 from stiffopt.model.scene import Scene
 from stiffopt.model.stopping import checkpoint
@@ -26,22 +26,18 @@ from stiffopt.optimise.solution import (
 )
 from stiffopt.optimise.task import Task
 
-Vector = NDArray[np.float64]
-
 
 class CompiledSearch:
     """Search by machine code for one kind of task; returns None until code is compiled.
 
-    Parameters
-    ----------
-    answers : the solver's factory of solutions.
+    `answers`: the solver's factory of solutions.
     """
 
     def __init__(self, answers: Answers) -> None:
         self._answers, self._prepared = answers, answers.prepared
         self._robot = answers.robot
 
-    def fast(self, task: Task, guess: Vector | None) -> tuple[FastSolver, Vector, Program] | None:
+    def fast(self, task: Task, guess: Array | None) -> tuple[FastSolver, Array, Program] | None:
         """Return the task's compiled solver, its row of numbers and its program.
 
         None without machine code, and for a brace: the compiled solvers do not model contact.
@@ -56,7 +52,7 @@ class CompiledSearch:
         return solver, solver.with_target(row, program, guess), program
 
     def solve(
-        self, task: Task, guess: Vector | None, limits: tuple[Vector, Vector] | None = None
+        self, task: Task, guess: Array | None, limits: tuple[Array, Array] | None = None
     ) -> PressureSolution | None:
         """Return the compiled solver's answer if it finds one that holds."""
         if limits is not None and guess is not None:
@@ -69,7 +65,7 @@ class CompiledSearch:
             solver.limit(row, *limits)
         return self._answers.if_it_holds(task, program, solver.solve(row))
 
-    def nearest(self, task: Task, start: Vector | None = None) -> PressureSolution | None:
+    def nearest(self, task: Task, start: Array | None = None) -> PressureSolution | None:
         """Return the closest configuration by machine code; a start (n,) is in Pa.
 
         None if there is no code, or if the pose is reached.  With a scene, a reached pose is solved
@@ -140,7 +136,7 @@ class CompiledSearch:
             return self.nearest(task, p)
         return self._clearest(task, p, len(samples) + drawn)
 
-    def _clearest_near(self, scene: Scene, p: Vector, distances: Vector) -> tuple[Vector, int]:
+    def _clearest_near(self, scene: Scene, p: Array, distances: Array) -> tuple[Array, int]:
         """Return pressures (n,) clear of a scene, or the clearest found, and how many were drawn.
 
         Each round draws closer around the clearest so far, at first those of p (N, n).
@@ -161,7 +157,7 @@ class CompiledSearch:
                 break
             drawn += len(others)
             p, distances = np.concatenate([p, others]), np.concatenate([distances, found])
-        nearest: Vector = p[distances.argmax()]
+        nearest: Array = p[distances.argmax()]
         return nearest, drawn
 
     def _too_soft(
@@ -178,7 +174,7 @@ class CompiledSearch:
             counts=answer.counts,
         )
 
-    def _clearest(self, task: Task, p: Vector, tried: int) -> PressureSolution:
+    def _clearest(self, task: Task, p: Array, tried: int) -> PressureSolution:
         """Return the sample with the most clearance, where none has enough."""
         judgement = judge(self._robot, task, p)
         return PressureSolution(

@@ -24,8 +24,8 @@ from functools import partial
 from typing import Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array, Flags
 from stiffopt.directions import unit_vector
 from stiffopt.errors import DerivativeError, InputError, shown
 from stiffopt.model.manipulator import Manipulator
@@ -38,22 +38,21 @@ from stiffopt.optimise.program import Program
 from stiffopt.optimise.settings import DERIVATIVES, DESCENT
 from stiffopt.optimise.task import Task
 
-Vector = NDArray[np.float64]
 By = Literal["target", "direction", "limits", "clearance"]
 
 
 class _Change(NamedTuple):
     """Rates of change of a point: terms and floors (k,), residual (m,), gradients (., n)."""
 
-    terms: Vector
-    term_gradients: Vector
-    floors: Vector
-    floor_gradients: Vector
-    residual: Vector
-    jacobian: Vector
+    terms: Array
+    term_gradients: Array
+    floors: Array
+    floor_gradients: Array
+    residual: Array
+    jacobian: Array
 
     @classmethod
-    def of(cls, points: list[ProgramPoint], weights: Vector) -> "_Change":
+    def of(cls, points: list[ProgramPoint], weights: Array) -> "_Change":
         """Return the weighted sum of points."""
         return cls(
             *(
@@ -70,11 +69,13 @@ class _Active:
     terms: list[int]
     balls: list[int]
     floors: list[int]
-    held: NDArray[np.bool_]
+    held: Flags
 
 
 class AnswerDerivatives:
     """Derivatives of the answer to a task.
+
+    Raises `DerivativeError` if the answer is not an isolated optimum.
 
     Parameters
     ----------
@@ -85,14 +86,9 @@ class AnswerDerivatives:
     ----------
     weak : constraints that are about to become active or inactive.  If there are any, derivatives
         hold only on the side on which the active constraints stay the same.
-
-    Raises
-    ------
-    DerivativeError
-        If the answer is not an isolated optimum.
     """
 
-    def __init__(self, robot: Manipulator, task: Task, pressures: Vector) -> None:
+    def __init__(self, robot: Manipulator, task: Task, pressures: Array) -> None:
         self._problem = problem = _problem(robot, task, pressures)
         self._evaluate = _evaluation(problem)
         x = pressures / problem.unit
@@ -119,7 +115,7 @@ class AnswerDerivatives:
         self._check_distances()
         self.weak = tuple(self._weak_names())
 
-    def _seems_to_bind(self, i: int, pull: Vector) -> bool:
+    def _seems_to_bind(self, i: int, pull: Array) -> bool:
         """Return whether a constraint is first assumed to be active, by its error and its price."""
         c = self._problem.constraints[i]
         if c.first >= self._problem.program.n_own_rows:
@@ -155,7 +151,7 @@ class AnswerDerivatives:
 
     # -- derivatives ------------------------------------------------------------------------
 
-    def gradient(self, of: str, by: By) -> Vector:
+    def gradient(self, of: str, by: By) -> Array:
         """See `PressureSolution.gradient`."""
         if of not in ("stiffness", "pressures"):
             raise InputError(f"derivatives are of 'stiffness' or 'pressures'; got {shown(of)}")
@@ -175,7 +171,7 @@ class AnswerDerivatives:
             f"derivatives are by 'target', 'direction', 'limits' or 'clearance'; got {shown(by)}"
         )
 
-    def _by(self, of: str, change: _Change, moved: int | None = None) -> Vector:
+    def _by(self, of: str, change: _Change, moved: int | None = None) -> Array:
         """Return the derivative of the answer for a change of the program."""
         if of == "stiffness":
             t = float(self._point.terms.max())
@@ -188,7 +184,7 @@ class AnswerDerivatives:
             rate[moved] = 1.0
         return rate * self._problem.unit
 
-    def _by_limits(self, of: str) -> Vector:
+    def _by_limits(self, of: str) -> Array:
         """Return derivatives (..., 2, n) by lower and upper limits; zero for inactive ones."""
         problem, n = self._problem, len(self._point.x)
         found = np.zeros((2, n, n) if of == "pressures" else (2, n))
@@ -212,7 +208,7 @@ class AnswerDerivatives:
         axes = np.eye(6)[: 6 if turns else 3]
         return [self._difference(partial(self._moved_target, axis)) for axis in axes]
 
-    def _moved_target(self, way: Vector, by: float) -> Program:
+    def _moved_target(self, way: Array, by: float) -> Program:
         return self._problem.program.at(self._problem.task.target.moved_back(-by * way))
 
     def _direction_changes(self) -> Iterator[list[_Change]]:
@@ -248,13 +244,13 @@ class AnswerDerivatives:
         points = [self._evaluate(self._point.x + h * s * e, problem.parameters) for s in steps]
         return _Change.of(points, np.array(weights) / h)
 
-    def _split(self) -> tuple[Vector, Vector, Vector]:
+    def _split(self) -> tuple[Array, Array, Array]:
         """Return the multipliers of the active terms, balls and floors."""
         a = len(self._active.terms)
         b = a + len(self._active.balls)
         return self._weights[:a], self._weights[a:b], self._weights[b:]
 
-    def _ball_slopes(self, change: _Change) -> tuple[Vector, Vector]:
+    def _ball_slopes(self, change: _Change) -> tuple[Array, Array]:
         """Return the rates of the active balls (b,), and their gradients' weighted sum (n,)."""
         rates, slope = [], np.zeros(len(self._point.x))
         for i, weight in zip(self._active.balls, self._split()[1], strict=True):
@@ -270,7 +266,7 @@ class AnswerDerivatives:
             slope += weight * (dr @ J + r @ dJ) / rho**2
         return np.array(rates), slope
 
-    def _rates(self, change: _Change) -> Vector:
+    def _rates(self, change: _Change) -> Array:
         """Return the rate of F with the unknowns fixed."""
         terms, _, floors = self._split()
         active = self._active
@@ -291,7 +287,7 @@ class AnswerDerivatives:
             - floors @ change.floors[self._active.floors]
         )
 
-    def _constraint_slopes(self) -> Vector:
+    def _constraint_slopes(self) -> Array:
         """Return the gradients (k, n) of active constraints, in the order of the multipliers."""
         point, active = self._point, self._active
         rows = [*point.term_gradients[active.terms]]
@@ -303,7 +299,7 @@ class AnswerDerivatives:
             rows.append(weights @ point.jacobian[c.first : c.end])
         return np.array([*rows, *(-point.floor_gradients[active.floors])])
 
-    def _left(self) -> Vector:
+    def _left(self) -> Array:
         """Return F at the present point."""
         point, active, problem = self._point, self._active, self._problem
         slopes, terms = self._constraint_slopes(), self._split()[0]
@@ -422,7 +418,7 @@ class AnswerDerivatives:
                 yield problem.robot.description.channel_name(i)
 
 
-def _turned(program: Program, which: int, way: Vector, by: float) -> Program:
+def _turned(program: Program, which: int, way: Array, by: float) -> Program:
     """Return the program with one direction moved along `way` and normalised."""
     measures = list(program.measures)
     measure = measures[which]
@@ -432,7 +428,7 @@ def _turned(program: Program, which: int, way: Vector, by: float) -> Program:
     return replace(program, measures=tuple(measures))
 
 
-def _problem(robot: Manipulator, task: Task, pressures: Vector) -> PressureProblem:
+def _problem(robot: Manipulator, task: Task, pressures: Array) -> PressureProblem:
     """Return the program of a task, with a row for each local minimum of a distance."""
     problem = PressureProblem(robot, task)
     if task.scene is None:
@@ -440,7 +436,7 @@ def _problem(robot: Manipulator, task: Task, pressures: Vector) -> PressureProbl
     return problem.among(FollowedObstacles(task.scene, robot.description, robot, pressures))
 
 
-def _evaluation(problem: PressureProblem) -> Callable[[Vector, Vector], ProgramPoint]:
+def _evaluation(problem: PressureProblem) -> Callable[[Array, Array], ProgramPoint]:
     """Return the function of pressures (n,), as shares, and parameters; from rest under loads."""
     robot, task = problem.robot, problem.task
     program = Program.of(task, robot.description)
@@ -449,7 +445,7 @@ def _evaluation(problem: PressureProblem) -> Callable[[Vector, Vector], ProgramP
     radii = np.array([c.radius for c in program.constraints(robot.length)])
     own = slice(program.n_own_rows)
 
-    def evaluate(x: Vector, parameters: Vector) -> ProgramPoint:
+    def evaluate(x: Array, parameters: Array) -> ProgramPoint:
         parts = None if fast is None else fast[0].point(parameters, radii, x * problem.unit)
         if parts is not None:
             residual, jacobian = problem.with_obstacles(x, parts[0][own], parts[1][own])

@@ -4,8 +4,8 @@ from collections.abc import Iterable
 from math import inf
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.display import display_units
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.scene import Scene
@@ -16,11 +16,9 @@ from stiffopt.optimise.settings import CLOSEST, OBSTACLES, Effort
 from stiffopt.optimise.solution import Judgement, Sensitivities
 from stiffopt.optimise.task import Task
 
-Vector = NDArray[np.float64]
-
 
 def closest_configurations(
-    problem: PressureProblem, candidates: Iterable[Vector]
+    problem: PressureProblem, candidates: Iterable[Array]
 ) -> list[LocalResult]:
     """Return pressures nearest to the target, found from all candidates, best first.
 
@@ -58,7 +56,7 @@ def last_stage(problem: PressureProblem, errors: dict[str, float]) -> PressurePr
     return problem.changed(problem.closest(last.name), {**radii, last.name: inf}, floors=False)
 
 
-def unimproved(problem: PressureProblem, x: Vector) -> LocalResult:
+def unimproved(problem: PressureProblem, x: Array) -> LocalResult:
     """Wrap pressures as a result that can be judged like those of descents."""
     problem.restart()
     point = problem.pose(x)
@@ -66,7 +64,7 @@ def unimproved(problem: PressureProblem, x: Vector) -> LocalResult:
     return LocalResult(nearest, point, inf, 0.0, converged=False, is_optimum=False)
 
 
-def freedom(problem: PressureProblem, x: Vector) -> int:
+def freedom(problem: PressureProblem, x: Array) -> int:
     """Return the number of independent pressure changes that keep the residuals."""
     problem.restart()
     balls = [ball for ball in problem.pose(x).bounded if not ball.constraint.one_sided]
@@ -120,7 +118,7 @@ def no_way_message(judgement: Judgement, task: Task, samples: int) -> str:
     )
 
 
-def in_the_way(robot: Manipulator, scene: Scene, pressures: Vector) -> str:
+def in_the_way(robot: Manipulator, scene: Scene, pressures: Array) -> str:
     """List the objects nearer than the clearance at pressures (n,), and by how much."""
     near = robot.clearances(pressures, scene)
     missing = (scene.clearance - near.distances).tolist()

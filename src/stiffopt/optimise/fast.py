@@ -14,8 +14,8 @@ from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.model.batch import in_parallel
 from stiffopt.model.compiled import Library
 from stiffopt.model.manipulator import Manipulator
@@ -26,8 +26,6 @@ from stiffopt.optimise.samples import SampleTable
 from stiffopt.optimise.search import effort
 from stiffopt.optimise.settings import CLOSEST, DESCENT, KEPT, REACH, SEARCH, Effort
 from stiffopt.optimise.solution import Confidence
-
-Vector = NDArray[np.float64]
 
 _NEAR = 18  # numbers of a term's `Nearness`
 _COUNTS = 14  # numbers of an answer before its pressures
@@ -88,23 +86,16 @@ class _OneTask(ctypes.Structure):
 
 
 class CompiledAnswer(NamedTuple):
-    """An answer of the compiled solver.
+    """An answer of the compiled solver."""
 
-    Attributes
-    ----------
-    pressures : (n,), in Pa.
-    counts : work done.
-    judged : arguments of `Judgement.of`: residuals, tip pose, compliance and values at the
-        pressures.
-    slope : (n,), for the closest configuration: gradient of its error's Lagrangian without limits,
-        per share of a pressure's range.
-    """
-
-    pressures: Vector
+    pressures: Array  # (n,), in Pa
     confidence: Confidence
-    counts: dict[str, int]
-    judged: tuple[list[float], Vector, Vector, list[float]]
-    slope: Vector | None = None
+    counts: dict[str, int]  # work done
+    # arguments of `Judgement.of`: residuals, tip pose, compliance and values at the pressures
+    judged: tuple[list[float], Array, Array, list[float]]
+    # (n,), for the closest configuration: gradient of its error's Lagrangian without limits, per
+    # share of a pressure's range
+    slope: Array | None = None
 
 
 class FastSolver:
@@ -214,7 +205,7 @@ class FastSolver:
         other._address = ctypes.addressof(other._setup)
         return other
 
-    def row(self, program: Program, lower: Vector, upper: Vector, floors: Vector) -> Vector:
+    def row(self, program: Program, lower: Array, upper: Array, floors: Array) -> Array:
         """Return the row of a task without its target and guess."""
         row = np.zeros(self._width)
         row[: self.targets.start] = self._numbers
@@ -223,7 +214,7 @@ class FastSolver:
         row[self._radii.stop : self._near.start] = np.concatenate([lower, upper, floors])
         return row
 
-    def with_target(self, row: Vector, program: Program, guess: Vector | None) -> Vector:
+    def with_target(self, row: Array, program: Program, guess: Array | None) -> Array:
         """Return a copy of a row with a target and, if given, a guess (Pa) to try first."""
         row = row.copy()
         row[self.targets] = program.target_parameters
@@ -237,11 +228,11 @@ class FastSolver:
             row[self.guess] = guess
         return row
 
-    def limit(self, row: Vector, lower: Vector, upper: Vector) -> None:
+    def limit(self, row: Array, lower: Array, upper: Array) -> None:
         """Set other limits (n,) in a row, in Pa, within those that it was made for."""
         row[self._radii.stop : self._radii.stop + 2 * len(lower)] = np.concatenate([lower, upper])
 
-    def next_to(self, row: Vector, guess: Vector, lower: Vector, upper: Vector) -> Vector:
+    def next_to(self, row: Array, guess: Array, lower: Array, upper: Array) -> Array:
         """Return a row that requests the answer next to a guess (n,), within limits (n,)."""
         row = row.copy()
         row[self._mode] = _GUESS_ALONE
@@ -249,21 +240,21 @@ class FastSolver:
         self.limit(row, lower, upper)
         return row
 
-    def judging(self, row: Vector, pressures: Vector) -> Vector:
+    def judging(self, row: Array, pressures: Array) -> Array:
         """Return a row that requests the judgement of pressures (n,)."""
         row = row.copy()
         row[self._mode] = _JUDGE
         row[self.guess] = pressures
         return row
 
-    def optima(self, rows: Vector, threads: int | None = None) -> tuple[Vector, Vector]:
+    def optima(self, rows: Array, threads: int | None = None) -> tuple[Array, Array]:
         """Return the answers to rows of `next_to`, not judged: pressures (N, n), objectives (N,).
 
         An objective is infinite where there is no answer.
         """
         return self._pressures_and_values(rows, threads, ANSWERED)
 
-    def brought(self, rows: Vector, guesses: Vector) -> tuple[Vector, Vector]:
+    def brought(self, rows: Array, guesses: Array) -> tuple[Array, Array]:
         """Return pressures (N, n) on target near guesses (N, n), which need not be optimal.
 
         The second array are their objectives (N,), infinite where a guess is not brought there.
@@ -275,22 +266,22 @@ class FastSolver:
         return self._pressures_and_values(rows, 1 if len(rows) < 64 else None, _REACHED)
 
     def _pressures_and_values(
-        self, rows: Vector, threads: int | None, outcome: int
-    ) -> tuple[Vector, Vector]:
+        self, rows: Array, threads: int | None, outcome: int
+    ) -> tuple[Array, Array]:
         """Return pressures (N, n) and objectives (N,) of rows; infinite without that outcome."""
         numbers = self._numbers_of(np.ascontiguousarray(rows), threads)
         n = self.guess.stop - self.guess.start
         values = np.where(numbers[:, 0] == outcome, numbers[:, 1], np.inf)
         return numbers[:, _COUNTS : _COUNTS + n], values
 
-    def solve(self, row: Vector) -> CompiledAnswer | None:
+    def solve(self, row: Array) -> CompiledAnswer | None:
         """Return the answer to one task; None if the general method is needed.
 
         If no answer meets a demanded stiffness, this is the one nearest to it: judge the answer.
         """
         return self.answer(self._run_one(row))
 
-    def closest(self, row: Vector, start: Vector | None = None) -> CompiledAnswer | None:
+    def closest(self, row: Array, start: Array | None = None) -> CompiledAnswer | None:
         """Return the configuration closest to an unreachable target.
 
         The search starts from samples and first from a start (n,) in Pa, if given.  None if the
@@ -301,17 +292,17 @@ class FastSolver:
         row[self.guess] = start
         return self.answer(self._run_one(row, _CLOSEST_FROM))
 
-    def can_reach(self, row: Vector) -> bool:
+    def can_reach(self, row: Array) -> bool:
         """Return whether a configuration nearest to the target is brought to it."""
         return bool(self._run_one(row, _REACH_ONLY)[0] == _REACHED)
 
-    def block(self, row: Vector) -> Vector:
+    def block(self, row: Array) -> Array:
         """Return a row that requests the answer next to its guess, followed by memory for it."""
         block = np.concatenate([row, np.zeros(self._answer_width)])
         block[self._mode] = _GUESS_ALONE
         return block
 
-    def call(self, block: Vector) -> tuple[Callable[[], int], ctypes.Structure]:
+    def call(self, block: Array) -> tuple[Callable[[], int], ctypes.Structure]:
         """Return a function that solves a block in place, and the structure that it works on.
 
         The function returns the outcome; the answer is not judged.  The block must not move.  The
@@ -324,7 +315,7 @@ class FastSolver:
         solve_one.argtypes = [_pointer]
         return partial(solve_one, ctypes.addressof(task)), task
 
-    def judged(self, block: Vector) -> CompiledAnswer | None:
+    def judged(self, block: Array) -> CompiledAnswer | None:
         """Return the answer in a block, judged by the model."""
         row, numbers = block[: self._width].copy(), block[self._width :]
         row[self.guess] = self.pressures(block)
@@ -332,11 +323,11 @@ class FastSolver:
         judged[1:_COUNTS] = numbers[1:_COUNTS]
         return self.answer(judged)
 
-    def pressures(self, block: Vector) -> Vector:
+    def pressures(self, block: Array) -> Array:
         """Return the pressures (n,) of the answer in a block, in Pa."""
         return block[self._pressures]
 
-    def point(self, parameters: Vector, radii: Vector, pressures: Vector) -> list[Vector] | None:
+    def point(self, parameters: Array, radii: Array, pressures: Array) -> list[Array] | None:
         """Evaluate a loaded arm's program from rest; None without an equilibrium.
 
         Pressures are (n,) in Pa.  Returns residuals (m,), with those of obstacles zero, their
@@ -354,7 +345,7 @@ class FastSolver:
         parts = np.split(values[s.n :], np.cumsum(counts)[:-1])
         return [each.reshape(-1, s.n) if i % 2 else each for i, each in enumerate(parts)]
 
-    def _run_one(self, row: Vector, mode: int | None = None) -> Vector:
+    def _run_one(self, row: Array, mode: int | None = None) -> Array:
         numbers = np.empty(self._answer_width)
         if mode is not None:
             row[self._mode] = mode
@@ -362,11 +353,11 @@ class FastSolver:
             self._run(row, numbers, 0, 1, stop)
         return numbers
 
-    def solve_all(self, rows: Vector, threads: int | None = None) -> list[CompiledAnswer | None]:
+    def solve_all(self, rows: Array, threads: int | None = None) -> list[CompiledAnswer | None]:
         """Answer many tasks, one row each, on `threads` threads (default: all cores)."""
         return [self.answer(each) for each in self._numbers_of(np.ascontiguousarray(rows), threads)]
 
-    def _numbers_of(self, rows: Vector, threads: int | None) -> Vector:
+    def _numbers_of(self, rows: Array, threads: int | None) -> Array:
         """Return the numbers (N, w) of the answers to rows."""
         chunk = 1 if self._setup.state else KEPT.chunk  # Ctrl-C waits for a chunk
         numbers = np.empty((len(rows), self._answer_width))
@@ -379,7 +370,7 @@ class FastSolver:
             in_parallel(work, range(0, len(rows), chunk), threads)
         return numbers
 
-    def _run(self, rows: Vector, answers: Vector, begin: int, end: int, stop: int) -> None:
+    def _run(self, rows: Array, answers: Array, begin: int, end: int, stop: int) -> None:
         failed = self._solve(
             self._address, rows.ctypes.data, self._width,
             answers.ctypes.data, self._answer_width, begin, end, stop,
@@ -387,7 +378,7 @@ class FastSolver:
         if failed:
             raise MemoryError("no memory is left for the compiled solver")
 
-    def answer(self, numbers: Vector) -> CompiledAnswer | None:
+    def answer(self, numbers: Array) -> CompiledAnswer | None:
         """Return the answer from the numbers of a call, which it keeps; None if there is none."""
         if numbers[0] not in (ANSWERED, _GLOBAL, _JUDGED, _NEAREST, _TOO_SOFT):
             return None

@@ -4,8 +4,8 @@ It also takes the tasks that the compiled search does not support or cannot solv
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.errors import EquilibriumError
 from stiffopt.optimise import diagnosis
 from stiffopt.optimise.answers import Answers
@@ -18,31 +18,27 @@ from stiffopt.optimise.settings import ANSWER, CLOSEST, Effort
 from stiffopt.optimise.solution import Confidence, PressureSolution
 from stiffopt.optimise.task import Task
 
-Vector = NDArray[np.float64]
-
 _ONE = Effort(1, 1, 1)
 
 
 class GeneralSearch:
     """Solve any task, more slowly than `CompiledSearch`.
 
-    Parameters
-    ----------
-    answers : the solver's factory of solutions.
+    `answers`: the solver's factory of solutions.
     """
 
     def __init__(self, answers: Answers) -> None:
         self._answers, self._prepared = answers, answers.prepared
         self._robot = answers.robot
 
-    def solve(self, task: Task, guess: Vector | None) -> PressureSolution:
+    def solve(self, task: Task, guess: Array | None) -> PressureSolution:
         """Solve a task; prefer the local optimum next to a guess, (n,) in Pa."""
         try:
             return self._solve(PressureProblem(self._robot, task), guess)
         except EquilibriumError as error:
             return PressureSolution("failed", str(error), task)
 
-    def _solve(self, problem: PressureProblem, guess: Vector | None) -> PressureSolution:
+    def _solve(self, problem: PressureProblem, guess: Array | None) -> PressureSolution:
         if guess is not None:
             nearby = self._from_guess(problem, guess)
             if nearby is not None:
@@ -55,7 +51,7 @@ class GeneralSearch:
         at_once = self._judged(problem, found.results[0], found.confidence)
         return at_once or self._first_that_holds(problem, found)
 
-    def _from_guess(self, problem: PressureProblem, guess: Vector) -> PressureSolution | None:
+    def _from_guess(self, problem: PressureProblem, guess: Array) -> PressureSolution | None:
         problem.restart()
         point = reach(problem, np.clip(guess / problem.unit, problem.lower, problem.upper))
         if point is None or not point.reached:

@@ -18,30 +18,28 @@ from typing import Any, NamedTuple, cast
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.display import display_units
 from stiffopt.errors import EquilibriumError
 from stiffopt.model.batch import InterpretedFunction
 from stiffopt.model.clearance import Nearest
 from stiffopt.model.codegen import dense
 from stiffopt.model.contact.equilibrium import ContactEquilibrium, Grip
-from stiffopt.model.contact.way import Rubbing, rubbed, states_from_rest
+from stiffopt.model.contact.way import Rubbing, states_from_rest
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.scene import Scene, SceneObject
 from stiffopt.model.shape import PointOfArm
 from stiffopt.model.stopping import checkpoint
 from stiffopt.optimise.brace import Brace, kept_clear_of, leant_on
 from stiffopt.optimise.brace_uncertainty import BraceUncertainty
+from stiffopt.optimise.easing import allowed_distance, distance_left, eased
 from stiffopt.optimise.measures.directional import StiffnessMeasure
 from stiffopt.optimise.problem import Objective, PressureProblem, ProgramPoint
 from stiffopt.optimise.program import Constraint, Program
-from stiffopt.optimise.quadratic import solve_qp
 from stiffopt.optimise.settings import BRACE, OBSTACLES
 from stiffopt.optimise.solution import Judgement, Preload, are_within
 from stiffopt.optimise.task import Task
-
-Vector = NDArray[np.float64]
 
 FORCE_ON, MARGIN_ON = "force on ", "margin on "
 """Prefixes of the names of constraints of contacts."""
@@ -98,7 +96,7 @@ class PlacedProgram:
         )
         self._parameters = program.parameters
 
-    def __call__(self, eq: ContactEquilibrium, C: Vector) -> tuple[Vector, Vector]:
+    def __call__(self, eq: ContactEquilibrium, C: Array) -> tuple[Array, Array]:
         """Return residuals (m,) of the terms and measures (k,); C is (6, 6), in tip axes."""
         tip = eq.tip_pose
         poses = eq.poses(self.at) if len(self.at) else ()
@@ -110,29 +108,27 @@ class PlacedProgram:
 class BracedPoint(ProgramPoint):
     """The program's values at an equilibrium in contact.
 
-    Attributes
-    ----------
-    force : sum of the contacts' normal forces, in N.
-    force_gradient : (n,), its derivative, per variable.
+    `force`: sum of the contacts' normal forces, in N. `force_gradient`: (n,), its derivative, per
+    variable.
     """
 
     __slots__ = ("equilibrium", "force", "force_gradient")
 
     equilibrium: ContactEquilibrium
     force: float
-    force_gradient: Vector
+    force_gradient: Array
 
 
 class Quantities(NamedTuple):
     """Quantities at one equilibrium from which the program's rows and values are computed."""
 
-    residuals: Vector
-    values: Vector
-    distances: Vector
-    forces: Vector  # along the normals, as large as they may be
-    pushed: Vector
-    slips: Vector
-    foretold: Vector  # slips, by the tangent
+    residuals: Array
+    values: Array
+    distances: Array
+    forces: Array  # along the normals, as large as they may be
+    pushed: Array
+    slips: Array
+    foretold: Array  # slips, by the tangent
 
 
 class BracedProblem(PressureProblem):
@@ -209,13 +205,10 @@ class BracedProblem(PressureProblem):
         """Find the next equilibrium from rest."""
         self.here = self._kept = None
 
-    def equilibrium(self, x: Vector) -> ContactEquilibrium:
+    def equilibrium(self, x: Array) -> ContactEquilibrium:
         """Return the equilibrium at pressures x, found from `here`.
 
-        Raises
-        ------
-        EquilibriumError
-            If there is none, or none with contact.
+        Raises `EquilibriumError` if there is none, or none with contact.
         """
         if self._kept is not None and self._kept[0] == x.tobytes():
             return self._kept[1]
@@ -227,19 +220,19 @@ class BracedProblem(PressureProblem):
         self.here, self._kept = eq, (x.tobytes(), eq)
         return eq
 
-    def pose(self, x: Vector) -> BracedPoint:
+    def pose(self, x: Array) -> BracedPoint:
         """See `PressureProblem.pose`."""
         return self._evaluated(x, full=False)
 
-    def point(self, x: Vector) -> BracedPoint:
+    def point(self, x: Array) -> BracedPoint:
         """See `PressureProblem.point`."""
         return self._evaluated(x, full=True)
 
-    def worth(self, x: Vector) -> BracedPoint:
+    def worth(self, x: Array) -> BracedPoint:
         """See `PressureProblem.worth`."""
         return self._evaluated(x, full=True)
 
-    def _evaluated(self, x: Vector, *, full: bool) -> BracedPoint:
+    def _evaluated(self, x: Array, *, full: bool) -> BracedPoint:
         checkpoint()
         eq = self.equilibrium(x)
         pushes = [] if self.only_target else list(self.pushes(eq))
@@ -267,7 +260,7 @@ class BracedProblem(PressureProblem):
         point.force_gradient = slopes.forces.sum(axis=0)
         return point
 
-    def pushes(self, eq: ContactEquilibrium) -> Iterator[Vector]:
+    def pushes(self, eq: ContactEquilibrium) -> Iterator[Array]:
         """Yield unit vectors (3,) of pushes at the tip, both ways per direction, in base axes."""
         R = eq.tip_pose[:3, :3]
         for measure, sign in product(self.directions, (1.0, -1.0)):
@@ -277,7 +270,7 @@ class BracedProblem(PressureProblem):
     def _seen(
         self,
         eq: ContactEquilibrium,
-        pushes: list[Vector],
+        pushes: list[Array],
         known: BraceUncertainty,
         near: list[Nearest],
         full: bool,
@@ -301,8 +294,8 @@ class BracedProblem(PressureProblem):
         return Quantities(residuals, values, distances, forces, np.array(pushed), slips, foretold)
 
     def _slips(
-        self, eq: ContactEquilibrium, pushes: list[Vector], grip: float, base: Quantities | None
-    ) -> tuple[Vector, Vector]:
+        self, eq: ContactEquilibrium, pushes: list[Array], grip: float, base: Quantities | None
+    ) -> tuple[Array, Array]:
         """Return the pushes at which a contact is lost or the arm snaps, at most twice the margin.
 
         Those of contacts that stick and, as friction is not certain, of contacts that slide; `grip`
@@ -324,7 +317,7 @@ class BracedProblem(PressureProblem):
                 found[k] = base.slips[k] * (share if np.isfinite(share) else 1.0)
         return found, foretold
 
-    def _rows(self, eq: ContactEquilibrium, seen: Quantities, near: list[Nearest]) -> Vector:
+    def _rows(self, eq: ContactEquilibrium, seen: Quantities, near: list[Nearest]) -> Array:
         rows = self.obstacle_rows(near)
         if self.only_target:
             return np.array([*rows, *(0.0 for _ in self._row_names)])
@@ -349,7 +342,7 @@ class BracedProblem(PressureProblem):
         required = self.program.obstacles.scene.clearance
         return [OBSTACLES.margin - (each.distance - required) for each in near]
 
-    def _slopes(self, eq: ContactEquilibrium, base: Quantities, slopes: Quantities) -> Vector:
+    def _slopes(self, eq: ContactEquilibrium, base: Quantities, slopes: Quantities) -> Array:
         """Return derivatives (rows, n) of `_rows`; of several contacts on an object, the worst."""
         rows = list(-slopes.distances)
         none = np.zeros(len(self.unit))
@@ -391,18 +384,15 @@ class BracedProblem(PressureProblem):
 
         Objects that come to the arm are taken to leave no friction.
 
-        Raises
-        ------
-        EquilibriumError
-            The way is lost.
+        Raises `EquilibriumError`: the way is lost.
         """
         if self.brace.approach == "objects" or not eq.sticking.own:
             return None
         states = list(states_from_rest(self.robot, self.scene, eq.pressures))
-        found, apart = rubbed(states), states[-1].tip_pose[:3, 3] - eq.tip_pose[:3, 3]
+        apart = states[-1].tip_pose[:3, 3] - eq.tip_pose[:3, 3]
         if float(np.linalg.norm(apart)) > BRACE.same:
             raise EquilibriumError("in smaller steps the arm comes to another equilibrium")
-        return found
+        return eased(self.robot, self.task, self.scene, states)[1]
 
     def judgement(self, eq: ContactEquilibrium, rubbing: Rubbing | None = None) -> Judgement:
         """Judge an equilibrium by the task, with what friction does on the way to it."""
@@ -472,42 +462,15 @@ class BracedProblem(PressureProblem):
                 )
 
     def _out_of_reach(self, eq: ContactEquilibrium, rubbing: Rubbing) -> Iterator[str]:
-        """Yield that pressures cannot bring the tip back that friction has moved; see `_corrected`.
-
-        Contacts stick meanwhile.
-        """
-        position = self.task.target.position
-        if position is None:
-            return
-        rows = [i for i, each in enumerate(position) if each is not None]
-        R, held = eq.tip_pose[:3, :3], rubbing.sticking
-        jacobian = R @ eq.tip_jacobian[:3] + held.bent()[0][:3] @ held.per_pressure
-        aim = np.array([0.0 if each is None else each for each in position])
-        off = eq.tip_pose[:3, 3] + rubbing.tip - aim
-        left = self._corrected(eq.pressures, off[rows], jacobian[rows])
-        if left > max(self.task.target.tolerance.position, BRACE.missed):
+        """Yield that pressures cannot bring the tip back that friction has moved."""
+        left = distance_left(self.robot, self.task, eq, rubbing)
+        if left > allowed_distance(self.task):
             length, most = display_units().length, display_units().pressure.text(BRACE.corrected)
             away = length.text(float(np.linalg.norm(rubbing.tip)), ".2g")
             yield (
                 f"friction on the way keeps the tip {away} away; pressures that are corrected by "
                 f"{most} leave it {length.text(left, '.2g')} from the target"
             )
-
-    def _corrected(self, pressures: Vector, off: Vector, jacobian: Vector) -> float:
-        """Return how far from its place a tip that is off by so much (k,) stays, in m.
-
-        The pressures (n,) change by at most `BRACE.corrected` each, within their limits; `jacobian`
-        (k, n).
-        """
-        most = BRACE.corrected
-        low = np.maximum(self.lower * self.unit - pressures, -most) / most
-        high = np.minimum(self.upper * self.unit - pressures, most) / most
-        # in mm, with little weight on the changes themselves
-        A, b, n = 1e3 * most * jacobian, 1e3 * off, len(pressures)
-        H, g, none = A.T @ A + 1e-6 * np.eye(n), A.T @ b, np.zeros((0, n))
-        found = solve_qp(H, g, none, np.minimum(low, 0.0), np.maximum(high, 0.0))
-        step = np.zeros(n) if found is None else found[0]
-        return float(np.linalg.norm(off + most * jacobian @ step))
 
     def _held_at_tip(self, eq: ContactEquilibrium) -> bool:
         """Return True if a rigid object holds the tip along a direction that is maximised."""
@@ -518,7 +481,7 @@ class BracedProblem(PressureProblem):
         m = measure
         return eq.stiffness(m.direction, m.kind, m.boundary, m.frame, self.brace.contacts)
 
-    def _left_in_doubt(self, eq: ContactEquilibrium, doubt: Vector) -> tuple[float, float]:
+    def _left_in_doubt(self, eq: ContactEquilibrium, doubt: Array) -> tuple[float, float]:
         """Return the force that a push of the margin leaves beyond the doubt, and that, in N."""
         if not doubt.any():
             return np.inf, 0.0
@@ -545,6 +508,6 @@ def _max_force(item: SceneObject) -> float | None:
     return None if item.contact is None else item.contact.max_force
 
 
-def _nothing(n: int) -> tuple[Vector, Vector, Vector, Vector]:
+def _nothing(n: int) -> tuple[Array, Array, Array, Array]:
     none = np.zeros((0, n))
     return none[:, 0], none, none[:, 0], none

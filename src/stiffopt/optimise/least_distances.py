@@ -12,8 +12,8 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.errors import DerivativeError
 from stiffopt.model.arm_clearance import ArmBody, gradients
 from stiffopt.model.clearance import Nearest, range_ends
@@ -23,8 +23,6 @@ from stiffopt.model.stopping import checkpoint
 from stiffopt.optimise.obstacles import Obstacles
 from stiffopt.optimise.settings import OBSTACLES
 
-Vector = NDArray[np.float64]
-
 _SPACING = 1 / 200  # of stations for finding minima, as a share of the arm's length
 _AROUND = 1e-3  # half width of the first interval searched for a minimum, m of arc length
 _STATIONS = 33  # in each interval
@@ -32,17 +30,11 @@ _EXACT = 1e-13  # precision of a minimum, m of arc length
 
 
 class LeastDistance(NamedTuple):
-    """A local minimum, along the body, of the distance from one object.
+    """A local minimum, along the body, of the distance from one object."""
 
-    Attributes
-    ----------
-    which : index of the object.
-    s : arc length at rest, in m.
-    low, high : ends of the range of the body that contains it.
-    """
-
-    which: int
-    s: float
+    which: int  # index of the object
+    s: float  # arc length at rest, in m
+    # low, high: ends of the range of the body that contains it
     low: float
     high: float
 
@@ -51,14 +43,12 @@ class LeastDistance(NamedTuple):
 class FollowedObstacles(Obstacles):
     """The objects around one arm, with one row for each local minimum near the clearance.
 
-    Attributes
-    ----------
-    pressures : (n,), pressures at which the minima were found, in Pa.
-    least : the minimum of each row.
+    `pressures`: (n,), pressures at which the minima were found, in Pa. `least`: the minimum of each
+    row.
     """
 
     arm: Manipulator = field(repr=False, compare=False)
-    pressures: Vector = field(repr=False, compare=False)
+    pressures: Array = field(repr=False, compare=False)
     least: tuple[LeastDistance, ...] = field(init=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -79,7 +69,7 @@ class FollowedObstacles(Obstacles):
             for i in np.flatnonzero(least).tolist():
                 yield LeastDistance(index, float(s[i]), *ends[i].tolist())
 
-    def rows(self, arm: Manipulator, p: Vector) -> tuple[Vector, Vector]:
+    def rows(self, arm: Manipulator, p: Array) -> tuple[Array, Array]:
         """See `Obstacles.rows`."""
         checkpoint()
         body = ArmBody(arm, p)
@@ -94,7 +84,7 @@ class FollowedObstacles(Obstacles):
 class _Profile:
     """Stations of a body with their distances, and the slopes of these along it."""
 
-    def __init__(self, body: ArmBody, item: MeasuredObject, at: Vector) -> None:
+    def __init__(self, body: ArmBody, item: MeasuredObject, at: Array) -> None:
         self.at = at
         self.positions, tangents, radii = body(at)
         seen = item.distances(self.positions)

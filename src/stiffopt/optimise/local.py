@@ -18,37 +18,27 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array, Flags
 from stiffopt.optimise.prices import Multipliers, prices_at
 from stiffopt.optimise.problem import Objective, PressureProblem, ProgramPoint
 from stiffopt.optimise.quadratic import FAR, solve_qp
 from stiffopt.optimise.reach import attempt, bounded_step, within
 from stiffopt.optimise.settings import DESCENT
 
-Vector = NDArray[np.float64]
-
 _CURVED = 2.0  # estimated second-order error of a correction e, in units of e^2 / scale
 
 
 @dataclass(frozen=True, eq=False)
 class LocalResult:
-    """End of a descent.
+    """End of a descent."""
 
-    Attributes
-    ----------
-    problem : the program that was solved.
-    value : objective there.
-    violation : sum of the violations of floors, in logarithms of stiffness.
-    is_optimum : False: the point is only a candidate, without prices.
-    """
-
-    problem: PressureProblem
+    problem: PressureProblem  # the program that was solved
     point: ProgramPoint
-    value: float
-    violation: float
+    value: float  # objective there
+    violation: float  # sum of the violations of floors, in logarithms of stiffness
     converged: bool
-    is_optimum: bool = True
+    is_optimum: bool = True  # False: the point is only a candidate, without prices
 
     @classmethod
     def at(cls, problem: PressureProblem, point: ProgramPoint) -> "LocalResult":
@@ -128,7 +118,7 @@ def descend(
     B = problem.objective.curvature(point)
     B = B + 1e-8 * np.trace(B) * np.eye(len(B))
     radius, price = DESCENT.first_radius, 10.0
-    weights: Vector | None = None
+    weights: Array | None = None
     held = np.zeros(len(point.x), dtype=bool)
     converged = False
     for _ in range(DESCENT.iterations):
@@ -171,17 +161,17 @@ def descend(
     return LocalResult(problem, here.point, here.value, here.missed, converged)
 
 
-def _pushed_back(problem: PressureProblem, x: Vector, rise: Vector) -> NDArray[np.bool_]:
+def _pushed_back(problem: PressureProblem, x: Array, rise: Array) -> Flags:
     """Return which steps off a limit met a slope back to it.
 
     If such a step gained nothing, there is a kink at the limit, as in the norm law where a segment
     is unpressurised.
     """
-    pushed: NDArray[np.bool_] = (rise > 0) & ((x <= problem.lower) | (x >= problem.upper))
+    pushed: Flags = (rise > 0) & ((x <= problem.lower) | (x >= problem.upper))
     return pushed
 
 
-def _last_step(problem: PressureProblem, here: _Place, d: Vector, price: float) -> _Place:
+def _last_step(problem: PressureProblem, here: _Place, d: Array, price: float) -> _Place:
     """Return the place after a step of negligible gain, if it gains at all."""
     trial = _pulled_back(problem, here.point, d, problem.lower, problem.upper)
     if trial is None:
@@ -200,7 +190,7 @@ def _next_to(here: _Place, known: Sequence[LocalResult], same: float) -> LocalRe
     return None
 
 
-def _update(B: Vector, s: Vector, y: Vector) -> None:
+def _update(B: Array, s: Array, y: Array) -> None:
     """Apply Powell's damped BFGS update in place, which keeps B positive definite."""
     Bs = B @ s
     sBs = float(s @ Bs)
@@ -215,7 +205,7 @@ def _update(B: Vector, s: Vector, y: Vector) -> None:
 
 
 def _pulled_back(
-    problem: PressureProblem, point: ProgramPoint, d: Vector, lower: Vector, upper: Vector
+    problem: PressureProblem, point: ProgramPoint, d: Array, lower: Array, upper: Array
 ) -> ProgramPoint | None:
     """Return a point near x + d within all balls, evaluated as needed; None if there is none."""
     bounding = problem.bounding
@@ -314,19 +304,19 @@ class _Subproblem:
         self._curvature = np.zeros(rows)
         self._one_sided = [c.first for c in problem.bounding.constraints if c.one_sided]
 
-    def dearest_floor(self, weights: Vector) -> float:
+    def dearest_floor(self, weights: Array) -> float:
         """Return the largest multiplier of a floor."""
         return float(weights[self._floors].max()) if self._floored else 0.0
 
     def step(
         self,
         here: _Place,
-        B: Vector,
-        held: NDArray[np.bool_],
+        B: Array,
+        held: Flags,
         radius: float,
         price: float,
-        weights: Vector | None,
-    ) -> tuple[Vector, float, Vector] | None:
+        weights: Array | None,
+    ) -> tuple[Array, float, Array] | None:
         """Return a step (n,), its promised decrease of the merit, and multipliers of the slopes.
 
         Pressures that are held (n,) do not change.  The multipliers of a ball combine those of the
@@ -368,7 +358,7 @@ class _Subproblem:
         return z[:n], promised, new
 
     def _turn_boxes(
-        self, here: _Place, weights: Vector | None, residual: Vector, jacobian: Vector
+        self, here: _Place, weights: Array | None, residual: Array, jacobian: Array
     ) -> None:
         """Set the axes of the box around each ball; the first is where the ball will be active."""
         bounding = self._problem.bounding
@@ -390,7 +380,7 @@ class _Subproblem:
             self._axes[first:end, first:end] /= rho
 
 
-def _least_squares(rows: Vector, wanted: Vector) -> list[float]:
+def _least_squares(rows: Array, wanted: Array) -> list[float]:
     """Return the weights of rows (k, n) whose sum is nearest to a vector (n,)."""
     square = rows @ rows.T
     square += 1e-10 * np.trace(square) * np.eye(len(square))
@@ -401,7 +391,7 @@ def _least_squares(rows: Vector, wanted: Vector) -> list[float]:
     return found
 
 
-def axes_along(vector: list[float]) -> Vector:
+def axes_along(vector: list[float]) -> Array:
     """Return orthonormal axes (k, k) by rows, the first along a vector (k,); any if it is zero."""
     length = math.hypot(*vector)
     axes = np.eye(len(vector))

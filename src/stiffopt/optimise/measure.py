@@ -10,15 +10,12 @@ from __future__ import annotations
 from abc import abstractmethod
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
-import numpy as np
-from numpy.typing import NDArray
-
+from stiffopt.arrays import Array
 from stiffopt.schema import Schema
 
 if TYPE_CHECKING:
     from stiffopt.model.manipulator import Manipulator
 
-Vector = NDArray[np.float64]
 Role = Literal["maximise", "at_least", "match"]
 
 
@@ -86,6 +83,6 @@ class Measure(Schema):
         """Describe the measure: ``against translation along (1, 0, 0), base axes, free``."""
         return self.key
 
-    def stiffness_gradient(self, robot: Manipulator, pressures: Vector) -> Vector | None:
+    def stiffness_gradient(self, robot: Manipulator, pressures: Array) -> Array | None:
         """Return the derivative (n,) of the stiffness by pressures (n,); None for a distance."""
         return None

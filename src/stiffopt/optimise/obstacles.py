@@ -14,8 +14,8 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.model.arm_clearance import (
     ArmBody,
     MeasuredScene,
@@ -32,8 +32,6 @@ from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.scene import Scene
 from stiffopt.model.stopping import checkpoint
 from stiffopt.optimise.settings import OBSTACLES
-
-Vector = NDArray[np.float64]
 
 CLEARANCE_OF = "clearance of "
 """Prefix of the names of constraints of obstacles."""
@@ -76,9 +74,7 @@ def _quickly_nearest(
 class ObstaclesInC:
     """Obstacles around an arm as a structure in C; this object owns the memory.
 
-    Attributes
-    ----------
-    address : of the `Obstacles`.
+    `address`: of the `Obstacles`.
     """
 
     def __init__(self, obstacles: "Obstacles", arm: Manipulator, rod: LoadedArm | None) -> None:
@@ -148,7 +144,7 @@ class Obstacles:
         """Names of the constraints, one for each row."""
         return tuple(f"{CLEARANCE_OF}{self.measured.names[index]}" for index in self.row_objects)
 
-    def rows(self, arm: Manipulator, p: Vector) -> tuple[Vector, Vector]:
+    def rows(self, arm: Manipulator, p: Array) -> tuple[Array, Array]:
         """Return rows (k,) and derivatives (k, n) per Pa at pressures (n,), not in machine code."""
         checkpoint()
         found = self.nearest(ArmBody(arm, p))
@@ -176,7 +172,7 @@ class Obstacles:
         found = [nearest_point(body, item, ranges) for item in self.measured.items]
         return [found[index] for index in self.row_objects]
 
-    def exact_rows(self, arm: Manipulator, p: Vector) -> list[float]:
+    def exact_rows(self, arm: Manipulator, p: Array) -> list[float]:
         """Return rows (k,) for judging, each with the exact least distance of the whole arm."""
         distances = arm.clearances(p, self.scene).distances[list(self.row_objects)]
         found: list[float] = (OBSTACLES.margin - (distances - self.scene.clearance)).tolist()

@@ -8,6 +8,7 @@ from stiffopt.errors import InputError, StoppedError, shown
 from stiffopt.model.arguments import checked_integer
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.stopping import Cancel, checkpoint, giving_up
+from stiffopt.optimise.braced import least_maximised
 from stiffopt.optimise.settings import ANSWER
 from stiffopt.optimise.solution import PressureSolution
 from stiffopt.optimise.solver import PressureSolver
@@ -70,13 +71,10 @@ def _extend(front: list[PressureSolution], solver: PressureSolver, target: Targe
     found = [solution for solution in candidates if solution.found]
     if not found:
         return
-    best = max(found, key=_smallest)
-    if not front or _smallest(best) > _smallest(front[-1]) * (1 + 1e-9):
+    best = max(found, key=_least)
+    if not front or _least(best) > _least(front[-1]) * (1 + 1e-9):
         front.append(best)
 
 
-def _smallest(solution: PressureSolution) -> float:
-    """Return the smallest of the maximised stiffnesses."""
-    goal = solution.task.stiffness
-    count = len(goal.maximise) if goal is not None else 0
-    return min(solution.stiffnesses[:count])
+def _least(solution: PressureSolution) -> float:
+    return least_maximised(solution.task, solution.stiffnesses)

@@ -4,9 +4,7 @@ from collections.abc import Callable, Hashable
 from functools import cached_property
 from typing import TypeVar
 
-import numpy as np
-from numpy.typing import NDArray
-
+from stiffopt.arrays import Array
 from stiffopt.errors import EquilibriumError
 from stiffopt.model.arm_clearance import SceneKey
 from stiffopt.model.compiled import Library
@@ -21,7 +19,6 @@ from stiffopt.optimise.settings import KEPT, SAMPLES
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import Task
 
-Vector = NDArray[np.float64]
 Made = TypeVar("Made")
 
 
@@ -46,13 +43,13 @@ class Prepared:
         limits = (self.lower.tobytes(), self.upper.tobytes())
         self._key = (self.robot.tip_load, *limits, seed)
         self._scene = None if task.scene is None else SceneKey(task.scene)
-        self._rows: dict[tuple[Hashable, ...], tuple[FastSolver, Vector] | None] = {}
+        self._rows: dict[tuple[Hashable, ...], tuple[FastSolver, Array] | None] = {}
 
     def program(self, target: Target) -> Program:
         """Return the program of a task with this target."""
         return self._program.at(target)
 
-    def fast(self, program: Program) -> tuple[FastSolver, Vector] | None:
+    def fast(self, program: Program) -> tuple[FastSolver, Array] | None:
         """Return the compiled solver and a task's row without its target; None if there is none."""
         terms = tuple(term.structure for term in program.terms)  # the rest is the same for all
         if terms not in self._rows:
@@ -115,10 +112,7 @@ class Prepared:
 def prepared(robot: Manipulator, task: Task, seed: int) -> Prepared:
     """Return the preparation for a task; recent ones are reused.
 
-    Raises
-    ------
-    InputError
-        If the task's pressure limits do not suit the robot.
+    Raises `InputError` if the task's pressure limits do not suit the robot.
     """
     scene = None if task.scene is None else SceneKey(task.scene)
     key = (task.stiffness, task.tip_load, task.pressure, scene, robot.tip_load, seed)

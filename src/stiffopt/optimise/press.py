@@ -6,14 +6,12 @@ from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
+from stiffopt.arrays import Array
 from stiffopt.directions import Direction, Frame
 from stiffopt.schema import Schema
 from stiffopt.units import Force, Length, Speed, within
-
-Array = NDArray[np.float64]
 
 SOFT_SHARE = 0.15
 """Compliance, as a share of the largest, below which a direction is too stiff to feel forces."""
@@ -62,12 +60,8 @@ class Press(Schema):
         The direction must be soft enough, and the force more than the allowed error of a felt one
         and than what a rigid surface gets before the contact is felt.
 
-        Parameters
-        ----------
-        rotation : (3, 3)
-            Axes of the tip in the base frame.
-        compliance : (3, 3)
-            Displacement of the tip per force in base axes, in m/N.
+        `rotation`: (3, 3), axes of the tip in the base frame. `compliance`: (3, 3), displacement of
+        the tip per force in base axes, in m/N.
         """
         felt = Feeling.of(self.direction_in_base(rotation), compliance)
         allowed = FELT_SHARE * self.force + FELT_FORCE
@@ -105,10 +99,8 @@ class Press(Schema):
 class Feeling:
     """How well a force along a direction shows as a displacement of the tip.
 
-    Attributes
-    ----------
-    share : squared share of the force that acts in the directions in which the tip is soft.
-    compliance : displacement along the direction per force along it, in m/N.
+    `share`: squared share of the force that acts in the directions in which the tip is soft.
+    `compliance`: displacement along the direction per force along it, in m/N.
     """
 
     share: float

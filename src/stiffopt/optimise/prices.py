@@ -8,34 +8,25 @@ a penalty that grows with their distance from the bound.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.optimise.problem import PressureProblem, ProgramPoint
 from stiffopt.optimise.quadratic import FAR, solve_qp
 from stiffopt.optimise.reach import attempt
 from stiffopt.optimise.settings import PRICES
 
-Vector = NDArray[np.float64]
-
 
 @dataclass(frozen=True)
 class Multipliers:
-    """Lagrange multipliers: gain of the objective per unit of each constraint.
+    """Lagrange multipliers: gain of the objective per unit of each constraint."""
 
-    Attributes
-    ----------
-    bounds : (n,), per unit of the variables; positive at an active upper bound, negative at a lower
-        one.
-    balls : vector for each of the point's `bounded` constraints, per unit of the term; its length
-        is the price of the radius.
-    terms : (m,), weights of the objective's terms, which sum to one.
-    floors : per unit of each floor's logarithm.
-    """
-
-    bounds: Vector
-    balls: tuple[Vector, ...]
-    terms: Vector
-    floors: Vector
+    # (n,), per unit of the variables; positive at an active upper bound, negative at a lower one
+    bounds: Array
+    # vector for each of the point's `bounded` constraints, per unit of the term; its length is the
+    # price of the radius
+    balls: tuple[Array, ...]
+    terms: Array  # (m,), weights of the objective's terms, which sum to one
+    floors: Array  # per unit of each floor's logarithm
 
 
 def prices_at(problem: PressureProblem, point: ProgramPoint) -> Multipliers | None:
@@ -91,12 +82,12 @@ class _Weights:
 
     def __init__(self) -> None:
         self.names: list[tuple[str, int]] = []
-        self._columns: list[Vector] = []
+        self._columns: list[Array] = []
         self._slacks: list[float] = []
         self._sizes: list[float] = []
 
     def add(
-        self, gradient: Vector, off: float, size: float = 1.0, name: tuple[str, int] = ("term", 0)
+        self, gradient: Array, off: float, size: float = 1.0, name: tuple[str, int] = ("term", 0)
     ) -> None:
         """Add the gradient of a constraint of some size that is off its bound by a share of it."""
         if off < PRICES.near:
@@ -105,7 +96,7 @@ class _Weights:
             self._sizes.append(size)
             self.names.append(name)
 
-    def solved(self, terms: int) -> Vector | None:
+    def solved(self, terms: int) -> Array | None:
         """Return weights per unit of each constraint; those of the first `terms` sum to one."""
         count = len(self._columns)
         A = np.array(self._columns).T
@@ -123,17 +114,17 @@ class _Weights:
         answer = solve_qp(np.ascontiguousarray(H), np.zeros(count), total, low, high)
         if answer is None:
             return None
-        found: Vector = np.maximum(answer[0], 0.0) * scale * np.array(self._sizes)
+        found: Array = np.maximum(answer[0], 0.0) * scale * np.array(self._sizes)
         return found
 
 
 def _slope(
     problem: PressureProblem, point: ProgramPoint, moved: ProgramPoint, multipliers: Multipliers
-) -> Vector:
+) -> Array:
     """Return the Lagrangian's gradient at a moved point, multipliers fixed, bounds left out."""
     objective = problem.objective
     gradients = objective.held(point, moved) if objective.held else objective.terms(moved)[1]
-    slope: Vector = multipliers.terms @ gradients
+    slope: Array = multipliers.terms @ gradients
     if len(problem.floors):
         slope = slope - multipliers.floors @ moved.floor_gradients
     for ball, pull in zip(moved.bounded, multipliers.balls, strict=True):

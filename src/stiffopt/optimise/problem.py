@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.model.arm import Evaluator
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.stopping import checkpoint
@@ -25,22 +25,17 @@ from stiffopt.optimise.program import BAR, Constraint, Program, pressure_ranges
 from stiffopt.optimise.settings import CLOSEST, DESCENT
 from stiffopt.optimise.task import Task
 
-Vector = NDArray[np.float64]
-
 
 @dataclass(frozen=True)
 class Ball:
     """A constraint with its residual at a point.
 
-    Attributes
-    ----------
-    residual : ndarray (k,)
-    jacobian : (k, n), per variable.
+    `residual`: (k,). `jacobian`: (k, n), per variable.
     """
 
     constraint: Constraint
-    residual: Vector
-    jacobian: Vector
+    residual: Array
+    jacobian: Array
 
     @property
     def name(self) -> str:
@@ -60,12 +55,12 @@ class Ball:
         return math.sqrt(self.residual @ self.residual)
 
     @property
-    def pull(self) -> Vector:
+    def pull(self) -> Array:
         """Gradient (n,) of the error; the error must not be zero."""
         if self.constraint.one_sided:
-            row: Vector = self.jacobian[0]
+            row: Array = self.jacobian[0]
             return row
-        gradient: Vector = self.residual / self.error @ self.jacobian
+        gradient: Array = self.residual / self.error @ self.jacobian
         return gradient
 
 
@@ -94,14 +89,14 @@ class ProgramPoint:
 
     def __init__(
         self,
-        x: Vector,
-        residual: Vector,
-        jacobian: Vector,
+        x: Array,
+        residual: Array,
+        jacobian: Array,
         constraints: tuple[Constraint, ...],
-        terms: Vector,
-        term_gradients: Vector,
-        floors: Vector,
-        floor_gradients: Vector,
+        terms: Array,
+        term_gradients: Array,
+        floors: Array,
+        floor_gradients: Array,
     ) -> None:
         self.x, self.residual, self.jacobian = x, residual, jacobian
         self.constraints = constraints
@@ -150,13 +145,13 @@ class Objective:
     depends on the residuals alone.
     """
 
-    terms: Callable[[ProgramPoint], tuple[Vector, Vector]]  # values (t,), gradients (t, n)
-    curvature: Callable[[ProgramPoint], Vector]  # (n, n)
+    terms: Callable[[ProgramPoint], tuple[Array, Array]]  # values (t,), gradients (t, n)
+    curvature: Callable[[ProgramPoint], Array]  # (n, n)
     precision: float  # decrease that no longer matters
     unit: str  # unit of `gain`, for prices
     gain: Callable[[ProgramPoint], float]  # stiffness or error gained per unit of decrease
     of_pose: bool = False
-    held: Callable[[ProgramPoint, ProgramPoint], Vector] | None = None
+    held: Callable[[ProgramPoint, ProgramPoint], Array] | None = None
     """Gradients (t, n) at the second point, with their weights frozen at the first."""
 
     def value(self, point: ProgramPoint) -> float:
@@ -213,7 +208,7 @@ class PressureProblem:
         """Forget the equilibrium of the last evaluation (see `Evaluator`)."""
         self._pose.restart()
 
-    def pose(self, x: Vector) -> ProgramPoint:
+    def pose(self, x: Array) -> ProgramPoint:
         """Return the constraints alone at pressures x; cheaper than `point`."""
         checkpoint()
         if self._is_loaded:
@@ -223,16 +218,14 @@ class PressureProblem:
         residual, jacobian = self.with_obstacles(x, residual[:, 0], jacobian.T * self.unit)
         return ProgramPoint(x, residual, jacobian, self.constraints, *_NOTHING)
 
-    def with_obstacles(
-        self, x: Vector, residual: Vector, jacobian: Vector
-    ) -> tuple[Vector, Vector]:
+    def with_obstacles(self, x: Array, residual: Array, jacobian: Array) -> tuple[Array, Array]:
         """Append the rows of obstacles at pressures x to those of the terms, (m,) and (m, n)."""
         if self.program.obstacles is None:
             return residual, jacobian
         rows, slopes = self.program.obstacles.rows(self.robot, x * self.unit)
         return np.append(residual, rows), np.vstack([jacobian, slopes * self.unit])
 
-    def poses(self, x: Vector) -> tuple[Vector, Vector]:
+    def poses(self, x: Array) -> tuple[Array, Array]:
         """Return residuals (N, m) and Jacobians (N, m, n) of an arm without loads.
 
         Rows of obstacles are not included.  Pressures are x (N, n).
@@ -243,7 +236,7 @@ class PressureProblem:
         )
         return residuals[:, :, 0], jacobians.swapaxes(1, 2) * self.unit
 
-    def point(self, x: Vector) -> ProgramPoint:
+    def point(self, x: Array) -> ProgramPoint:
         """Return all values and derivatives at pressures x."""
         checkpoint()
         if self._is_loaded:
@@ -265,12 +258,12 @@ class PressureProblem:
             floor_gradients.reshape(len(x), -1).T * self.unit,
         )
 
-    def needed(self, x: Vector) -> ProgramPoint:
+    def needed(self, x: Array) -> ProgramPoint:
         """Return as much as objective and floors need at pressures x."""
         of_pose = self.objective.of_pose and not len(self.floors)
         return self.pose(x) if of_pose else self.point(x)
 
-    def worth(self, x: Vector) -> ProgramPoint:
+    def worth(self, x: Array) -> ProgramPoint:
         """Return the objective and floors at pressures x that reach the pose, for ranking."""
         worth = self._functions.worth
         if self.objective.of_pose or worth is None:
@@ -281,7 +274,7 @@ class PressureProblem:
         floors = floors[:, 0] if floors.size else _NONE
         return ProgramPoint(x, at_target, none, self.constraints, terms[:, 0], none, floors, none)
 
-    def judged(self, pressures: Vector) -> tuple[list[float], Vector, Vector, list[float]]:
+    def judged(self, pressures: Array) -> tuple[list[float], Array, Array, list[float]]:
         """Return the arguments of `Judgement.of` at (n,) in Pa, for an arm without loads."""
         residuals, pose, compliance, values = self._functions["judge"](pressures, self.parameters)
         found = residuals.ravel().tolist()
@@ -315,19 +308,19 @@ class PressureProblem:
         rows, one_sided, scale = slice(own[0].first, own[-1].end), own[0].one_sided, own[0].scale
         (radius,) = {term.radius for term in self.program.terms if term.name == name}
 
-        def error(point: ProgramPoint) -> Vector:
+        def error(point: ProgramPoint) -> Array:
             residual = point.residual[rows]
             return (np.maximum(residual - radius, 0.0) if one_sided else residual) / scale
 
-        def terms(point: ProgramPoint) -> tuple[Vector, Vector]:
+        def terms(point: ProgramPoint) -> tuple[Array, Array]:
             e = error(point)
             return np.array([0.5 * e.dot(e)]), held(point, point)
 
-        def held(point: ProgramPoint, moved: ProgramPoint) -> Vector:
-            gradient: Vector = error(point) @ moved.jacobian[rows] / scale
+        def held(point: ProgramPoint, moved: ProgramPoint) -> Array:
+            gradient: Array = error(point) @ moved.jacobian[rows] / scale
             return gradient[np.newaxis]
 
-        def curvature(point: ProgramPoint) -> Vector:
+        def curvature(point: ProgramPoint) -> Array:
             jacobian = point.jacobian[rows] / scale
             return jacobian.T @ jacobian
 
@@ -402,16 +395,16 @@ class Bounding:
         self._is_one_sided = bool(self._one_sided.any())
 
     @cached_property
-    def far_damping(self) -> Vector:
+    def far_damping(self) -> Array:
         """Diagonal matrix (m, m) of squared scales."""
         return np.diag(self.scale**2)
 
     @cached_property
-    def near_damping(self) -> Vector:
+    def near_damping(self) -> Array:
         """Diagonal matrix (m, m) of squared radii."""
         return np.diag(self.radius**2)
 
-    def missing(self, residual: Vector, jacobian: Vector) -> tuple[Vector, Vector]:
+    def missing(self, residual: Array, jacobian: Array) -> tuple[Array, Array]:
         """Return the violations of residuals (..., m), and their Jacobian.
 
         A two-sided residual is returned as it is; a one-sided one by how much it exceeds its bound,
@@ -424,7 +417,7 @@ class Bounding:
         lacks = np.where(self._one_sided, np.maximum(residual - inside, 0.0), residual)
         return lacks, np.where(holds[..., np.newaxis], 0.0, jacobian)
 
-    def errors(self, residuals: Vector) -> Vector:
+    def errors(self, residuals: Array) -> Array:
         """Return the largest ratio (N,) of an error to its radius, for residuals (N, m)."""
         worst = np.zeros(len(residuals))
         for c in self.constraints:
@@ -434,10 +427,10 @@ class Bounding:
         return worst
 
 
-def floor_bounds(goal: StiffnessGoal | None) -> Vector:
+def floor_bounds(goal: StiffnessGoal | None) -> Array:
     """Return the lower bounds (f,) on the logarithms of a goal's floors, with some margin."""
     values = [floor.value for floor in goal.at_least] if goal is not None else []
-    bounds: Vector = np.log(np.array(values)) + DESCENT.floor_margin
+    bounds: Array = np.log(np.array(values)) + DESCENT.floor_margin
     return bounds
 
 

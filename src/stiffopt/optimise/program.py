@@ -14,8 +14,8 @@ from typing import Any, Literal, NamedTuple
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.model.description import RobotDescription
 from stiffopt.model.shape import Shape
 from stiffopt.optimise.measure import Measure
@@ -25,14 +25,12 @@ from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import Task
 from stiffopt.optimise.term import Term
 
-Vector = NDArray[np.float64]
-
 BAR = 1e5  # Pa
 
 Aim = Literal["maximise", "match", "least pressure"]
 
 
-def pressure_ranges(description: RobotDescription) -> Vector:
+def pressure_ranges(description: RobotDescription) -> Array:
     """Return the units (n,) of the optimiser's variables in Pa: the range of each channel.
 
     A channel without a range takes the largest range of the others.
@@ -43,21 +41,15 @@ def pressure_ranges(description: RobotDescription) -> Vector:
 
 
 class Constraint(NamedTuple):
-    """A bound on the rows first to end - 1 of the residual.
+    """A bound on the rows first to end - 1 of the residual."""
 
-    Attributes
-    ----------
-    name : name of the term.
-    radius : bound on the length of the rows, ``|r| <= radius``; if `one_sided`, bound on the single
-        row, ``r <= radius``.
-    scale : typical size of the residual far from the target, in its unit.
-    """
-
-    name: str
+    name: str  # name of the term
     first: int
     end: int
+    # bound on the length of the rows, ``|r| <= radius``; if `one_sided`, bound on the single row,
+    # ``r <= radius``
     radius: float
-    scale: float
+    scale: float  # typical size of the residual far from the target, in its unit
     one_sided: bool
 
 
@@ -72,22 +64,15 @@ class ProgramStructure(NamedTuple):
 
 @dataclass(frozen=True)
 class Program:
-    """A task's terms and stiffness measures.
-
-    Attributes
-    ----------
-    measures : the maximised or matched ones, then the floors.
-    aim : whether the first measures are maximised or matched; without any, pressure is minimised.
-    n_floors : number of stiffnesses with a lower bound.
-    reference : pressure in Pa that is one unit of mean square pressure.
-    obstacles : objects around the arm; their rows of the residual follow those of the terms.
-    """
+    """A task's terms and stiffness measures."""
 
     terms: tuple[Term, ...]
-    measures: tuple[Measure, ...]
+    measures: tuple[Measure, ...]  # the maximised or matched ones, then the floors
+    # whether the first measures are maximised or matched; without any, pressure is minimised
     aim: Aim
-    n_floors: int
-    reference: float = BAR
+    n_floors: int  # number of stiffnesses with a lower bound
+    reference: float = BAR  # pressure in Pa that is one unit of mean square pressure
+    # objects around the arm; their rows of the residual follow those of the terms
     obstacles: Obstacles | None = None
 
     @classmethod
@@ -134,7 +119,7 @@ class Program:
         )
 
     @property
-    def parameters(self) -> Vector:
+    def parameters(self) -> Array:
         """All parameters, in the order of the functions' arguments."""
         return np.array((*self.target_parameters, *self.measure_parameters))
 

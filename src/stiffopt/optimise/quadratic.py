@@ -4,17 +4,14 @@ import math
 
 import daqp
 import numpy as np
-from numpy.typing import NDArray
 
-Vector = NDArray[np.float64]
+from stiffopt.arrays import Array
 
 FAR = 1e6
 """Value of a bound that is absent."""
 
 
-def solve_qp(
-    H: Vector, g: Vector, A: Vector, low: Vector, high: Vector
-) -> tuple[Vector, Vector] | None:
+def solve_qp(H: Array, g: Array, A: Array, low: Array, high: Array) -> tuple[Array, Array] | None:
     """Minimise ``z'Hz/2 + g'z`` subject to ``low <= (z, Az) <= high``.
 
     Arrays must be contiguous.  Returns the solution and the multipliers; None if the solver's

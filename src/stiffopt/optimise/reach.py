@@ -5,19 +5,18 @@ from collections.abc import Callable
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.errors import EquilibriumError
 from stiffopt.model.stopping import checkpoint
 from stiffopt.optimise.problem import PressureProblem, ProgramPoint
 from stiffopt.optimise.settings import REACH
 
-Vector = NDArray[np.float64]
 Point = TypeVar("Point", bound=ProgramPoint)
 
 
 def reach(
-    problem: PressureProblem, x: Vector, most_iterations: int = REACH.iterations
+    problem: PressureProblem, x: Array, most_iterations: int = REACH.iterations
 ) -> ProgramPoint | None:
     """Bring pressures to the pose, or as near to it as possible.
 
@@ -61,7 +60,7 @@ def reach(
     return point
 
 
-def can_reach(problem: PressureProblem, candidates: list[Vector]) -> bool:
+def can_reach(problem: PressureProblem, candidates: list[Array]) -> bool:
     """Return whether one of these pressures (n,) can be brought to the pose."""
     if not problem.robot.is_loaded:
         return bool((reach_all(problem, np.array(candidates))[1] <= 1).any())
@@ -73,7 +72,7 @@ def can_reach(problem: PressureProblem, candidates: list[Vector]) -> bool:
     return False
 
 
-def reach_all(problem: PressureProblem, x: Vector) -> tuple[Vector, Vector]:
+def reach_all(problem: PressureProblem, x: Array) -> tuple[Array, Array]:
     """Bring pressures (N, n) of an arm without loads to the pose, all at once.
 
     Returns the final pressures, and the largest ratio (N,) of a residual to its radius: at most one
@@ -120,7 +119,7 @@ def reach_all(problem: PressureProblem, x: Vector) -> tuple[Vector, Vector]:
     return x, ratio
 
 
-def bounded_steps(J: Vector, wanted: Vector, D: Vector, low: Vector, high: Vector) -> Vector:
+def bounded_steps(J: Array, wanted: Array, D: Array, low: Array, high: Array) -> Array:
     """Return steps d (..., n) within [low, high] that make ``|W (J d - wanted)|^2 + |d|^2`` small.
 
     J is (..., m, n), wanted (..., m), and D (..., m, m) the inverse of ``W^2``.  Components that
@@ -142,7 +141,7 @@ def bounded_steps(J: Vector, wanted: Vector, D: Vector, low: Vector, high: Vecto
     return d
 
 
-def bounded_step(J: Vector, wanted: Vector, D: Vector, low: Vector, high: Vector) -> Vector:
+def bounded_step(J: Array, wanted: Array, D: Array, low: Array, high: Array) -> Array:
     """Return a single step of `bounded_steps`, with less overhead.
 
     Rows of J that are zero, as those of distant obstacles, are skipped.
@@ -155,7 +154,7 @@ def bounded_step(J: Vector, wanted: Vector, D: Vector, low: Vector, high: Vector
     return bounded_steps(J, wanted, D, low, high) if leaving.any() else d
 
 
-def _solved(A: Vector, b: Vector) -> Vector:
+def _solved(A: Array, b: Array) -> Array:
     """Solve A y = b for positive definite A; if rounding makes it singular, with least norm."""
     try:
         return np.asarray(np.linalg.solve(A, b), dtype=float)
@@ -163,22 +162,22 @@ def _solved(A: Vector, b: Vector) -> Vector:
         return np.asarray(np.linalg.pinv(A, hermitian=True) @ b)
 
 
-def _misfit(residual: Vector) -> float:
+def _misfit(residual: Array) -> float:
     return float(residual.dot(residual))
 
 
-def _misfits(residuals: Vector) -> Vector:
+def _misfits(residuals: Array) -> Array:
     """Return squared lengths (N,) of residuals (N, m), infinite where any is not finite."""
     squares = np.einsum("ij,ij->i", residuals, residuals)
     return np.where(np.isfinite(squares), squares, np.inf)
 
 
-def within(low: Vector, x: Vector, high: Vector) -> Vector:
+def within(low: Array, x: Array, high: Array) -> Array:
     """Clip x to [low, high]."""
     return np.minimum(np.maximum(x, low), high)
 
 
-def attempt(evaluate: Callable[[Vector], Point], x: Vector) -> Point | None:
+def attempt(evaluate: Callable[[Array], Point], x: Array) -> Point | None:
     """Evaluate; return None without a stable equilibrium or with non-finite numbers."""
     try:
         point = evaluate(x)

@@ -15,18 +15,16 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.optimise.leaning import BracedPoint, BracedProblem
 from stiffopt.optimise.problem import Bounding
 from stiffopt.optimise.quadratic import FAR, solve_qp
 from stiffopt.optimise.reach import attempt, within
 from stiffopt.optimise.settings import REACH_IN_CONTACT
 
-Vector = NDArray[np.float64]
 
-
-def reach_in_contact(problem: BracedProblem, x: Vector) -> BracedPoint | None:
+def reach_in_contact(problem: BracedProblem, x: Array) -> BracedPoint | None:
     """Bring pressures (n,) to the target in contact, or as near to it as possible.
 
     Returns the last point; None if the arm has no equilibrium in contact at the start.
@@ -73,13 +71,13 @@ class _Misses:
         self._high = box / self._scale
         self._low = np.where(one_sided, -math.inf, -self._high)
 
-    def of(self, residual: Vector) -> float:
+    def of(self, residual: Array) -> float:
         """Return the sum of the squares of these distances."""
         rows = residual[self._bounding.rows] / self._scale
         missed = rows - np.clip(rows, self._low, self._high)
         return float(missed @ missed)
 
-    def step(self, problem: BracedProblem, point: BracedPoint, radius: float) -> Vector | None:
+    def step(self, problem: BracedProblem, point: BracedPoint, radius: float) -> Array | None:
         """Return the step (n,) that brings the rows nearest to their bounds, or None."""
         n, m, settings = len(point.x), len(self._scale), REACH_IN_CONTACT
         rows = self._bounding.rows

@@ -5,14 +5,13 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.errors import EquilibriumError
 from stiffopt.model.loaded_arm import LoadedArm
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.optimise.program import pressure_ranges
 from stiffopt.optimise.settings import SAMPLES
 from stiffopt.optimise.term import Term
-
-Vector = NDArray[np.float64]
 
 
 class SampleTable:
@@ -35,8 +34,8 @@ class SampleTable:
     def __init__(
         self,
         robot: Manipulator,
-        lower: Vector,
-        upper: Vector,
+        lower: Array,
+        upper: Array,
         seed: int,
         arm: LoadedArm | None = None,
         count: int | None = None,
@@ -62,20 +61,20 @@ class SampleTable:
         self.pressures, self.poses = np.ascontiguousarray(x), poses
 
     @cached_property
-    def shares(self) -> Vector:
+    def shares(self) -> Array:
         """Pressures (N, n) as shares of the channels' ranges."""
         return np.ascontiguousarray(self.pressures / self._ranges)
 
     @cached_property
-    def flat_poses(self) -> Vector:
+    def flat_poses(self) -> Array:
         """Positions and rotations (by columns), (N, 12)."""
         return _flattened(self.poses)
 
-    def distances(self, terms: tuple[Term, ...], length: float) -> Vector:
+    def distances(self, terms: tuple[Term, ...], length: float) -> Array:
         """Return rough distances (N,) of the tips from meeting all terms (see `Nearness`)."""
         return _distances(self.flat_poses, terms, length)
 
-    def nearest_first(self, distances: Vector, count: int | None = None) -> NDArray[np.intp]:
+    def nearest_first(self, distances: Array, count: int | None = None) -> NDArray[np.intp]:
         """Return the indices of `count` samples (default: all) by increasing distance (N,)."""
         if count is None or count >= len(distances):
             return np.argsort(distances, kind="stable")
@@ -83,7 +82,7 @@ class SampleTable:
         return nearest[np.argsort(distances[nearest], kind="stable")]
 
 
-def _spread_with_edges(count: int, n: int, seed: int) -> Vector:
+def _spread_with_edges(count: int, n: int, seed: int) -> Array:
     """Return points (count, n) of the unit cube, a part of them on its faces and edges.
 
     Additive recurrence with the generalised golden ratio (M. Roberts, 2018).  Optima often lie at
@@ -98,12 +97,12 @@ def _spread_with_edges(count: int, n: int, seed: int) -> Vector:
     return np.clip(1.25 * points - 0.125, 0.0, 1.0)
 
 
-def distances(poses: Vector, terms: tuple[Term, ...], length: float) -> Vector:
+def distances(poses: Array, terms: tuple[Term, ...], length: float) -> Array:
     """Return rough distances (N,) of poses (N, 4, 4) from meeting all terms; see `Nearness`."""
     return _distances(_flattened(poses), terms, length)
 
 
-def _distances(flat: Vector, terms: tuple[Term, ...], length: float) -> Vector:
+def _distances(flat: Array, terms: tuple[Term, ...], length: float) -> Array:
     position, rotation = flat[:, :3], flat[:, 3:]
     total = np.zeros(len(flat))
     for term in terms:
@@ -116,12 +115,12 @@ def _distances(flat: Vector, terms: tuple[Term, ...], length: float) -> Vector:
     return total
 
 
-def _flattened(poses: Vector) -> Vector:
+def _flattened(poses: Array) -> Array:
     columns = poses[:, :3, [3, 0, 1, 2]].swapaxes(1, 2)
     return np.ascontiguousarray(columns.reshape(-1, 12))
 
 
-def _unflattened(flat: Vector) -> Vector:
+def _unflattened(flat: Array) -> Array:
     """Return poses (N, 4, 4) from positions and rotations by columns (N, 12)."""
     poses = np.tile(np.eye(4), (len(flat), 1, 1))
     poses[:, :3, 3] = flat[:, :3]
@@ -129,11 +128,11 @@ def _unflattened(flat: Vector) -> Vector:
     return poses
 
 
-def _settled(robot: Manipulator, x: Vector) -> tuple[Vector, Vector]:
+def _settled(robot: Manipulator, x: Array) -> tuple[Array, Array]:
     """Return the configurations of a loaded arm that have an equilibrium, and their poses."""
     evaluator = robot.evaluator("pose", lambda shape, _: [shape.transform])
     kept: list[int] = []
-    poses: list[Vector] = []
+    poses: list[Array] = []
     for index in range(len(x)):
         evaluator.restart()  # from rest, so that local searches start on the right branch
         try:

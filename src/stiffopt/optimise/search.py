@@ -15,8 +15,8 @@ from itertools import islice
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.errors import StoppedError
 from stiffopt.optimise.local import LocalResult, descend, violation
 from stiffopt.optimise.problem import PressureProblem, ProgramPoint
@@ -25,8 +25,7 @@ from stiffopt.optimise.samples import SampleTable
 from stiffopt.optimise.settings import DESCENT, OBSTACLES, REACH, SEARCH, Effort
 from stiffopt.optimise.solution import Confidence
 
-Vector = NDArray[np.float64]
-Places = Callable[[Any, Iterable[Vector]], Iterator[tuple[int, ProgramPoint | None]]]
+Places = Callable[[Any, Iterable[Array]], Iterator[tuple[int, ProgramPoint | None]]]
 """Brings candidates to the target: yields points to descend from, with the number tried so far."""
 
 
@@ -52,7 +51,7 @@ def effort(rows: int, covered: float, loaded: bool = False) -> Effort:
     return Effort(*(int(a + share * (b - a)) for a, b in zip(placed, loose, strict=True)))
 
 
-def starts(problem: PressureProblem, table: SampleTable) -> tuple[Iterator[Vector], Effort]:
+def starts(problem: PressureProblem, table: SampleTable) -> tuple[Iterator[Array], Effort]:
     """Return variables (n,) to start from, near the target first, and the effort of the search.
 
     Evaluations are slower than in compiled code, so the effort is smaller.  Without loads, one
@@ -78,25 +77,18 @@ def starts(problem: PressureProblem, table: SampleTable) -> tuple[Iterator[Vecto
 
 @dataclass(frozen=True)
 class Search:
-    """Outcome of a global search.
+    """Outcome of a global search."""
 
-    Attributes
-    ----------
-    results : ends of descents, the best first, without those that stopped next to a known optimum.
-    nearest : ends of starts that did not reach the pose, if none reached it.
-    confidence : in the best result.
-    ends : ends of the converged descents, one of each, those included that stopped next to a known
-        optimum.
-    same : difference of values below which ends count as one optimum.
-    best_found : how many descents must have found an answer for a complete search.
-    """
-
+    # ends of descents, the best first, without those that stopped next to a known optimum
     results: tuple[LocalResult, ...]
+    # ends of starts that did not reach the pose, if none reached it
     nearest: tuple[ProgramPoint, ...]
-    confidence: Confidence
+    confidence: Confidence  # in the best result
+    # ends of the converged descents, one of each, those included that stopped next to a known
+    # optimum
     ends: tuple[LocalResult, ...] = ()
-    same: float = SEARCH.same_optimum
-    best_found: int = 1
+    same: float = SEARCH.same_optimum  # difference of values below which ends count as one optimum
+    best_found: int = 1  # how many descents must have found an answer for a complete search
 
     def confidence_in(self, result: LocalResult) -> Confidence:
         """Return how sure the search is of another result than the best, with its own descent."""
@@ -107,7 +99,7 @@ class Search:
 
 def search(
     problem: PressureProblem,
-    candidates: Iterable[Vector],
+    candidates: Iterable[Array],
     tries: Effort = SEARCH.placed,
     same: float = SEARCH.same_optimum,
     places: Places | None = None,
@@ -209,7 +201,7 @@ def _rank(result: LocalResult) -> tuple[float, float]:
 
 
 def _places(
-    problem: PressureProblem, candidates: Iterable[Vector]
+    problem: PressureProblem, candidates: Iterable[Array]
 ) -> Iterator[tuple[int, ProgramPoint | None]]:
     """Yield points to descend from, each with the number of candidates tried so far.
 
@@ -241,7 +233,7 @@ def _places(
         yield len(x), point if point.is_finite and point.reached else None
 
 
-def _past_obstacles(problem: PressureProblem, x: Vector) -> ProgramPoint:
+def _past_obstacles(problem: PressureProblem, x: Array) -> ProgramPoint:
     """Evaluate pressures (n,) at the target; if the body hits obstacles, move it clear first."""
     point = problem.needed(x)
     if problem.program.obstacles is None or point.reached:
@@ -250,21 +242,21 @@ def _past_obstacles(problem: PressureProblem, x: Vector) -> ProgramPoint:
     return point if moved is None or not moved.reached else problem.needed(moved.x)
 
 
-def _intrusion(problem: PressureProblem, x: Vector) -> float:
+def _intrusion(problem: PressureProblem, x: Array) -> float:
     """Return the sum of missing clearances at pressures (n,), over the arm's length."""
     own = problem.program.n_own_rows
     missing = problem.pose(x).residual[own:] - OBSTACLES.margin
     return float(np.maximum(missing, 0.0).sum()) / problem.robot.length
 
 
-def _first_at_same_place(x: Vector) -> list[int]:
+def _first_at_same_place(x: Array) -> list[int]:
     """Return for each of the pressures (N, n) the index of the first that is nearly equal."""
     same_place = np.abs(x[:, np.newaxis] - x).max(axis=2) < DESCENT.next_to
     first: list[int] = same_place.argmax(axis=1).tolist()
     return first
 
 
-def _rank_of_start(problem: PressureProblem, x: Vector) -> float:
+def _rank_of_start(problem: PressureProblem, x: Array) -> float:
     """Return the objective at pressures (n,), with penalties on missed floors and clearances."""
     point = problem.worth(x)
     value = problem.objective.value(point) + SEARCH.price_of_floors * violation(problem, point)
@@ -273,7 +265,7 @@ def _rank_of_start(problem: PressureProblem, x: Vector) -> float:
     return value if np.isfinite(value) else np.inf
 
 
-def unlike_first(problem: PressureProblem, x: Vector) -> Iterator[int]:
+def unlike_first(problem: PressureProblem, x: Array) -> Iterator[int]:
     """Yield the indices of pressures (N, n): those far from all before first, then the rest."""
     range_ = problem.upper - problem.lower
     spacing = SEARCH.unlike**2 * float(range_ @ range_)

@@ -8,9 +8,9 @@ from functools import cached_property
 from typing import Any, Literal, NamedTuple, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stiffopt import lie
+from stiffopt.arrays import Array
 from stiffopt.display import display_units
 from stiffopt.errors import DerivativeError
 from stiffopt.model.arm import Evaluator
@@ -26,7 +26,6 @@ from stiffopt.optimise.program import Program
 from stiffopt.optimise.settings import ANSWER, OBSTACLES
 from stiffopt.optimise.task import Task
 
-Vector = NDArray[np.float64]
 Status = Literal["solved", "unreachable", "failed"]
 
 _explaining = threading.RLock()
@@ -45,22 +44,15 @@ def _protect(owner: object, *names: str) -> None:
 
 @dataclass(frozen=True)
 class Confidence:
-    """How sure the global search is of its answer.
+    """How sure the global search is of its answer."""
 
-    Attributes
-    ----------
-    starts : configurations that were brought towards the pose.
-    reached : converged descents from starts that reached the pose.
-    agreeing : converged descents that ended within 0.1 % of the best; with a brace, of the answer.
-    optima : distinct local optima among them.
-    complete : whether the search ended because enough descents in a row found nothing new (see
-        `stiffopt.optimise.search.effort`).  False: it ended before.
-    """
-
-    starts: int
-    reached: int
+    starts: int  # configurations that were brought towards the pose
+    reached: int  # converged descents from starts that reached the pose
+    # converged descents that ended within 0.1 % of the best; with a brace, of the answer
     agreeing: int
-    optima: int
+    optima: int  # distinct local optima among them
+    # whether the search ended because enough descents in a row found nothing new (see
+    # `stiffopt.optimise.search.effort`).  False: it ended before
     complete: bool
 
     def __str__(self) -> str:
@@ -96,8 +88,8 @@ class Sensitivities:
         for a task without a stiffness; "1", the squared relative mismatch, where one is matched.
     """
 
-    tip_jacobian: Vector
-    stiffness_gradient: Vector | None
+    tip_jacobian: Array
+    stiffness_gradient: Array | None
     per_bound: dict[str, float]
     per_tolerance: dict[str, float]
     objective_unit: str
@@ -133,18 +125,11 @@ class NearestObject(NamedTuple):
 
 
 class Preload(NamedTuple):
-    """The push at the tip that the contacts of a brace withstand.
+    """The push at the tip that the contacts of a brace withstand."""
 
-    Attributes
-    ----------
-    direction : of the push (3,), in base axes.
-    contacts : whether they slide without resistance, or stick where there is friction.
-    loss : the push by which the first contact is lost, and how.
-    """
-
-    direction: Vector
-    contacts: Grip
-    loss: ContactLoss
+    direction: Array  # of the push (3,), in base axes
+    contacts: Grip  # whether they slide without resistance, or stick where there is friction
+    loss: ContactLoss  # the push by which the first contact is lost, and how
 
 
 class Explanation(NamedTuple):
@@ -214,11 +199,11 @@ class PressureSolution(ShownInNotebook):
     status: Status
     message: str
     task: Task
-    pressures: Vector | None = None
-    tip_pose: Vector | None = None
+    pressures: Array | None = None
+    tip_pose: Array | None = None
     position_error: float | None = None
     angle_error: float | None = None
-    compliance: Vector | None = None
+    compliance: Array | None = None
     stiffness: float | None = None
     stiffness_unit: str | None = None
     stiffnesses: tuple[float, ...] = ()
@@ -288,7 +273,7 @@ class PressureSolution(ShownInNotebook):
         self,
         of: Literal["stiffness", "pressures"],
         by: Literal["target", "direction", "limits", "clearance"],
-    ) -> Vector:
+    ) -> Array:
         """Return the derivative of the optimum at this answer with respect to the task's data.
 
         Parameters
@@ -321,7 +306,7 @@ class PressureSolution(ShownInNotebook):
         -----
         Where `weakly_active` names a constraint, the derivative holds on one side only.
         """
-        gradient: Vector = self._derivatives.gradient(of, by)
+        gradient: Array = self._derivatives.gradient(of, by)
         return gradient
 
     @property
@@ -415,25 +400,25 @@ class PressureSolution(ShownInNotebook):
         return self.status == "solved"
 
     @property
-    def tip_position(self) -> Vector | None:
+    def tip_position(self) -> Array | None:
         """Tip position (3,) in the base frame, in m."""
         return None if self.tip_pose is None else self.tip_pose[:3, 3]
 
     @property
-    def tip_quaternion(self) -> Vector | None:
+    def tip_quaternion(self) -> Array | None:
         """Tip orientation (w, x, y, z), w >= 0."""
         if self.tip_pose is None:
             return None
-        quaternion: Vector = lie.quaternion_from_rotation(self.tip_pose[:3, :3])
+        quaternion: Array = lie.quaternion_from_rotation(self.tip_pose[:3, :3])
         return quaternion
 
 
 class Judgement(NamedTuple):
     """A task's quantities at given pressures, from the model alone."""
 
-    tip_pose: Vector
+    tip_pose: Array
     errors: dict[str, float]
-    compliance: Vector
+    compliance: Array
     stiffnesses: tuple[float, ...]
     matrix_distance: float | None
     pose_holds: bool
@@ -456,7 +441,7 @@ class Judgement(NamedTuple):
     def of(
         cls,
         program: Program,
-        numbers: tuple[list[float], Vector, Vector, list[float]],
+        numbers: tuple[list[float], Array, Array, list[float]],
         within: bool,
     ) -> "Judgement":
         """Return the judgement from the outputs of `Program.judge`.
@@ -493,19 +478,16 @@ class Judgement(NamedTuple):
         )
 
 
-def are_within(pressures: Vector, lower: Vector, upper: Vector) -> bool:
+def are_within(pressures: Array, lower: Array, upper: Array) -> bool:
     """Return whether all pressures (n,) are within their limits."""
     limits = zip(lower.tolist(), pressures.tolist(), upper.tolist(), strict=True)
     return all(low <= p <= high for low, p, high in limits)
 
 
-def judge(robot: Manipulator, task: Task, pressures: Vector) -> Judgement:
+def judge(robot: Manipulator, task: Task, pressures: Array) -> Judgement:
     """Judge pressures (n,) by the model of the arm (which carries the task's load).
 
-    Raises
-    ------
-    EquilibriumError
-        If no equilibrium at these pressures is reached from rest.
+    Raises `EquilibriumError` if no equilibrium at these pressures is reached from rest.
     """
     program = Program.of(task, robot.description)
     found = Evaluator(robot, functions(robot, program)["judge"])
@@ -519,7 +501,7 @@ def judge(robot: Manipulator, task: Task, pressures: Vector) -> Judgement:
     return Judgement.of(program, numbers, within)
 
 
-def active_bounds(robot: Manipulator, task: Task, pressures: Vector) -> dict[str, tuple[int, int]]:
+def active_bounds(robot: Manipulator, task: Task, pressures: Array) -> dict[str, tuple[int, int]]:
     """Return the names of active limits, with channel and side (-1: lower, 1: upper)."""
     lower, upper = task.pressure_bounds(robot.description)
     found = {}

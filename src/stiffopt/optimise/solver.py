@@ -11,8 +11,9 @@ from itertools import islice
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from stiffopt.arrays import Array
 from stiffopt.errors import InputError, StoppedError, shown
 from stiffopt.model.arguments import checked_integer, checked_vector
 from stiffopt.model.compiled import (
@@ -40,8 +41,6 @@ from stiffopt.optimise.solution import Judgement, PressureSolution, are_within
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import PressureRange, Task
 from stiffopt.optimise.warm import WarmAnswer, WarmCalls, task_with_target
-
-Vector = NDArray[np.float64]
 
 
 class PressureSolver:
@@ -216,7 +215,7 @@ class PressureSolver:
         self,
         target: Target | None = None,
         guess: ArrayLike | None = None,
-        limits: tuple[Vector, Vector] | None = None,
+        limits: tuple[Array, Array] | None = None,
     ) -> PressureSolution | None:
         """Solve by the compiled search alone, in about a millisecond; for control loops.
 
@@ -275,7 +274,7 @@ class PressureSolver:
         return self._warm_calls
 
     def _warm_otherwise(
-        self, task: Task, guess: Vector, limits: tuple[ArrayLike, ArrayLike] | None
+        self, task: Task, guess: Array, limits: tuple[ArrayLike, ArrayLike] | None
     ) -> WarmAnswer:
         """Answer a warm call that `WarmCalls` cannot; all arguments but the limits are checked."""
         narrow = None
@@ -296,7 +295,7 @@ class PressureSolver:
         solution = solution if solution is not None and solution.found else None
         return WarmAnswer.judged(None if solution is None else solution.pressures, solution)
 
-    def _confirms(self, block: Vector) -> bool:
+    def _confirms(self, block: Array) -> bool:
         """Return whether the model confirms an answer of a warm call."""
         calls = self._warm_calls
         assert calls is not None  # or there would be no block
@@ -306,7 +305,7 @@ class PressureSolver:
         within = are_within(answer.pressures, self._prepared.lower, self._prepared.upper)
         return Judgement.of(calls.program, answer.judged, within).holds
 
-    def _solution_of(self, block: Vector) -> PressureSolution | None:
+    def _solution_of(self, block: Array) -> PressureSolution | None:
         """Return the solution for an answer of a warm call; None if it does not hold."""
         calls = self._warm_calls
         assert calls is not None
@@ -317,12 +316,12 @@ class PressureSolver:
 
     # -- solutions --------------------------------------------------------------------------
 
-    def _found(self, task: Task, guess: Vector | None) -> PressureSolution:
+    def _found(self, task: Task, guess: Array | None) -> PressureSolution:
         if task.brace is not None:
             return self._leaning(task, guess)
         return self._search.solve(task, guess) or self._otherwise(task, guess)
 
-    def _leaning(self, task: Task, guess: Vector | None) -> PressureSolution:
+    def _leaning(self, task: Task, guess: Array | None) -> PressureSolution:
         """Return the better of the best answer that leans on objects and the best that does not."""
         plain = task.unbraced
         free = self._found(plain, guess)
@@ -336,7 +335,7 @@ class PressureSolver:
 
         return lean(BracedProblem(self.robot, task), samples, free, guess)
 
-    def _otherwise(self, task: Task, guess: Vector | None) -> PressureSolution:
+    def _otherwise(self, task: Task, guess: Array | None) -> PressureSolution:
         """Answer a task for which the compiled search found no solution."""
         try:
             checkpoint()
@@ -347,7 +346,7 @@ class PressureSolver:
         except StoppedError as error:
             return PressureSolution("failed", str(error), task)
 
-    def _general(self, task: Task, guess: Vector | None) -> PressureSolution:
+    def _general(self, task: Task, guess: Array | None) -> PressureSolution:
         """Answer by the general method, or by the compiled search once its code is ready."""
         awaited = self._search.fast(task, None) is None
         try:
@@ -357,7 +356,7 @@ class PressureSolver:
             found = self._search.solve(task, guess) or self._search.nearest(task)
             return found or self._generally.solve(task, guess)
 
-    def _checked(self, guess: ArrayLike | None) -> Vector | None:
+    def _checked(self, guess: ArrayLike | None) -> Array | None:
         if guess is None:
             return None
         return checked_vector("guess", guess, self.robot.n_pressures)
@@ -434,13 +433,13 @@ def solve_batch(
 
 
 def _solved(
-    jobs: list[tuple[PressureSolver, Task, Vector | None]],
+    jobs: list[tuple[PressureSolver, Task, Array | None]],
     threads: int | None,
     watch: Stopwatch,
 ) -> list[PressureSolution]:
     """Solve checked tasks; tasks of one structure are solved together."""
     found: dict[int, PressureSolution | None] = {}
-    groups: dict[FastSolver, list[tuple[int, Vector, Program]]] = {}
+    groups: dict[FastSolver, list[tuple[int, Array, Program]]] = {}
     for index, (solver, task, guess) in enumerate(jobs):
         fast = solver._search.fast(task, guess)
         if fast is not None:

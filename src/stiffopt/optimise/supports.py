@@ -18,8 +18,8 @@ from itertools import islice
 from typing import Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.display import display_units
 from stiffopt.errors import InputError
 from stiffopt.model.compliance import stiffness_of
@@ -38,7 +38,6 @@ from stiffopt.optimise.solution import PressureSolution
 from stiffopt.optimise.solver import solve_pressure
 from stiffopt.optimise.task import Task
 
-Vector = NDArray[np.float64]
 Kind = Literal["post", "wall"]
 
 POST_RADIUS, POST_LENGTH = 5e-3, 0.12  # m
@@ -110,9 +109,9 @@ class SupportMap:
     """
 
     free: PressureSolution
-    at: Vector
-    sides: Vector
-    stiffness: dict[Kind, Vector]
+    at: Array
+    sides: Array
+    stiffness: dict[Kind, Array]
     supports: tuple[Support, ...]
 
     def times(self, support: Support) -> float:
@@ -187,7 +186,7 @@ def suggest_supports(
     return SupportMap(free, first.at, first.sides, stiffness, tuple(found))
 
 
-def _at_target(robot: Manipulator, task: Task, seed: int) -> Iterator[Vector]:
+def _at_target(robot: Manipulator, task: Task, seed: int) -> Iterator[Array]:
     """Yield pressures (n,) at a task's target, unlike each other."""
     ready = prepared(robot, task, seed)
     problem = PressureProblem(ready.robot, task)
@@ -197,7 +196,7 @@ def _at_target(robot: Manipulator, task: Task, seed: int) -> Iterator[Vector]:
             yield point.x * problem.unit
 
 
-def _best(posture: _Posture, stiffness: Vector) -> Iterator[tuple[int, int, int]]:
+def _best(posture: _Posture, stiffness: Array) -> Iterator[tuple[int, int, int]]:
     """Yield the indices of posture, station and side, stiffest first, none near an earlier one.
 
     The stiffness (postures, s, a) is -inf where there can be no object. Places are near each other
@@ -251,7 +250,7 @@ class _Posture:
     def __init__(
         self,
         robot: Manipulator,
-        p: Vector,
+        p: Array,
         measures: list[StiffnessMeasure],
         margin: float,
         max_force: float,
@@ -293,7 +292,7 @@ class _Posture:
         self._lines = robot.pose(shares, self._body)[..., :3, 3]
         self._radii = robot.body_radius(shares, self._body)
 
-    def stiffness(self, kind: Kind) -> Vector:
+    def stiffness(self, kind: Kind) -> Array:
         """Return stiffnesses (s, a) in contact, in N/m; -inf where there can be no object."""
         gaps = np.array([self._distances(kind, line) for line in self._lines])  # (way, s, a, body)
         gaps -= self._radii[:, None, None]
@@ -305,11 +304,11 @@ class _Posture:
         is_possible = self._holds & is_first & is_clear & passes
         return np.asarray(np.where(is_possible, self._braced, -np.inf))
 
-    def _distances(self, kind: Kind, points: Vector) -> Vector:
+    def _distances(self, kind: Kind, points: Array) -> Array:
         """Return distances (s, a, k) of points (k, 3) from the objects."""
         surface, out = self.surface, self._out
         if kind == "wall":
-            level: Vector = np.einsum("sai,sai->sa", surface, out)
+            level: Array = np.einsum("sai,sai->sa", surface, out)
             return np.asarray(level[..., None] - np.einsum("sai,ki->sak", out, points))
         apart = points - (surface + POST_RADIUS * out)[..., None, :]
         along = np.einsum("saki,sai->sak", apart, self._axes)

@@ -8,10 +8,9 @@ from __future__ import annotations
 from functools import cache
 from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
-from numpy.typing import NDArray
 from pydantic import create_model, model_validator
 
+from stiffopt.arrays import Array
 from stiffopt.optimise.term import Term, Tolerance
 from stiffopt.optimise.terms import TERMS
 from stiffopt.schema import BadKeyError, Schema
@@ -56,7 +55,7 @@ class Target(_Keys):
         given = ((kind, getattr(self, key)) for key, kind in _kinds(type(self)))
         return tuple(kind(value, self.tolerance) for kind, value in given if value is not None)
 
-    def moved_back(self, offset: NDArray[np.float64]) -> Target:
+    def moved_back(self, offset: Array) -> Target:
         """Return the target for the model with which an arm off by an offset meets this target.
 
         Parameters

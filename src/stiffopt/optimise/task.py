@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import (
     BeforeValidator,
     Discriminator,
@@ -27,6 +26,7 @@ from pydantic import (
 )
 from pydantic_core import PydanticKnownError
 
+from stiffopt.arrays import Array
 from stiffopt.directions import Frame
 from stiffopt.errors import FileError, InputError, dotted
 from stiffopt.files import SourceFile, line_of, read_file
@@ -122,10 +122,7 @@ class ForRobot(Schema, ShownInNotebook):
     def resolve_robot(self) -> RobotDescription:
         """Return the robot; a relative path starts at the folder of the file.
 
-        Raises
-        ------
-        InputError
-            No robot is named, it does not exist, or its file is wrong.
+        Raises `InputError`: no robot is named, it does not exist, or its file is wrong.
         """
         if self.robot is None:
             name = type(self).__name__
@@ -145,32 +142,21 @@ class ForRobot(Schema, ShownInNotebook):
     def check_scene(self, description: RobotDescription) -> None:
         """Reject a scene that does not suit a robot.
 
-        Raises
-        ------
-        InputError
-            See `Scene.check_against`.
+        Raises `InputError`: see `Scene.check_against`.
         """
         if self.scene is not None:
             self.scene.check_against(description, self.source)
 
-    def pressure_bounds(
-        self, description: RobotDescription
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def pressure_bounds(self, description: RobotDescription) -> tuple[Array, Array]:
         """Return the pressure limits of each channel: the robot's, tightened by `pressure`.
 
-        Parameters
-        ----------
-        description : the robot, with n channels.
+        `description`: the robot, with n channels. Raises `InputError`: a list of the wrong length,
+        or a channel whose range is empty.
 
         Returns
         -------
         lower, upper : (n,) arrays
             In Pa, with lower <= upper.
-
-        Raises
-        ------
-        InputError
-            A list of the wrong length, or a channel whose range is empty.
         """
         lower = np.array(description.pressure_min)
         upper = np.array(description.pressure_max)

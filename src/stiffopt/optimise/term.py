@@ -18,15 +18,12 @@ from copy import copy
 from functools import cache
 from typing import Annotated, Any, ClassVar, NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
+from stiffopt.arrays import Array
 from stiffopt.display import PLAIN, DisplayUnit, display_units
 from stiffopt.schema import Schema
 from stiffopt.units import Angle, Length
-
-Vector = NDArray[np.float64]
 
 
 class Tolerance(Schema):
@@ -154,7 +151,7 @@ class Term(ABC):
         return Nearness()
 
     @classmethod
-    def moved_back(cls, value: Any, offset: Vector) -> Any:
+    def moved_back(cls, value: Any, offset: Array) -> Any:
         """Return the value for the model with which an arm off by an offset (6,) meets `value`.
 
         `offset` is a displacement in m and a rotation vector in rad, in base axes.

@@ -11,8 +11,9 @@ from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from stiffopt.arrays import Array
 from stiffopt.errors import EquilibriumError
 from stiffopt.model.compiled import Library, compiling_at_once, library
 from stiffopt.model.layout import Layout
@@ -21,8 +22,6 @@ from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.rod import rod_functions
 from stiffopt.model.tip_functions import tip_formulas
 
-Vector = NDArray[np.float64]
-
 _SOURCES = (str(Path(__file__).with_name("native") / "tip.c"),)
 _FOUND, _BEYOND_LAW, _NO_EQUILIBRIUM = range(3)  # as in tip.c
 
@@ -30,19 +29,12 @@ _integer, _pointer = ctypes.c_int64, ctypes.c_void_p
 
 
 class TipAt(NamedTuple):
-    """The tip at one set of pressures; the arrays belong to the caller.
+    """The tip at one set of pressures; the arrays belong to the caller."""
 
-    Attributes
-    ----------
-    pose : (4, 4), in the base frame.
-    jacobian : (6, n), twist of the tip in tip axes per pressure: three rows in m/Pa, then three in
-        rad/Pa.
-    compliance : (6, 6), in tip axes, linear first, as `Manipulator.tip_compliance`.
-    """
-
-    pose: Vector
-    jacobian: Vector
-    compliance: Vector
+    pose: Array  # (4, 4), in the base frame
+    # (6, n), twist of the tip in tip axes per pressure: three rows in m/Pa, then three in rad/Pa
+    jacobian: Array
+    compliance: Array  # (6, 6), in tip axes, linear first, as `Manipulator.tip_compliance`
 
 
 class TipModel:
@@ -54,6 +46,8 @@ class TipModel:
 
     An instance belongs to one thread; see `copy`.  Calls release the interpreter lock.
 
+    Raises `EquilibriumError` if the unpressurised arm falls over under its weight.
+
     Parameters
     ----------
     robot : the arm with its gravity and load.
@@ -63,11 +57,6 @@ class TipModel:
     is_fast : whether calls run in machine code, which is compiled when an instance is made.
         Without a compiler the model is used, from rest each time, which takes milliseconds for a
         loaded arm.
-
-    Raises
-    ------
-    EquilibriumError
-        If the unpressurised arm falls over under its weight.
     """
 
     def __init__(self, robot: Manipulator) -> None:
@@ -85,10 +74,8 @@ class TipModel:
 
         This takes much less time than a new instance.
 
-        Raises
-        ------
-        EquilibriumError
-            If the unpressurised arm falls over under its weight; the instance is unusable then.
+        Raises `EquilibriumError` if the unpressurised arm falls over under its weight; the instance
+        is unusable then.
         """
         self._robot = robot
         if self._code is not None:
@@ -97,12 +84,8 @@ class TipModel:
     def at(self, pressures: ArrayLike) -> TipAt:
         """Return the tip at pressures (n,) in Pa.
 
-        Raises
-        ------
-        PressureError
-            Pressures that are not n finite numbers, or are beyond the strain law.
-        EquilibriumError
-            The loaded arm has no stable equilibrium there.
+        Raises `PressureError`: pressures that are not n finite numbers, or are beyond the strain
+        law; `EquilibriumError`: the loaded arm has no stable equilibrium there.
         """
         robot, p = self._robot, self._robot.checked_pressures(pressures)
         found = None if self._code is None else self._code(p)
@@ -131,7 +114,7 @@ class _LoadedTip:
         self._state[:] = np.nan
         self._arm.change(robot)
 
-    def __call__(self, pressures: Vector) -> TipAt | None:
+    def __call__(self, pressures: Array) -> TipAt | None:
         self._pressures[:], before = pressures, self._state.copy()
         outcome = self._tip(*self._call)
         if outcome == _FOUND:
@@ -158,7 +141,7 @@ class _FreeTip:
         """Take another arm's numbers."""
         self._numbers = robot.numbers
 
-    def __call__(self, pressures: Vector) -> TipAt | None:
+    def __call__(self, pressures: Array) -> TipAt | None:
         pose, jacobian, compliance, margin = self._function(pressures, self._numbers)
         return TipAt(pose, jacobian, compliance) if margin[0, 0] > 0 else None
 

@@ -9,8 +9,9 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from stiffopt.arrays import Array
 from stiffopt.directions import unit_quaternion, unit_vector
 from stiffopt.errors import InputError
 from stiffopt.model.arguments import checked_vector
@@ -22,8 +23,6 @@ from stiffopt.optimise.term import Term
 
 if TYPE_CHECKING:
     from stiffopt.optimise.solver import PressureSolver
-
-Vector = NDArray[np.float64]
 
 
 def task_with_target(
@@ -66,11 +65,11 @@ class WarmAnswer:
 
     __slots__ = ("_block", "_solved", "_solver", "pressures")
 
-    def __init__(self, pressures: Vector | None, solver: "PressureSolver", block: Vector) -> None:
+    def __init__(self, pressures: Array | None, solver: "PressureSolver", block: Array) -> None:
         self.pressures, self._solver, self._block = pressures, solver, block
 
     @classmethod
-    def judged(cls, pressures: Vector | None, solution: PressureSolution | None) -> "WarmAnswer":
+    def judged(cls, pressures: Array | None, solution: PressureSolution | None) -> "WarmAnswer":
         """Return an answer whose solution is known."""
         answer = cls.__new__(cls)
         answer.pressures, answer._solved = pressures, solution
@@ -108,9 +107,9 @@ class WarmAnswer:
 class _WarmMemory(NamedTuple):
     """A block of numbers, its views for position and guess, and the call that solves it."""
 
-    block: Vector
-    place: Vector | None
-    start: Vector
+    block: Array
+    place: Array | None
+    start: Array
     call: Callable[[], int]
     task: Any
 
@@ -118,13 +117,10 @@ class _WarmMemory(NamedTuple):
 class WarmCalls:
     """Warm calls for one task; their memory is reused.
 
-    Attributes
-    ----------
-    program : of the task.
-    like : block of numbers of the task (see `FastSolver.block`).
+    `program`: of the task. `like`: block of numbers of the task (see `FastSolver.block`).
     """
 
-    def __init__(self, fast: FastSolver, row: Vector, program: Program) -> None:
+    def __init__(self, fast: FastSolver, row: Array, program: Program) -> None:
         self.fast, self.program = fast, program
         self.like = fast.block(fast.with_target(row, program, None))
         self._n = fast.guess.stop - fast.guess.start
@@ -147,7 +143,7 @@ class WarmCalls:
 
     def next_to(
         self, guess: Any, position: Any, pointing: Any, orientation: Any, stop: int = 0
-    ) -> Vector | None:
+    ) -> Array | None:
         """Return a block with the answer next to a guess; None without one, or for bad arguments.
 
         `stop` is the address of a `StopFlag`.
@@ -182,7 +178,7 @@ class WarmCalls:
         self._spare.append(memory)
         return found
 
-    def _turn(self, block: Vector, pointing: Any, orientation: Any) -> None:
+    def _turn(self, block: Array, pointing: Any, orientation: Any) -> None:
         """Write the angular parts of a target."""
         if pointing is not None:
             where, term = self._parts["pointing"]
@@ -191,7 +187,7 @@ class WarmCalls:
             where, _ = self._parts["orientation"]
             block[where] = unit_quaternion(tuple(map(float, orientation)))
 
-    def task_of(self, block: Vector, task: Task) -> Task:
+    def task_of(self, block: Array, task: Task) -> Task:
         """Return the task that a block describes."""
         parts: dict[str, Any] = {}
         for key, (where, _) in self._parts.items():

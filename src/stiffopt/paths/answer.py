@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.display import display_units
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.optimise.solution import Judgement
@@ -15,7 +15,6 @@ from stiffopt.paths.points import BodyCheck, PathTasks
 from stiffopt.paths.rates import step_limits
 from stiffopt.paths.solution import PathSolution
 
-Vector = NDArray[np.float64]
 Failure = tuple[int, str]
 """A point at which something fails, and why."""
 
@@ -24,7 +23,7 @@ class PathAnswers:
     """The solutions of one path on one arm, with their messages; `slew` (n,) is in Pa/s or None."""
 
     def __init__(
-        self, robot: Manipulator, path: Path, points: PathPoints, slew: Vector | None
+        self, robot: Manipulator, path: Path, points: PathPoints, slew: Array | None
     ) -> None:
         self._robot, self._path, self._points, self._slew = robot, path, points, slew
 
@@ -39,9 +38,9 @@ class PathAnswers:
     def judged(
         self,
         tasks: PathTasks,
-        pressures: Vector,
-        times: Vector,
-        alone: Vector,
+        pressures: Array,
+        times: Array,
+        alone: Array,
         unreachable: Failure | None,
     ) -> PathSolution:
         """Return the solution at pressures (N, n), judged by the model against the path's tasks.
@@ -99,7 +98,7 @@ class PathAnswers:
         return _unreachable(self.failed(message), index, message)
 
     def cut_short(
-        self, solution: PathSolution, pressures: Vector, beyond: float | None
+        self, solution: PathSolution, pressures: Array, beyond: float | None
     ) -> PathSolution:
         """Return the solution of a path's beginning, beyond whose pressures (k, n) none were found.
 
@@ -141,7 +140,7 @@ class PathAnswers:
             assert (np.abs(np.diff(solution.pressures, axis=0)) <= limits * (1 + 1e-6) + 1e-6).all()
         return self._blocked(tasks, solution.pressures)
 
-    def _blocked(self, tasks: PathTasks, p: Vector) -> Failure | None:
+    def _blocked(self, tasks: PathTasks, p: Array) -> Failure | None:
         """Return the first point after which the body is too near the scene, and why; or None."""
         if tasks.scene is None or len(p) < 2:
             return None
@@ -219,7 +218,7 @@ def _unreachable(solution: PathSolution, index: int, message: str) -> PathSoluti
     return replace(solution, status="unreachable", message=message, first_failure=index)
 
 
-def _errors(judgements: Sequence[Judgement], name: str) -> Vector | None:
+def _errors(judgements: Sequence[Judgement], name: str) -> Array | None:
     if name not in judgements[0].errors:
         return None
     return np.array([judgement.errors[name] for judgement in judgements])

@@ -5,9 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from stiffopt.arrays import Array
 from stiffopt.paths.gaps import gaps
 from stiffopt.paths.lanes import lanes
-from stiffopt.paths.links import Vector
 from stiffopt.paths.points import PathCandidate, PathTasks
 from stiffopt.paths.quickening import quickened, share_of
 from stiffopt.paths.refinement import refined
@@ -21,9 +21,7 @@ class RouteAttempts:
 
     Pressures are given at the `given` points; other arguments are those of `RouteSearch`.
 
-    Attributes
-    ----------
-    alone : (N,), largest values of the local optima; not a number where there is none.
+    `alone`: (N,), largest values of the local optima; not a number where there is none.
     """
 
     def __init__(
@@ -41,7 +39,7 @@ class RouteAttempts:
         self.alone = np.array([max((c.value for c in layer), default=np.nan) for layer in layers])
         self._further: list[list[PathCandidate]] = [[] for _ in layers]
 
-    def best(self, steps: Vector, *, any_will_do: bool = False) -> list[Route]:
+    def best(self, steps: Array, *, any_will_do: bool = False) -> list[Route]:
         """Return the best sequences within steps (N - 1, n), the best first, or none.
 
         There are several only if another one, once refined, may become better than the best.
@@ -77,7 +75,7 @@ class RouteAttempts:
             self._add_lanes(regions, attempt, is_last, known[0] if known else None)
         return known[: 1 if has_scene else ROUTE.refined]
 
-    def slower(self, steps: Vector) -> tuple[float, list[Route]]:
+    def slower(self, steps: Array) -> tuple[float, list[Route]]:
         """Find a small slow-down with which the path can be followed, and how; 1 if none is needed.
 
         Any sequence will do at first; it is then quickened as a whole.
@@ -104,13 +102,13 @@ class RouteAttempts:
             return factor, routes
         return factor, [relaxed(self._tasks, best, steps * factor, self.alone, self._fixed)]
 
-    def refined(self, routes: Sequence[Route], steps: Vector) -> tuple[Route, Vector]:
+    def refined(self, routes: Sequence[Route], steps: Array) -> tuple[Route, Array]:
         """Return the sequence that is best when refined, and its pressures.
 
         Others are refined only if the first does not become about as stiff as single points.
         """
         tasks, join = self._tasks, np.min if self._over == "worst" else np.mean
-        found: list[tuple[float, Route, Vector]] = []
+        found: list[tuple[float, Route, Array]] = []
         for route in routes:
             if route.comes_up_to(ROUTE.nearly_all, self.alone, self._over):
                 return route, route.pressures
@@ -122,11 +120,11 @@ class RouteAttempts:
                 break
         return max(found, key=lambda each: each[0])[1:]
 
-    def beginning(self, steps: Vector) -> list[PathCandidate]:
+    def beginning(self, steps: Array) -> list[PathCandidate]:
         """Return the longest sequence of candidates from the first point on."""
         return self._search(steps).beginning()
 
-    def clearance_beyond(self, last: PathCandidate, point: int, step: Vector) -> float | None:
+    def clearance_beyond(self, last: PathCandidate, point: int, step: Array) -> float | None:
         """Return the largest clearance with which steps (n,) go on from a candidate at a point.
 
         None without a scene, or if the rates allow no step.
@@ -138,7 +136,7 @@ class RouteAttempts:
             return None
         return max(body.motion(np.array([p, q])).least for q in near)
 
-    def _search(self, steps: Vector) -> RouteSearch:
+    def _search(self, steps: Array) -> RouteSearch:
         """Return a search over local optima and the further candidates that there are."""
         return RouteSearch(
             self._tasks, self._layers, steps, self._over, self._further, self._is_closed

@@ -14,8 +14,6 @@ from stiffopt.model.stopping import checkpoint
 from stiffopt.paths.points import Local, PathCandidate, PathTasks
 from stiffopt.paths.settings import CANDIDATES, WITHOUT_MACHINE_CODE, CandidateSettings
 
-Vector = NDArray[np.float64]
-
 
 def candidates(tasks: PathTasks) -> tuple[list[list[PathCandidate]], int]:
     """Return distinct candidates at each point, the best first, and the number of starts."""

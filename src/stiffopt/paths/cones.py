@@ -6,15 +6,14 @@ from collections.abc import Sequence
 
 import clarabel
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 
-Vector = NDArray[np.float64]
+from stiffopt.arrays import Array
 
 
 def minimised(
-    P: sparse.csc_matrix, q: Vector, A: sparse.csc_matrix, b: Vector, cones: Sequence[object]
-) -> tuple[Vector, Vector] | None:
+    P: sparse.csc_matrix, q: Array, A: sparse.csc_matrix, b: Array, cones: Sequence[object]
+) -> tuple[Array, Array] | None:
     """Minimise ``x'Px/2 + q'x`` subject to ``A x + s = b``, s in the cones.
 
     P holds its upper triangle. Returns x and the multipliers; None if the solver fails.

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from typing import cast
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from stiffopt.arrays import Array
 from stiffopt.display import display_units
 from stiffopt.errors import InputError, StoppedError
 from stiffopt.model.arguments import checked_vector
@@ -17,7 +18,6 @@ from stiffopt.optimise.goal import StiffnessMeasure
 from stiffopt.optimise.solver import PressureSolver
 from stiffopt.optimise.task import Task
 
-Vector = NDArray[np.float64]
 End = ArrayLike | Task
 
 _LOCAL = 3  # number of searches from random guesses, for other local optima
@@ -28,18 +28,12 @@ _ALIKE = 0.02  # of the ranges; configurations that differ by less count as one
 
 @dataclass(frozen=True, eq=False)
 class Configuration:
-    """Pressures at which a motion may end.
+    """Pressures at which a motion may end."""
 
-    Attributes
-    ----------
-    pressures : (n,), in Pa.
-    worth : its stiffness as a share of the best known for its task; 1 if nothing is maximised.
-    name : of the end to which it belongs: "goal 2".
-    """
-
-    pressures: Vector
+    pressures: Array  # (n,), in Pa
+    # its stiffness as a share of the best known for its task; 1 if nothing is maximised
     worth: float = 1.0
-    name: str = ""
+    name: str = ""  # of the end to which it belongs: "goal 2"
 
 
 class Unsolved(Exception):  # noqa: N818
@@ -60,7 +54,7 @@ def several(goal: End | Sequence[End]) -> list[End]:
     return [cast(End, goal)]
 
 
-def checked_pressures(name: str, robot: Manipulator, pressures: ArrayLike) -> Vector:
+def checked_pressures(name: str, robot: Manipulator, pressures: ArrayLike) -> Array:
     """Return pressures (n,), or raise `InputError` if they are outside the robot's limits."""
     p = checked_vector(f"the {name}'s pressures", pressures, robot.n_pressures)
     low, high = robot.pressure_min, robot.pressure_max
@@ -76,6 +70,9 @@ def checked_pressures(name: str, robot: Manipulator, pressures: ArrayLike) -> Ve
 class TaskConfigurations:
     """Finds configurations that solve a task.
 
+    Raises `Unsolved`: the task has no solution; `StoppedError`: the solver failed, or the time is
+    over.
+
     Parameters
     ----------
     name : of the end, for messages.
@@ -87,13 +84,6 @@ class TaskConfigurations:
     ----------
     best : the stiffest configuration.
     limits : lower and upper limits of the pressures, (n,) each.
-
-    Raises
-    ------
-    Unsolved
-        The task has no solution.
-    StoppedError
-        The solver failed, or the time is over.
     """
 
     def __init__(self, name: str, robot: Manipulator, task: Task, seed: int) -> None:
@@ -108,7 +98,7 @@ class TaskConfigurations:
         self._maximised = len(maximised(task))
         self._most = min(solution.stiffnesses[: self._maximised], default=None)
 
-    def others(self, start: Vector) -> list[Configuration]:
+    def others(self, start: Array) -> list[Configuration]:
         """Search further configurations, near the start of a motion and near random guesses."""
         low, high = self.limits
         span = high - low

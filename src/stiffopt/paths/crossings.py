@@ -7,15 +7,16 @@ from __future__ import annotations
 
 import numpy as np
 
+from stiffopt.arrays import Array
 from stiffopt.model.stopping import checkpoint
-from stiffopt.paths.links import Indices, Layers, Links, Vector, largest
+from stiffopt.paths.links import Indices, Layers, Links, largest
 from stiffopt.paths.points import Local, PathCandidate, PathTasks
 from stiffopt.paths.settings import ROUTE
 
 _NONE = np.zeros(0, dtype=np.intp)
 
 
-def crossings(layers: Layers, steps: Vector, over: str) -> Links:
+def crossings(layers: Layers, steps: Array, over: str) -> Links:
     """Return crossings from some points between candidates that are too far apart for a step.
 
     Their values are estimates.  `steps` (N - 1, n) are the largest changes from point to point, in
@@ -38,7 +39,7 @@ def crossings(layers: Layers, steps: Vector, over: str) -> Links:
 
 
 def _pairs(
-    layers: Layers, over: str, begin: int, lengths: Indices, limits: Vector, every: int
+    layers: Layers, over: str, begin: int, lengths: Indices, limits: Array, every: int
 ) -> list[tuple[Indices, Indices]]:
     """Choose crossings from candidates at one point; return their origins and goals.
 
@@ -83,7 +84,7 @@ def _guessed(layers: Layers, origin: Indices, goal: Indices) -> Links:
 
 
 def crossed(
-    tasks: PathTasks, begin: int, start: Vector, goal: Vector, steps: Vector
+    tasks: PathTasks, begin: int, start: Array, goal: Array, steps: Array
 ) -> list[PathCandidate] | None:
     """Return candidates at the points between point `begin`, at pressures `start`, and the goal.
 

@@ -6,7 +6,8 @@ import math
 
 import numpy as np
 
-from stiffopt.paths.links import Layers, Links, Mask, Vector
+from stiffopt.arrays import Array, Flags
+from stiffopt.paths.links import Layers, Links
 from stiffopt.paths.points import joined
 from stiffopt.paths.settings import ROUTE
 
@@ -39,19 +40,19 @@ def gaps(
     return joined(regions) or [range(len(layers))]
 
 
-def _nearest(layers: Layers, points: range, before: Mask, after: Mask) -> int:
+def _nearest(layers: Layers, points: range, before: Flags, after: Flags) -> int:
     """Return the point at which two sets of candidates are nearest to each other."""
 
     def apart(point: int) -> float:
         own = layers.at(point)
         x = layers.pressures[own]
-        gaps: Vector = np.abs(x[before[own]][:, np.newaxis] - x[after[own]]).max(axis=2)
+        gaps: Array = np.abs(x[before[own]][:, np.newaxis] - x[after[own]]).max(axis=2)
         return float(gaps.min(initial=np.inf))
 
     return min(points, key=apart)
 
 
-def _breaks(layers: Layers, links: Links, usable: Mask, way: int) -> tuple[list[int], Mask]:
+def _breaks(layers: Layers, links: Links, usable: Flags, way: int) -> tuple[list[int], Flags]:
     """Return the points at which every sequence of usable candidates has ended.
 
     They are counted from the first point (`way` 1) or the last (-1), anew after each.  The

@@ -6,12 +6,11 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from stiffopt.arrays import Array
 from stiffopt.optimise.goal import StiffnessGoal
 from stiffopt.optimise.target import Target
-
-Vector = NDArray[np.float64]
 
 _SAMPLES = 20_000  # of a spline, to integrate its arc length
 _STRAIGHT = 1e-6  # sine of the angle between two chords up to which three points are collinear
@@ -19,21 +18,16 @@ _ALONG_Z = 1e-6  # sine of a tangent's angle to the base's z axis below which x 
 
 
 class Curve(ABC):
-    """A curve in space, parametrised by the arc length from its start.
-
-    Attributes
-    ----------
-    length : in m.
-    """
+    """A curve in space, parametrised by the arc length from its start. `length`: in m."""
 
     length: float
 
     @abstractmethod
-    def at(self, lengths: ArrayLike) -> Vector:
+    def at(self, lengths: ArrayLike) -> Array:
         """Return positions (..., 3) in m at arc lengths (...) in m."""
 
     @abstractmethod
-    def tangents(self, lengths: ArrayLike) -> Vector:
+    def tangents(self, lengths: ArrayLike) -> Array:
         """Return unit tangents (..., 3) at arc lengths (...); zero if the curve is a point."""
 
 
@@ -43,13 +37,10 @@ class Polyline(Curve):
     At a point, the tangent bisects the directions of the two lines; if the line turns straight
     back, it is that of the second. Between points, tangents are interpolated.
 
-    Parameters
-    ----------
-    points : (k, 3), in m; some may coincide.
-    closed : whether it ends where it begins.
+    `points`: (k, 3), in m; some may coincide. `closed`: whether it ends where it begins.
     """
 
-    def __init__(self, points: Vector, closed: bool = False) -> None:
+    def __init__(self, points: Array, closed: bool = False) -> None:
         self.points = points
         steps = np.diff(points, axis=0)  # (k - 1, 3)
         sizes = np.linalg.norm(steps, axis=1)
@@ -65,11 +56,11 @@ class Polyline(Curve):
             halves = _unit(np.where(turns_back[:, None], after, before + after))
             self._tangents = halves[np.concatenate([[0], np.cumsum(moved)])]
 
-    def at(self, lengths: ArrayLike) -> Vector:
+    def at(self, lengths: ArrayLike) -> Array:
         """See `Curve.at`."""
         return interpolated(lengths, self.knots, self.points)
 
-    def tangents(self, lengths: ArrayLike) -> Vector:
+    def tangents(self, lengths: ArrayLike) -> Array:
         """See `Curve.tangents`."""
         return _unit(interpolated(lengths, self.knots, self._tangents))
 
@@ -84,18 +75,18 @@ class ArcCurve(Curve):
     angle : angle of the arc, in rad.
     """
 
-    def __init__(self, centre: Vector, start: Vector, axis: Vector, angle: float) -> None:
+    def __init__(self, centre: Array, start: Array, axis: Array, angle: float) -> None:
         self._centre, self._x = centre, start - centre
         self._y = np.cross(axis, self._x)
         self._radius = float(np.linalg.norm(self._x))
         self.length = angle * self._radius
 
-    def at(self, lengths: ArrayLike) -> Vector:
+    def at(self, lengths: ArrayLike) -> Array:
         """See `Curve.at`."""
         angle = np.asarray(lengths, dtype=float)[..., None] / self._radius
         return self._centre + np.cos(angle) * self._x + np.sin(angle) * self._y
 
-    def tangents(self, lengths: ArrayLike) -> Vector:
+    def tangents(self, lengths: ArrayLike) -> Array:
         """See `Curve.tangents`."""
         angle = np.asarray(lengths, dtype=float)[..., None] / self._radius
         return _unit(np.cos(angle) * self._y - np.sin(angle) * self._x)
@@ -106,13 +97,11 @@ class SplineCurve(Curve):
 
     Simpson's rule on a fine grid gives the arc length.
 
-    Parameters
-    ----------
-    points : (k, 3), in m, k >= 2, neighbours distinct.
-    closed : whether the last point equals the first and the spline is periodic; else it is natural.
+    `points`: (k, 3), in m, k >= 2, neighbours distinct. `closed`: whether the last point equals the
+    first and the spline is periodic; else it is natural.
     """
 
-    def __init__(self, points: Vector, closed: bool = False) -> None:
+    def __init__(self, points: Array, closed: bool = False) -> None:
         from scipy.interpolate import CubicSpline  # takes 0.2 s
 
         chords = np.linalg.norm(np.diff(points, axis=0), axis=1)
@@ -128,21 +117,21 @@ class SplineCurve(Curve):
         self._dense, self._lengths = dense, np.concatenate([[0.0], np.cumsum(pieces)])
         self.length = float(self._lengths[-1])
 
-    def at(self, lengths: ArrayLike) -> Vector:
+    def at(self, lengths: ArrayLike) -> Array:
         """See `Curve.at`."""
-        found: Vector = self._spline(self._parameters(lengths))
+        found: Array = self._spline(self._parameters(lengths))
         return found
 
-    def tangents(self, lengths: ArrayLike) -> Vector:
+    def tangents(self, lengths: ArrayLike) -> Array:
         """See `Curve.tangents`."""
         return _unit(self._slope(self._parameters(lengths)))
 
-    def _parameters(self, lengths: ArrayLike) -> Vector:
-        found: Vector = np.interp(np.asarray(lengths, float), self._lengths, self._dense)
+    def _parameters(self, lengths: ArrayLike) -> Array:
+        found: Array = np.interp(np.asarray(lengths, float), self._lengths, self._dense)
         return found
 
 
-def arc_through(start: Vector, via: Vector, end: Vector) -> ArcCurve | None:
+def arc_through(start: Array, via: Array, end: Array) -> ArcCurve | None:
     """Return the arc from `start` through `via` to `end`; None if they are collinear.
 
     Its centre is ``start + (|u|^2 v x n + |v|^2 n x u) / (2 |n|^2)`` with ``u = via - start``,
@@ -160,15 +149,13 @@ def arc_through(start: Vector, via: Vector, end: Vector) -> ArcCurve | None:
     return ArcCurve(centre, start, axis, angle)
 
 
-def path_axes(tangents: Vector) -> Vector:
+def path_axes(tangents: Array) -> Array:
     """Return the axes of a path in the base frame.
 
     x is the tangent, z is the base's z axis made perpendicular to it (the base's x axis where the
     tangent is along z), and y is the cross product of z and x.
 
-    Parameters
-    ----------
-    tangents : (N, 3), unit vectors.
+    `tangents`: (N, 3), unit vectors.
 
     Returns
     -------
@@ -184,42 +171,31 @@ def path_axes(tangents: Vector) -> Vector:
 
 @dataclass(frozen=True, eq=False)
 class PathPoints:
-    """The points of a path, and its curve.
+    """The points of a path, and its curve."""
 
-    Attributes
-    ----------
-    targets : (N,), all prescribe the same components of the pose.
-    goals : (N,), with directions in base or tip axes.
-    positions : (N, 3), in m, base frame.
-    tangents : (N, 3), unit vectors.
-    lengths : (N,), arc length from the first point, in m.
-    times : (N,), in s, from 0; None if the rates decide.
-    curve : the curve through the points.
-    """
-
-    targets: tuple[Target, ...]
-    goals: tuple[StiffnessGoal | None, ...]
-    positions: Vector
-    tangents: Vector
-    lengths: Vector
-    times: Vector | None
-    curve: Curve
+    targets: tuple[Target, ...]  # (N,), all prescribe the same components of the pose
+    goals: tuple[StiffnessGoal | None, ...]  # (N,), with directions in base or tip axes
+    positions: Array  # (N, 3), in m, base frame
+    tangents: Array  # (N, 3), unit vectors
+    lengths: Array  # (N,), arc length from the first point, in m
+    times: Array | None  # (N,), in s, from 0; None if the rates decide
+    curve: Curve  # the curve through the points
 
     def __len__(self) -> int:
         return len(self.targets)
 
-    def at(self, length: ArrayLike) -> Vector:
+    def at(self, length: ArrayLike) -> Array:
         """Return positions (..., 3) on the curve, in m, at arc lengths (...) in m."""
         return self.curve.at(length)
 
 
-def interpolated(lengths: ArrayLike, knots: Vector, rows: Vector) -> Vector:
+def interpolated(lengths: ArrayLike, knots: Array, rows: Array) -> Array:
     """Interpolate rows (k, 3) at knots (k,) linearly at arc lengths (...)."""
     x = np.asarray(lengths, float)
     return np.stack([np.interp(x, knots, column) for column in rows.T], axis=-1)
 
 
-def _unit(vectors: Vector) -> Vector:
+def _unit(vectors: Array) -> Array:
     """Normalise vectors (..., 3); zeros stay zeros."""
     sizes = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return vectors / np.where(sizes > 0, sizes, 1.0)

@@ -9,15 +9,14 @@ import itertools
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.model.stopping import checkpoint
 from stiffopt.paths.candidates import spaced
 from stiffopt.paths.points import PathCandidate, PathTasks
 from stiffopt.paths.settings import LANES
 
-Vector = NDArray[np.float64]
-Guesses = list[tuple[int, Vector]]
+Guesses = list[tuple[int, Array]]
 """Points of a path, with pressures (k, n) near their targets."""
 
 
@@ -64,7 +63,7 @@ def _followed(
     tasks: PathTasks,
     marks: Sequence[int],
     knots: Sequence[int],
-    born: dict[int, Vector],
+    born: dict[int, Array],
     rng: np.random.Generator | None,
 ) -> Guesses:
     """Follow configurations from mark to mark, joined by those born there.
@@ -93,7 +92,7 @@ def _followed(
     return guesses
 
 
-def _spread(tasks: PathTasks, live: Vector, new: Vector) -> Vector:
+def _spread(tasks: PathTasks, live: Array, new: Array) -> Array:
     """Return at most `LANES.kept` distinct pressures (k, n): of `live`, then of `new`.
 
     New ones are farther from all others, and the farthest come first.

@@ -2,34 +2,35 @@
 
 All pressures grow in proportion, as in the definition of equilibria in contact
 (`Manipulator.contact_equilibrium`). Each equilibrium along the way is found from the one before. If
-they do not end in the wanted one, the motion is refused. Played backwards, it releases the contact.
+they do not end in the wanted one, the motion is refused. Where friction would keep the tip from its
+target, the way goes on past its end, and comes back (`eased`). Played backwards from where it first
+reaches its end, it releases the contact.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.display import display_units
 from stiffopt.errors import EquilibriumError
-from stiffopt.model.arm_clearance import measured_scene
 from stiffopt.model.contact.equilibrium import Contact, ContactEquilibrium
 from stiffopt.model.contact.sticking import Sticking
 from stiffopt.model.contact.way import STATES, Rubbing, rubbed, states_from_rest
 from stiffopt.model.manipulator import Manipulator
-from stiffopt.model.scene import Scene
 from stiffopt.optimise.brace import kept_clear_of, leant_on, quoted
 from stiffopt.optimise.brace_uncertainty import BraceUncertainty
+from stiffopt.optimise.easing import eased, missing_clearance
 from stiffopt.optimise.settings import BRACE
 from stiffopt.optimise.solution import PressureSolution
 from stiffopt.optimise.task import Task
 from stiffopt.optimise.tip import TipAt
 from stiffopt.paths.configurations import Unsolved, maximised
-
-Vector = NDArray[np.float64]
 
 SPEED = 0.02  # m/s, largest, of any part of the body
 FORCE_RATE = 0.1  # N/s, largest change of a contact's force
@@ -37,7 +38,8 @@ GRADUAL = 1.0  # s, in which the way gets its speed or loses it
 _STATIONS = 41  # of the body
 _AS_STIFF = 0.05  # largest difference of stiffnesses in the same equilibrium
 _PUSH = 2e-3  # N, step of finite differences by a push at the tip
-_FORGIVEN = 1e-4  # m, tolerated lack of clearance from other objects
+_SAME_PRESSURE = 1.0  # Pa
+_STRAIGHT = 0.9  # least cosine of the angle between steps of a way that does not turn
 
 
 class Hold(NamedTuple):
@@ -53,12 +55,12 @@ class Hold(NamedTuple):
     tangential : the forces of friction that the way leaves, as in `Rubbing`, in N.
     """
 
-    forces: Vector
-    deviations: Vector
-    per_pressure: Vector
-    per_push: Vector
+    forces: Array
+    deviations: Array
+    per_pressure: Array
+    per_push: Array
     sticking: Sticking
-    tangential: Vector
+    tangential: Array
 
 
 @dataclass(frozen=True)
@@ -68,7 +70,7 @@ class BraceApproach:
     Attributes
     ----------
     times : (k,), in s.
-    pressures : (k, n), in Pa, growing in proportion from zero.
+    pressures : (k, n), in Pa, growing in proportion from zero; then perhaps past this and back.
     tips : of the equilibria on the way, with their Jacobians and compliances.
     forces : largest force of a contact (k,), in N.
     contacts : at the end.
@@ -76,17 +78,29 @@ class BraceApproach:
     free_tips : positions (k, 3), in m, of the tip at these pressures without contact.
     """
 
-    times: Vector
-    pressures: Vector
+    times: Array
+    pressures: Array
     tips: tuple[TipAt, ...]
-    forces: Vector
+    forces: Array
     contacts: tuple[Contact, ...]
     hold: Hold
-    free_tips: Vector
+    free_tips: Array
+
+    def time_back(self, time: float) -> float:
+        """Return when the way first has its pressures of a time, in s.
+
+        From there backwards, a way that went past its end does not do so again.
+        """
+        past = np.linalg.norm(self.pressures - self.pressures[-1], axis=1)
+        reached = int(np.argmax(past < _SAME_PRESSURE))
+        if time <= self.times[reached]:
+            return time
+        leg = slice(reached, reached + int(np.argmax(past[reached:])) + 1)
+        return float(np.interp(np.interp(time, self.times, past), past[leg], self.times[leg]))
 
 
 def approach_to(
-    robot: Manipulator, solution: PressureSolution, slew: Vector | float = np.inf
+    robot: Manipulator, solution: PressureSolution, slew: Array | float = np.inf
 ) -> BraceApproach:
     """Return the motion from rest to a braced solution.
 
@@ -124,7 +138,7 @@ def way_into_contact(robot: Manipulator, solution: PressureSolution) -> list[Con
     """
     assert solution.tip_pose is not None
     assert solution.pressures is not None
-    states = way_from_rest(robot, solution.task, solution.pressures)
+    states = way_from_rest(robot, solution.task, solution.pressures, is_eased=True)
     end = states[-1]
     names, wanted = ({each.object for each in found.contacts} for found in (end, solution))
     apart = float(np.linalg.norm(end.tip_pose[:3, 3] - solution.tip_pose[:3, 3]))
@@ -152,7 +166,7 @@ def stiffness_leaning(eq: ContactEquilibrium, task: Task) -> float:
     )
 
 
-def touches_at(robot: Manipulator, task: Task, p: Vector) -> bool:
+def touches_at(robot: Manipulator, task: Task, p: Array) -> bool:
     """Return whether the arm at pressures (n,) touches an object of a task's brace."""
     assert task.brace is not None
     assert task.scene is not None
@@ -162,8 +176,12 @@ def touches_at(robot: Manipulator, task: Task, p: Vector) -> bool:
         return False
 
 
-def way_from_rest(robot: Manipulator, task: Task, p: Vector) -> list[ContactEquilibrium]:
+def way_from_rest(
+    robot: Manipulator, task: Task, p: Array, *, is_eased: bool = False
+) -> list[ContactEquilibrium]:
     """Return the equilibria from rest to pressures (n,) among the objects of a task with a brace.
+
+    `is_eased`: whether the way may end by easing the friction (`eased`).
 
     Raises
     ------
@@ -180,6 +198,8 @@ def way_from_rest(robot: Manipulator, task: Task, p: Vector) -> list[ContactEqui
     except EquilibriumError as error:
         share = len(states) / (STATES - 1)
         raise Unsolved(f"the way from rest is lost at {share:.0%} of it: {error}") from None
+    if is_eased and states[-1].contacts:
+        states, _ = eased(robot, task, scene, states)
     for number, eq in enumerate(states):
         for own, force in eq.pressed():
             each = eq.contacts[own[0]]
@@ -188,15 +208,20 @@ def way_from_rest(robot: Manipulator, task: Task, p: Vector) -> list[ContactEqui
                 where = "on the way" if number else "at rest"
                 raise Unsolved(f"{where}, '{each.object}' would be pressed with {text}")
     if others is not None:
-        at = _stations(robot)
-        _check_clear(robot, others, np.array([eq.poses(at)[:, :3, 3] for eq in states]), at)
+        missing = missing_clearance(robot, others, states)
+        if missing:
+            text = display_units().length.text(missing, ".2g")
+            raise Unsolved(f"on the way the body is {text} too near an object")
     return states
 
 
 def least_times_along(
-    robot: Manipulator, states: list[ContactEquilibrium], slew: Vector | float
-) -> Vector:
-    """Return the times (k,), in s, of equilibria that keep speed, rates of force and pressure."""
+    robot: Manipulator, states: list[ContactEquilibrium], slew: Array | float
+) -> Array:
+    """Return the times (k,), in s, of equilibria that keep speed, rates of force and pressure.
+
+    Where the way turns, it slows down.
+    """
     lines = np.array([eq.poses(_stations(robot))[:, :3, 3] for eq in states])  # (k, stations, 3)
     moved = np.linalg.norm(np.diff(lines, axis=0), axis=-1).max(axis=1)
     forces = np.array([_largest(eq) for eq in states])
@@ -207,10 +232,24 @@ def least_times_along(
     least = np.maximum.reduce([moved / SPEED, np.abs(np.diff(forces)) / FORCE_RATE, rates])
     # in the step of the first touch, its mean speed is less than that before, or the force's after
     least = np.maximum.reduce([least, np.append(least[1:], 0.0), np.append(0.0, least[:-1])])
-    return np.concatenate([[0.0], np.cumsum(np.maximum(least, 1e-3))])
+    times = np.concatenate([[0.0], np.cumsum(np.maximum(least, 1e-3))])
+    ways = np.diff(pressures, axis=0)
+    ways /= np.maximum(np.linalg.norm(ways, axis=1, keepdims=True), 1e-6)
+    turns = 1 + np.flatnonzero((ways[1:] * ways[:-1]).sum(axis=1) < _STRAIGHT)
+    if not len(turns):
+        return times
+    legs = [np.diff(gradual(leg - leg[0])) for leg in _pieces(times, turns.tolist())]
+    return np.concatenate([[0.0], np.cumsum(np.concatenate(legs))])
 
 
-def gradual(times: Vector) -> Vector:
+def _pieces(values: Array, at: list[int]) -> Iterator[Array]:
+    """Yield the pieces of values (k,) between indices, with both ends."""
+    ends = [0, *at, len(values) - 1]
+    for begin, end in pairwise(ends):
+        yield values[begin : end + 1]
+
+
+def gradual(times: Array) -> Array:
     """Return times (k,), in s, of the same way with a speed that grows and falls uniformly."""
     to_end = times[-1] - times
     after = _begun_gradually(np.minimum(times, to_end))
@@ -218,7 +257,7 @@ def gradual(times: Vector) -> Vector:
     return np.where(times <= to_end, after, whole - after)
 
 
-def _begun_gradually(times: Vector) -> Vector:
+def _begun_gradually(times: Array) -> Array:
     """Return when a way is as far as it would be at times (k,) if it began at full speed.
 
     Its share of the speed grows as t / T with T = `GRADUAL`, so that it is at t^2 / (2 T).
@@ -226,11 +265,11 @@ def _begun_gradually(times: Vector) -> Vector:
     return np.where(times < GRADUAL / 2, np.sqrt(2 * GRADUAL * times), times + GRADUAL / 2)
 
 
-def _stations(robot: Manipulator) -> Vector:
+def _stations(robot: Manipulator) -> Array:
     return np.linspace(0.0, robot.length, _STATIONS)
 
 
-def _hold(eq: ContactEquilibrium, deviations: Vector, rubbing: Rubbing) -> Hold:
+def _hold(eq: ContactEquilibrium, deviations: Array, rubbing: Rubbing) -> Hold:
     pushed = [
         (eq.shifted(push=step).normal_forces - eq.shifted(push=-step).normal_forces) / (2 * _PUSH)
         for step in _PUSH * np.eye(3)
@@ -241,14 +280,3 @@ def _hold(eq: ContactEquilibrium, deviations: Vector, rubbing: Rubbing) -> Hold:
 
 def _largest(eq: ContactEquilibrium) -> float:
     return max((force for _, force in eq.pressed()), default=0.0)
-
-
-def _check_clear(robot: Manipulator, others: Scene, lines: Vector, at: Vector) -> None:
-    """Raise `Unsolved` if on the way (k, stations, 3) the body comes too near to other objects."""
-    radii = robot.body_radius(np.zeros(robot.n_pressures), at)
-    for item in measured_scene(others, robot.description).items:
-        gaps = item.distances(lines.reshape(-1, 3)).values.reshape(lines.shape[:2]) - radii
-        gaps = gaps[:, at >= item.begin]
-        if gaps.size and gaps.min() < others.clearance - _FORGIVEN:
-            missing = display_units().length.text(others.clearance - float(gaps.min()), ".2g")
-            raise Unsolved(f"on the way the body is {missing} too near an object")

@@ -12,12 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.arrays import Array, Flags
 from stiffopt.paths.points import PathCandidate
 from stiffopt.paths.settings import RATES
 
-Vector = NDArray[np.float64]
 Indices = NDArray[np.intp]
-Mask = NDArray[np.bool_]
 
 
 class Layers:
@@ -67,23 +66,17 @@ class Layers:
 
 @dataclass
 class Links:
-    """Links from a candidate to one at a later point, sorted by their ends.
+    """Links from a candidate to one at a later point, sorted by their ends."""
 
-    Attributes
-    ----------
-    origin, goal : numbers of the candidates at both ends.
-    worst, total : smallest value and sum of values in between; estimates until `known`.
-    known : whether these are computed.
-    checked : whether the body is known to keep clear along a link.
-    between : the candidates along each computed crossing, by the link's number.
-    """
-
+    # origin, goal: numbers of the candidates at both ends
     origin: Indices
     goal: Indices
-    worst: Vector
-    total: Vector
-    known: Mask
-    checked: Mask
+    # worst, total: smallest value and sum of values in between; estimates until `known`
+    worst: Array
+    total: Array
+    known: Flags  # whether these are computed
+    checked: Flags  # whether the body is known to keep clear along a link
+    # the candidates along each computed crossing, by the link's number
     between: dict[int, list[PathCandidate]] = field(default_factory=dict)
 
     def with_crossings(self, others: Links) -> Links:
@@ -100,7 +93,7 @@ class Links:
         self.worst[numbers] = self.total[numbers] = -np.inf
 
 
-def all_steps(layers: Layers, steps: Vector) -> Links:
+def all_steps(layers: Layers, steps: Array) -> Links:
     """Return the steps from point to point that the rates allow, at most `steps` (N - 1, n)."""
     origins, goals = [], []
     for point, step in enumerate(steps):
@@ -119,6 +112,6 @@ def all_steps(layers: Layers, steps: Vector) -> Links:
     return Links(origin, goal, np.full(count, np.inf), np.zeros(count), known, checked)
 
 
-def largest(step: Vector) -> Vector:
+def largest(step: Array) -> Array:
     """Return the largest change (n,) that counts as within a step."""
     return step * (1 + RATES.rounding) + 1e-9

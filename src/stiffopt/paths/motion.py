@@ -8,8 +8,9 @@ from time import perf_counter
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from stiffopt.arrays import Array
 from stiffopt.display import display_units
 from stiffopt.errors import EquilibriumError, InputError, StoppedError
 from stiffopt.model.compiled import Stopwatch
@@ -42,8 +43,6 @@ from stiffopt.paths.rates import least_times
 from stiffopt.paths.shortening import rounded, shortened
 from stiffopt.paths.solution import PathSolution
 from stiffopt.paths.tree_search import TreeSearch
-
-Vector = NDArray[np.float64]
 
 _NEARLY_AS_STIFF = 0.95  # share of the best stiffness from which no stiffer goal is sought
 _MORE = 50  # motions checked for a stiffer goal, in addition to as many as for the first
@@ -145,7 +144,7 @@ def plan_motion(
     return found
 
 
-def _with_margin(request: MotionRequest, timings: dict[str, float]) -> tuple[_Planner, Vector]:
+def _with_margin(request: MotionRequest, timings: dict[str, float]) -> tuple[_Planner, Array]:
     """Return a way whose margin is at least the calibrated uncertainty along it, and its planner.
 
     The margin begins with the uncertainty at given ends, and grows to that along the last way.
@@ -263,7 +262,7 @@ class _Planner:
         scene = self.request.scene
         self.motions = None if scene is None else ClearMotions(self.request.robot, scene)
 
-    def is_clear(self, rows: Vector) -> bool:
+    def is_clear(self, rows: Array) -> bool:
         """Whether the way along pressures (N, n) is clear."""
         if self.motions is None:
             return True
@@ -271,14 +270,14 @@ class _Planner:
         self.poses += found.poses
         return found.clear
 
-    def is_still_clear(self, rows: Vector) -> bool:
+    def is_still_clear(self, rows: Array) -> bool:
         """Whether the way is clear; false once the time is over."""
         try:
             return self.is_clear(rows)
         except StoppedError:
             return False
 
-    def way(self) -> Vector:
+    def way(self) -> Array:
         """Return a way (k, n) in pressures, not yet shortened; raise `Unsolved` with a reason."""
         begin = perf_counter()
         start = self._start()
@@ -295,7 +294,7 @@ class _Planner:
             way = self._search(start, goals, tasks)
         return way
 
-    def shorter(self, way: Vector) -> Vector:
+    def shorter(self, way: Array) -> Array:
         """Return a shorter and rounder way if its margin suffices, else the given one."""
         begin, found = perf_counter(), way
         try:
@@ -312,7 +311,7 @@ class _Planner:
 
     # -- ends -------------------------------------------------------------------------------
 
-    def _start(self) -> Vector:
+    def _start(self) -> Array:
         request = self.request
         given = request.start
         if isinstance(given, Task):
@@ -342,12 +341,12 @@ class _Planner:
             raise Unsolved("; ".join(refused))
         return tasks, goals
 
-    def _check(self, name: str, p: Vector) -> None:
+    def _check(self, name: str, p: Array) -> None:
         """Refuse an end that is not clear."""
         if self.motions is not None and not self.is_clear(np.stack([p, p])):
             raise Unsolved(f"{name}: {self._in_the_way(p)}")
 
-    def _in_the_way(self, p: Vector) -> str:
+    def _in_the_way(self, p: Array) -> str:
         """Describe the nearest object at pressures (n,) and the missing clearance."""
         request = self.request
         assert request.scene is not None
@@ -367,15 +366,15 @@ class _Planner:
 
     # -- ways -------------------------------------------------------------------------------
 
-    def _straight_to(self, start: Vector, goals: list[Configuration]) -> Configuration | None:
+    def _straight_to(self, start: Array, goals: list[Configuration]) -> Configuration | None:
         """Return the best goal to which the straight way is clear."""
         best_first = sorted(goals, key=lambda each: -each.worth)
         ways = ((each, np.stack([start, each.pressures])) for each in best_first)
         return next((each for each, way in ways if self.is_clear(way)), None)
 
     def _search(
-        self, start: Vector, goals: list[Configuration], tasks: list[TaskConfigurations]
-    ) -> Vector:
+        self, start: Array, goals: list[Configuration], tasks: list[TaskConfigurations]
+    ) -> Array:
         """Search a way around obstacles; `plan_motion` says to which goal."""
         begin = perf_counter()
         assert self.motions is not None  # or the straight way was clear
@@ -398,7 +397,7 @@ class _Planner:
         self.timings["search"] = perf_counter() - begin
         return way
 
-    def _stiffer(self, search: TreeSearch, way: Vector, stiff: list[Configuration]) -> Vector:
+    def _stiffer(self, search: TreeSearch, way: Array, stiff: list[Configuration]) -> Array:
         """Extend the way to one of the stiff goals, if a short search finds how."""
         goal = self._straight_to(way[-1], stiff)
         if goal is not None:
@@ -409,8 +408,8 @@ class _Planner:
         return np.concatenate([way, found[1:-1], [_nearest(stiff, found[-1]).pressures]])
 
     def _limits(
-        self, start: Vector, goals: list[Configuration], tasks: list[TaskConfigurations]
-    ) -> tuple[Vector, Vector]:
+        self, start: Array, goals: list[Configuration], tasks: list[TaskConfigurations]
+    ) -> tuple[Array, Array]:
         """Return limits of the way that include its ends.
 
         They are those of the tasks if all goals are tasks, else the robot's.
@@ -424,7 +423,7 @@ class _Planner:
         ends = np.stack([start, *(goal.pressures for goal in goals)])
         return np.minimum(low, ends.min(axis=0)), np.maximum(high, ends.max(axis=0))
 
-    def _no_way(self, reached: Vector | None) -> str:
+    def _no_way(self, reached: Array | None) -> str:
         text = "no clear way was found in the time given, which is no proof that there is none"
         if reached is not None and self.request.scene is not None:
             nearest = self.request.robot.clearances(reached, self.request.scene).nearest
@@ -433,7 +432,7 @@ class _Planner:
 
     # -- the answer -------------------------------------------------------------------------
 
-    def described(self, way: Vector) -> PathSolution:
+    def described(self, way: Array) -> PathSolution:
         """Return the motion along a way, timed and evaluated by the model."""
         begin = perf_counter()
         request = self.request
@@ -457,7 +456,7 @@ class _Planner:
         self.timings["describe"] = perf_counter() - begin
         return found
 
-    def _message(self, end: Vector, clearance: Vector | None) -> str:
+    def _message(self, end: Array, clearance: Array | None) -> str:
         reached = ""
         if len(self.request.goals) > 1:
             reached = f"to {_nearest(self.goals, end).name} of {len(self.request.goals)}"
@@ -483,7 +482,7 @@ class _Planner:
         return f"{how}{goals}, {self.poses} poses looked at; {kept}"
 
 
-def _least_stiffness(robot: Manipulator, p: Vector, measures: Sequence[StiffnessMeasure]) -> Vector:
+def _least_stiffness(robot: Manipulator, p: Array, measures: Sequence[StiffnessMeasure]) -> Array:
     """Return the smallest (N,) of several stiffnesses of the tip at pressures (N, n)."""
     C = robot.compliance_between(p, robot.length, robot.length)  # base axes
     R = robot.pose(p, robot.length)[:, :3, :3]
@@ -492,11 +491,11 @@ def _least_stiffness(robot: Manipulator, p: Vector, measures: Sequence[Stiffness
         for each in measures
     ]
     pairs = zip(measures, directions, strict=True)
-    found: Vector = np.min([stiffness_of(C, d, each.kind, each.boundary) for each, d in pairs], 0)
+    found: Array = np.min([stiffness_of(C, d, each.kind, each.boundary) for each, d in pairs], 0)
     return found
 
 
-def timed(way: Vector, rates: Vector) -> tuple[Vector, Vector]:
+def timed(way: Array, rates: Array) -> tuple[Array, Array]:
     """Return points (N, n) along a way at the highest speed within the rates, and times (N,)."""
     if len(way) < 2 or not np.ptp(way, axis=0).any():
         return way[:1], np.zeros(1)
@@ -512,16 +511,16 @@ def timed(way: Vector, rates: Vector) -> tuple[Vector, Vector]:
     return np.concatenate(points), np.concatenate(times)
 
 
-def _all(goals: Sequence[Configuration]) -> Vector:
+def _all(goals: Sequence[Configuration]) -> Array:
     return np.stack([goal.pressures for goal in goals])
 
 
-def _nearest(goals: Sequence[Configuration], p: Vector) -> Configuration:
+def _nearest(goals: Sequence[Configuration], p: Array) -> Configuration:
     """Return the goal nearest to pressures (n,)."""
     return min(goals, key=lambda goal: float(np.abs(goal.pressures - p).max()))
 
 
-def _measures(goals: Sequence[Vector | Task]) -> tuple[StiffnessMeasure, ...]:
+def _measures(goals: Sequence[Array | Task]) -> tuple[StiffnessMeasure, ...]:
     """Return the stiffnesses maximised by the first goal that maximises any."""
     tasks = (goal for goal in goals if isinstance(goal, Task))
     return next((found for found in map(maximised, tasks) if found), ())

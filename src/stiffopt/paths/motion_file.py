@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.documents import read_document
 from stiffopt.errors import FileError, InputError
 from stiffopt.logs.table import read_bytes, read_table
@@ -28,38 +28,21 @@ LEANING = "leaning"
 POSITION_ERROR = "position_error_m"
 """A column that no log has; it identifies a solution."""
 
-Vector = NDArray[np.float64]
-
 
 @dataclass(frozen=True, eq=False)
 class MotionTable:
-    """A motion: pressures over time.
+    """A motion: pressures over time."""
 
-    Attributes
-    ----------
-    file : from which it was read.
-    times : (N,), in s, increasing.
-    pressures : (N, n), in Pa; linear between two times.
-    tips : (N, 3), positions of the tip in the base frame, in m.
-    """
+    file: str  # from which it was read
+    times: Array  # (N,), in s, increasing
+    pressures: Array  # (N, n), in Pa; linear between two times
+    tips: Array  # (N, 3), positions of the tip in the base frame, in m
 
-    file: str
-    times: Vector
-    pressures: Vector
-    tips: Vector
-
-    def trajectory(self, ranges: Vector, begin: float) -> Trajectory:
+    def trajectory(self, ranges: Array, begin: float) -> Trajectory:
         """Return the trajectory for a control loop.
 
-        Parameters
-        ----------
-        ranges : (n,), ranges of the pressures, in Pa; see `trajectory_through`.
-        begin : time of the first point, in s.
-
-        Raises
-        ------
-        FileError
-            It has too many points.
+        `ranges`: (n,), ranges of the pressures, in Pa; see `trajectory_through`. `begin`: time of
+        the first point, in s. Raises `FileError`: it has too many points.
         """
         try:
             return trajectory_through(self.times, self.pressures, self.tips, ranges, begin)
@@ -75,11 +58,8 @@ def is_motion_csv(file: str | os.PathLike[str]) -> bool:
 def read_motion(file: str | os.PathLike[str], description: RobotDescription) -> MotionTable:
     """Read a motion of a robot: CSV, or a result file with one result.
 
-    Raises
-    ------
-    FileError
-        The file cannot be read, holds no complete motion, one of another robot, or one that leans
-        on objects.
+    Raises `FileError`: the file cannot be read, holds no complete motion, one of another robot, or
+    one that leans on objects.
     """
     name = os.fspath(file)
     if name.lower().endswith(".csv"):
@@ -141,5 +121,5 @@ def _of_result(name: str, description: RobotDescription) -> MotionTable:
     return motion
 
 
-def _si(values: list[str], unit: str, what: str) -> Vector:
+def _si(values: list[str], unit: str, what: str) -> Array:
     return np.array([parse_quantity(value, unit, what) for value in values])

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from stiffopt.arrays import Array
 from stiffopt.errors import InputError, shown
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.scene import Scene
@@ -17,8 +18,6 @@ from stiffopt.optimise.task import Load, Task
 from stiffopt.paths.configurations import End, checked_pressures, several
 from stiffopt.paths.solution import PathSolution
 
-Vector = NDArray[np.float64]
-
 _PER_PIECE = 6  # pressures on each piece of a way at which the calibrated uncertainty is evaluated
 
 
@@ -26,22 +25,19 @@ _PER_PIECE = 6  # pressures on each piece of a way at which the calibrated uncer
 class MotionRequest:
     """The checked arguments of `plan_motion`.
 
-    Attributes
-    ----------
-    bare, robot : the robot without and with the load of the motion.
-    margin : clearance added for the calibrated uncertainty, in m; None without a calibration or a
-        scene.
+    `bare`, `robot`: the robot without and with the load of the motion. `margin`: clearance added
+    for the calibrated uncertainty, in m; None without a calibration or a scene.
     """
 
     bare: Manipulator
     robot: Manipulator
     load: Load | None
-    start: Vector | Task
-    goals: list[Vector | Task]
+    start: Array | Task
+    goals: list[Array | Task]
     scene: Scene | None
     clearance: float
     margin: float | None
-    slew: Vector
+    slew: Array
     seed: int
 
     @classmethod
@@ -96,7 +92,7 @@ class MotionRequest:
         """Clearance required of the model's body, in m, margin included."""
         return self.clearance + (self.margin or 0.0)
 
-    def uncertainty(self, way: Vector) -> float:
+    def uncertainty(self, way: Array) -> float:
         """Return the largest calibrated uncertainty of the tip along a way (k, n), in m."""
         shares = np.linspace(0.0, 1.0, _PER_PIECE)[:, None]
         pieces = [a + shares * (b - a) for a, b in pairwise(way)]
@@ -133,7 +129,7 @@ def _checked_clearance(clearance: float) -> float:
     return float(clearance)
 
 
-def _rates(robot: Manipulator, slew: float | ArrayLike | None) -> Vector:
+def _rates(robot: Manipulator, slew: float | ArrayLike | None) -> Array:
     """Return the largest rates (n,) of the pressures, in Pa/s."""
     own = None
     if slew is not None:

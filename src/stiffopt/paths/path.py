@@ -19,9 +19,9 @@ from pathlib import Path as FilePath
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 
+from stiffopt.arrays import Array
 from stiffopt.directions import Direction, Quaternion
 from stiffopt.files import read_file
 from stiffopt.model.description import PerChannelRate, RobotDescription
@@ -32,8 +32,6 @@ from stiffopt.paths.geometry import Curve, PathPoints, Polyline, path_axes
 from stiffopt.paths.shapes import PathShape, check_one_key, fault_of_times, mm_text
 from stiffopt.schema import BadKeyError, Items, Schema
 from stiffopt.units import Duration, Length, Pressure, Speed
-
-Vector = NDArray[np.float64]
 
 MAX_POINTS = 5_000
 """Largest number of points of a path."""
@@ -89,7 +87,7 @@ class PathStiffness(Schema):
         """Whether the worst value on the path is maximised, or the mean."""
         return self.maximise[0].over
 
-    def goals(self, tangents: Vector) -> tuple[StiffnessGoal, ...]:
+    def goals(self, tangents: Array) -> tuple[StiffnessGoal, ...]:
         """Return the goal at each point of a path with tangents (N, 3)."""
         plain = [
             StiffnessMeasure(
@@ -227,7 +225,7 @@ class Path(ForRobot):
             source=self.source,
         )  # fmt: skip
 
-    def end_pressures(self, description: RobotDescription) -> tuple[Vector | None, Vector | None]:
+    def end_pressures(self, description: RobotDescription) -> tuple[Array | None, Array | None]:
         """Return the pressures at the start and at the end, each (n,) in Pa, or None where free.
 
         Raises
@@ -236,7 +234,7 @@ class Path(ForRobot):
             They are too many or too few for the robot, or beyond its limits or the path's.
         """
         lower, upper = self.pressure_bounds(description)
-        found: list[Vector | None] = []
+        found: list[Array | None] = []
         for key, given in (("start", self.start), ("end", self.end)):
             if given is None:
                 found.append(None)
@@ -268,7 +266,7 @@ class Path(ForRobot):
         except BadKeyError as error:
             raise BadKeyError(".".join(map(str, ("path", *error.loc))), str(error)) from None
 
-    def _lengths(self, curve: Curve) -> Vector:
+    def _lengths(self, curve: Curve) -> Array:
         """Return the arc lengths (N,) of the points."""
         if self.path.is_listed and isinstance(curve, Polyline):
             self._check_listed(curve)
@@ -308,7 +306,7 @@ class Path(ForRobot):
                 f"path.{self.path.kind} are {mm_text(float(steps[index]))} apart",
             )
 
-    def _times(self, lengths: Vector) -> Vector | None:
+    def _times(self, lengths: Array) -> Array | None:
         table, timing = self.path.table, self.timing
         if table is not None and table.times is not None:
             if timing is not None:
@@ -337,7 +335,7 @@ class Path(ForRobot):
             raise BadKeyError(f"timing.times.{fault[0]}", fault[1])
         return times
 
-    def _targets(self, positions: Vector) -> tuple[Target, ...]:
+    def _targets(self, positions: Array) -> tuple[Target, ...]:
         own = {"pointing": self.pointing, "orientation": self.orientation}
         if self.path.through is not None:
             return tuple(self._with_own(target, own) for target in self.path.through)
@@ -369,7 +367,7 @@ class Path(ForRobot):
             if getattr(self, key) is not None:
                 raise BadKeyError(key, f"is given by {where} too; remove one of them")
 
-    def _goals(self, tangents: Vector) -> tuple[StiffnessGoal | None, ...]:
+    def _goals(self, tangents: Array) -> tuple[StiffnessGoal | None, ...]:
         if self.stiffness is None:
             return (None,) * len(tangents)
         turns = any(m.frame == "path" for m in self.stiffness.maximise)

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.arrays import Array, Flags
 from stiffopt.errors import EquilibriumError
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.motion_clearance import ClearMotions, MotionClearance
@@ -26,21 +27,15 @@ from stiffopt.optimise.solution import Judgement, are_within, judge
 from stiffopt.optimise.task import Task
 from stiffopt.paths.settings import RATES
 
-Vector = NDArray[np.float64]
-Mask = NDArray[np.bool_]
-
 
 class PathCandidate(NamedTuple):
     """Pressures that solve the task at a point.
 
-    Attributes
-    ----------
-    pressures : (n,), in Pa.
-    value : logarithm of the smallest stiffness that is maximised; if none is, the negative mean
-        square of the relative pressures.
+    `pressures`: (n,), in Pa. `value`: logarithm of the smallest stiffness that is maximised; if
+    none is, the negative mean square of the relative pressures.
     """
 
-    pressures: Vector
+    pressures: Array
     value: float
 
 
@@ -48,9 +43,9 @@ class Local(NamedTuple):
     """A local search at a point, from a guess and within limits, in Pa."""
 
     point: int
-    guess: Vector
-    lower: Vector
-    upper: Vector
+    guess: Array
+    lower: Array
+    upper: Array
 
 
 class Brought(NamedTuple):
@@ -59,11 +54,11 @@ class Brought(NamedTuple):
     A value is minus infinity where the target was not reached.
     """
 
-    pressures: Vector
-    values: Vector
+    pressures: Array
+    values: Array
 
     @property
-    def arrived(self) -> Mask:
+    def arrived(self) -> Flags:
         """Which of them (k,) reached their targets."""
         return np.isfinite(self.values)
 
@@ -71,18 +66,14 @@ class Brought(NamedTuple):
 class Slopes(NamedTuple):
     """The tasks at k points, linearised; derivatives are per share of a channel's range.
 
-    Attributes
-    ----------
-    residuals, jacobians : ndarray (k, m), (k, m, n)
-        Of the terms.
-    costs, gradients : ndarray (k, t), (k, t, n)
-        Negative logarithms of the stiffnesses; the largest of each point is minimised.
+    `residuals` (k, m), `jacobians` (k, m, n): of the terms. `costs` (k, t), `gradients` (k, t, n):
+    negative logarithms of the stiffnesses; the largest of each point is minimised.
     """
 
-    residuals: Vector
-    jacobians: Vector
-    costs: Vector
-    gradients: Vector
+    residuals: Array
+    jacobians: Array
+    costs: Array
+    gradients: Array
 
 
 def joined(ranges: Iterable[range]) -> list[range]:
@@ -99,9 +90,7 @@ def joined(ranges: Iterable[range]) -> list[range]:
 class BodyCheck:
     """Checks that the body keeps the clearance of a scene between the points of a path.
 
-    Parameters
-    ----------
-    robot : with its load.
+    `robot`: with its load.
     """
 
     def __init__(self, robot: Manipulator, scene: Scene) -> None:
@@ -109,11 +98,11 @@ class BodyCheck:
         self._motions = ClearMotions(robot, scene)
         self._required = scene.clearance - RATES.clearance_between
 
-    def motion(self, pressures: Vector) -> MotionClearance:
+    def motion(self, pressures: Array) -> MotionClearance:
         """Check the motion along rows of pressures (N, n)."""
         return self._motions.along(pressures, self._required)
 
-    def are_clear(self, pressures: Vector) -> Mask:
+    def are_clear(self, pressures: Array) -> Flags:
         """Return whether the body keeps clear at each of the pressures (N, n)."""
         return np.asarray(self._robot.clearance(pressures, self._scene) >= self._required)
 
@@ -149,7 +138,7 @@ class PathTasks:
         self._fast = self._prepared.fast(first)
         self.is_compiled = self._fast is not None
         self._functions = functions(self.robot, self.programs[0])
-        self._rows: dict[int, Vector] = {}
+        self._rows: dict[int, Array] = {}
 
     @cached_property
     def body(self) -> BodyCheck | None:
@@ -159,12 +148,12 @@ class PathTasks:
         return BodyCheck(self.robot, self.scene)
 
     @cached_property
-    def _all_rows(self) -> Vector:
+    def _all_rows(self) -> Array:
         """The rows (N, w) of all points."""
         return np.array([self._row(index) for index in range(len(self))])
 
     @cached_property
-    def _parameters(self) -> Vector:
+    def _parameters(self) -> Array:
         """Parameters of the compiled functions at each point."""
         return np.array([self.robot.parameters(each.parameters) for each in self.programs])
 
@@ -175,7 +164,7 @@ class PathTasks:
         return [c for c in first.constraints(self.robot.length) if c.first < first.n_own_rows]
 
     @cached_property
-    def radii(self) -> Vector:
+    def radii(self) -> Array:
         """Radii (N, c) of the own constraints at each point."""
         count = len(self.own_constraints)
         return np.array([each.radii[:count] for each in self.programs])
@@ -183,11 +172,11 @@ class PathTasks:
     def __len__(self) -> int:
         return len(self.tasks)
 
-    def near(self, index: int, count: int) -> Vector:
+    def near(self, index: int, count: int) -> Array:
         """Return the sampled pressures (count, n) whose tips are nearest to a point's target."""
         table = self._prepared.samples
         distances = table.distances(self.programs[index].terms, self.robot.length)
-        near: Vector = table.pressures[table.nearest_first(distances, count)]
+        near: Array = table.pressures[table.nearest_first(distances, count)]
         return near
 
     # -- local optima -----------------------------------------------------------------------
@@ -216,7 +205,7 @@ class PathTasks:
             for i, a in zip(indices, answers, strict=True)
         ]
 
-    def _row(self, index: int) -> Vector:
+    def _row(self, index: int) -> Array:
         """Return the numbers of a point's task, as machine code expects them."""
         if index not in self._rows:
             assert self._fast is not None
@@ -230,7 +219,7 @@ class PathTasks:
         return Judgement.of(self.programs[index], answer.judged, within)
 
     def accepted(
-        self, index: int, pressures: Vector, judgement: Judgement | None
+        self, index: int, pressures: Array, judgement: Judgement | None
     ) -> PathCandidate | None:
         """Return judged pressures (n,) as a candidate at a point, or None if they miss its task."""
         if judgement is None or not judgement.holds:
@@ -260,7 +249,7 @@ class PathTasks:
 
     # -- evaluation -------------------------------------------------------------------------
 
-    def brought(self, indices: NDArray[np.intp], pressures: Vector) -> Brought:
+    def brought(self, indices: NDArray[np.intp], pressures: Array) -> Brought:
         """Bring pressures (k, n) to the targets of points (k,) nearby, clear of the scene.
 
         They need not be optimal there.  Without machine code, none arrives.
@@ -270,7 +259,7 @@ class PathTasks:
         found, objectives = self._fast[0].brought(self._all_rows[indices], pressures)
         return Brought(found, -objectives)
 
-    def judged(self, pressures: Vector) -> list[Judgement | None]:
+    def judged(self, pressures: Array) -> list[Judgement | None]:
         """Judge pressures (N, n), one row for each point; None where there is no equilibrium."""
         if self._fast is None:
             return [self.judged_at(index, p) for index, p in enumerate(pressures)]
@@ -279,14 +268,14 @@ class PathTasks:
         answers = enumerate(solver.solve_all(np.stack(rows)))
         return [answer and self._judgement(index, answer) for index, answer in answers]
 
-    def judged_at(self, index: int, pressures: Vector) -> Judgement | None:
+    def judged_at(self, index: int, pressures: Array) -> Judgement | None:
         """Judge pressures (n,) at one point; None if there is no equilibrium."""
         try:
             return judge(self.robot, self._without_load[index], pressures)
         except EquilibriumError:
             return None
 
-    def candidate(self, index: int, pressures: Vector) -> PathCandidate | None:
+    def candidate(self, index: int, pressures: Array) -> PathCandidate | None:
         """Return pressures (n,) as a candidate at a point, or None if they miss its task."""
         return self.accepted(index, pressures, self.judged_at(index, pressures))
 
@@ -299,7 +288,7 @@ class PathTasks:
                 return False
         return True
 
-    def slopes(self, indices: Sequence[int], pressures: Vector) -> Slopes | None:
+    def slopes(self, indices: Sequence[int], pressures: Array) -> Slopes | None:
         """Linearise the tasks at some points about pressures (k, n); None without equilibrium."""
         if self.robot.is_loaded:
             parts = [self._loaded(i, p) for i, p in zip(indices, pressures, strict=True)]
@@ -317,7 +306,7 @@ class PathTasks:
             gradients.swapaxes(1, 2) * self.unit,
         )
 
-    def _loaded(self, index: int, pressures: Vector) -> tuple[Vector, ...] | None:
+    def _loaded(self, index: int, pressures: Array) -> tuple[Array, ...] | None:
         """Return `Slopes` at one point of a loaded arm; None if it has no equilibrium."""
         program = self.programs[index]
         if self._fast is not None:

@@ -16,14 +16,14 @@ import clarabel
 import numpy as np
 from scipy import sparse
 
+from stiffopt.arrays import Array
 from stiffopt.model.stopping import checkpoint
 from stiffopt.paths.cones import minimised
-from stiffopt.paths.links import Vector
 from stiffopt.paths.points import PathCandidate, PathTasks, Slopes
 from stiffopt.paths.settings import QUICKENING, REFINEMENT
 
 
-def share_of(steps: Vector, pressures: Vector) -> float:
+def share_of(steps: Array, pressures: Array) -> float:
     """Return the largest share of steps (N - 1, n) that pressures (N, n) use."""
     return float((np.abs(np.diff(pressures, axis=0)) / steps).max())
 
@@ -31,7 +31,7 @@ def share_of(steps: Vector, pressures: Vector) -> float:
 def quickened(
     tasks: PathTasks,
     found: list[PathCandidate],
-    steps: Vector,
+    steps: Array,
     fixed: Collection[int],
     is_closed: bool = False,
 ) -> list[PathCandidate]:
@@ -81,9 +81,9 @@ class _Program:
         self,
         tasks: PathTasks,
         slopes: Slopes,
-        pressures: Vector,
-        steps: Vector,
-        move: Vector,
+        pressures: Array,
+        steps: Array,
+        move: Array,
         is_closed: bool,
     ) -> None:
         self._tasks, self._slopes, self._pressures = tasks, slopes, pressures
@@ -121,7 +121,7 @@ class _Program:
             else:
                 self._cones += [clarabel.SecondOrderConeT(rows.shape[1])] * len(rows)
 
-    def solved(self, at: Vector | None = None, there: Slopes | None = None) -> Vector | None:
+    def solved(self, at: Array | None = None, there: Slopes | None = None) -> Array | None:
         """Return better pressures (N, n); None if the program fails.
 
         Linear constraints are exact at pressures `at`, whose residuals are those of `there`; by

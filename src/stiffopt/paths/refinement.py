@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
+from stiffopt.arrays import Array
 from stiffopt.model.stopping import checkpoint
 from stiffopt.optimise.program import Constraint
 from stiffopt.optimise.settings import DESCENT
@@ -29,14 +30,13 @@ from stiffopt.paths.cones import minimised
 from stiffopt.paths.points import PathTasks, Slopes, joined
 from stiffopt.paths.settings import REFINEMENT
 
-Vector = NDArray[np.float64]
 Entries = tuple[NDArray[Any], NDArray[Any], NDArray[Any]]
 """Rows, columns and values of entries of a matrix."""
 
 
 def refined(
-    tasks: PathTasks, pressures: Vector, steps: Vector, over: str, fixed: Collection[int] = ()
-) -> Vector:
+    tasks: PathTasks, pressures: Array, steps: Array, over: str, fixed: Collection[int] = ()
+) -> Array:
     """Return pressures (N, n) that are better where the rates bind.
 
     A window in which the body would not keep clear is left as it was.
@@ -78,7 +78,7 @@ def _wider(window: range, count: int) -> range:
     return range(max(0, window.start - len(window)), min(count, window.stop + len(window)))
 
 
-def _windows(pressures: Vector, steps: Vector) -> list[range]:
+def _windows(pressures: Array, steps: Array) -> list[range]:
     """Return windows of points about steps that are near the rates; overlapping ones are joined."""
     near = (np.abs(np.diff(pressures, axis=0)) > REFINEMENT.near * steps).any(axis=1)
     margin, count = REFINEMENT.margin, len(pressures)
@@ -88,22 +88,15 @@ def _windows(pressures: Vector, steps: Vector) -> list[range]:
 
 @dataclass
 class _State:
-    """A window at some pressures, with its linearisation.
+    """A window at some pressures, with its linearisation."""
 
-    Attributes
-    ----------
-    x : ndarray (k, n)
-        As shares of the ranges.
-    slopes : Slopes
-    near, near_slopes : ndarray (k, b), (k, b, n)
-        Values of one-sided constraints, which must be at most 0, and their derivatives.
-    merit, excess : the merit function, and the sum of the constraints' violations.
-    """
-
-    x: Vector
+    x: Array  # ndarray (k, n) As shares of the ranges
     slopes: Slopes
-    near: Vector
-    near_slopes: Vector
+    # near, near_slopes: ndarray (k, b), (k, b, n) Values of one-sided constraints, which must be at
+    # most 0, and their derivatives
+    near: Array
+    near_slopes: Array
+    # merit, excess: the merit function, and the sum of the constraints' violations
     merit: float
     excess: float
 
@@ -111,9 +104,9 @@ class _State:
 class _Step(NamedTuple):
     """A step d (k, n), multipliers of costs (k, t) and residuals (k, m), and the predicted gain."""
 
-    d: Vector
-    weights: Vector
-    pulls: Vector
+    d: Array
+    weights: Array
+    pulls: Array
     promised: float
 
 
@@ -123,8 +116,8 @@ class _Window:
     def __init__(
         self,
         tasks: PathTasks,
-        pressures: Vector,
-        steps: Vector,
+        pressures: Array,
+        steps: Array,
         over: str,
         window: range,
         fixed: Collection[int],
@@ -148,7 +141,7 @@ class _Window:
                 self._floor = float(slopes.costs.max())
         self._price = REFINEMENT.price
 
-    def optimised(self) -> Vector:
+    def optimised(self) -> Array:
         """Return all pressures (N, n), with those of the window optimised."""
         state = self._state(self._x[self._free.start : self._free.stop])
         if state is None:
@@ -196,14 +189,14 @@ class _Window:
     # -- evaluation -----------------------------------------------------------------------------
 
     @staticmethod
-    def _bent(state: _State, trial: _State, d: Vector) -> _State:
+    def _bent(state: _State, trial: _State, d: Array) -> _State:
         """Return a state with linear constraints exact at a step d (second-order correction)."""
         bend = np.einsum("kmn,kn->km", state.slopes.jacobians, d)
         residuals = trial.slopes.residuals - bend
         near = trial.near - np.einsum("kbn,kn->kb", state.near_slopes, d)
         return replace(state, slopes=state.slopes._replace(residuals=residuals), near=near)
 
-    def _state(self, x: Vector) -> _State | None:
+    def _state(self, x: Array) -> _State | None:
         tasks, pressures = self._tasks, x * self._tasks.unit
         slopes = tasks.slopes(self._free, pressures)
         if slopes is None or not all(np.isfinite(each).all() for each in slopes):
@@ -219,11 +212,11 @@ class _Window:
             merit = max(float(costs.max()), self._floor) + REFINEMENT.mean * merit
         return _State(x, slopes, near, near_slopes, merit + self._price * excess, excess)
 
-    def _near(self, slopes: Slopes, pressures: Vector) -> tuple[Vector, Vector]:
+    def _near(self, slopes: Slopes, pressures: Array) -> tuple[Array, Array]:
         """Return scaled inequalities of terms and clearances, each to be at most 0."""
         k, n = pressures.shape
-        values: list[Vector] = []
-        derivatives: list[Vector] = []
+        values: list[Array] = []
+        derivatives: list[Array] = []
         for c, radii in self._one_sided:
             values.append((slopes.residuals[:, c.first] - radii) / c.scale)
             derivatives.append(slopes.jacobians[:, c.first] / c.scale)
@@ -237,13 +230,13 @@ class _Window:
             return np.zeros((k, 0)), np.zeros((k, 0, n))
         return np.stack(values, axis=1), np.stack(derivatives, axis=1)
 
-    def _curvature(self, state: _State, weights: Vector, pulls: Vector) -> Vector:
+    def _curvature(self, state: _State, weights: Array, pulls: Array) -> Array:
         """Return the convex part (k, n, n) of the Lagrangian's second derivatives."""
         k, n = state.x.shape
         h = REFINEMENT.difference
 
-        def gradients(slopes: Slopes) -> Vector:
-            found: Vector = np.einsum("kt,ktn->kn", weights, slopes.gradients)
+        def gradients(slopes: Slopes) -> Array:
+            found: Array = np.einsum("kt,ktn->kn", weights, slopes.gradients)
             found += np.einsum("km,kmn->kn", pulls, slopes.jacobians)
             return found
 
@@ -258,12 +251,12 @@ class _Window:
         H = np.stack(columns, axis=2)
         values, vectors = np.linalg.eigh((H + H.swapaxes(1, 2)) / 2)
         values = np.maximum(values, 1e-6)
-        convex: Vector = (vectors * values[:, np.newaxis, :]) @ vectors.swapaxes(1, 2)
+        convex: Array = (vectors * values[:, np.newaxis, :]) @ vectors.swapaxes(1, 2)
         return convex
 
     # -- the convex program ---------------------------------------------------------------------
 
-    def _step(self, state: _State, curvature: Vector, radius: float) -> _Step | None:
+    def _step(self, state: _State, curvature: Array, radius: float) -> _Step | None:
         """Solve the convex program for a step; None if that fails."""
         k, n = state.x.shape
         costs = state.slopes.costs
@@ -318,7 +311,7 @@ class _Window:
         hoped = float(q @ x)
         return _Step(d, weights, pulls, state.merit - hoped)
 
-    def _add_rates(self, rows: "_Rows", x: Vector) -> None:
+    def _add_rates(self, rows: "_Rows", x: Array) -> None:
         """Add the rates between points of the window, and to the neighbours outside."""
         k, n = x.shape
         first, last = self._free.start, self._free.stop - 1
@@ -343,7 +336,7 @@ class _Window:
                 )
 
     def _add_ball(
-        self, rows: "_Rows", state: _State, ball: Constraint, radii: Vector, slack: int
+        self, rows: "_Rows", state: _State, ball: Constraint, radii: Array, slack: int
     ) -> None:
         """Add the scaled cones ``(radius + slack, r + J d)`` of one constraint, radii (k,)."""
         k, n = state.x.shape
@@ -371,16 +364,16 @@ class _Rows:
 
     def __init__(self, size: int) -> None:
         self._size, self.count = size, 0
-        self._bounds: list[Vector] = []
+        self._bounds: list[Array] = []
         self._entries: list[Entries] = []
 
-    def add(self, bounds: Vector, *entries: Entries) -> None:
+    def add(self, bounds: Array, *entries: Entries) -> None:
         """Add rows with these b, and entries (row from the first of them, column, value)."""
         self._bounds.append(bounds)
         self._entries += [(row + self.count, column, value) for row, column, value in entries]
         self.count += len(bounds)
 
-    def add_upper(self, values: Vector, slopes: Vector, bound: int) -> None:
+    def add_upper(self, values: Array, slopes: Array, bound: int) -> None:
         """Bound linearised values (k, b) of k points, with slopes (k, b, n), each by a variable.
 
         The bounds are the k variables from column `bound` on.
@@ -394,7 +387,7 @@ class _Rows:
                 (index, bound + point, -np.ones(k * b)),
             )
 
-    def matrix(self) -> tuple[sparse.csc_matrix, Vector]:
+    def matrix(self) -> tuple[sparse.csc_matrix, Array]:
         """Return A and b."""
         row, column, value = (np.concatenate(each) for each in zip(*self._entries, strict=True))
         A = sparse.csc_matrix((value, (row, column)), shape=(self.count, self._size))

@@ -5,15 +5,15 @@ from dataclasses import replace
 
 import numpy as np
 
+from stiffopt.arrays import Array
 from stiffopt.model.stopping import checkpoint
-from stiffopt.paths.links import Vector
 from stiffopt.paths.points import Local, PathCandidate, PathTasks
 from stiffopt.paths.route import Route
 from stiffopt.paths.settings import ROUTE
 
 
 def relaxed(
-    tasks: PathTasks, route: Route, steps: Vector, best: Vector, fixed: Collection[int]
+    tasks: PathTasks, route: Route, steps: Array, best: Array, fixed: Collection[int]
 ) -> Route:
     """Return a sequence whose points are moved one by one, each between its neighbours.
 
@@ -43,7 +43,7 @@ def relaxed(
 
 
 def _move(
-    tasks: PathTasks, found: list[PathCandidate], points: Sequence[int], steps: Vector
+    tasks: PathTasks, found: list[PathCandidate], points: Sequence[int], steps: Array
 ) -> list[bool]:
     """Move some points of a sequence, in place, if they become stiffer; return which moved."""
     p = [each.pressures for each in found]

@@ -14,9 +14,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from stiffopt.arrays import Array
 from stiffopt.model.stopping import checkpoint
 from stiffopt.paths.crossings import crossed, crossings
-from stiffopt.paths.links import Layers, Links, Vector, all_steps
+from stiffopt.paths.links import Layers, Links, all_steps
 from stiffopt.paths.points import BodyCheck, PathCandidate, PathTasks
 from stiffopt.paths.sequences import LinkedSequence, Sequences, compiled
 from stiffopt.paths.settings import ROUTE
@@ -26,16 +27,14 @@ from stiffopt.paths.settings import ROUTE
 class Route:
     """A sequence of candidates, one at each point.
 
-    Attributes
-    ----------
-    crossings : number of crossings from branch to branch.
+    `crossings`: number of crossings from branch to branch.
     """
 
     candidates: list[PathCandidate]
     crossings: int
 
     @property
-    def pressures(self) -> Vector:
+    def pressures(self) -> Array:
         """Pressures (N, n), in Pa."""
         return np.array([each.pressures for each in self.candidates])
 
@@ -44,7 +43,7 @@ class Route:
         values = [each.value for each in self.candidates]
         return float(min(values) if over == "worst" else np.mean(values))
 
-    def comes_up_to(self, share: float, alone: Vector, over: str) -> bool:
+    def comes_up_to(self, share: float, alone: Array, over: str) -> bool:
         """Whether it has more than this share of the single points' stiffness, values (N,)."""
         best = float(alone.min() if over == "worst" else alone.mean())
         return self.value(over) > best + math.log(share)
@@ -58,8 +57,7 @@ class RouteSearch:
     tasks : PathTasks
     layers : list of list of PathCandidate
         Local optima at each of N points.
-    steps : (N - 1, n)
-        Largest changes of pressure from point to point, in Pa.
+    steps : (N - 1, n), largest changes of pressure from point to point, in Pa.
     over : "worst" or "mean"
         Which value along the path to maximise.
     lanes : list of list of PathCandidate, optional
@@ -76,7 +74,7 @@ class RouteSearch:
         self,
         tasks: PathTasks,
         layers: Sequence[Sequence[PathCandidate]],
-        steps: Vector,
+        steps: Array,
         over: str,
         lanes: Sequence[Sequence[PathCandidate]] | None = None,
         is_closed: bool = False,

@@ -10,8 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from stiffopt.arrays import Array
 from stiffopt.model.compiled import Library, compiling_at_once, library
-from stiffopt.paths.links import Indices, Layers, Links, Vector
+from stiffopt.paths.links import Indices, Layers, Links
 
 _SOURCES = (str(Path(__file__).with_name("native") / "route.c"),)
 
@@ -95,7 +96,7 @@ class Sequences:
             at = int(self.links.origin[links[-1]])
         return LinkedSequence(at, links[::-1], worst, mean)
 
-    def _reached(self, least: float, *, bottleneck: bool, computed: bool) -> tuple[Vector, Indices]:
+    def _reached(self, least: float, *, bottleneck: bool, computed: bool) -> tuple[Array, Indices]:
         """Return for each candidate the best sequence to it: its worst value or sum, its last link.
 
         All values of a sequence are at least `least`.

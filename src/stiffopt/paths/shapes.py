@@ -9,7 +9,6 @@ from pathlib import Path as FilePath
 from typing import Annotated, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import (
     ConfigDict,
     Field,
@@ -19,6 +18,7 @@ from pydantic import (
     model_validator,
 )
 
+from stiffopt.arrays import Array
 from stiffopt.directions import Direction, unit_quaternion
 from stiffopt.errors import FileError, InputError
 from stiffopt.files import folder_of
@@ -27,8 +27,6 @@ from stiffopt.model.obstacle import Point, Radius
 from stiffopt.optimise.target import Target
 from stiffopt.paths.geometry import ArcCurve, Curve, Polyline, SplineCurve, arc_through
 from stiffopt.schema import BadKeyError, Items, Schema
-
-Vector = NDArray[np.float64]
 
 _OFF_CIRCLE = 1e-5  # m, tolerated distance of a circle's start from the circle, for rounding
 _APART = 1e-9  # m, distance from which the ends of a closed path count as different points
@@ -199,7 +197,7 @@ class PathShape(Schema):
         return Polyline(points, closed)
 
     @staticmethod
-    def _knots(spline: tuple[tuple[float, float, float], ...], closed: bool) -> Vector:
+    def _knots(spline: tuple[tuple[float, float, float], ...], closed: bool) -> Array:
         """Return the points (k, 3) of a spline; a closed one ends at the first."""
         if len(spline) < 2:
             raise BadKeyError("spline", f"expected at least 2 points, not {len(spline)}")
@@ -214,7 +212,7 @@ class PathShape(Schema):
             raise BadKeyError("spline", "expected at least 3 points, as the path is closed")
         return points
 
-    def _positions(self) -> Vector:
+    def _positions(self) -> Array:
         """Return the positions (N, 3) of listed points."""
         if self.table is not None:
             return np.array(self.table.positions)
@@ -307,7 +305,7 @@ def _check_columns(file: FilePath, columns: tuple[str, ...]) -> None:
 # -- words ----------------------------------------------------------------------------------------
 
 
-def fault_of_times(times: Vector) -> tuple[int, str] | None:
+def fault_of_times(times: Array) -> tuple[int, str] | None:
     """Return the index of the first invalid time and the fault; None if all are valid."""
     if times[0] != 0:
         return 0, f"begins at {times[0]:g} s; expected 0 s"

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.paths.geometry import interpolated
 from stiffopt.paths.tree_search import IsClear
-
-Vector = NDArray[np.float64]
 
 _SHORTCUTS = 60  # largest number tried
 _IN_VAIN = 12  # consecutive failed shortcuts after which to stop
@@ -18,7 +16,7 @@ _CHORDS = 8  # in a rounded corner
 _FLAT = 0.999  # cosine above which a corner counts as straight
 
 
-def shortened(way: Vector, is_clear: IsClear, scale: Vector, seed: int) -> Vector:
+def shortened(way: Array, is_clear: IsClear, scale: Array, seed: int) -> Array:
     """Return a shorter way (k, n), by skipping corners and by random shortcuts.
 
     Parameters
@@ -47,7 +45,7 @@ def shortened(way: Vector, is_clear: IsClear, scale: Vector, seed: int) -> Vecto
     return _without_corners(way, is_clear)
 
 
-def _without_corners(way: Vector, is_clear: IsClear) -> Vector:
+def _without_corners(way: Array, is_clear: IsClear) -> Array:
     """Skip corners: connect each point with the last one to which the straight way is clear."""
     kept, here = [0], 0
     while here < len(way) - 1:
@@ -56,17 +54,17 @@ def _without_corners(way: Vector, is_clear: IsClear) -> Vector:
             ahead -= 1
         here = ahead
         kept.append(here)
-    found: Vector = way[kept]
+    found: Array = way[kept]
     return found
 
 
-def _marks(way: Vector, scale: Vector) -> Vector:
+def _marks(way: Array, scale: Array) -> Array:
     """Return the length (m,) from the start to each point."""
     steps = np.linalg.norm(np.diff(way, axis=0) / scale, axis=1)
     return np.concatenate([[0.0], np.cumsum(steps)])
 
 
-def rounded(way: Vector, is_clear: IsClear, scale: Vector) -> Vector:
+def rounded(way: Array, is_clear: IsClear, scale: Array) -> Array:
     """Replace corners by parabolic arcs (in chords), the widest that are clear.
 
     If all corners can be as wide as possible, the result is a quadratic B-spline.
@@ -80,7 +78,7 @@ def rounded(way: Vector, is_clear: IsClear, scale: Vector) -> Vector:
     return np.asarray(found[np.concatenate([[True], moves])])
 
 
-def _corner(corner: Vector, lengths: Vector, is_clear: IsClear, scale: Vector) -> Vector:
+def _corner(corner: Array, lengths: Array, is_clear: IsClear, scale: Array) -> Array:
     before, at, after = corner
     into, out = (at - before) / lengths[0], (after - at) / lengths[1]
     if float((into / scale) @ (out / scale)) > _FLAT:

@@ -3,8 +3,8 @@
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array, Flags
 from stiffopt.display import display_units
 from stiffopt.errors import InputError
 from stiffopt.model.contact.equilibrium import ContactEquilibrium
@@ -12,8 +12,6 @@ from stiffopt.model.manipulator import Manipulator
 from stiffopt.notebook import ShownInNotebook
 from stiffopt.optimise.solution import Status
 from stiffopt.paths.trajectory import Trajectory, trajectory_through
-
-Vector = NDArray[np.float64]
 
 LEANS = (
     "leans on objects, and is not followed as a trajectory: give the rig its task, and the daemon "
@@ -67,16 +65,16 @@ class PathSolution(ShownInNotebook):
     status: Status
     message: str
     robot: Manipulator
-    times: Vector
-    pressures: Vector
-    tip_poses: Vector
-    slew: Vector | None = None
-    stiffness: Vector | None = None
+    times: Array
+    pressures: Array
+    tip_poses: Array
+    slew: Array | None = None
+    stiffness: Array | None = None
     stiffness_unit: str | None = None
-    alone: Vector | None = None
-    position_errors: Vector | None = None
-    angle_errors: Vector | None = None
-    clearance: Vector | None = None
+    alone: Array | None = None
+    position_errors: Array | None = None
+    angle_errors: Array | None = None
+    clearance: Array | None = None
     equilibria: tuple[ContactEquilibrium, ...] = ()
     first_failure: int | None = None
     confidence: str = ""
@@ -84,7 +82,7 @@ class PathSolution(ShownInNotebook):
 
     @classmethod
     def without_answer(
-        cls, status: Status, message: str, robot: Manipulator, slew: Vector | None
+        cls, status: Status, message: str, robot: Manipulator, slew: Array | None
     ) -> "PathSolution":
         """Return a solution with a message alone."""
         none = np.zeros((0, robot.n_pressures))
@@ -101,7 +99,7 @@ class PathSolution(ShownInNotebook):
         return self.equilibria[own] if own >= 0 else None
 
     @property
-    def leans(self) -> NDArray[np.bool_]:
+    def leans(self) -> Flags:
         """Flags (N,) of the points at which the arm is in contact."""
         own = [bool(eq.contacts) for eq in self.equilibria]
         return np.array([False] * (len(self.times) - len(own)) + own)

@@ -3,8 +3,8 @@
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.errors import EquilibriumError, InputError, StoppedError, shown
 from stiffopt.model.compiled import Stopwatch
 from stiffopt.model.manipulator import Manipulator
@@ -20,8 +20,6 @@ from stiffopt.paths.points import PathCandidate, PathTasks
 from stiffopt.paths.rates import least_times, step_limits
 from stiffopt.paths.settings import RATES
 from stiffopt.paths.solution import PathSolution
-
-Vector = NDArray[np.float64]
 
 
 def solve_path(
@@ -130,7 +128,7 @@ class _PathSolver:
     ) -> tuple[PathTasks, list[list[PathCandidate]]]:
         """Return tasks and candidates in which unreachable points are moved to the nearest pose."""
         moved = list(self._tasks)
-        closest: dict[int, Vector] = {}
+        closest: dict[int, Array] = {}
         for index, layer in enumerate(layers):
             if layer:
                 continue
@@ -202,7 +200,7 @@ class _PathSolver:
         tasks: PathTasks,
         layers: list[list[PathCandidate]],
         attempts: RouteAttempts,
-        steps: Vector,
+        steps: Array,
     ) -> PathSolution:
         """Return the answer when no sequence was found: the path up to where it ends."""
         if self._unreachable is not None:
@@ -219,13 +217,13 @@ class _PathSolver:
         solution = self._answers.judged(tasks, pressures, times, attempts.alone[:count], None)
         return self._answers.cut_short(solution, pressures, beyond)
 
-    def _steps(self, tasks: PathTasks, times: Vector | None) -> Vector:
+    def _steps(self, tasks: PathTasks, times: Array | None) -> Array:
         """Return the largest changes (N - 1, n) of the pressures from point to point."""
         if times is None or self._slew is None:
             return np.tile(RATES.largest_step * tasks.unit, (len(tasks) - 1, 1))
         return step_limits(times, self._slew)
 
-    def _fastest(self, pressures: Vector) -> Vector:
+    def _fastest(self, pressures: Array) -> Array:
         """Return the earliest times (N,) of the points that the rates allow."""
         if self._slew is None:
             raise self._path.error_at(

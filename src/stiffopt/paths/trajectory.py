@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from stiffopt.arrays import Array
 from stiffopt.errors import InputError
 from stiffopt.optimise.target import Target
 from stiffopt.schema import Items, Schema
@@ -72,7 +73,7 @@ class Trajectory(Schema):
         return self.waypoints[-1].time
 
     @property
-    def pressures(self) -> NDArray[np.float64] | None:
+    def pressures(self) -> Array | None:
         """Pressures of all waypoints (k, n), in Pa; None if they have none."""
         if self.waypoints[0].pressures is None:
             return None
@@ -80,16 +81,18 @@ class Trajectory(Schema):
 
 
 def trajectory_through(
-    times: NDArray[np.float64],
-    pressures: NDArray[np.float64],
-    tips: NDArray[np.float64],
-    ranges: NDArray[np.float64],
+    times: Array,
+    pressures: Array,
+    tips: Array,
+    ranges: Array,
     begin: float = 0.0,
 ) -> Trajectory:
     """Return a trajectory from pressures and the resulting tip positions.
 
     If there are more points than a trajectory may have, or points closer in time, those are left
     out whose pressures linear interpolation reproduces to a thousandth of their range.
+
+    Raises `InputError`: too many points remain.
 
     Parameters
     ----------
@@ -98,11 +101,6 @@ def trajectory_through(
     tips : (N, 3), in m, in the base frame.
     ranges : (n,), ranges of the pressures, in Pa.
     begin : time of the first point, in s; it leaves the arm time to go there.
-
-    Raises
-    ------
-    InputError
-        Too many points remain.
     """
     kept = np.arange(len(times))
     if len(kept) > MAX_WAYPOINTS or (np.diff(times) < CLOSEST).any():
@@ -140,9 +138,7 @@ def check_times(times: list[float]) -> None:
             )
 
 
-def without_straight(
-    times: NDArray[np.float64], values: NDArray[np.float64], tolerance: float
-) -> NDArray[np.intp]:
+def without_straight(times: Array, values: Array, tolerance: float) -> NDArray[np.intp]:
     """Return indices (k,) of the points needed to interpolate values (N, n) linearly in time (N,).
 
     The first and the last point are kept; then, wherever the error exceeds the tolerance in any

@@ -11,13 +11,12 @@ from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.errors import StoppedError, require_package
 from stiffopt.model.stopping import checkpoint
 
-Vector = NDArray[np.float64]
-IsClear = Callable[[Vector], bool]
+IsClear = Callable[[Array], bool]
 """Returns whether the way along rows of pressures (N, n) is clear."""
 
 _RANGE = 0.3  # longest branch, as a share of the space's diagonal
@@ -26,20 +25,18 @@ _RANGE = 0.3  # longest branch, as a share of the space's diagonal
 class TreeSearch:
     """Searches for ways between pressures (n,) in Pa.
 
+    Raises `MissingExtraError`.
+
     Parameters
     ----------
     is_clear : checks motions.
     low, high : limits of the pressures, (n,).
     weights : (n,), bound on the body's displacement per pressure, in m/Pa.
     seed : the same seed gives the same ways, unless time ends the search.
-
-    Raises
-    ------
-    MissingExtraError
     """
 
     def __init__(
-        self, is_clear: IsClear, low: Vector, high: Vector, weights: Vector, seed: int
+        self, is_clear: IsClear, low: Array, high: Array, weights: Array, seed: int
     ) -> None:
         require_package("ompl", "plan")
         self._is_clear, self._seed = is_clear, seed
@@ -48,7 +45,7 @@ class TreeSearch:
         self._weights = weights[self._free]
         self.tried = 0
 
-    def way(self, start: Vector, goals: Vector, most: float) -> tuple[Vector | None, Vector | None]:
+    def way(self, start: Array, goals: Array, most: float) -> tuple[Array | None, Array | None]:
         """Search a way (k, n) from the start to one of the goals (N, n).
 
         The search ends after checking `most` motions. Without a way it returns None, and, if known,
@@ -98,7 +95,7 @@ class TreeSearch:
                 return path, None
             return None, path[-1]
 
-    def _validator(self, base: Any, info: Any, start: Vector) -> Any:
+    def _validator(self, base: Any, info: Any, start: Array) -> Any:
         """Return the check of a motion between two states, as OMPL expects it."""
         search, count = self, len(self._free)
         rows, weights = np.stack([start, start]), self._weights
@@ -115,12 +112,12 @@ class TreeSearch:
 
         return Motions(info)
 
-    def _state(self, info: Any, p: Vector) -> Any:
+    def _state(self, info: Any, p: Array) -> Any:
         state = info.allocState()
         state[0 : len(self._free)] = (self._weights * p[self._free]).tolist()
         return state
 
-    def _pressures(self, state: Any, start: Vector) -> Vector:
+    def _pressures(self, state: Any, start: Array) -> Array:
         p = start.copy()
         p[self._free] = state[0 : len(self._free)] / self._weights
         return np.clip(p, self._low, self._high)

@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.polynomial import legendre
-from numpy.typing import NDArray
 
 from stiffopt import lie
+from stiffopt.arrays import Array
 from stiffopt.errors import InputError
 from stiffopt.model.description import Compensation, Corrections, RobotDescription, Segment
 from stiffopt.model.history import NO_HISTORY, Memory
@@ -17,8 +17,6 @@ from stiffopt.plant.material import LINEAR, YEOH, SectionMaterial
 from stiffopt.plant.rod import DiscreteRod
 from stiffopt.plant.settings import Mismatch, PlantSettings
 from stiffopt.registration import Placement
-
-Array = NDArray[np.float64]
 
 _ON_RING = 6  # fibres on each of two rings
 _SAME = 1e-6  # of a segment's length; a load as near to a node as this acts on the node
@@ -28,11 +26,9 @@ _DENSITY = 1070.0  # kg/m^3, of silicone; for robots without gravity and density
 class ChannelEffects(NamedTuple):
     """The effect of the channels: corrections of the robot file, plus the mismatch.
 
-    Attributes
-    ----------
-    dead_band, gain, offset : (n,); ``gain onset(p) + offset`` acts if the shape is that of the
-        pressure p, Pa; see `stiffopt.model.description.Corrections`.
-    angle : rotation of the channel's chambers about the axis (n,), rad.
+    `dead_band`, `gain`, `offset`: (n,); ``gain onset(p) + offset`` acts if the shape is that of the
+    pressure p, Pa; see `stiffopt.model.description.Corrections`. `angle`: rotation of the channel's
+    chambers about the axis (n,), rad.
     """
 
     dead_band: Array
@@ -142,15 +138,8 @@ def make_rod(
 def station_of(robot: RobotDescription, at: float) -> tuple[int, float, float]:
     """Return segment (from 0), place within it (0 to 1) and lever on its connector (m).
 
-    Parameters
-    ----------
-    robot : defines the lengths; those of the simulated arm do not count.
-    at : arc length at rest, connectors included, in m.
-
-    Raises
-    ------
-    InputError
-        The arm is shorter.
+    `robot`: defines the lengths; those of the simulated arm do not count. `at`: arc length at rest,
+    connectors included, in m. Raises `InputError`: the arm is shorter.
     """
     begin = 0.0
     for s, segment in enumerate(robot.segments):
@@ -225,10 +214,7 @@ def make_material(
 ) -> SectionMaterial:
     """Return the sections of the arm; `viscosity` is the dashpot's over E, in s.
 
-    Raises
-    ------
-    InputError
-        The robot file has a compensation that the simulator does not support.
+    Raises `InputError`: the robot file has a compensation that the simulator does not support.
     """
     silicone = settings.silicone
     n = robot.n_segments
@@ -349,10 +335,7 @@ def node_at(robot: RobotDescription, rod: DiscreteRod, at: float) -> tuple[int, 
 def draw(robot: RobotDescription, settings: PlantSettings) -> Mismatch:
     """Return the mismatch of the settings, plus a random part from their spread and seed.
 
-    Raises
-    ------
-    InputError
-        A list does not have one value per channel or per segment.
+    Raises `InputError`: a list does not have one value per channel or per segment.
     """
     given = settings.mismatch
     channels, segments = robot.n_pressures, robot.n_segments

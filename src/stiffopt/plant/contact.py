@@ -41,54 +41,34 @@ class Surroundings(NamedTuple):
     """Objects that the body may touch, and the points on it.
 
     There are k objects, m pieces, P points and N nodes.
-
-    Attributes
-    ----------
-    kind : of the objects (k,): `LINE` (sphere, capsule), `TUBE`, `PLANE`, `CYLINDER` or `BOX`.
-    first_piece : of the objects (k + 1,); a distance is the largest of the pieces' distances.
-    numbers : of the pieces (m, 15), see `stiffopt.model.obstacle.Obstacle.pieces`.
-    begin : arc length at rest from which the body counts (k,), m.
-    friction : coefficient (k,).
-    stiffness : of the objects (k,), N/m; infinite for rigid ones.
-    first_point : first point after each node (N + 1,).
-    at : arc length of the points at rest (P,), m.
-    share : position of the points between two nodes (P,), from 0 to 1.
-    radius, spring : of the body there (P,), m, and stiffness of the springs, N/m.
     """
 
+    # of the objects (k,): `LINE` (sphere, capsule), `TUBE`, `PLANE`, `CYLINDER` or `BOX`
     kind: Array
+    # of the objects (k + 1,); a distance is the largest of the pieces' distances
     first_piece: Array
-    numbers: Array
-    begin: Array
-    friction: Array
-    stiffness: Array
-    first_point: Array
-    at: Array
-    share: Array
+    numbers: Array  # of the pieces (m, 15), see `stiffopt.model.obstacle.Obstacle.pieces`
+    begin: Array  # arc length at rest from which the body counts (k,), m
+    friction: Array  # coefficient (k,)
+    stiffness: Array  # of the objects (k,), N/m; infinite for rigid ones
+    first_point: Array  # first point after each node (N + 1,)
+    at: Array  # arc length of the points at rest (P,), m
+    share: Array  # position of the points between two nodes (P,), from 0 to 1
+    # radius, spring: of the body there (P,), m, and stiffness of the springs, N/m
     radius: Array
     spring: Array
 
 
 class ContactForces(NamedTuple):
-    """Forces of the objects on the arm, and buffers for their computation.
+    """Forces of the objects on the arm, and buffers for their computation."""
 
-    Attributes
-    ----------
-    wrench : on the nodes, in base axes (N, 6).
-    force : of each object (k, 3), in base axes, N.
-    middle : arc length at rest of the middle of each contact (k,), m.
-    deepest : greatest depth of the body in each object (k,), m.
-    grip : stretch of the springs across the normals (k, P, 3), m.
-    energy : in all springs (1,), J.
-    depth, normal : of the points in the present object (P,), m, and (P, 3).
-    """
-
-    wrench: Array
-    force: Array
-    middle: Array
-    deepest: Array
-    grip: Array
-    energy: Array
+    wrench: Array  # on the nodes, in base axes (N, 6)
+    force: Array  # of each object (k, 3), in base axes, N
+    middle: Array  # arc length at rest of the middle of each contact (k,), m
+    deepest: Array  # greatest depth of the body in each object (k,), m
+    grip: Array  # stretch of the springs across the normals (k, P, 3), m
+    energy: Array  # in all springs (1,), J
+    # depth, normal: of the points in the present object (P,), m, and (P, 3)
     depth: Array
     normal: Array
 

@@ -7,8 +7,9 @@ from contextlib import suppress
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from stiffopt.arrays import Array
 from stiffopt.errors import CommandError, DeviceError
 from stiffopt.model.description import RobotDescription
 from stiffopt.plant.plant import SimulationError
@@ -25,8 +26,6 @@ from stiffopt.rig.interface import (
     RawPose,
     Rig,
 )
-
-Array = NDArray[np.float64]
 
 _TICK = 0.005  # s between checks of a moving stage
 
@@ -170,9 +169,7 @@ class SimulatedProbe(ForceProbe):
 class SimulatedRig(Rig):
     """A rig whose arm is simulated.
 
-    Attributes
-    ----------
-    world : the simulated truth, which no controller may read, and the place to inject faults.
+    `world`: the simulated truth, which no controller may read, and the place to inject faults.
     """
 
     world: World
@@ -182,7 +179,7 @@ def simulated_rig(
     description: Any,
     robot: RobotDescription,
     limits: PressureLimits,
-    slew: NDArray[np.float64] | None = None,
+    slew: Array | None = None,
     *,
     real_time: bool = False,
 ) -> SimulatedRig:

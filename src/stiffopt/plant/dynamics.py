@@ -60,32 +60,25 @@ _REACH = 0.015  # m; converts curvatures to strains
 
 
 class RodState(NamedTuple):
-    """The rod's state, which changes with time. n coefficients, N nodes.
+    """The rod's state, which changes with time. n coefficients, N nodes."""
 
-    Attributes
-    ----------
-    q, momentum : (n,).
-    rate, last_rate : of q during the last two steps (n,), 1/s; the next step's guess extrapolates
-        them.
-    rotations, positions : of the nodes (N, 3, 3), (N, 3), always consistent with q.
-    inverse : of the tangent (n, n).
-    tangent_of : step and kind of equations of the tangent (2,); 0 if there is none.
-    totals : energy dissipated, work of the pressures, and of loads and the plate, so far, and the
-        present energy in the contact along the body (4,), J.
-    memory : of the fibres.
-    grip : stretch of the contact's springs across the normals, see `ContactForces` (k, P, 3), m.
-    """
-
+    # q, momentum: (n,)
     q: Array
     momentum: Array
+    # rate, last_rate: of q during the last two steps (n,), 1/s; the next step's guess extrapolates
+    # them
     rate: Array
     last_rate: Array
+    # rotations, positions: of the nodes (N, 3, 3), (N, 3), always consistent with q
     rotations: Array
     positions: Array
-    inverse: Array
-    tangent_of: Array
+    inverse: Array  # of the tangent (n, n)
+    tangent_of: Array  # step and kind of equations of the tangent (2,); 0 if there is none
+    # energy dissipated, work of the pressures, and of loads and the plate, so far, and the present
+    # energy in the contact along the body (4,), J
     totals: Array
-    memory: FibreMemory
+    memory: FibreMemory  # of the fibres
+    # stretch of the contact's springs across the normals, see `ContactForces` (k, P, 3), m
     grip: Array
 
 
@@ -155,23 +148,16 @@ def _invert(A: Array, out: Array) -> bool:
 
 
 class Step(NamedTuple):
-    """Everything that determines one step, except the state at its beginning.
+    """Everything that determines one step, except the state at its beginning."""
 
-    Attributes
-    ----------
-    rod, around, material, scheme : see there.
-    loads : at the end of the step.
-    inertia : whether the arm has inertia.
-    pressures : in the chambers, constant (n,), Pa.
-    """
-
+    # rod, around, material, scheme: see there
     rod: DiscreteRod
     around: Surroundings
     material: SectionMaterial
     scheme: Scheme
-    loads: RodLoads
-    inertia: bool
-    pressures: Array
+    loads: RodLoads  # at the end of the step
+    inertia: bool  # whether the arm has inertia
+    pressures: Array  # in the chambers, constant (n,), Pa
 
 
 class StepBuffers(NamedTuple):

@@ -12,9 +12,10 @@ from threading import RLock
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from stiffopt import lie
+from stiffopt.arrays import Array
 from stiffopt.plant.jit import jit
 from stiffopt.plant.plant import Plant
 from stiffopt.plant.settings import (
@@ -23,7 +24,6 @@ from stiffopt.plant.settings import (
     SimulatedTrackerSettings,
 )
 
-Array = NDArray[np.float64]
 Compiled = Any  # an array of floats in compiled code; numba infers the rest
 
 IMMOBILE = ("off", "stuck")
@@ -65,6 +65,8 @@ def regulate(
 ) -> int:
     """Simulate the regulators for a number of steps.
 
+    Returns the index of the oldest set-point in the ring afterwards.
+
     Parameters
     ----------
     regulators : their parameters.
@@ -74,10 +76,6 @@ def regulate(
     pressure : in the chambers (n,), without ripple; updated.
     ripple : added at each step (m, n).
     trace : set to the pressure midway through each step (m, n).
-
-    Returns
-    -------
-    Index of the oldest set-point in the ring afterwards.
     """
     h = regulators.step
     depth = len(delayed)
@@ -128,9 +126,7 @@ class Frame:
 class Camera:
     """Simulated tracking camera: captures the sensor at the tip and delivers frames late.
 
-    Attributes
-    ----------
-    count : frames captured so far, lost ones included.
+    `count`: frames captured so far, lost ones included.
     """
 
     def __init__(

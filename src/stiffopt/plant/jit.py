@@ -71,10 +71,7 @@ def _lock() -> Iterator[None]:
 def jit(function: FunctionT) -> FunctionT:
     """Compile a function when it is first called, without the interpreter's lock.
 
-    Raises
-    ------
-    MissingExtraError
-        numba is not installed.
+    Raises `MissingExtraError`: numba is not installed.
     """
     try:
         import numba

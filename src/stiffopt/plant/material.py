@@ -23,78 +23,56 @@ _THINNEST = 0.1  # stretch below which the hyperelastic law is continued by its 
 
 
 class SectionMaterial(NamedTuple):
-    """The sections and their material, constant in time. S segments, f fibres, n channels.
+    """The sections and their material, constant in time. S segments, f fibres, n channels."""
 
-    Attributes
-    ----------
-    law : `LINEAR` or `YEOH` (neo-Hookean with no stiffening).
-    stiffening : C2 / C1 of the Yeoh law.
-    viscosity : of the dashpot, over the modulus, s.
-    creep_share, creep_time : of the Maxwell branches (c,).
-    slip_share, slip_strain : of the Jenkin elements (j,).
-    modulus, modulus_slope : of the segments (S,): E at rest in Pa, and its change per norm of the
-        segment's pressures.
-    actuation, actuation_slope : of the segments (S,): factor on the effect of pressure at rest, and
-        the slope of the modulus that free shapes show, instead of `modulus_slope`.
-    shear, torsion : G A / E and G J / E of the segments (S,).
-    centroid : of the sections (S, 2), m.
-    fibre_x, fibre_y, fibre_area : of the fibres (S, f), m and m^2.
-    first_channel : of the segments (S + 1,).
-    channel_force, channel_x, channel_y : of the channels (n,): area, and first moments of area.
-    """
-
-    law: int
-    stiffening: float
-    viscosity: float
+    law: int  # `LINEAR` or `YEOH` (neo-Hookean with no stiffening)
+    stiffening: float  # C2 / C1 of the Yeoh law
+    viscosity: float  # of the dashpot, over the modulus, s
+    # creep_share, creep_time: of the Maxwell branches (c,)
     creep_share: Array
     creep_time: Array
+    # slip_share, slip_strain: of the Jenkin elements (j,)
     slip_share: Array
     slip_strain: Array
+    # modulus, modulus_slope: of the segments (S,): E at rest in Pa, and its change per norm of the
+    # segment's pressures
     modulus: Array
     modulus_slope: Array
+    # actuation, actuation_slope: of the segments (S,): factor on the effect of pressure at rest,
+    # and the slope of the modulus that free shapes show, instead of `modulus_slope`
     actuation: Array
     actuation_slope: Array
+    # shear, torsion: G A / E and G J / E of the segments (S,)
     shear: Array
     torsion: Array
-    centroid: Array
+    centroid: Array  # of the sections (S, 2), m
+    # fibre_x, fibre_y, fibre_area: of the fibres (S, f), m and m^2
     fibre_x: Array
     fibre_y: Array
     fibre_area: Array
-    first_channel: Array
+    first_channel: Array  # of the segments (S + 1,)
+    # channel_force, channel_x, channel_y: of the channels (n,): area, and first moments of area
     channel_force: Array
     channel_x: Array
     channel_y: Array
 
 
 class FibreMemory(NamedTuple):
-    """History variables of the fibres. S segments, g Gauss points, f fibres.
+    """History variables of the fibres. S segments, g Gauss points, f fibres."""
 
-    Attributes
-    ----------
-    strain : of the fibres (S, g, f).
-    creep : strain of the Maxwell branches' dashpots (S, g, c, f).
-    slip : strain of the Jenkin elements' springs (S, g, j, f).
-    """
-
-    strain: Array
-    creep: Array
-    slip: Array
+    strain: Array  # of the fibres (S, g, f)
+    creep: Array  # strain of the Maxwell branches' dashpots (S, g, c, f)
+    slip: Array  # strain of the Jenkin elements' springs (S, g, j, f)
 
 
 class Scheme(NamedTuple):
-    """Time discretisation of one step.
+    """Time discretisation of one step."""
 
-    Attributes
-    ----------
-    step : s.
-    share : weight of the step's end in the strain for elastic stresses: 1/2 is the midpoint rule,
-        which loses no energy; 1 is backward Euler, which does not oscillate.
-    history : whether there are creep and hysteresis; without them the stresses are those in the
-        long run.
-    """
-
-    step: float
+    step: float  # s
+    # weight of the step's end in the strain for elastic stresses: 1/2 is the midpoint rule, which
+    # loses no energy; 1 is backward Euler, which does not oscillate
     share: float
+    # whether there are creep and hysteresis; without them the stresses are those in the long run
     history: bool
 
 

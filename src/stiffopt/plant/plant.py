@@ -18,8 +18,9 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from stiffopt.arrays import Array
 from stiffopt.errors import DeviceError, EquilibriumError, InputError, PressureError
 from stiffopt.model.description import RobotDescription
 from stiffopt.plant import contact, dynamics, material, rod
@@ -37,8 +38,6 @@ from stiffopt.plant.material import FibreMemory, Scheme
 from stiffopt.plant.rod import RodLoads, contact_energy, contact_force, depth_of
 from stiffopt.plant.settings import PlantLoad, PlantSettings
 
-Array = NDArray[np.float64]
-
 _STILL = 1e-3  # s, step for the stiffness against fast motions, without creep or slip
 
 
@@ -48,81 +47,49 @@ class SimulationError(DeviceError):
 
 @dataclass(frozen=True)
 class Energies:
-    """Energies of the plant, in J.
+    """Energies of the plant, in J."""
 
-    Attributes
-    ----------
-    kinetic : of the motion.
-    elastic : in the silicone, the springs of creep and hysteresis included.
-    gravity : potential, zero where the arm's mass is at the base.
-    contact : in the contact with the probe and with objects.
-    dissipated : by viscosity, creep, hysteresis, impacts and friction so far.
-    work : of the pressures so far.
-    load_work : of the load's force and of the moving probe so far (moments are not counted).
-    """
-
-    kinetic: float
-    elastic: float
-    gravity: float
-    contact: float
-    dissipated: float
-    work: float
-    load_work: float
+    kinetic: float  # of the motion
+    elastic: float  # in the silicone, the springs of creep and hysteresis included
+    gravity: float  # potential, zero where the arm's mass is at the base
+    contact: float  # in the contact with the probe and with objects
+    dissipated: float  # by viscosity, creep, hysteresis, impacts and friction so far
+    work: float  # of the pressures so far
+    load_work: float  # of the load's force and of the moving probe so far (moments are not counted)
 
 
 class ObjectForce(NamedTuple):
-    """The contact force of an object on the arm.
+    """The contact force of an object on the arm."""
 
-    Attributes
-    ----------
-    object : its name.
-    force : on the arm (3,), in base axes, in N.
-    at : arc length at rest of the middle of the contact, in m.
-    depth : greatest depth of the body in the object, in m.
-    """
-
-    object: str
-    force: Array
-    at: float
-    depth: float
+    object: str  # its name
+    force: Array  # on the arm (3,), in base axes, in N
+    at: float  # arc length at rest of the middle of the contact, in m
+    depth: float  # greatest depth of the body in the object, in m
 
 
 @dataclass(frozen=True)
 class Settling:
-    """How `Plant.settle` follows a slow arm to rest: by steps of growing length.
+    """How `Plant.settle` follows a slow arm to rest: by steps of growing length."""
 
-    Attributes
-    ----------
-    first, shortest, last : lengths of steps, in s: of the first; of the shortest one before it
-        gives up; and of the last one, after which viscosity has no effect any more.
-    growth, cut : factor on the next step after a success, and divisor after a failure.
-    tries : maximum number of steps.
-    viscosity : lower bound of the viscosity that slows the arm down, over the modulus, in s.
-    """
-
+    # first, shortest, last: lengths of steps, in s: of the first; of the shortest one before it
+    # gives up; and of the last one, after which viscosity has no effect any more
     first: float = 0.02
     shortest: float = 1e-6
     last: float = 1e9
+    # growth, cut: factor on the next step after a success, and divisor after a failure
     growth: float = 3.0
     cut: float = 5.0
-    tries: int = 400
+    tries: int = 400  # maximum number of steps
+    # lower bound of the viscosity that slows the arm down, over the modulus, in s
     viscosity: float = 0.02
 
 
 class Plant:
     """The simulated arm: chamber pressures in, poses out, step by step.
 
-    Parameters
-    ----------
-    robot : description of the arm.
-    settings : how this arm differs, and how it is simulated.
-
-    Raises
-    ------
-    InputError
-        The settings do not fit the robot.
-    MissingExtraError
-        numba is not installed.
+    `robot`: description of the arm. `settings`: how this arm differs, and how it is simulated.
+    Raises `InputError`: the settings do not fit the robot; `MissingExtraError`: numba is not
+    installed.
     """
 
     settling = Settling()
@@ -203,13 +170,7 @@ class Plant:
         return T
 
     def set_load(self, load: PlantLoad | None) -> None:
-        """Apply a wrench from now on, or none.
-
-        Raises
-        ------
-        InputError
-            The load is not on the arm.
-        """
+        """Apply a wrench from now on, or none. Raises `InputError`: the load is not on the arm."""
         station = None if load is None else load.at
         if station != (None if self._load is None else self._load.at):
             self._mesh(station)
@@ -262,15 +223,8 @@ class Plant:
     def advance(self, duration: float, pressures: ArrayLike) -> None:
         """Advance time at constant pressures in the chambers.
 
-        Parameters
-        ----------
-        duration : in s; rounded to whole steps.
-        pressures : gauge pressures (n,), in Pa.
-
-        Raises
-        ------
-        SimulationError
-            The simulation fails.
+        `duration`: in s; rounded to whole steps. `pressures`: gauge pressures (n,), in Pa. Raises
+        `SimulationError`: the simulation fails.
         """
         steps = round(duration / self.step)
         self.follow(np.tile(self._checked(pressures), (steps, 1)))
@@ -278,10 +232,7 @@ class Plant:
     def follow(self, pressures: Array) -> None:
         """Take one step at each row of chamber pressures (m, n), in Pa.
 
-        Raises
-        ------
-        SimulationError
-            The simulation fails; the state is that before the failure.
+        Raises `SimulationError`: the simulation fails; the state is that before the failure.
         """
         full = self.settings.dynamics == "full"
         scheme = Scheme(self.step, 0.5 if full else 1.0, True)
@@ -318,15 +269,8 @@ class Plant:
         A history in the robot file, by contrast, restarts with a rise from no pressure to these,
         see `stiffopt.model.history.Memory.start`.
 
-        Parameters
-        ----------
-        pressures : in the chambers (n,), in Pa.
-        load : replaces the present one from now on, if given.
-
-        Raises
-        ------
-        EquilibriumError
-            A slow arm would reach no equilibrium.
+        `pressures`: in the chambers (n,), in Pa. `load`: replaces the present one from now on, if
+        given. Raises `EquilibriumError`: a slow arm would reach no equilibrium.
         """
         if load is not None:
             self.set_load(load)

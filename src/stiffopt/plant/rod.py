@@ -34,38 +34,28 @@ class DiscreteRod(NamedTuple):
 
     The first node of a segment is its proximal end; the very last node is the tip, after the last
     connector.
-
-    Attributes
-    ----------
-    first, count : index of the first coefficient of each strain component within a segment (6,),
-        and their number (6,).
-    per_segment : number of coefficients of a segment.
-    length, connector : of the segments (S,), m.
-    first_node : of the segments (S,).
-    intervals : number of intervals between the nodes of a segment (S,).
-    interval : their lengths (S, m), m.
-    interval_basis : polynomials at the Gauss points of the intervals (S, m, 2, k).
-    weight, basis : Gauss points for the stresses (g,), and the polynomials there (g, k).
-    base_rotation, base_position : of the arm (3, 3), (3,).
-    mass : of each node, over (position, x axis, y axis) (N, 3, 3), kg, kg m, kg m^2.
-    gravity : (3,), m/s^2.
     """
 
+    # first, count: index of the first coefficient of each strain component within a segment (6,),
+    # and their number (6,)
     first: Array
     count: Array
-    per_segment: int
+    per_segment: int  # number of coefficients of a segment
+    # length, connector: of the segments (S,), m
     length: Array
     connector: Array
-    first_node: Array
-    intervals: Array
-    interval: Array
-    interval_basis: Array
+    first_node: Array  # of the segments (S,)
+    intervals: Array  # number of intervals between the nodes of a segment (S,)
+    interval: Array  # their lengths (S, m), m
+    interval_basis: Array  # polynomials at the Gauss points of the intervals (S, m, 2, k)
+    # weight, basis: Gauss points for the stresses (g,), and the polynomials there (g, k)
     weight: Array
     basis: Array
+    # base_rotation, base_position: of the arm (3, 3), (3,)
     base_rotation: Array
     base_position: Array
-    mass: Array
-    gravity: Array
+    mass: Array  # of each node, over (position, x axis, y axis) (N, 3, 3), kg, kg m, kg m^2
+    gravity: Array  # (3,), m/s^2
 
 
 @jit
@@ -294,29 +284,18 @@ def mass_matrix(rod: DiscreteRod, R: Array, J: Array, out: Array) -> None:
 
 
 class RodLoads(NamedTuple):
-    """Loads on the rod from outside.
+    """Loads on the rod from outside."""
 
-    Attributes
-    ----------
-    node : node on which the wrench acts.
-    lever : distance of the wrench beyond the node along its z axis, on a connector, m.
-    force, moment : (3,), N and N m.
-    follows : whether they turn with the node's section.
-    plate : unit normal of the probe's plate (3,), from the probe towards the tip.
-    plate_at : position of the plate along its normal, m.
-    plate_speed : its speed, m/s.
-    plate_stiffness : N/m; 0 without a plate.
-    """
-
-    node: int
-    lever: float
+    node: int  # node on which the wrench acts
+    lever: float  # distance of the wrench beyond the node along its z axis, on a connector, m
+    # force, moment: (3,), N and N m
     force: Array
     moment: Array
-    follows: bool
-    plate: Array
-    plate_at: float
-    plate_speed: float
-    plate_stiffness: float
+    follows: bool  # whether they turn with the node's section
+    plate: Array  # unit normal of the probe's plate (3,), from the probe towards the tip
+    plate_at: float  # position of the plate along its normal, m
+    plate_speed: float  # its speed, m/s
+    plate_stiffness: float  # N/m; 0 without a plate
 
 
 @jit

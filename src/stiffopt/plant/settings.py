@@ -134,10 +134,7 @@ class Mismatch(Schema):
     def check_lengths(self, robot: RobotDescription) -> None:
         """Refuse a list without exactly one value per channel or per segment of a robot.
 
-        Raises
-        ------
-        MisfitError
-            With the name of the list.
+        Raises `MisfitError` with the name of the list.
         """
         channels, segments = robot.n_pressures, robot.n_segments
         for name, length, noun in (
@@ -202,10 +199,7 @@ class SoftSurface(Schema):
 def check_touchable(scene: Scene) -> Scene:
     """Refuse a scene with a shape that the simulated arm cannot touch.
 
-    Raises
-    ------
-    InputError
-        With the name of the object.
+    Raises `InputError` with the name of the object.
     """
     for item in scene.objects:
         if item.shape.key not in TOUCHABLE:
@@ -293,10 +287,7 @@ def plant_of(description: Any) -> PlantSettings:
 
     Without a scene of its own it has those objects of the rig's scene that the arm may lean on.
 
-    Raises
-    ------
-    InputError
-        The simulated arm cannot touch one of them.
+    Raises `InputError`: the simulated arm cannot touch one of them.
     """
     plant, scene = description.plant, description.scene
     plant = plant if isinstance(plant, PlantSettings) else PlantSettings()
@@ -397,35 +388,26 @@ class SimulatedProbeSettings(ProbeSettings):
 
 @dataclass(frozen=True)
 class FaultSizes:
-    """Errors of the devices while a fault is injected, see `stiffopt.plant.world.FAULTS`.
+    """Errors of the devices while a fault is injected, see `stiffopt.plant.world.FAULTS`."""
 
-    Attributes
-    ----------
-    lag : added to the time constant of a slow regulator, in s.
-    leak_time : time constant with which a leaking chamber empties, in s.
-    reading_gain, reading_offset : of wrong pressure readings, the offset in Pa.
-    frame_delay : additional delay of a slow tracker's frames, in s.
-    tracker_offset : error of a wrong tracker (3,), in m.
-    drift : speed of a drifting tracker (3,), in m/s.
-    turn : angular speed of a turning tracker's frame about its origin (3,), in rad/s.
-    shake, shake_rate : amplitude (3,) and frequency of a shaking tracker, in m and Hz.
-    lag_growth : growth of a lagging tracker's delay per second, in s.
-    stage_speed : speed of a slow stage, as a share of the normal one.
-    force_gain, force_offset : of wrong force readings, the offset in N.
-    """
-
-    lag: float = 0.5
-    leak_time: float = 0.3
+    lag: float = 0.5  # added to the time constant of a slow regulator, in s
+    leak_time: float = 0.3  # time constant with which a leaking chamber empties, in s
+    # reading_gain, reading_offset: of wrong pressure readings, the offset in Pa
     reading_gain: float = 0.7
     reading_offset: float = 2e4
-    frame_delay: float = 0.5
+    frame_delay: float = 0.5  # additional delay of a slow tracker's frames, in s
+    # error of a wrong tracker (3,), in m
     tracker_offset: tuple[float, float, float] = (0.02, -0.015, 0.01)
+    # speed of a drifting tracker (3,), in m/s
     drift: tuple[float, float, float] = (0.004, 0.003, 0.0)
+    # angular speed of a turning tracker's frame about its origin (3,), in rad/s
     turn: tuple[float, float, float] = (0.0, 0.05, 0.0)
+    # shake, shake_rate: amplitude (3,) and frequency of a shaking tracker, in m and Hz
     shake: tuple[float, float, float] = (0.01, 0.0, 0.0)
     shake_rate: float = 3.0
-    lag_growth: float = 0.1
-    stage_speed: float = 0.1
+    lag_growth: float = 0.1  # growth of a lagging tracker's delay per second, in s
+    stage_speed: float = 0.1  # speed of a slow stage, as a share of the normal one
+    # force_gain, force_offset: of wrong force readings, the offset in N
     force_gain: float = 0.5
     force_offset: float = 0.1
 

@@ -11,8 +11,9 @@ import threading
 import time
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from stiffopt.arrays import Array
 from stiffopt.errors import InputError
 from stiffopt.model.description import RobotDescription
 from stiffopt.plant.hardware import (
@@ -32,8 +33,6 @@ from stiffopt.plant.settings import (
     SimulatedTrackerSettings,
 )
 from stiffopt.rig.interface import Clock, PressureLimits
-
-Array = NDArray[np.float64]
 
 FAULTS = {
     "supply": ("ok", "off", "stuck", "garbage", "wrong", "slow", "leak", "high"),
@@ -243,15 +242,9 @@ class World:
     def inject(self, device: str, fault: str, channel: int | None = None) -> None:
         """Make a device faulty from now on, or ``ok`` again.
 
-        Parameters
-        ----------
-        device, fault : see `known_faults`.
-        channel : faulty channel of the supply (from 0); None: all of them.
-
-        Raises
-        ------
-        InputError
-            There is no such device, fault or channel, or the rig file does not allow faults.
+        `device`, `fault`: see `known_faults`. `channel`: faulty channel of the supply (from 0);
+        None: all of them. Raises `InputError`: there is no such device, fault or channel, or the
+        rig file does not allow faults.
         """
         if not self.plant.settings.faults:
             raise InputError("faults are not enabled; set 'faults: true' in the rig file's plant")

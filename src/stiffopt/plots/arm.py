@@ -6,8 +6,9 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from stiffopt.arrays import Array
 from stiffopt.display import DisplayUnit, display_units
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.scene import Scene
@@ -15,8 +16,6 @@ from stiffopt.plots import style
 from stiffopt.plots.scene import draw_objects
 from stiffopt.plots.shapes import segment_poses
 from stiffopt.plots.view import View, ViewAngles, fill_panel
-
-Vector = NDArray[np.float64]
 
 TUBE_STATIONS = 24
 """Number of stations of the tube, per segment."""
@@ -36,30 +35,19 @@ def draw_arm(
 ) -> list[Any]:
     """Draw an arm in space, in the display unit of lengths.
 
+    Returns handles for a legend. Raises `InputError`: the pressures do not suit the arm, or the
+    view is invalid.
+
     Parameters
     ----------
-    axes :
-        In 3-D: ``figure.add_subplot(projection="3d", computed_zorder=False)``. Their limits, labels
-        and view are set.
-    robot : Manipulator
-    pressures : (n,)
-        In Pa.
-    scene : Scene, optional
-        The objects around it.
-    view : (elevation, azimuth), optional
-        The viewpoint: the angle of the eye above the horizontal, and about the z axis of the base
-        from its x axis; in rad, or as text with a unit: ``("20 deg", "-60 deg")``. By default x
-        points to the right, and z up or, for a hanging arm, down.
-
-    Returns
-    -------
-    list
-        Handles for a legend.
-
-    Raises
-    ------
-    InputError
-        The pressures do not suit the arm, or the view is invalid.
+    axes : in 3-D: ``figure.add_subplot(projection="3d", computed_zorder=False)``. Their limits,
+        labels and view are set.
+    pressures : (n,), in Pa.
+    scene : the objects around it.
+    view : (elevation, azimuth), the viewpoint: the angle of the eye above the horizontal, and about
+        the z axis of the base from its x axis; in rad, or as text with a unit:
+        ``("20 deg", "-60 deg")``. By default x points to the right, and z up or, for a hanging arm,
+        down.
     """
     drawing = ArmDrawing(axes, robot)
     drawing.draw_base()
@@ -71,33 +59,26 @@ def draw_arm(
 class Label(NamedTuple):
     """A text beside a point (3,) of the axes."""
 
-    point: Vector
+    point: Array
     text: str
     colour: str
 
 
 @dataclass
 class ArmDrawing:
-    """3-D axes and their contents, in the display unit of lengths.
-
-    Attributes
-    ----------
-    axes :
-    robot : Manipulator
-    corners : points (k, 3) that must be visible.
-    covered : points (k, 3), close together, which labels avoid.
-    marks : points (3,) with a marker, which labels avoid too.
-    labels : texts beside points, the most important first.
-    handles : for a legend.
-    """
+    """3-D axes and their contents, in the display unit of lengths."""
 
     axes: Any
     robot: Manipulator
-    corners: list[Vector] = field(default_factory=list, kw_only=True)
-    handles: list[Any] = field(default_factory=list, kw_only=True)
+    # points (k, 3) that must be visible
+    corners: list[Array] = field(default_factory=list, kw_only=True)
+    handles: list[Any] = field(default_factory=list, kw_only=True)  # for a legend
+    # texts beside points, the most important first
     labels: list[Label] = field(default_factory=list, kw_only=True)
-    covered: list[Vector] = field(default_factory=list, kw_only=True)
-    marks: list[Vector] = field(default_factory=list, kw_only=True)
+    # points (k, 3), close together, which labels avoid
+    covered: list[Array] = field(default_factory=list, kw_only=True)
+    # points (3,) with a marker, which labels avoid too
+    marks: list[Array] = field(default_factory=list, kw_only=True)
 
     @property
     def size(self) -> float:
@@ -119,9 +100,7 @@ class ArmDrawing:
         self.axes.plot(*rim, color="#5c6670", linewidth=1.2, zorder=1)
         self.corners.append(rim.T)
 
-    def draw_tube(
-        self, pressures: Vector, shade: float = 0.38, poses: Vector | None = None
-    ) -> None:
+    def draw_tube(self, pressures: Array, shade: float = 0.38, poses: Array | None = None) -> None:
         """Draw the tube with each segment in its colour, its backbone, and a ring at each end.
 
         Poses (segments, k, 4, 4), if given, replace those at the pressures.
@@ -162,7 +141,7 @@ class ArmDrawing:
     # -- parts ------------------------------------------------------------------------------
 
     def draw_arrow(
-        self, start: Vector, vector: Vector, colour: str, zorder: int, linestyle: str = "-"
+        self, start: Array, vector: Array, colour: str, zorder: int, linestyle: str = "-"
     ) -> None:
         """Draw a shaft with a conical head, in the units of the axes."""
         end = start + vector
@@ -190,16 +169,16 @@ class ArmDrawing:
         look = {"color": colour, "linestyle": linestyle, "linewidth": 2, **look}
         self.handles.append(Line2D([], [], label=label, **look))
 
-    def add_label(self, point: Vector, text: str, colour: str) -> None:
+    def add_label(self, point: Array, text: str, colour: str) -> None:
         """Request a text beside a point of the axes; earlier requests take precedence."""
         self.labels.append(Label(np.asarray(point), text, colour))
 
-    def add_body(self, points: Vector) -> None:
+    def add_body(self, points: Array) -> None:
         """Make points (k, 3) visible, and let labels avoid them."""
         self.corners.append(points)
         self.covered.append(points)
 
-    def add_mark(self, point: Vector) -> None:
+    def add_mark(self, point: Array) -> None:
         """Make a point with a marker visible, and let labels avoid it."""
         self.corners.append(point[None])
         self.marks.append(point)
@@ -207,10 +186,7 @@ class ArmDrawing:
     def finish(self, view: View | None = None, scene: Scene | None = None) -> list[Any]:
         """Draw a scene, set one scale for all axes and the view, and place the labels.
 
-        Returns
-        -------
-        list
-            Handles for a legend.
+        Returns handles for a legend.
         """
         from matplotlib.ticker import MaxNLocator
 
@@ -246,7 +222,7 @@ class ArmDrawing:
         return self.handles
 
 
-def _cone(point: Vector, way: Vector, length: float) -> Vector:
+def _cone(point: Array, way: Array, length: float) -> Array:
     """Return the surface (3, 2, k) of a cone with its apex at a point."""
     aside = np.eye(3)[np.abs(way).argmin()]
     across = np.cross(way, aside)

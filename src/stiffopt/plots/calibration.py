@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.directions import direction_name
 from stiffopt.display import display_units
 from stiffopt.identify.results import Comparison
@@ -34,7 +35,6 @@ from stiffopt.plots.wording import vector_text
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-Array = NDArray[np.float64]
 
 _MAX_LOGS = 8  # logs in a figure: those with the largest errors
 _MAX_PATHS = 4  # logs in a figure of paths

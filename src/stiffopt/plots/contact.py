@@ -26,10 +26,7 @@ def plot_contact(
 ) -> Figure:
     """Draw an arm that leans on objects, with its contact forces and the free arm as a line.
 
-    Parameters
-    ----------
-    equilibrium : of that arm in that scene.
-    view : (elevation, azimuth), see `draw_arm`.
+    `equilibrium`: of that arm in that scene. `view`: (elevation, azimuth), see `draw_arm`.
     """
     figure = style.new_figure(6.6, 6.6)
     axes = style.add_space(figure, (0.02, 0.02, 0.96, 0.94))

@@ -7,15 +7,14 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from matplotlib.text import Annotation
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.plots.style import literal
 from stiffopt.plots.view import box_corners, projected
 
 if TYPE_CHECKING:
     from stiffopt.plots.arm import Label
 
-Vector = NDArray[np.float64]
 
 _SIZE = 8.5  # points, of letters
 _CELL = 3  # pixels, size of a cell in the map of covered area
@@ -46,7 +45,7 @@ class PlacedLabel(Annotation):
         x, y = projected(self.axes, self.point[None])
         self.xy = (float(x[0]), float(y[0]))
 
-    def move(self, offset: Vector, *, with_line: bool) -> None:
+    def move(self, offset: Array, *, with_line: bool) -> None:
         """Put the middle of the text at an offset (2,) from its point, in points."""
         self.set_position((float(offset[0]), float(offset[1])))
         if self.arrow_patch is not None:
@@ -58,18 +57,15 @@ class PlacedLabel(Annotation):
         super().draw(renderer)
 
 
-def place_labels(axes: Any, labels: Sequence[Label], covered: Vector, marks: Vector) -> None:
+def place_labels(axes: Any, labels: Sequence[Label], covered: Array, marks: Array) -> None:
     """Place texts in 3-D axes whose limits and view are set.
 
     Parameters
     ----------
     axes :
-    labels : sequence of Label
-        The most important first.
-    covered : (k, 3)
-        Points of the axes, close together, which texts avoid.
-    marks : (j, 3)
-        Points with a marker, which texts avoid with a margin.
+    labels : the most important first.
+    covered : (k, 3), points of the axes, close together, which texts avoid.
+    marks : (j, 3), points with a marker, which texts avoid with a margin.
     """
     if not labels:
         return
@@ -89,7 +85,7 @@ class _TextPlace(NamedTuple):
 
     cost: float
     distance: float
-    middle: Vector
+    middle: Array
 
 
 class _CoveredCells:
@@ -105,12 +101,12 @@ class _CoveredCells:
         edge = np.array([_NUMBERS * self.pixels, 0.0])
         self.low, self.high = corners.min(axis=0) + edge, corners.max(axis=0) - edge
 
-    def at(self, points: Vector) -> Vector:
+    def at(self, points: Array) -> Array:
         """Return points (k, 3) in pixels (k, 2) from the lower left corner of the axes."""
         plane = projected(self.axes, np.atleast_2d(points)).T
         return np.asarray(self.axes.transData.transform(plane) - self.start)
 
-    def cover(self, points: Vector, radius: float) -> None:
+    def cover(self, points: Array, radius: float) -> None:
         """Mark squares around points (k, 3) as covered; the radius is in points."""
         reach = round(radius * self.pixels / _CELL) + 1
         bounds = np.array(self.cells.shape) - 1
@@ -135,7 +131,7 @@ class _CoveredCells:
         label.move(offset, with_line=best.distance > _LINED_FROM)
         self._of(best.middle - half, best.middle + half)[:] = _COVERS_TEXT / _COVERS
 
-    def _place(self, anchor: Vector, way: Vector, distance: float, half: Vector) -> _TextPlace:
+    def _place(self, anchor: Array, way: Array, distance: float, half: Array) -> _TextPlace:
         """Rate a place in a direction (2,) from an anchor; `half` (2,) is half the text's size."""
         edge = 1 / max(np.abs(way) / half)  # from the middle of the text to its frame
         middle = anchor + way * (distance * self.pixels + edge)
@@ -149,7 +145,7 @@ class _CoveredCells:
         )
         return _TextPlace(cost, distance, middle)
 
-    def _of(self, low: Vector, high: Vector) -> Vector:
+    def _of(self, low: Array, high: Array) -> Array:
         """Return the cells of a box in pixels; cells at the edge for a box outside the axes."""
         bounds = np.array(self.cells.shape)
         first = np.clip((low // _CELL).astype(int), 0, bounds - 1)

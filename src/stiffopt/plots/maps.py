@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.directions import direction_name
 from stiffopt.display import display_units
 from stiffopt.errors import InputError
@@ -26,7 +27,6 @@ from stiffopt.workspace import WorkspaceMap
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-Vector = NDArray[np.float64]
 
 _ENOUGH = 10  # samples in a cell from which its ratio of stiffnesses is shown
 _UNKNOWN = "#d5d9dd"
@@ -45,10 +45,7 @@ def plot_workspace(found: WorkspaceMap, *, title: str | None = None) -> Figure:
     section contains the arm at rest; the level one is where the workspace is widest.
     The title is by default the name of the robot.
 
-    Raises
-    ------
-    InputError
-        The map has no cell with a sample.
+    Raises `InputError`: the map has no cell with a sample.
     """
     if not len(found.table):
         raise InputError("there is nothing to draw: no sample has a stable equilibrium")
@@ -114,7 +111,7 @@ class _Section:
         """The position of the section, in words."""
         return f"at {'xyz'[self.normal]} = {display_units().length.text(self.place, 'g')}"
 
-    def image(self, values: Vector) -> Vector:
+    def image(self, values: Array) -> Array:
         """Return values (M,) of cells as an image, row by row from below."""
         picture = np.full(self._shape, np.nan)
         picture[tuple(self._at.T)] = values[self.rows]
@@ -135,7 +132,7 @@ def _fullest(layers: NDArray[np.int64]) -> int:
 
 
 def _draw_sections(
-    panels: Sequence[Any], sections: Sequence[_Section], values: Vector, colours: str
+    panels: Sequence[Any], sections: Sequence[_Section], values: Array, colours: str
 ) -> Any:
     """Draw a quantity in both sections with the same colours; return the coloured artist."""
     from matplotlib.colors import ListedColormap, LogNorm
@@ -280,10 +277,10 @@ def _draw_shapes(axes: Any, found: ArmMap, row: int, colours: list[Any]) -> None
     tidy(axes)
 
 
-def _bending_plane(shapes: Vector) -> Vector:
+def _bending_plane(shapes: Array) -> Array:
     """Return the unit vector (2,) in the x-y plane along which the tip moves most, x by default."""
     tips = shapes[:, -1, :2] - shapes[0, -1, :2]
-    farthest: Vector = tips[np.argmax(np.linalg.norm(tips, axis=1))]
+    farthest: Array = tips[np.argmax(np.linalg.norm(tips, axis=1))]
     size = float(np.linalg.norm(farthest))
     if size < 1e-3 or abs(farthest[0]) > 0.999 * size:
         return np.array([1.0, 0.0])
@@ -361,7 +358,7 @@ def _draw_heat(figure: Figure, axes: Any, found: TipMap, column: int) -> None:
         label_logarithmic(bar.ax.yaxis, low, high)
 
 
-def _levels(low: float, high: float) -> Vector:
+def _levels(low: float, high: float) -> Array:
     from matplotlib.ticker import MaxNLocator
 
     if high > 5 * low > 0:
@@ -375,7 +372,7 @@ def _colours(count: int) -> list[Any]:
     return [colormaps[_BEST](k) for k in np.linspace(0, 0.92, count)]
 
 
-def _pressure_bar(figure: Figure, axes: Any, pressures: Vector) -> None:
+def _pressure_bar(figure: Figure, axes: Any, pressures: Array) -> None:
     """Add a colour bar of the pressures."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import BoundaryNorm, ListedColormap

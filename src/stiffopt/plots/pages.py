@@ -54,10 +54,7 @@ class _Page(NamedTuple):
 def page(shown: object) -> str:
     """Return HTML of an object: its table and its figure, as far as the time limit allows.
 
-    Raises
-    ------
-    TypeError
-        There is no page for this type.
+    Raises `TypeError`: there is no page for this type.
     """
     made, rows, picture = _page_of(shown), "", ""
     with suppress(ImportError):

@@ -9,8 +9,8 @@ from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array, Flags
 from stiffopt.display import display_units
 from stiffopt.errors import InputError
 from stiffopt.model.manipulator import Manipulator
@@ -27,7 +27,6 @@ from stiffopt.plots.wording import stiffness_text
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-Vector = NDArray[np.float64]
 
 _POSES = 5  # of the arm
 _LOGARITHMIC = 30  # largest by smallest stiffness from which the scale is logarithmic
@@ -39,21 +38,14 @@ def plot_path(
 ) -> Figure:
     """Draw a solved path: the arm along it, and stiffness, clearance and pressures over time.
 
+    Raises `InputError`: the solution has no points, or the view is invalid; `MissingExtraError` if
+    matplotlib is not installed.
+
     Parameters
     ----------
-    path : Path
-    solution : PathSolution
-    title : str, optional
-        By default the name of the path's file.
-    view : (elevation, azimuth), optional
-        From where to look at the arm, in rad or as text with a unit; see `draw_arm`.
-
-    Raises
-    ------
-    InputError
-        The solution has no points, or the view is invalid.
-    MissingExtraError
-        If matplotlib is not installed.
+    title : by default the name of the path's file.
+    view : (elevation, azimuth), from where to look at the arm, in rad or as text with a unit; see
+        `draw_arm`.
     """
     source = path.source
     name = solution.robot.description.name if source is None else source.stem
@@ -78,22 +70,15 @@ def plot_motion(
 ) -> Figure:
     """Draw a motion of `stiffopt.plan_motion` as `plot_path` draws a path.
 
+    Raises `InputError`: the solution has no points, or the view is invalid; `MissingExtraError` if
+    matplotlib is not installed.
+
     Parameters
     ----------
-    solution : PathSolution
-    scene : Scene, optional
-        The scene that the motion keeps clear of.
-    title : str, optional
-        By default the name of the robot.
-    view : (elevation, azimuth), optional
-        From where to look at the arm, in rad or as text with a unit; see `draw_arm`.
-
-    Raises
-    ------
-    InputError
-        The solution has no points, or the view is invalid.
-    MissingExtraError
-        If matplotlib is not installed.
+    scene : the scene that the motion keeps clear of.
+    title : by default the name of the robot.
+    view : (elevation, azimuth), from where to look at the arm, in rad or as text with a unit; see
+        `draw_arm`.
     """
     robot = solution.robot
     limits = robot.pressure_min, robot.pressure_max
@@ -102,7 +87,7 @@ def plot_motion(
 
 
 def _figure(
-    solution: PathSolution, path: Path | None, scene: Scene | None, limits: tuple[Vector, Vector],
+    solution: PathSolution, path: Path | None, scene: Scene | None, limits: tuple[Array, Array],
     view: View | None, title: str, key_numbers: Callable[[], str],
 ) -> Figure:  # fmt: skip
     style.require_matplotlib()
@@ -175,29 +160,16 @@ def draw_path(
 ) -> list[Any]:
     """Draw the arm at some of the points, and the path of its tip.
 
+    Returns handles for a legend. Raises `InputError`: the solution has no points, or the view is
+    invalid.
+
     Parameters
     ----------
-    axes :
-        In 3-D, as for `draw_arm`.
-    solution : PathSolution
-    path : Path, optional
-        The requested path, to draw beside the followed one.
-    scene : Scene, optional
-        The objects around the arm.
-    view : (elevation, azimuth), optional
-        See `draw_arm`.
-    labelled : bool
-        Whether to label the point of least stiffness.
-
-    Returns
-    -------
-    list
-        Handles for a legend.
-
-    Raises
-    ------
-    InputError
-        The solution has no points, or the view is invalid.
+    axes : in 3-D, as for `draw_arm`.
+    path : the requested path, to draw beside the followed one.
+    scene : the objects around the arm.
+    view : (elevation, azimuth), see `draw_arm`.
+    labelled : whether to label the point of least stiffness.
     """
     _require_points(solution)
     drawing = ArmDrawing(axes, solution.robot)
@@ -241,24 +213,12 @@ def draw_asked_path(
 ) -> list[Any]:
     """Draw a requested path, and the arm at its lowest pressures.
 
+    Returns handles for a legend. Raises `InputError`: the view is invalid.
+
     Parameters
     ----------
-    axes :
-        In 3-D, as for `draw_arm`.
-    robot : Manipulator
-    path : Path
-    view : (elevation, azimuth), optional
-        See `draw_arm`.
-
-    Returns
-    -------
-    list
-        Handles for a legend.
-
-    Raises
-    ------
-    InputError
-        The view is invalid.
+    axes : in 3-D, as for `draw_arm`.
+    view : (elevation, azimuth), see `draw_arm`.
     """
     drawing = ArmDrawing(axes, robot)
     drawing.draw_base()
@@ -275,7 +235,7 @@ def _draw_requested(drawing: ArmDrawing, path: Path) -> None:
     drawing.corners.append(points)
 
 
-def _label_stiffness(drawing: ArmDrawing, solution: PathSolution, tips: Vector) -> None:
+def _label_stiffness(drawing: ArmDrawing, solution: PathSolution, tips: Array) -> None:
     """Label the point of least stiffness."""
     if solution.worst is not None and np.isfinite(solution.worst):
         text = f"least stiff:\n{stiffness_text(solution.worst, solution.stiffness_unit)}"
@@ -285,16 +245,12 @@ def _label_stiffness(drawing: ArmDrawing, solution: PathSolution, tips: Vector) 
 def draw_stiffness_along(axes: Any, solution: PathSolution) -> None:
     """Draw stiffness over time, and the best stiffness of each single point.
 
+    Raises `InputError`: the solution has no stiffness: its path maximises none, or it has no
+    points.
+
     Parameters
     ----------
-    axes :
-        Of matplotlib.
-    solution : PathSolution
-
-    Raises
-    ------
-    InputError
-        The solution has no stiffness: its path maximises none, or it has no points.
+    axes : of matplotlib.
     """
     index = solution.worst_index
     if solution.stiffness is None or index is None:
@@ -332,7 +288,7 @@ def draw_stiffness_along(axes: Any, solution: PathSolution) -> None:
     _legend(axes)
 
 
-def _stretches(times: Vector, where: NDArray[np.bool_]) -> Iterator[tuple[float, float]]:
+def _stretches(times: Array, where: Flags) -> Iterator[tuple[float, float]]:
     """Yield the beginning and end of each stretch, halfway to the next samples."""
     edges = np.concatenate([times[:1], (times[1:] + times[:-1]) / 2, times[-1:]])
     changes = np.flatnonzero(np.diff(np.concatenate([[False], where, [False]]).astype(int)))
@@ -343,18 +299,12 @@ def _stretches(times: Vector, where: NDArray[np.bool_]) -> Iterator[tuple[float,
 def draw_clearance_along(axes: Any, solution: PathSolution, required: float | None = None) -> None:
     """Draw clearance over time, and the required clearance.
 
+    Raises `InputError`: the solution has no clearance: there is no scene, or it has no points.
+
     Parameters
     ----------
-    axes :
-        Of matplotlib.
-    solution : PathSolution
-    required : float, optional
-        In m.
-
-    Raises
-    ------
-    InputError
-        The solution has no clearance: there is no scene, or it has no points.
+    axes : of matplotlib.
+    required : in m.
     """
     if solution.clearance is None or not len(solution.times):
         raise InputError("there is nothing to draw: the solution has no clearance")
@@ -370,24 +320,17 @@ def draw_clearance_along(axes: Any, solution: PathSolution, required: float | No
 
 
 def draw_pressures_along(
-    axes: Any, solution: PathSolution, segment: int, limits: tuple[Vector, Vector] | None = None
+    axes: Any, solution: PathSolution, segment: int, limits: tuple[Array, Array] | None = None
 ) -> None:
     """Draw the pressures of a segment over time; steps at the full rate stand out.
 
+    Raises `InputError`: the solution has no points, or the arm has no such segment.
+
     Parameters
     ----------
-    axes :
-        Of matplotlib.
-    solution : PathSolution
-    segment : int
-        From 1, at the base.
-    limits : ((n,), (n,)), optional
-        Lower and upper limits of all channels in Pa; by default the robot's.
-
-    Raises
-    ------
-    InputError
-        The solution has no points, or the arm has no such segment.
+    axes : of matplotlib.
+    segment : from 1, at the base.
+    limits : ((n,), (n,)), lower and upper limits of all channels in Pa; by default the robot's.
     """
     _require_points(solution)
     segments = solution.robot.description.segments
@@ -414,7 +357,7 @@ def draw_pressures_along(
     _legend(axes)
 
 
-def _mark_fast_steps(axes: Any, times: Vector, values: Vector, fast: Any) -> None:
+def _mark_fast_steps(axes: Any, times: Array, values: Array, fast: Any) -> None:
     """Mark the steps, given by `fast` (N - 1, k), in which pressures (N, k) change at full rate."""
     from matplotlib.collections import LineCollection
 

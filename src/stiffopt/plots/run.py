@@ -7,8 +7,8 @@ from textwrap import shorten
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array, Flags
 from stiffopt.control.state import Event
 from stiffopt.daemon.run_errors import ARRIVED, ARRIVED_ANGLE, ErrorStatistics, RunStages
 from stiffopt.daemon.run_log import RecordedRun, RunSpan
@@ -33,7 +33,6 @@ from stiffopt.plots.style import (
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-Array = NDArray[np.float64]
 
 _WIDE = 11.5  # inches
 _HEAD = 1.82  # inches, title and four lines
@@ -57,6 +56,8 @@ _HALF = 0.36  # half width of a band, as a share of a row
 _LONGEST = 20  # letters of a name
 _LETTER_WIDTH = 0.0095  # of the panel's width
 _APART = 0.012  # of the panel's width; smallest distance between two numbers of events
+_WANTED: dict[str, Any] = {"color": TARGET, "linestyle": (0, (4, 2))}
+_LIMIT: dict[str, Any] = {"color": GREY, "linewidth": 0.9, "linestyle": (0, (1, 2))}
 
 
 def plot_run(run: RecordedRun, *, title: str | None = None) -> Figure:
@@ -101,6 +102,10 @@ def plot_run(run: RecordedRun, *, title: str | None = None) -> Figure:
     return figure
 
 
+def _line(axes: Any, time: Array, values: Array, label: str | None, **look: Any) -> None:
+    axes.plot(*thinned(time, values), label=label, **{"linewidth": 1.3, **look})
+
+
 def _draw_tip(axes: Any, run: RecordedRun, axis: int) -> None:
     unit = display_units().length
     seen = unit.of(run.seen_position[:, axis])
@@ -109,16 +114,10 @@ def _draw_tip(axes: Any, run: RecordedRun, axis: int) -> None:
             *thinned(run.captured, seen), "o", color=AXES[axis], alpha=0.3, markersize=4.5,
             markeredgewidth=0, label="tracker",
         )  # fmt: skip
-    axes.plot(
-        *thinned(run.time, unit.of(run.tip_position[:, axis])), color=AXES[axis], linewidth=1.3,
-        label="estimate",
-    )  # fmt: skip
+    _line(axes, run.time, unit.of(run.tip_position[:, axis]), "estimate", color=AXES[axis])
     target = unit.of(run.target_position[:, axis])
     if np.isfinite(target).any():
-        axes.plot(
-            *thinned(run.time, target), color=TARGET, linewidth=1.3, linestyle=(0, (4, 2)),
-            label="target",
-        )  # fmt: skip
+        _line(axes, run.time, target, "target", **_WANTED)
     low, high = axes.get_ylim()
     minimum = unit.of(_SMALLEST_RANGE)
     if high - low < minimum:  # else noise would look like motion
@@ -132,8 +131,8 @@ def _draw_error(axes: Any, run: RecordedRun, stages: RunStages) -> None:
     unit = display_units().length
     error = unit.of(np.maximum(run.position_error, _FLOOR))
     look = {"color": DARK, "linewidth": 1.2}
-    axes.plot(*thinned(run.time, error), **{**look, "alpha": 0.35}, label="approaching")
-    axes.plot(*thinned(run.time, np.where(stages.hold, error, np.nan)), **look, label="holding")
+    _line(axes, run.time, error, "approaching", **look, alpha=0.35)
+    _line(axes, run.time, np.where(stages.hold, error, np.nan), "holding", **look)
     axes.set_ylabel(f"error ({unit})")
     known = error[np.isfinite(error)]
     if len(known):
@@ -148,10 +147,7 @@ def _draw_error(axes: Any, run: RecordedRun, stages: RunStages) -> None:
 
 def _draw_angle(axes: Any, run: RecordedRun) -> None:
     unit = display_units().angle
-    axes.plot(
-        *thinned(run.time, unit.of(run.angle_error)), color=DARK, linewidth=1.2,
-        label="angle",
-    )  # fmt: skip
+    _line(axes, run.time, unit.of(run.angle_error), "angle", color=DARK, linewidth=1.2)
     axes.set_ylabel(f"error ({unit})")
     axes.set_ylim(bottom=0)
     axes.grid(alpha=0.25, axis="y")
@@ -166,15 +162,12 @@ def _draw_force(axes: Any, run: RecordedRun) -> None:
     covariance = run.wrench_covariance.reshape(-1, 3, 3)
     way = force / np.maximum(size, 1e-12)[:, None]
     band = 2 * np.sqrt(np.einsum("ti,tij,tj->t", way, covariance, way))
-    axes.plot(*thinned(run.time, unit.of(felt)), color=FORCE, linewidth=1.3, label="felt")
+    _line(axes, run.time, unit.of(felt), "felt", color=FORCE)
     time, low = thinned(run.time, unit.of(felt - band))
     _, high = thinned(run.time, unit.of(felt + band))
     axes.fill_between(time, low, high, color=FORCE, alpha=0.18, linewidth=0, label="95 %")
     if np.isfinite(run.press_goal).any():
-        axes.plot(
-            *thinned(run.time, unit.of(run.press_goal)), color=TARGET, linewidth=1.3,
-            linestyle=(0, (4, 2)), label="wanted",
-        )  # fmt: skip
+        _line(axes, run.time, unit.of(run.press_goal), "wanted", **_WANTED)
     axes.set_ylabel(f"force ({unit})")
     axes.grid(alpha=0.25, axis="y")
     legend_beside(axes)
@@ -186,23 +179,18 @@ def _draw_pressures(axes: Any, run: RecordedRun, segment: int, channels: range) 
     unit = display_units().pressure
     for channel in channels:
         colour = channel_colour(channel - channels[0])
-        axes.plot(
-            *thinned(run.time, unit.of(run.measured[:, channel])), color=colour, linewidth=2.6,
-            alpha=0.3,
-        )  # fmt: skip
-        axes.plot(
-            *thinned(run.time, unit.of(run.commanded[:, channel])), color=colour, linewidth=1.1,
-            label=f"p{channel + 1}",
-        )  # fmt: skip
+        measured, commanded = (unit.of(p[:, channel]) for p in (run.measured, run.commanded))
+        _line(axes, run.time, measured, None, color=colour, linewidth=2.6, alpha=0.3)
+        _line(axes, run.time, commanded, f"p{channel + 1}", color=colour, linewidth=1.1)
     limits = np.unique(unit.of(np.stack([run.low, run.high])[:, :, list(channels)]))
     for limit in limits[np.isfinite(limits)]:
-        axes.axhline(limit, color=GREY, linewidth=0.9, linestyle=(0, (1, 2)), zorder=1)
+        axes.axhline(limit, **_LIMIT, zorder=1)
     handles = [*axes.get_legend_handles_labels()[0]]
     if segment == 0:
         handles += [
             Line2D([], [], color=GREY, linewidth=2.6, alpha=0.5, label="measured"),
             Line2D([], [], color=GREY, linewidth=1.1, label="commanded"),
-            Line2D([], [], color=GREY, linewidth=0.9, linestyle=(0, (1, 2)), label="limits"),
+            Line2D([], [], **_LIMIT, label="limits"),
         ]
     axes.set_ylabel(f"segment {segment + 1}\n({unit})")
     low, high = axes.get_ylim()
@@ -213,14 +201,8 @@ def _draw_pressures(axes: Any, run: RecordedRun, segment: int, channels: range) 
 def _draw_stiffness(axes: Any, run: RecordedRun) -> None:
     unit = display_units().of_si(run.stiffness_unit)
     if np.isfinite(run.best_stiffness).any():
-        axes.plot(
-            *thinned(run.time, unit.of(run.best_stiffness)), color=TARGET, linewidth=1.3,
-            linestyle=(0, (4, 2)), label="of the plan",
-        )  # fmt: skip
-    axes.plot(
-        *thinned(run.time, unit.of(run.stiffness)), color=ELLIPSOID, linewidth=1.3,
-        label="of the arm,\nnow",
-    )  # fmt: skip
+        _line(axes, run.time, unit.of(run.best_stiffness), "of the plan", **_WANTED)
+    _line(axes, run.time, unit.of(run.stiffness), "of the arm,\nnow", color=ELLIPSOID)
     axes.set_ylabel(f"stiffness\n({unit})")
     axes.grid(alpha=0.25, axis="y")
     legend_beside(axes)
@@ -231,14 +213,8 @@ def _shade(panels: Any, run: RecordedRun) -> None:
     for span in run.states:
         if span.kind in _STATES and span.kind != "active":
             for axes in panels:
-                axes.axvspan(
-                    span.begin,
-                    span.end,
-                    color=_STATES[span.kind],
-                    alpha=0.22,
-                    linewidth=0,
-                    zorder=0,
-                )
+                shade = {"color": _STATES[span.kind], "alpha": 0.22, "linewidth": 0}
+                axes.axvspan(span.begin, span.end, **shade, zorder=0)
 
 
 def _list_events(figure: Any, listed: list[Event], below: float) -> None:
@@ -290,7 +266,7 @@ def error_lines(run: RecordedRun, stages: RunStages | None = None) -> list[str]:
     ]
 
 
-def _errors_text(run: RecordedRun, ticks: NDArray[np.bool_]) -> str:
+def _errors_text(run: RecordedRun, ticks: Flags) -> str:
     length, angle = display_units().length, display_units().angle
     known = (
         (ErrorStatistics.of(length.of(run.position_error[ticks])), length),

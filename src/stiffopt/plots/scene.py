@@ -5,19 +5,17 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.display import display_units
 from stiffopt.model.scene import Scene
 from stiffopt.plots import style
-
-Vector = NDArray[np.float64]
 
 _SHADES = {"inside_tube": 0.12, "half_space": 0.2}
 _SHADE = 0.45
 
 
-def draw_objects(axes: Any, scene: Scene, size: float, seen: Vector) -> tuple[Vector, list[Vector]]:
+def draw_objects(axes: Any, scene: Scene, size: float, seen: Array) -> tuple[Array, list[Array]]:
     """Draw a scene's objects, in the display unit of lengths.
 
     Parameters
@@ -47,7 +45,7 @@ def draw_objects(axes: Any, scene: Scene, size: float, seen: Vector) -> tuple[Ve
     return np.vstack(near), middles
 
 
-def _draw_surface(axes: Any, surface: Vector, shade: float, is_mesh: bool) -> None:
+def _draw_surface(axes: Any, surface: Array, shade: float, is_mesh: bool) -> None:
     if is_mesh:
         from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 

@@ -8,31 +8,27 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.obstacle import Obstacle
 
-Vector = NDArray[np.float64]
 
-
-def segment_poses(robot: Manipulator, pressures: ArrayLike, count: int) -> Vector:
+def segment_poses(robot: Manipulator, pressures: ArrayLike, count: int) -> Array:
     """Return poses (segments, count, 4, 4) along each segment with its connector, ends included.
 
-    Parameters
-    ----------
-    pressures : (n,), in Pa.
-    count : number of stations of each segment, at least 2.
+    `pressures`: (n,), in Pa. `count`: number of stations of each segment, at least 2.
     """
     stations = segment_stations(robot, count).ravel()
     poses = np.concatenate([np.eye(4)[None], robot.pose(pressures, stations[1:])])
     return poses.reshape(robot.n_segments, count, 4, 4)
 
 
-def segment_stations(robot: Manipulator, count: int) -> Vector:
+def segment_stations(robot: Manipulator, count: int) -> Array:
     """Return arc lengths (segments, count), in m, along each segment with its connector."""
     return robot.kept(("segment stations", count), lambda: _stations(robot, count))
 
 
-def _stations(robot: Manipulator, count: int) -> Vector:
+def _stations(robot: Manipulator, count: int) -> Array:
     lengths = [each.length + each.connector for each in robot.description.segments]
     ends = np.concatenate([[0.0], np.cumsum(lengths)])
     ends[-1] = robot.length
@@ -62,14 +58,12 @@ class StiffnessEllipsoid(NamedTuple):
     The square of a semi-axis is the free stiffness along it; the square root keeps thin ellipsoids
     visible.
 
-    Attributes
-    ----------
-    stiffnesses : (3,), along its axes, in N/m, increasing.
-    axes : (3, 3), the columns, right-handed.
+    `stiffnesses`: (3,), along its axes, in N/m, increasing. `axes`: (3, 3), the columns,
+    right-handed.
     """
 
-    stiffnesses: Vector
-    axes: Vector
+    stiffnesses: Array
+    axes: Array
 
     @classmethod
     def of(cls, compliance: ArrayLike, rotation: ArrayLike) -> StiffnessEllipsoid:
@@ -79,6 +73,6 @@ class StiffnessEllipsoid(NamedTuple):
         values, axes = np.linalg.eigh(stiffness)
         return cls(np.abs(values), axes * np.sign(np.linalg.det(axes)))
 
-    def radii(self, largest: float) -> Vector:
+    def radii(self, largest: float) -> Array:
         """Return the semi-axes (3,), scaled to a largest one."""
         return np.asarray(largest * np.sqrt(self.stiffnesses / self.stiffnesses.max()))

@@ -8,9 +8,9 @@ from itertools import zip_longest
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stiffopt import lie
+from stiffopt.arrays import Array
 from stiffopt.display import FIGURES, display_units
 from stiffopt.errors import InputError
 from stiffopt.model.manipulator import Manipulator
@@ -36,7 +36,6 @@ from stiffopt.plots.wording import (
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-Vector = NDArray[np.float64]
 
 _MAX_LABELS = 15  # largest number of pressures with a number on their bar
 _NEAR_BOUND = 0.06  # of the axis; a bar nearer to its limit has its number above the limit
@@ -57,28 +56,18 @@ def plot_solution(
 ) -> Figure:
     """Draw a solution: the arm in space, and its pressures against their limits.
 
+    Raises `InputError`: the solution has no pressures, or the view is invalid; `MissingExtraError`
+    if matplotlib is not installed.
+
     Parameters
     ----------
-    robot : Manipulator
-        The arm; the load of the solution's task is applied to it.
-    solution : PressureSolution
-    front : sequence of PressureSolution, optional
-        A trade-off to draw beside it, as `stiffopt.pareto_front` returns it.
-    plain : float, optional
-        First stiffness of the plain solution, which ignores stiffness, for comparison.
-    title : str, optional
-        By default the name of the task's file.
-    scene : Scene, optional
-        The objects around the arm; by default those of the task.
-    view : (elevation, azimuth), optional
-        From where to look at the arm, in rad or as text with a unit; see `draw_arm`.
-
-    Raises
-    ------
-    InputError
-        The solution has no pressures, or the view is invalid.
-    MissingExtraError
-        If matplotlib is not installed.
+    robot : the arm; the load of the solution's task is applied to it.
+    front : a trade-off to draw beside it, as `stiffopt.pareto_front` returns it.
+    plain : first stiffness of the plain solution, which ignores stiffness, for comparison.
+    title : by default the name of the task's file.
+    scene : the objects around the arm; by default those of the task.
+    view : (elevation, azimuth), from where to look at the arm, in rad or as text with a unit; see
+        `draw_arm`.
     """
     style.require_matplotlib()
     figure = new_figure(13, 6.6 if front is None else 7.8)
@@ -103,15 +92,12 @@ def plot_pareto(
 ) -> Figure:
     """Draw a trade-off: stiffness against tip error.
 
+    Raises `MissingExtraError` if matplotlib is not installed.
+
     Parameters
     ----------
     front : as `stiffopt.pareto_front` returns it.
     plain : first stiffness of the plain solution, which ignores stiffness, for comparison.
-
-    Raises
-    ------
-    MissingExtraError
-        If matplotlib is not installed.
     """
     figure = new_figure(6.4, 4.4, layout="constrained")
     axes = figure.add_subplot()
@@ -154,17 +140,11 @@ def _key_numbers(solution: PressureSolution, plain: float | None) -> str:
 def draw_pressures(axes: Any, robot: Manipulator, solution: PressureSolution) -> None:
     """Draw the pressures as bars with their limits; those at a limit are highlighted.
 
+    Raises `InputError`: the solution has no pressures.
+
     Parameters
     ----------
-    axes :
-        Of matplotlib.
-    robot : Manipulator
-    solution : PressureSolution
-
-    Raises
-    ------
-    InputError
-        The solution has no pressures.
+    axes : of matplotlib.
     """
     _require_pressures(solution)
     description, unit = robot.description, display_units().pressure
@@ -208,12 +188,9 @@ def draw_pareto(
 
     Parameters
     ----------
-    axes :
-        Of matplotlib.
-    front : sequence of PressureSolution
-        As `stiffopt.pareto_front` returns it.
-    plain : float, optional
-        First stiffness of the plain solution, which ignores stiffness, for comparison.
+    axes : of matplotlib.
+    front : as `stiffopt.pareto_front` returns it.
+    plain : first stiffness of the plain solution, which ignores stiffness, for comparison.
     """
     axes.set_title("stiffness gained by a larger tip error", fontsize=11, loc="left")
     tidy(axes)
@@ -290,27 +267,15 @@ def draw_solution(
 ) -> list[Any]:
     """Draw a solution in space: the arm, its stiffness and its task.
 
+    Returns handles for a legend. Raises `InputError`: the solution has no pressures, or the view is
+    invalid.
+
     Parameters
     ----------
-    axes :
-        In 3-D, as for `draw_arm`.
-    robot : Manipulator
-        The arm; the load of the solution's task is applied to it.
-    solution : PressureSolution
-    scene : Scene, optional
-        The objects around the arm; by default those of the task.
-    view : (elevation, azimuth), optional
-        See `draw_arm`.
-
-    Returns
-    -------
-    list
-        Handles for a legend.
-
-    Raises
-    ------
-    InputError
-        The solution has no pressures, or the view is invalid.
+    axes : in 3-D, as for `draw_arm`.
+    robot : the arm; the load of the solution's task is applied to it.
+    scene : the objects around the arm; by default those of the task.
+    view : (elevation, azimuth), see `draw_arm`.
     """
     _require_pressures(solution)
     arm = solution.task.loaded(robot)
@@ -335,25 +300,13 @@ def draw_solution(
 def draw_task(axes: Any, robot: Manipulator, task: Task, *, view: View | None = None) -> list[Any]:
     """Draw a task in space: the arm at its lowest pressures, and the task's target and goals.
 
+    Returns handles for a legend. Raises `InputError`: the view is invalid.
+
     Parameters
     ----------
-    axes :
-        In 3-D, as for `draw_arm`.
-    robot : Manipulator
-        The arm; the load of the task is applied to it.
-    task : Task
-    view : (elevation, azimuth), optional
-        See `draw_arm`.
-
-    Returns
-    -------
-    list
-        Handles for a legend.
-
-    Raises
-    ------
-    InputError
-        The view is invalid.
+    axes : in 3-D, as for `draw_arm`.
+    robot : the arm; the load of the task is applied to it.
+    view : (elevation, azimuth), see `draw_arm`.
     """
     arm = task.loaded(robot)
     start = arm.pressure_min
@@ -379,12 +332,12 @@ class _Drawing(ArmDrawing):
     solution: PressureSolution
 
     @property
-    def tip(self) -> Vector:
+    def tip(self) -> Array:
         """Position of the tip in the axes."""
         return np.asarray(self.unit.of(np.asarray(self.solution.tip_pose)[:3, 3]))
 
     @property
-    def rotation(self) -> Vector:
+    def rotation(self) -> Array:
         """Orientation of the tip."""
         return np.asarray(self.solution.tip_pose)[:3, :3]
 
@@ -473,7 +426,7 @@ class _Drawing(ArmDrawing):
         if target.orientation is not None:
             self._draw_triad(point, target.orientation, length)
 
-    def _draw_point(self, point: Vector, free: list[int]) -> None:
+    def _draw_point(self, point: Array, free: list[int]) -> None:
         self.axes.plot(
             *point[:, None], marker="X", markersize=11, color=style.TARGET,
             markeredgecolor="white", linestyle="none", zorder=10,
@@ -497,7 +450,7 @@ class _Drawing(ArmDrawing):
             )
             self.covered.append(np.linspace(self.tip, point, 40))
 
-    def _draw_triad(self, point: Vector, quaternion: Any, length: float) -> None:
+    def _draw_triad(self, point: Array, quaternion: Any, length: float) -> None:
         wanted = np.asarray(lie.rotation_from_quaternion(np.array(quaternion)))
         for k, shade in enumerate(("#d62728", "#2ca02c", "#1f4fd6")):
             self.draw_arrow(point, 0.8 * length * wanted[:, k], shade, 8, "--")

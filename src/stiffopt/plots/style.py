@@ -13,15 +13,14 @@ from textwrap import shorten
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.documents import write_whole
 from stiffopt.errors import FileError, printable, require_package
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-Array = NDArray[np.float64]
 
 # -- colours --------------------------------------------------------------------------------------
 
@@ -87,10 +86,7 @@ def require_matplotlib() -> None:
 def new_figure(width: float, height: float, **settings: Any) -> Figure:
     """Return an empty figure of a size in inches.
 
-    Raises
-    ------
-    MissingExtraError
-        If matplotlib is not installed.
+    Raises `MissingExtraError` if matplotlib is not installed.
     """
     require_matplotlib()
     from matplotlib.figure import Figure
@@ -137,10 +133,7 @@ def stacked_panels(
 def save_figure(figure: Figure, path: str | os.PathLike[str]) -> None:
     """Write a figure atomically, in the format of the path's ending.
 
-    Raises
-    ------
-    FileError
-        The file cannot be written.
+    Raises `FileError`: the file cannot be written.
     """
     buffer = BytesIO()
     try:

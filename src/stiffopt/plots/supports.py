@@ -34,10 +34,7 @@ def plot_supports(
     On the left is the arm on the best of them. The maps on the right are the surface of its body,
     unrolled; numbers are the places that were tested.
 
-    Parameters
-    ----------
-    title : begins the title.
-    view : (elevation, azimuth), see `draw_arm`.
+    `title`: begins the title. `view`: (elevation, azimuth), see `draw_arm`.
     """
     figure = style.new_figure(13, 8.0)
     axes = style.add_space(figure, (0.02, 0.03, 0.45, 0.77))

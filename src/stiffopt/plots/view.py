@@ -7,13 +7,12 @@ from math import degrees, radians
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.errors import InputError, shown
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.units import finite_number, parse_quantity
 
-Vector = NDArray[np.float64]
 View = Sequence[float | str]
 """Elevation and azimuth: numbers in rad, or text with a unit, such as ``"20 deg"``."""
 
@@ -23,27 +22,17 @@ _ASIDE, _BELOW, _ABOVE = 40.0, 37.0, 4.0  # points, margins for the numbers at t
 
 
 class ViewAngles(NamedTuple):
-    """A view of a standing or a hanging arm, in rad.
+    """A view of a standing or a hanging arm, in rad."""
 
-    Attributes
-    ----------
-    elevation : of the eye above the horizontal through the arm, as the page shows it.
-    azimuth : of the eye about the z axis of the base, from the x axis.
-    hangs : whether z points down on the page.
-    """
-
-    elevation: float
-    azimuth: float
-    hangs: bool
+    elevation: float  # of the eye above the horizontal through the arm, as the page shows it
+    azimuth: float  # of the eye about the z axis of the base, from the x axis
+    hangs: bool  # whether z points down on the page
 
     @classmethod
     def of(cls, robot: Manipulator, view: View | None = None) -> ViewAngles:
         """Return the requested view, or the default one, with x to the right.
 
-        Raises
-        ------
-        InputError
-            The view is not two angles, or its elevation exceeds 90 deg.
+        Raises `InputError`: the view is not two angles, or its elevation exceeds 90 deg.
         """
         hangs = robot.description.gravity[2] > 0
         if view is None:
@@ -103,13 +92,13 @@ def move_to_the_right(axes: Any) -> None:
     axes.stale = True
 
 
-def box_corners(axes: Any) -> Vector:
+def box_corners(axes: Any) -> Array:
     """Return the corners (8, 3) of the box of 3-D axes."""
     limits = axes.get_xlim(), axes.get_ylim(), axes.get_zlim()
     return np.stack(np.meshgrid(*limits, indexing="ij"), axis=-1).reshape(8, 3)
 
 
-def projected(axes: Any, points: Vector) -> Vector:
+def projected(axes: Any, points: Array) -> Array:
     """Project points (k, 3) to the picture (2, k), in data units of its plane."""
     from mpl_toolkits.mplot3d import proj3d
 

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field, SerializeAsAny, ValidationError, ValidationInfo
 from pydantic_core import InitErrorDetails
 
+from stiffopt.arrays import Array
 from stiffopt.errors import FileError, InputError, dotted
 from stiffopt.files import line_of, read_file
 from stiffopt.model.description import RobotDescription
@@ -177,10 +177,7 @@ def load_rig_description(path: str | os.PathLike[str]) -> RigDescription:
 def load_rig(path: str | os.PathLike[str]) -> tuple[RigDescription, RobotDescription]:
     """Read a rig file and the file of its robot; check that they fit.
 
-    Raises
-    ------
-    FileError
-        The file, or the robot file that it names, cannot be read or is wrong.
+    Raises `FileError`: the file, or the robot file that it names, cannot be read or is wrong.
     """
     description = read_file(path, "rig", RigDescription)
     try:
@@ -206,10 +203,7 @@ def load_rig(path: str | os.PathLike[str]) -> tuple[RigDescription, RobotDescrip
 def _check_against(description: RigDescription, robot: RobotDescription) -> None:
     """Refuse a rig that does not fit its robot.
 
-    Raises
-    ------
-    InputError
-        The number of channels differs, a limit is above the robot's, or the like.
+    Raises `InputError`: the number of channels differs, a limit is above the robot's, or the like.
     """
     n = robot.n_pressures
     supply = description.supply
@@ -288,7 +282,7 @@ def limits_of(description: RigDescription, robot: RobotDescription) -> PressureL
     return PressureLimits(np.array(robot.pressure_min), high)
 
 
-def slew_of(description: RigDescription, robot: RobotDescription) -> NDArray[np.float64] | None:
+def slew_of(description: RigDescription, robot: RobotDescription) -> Array | None:
     """Return the greatest rates of change (n,), in Pa/s, or None if there is no limit."""
     return robot.slew_limits(description.safety.max_slew)
 
@@ -296,10 +290,8 @@ def slew_of(description: RigDescription, robot: RobotDescription) -> NDArray[np.
 def registration_of(tracker: TrackerSettings, robot: RobotDescription) -> Registration:
     """Return the registration that turns a tracker's readings into tip poses in the base frame.
 
-    Raises
-    ------
-    InputError
-        The tracker relies on the robot file's correction, but the file has none that fits.
+    Raises `InputError`: the tracker relies on the robot file's correction, but the file has none
+    that fits.
     """
     given = tracker.registration
     if not tracker.calibrated:

@@ -114,9 +114,7 @@ class Device(Opened):
 class MisfitError(InputError):
     """A section of a rig file contradicts another section, or the robot.
 
-    Attributes
-    ----------
-    place : keys that lead to the mistake, from the top of the rig file.
+    `place`: keys that lead to the mistake, from the top of the rig file.
     """
 
     def __init__(self, reason: str, *place: str | int) -> None:
@@ -168,10 +166,7 @@ class DeviceSettings(RigSection):
 def library(module: str, package: str, extra: str) -> Any:
     """Import a library that one of stiffopt's extras installs.
 
-    Raises
-    ------
-    MissingExtraError
-        It is not installed.
+    Raises `MissingExtraError`: it is not installed.
     """
     try:
         return import_module(module)

@@ -21,10 +21,7 @@ def tcp_endpoints(host: str, port: int) -> tuple[str, ...]:
 
     All addresses of this machine are one host: a server on it usually listens on all of them.
 
-    Raises
-    ------
-    DeviceError
-        The host has no address.
+    Raises `DeviceError`: the host has no address.
     """
     try:
         found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)

@@ -11,12 +11,11 @@ from dataclasses import dataclass, field
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from stiffopt.arrays import Array
 from stiffopt.errors import CommandError, DeviceError, InputError
 from stiffopt.rig.device import Clock, Device, DeviceSettings
-
-Array = NDArray[np.float64]
 
 _FLOAT = np.dtype(float)
 _LOOK = 0.05  # s between checks whether another program commands the device
@@ -27,10 +26,7 @@ _SLACK = 1e-6  # of a channel's range
 class PressureLimits:
     """Lowest and highest pressure that may be commanded, for each channel.
 
-    Attributes
-    ----------
-    low, high : ndarray
-        Gauge pressures (n,), in Pa; venting (0 Pa) is always allowed.
+    `low`, `high`: gauge pressures (n,), in Pa; venting (0 Pa) is always allowed.
     """
 
     low: Array
@@ -57,10 +53,8 @@ class PressureLimits:
     def within(self, other: PressureLimits) -> PressureLimits:
         """Return the limits that allow what both allow.
 
-        Raises
-        ------
-        InputError
-            The other has another number of channels, or leaves a channel no pressure.
+        Raises `InputError`: the other has another number of channels, or leaves a channel no
+        pressure.
         """
         if other.n != self.n:
             raise InputError(f"there are {self.n} channels, but limits for {other.n}")
@@ -77,10 +71,7 @@ class PressureLimits:
     def check(self, pressures: ArrayLike) -> Array:
         """Return pressures (n,) if they are permitted.
 
-        Raises
-        ------
-        CommandError
-            Wrong number, not finite or out of range; it names the channel.
+        Raises `CommandError`: wrong number, not finite or out of range; it names the channel.
         """
         within = self._copy_within(pressures)
         if within is not None:
@@ -134,10 +125,8 @@ class PressureLimits:
 class PressureReading:
     """Pressures that a supply has measured.
 
-    Attributes
-    ----------
-    time : when it was read.
-    pressures : gauge pressures (n,), in Pa; NaN where the device measures none.
+    `time`: when it was read. `pressures`: gauge pressures (n,), in Pa; NaN where the device
+    measures none.
     """
 
     time: float

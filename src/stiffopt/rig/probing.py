@@ -11,18 +11,11 @@ from stiffopt.rig.device import Clock, Device, DeviceSettings
 
 @dataclass(frozen=True)
 class ForceSample:
-    """One measurement of a probe.
+    """One measurement of a probe."""
 
-    Attributes
-    ----------
-    time : when it was measured.
-    force : force of the probe on the tip along its axis, in N.
-    position : position of the probe along its axis, in m.
-    """
-
-    time: float
-    force: float
-    position: float
+    time: float  # when it was measured
+    force: float  # force of the probe on the tip along its axis, in N
+    position: float  # position of the probe along its axis, in m
 
 
 class ProbeSettings(DeviceSettings):

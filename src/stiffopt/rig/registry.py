@@ -64,15 +64,9 @@ def driver_names(kind: str) -> tuple[str, ...]:
 def driver_class(kind: str, driver: Any) -> type[DeviceSettings]:
     """Return the settings class of a driver.
 
-    Parameters
-    ----------
-    kind : kind of the device, a key of `KINDS`.
-    driver : value in the rig file: a name, or ``package.module:Class``.
-
-    Raises
-    ------
-    InputError
-        There is no such driver, it is not installed, or it is for another kind of device.
+    `kind`: kind of the device, a key of `KINDS`. `driver`: value in the rig file: a name, or
+    ``package.module:Class``. Raises `InputError`: there is no such driver, it is not installed, or
+    it is for another kind of device.
     """
     if not isinstance(driver, str):
         raise InputError(f"expected the name of a driver, not {shown(driver)}")
@@ -123,10 +117,7 @@ def _load_announced(kind: str, name: str) -> Any:
 def _load_installed(reference: str, owners: Iterable[Distribution]) -> Any:
     """Load a class after checking that one of these packages has installed its module.
 
-    Raises
-    ------
-    InputError
-        None has, or the class cannot be imported.
+    Raises `InputError`: none has, or the class cannot be imported.
     """
     module, _, name = reference.partition(":")
     owned = list(owners)

@@ -9,14 +9,13 @@ from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydantic import Field
 
+from stiffopt.arrays import Array
 from stiffopt.registration import Registration
 from stiffopt.rig.device import Clock, Device, DeviceSettings
 from stiffopt.units import Duration, Length
-
-Array = NDArray[np.float64]
 
 _QUEUED = 4096  # samples that a tracker keeps until they are read; the oldest are dropped first
 _NORM_SLACK = 0.05  # by which the norm of a tracker's quaternion may differ from 1
@@ -102,10 +101,7 @@ class PoseTracker(Device):
     registration, sign of the quaternion and plausibility. `read` never waits: if a device is
     silent, only the age of the latest sample shows it.
 
-    Attributes
-    ----------
-    registration : Registration
-        Turns the device's readings into poses of the tip in the base frame.
+    `registration`: turns the device's readings into poses of the tip in the base frame.
     """
 
     def __init__(

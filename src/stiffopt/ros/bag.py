@@ -40,12 +40,8 @@ def write_bag(
 
     `check` is called now and then, and may raise.
 
-    Raises
-    ------
-    FileError
-        The bag cannot be written.
-    MissingExtraError
-        foxglove-sdk is not installed.
+    Raises `FileError`: the bag cannot be written; `MissingExtraError`: foxglove-sdk is not
+    installed.
     """
     from foxglove import Channel, Context, Schema
 

@@ -132,13 +132,7 @@ class Bridge:
         node.announce()
 
     def run(self, over: threading.Event) -> None:
-        """Publish until `over` is set.
-
-        Raises
-        ------
-        ServiceError
-            The daemon has ended.
-        """
+        """Publish until `over` is set. Raises `ServiceError`: the daemon has ended."""
         works = [self._listen, self._command, self._solve, self._vent]
         threads = [threading.Thread(target=work, daemon=True) for work in works]
         with ExitStack() as stack:

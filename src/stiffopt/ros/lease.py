@@ -64,10 +64,7 @@ class GraphLease:
     def move(self, source: Subscription, writer: Writer, command: Callable[[], None]) -> None:
         """Set the arm in motion for a writer, which has control from then on.
 
-        Raises
-        ------
-        StiffoptError
-            Another writer has control, or the daemon refuses.
+        Raises `StiffoptError`: another writer has control, or the daemon refuses.
         """
         self._check(writer)
         had = self._holder is not None

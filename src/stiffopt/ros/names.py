@@ -26,21 +26,13 @@ def _checked(name: str, what: str) -> str:
 class NodeNames:
     """The full names of a node's topics and services.
 
-    Attributes
-    ----------
-    node : name of the node.
-    namespace : begins with ``/``; ``/`` alone means none.
-    remap : names that replace others. Both may be full (``/a``), relative to the namespace
-        (``a``) or to the node (``~/a``).
-
-    Raises
-    ------
-    InputError
-        One of them is invalid in ROS 2, or two rules are for the same name.
+    Raises `InputError`: one of them is invalid in ROS 2, or two rules are for the same name.
     """
 
-    node: str
-    namespace: str = "/"
+    node: str  # name of the node
+    namespace: str = "/"  # begins with ``/``; ``/`` alone means none
+    # names that replace others. Both may be full (``/a``), relative to the namespace (``a``) or to
+    # the node (``~/a``)
     remap: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

@@ -70,18 +70,11 @@ def _qos(depth: int, *more: Any, reliable: bool = True, latched: bool = False) -
 
 @dataclass(frozen=True)
 class Writer:
-    """The writer of a message.
+    """The writer of a message."""
 
-    Attributes
-    ----------
-    handle : of the writer, in this process.
-    participant : of its process; a context in ROS 2.
-    lease : time within which it must assert its liveliness, in s; infinite if it need not.
-    """
-
-    handle: int
-    participant: UUID
-    lease: float
+    handle: int  # of the writer, in this process
+    participant: UUID  # of its process; a context in ROS 2
+    lease: float  # time within which it must assert its liveliness, in s; infinite if it need not
 
 
 @dataclass(frozen=True)
@@ -188,10 +181,7 @@ class Service:
 def network_interface(name: str | None) -> str:
     """Return the name of a network interface; None: that of loopback.
 
-    Raises
-    ------
-    InputError
-        There is no such interface.
+    Raises `InputError`: there is no such interface.
     """
     place = name or _LOOPBACK
     existing = [name for _, name in socket.if_nameindex()]
@@ -205,17 +195,14 @@ def network_interface(name: str | None) -> str:
 class RosNode:
     """A node with topics and services; other nodes find it once `announce` is called.
 
+    Raises `InputError`: there is no such interface, or DDS refuses it.
+
     Parameters
     ----------
     names : names of the node, its topics and services.
     domain, interface : the DDS domain, and the network interface; None for loopback, which no other
         machine can reach.
     distro : ``humble`` or ``jazzy``: the layout of the discovery messages.
-
-    Raises
-    ------
-    InputError
-        There is no such interface, or DDS refuses it.
     """
 
     def __init__(

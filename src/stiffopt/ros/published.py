@@ -8,9 +8,9 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stiffopt import lie
+from stiffopt.arrays import Array
 from stiffopt.control.state import Event, Severity, Snapshot, State
 from stiffopt.daemon.state_json import json_of
 from stiffopt.daemon.topics import BASE, TARGET, TIP, target_place, target_turn
@@ -43,7 +43,6 @@ from stiffopt.ros.messages import (
     WrenchStamped,
 )
 
-Array = NDArray[np.float64]
 Message = tuple[str, Any]
 """A topic and a message for it."""
 

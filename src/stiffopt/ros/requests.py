@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.daemon.messages import task_of
 from stiffopt.errors import InputError, shown
 from stiffopt.model.manipulator import Manipulator
@@ -15,8 +15,6 @@ from stiffopt.optimise.task import Task
 from stiffopt.paths.trajectory import Trajectory, trajectory_through
 from stiffopt.ros.messages import Header, JointTrajectory, PointStamped, PoseStamped
 from stiffopt.ros.published import channel_names, seconds_of
-
-Array = NDArray[np.float64]
 
 MAX_AGE = 1.0
 """Greatest difference between the stamp of a request and now, in s: no recording moves the arm."""
@@ -48,10 +46,8 @@ def check_frame(header: Header, base: str) -> None:
 def target_of(message: PoseStamped | PointStamped, base: str, now: float) -> Target:
     """Return the target of a pose, or of a point, in the base frame.
 
-    Raises
-    ------
-    InputError
-        It is old, in another frame or not finite, or its quaternion does not have length 1.
+    Raises `InputError`: it is old, in another frame or not finite, or its quaternion does not have
+    length 1.
     """
     check_stamp(message.header, now)
     check_frame(message.header, base)
@@ -77,10 +73,8 @@ def trajectory_of(message: JointTrajectory, robot: Manipulator, now: float) -> T
     The model determines the tip's targets. Velocities, accelerations and effort are not used:
     between two points the pressures change linearly.
 
-    Raises
-    ------
-    InputError
-        It is old, does not name each channel once, or its points are no pressures over time.
+    Raises `InputError`: it is old, does not name each channel once, or its points are no pressures
+    over time.
     """
     check_stamp(message.header, now)
     channels = channel_names(robot.description)

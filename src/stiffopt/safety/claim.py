@@ -57,10 +57,7 @@ class Claim:
     def take(self) -> None:
         """Claim all endpoints; do nothing if they are already held.
 
-        Raises
-        ------
-        DeviceError
-            Another program has one of them, or this system has no such claims.
+        Raises `DeviceError`: another program has one of them, or this system has no such claims.
         """
         with self._lock:
             if self._names:

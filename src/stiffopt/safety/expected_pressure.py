@@ -6,12 +6,10 @@ from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.model.description import RobotDescription
 from stiffopt.rig.settings import ControlSettings
-
-Array = NDArray[np.float64]
 
 _MAX_COMMANDS = 1000  # commands kept, at most, while a dead time passes
 
@@ -20,10 +18,8 @@ _MAX_COMMANDS = 1000  # commands kept, at most, while a dead time passes
 class Regulation:
     """The slowest response of healthy regulators: a dead time and a first-order lag.
 
-    Attributes
-    ----------
-    lag, lag_falling : time constants (n,) of rising and falling pressures, in s.
-    dead_time : time until a command has any effect, in s.
+    `lag`, `lag_falling`: time constants (n,) of rising and falling pressures, in s. `dead_time`:
+    time until a command has any effect, in s.
     """
 
     lag: Array

@@ -12,8 +12,9 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from stiffopt.arrays import Array
 from stiffopt.errors import CommandError, InputError
 from stiffopt.rig.interface import (
     Clock,
@@ -29,27 +30,17 @@ from stiffopt.safety.claim import Claim
 from stiffopt.safety.settings import COMMANDS
 from stiffopt.safety.vent_line import guards_of
 
-Array = NDArray[np.float64]
-
 
 @dataclass(frozen=True)
 class Applied:
-    """Outcome of a command.
+    """Outcome of a command."""
 
-    Attributes
-    ----------
-    pressures : set-points (n,) of the supply, in Pa.
-    reading : newest measured pressures, with the time of the measurement.
-    limited : whether the set-points differ from the command, because of its rate or force.
-    refused : why the command was refused; empty if it was carried out.
-    force_limited : whether it was reduced because of the total force.
-    """
-
-    pressures: Array
-    reading: PressureReading
+    pressures: Array  # set-points (n,) of the supply, in Pa
+    reading: PressureReading  # newest measured pressures, with the time of the measurement
+    # whether the set-points differ from the command, because of its rate or force
     limited: bool = False
-    refused: str = ""
-    force_limited: bool = False
+    refused: str = ""  # why the command was refused; empty if it was carried out
+    force_limited: bool = False  # whether it was reduced because of the total force
 
 
 class Outlet(Protocol):
@@ -102,6 +93,9 @@ class SafetyGate:
     A channel whose low limit is above 0 has no set-points between 0 and that limit: it stays at 0
     for as long as a rise from 0 to the limit takes, then steps to the limit.
 
+    Raises `InputError`: an argument does not fit the number of channels, or is not a positive
+    number.
+
     Parameters
     ----------
     supply : the supply; nothing else may command it while the gate is in use.
@@ -116,11 +110,6 @@ class SafetyGate:
     Attributes
     ----------
     limits : limits of the commands: the supply's, tightened by those of `safety`.
-
-    Raises
-    ------
-    InputError
-        An argument does not fit the number of channels, or is not a positive number.
     """
 
     def __init__(
@@ -167,10 +156,7 @@ class SafetyGate:
     def open(self) -> None:
         """Claim the supply and connect to it, which vents it.
 
-        Raises
-        ------
-        DeviceError
-            Another program commands it, or it does not answer.
+        Raises `DeviceError`: another program commands it, or it does not answer.
         """
         with self._lock:
             self._claim.take()
@@ -183,11 +169,8 @@ class SafetyGate:
     def close(self) -> None:
         """Vent, disconnect and give up the claim.
 
-        Raises
-        ------
-        DeviceError
-            Venting failed, see `PressureSupply.close`. The supply stays claimed, because closing is
-            tried again when the interpreter exits.
+        Raises `DeviceError`: venting failed, see `PressureSupply.close`. The supply stays claimed,
+        because closing is tried again when the interpreter exits.
         """
         with self._lock:
             self._armed = False
@@ -197,13 +180,8 @@ class SafetyGate:
     def arm(self) -> None:
         """Accept commands from now on; the set-points are 0 at first.
 
-        Raises
-        ------
-        CommandError
-            No rate of change is set, or nothing would vent the arm if this computer failed and
-            the rig file does not accept that.
-        DeviceError
-            The supply failed.
+        Raises `CommandError`: no rate of change is set, or nothing would vent the arm if this
+        computer failed and the rig file does not accept that; `DeviceError`: the supply failed.
         """
         with self._lock:
             self.check_arming()
@@ -225,10 +203,7 @@ class SafetyGate:
 
         A channel that is already above its limit may stay there, or fall.
 
-        Raises
-        ------
-        InputError
-            They are not one finite pressure for each channel.
+        Raises `InputError`: they are not one finite pressure for each channel.
         """
         given = np.array(high, dtype=float)
         if given.shape != self.limits.high.shape or not np.isfinite(given).all():
@@ -239,10 +214,7 @@ class SafetyGate:
     def vent(self) -> None:
         """Let all pressure out at once; refuse commands until `arm`.
 
-        Raises
-        ------
-        DeviceError
-            The supply failed: try again; `expire` does so too.
+        Raises `DeviceError`: the supply failed: try again; `expire` does so too.
         """
         with self._lock:
             self._armed = False
@@ -254,18 +226,8 @@ class SafetyGate:
     def expire(self, now: float) -> bool:
         """Vent if no valid command came for too long, or if venting failed before; call it often.
 
-        Parameters
-        ----------
-        now : time on the rig's clock, in s.
-
-        Returns
-        -------
-        True if it vented.
-
-        Raises
-        ------
-        DeviceError
-            The supply failed; the next call tries again.
+        `now`: time on the rig's clock, in s. Returns True if it vented. Raises `DeviceError`: the
+        supply failed; the next call tries again.
         """
         with self._lock:
             kept = not self._armed or now - self._valid_at <= self._timeout
@@ -281,10 +243,8 @@ class SafetyGate:
     def apply(self, command: PressureCommand) -> Applied:
         """Carry out a command as far as the limits allow, or refuse it.
 
-        Raises
-        ------
-        DeviceError
-            The supply does not answer; whether it has the new set-points is unknown.
+        Raises `DeviceError`: the supply does not answer; whether it has the new set-points is
+        unknown.
         """
         with self._lock:
             now = self.clock.now()
@@ -405,10 +365,7 @@ def gate_before(rig: Rig, safety: Safety, period: float) -> SafetyGate:
 def check_protection(supply: PressureSupply, safety: Safety) -> None:
     """Refuse a supply that nothing vents when this computer fails, unless that is accepted.
 
-    Raises
-    ------
-    CommandError
-        The supply is real and has neither a watchdog nor a dump valve.
+    Raises `CommandError`: the supply is real and has neither a watchdog nor a dump valve.
     """
     protected = supply.is_simulated or supply.has_watchdog or supply.has_dump_valve
     if not protected and safety.unprotected_supply != "accepted":

@@ -13,8 +13,9 @@ import threading
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from stiffopt.arrays import Array
 from stiffopt.errors import CommandError, DeviceError
 from stiffopt.rig.interface import (
     Clock,
@@ -30,7 +31,6 @@ from stiffopt.safety.settings import COMMANDS
 if TYPE_CHECKING:
     from stiffopt.safety.guard_client import GuardLink
 
-Array = NDArray[np.float64]
 
 _EXPIRED = (
     "no command came for as long as the last one was valid, so the pressures were let down and "
@@ -41,10 +41,8 @@ _EXPIRED = (
 def check_goal(goal: PressureCommand, now: float, limits: PressureLimits) -> Array:
     """Return the pressures (n,) of a valid goal, in Pa.
 
-    Raises
-    ------
-    CommandError
-        They are outside the limits, or the goal has expired or is valid for too long.
+    Raises `CommandError`: they are outside the limits, or the goal has expired or is valid for too
+    long.
     """
     if isinstance(goal.valid_for, str):
         raise CommandError("expected a number of seconds for valid_for, not text")
@@ -127,10 +125,7 @@ class GoalFollower:
     def arm_for_goals(self) -> None:
         """Accept goals from now on; all set-points are 0 until the first one.
 
-        Raises
-        ------
-        CommandError, DeviceError
-            As `SafetyGate.arm`.
+        Raises `CommandError` or `DeviceError` as `SafetyGate.arm`.
         """
         with self._lock:
             if self._gate.armed:  # it may be under pressure, and arming begins without
@@ -154,12 +149,8 @@ class GoalFollower:
     def pursue(self, goal: PressureCommand) -> Applied:
         """Replace the goal and make the first step towards the new one.
 
-        Raises
-        ------
-        CommandError
-            The goal is refused and the last one stays, as if `Applied.refused` reports it.
-        DeviceError
-            The supply does not answer.
+        Raises `CommandError`: the goal is refused and the last one stays, as if `Applied.refused`
+        reports it; `DeviceError`: the supply does not answer.
         """
         with self._lock:
             now = self._clock.now()
@@ -187,10 +178,7 @@ class GoalFollower:
     def tick(self) -> None:
         """Repeat the goal, or let the pressures down if it has expired.
 
-        Raises
-        ------
-        DeviceError
-            The supply does not answer.
+        Raises `DeviceError`: the supply does not answer.
         """
         with self._lock:
             now = self._clock.now()
@@ -246,10 +234,8 @@ class GoalSupply(Supply):
     the pressures are let down within `Safety.ramp_time` and vented. In real time the guard process
     does all this, and vents at once when this process ends; a simulated rig uses its own clock.
 
-    Parameters
-    ----------
-    outlet : accepts the goals: a follower in this process, or the link to a guard that has one.
-    clock : clock of the rig.
+    `outlet`: accepts the goals: a follower in this process, or the link to a guard that has one.
+    `clock`: clock of the rig.
     """
 
     def __init__(self, outlet: GoalFollower | GuardLink, clock: Clock) -> None:
@@ -321,10 +307,7 @@ class GoalSupply(Supply):
 class TickingClock(Clock):
     """Clock of a simulated rig that ticks a goal follower while simulated time passes.
 
-    Parameters
-    ----------
-    clock : clock that lets simulated time pass.
-    follower : ticked whenever it is due.
+    `clock`: clock that lets simulated time pass. `follower`: ticked whenever it is due.
     """
 
     def __init__(self, clock: Clock, follower: GoalFollower) -> None:

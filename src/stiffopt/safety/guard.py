@@ -416,12 +416,9 @@ def _on_monotonic(sample: PoseSample, epoch: float) -> PoseSample:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the guard process and return its exit code: 0 if the supply is vented at the end.
 
-    Parameters
-    ----------
-    arguments :
-        File descriptor of the inherited socket, and optionally ``json`` for JSON lines on stderr;
-        None: those of the command line. The parent process sends the rig, pickled, on standard
-        input.
+    `arguments`: file descriptor of the inherited socket, and optionally ``json`` for JSON lines on
+    stderr; None: those of the command line. The parent process sends the rig, pickled, on standard
+    input.
     """
     parent = os.getppid()
     _ignore(_IGNORED)

@@ -20,8 +20,8 @@ from contextlib import suppress
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.errors import DeviceError, GuardTripped, MissingExtraError, warn_slow
 from stiffopt.model.description import RobotDescription
 from stiffopt.rig.config import RigDescription
@@ -46,8 +46,6 @@ from stiffopt.safety.messages import (
 )
 from stiffopt.safety.rescue import GuardWatch
 from stiffopt.safety.settings import CLIENT
-
-Array = NDArray[np.float64]
 
 _START_SLICE = 0.05  # s between checks of a guard that starts
 _SLICE = 0.02  # s; no thread keeps others from receiving for longer
@@ -96,12 +94,8 @@ class GuardProcess:
     def wait_until_ready(self) -> str:
         """Wait until the guard owns the supply; return its real-time privileges, in words.
 
-        Raises
-        ------
-        DeviceError
-            The supply does not answer, or the process does not start.
-        MissingExtraError
-            A library is not installed.
+        Raises `DeviceError`: the supply does not answer, or the process does not start;
+        `MissingExtraError`: a library is not installed.
         """
         if self._process.stdin is not None:
             with suppress(BrokenPipeError), self._process.stdin as stdin:
@@ -194,10 +188,7 @@ class Exchange:
     def send_goal(self, goal: PressureCommand) -> GuardAnswer:
         """Send a goal and return the answer to it.
 
-        Raises
-        ------
-        DeviceError
-            The guard has ended, or does not answer.
+        Raises `DeviceError`: the guard has ended, or does not answer.
         """
         sequence, now = next(self._numbers), time.monotonic()
         pressures = np.asarray(goal.pressures, dtype=float)
@@ -207,10 +198,7 @@ class Exchange:
     def send(self, command: PressureCommand, wait: float) -> None:
         """Send a command of a stream and wait up to `wait` s for its answer.
 
-        Raises
-        ------
-        DeviceError
-            The guard has ended, or does not accept the command.
+        Raises `DeviceError`: the guard has ended, or does not accept the command.
         """
         sequence, now = next(self._numbers), time.monotonic()
         pressures = np.asarray(command.pressures, dtype=float)
@@ -228,10 +216,7 @@ class Exchange:
     def ask(self, do: str, **about: Any) -> GuardAnswer:
         """Send a request and return the answer, which may report a failure.
 
-        Raises
-        ------
-        DeviceError
-            The guard has ended, or does not answer.
+        Raises `DeviceError`: the guard has ended, or does not answer.
         """
         return self._answer_to(GuardRequest(next(self._numbers), do, about), f"'{do}'")
 
@@ -373,12 +358,8 @@ class GuardLink:
     def open(self) -> None:
         """Start the guard and wait until it has connected to the supply and vented it.
 
-        Raises
-        ------
-        DeviceError
-            The supply does not answer, or the guard does not start.
-        MissingExtraError
-            A library is not installed.
+        Raises `DeviceError`: the supply does not answer, or the guard does not start;
+        `MissingExtraError`: a library is not installed.
         """
         if self._process is not None:
             return
@@ -397,10 +378,7 @@ class GuardLink:
     def close(self) -> None:
         """Vent, and end the guard; it is killed only if it does not end by itself.
 
-        Raises
-        ------
-        DeviceError
-            It is not certain that the supply is vented.
+        Raises `DeviceError`: it is not certain that the supply is vented.
         """
         if self._process is None:
             return
@@ -482,22 +460,15 @@ class GuardLink:
     def arm(self) -> None:
         """Arm for a stream of commands, the first of which must come within a second.
 
-        Raises
-        ------
-        GuardTripped
-            The guard had vented on its own and the caller did not know yet.
-        DeviceError
-            The supply or the guard fails.
+        Raises `GuardTripped`: the guard had vented on its own and the caller did not know yet;
+        `DeviceError`: the supply or the guard fails.
         """
         self._arm(goals=False)
 
     def arm_for_goals(self) -> None:
         """Arm for goals; all set-points are 0 until the first one.
 
-        Raises
-        ------
-        GuardTripped, DeviceError
-            As for `arm`.
+        Raises `GuardTripped` or `DeviceError` as for `arm`.
         """
         self._arm(goals=True)
 
@@ -513,10 +484,7 @@ class GuardLink:
     def restrict(self, high: Array) -> None:
         """Let no channel rise above a task's limits (n,), in Pa; see `SafetyGate.restrict`.
 
-        Raises
-        ------
-        DeviceError
-            The guard refuses them, or does not answer.
+        Raises `DeviceError`: the guard refuses them, or does not answer.
         """
         self._ask("restrict", high=np.asarray(high, dtype=float).tolist())
 
@@ -533,11 +501,8 @@ class GuardLink:
     def vent(self) -> None:
         """Let all pressure out at once; wait for nothing but the guard.
 
-        Raises
-        ------
-        DeviceError
-            The supply did not accept it; the guard keeps trying as long as it lives. Or the guard
-            has ended, and the supply could not be vented directly yet.
+        Raises `DeviceError`: the supply did not accept it; the guard keeps trying as long as it
+        lives. Or the guard has ended, and the supply could not be vented directly yet.
         """
         try:
             self._told = self._ask("vent").trips
@@ -548,20 +513,15 @@ class GuardLink:
     def read(self) -> PressureReading:
         """Return the measured pressures, in Pa.
 
-        Raises
-        ------
-        DeviceError
-            The supply or the guard does not answer.
+        Raises `DeviceError`: the supply or the guard does not answer.
         """
         return _reading(self._ask("read"))
 
     def apply(self, command: PressureCommand) -> Applied:
         """Send a command of a stream; return the newest answer, to this command or an earlier one.
 
-        Raises
-        ------
-        DeviceError
-            The guard has ended, does not answer or has vented on its own, or the supply fails.
+        Raises `DeviceError`: the guard has ended, does not answer or has vented on its own, or the
+        supply fails.
         """
         exchange = self._open_exchange()
         exchange.send(command, CLIENT.fresh)
@@ -577,12 +537,8 @@ class GuardLink:
     def pursue(self, goal: PressureCommand) -> Applied:
         """Send a goal and return the answer to it.
 
-        Raises
-        ------
-        GuardTripped
-            The guard has vented on its own.
-        DeviceError
-            The guard has ended or does not answer, or the supply fails.
+        Raises `GuardTripped`: the guard has vented on its own; `DeviceError`: the guard has ended
+        or does not answer, or the supply fails.
         """
         answer = self._open_exchange().send_goal(goal)
         self._check_trip(answer)
@@ -598,10 +554,7 @@ class GuardLink:
     def inject(self, device: str, fault: str, channel: int | None = None) -> None:
         """Inject a fault into a device of a simulated rig; see `stiffopt.plant.world.World`.
 
-        Raises
-        ------
-        DeviceError
-            The rig is real, does not allow faults, or has no such fault.
+        Raises `DeviceError`: the rig is real, does not allow faults, or has no such fault.
         """
         self._ask("inject", device=device, fault=fault, channel=channel)
 
@@ -612,10 +565,7 @@ class GuardLink:
     def ask_world(self, word: str, **about: Any) -> Any:
         """Send a request to the simulated rig in the guard process and return its result.
 
-        Raises
-        ------
-        DeviceError
-            The request fails, or the rig is not simulated.
+        Raises `DeviceError`: the request fails, or the rig is not simulated.
         """
         return self._ask(word, **about).value
 

@@ -40,33 +40,22 @@ _LOOK = 0.005  # s between checks of a moving stage
 
 @dataclass(frozen=True)
 class Owned:
-    """The objects that a guard owns.
+    """The objects that a guard owns."""
 
-    Attributes
-    ----------
-    gate : the gate in front of the supply, not yet open.
-    follower : brings the supply to the goals of programs, through the gate.
-    timeout : silence of a stream after which the guard vents, in s.
-    line : makes the vent line on which the guard listens for `stiffopt vent`.
-    epoch : time 0 of the rig's clock on `time.monotonic`, in s.
-    hosted : tracker, probe and truth of a simulated rig; None for real devices.
-    """
-
-    gate: SafetyGate
-    follower: GoalFollower
-    timeout: float
+    gate: SafetyGate  # the gate in front of the supply, not yet open
+    follower: GoalFollower  # brings the supply to the goals of programs, through the gate
+    timeout: float  # silence of a stream after which the guard vents, in s
+    # makes the vent line on which the guard listens for `stiffopt vent`
     line: Callable[[], VentLine]
-    epoch: float = 0.0
+    epoch: float = 0.0  # time 0 of the rig's clock on `time.monotonic`, in s
+    # tracker, probe and truth of a simulated rig; None for real devices
     hosted: HostedDevices | None = None
 
 
 def owned(description: RigDescription, robot: RobotDescription) -> Owned:
     """Make what the guard of a rig owns, without connecting to anything.
 
-    Raises
-    ------
-    MissingExtraError
-        A library is not installed.
+    Raises `MissingExtraError`: a library is not installed.
     """
     simulated = description.supply.simulated
     away = {} if simulated else {"probe": None, "tracker": None}
@@ -90,9 +79,7 @@ def simulated_endpoint(description: RigDescription) -> str:
 class HostedDevices:
     """Tracker, probe and truth of a simulated rig in real time, inside the guard process.
 
-    Parameters
-    ----------
-    rig : a simulated rig.
+    `rig`: a simulated rig.
     """
 
     def __init__(self, rig: Rig) -> None:
@@ -111,12 +98,8 @@ class HostedDevices:
     def ask(self, word: str, about: dict[str, Any]) -> Any:
         """Carry out the request ``inject``, ``truth``, ``pressures`` or one of a `ForwardedProbe`.
 
-        Raises
-        ------
-        DeviceError
-            There is no such request, or the probe fails.
-        InputError
-            There is no such fault, or the rig file does not allow faults.
+        Raises `DeviceError`: there is no such request, or the probe fails; `InputError`: there is
+        no such fault, or the rig file does not allow faults.
         """
         self.world.catch_up()
         match word:

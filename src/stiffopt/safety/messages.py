@@ -18,11 +18,9 @@ from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.rig.interface import PoseSample
-
-Array = NDArray[np.float64]
 
 _LARGEST = 1 << 16  # bytes in a packet
 _COMMAND = struct.Struct("<cQddd")
@@ -36,24 +34,16 @@ JSON = "json"
 
 @dataclass(frozen=True)
 class CommandFrame:
-    """A pressure command to the guard.
+    """A pressure command to the guard."""
 
-    Attributes
-    ----------
-    sequence : number of the message; the client counts all its messages.
-    sent : when it was sent, in s.
-    time, valid_for : when the command was given and for how long it is valid, in s.
-    pressures : (n,), in Pa.
-    goal : True: the guard approaches and repeats the pressures while they are valid, see
-        `stiffopt.safety.goal`. False: one command of a stream; the guard vents when the stream
-        stops.
-    """
-
-    sequence: int
-    sent: float
+    sequence: int  # number of the message; the client counts all its messages
+    sent: float  # when it was sent, in s
+    # time, valid_for: when the command was given and for how long it is valid, in s
     time: float
     valid_for: float
-    pressures: Array
+    pressures: Array  # (n,), in Pa
+    # True: the guard approaches and repeats the pressures while they are valid, see
+    # `stiffopt.safety.goal`. False: one command of a stream; the guard vents when the stream stops
     goal: bool = False
 
     def pack(self) -> bytes:
@@ -65,37 +55,25 @@ class CommandFrame:
 
 @dataclass(frozen=True)
 class GuardAnswer:
-    """The guard's answer to a command or request, with the state of the supply.
+    """The guard's answer to a command or request, with the state of the supply."""
 
-    Attributes
-    ----------
-    sequence : number of the message that is answered; 0: a report of the guard. It replaces the
-        missing answers to older commands.
-    commanded : set-points (n,) of the supply, in Pa.
-    measured, time : measured pressures (n,), in Pa, and when they were read; NaN if unknown.
-    armed : whether the guard accepts commands.
-    limited, force_limited : whether the command was limited at all, and by the total force.
-    trips : number of trips of the guard so far.
-    broken : number of packets so far that the guard could not decode.
-    tripped : why the guard is tripped now; empty if it is not.
-    refused : why the command was refused; empty if it was carried out.
-    error : why the request failed; empty if it did not.
-    value : result of a request that has one.
-    """
-
+    # number of the message that is answered; 0: a report of the guard. It replaces the missing
+    # answers to older commands
     sequence: int
-    commanded: Array
+    commanded: Array  # set-points (n,) of the supply, in Pa
+    # measured, time: measured pressures (n,), in Pa, and when they were read; NaN if unknown
     measured: Array
     time: float
-    armed: bool = False
+    armed: bool = False  # whether the guard accepts commands
+    # limited, force_limited: whether the command was limited at all, and by the total force
     limited: bool = False
     force_limited: bool = False
-    trips: int = 0
-    broken: int = 0
-    tripped: str = ""
-    refused: str = ""
-    error: str = ""
-    value: Any = None
+    trips: int = 0  # number of trips of the guard so far
+    broken: int = 0  # number of packets so far that the guard could not decode
+    tripped: str = ""  # why the guard is tripped now; empty if it is not
+    refused: str = ""  # why the command was refused; empty if it was carried out
+    error: str = ""  # why the request failed; empty if it did not
+    value: Any = None  # result of a request that has one
 
     def pack(self) -> bytes:
         """Return the packet (bytes)."""
@@ -117,18 +95,11 @@ class GuardAnswer:
 
 @dataclass(frozen=True)
 class GuardRequest:
-    """A request to the guard: ``arm``, ``vent``, ``read``, ``restrict``, ``ping``, ``close`` ...
+    """A request to the guard: ``arm``, ``vent``, ``read``, ``restrict``, ``ping``, ``close`` ..."""
 
-    Attributes
-    ----------
-    sequence : number of the message; the client counts all its messages.
-    do : name of the request.
-    about : its arguments by name.
-    """
-
-    sequence: int
-    do: str
-    about: dict[str, Any] = field(default_factory=dict)
+    sequence: int  # number of the message; the client counts all its messages
+    do: str  # name of the request
+    about: dict[str, Any] = field(default_factory=dict)  # its arguments by name
 
     def pack(self) -> bytes:
         """Return the packet (bytes)."""
@@ -139,10 +110,7 @@ class GuardRequest:
 class GuardNotice:
     """A report of a starting guard: ``notice``, then ``ready`` or ``failed``.
 
-    Attributes
-    ----------
-    kind : which of these.
-    about : its details by name.
+    `kind`: which of these. `about`: its details by name.
     """
 
     kind: str
@@ -174,13 +142,7 @@ Message = CommandFrame | GuardAnswer | GuardRequest | GuardNotice | TrackedPoses
 
 
 def unpack(packet: bytes) -> Message:
-    """Decode a packet.
-
-    Raises
-    ------
-    ValueError
-        The packet is no valid message.
-    """
+    """Decode a packet. Raises `ValueError`: the packet is no valid message."""
     try:
         match packet[:1]:
             case b"C" | b"G" as kind:

@@ -5,25 +5,21 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from stiffopt.arrays import Array, Flags
 from stiffopt.rig.interface import PressureLimits, PressureReading
 from stiffopt.rig.settings import Safety
 from stiffopt.safety.expected_pressure import ExpectedPressure, Regulation
 from stiffopt.safety.settings import MONITOR
 from stiffopt.safety.shortage import Shortage, SupplyLine
 
-Array = NDArray[np.float64]
-
 
 @dataclass(frozen=True)
 class Trouble:
     """A fault that the monitor has found.
 
-    Attributes
-    ----------
-    kind : ``pressure-reading``, ``regulator-stuck`` or ``leak``.
-    text : a sentence for people.
+    `kind`: ``pressure-reading``, ``regulator-stuck`` or ``leak``. `text`: a sentence for people.
     """
 
     kind: str
@@ -72,7 +68,7 @@ class PressureMonitor:
     ) -> None:
         n = limits.n
         most = np.broadcast_to(np.asarray(safety.max_pressure_error, dtype=float), n)
-        self.saturated: NDArray[np.bool_] = np.zeros(n, dtype=bool)
+        self.saturated: Flags = np.zeros(n, dtype=bool)
         self._expected = ExpectedPressure(regulation, np.broadcast_to(slew, n).astype(float))
         self._commanded: Array = np.zeros(n)
         self._time, self._oldest = safety.pressure_error_time, safety.command_timeout
@@ -94,7 +90,7 @@ class PressureMonitor:
         span = limits.high - np.minimum(limits.low, 0.0)
         self._lowest: Array = np.minimum(limits.low, 0.0) - span - most
         self._highest: Array = limits.high + span + most
-        self._measures: NDArray[np.bool_] = np.zeros(n, dtype=bool)
+        self._measures: Flags = np.zeros(n, dtype=bool)
         self.unsupervised = tuple(range(n))
 
     def tell(self, time: float, commanded: Array) -> None:
@@ -158,7 +154,7 @@ class PressureMonitor:
         lasting[0] |= self._shortage.leaks(elapsed, short, due, p, at_rest)
         return self._found(lasting, p)
 
-    def _found(self, lasting: NDArray[np.bool_], p: Array) -> Trouble | None:
+    def _found(self, lasting: Flags, p: Array) -> Trouble | None:
         """Return the fault of a channel whose reading (n,) was wrong for too long, or None."""
         for channel in np.flatnonzero(lasting[1]):
             return self._stuck(int(channel), p)
@@ -206,7 +202,7 @@ class PressureMonitor:
         self._measured(plausible)
         return None
 
-    def _measured(self, channels: NDArray[np.bool_]) -> None:
+    def _measured(self, channels: Flags) -> None:
         self._measures |= channels
         self.unsupervised = tuple(int(c) for c in np.flatnonzero(~self._measures))
 

@@ -33,10 +33,8 @@ _NICE = -10  # of the other threads of a process that has a real-time thread
 class RealTimeReport:
     """The real-time privileges of a thread.
 
-    Attributes
-    ----------
-    granted : privileges that it has, in a few words each.
-    denied : privileges that it lacks, why, and how to allow them: a sentence each.
+    `granted`: privileges that it has, in a few words each. `denied`: privileges that it lacks, why,
+    and how to allow them: a sentence each.
     """
 
     granted: tuple[str, ...]
@@ -59,9 +57,7 @@ def real_time(priority: int = 80) -> Iterator[RealTimeReport]:
     often, and only `tidy` collects garbage. What the system does not permit is left out and
     reported; no error is raised.
 
-    Parameters
-    ----------
-    priority : from 1 to 99; kernel threads that serve interrupts have 50.
+    `priority`: from 1 to 99; kernel threads that serve interrupts have 50.
     """
     granted: list[str] = []
     denied: list[str] = []

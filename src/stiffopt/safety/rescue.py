@@ -26,10 +26,7 @@ def vent_directly(supply: PressureSupply) -> bool:
 
     Even then it is vented, but that program may raise the pressure again.
 
-    Raises
-    ------
-    DeviceError
-        The supply does not answer.
+    Raises `DeviceError`: the supply does not answer.
     """
     claim = Claim(lambda: supply.endpoints, wait=CLIENT.claim)
     try:
@@ -50,11 +47,9 @@ class GuardWatch:
 
     Parameters
     ----------
-    guard :
-        The client's link to the guard.
-    supply :
-        Another object for the guard's supply, not open; None: the supply is simulated and ends with
-        the guard.
+    guard : the client's link to the guard.
+    supply : another object for the guard's supply, not open; None: the supply is simulated and ends
+        with the guard.
 
     Attributes
     ----------

@@ -86,17 +86,9 @@ def guarded_rig(
     Nothing starts before the rig or the link is opened. Opening or closing the rig opens or closes
     the link too.
 
-    Parameters
-    ----------
-    description, robot : content of a rig file, and its robot.
-    json_lines : whether the guard writes JSON lines on stderr.
-
-    Raises
-    ------
-    InputError
-        A setting does not fit the robot.
-    MissingExtraError
-        A library is not installed.
+    `description`, `robot`: content of a rig file, and its robot. `json_lines`: whether the guard
+    writes JSON lines on stderr. Raises `InputError`: a setting does not fit the robot;
+    `MissingExtraError`: a library is not installed.
     """
     limits, slew = limits_of(description, robot), slew_of(description, robot)
     clock: Clock = SystemClock()

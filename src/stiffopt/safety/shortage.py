@@ -7,11 +7,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array, Flags
 from stiffopt.safety.settings import MONITOR
-
-Array = NDArray[np.float64]
 
 
 class Shortage:
@@ -29,10 +27,8 @@ class Shortage:
     share `much` of it, even while commands move. Between these cases, a leak that takes all that
     its regulator can deliver is indistinguishable from a line that has no more.
 
-    Parameters
-    ----------
-    tolerance : shortage (n,) that is too much, in Pa; a response must be at least half of it.
-    time : minimum duration of these conditions, in s.
+    `tolerance`: shortage (n,) that is too much, in Pa; a response must be at least half of it.
+    `time`: minimum duration of these conditions, in s.
     """
 
     def __init__(self, tolerance: Array, time: float) -> None:
@@ -50,11 +46,11 @@ class Shortage:
     def leaks(
         self,
         elapsed: float,
-        short: NDArray[np.bool_],
+        short: Flags,
         due: Array,
         reading: Array,
-        at_rest: NDArray[np.bool_],
-    ) -> NDArray[np.bool_]:
+        at_rest: Flags,
+    ) -> Flags:
         """Return which channels (n,) certainly leak.
 
         Parameters
@@ -82,7 +78,7 @@ class Shortage:
         self._for = np.where((follows, nothing), self._for + elapsed, 0.0)
         within = np.array([[self._time], [max(self._time, MONITOR.nothing_time)]])
         follows, nothing = self._for >= within * (1 - 1e-9)
-        leaking: NDArray[np.bool_] = follows | nothing
+        leaking: Flags = follows | nothing
         return leaking
 
 
@@ -110,7 +106,7 @@ class SupplyLine:
     def __init__(self, shortage: Array) -> None:
         self._shortage = shortage
         self._little: Array = 0.5 * shortage
-        self._none: NDArray[np.bool_] = np.zeros(len(shortage), dtype=bool)
+        self._none: Flags = np.zeros(len(shortage), dtype=bool)
         self.pressure = np.inf
 
     @property
@@ -122,13 +118,11 @@ class SupplyLine:
         """Forget the pressure of the line."""
         self.pressure = np.inf
 
-    def look(self, missing: Array, reading: Array, reached: Array) -> NDArray[np.bool_]:
+    def look(self, missing: Array, reading: Array, reached: Array) -> Flags:
         """Return which channels (n,) have the pressure of a sagging line.
 
-        Parameters
-        ----------
-        missing : expected less measured pressures (n,), in Pa.
-        reading, reached : measured pressures (n,), and the highest since arming, in Pa.
+        `missing`: expected less measured pressures (n,), in Pa. `reading`, `reached`: measured
+        pressures (n,), and the highest since arming, in Pa.
         """
         short = missing > self._shortage  # False where nothing is measured (NaN)
         if not (self.known or short.any()):

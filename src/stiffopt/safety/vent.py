@@ -28,14 +28,8 @@ def vent_rig(path: str | os.PathLike[str]) -> str:
     supply is vented directly, even if another guard owns it. None of this uses the network, unless
     the device itself does, and no other user can prevent it.
 
-    Raises
-    ------
-    FileError
-        A file is wrong.
-    MissingExtraError
-        A library is not installed.
-    DeviceError
-        It is not certain that the supply is vented.
+    Raises `FileError`: a file is wrong; `MissingExtraError`: a library is not installed;
+    `DeviceError`: it is not certain that the supply is vented.
     """
     description, robot = load_rig(path)
     if description.supply.simulated:

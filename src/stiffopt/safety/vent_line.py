@@ -87,9 +87,7 @@ class Caller:
 class VentLine:
     """The guard's end of the vent line; it never blocks.
 
-    Parameters
-    ----------
-    endpoints : names of the supply that the guard owns, see `PressureSupply.endpoints`.
+    `endpoints`: names of the supply that the guard owns, see `PressureSupply.endpoints`.
     """
 
     def __init__(self, endpoints: Sequence[str]) -> None:
@@ -152,18 +150,11 @@ def _listening(endpoint: str) -> socket.socket:
 
 @dataclass(frozen=True)
 class Reply:
-    """Reply of a guard that was called to vent, or the lack of one.
+    """Reply of a guard that was called to vent, or the lack of one."""
 
-    Attributes
-    ----------
-    guard : the guard's process.
-    answered : whether it answered.
-    error : why its supply may not be vented; empty if it reports that it is.
-    """
-
-    guard: SocketPeer
-    answered: bool
-    error: str = ""
+    guard: SocketPeer  # the guard's process
+    answered: bool  # whether it answered
+    error: str = ""  # why its supply may not be vented; empty if it reports that it is
 
 
 def trusted(uid: int) -> bool:
@@ -187,10 +178,7 @@ def guards_of(endpoint: str) -> list[SocketPeer]:
 def ask_to_vent(endpoint: str, patience: float = 5.0) -> list[Reply]:
     """Call all guards of an endpoint that accept this user, and return their replies.
 
-    Parameters
-    ----------
-    endpoint : name of the supply.
-    patience : time for all answers together, in s.
+    `endpoint`: name of the supply. `patience`: time for all answers together, in s.
     """
     asked: list[tuple[SocketPeer, socket.socket | None]] = []
     strangers = 0

@@ -7,21 +7,13 @@ from typing import Any
 import numpy as np
 
 from stiffopt import lie
+from stiffopt.arrays import Array
 from stiffopt.model.description import RobotDescription
 from stiffopt.optimise.measures.directional import StiffnessMeasure
 from stiffopt.plots import style
 from stiffopt.plots.shapes import StiffnessEllipsoid
 from stiffopt.plots.wording import stiffness_text
-from stiffopt.studio.drawing import (
-    NOWHERE,
-    ArmTube,
-    Vector,
-    add_force_arrows,
-    draw,
-    place,
-    rgb,
-    turn,
-)
+from stiffopt.studio.drawing import NOWHERE, ArmTube, add_force_arrows, draw, place, rgb, turn
 from stiffopt.studio.leaning import force_arrows
 from stiffopt.studio.workbench import StudioAnswer
 
@@ -61,17 +53,15 @@ class AnswerView:
         self._label = scene.add_label("/stiffness", "", visible=False)
 
     @property
-    def arm_end(self) -> Vector:
+    def arm_end(self) -> Array:
         """Position of the drawn arm's end (3,), in m."""
         return self._arm.end
 
-    def show(self, answer: StudioAnswer, target: Vector, *, with_plain: bool) -> None:
+    def show(self, answer: StudioAnswer, target: Array, *, with_plain: bool) -> None:
         """Draw a solution.
 
-        Parameters
-        ----------
-        target : (3,), position of the target, in m.
-        with_plain : whether to draw the plain solution too.
+        `target`: (3,), position of the target, in m. `with_plain`: whether to draw the plain
+        solution too.
         """
         leaning = answer.solution.equilibrium
         self._arm.show(answer.robot, answer.pressures, leaning)
@@ -82,7 +72,7 @@ class AnswerView:
         self._show_miss(answer, target)
         self._show_load(answer)
 
-    def direction_end(self, answer: StudioAnswer) -> Vector | None:
+    def direction_end(self, answer: StudioAnswer) -> Array | None:
         """Return the end (3,), in m, of the first direction's arrow, or None."""
         ways = _directions(answer)
         if not ways or answer.solution.stiffness is None:
@@ -115,7 +105,7 @@ class AnswerView:
             self._label.text = stiffness_text(value, unit)
             place(self._label, tip + 1.25 * reach * ways[0])
 
-    def _show_miss(self, answer: StudioAnswer, target: Vector) -> None:
+    def _show_miss(self, answer: StudioAnswer, target: Array) -> None:
         """Draw an arrow from the tip to a target that it does not reach."""
         far = (answer.solution.position_error or 0.0) > 0.004 * self._length
         draw(self._miss, _arrows([(_pose(answer)[:3, 3], target)] if far else []))
@@ -132,11 +122,11 @@ class AnswerView:
         draw(self._forces, _arrows(forces))
 
 
-def _pose(answer: StudioAnswer) -> Vector:
+def _pose(answer: StudioAnswer) -> Array:
     return np.asarray(answer.solution.tip_pose)
 
 
-def _directions(answer: StudioAnswer) -> list[Vector]:
+def _directions(answer: StudioAnswer) -> list[Array]:
     """Return the directions of the task's stiffnesses as unit vectors, in base axes."""
     rotation = _pose(answer)[:3, :3]
     return [
@@ -146,5 +136,5 @@ def _directions(answer: StudioAnswer) -> list[Vector]:
     ]
 
 
-def _arrows(pairs: list[tuple[Vector, Vector]]) -> Any:
+def _arrows(pairs: list[tuple[Array, Array]]) -> Any:
     return np.array(pairs, dtype=np.float32) if pairs else NOWHERE

@@ -17,20 +17,12 @@ _SCALE = np.array([(68, 1, 84), (59, 82, 139), (33, 145, 140), (94, 201, 98), (2
 
 
 class StiffnessCloud(NamedTuple):
-    """The cells of a map with their stiffness in one direction.
+    """The cells of a map with their stiffness in one direction."""
 
-    Attributes
-    ----------
-    points : (m, 3), centres of cells in m.
-    colours : (m, 3), from violet (soft) to yellow (stiff).
-    legend : meaning of the colours, in words.
-    size : of a point, in m.
-    """
-
-    points: NDArray[np.float32]
-    colours: NDArray[np.uint8]
-    legend: str
-    size: float
+    points: NDArray[np.float32]  # (m, 3), centres of cells in m
+    colours: NDArray[np.uint8]  # (m, 3), from violet (soft) to yellow (stiff)
+    legend: str  # meaning of the colours, in words
+    size: float  # of a point, in m
 
     @classmethod
     def of(cls, found: WorkspaceMap, direction: int, cut: float = -np.inf) -> StiffnessCloud:

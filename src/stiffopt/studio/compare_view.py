@@ -14,10 +14,7 @@ from stiffopt.studio.workbench import Workbench
 class CompareView:
     """Draws the kept solutions, with inputs that keep and clear them.
 
-    Parameters
-    ----------
-    server : viser.ViserServer
-    redraw : called when the plain solution is switched on or off.
+    `server`: viser.ViserServer. `redraw`: called when the plain solution is switched on or off.
     """
 
     def __init__(self, server: Any, bench: Workbench, redraw: Callable[[], None]) -> None:
@@ -67,10 +64,7 @@ class CompareView:
 class CopyView:
     """Shows the design as files and as Python, for copying.
 
-    Parameters
-    ----------
-    gui : of viser.
-    design : returns the present design.
+    `gui`: of viser. `design`: returns the present design.
     """
 
     def __init__(self, gui: Any, design: Callable[[], Design]) -> None:

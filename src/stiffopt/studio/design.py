@@ -44,20 +44,12 @@ def changed(schema: SchemaT, **update: Any) -> SchemaT:
 
 @dataclass(frozen=True)
 class Design:
-    """A robot and a task on it.
+    """A robot and a task on it."""
 
-    Attributes
-    ----------
-    description : the present robot.
-    task : the task on it.
-    robot : name or absolute path of the original robot.
-    original : the robot before any change.
-    """
-
-    description: RobotDescription
-    task: Task
-    robot: str
-    original: RobotDescription
+    description: RobotDescription  # the present robot
+    task: Task  # the task on it
+    robot: str  # name or absolute path of the original robot
+    original: RobotDescription  # the robot before any change
 
     @classmethod
     def of_robot(cls, name_or_path: str | os.PathLike[str]) -> Design:

@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.model.contact.equilibrium import ContactEquilibrium
 from stiffopt.model.description import RobotDescription
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.plots import style
 from stiffopt.plots.shapes import segment_poses, segment_stations
 
-Vector = NDArray[np.float64]
 Floats = NDArray[np.float32]
 
 _STATIONS = 16  # of the tube, per segment
@@ -32,7 +32,7 @@ def rgb(colour: str) -> tuple[int, int, int]:
     return (int(colour[1:3], 16), int(colour[3:5], 16), int(colour[5:7], 16))
 
 
-def tube_vertices(poses: Vector, radius: float) -> Floats:
+def tube_vertices(poses: Array, radius: float) -> Floats:
     """Return the vertices of a tube: a ring about each pose (k, 4, 4), and the last centre."""
     ring = radius * np.stack([np.cos(_ANGLES), np.sin(_ANGLES)])  # (2, spokes)
     points = poses[:, None, :3, 3] + np.einsum("kij,js->ksi", poses[:, :3, :2], ring)
@@ -123,7 +123,7 @@ class ArmTube:
                 mesh.visible = visible
 
     @property
-    def end(self) -> Vector:
+    def end(self) -> Array:
         """Centre of the tip's lid (3,), in m."""
         return np.asarray(self._meshes[-1].vertices[-1], dtype=np.float64)
 

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from stiffopt import lie
+from stiffopt.arrays import Array
 from stiffopt.display import FIGURES, display_units
 from stiffopt.errors import InputError
 from stiffopt.model.contact.equilibrium import Approach, Contact, ContactEquilibrium
@@ -25,16 +26,7 @@ from stiffopt.optimise.measures.directional import StiffnessMeasure
 from stiffopt.plots import style
 from stiffopt.plots.shapes import StiffnessEllipsoid
 from stiffopt.studio.design import Design
-from stiffopt.studio.drawing import (
-    NOWHERE,
-    ArmTube,
-    Vector,
-    add_force_arrows,
-    draw,
-    place,
-    rgb,
-    turn,
-)
+from stiffopt.studio.drawing import NOWHERE, ArmTube, add_force_arrows, draw, place, rgb, turn
 
 _LARGEST_PUSH = 1.0  # N, up to which the loss of a contact is sought
 _ARROW_SHARE, _ELLIPSOID_SHARE = 0.25, 0.22  # of the arm's length
@@ -57,17 +49,13 @@ class Leaning:
     _losses: dict[str, ContactLoss] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, design: Design, robot: Manipulator, pressures: Vector) -> Leaning:
+    def of(cls, design: Design, robot: Manipulator, pressures: Array) -> Leaning:
         """Find the equilibrium of an arm against objects that allow contact.
 
         With a brace it is reached as that says, else the objects come to the arm.
 
-        Raises
-        ------
-        InputError
-            No object allows contact.
-        EquilibriumError
-            The arm slips off, snaps through or buckles on the way.
+        Raises `InputError`: no object allows contact; `EquilibriumError`: the arm slips off, snaps
+        through or buckles on the way.
         """
         scene = design.task.scene
         if scene is None or not any(each.may_be_leant_on for each in scene.objects):
@@ -163,10 +151,7 @@ def force_arrows(equilibrium: ContactEquilibrium | None, length: float) -> Any:
 class LeaningView:
     """Draws a leaning arm: its shape, the forces on it, and its braced stiffness.
 
-    Parameters
-    ----------
-    server : viser.ViserServer
-    description : the robot.
+    `server`: viser.ViserServer. `description`: the robot.
     """
 
     def __init__(self, server: Any, description: RobotDescription) -> None:
@@ -185,7 +170,7 @@ class LeaningView:
         return self._arm.visible
 
     @property
-    def arm_end(self) -> Vector:
+    def arm_end(self) -> Array:
         """Position of the drawn arm's end (3,), in m."""
         return self._arm.end
 

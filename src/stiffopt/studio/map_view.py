@@ -17,10 +17,7 @@ _NO_MAP = "do not show"
 class MapView:
     """Draws a map, with inputs that choose the direction and the cut.
 
-    Parameters
-    ----------
-    server : viser.ViserServer
-    found : of the drawn arm.
+    `server`: viser.ViserServer. `found`: of the drawn arm.
     """
 
     def __init__(self, server: Any, found: WorkspaceMap) -> None:

@@ -9,15 +9,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from stiffopt.arrays import Array
 from stiffopt.errors import FileError
 from stiffopt.files import save_file
 from stiffopt.model.obstacle import Obstacle
 from stiffopt.model.scene import AllowedContact, Scene, SceneObject, load_scene
 from stiffopt.studio.design import changed
-
-Vector = NDArray[np.float64]
 
 NEW = ("sphere", "box", "capsule", "cylinder", "half_space")
 """Kinds of objects that can be added."""
@@ -41,7 +40,7 @@ def new_object(kind: str, others: Sequence[SceneObject], length: float) -> Scene
     return SceneObject(**{"name": name, kind: shapes[kind]})
 
 
-def place_of(shape: Obstacle) -> Vector:
+def place_of(shape: Obstacle) -> Array:
     """Return the point (3,) of a shape at which its handle is, in m."""
     points = [getattr(shape, key) for key in _PLACES if hasattr(shape, key)]
     return np.asarray(np.mean(points or [shape.points[0]], axis=0))  # type: ignore[attr-defined]
@@ -88,10 +87,7 @@ def replaced(objects: Sequence[SceneObject], item: SceneObject) -> tuple[SceneOb
 def save_scene(path: str | os.PathLike[str], scene: Scene) -> None:
     """Write a scene file; only another scene file is overwritten.
 
-    Raises
-    ------
-    FileError
-        The file exists and is not a scene file, or cannot be written.
+    Raises `FileError`: the file exists and is not a scene file, or cannot be written.
     """
     if Path(path).suffix.lower() not in (".yaml", ".yml"):
         raise FileError(path, "is no name of a scene file; expected one that ends in .yaml")

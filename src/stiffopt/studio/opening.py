@@ -21,12 +21,7 @@ from stiffopt.workspace.mapping import open_workspace_map
 
 
 class OpenStudio:
-    """An open page with its view.
-
-    Attributes
-    ----------
-    view : draws on the page.
-    """
+    """An open page with its view. `view`: draws on the page."""
 
     def __init__(self, page: StudioPage, view: Any) -> None:
         self.page, self.view = page, view
@@ -53,6 +48,9 @@ def open_studio(
 ) -> OpenStudio:
     """Show a file on a page; return when a browser can open it.
 
+    Raises `InputError`: the file is invalid or of another kind, or the address cannot be listened
+    on; `MissingExtraError`: viser, or a package that reads the file, is not installed.
+
     Parameters
     ----------
     file : a built-in robot, or a file of a kind that the studio shows.
@@ -60,13 +58,6 @@ def open_studio(
     map_file : a workspace map to show with a robot, a task or a scene.
     token : for a rig: its daemon's token, or the file with it; without it the rig is only shown.
     host, port : address to listen on, see `StudioPage`.
-
-    Raises
-    ------
-    InputError
-        The file is invalid or of another kind, or the address cannot be listened on.
-    MissingExtraError
-        viser, or a package that reads the file, is not installed.
     """
     kind = kind_of(file)
     if map_file is not None and kind not in ("robot", "task", "scene"):

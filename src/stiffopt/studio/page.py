@@ -51,9 +51,7 @@ _starting = threading.Lock()
 class KeyCheck:
     """Accepts only requests from this studio's page with its key.
 
-    Parameters
-    ----------
-    hosts : accepted host names, besides addresses and localhost.
+    `hosts`: accepted host names, besides addresses and localhost.
     """
 
     def __init__(self, hosts: tuple[str, ...] = ()) -> None:
@@ -111,6 +109,9 @@ class _PrivateServer(viser.ViserServer):
 class StudioPage:
     """A viser server that only the studio's user can use.
 
+    Raises `InputError`: the address cannot be listened on; `ServiceError`: the check does not work
+    with the installed version of viser.
+
     Parameters
     ----------
     host, port : address to listen on; port 0 takes any free one.
@@ -119,13 +120,6 @@ class StudioPage:
     Attributes
     ----------
     server : viser.ViserServer
-
-    Raises
-    ------
-    InputError
-        The address cannot be listened on.
-    ServiceError
-        The check does not work with the installed version of viser.
     """
 
     def __init__(self, host: str = "127.0.0.1", port: int = 0, label: str = "stiffopt") -> None:

@@ -23,9 +23,7 @@ _PERIOD = 0.1  # s, polling period of the daemon
 class RigView:
     """Draws a daemon's arm; with the token, also a preview to drag, whose task *go* sends.
 
-    Parameters
-    ----------
-    server : viser.ViserServer
+    `server`: viser.ViserServer.
     """
 
     def __init__(self, server: Any, watch: RigWatch) -> None:

@@ -17,7 +17,6 @@ from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stiffopt.control.bracing import BracePhase
 from stiffopt.control.state import Event, Snapshot
@@ -31,8 +30,6 @@ from stiffopt.rig.config import limits_of, load_rig
 from stiffopt.safety.vent import vent_rig
 from stiffopt.studio.design import Design
 from stiffopt.studio.workbench import Workbench
-
-Vector = NDArray[np.float64]
 
 NAME = "studio"
 """Name of this client that others see."""

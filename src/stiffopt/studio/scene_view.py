@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from stiffopt.arrays import Array
 from stiffopt.display import display_units
 from stiffopt.errors import StiffoptError
 from stiffopt.model.scene import SceneObject
@@ -14,7 +15,7 @@ from stiffopt.plots import style
 from stiffopt.plots.shapes import surface_mesh
 from stiffopt.studio import objects, texts
 from stiffopt.studio.design import Design
-from stiffopt.studio.drawing import Vector, place, rgb
+from stiffopt.studio.drawing import place, rgb
 from stiffopt.studio.task_inputs import add_slider, show_on_slider
 
 _NONE = "(none)"
@@ -68,7 +69,7 @@ class SceneView:
         self._handle.on_update(self._moved)
 
     @property
-    def handle_position(self) -> Vector:
+    def handle_position(self) -> Array:
         """Position of the chosen object's handle (3,), in m."""
         return np.asarray(self._handle.position)
 

@@ -30,10 +30,7 @@ _KINDS = ("robot", "task", "scene", "path", "rig")
 def kind_of(file: str) -> str:
     """Return the kind of a file by its ending and its ``format``; a built-in name is a robot.
 
-    Raises
-    ------
-    FileError
-        The file cannot be read, or the studio does not show its kind.
+    Raises `FileError`: the file cannot be read, or the studio does not show its kind.
     """
     if file in builtin_robots():
         return "robot"

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from stiffopt import lie
+from stiffopt.arrays import Array
 from stiffopt.display import DisplayUnit, display_units
 from stiffopt.studio.design import Angular, Design
-from stiffopt.studio.drawing import Vector
 
 On = Callable[[str, Callable[[Design, Any], Design]], Callable[[Any], None]]
 """Takes the kind of a change and a function of design and input; returns viser's callback."""
@@ -47,7 +47,7 @@ class TargetInputs:
     """
 
     def __init__(
-        self, gui: Any, on: On, tip: Callable[[], Vector], turned: Callable[[], Any]
+        self, gui: Any, on: On, tip: Callable[[], Array], turned: Callable[[], Any]
     ) -> None:
         self._lengths, self._angles = display_units().length, display_units().angle
         step = _rounded(self._lengths.of(1e-4))
@@ -73,7 +73,7 @@ class TargetInputs:
                 float(self._lengths.to_si(self._tolerance.value)),
                 float(self._angles.to_si(self._angle.value)))))  # fmt: skip
 
-    def show(self, design: Design, position: Vector) -> None:
+    def show(self, design: Design, position: Array) -> None:
         """Show a design, and the position (3,) of the target's handle, in m."""
         decimals = 2 + self._lengths.more_decimals
         shown = np.asarray(self._lengths.of(position)).round(decimals)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from stiffopt import lie
+from stiffopt.arrays import Array
 from stiffopt.errors import StiffoptError
 from stiffopt.model.stopping import Cancel
 from stiffopt.plots import style
@@ -15,7 +16,7 @@ from stiffopt.studio import texts
 from stiffopt.studio.answer_view import AnswerView
 from stiffopt.studio.compare_view import CompareView, CopyView
 from stiffopt.studio.design import Design
-from stiffopt.studio.drawing import Vector, add_surroundings, place, rgb, turn
+from stiffopt.studio.drawing import add_surroundings, place, rgb, turn
 from stiffopt.studio.leaning import LeaningView
 from stiffopt.studio.map_view import MapView
 from stiffopt.studio.scene_view import SceneView
@@ -64,22 +65,22 @@ class TaskView:
         self.worker.close()
 
     @property
-    def target_position(self) -> Vector:
+    def target_position(self) -> Array:
         """Position of the target's handle (3,), in m."""
         return np.array(self._target.position)
 
     @property
-    def direction_position(self) -> Vector:
+    def direction_position(self) -> Array:
         """Position of the direction's handle (3,), in m."""
         return np.asarray(self._pull.position)
 
     @property
-    def object_position(self) -> Vector:
+    def object_position(self) -> Array:
         """Position of the handle of the scene's chosen object (3,), in m."""
         return self._scene.handle_position
 
     @property
-    def arm_end(self) -> Vector:
+    def arm_end(self) -> Array:
         """Position of the drawn arm's end (3,), in m."""
         return (self._leaning if self._leaning.visible else self._drawn).arm_end
 
@@ -255,7 +256,7 @@ class TaskView:
     def _show_words(self) -> None:
         self._words.content = texts.answer_html(self.bench)
 
-    def _tip_pose(self) -> Vector:
+    def _tip_pose(self) -> Array:
         """Return the pose (4, 4) of the solution's tip; without one, that of the straight arm."""
         answer = self.bench.answer
         if answer is None or answer.solution.tip_pose is None:

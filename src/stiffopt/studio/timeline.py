@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.daemon.run_log import RecordedRun, log_of_run
 from stiffopt.display import display_units
 from stiffopt.errors import FileError, InputError
@@ -24,70 +25,41 @@ from stiffopt.paths.path import Path
 from stiffopt.paths.solution import PathSolution
 from stiffopt.plots.wording import stiffness_text
 
-Vector = NDArray[np.float64]
-
 _SHOWN = 400  # points of a chart
 _EVENTS = 4  # shown at a time
 
 
 class TimelineChart(NamedTuple):
-    """A chart over time.
+    """A chart over time."""
 
-    Attributes
-    ----------
-    title : with the unit.
-    names : of the k lines.
-    values : (N, k).
-    shows_pressures : whether they are pressures of channels.
-    """
-
-    title: str
-    names: tuple[str, ...]
-    values: Vector
-    shows_pressures: bool = False
+    title: str  # with the unit
+    names: tuple[str, ...]  # of the k lines
+    values: Array  # (N, k)
+    shows_pressures: bool = False  # whether they are pressures of channels
 
 
 class TimelineMoment(NamedTuple):
-    """The state at one moment of a timeline.
+    """The state at one moment of a timeline."""
 
-    Attributes
-    ----------
-    row : index of the last row until then.
-    pressures : (n,), in Pa, interpolated.
-    seen : (3,), last measured position of the tip, in m, or None.
-    """
-
-    row: int
-    pressures: Vector
-    seen: Vector | None
+    row: int  # index of the last row until then
+    pressures: Array  # (n,), in Pa, interpolated
+    seen: Array | None  # (3,), last measured position of the tip, in m, or None
 
 
 @dataclass(frozen=True, eq=False)
 class Timeline:
-    """Pressures over time, with charts, positions and events.
+    """Pressures over time, with charts, positions and events."""
 
-    Attributes
-    ----------
-    robot : the arm, with the load of the path.
-    times : (N,), in s, from 0, increasing.
-    pressures : (N, n), in Pa, without gaps.
-    charts : quantities to draw over time.
-    headline : status and message, for the user.
-    asked : (N, 3), target positions, in m, or None.
-    seen : (N, 3), measured positions of the tip, in m, NaN where it was not seen; or None.
-    events : times and texts.
-    scene : the objects around the arm, or None.
-    """
-
-    robot: Manipulator
-    times: Vector
-    pressures: Vector
-    charts: tuple[TimelineChart, ...] = ()
-    headline: str = ""
-    asked: Vector | None = None
-    seen: Vector | None = None
-    events: tuple[tuple[float, str], ...] = ()
-    scene: Scene | None = None
+    robot: Manipulator  # the arm, with the load of the path
+    times: Array  # (N,), in s, from 0, increasing
+    pressures: Array  # (N, n), in Pa, without gaps
+    charts: tuple[TimelineChart, ...] = ()  # quantities to draw over time
+    headline: str = ""  # status and message, for the user
+    asked: Array | None = None  # (N, 3), target positions, in m, or None
+    # (N, 3), measured positions of the tip, in m, NaN where it was not seen; or None
+    seen: Array | None = None
+    events: tuple[tuple[float, str], ...] = ()  # times and texts
+    scene: Scene | None = None  # the objects around the arm, or None
 
     @property
     def duration(self) -> float:
@@ -120,13 +92,7 @@ class Timeline:
 
     @classmethod
     def of_path(cls, path: Path, solution: PathSolution) -> Timeline:
-        """Return the timeline of a solved path.
-
-        Raises
-        ------
-        InputError
-            The solution has no points.
-        """
+        """Return the timeline of a solved path. Raises `InputError`: the solution has no points."""
         if not len(solution.times):
             raise InputError(f"there is nothing to play: {solution.message}")
         charts = []
@@ -219,14 +185,14 @@ class Timeline:
         return cls.of_log(file, log_of_run(run), description, events)
 
 
-def _check_rows(file: str | os.PathLike[str], times: Vector, pressures: Vector) -> None:
+def _check_rows(file: str | os.PathLike[str], times: Array, pressures: Array) -> None:
     if len(times) < 2:
         raise FileError(file, "has too few rows with pressures to play; expected two or more")
     if not np.isfinite(pressures).all() or not (np.diff(times) > 0).all():
         raise FileError(file, "has pressures that are missing, or times that do not increase")
 
 
-def _pressure_charts(description: RobotDescription, pressures: Vector) -> tuple[TimelineChart, ...]:
+def _pressure_charts(description: RobotDescription, pressures: Array) -> tuple[TimelineChart, ...]:
     """Return a chart of the pressures of each segment."""
     unit = display_units().pressure
     return tuple(

@@ -20,12 +20,7 @@ _SPEEDS = {"1/4": 0.25, "as it is": 1.0, "4 times": 4.0, "20 times": 20.0}
 
 
 class TimelineView:
-    """Plays a timeline.
-
-    Parameters
-    ----------
-    server : viser.ViserServer
-    """
+    """Plays a timeline. `server`: viser.ViserServer."""
 
     def __init__(self, server: Any, timeline: Timeline) -> None:
         self.server, self.timeline = server, timeline

@@ -16,6 +16,7 @@ from time import perf_counter
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.errors import InputError
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.stopping import Cancel
@@ -36,23 +37,17 @@ _STEPS = 200  # that can be undone
 
 @dataclass(frozen=True, eq=False)
 class StudioAnswer:
-    """The solution of a design.
+    """The solution of a design."""
 
-    Attributes
-    ----------
-    design : the design that it solves.
-    solution : with pressures.
-    plain : the plain solution, with the least pressures for the same pose; None if unknown.
-    is_best : whether it comes from the global search, not only from one near the previous one.
-    """
-
-    design: Design
-    solution: PressureSolution
+    design: Design  # the design that it solves
+    solution: PressureSolution  # with pressures
+    # the plain solution, with the least pressures for the same pose; None if unknown
     plain: PressureSolution | None
+    # whether it comes from the global search, not only from one near the previous one
     is_best: bool
 
     @property
-    def pressures(self) -> NDArray[np.float64]:
+    def pressures(self) -> Array:
         """Pressures (n,), in Pa."""
         assert self.solution.pressures is not None
         return self.solution.pressures
@@ -102,7 +97,7 @@ class Workbench:
         self.kept: list[StudioAnswer] = []
         self.leaning: Leaning | None = None
         self.trouble = ""
-        self._held: NDArray[np.float64] | None = None  # pressures, in Pa
+        self._held: Array | None = None  # pressures, in Pa
         self._past: deque[Design] = deque(maxlen=_STEPS)
         self._step = ""
         self._robot: Manipulator | None = None
@@ -114,10 +109,7 @@ class Workbench:
 
         Returns False, and leaves the design as it is, if nothing changes.
 
-        Raises
-        ------
-        InputError
-            The change is invalid; the design stays as it was.
+        Raises `InputError`: the change is invalid; the design stays as it was.
         """
         with self._lock:
             new = change(self.design)
@@ -154,10 +146,7 @@ class Workbench:
     def hold(self, *, held: bool) -> None:
         """Hold the solution's pressures, so that the arm leans on objects; or stop holding them.
 
-        Raises
-        ------
-        InputError
-            There is no solution.
+        Raises `InputError`: there is no solution.
         """
         if held and self.answer is None:
             raise InputError("there are no pressures to hold yet")
@@ -165,7 +154,7 @@ class Workbench:
             self._held = self.answer.pressures if held and self.answer is not None else None
             self.leaning = None
 
-    def _lean(self, design: Design, pressures: NDArray[np.float64]) -> bool:
+    def _lean(self, design: Design, pressures: Array) -> bool:
         self.leaning = None
         self.leaning = Leaning.of(design, self._solver(design).robot, pressures)
         self.trouble = ""

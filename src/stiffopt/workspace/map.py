@@ -8,11 +8,11 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.directions import direction_name
 from stiffopt.workspace.plan import MapPlan
 from stiffopt.workspace.table import CellTable
 
-Vector = NDArray[np.float64]
 Numbers = NDArray[np.int64]
 Quantity = Literal["count", "best", "worst", "best_sample", "worst_sample"]
 
@@ -33,8 +33,8 @@ class Extreme(NamedTuple):
 
     stiffness: float
     sample: int
-    pressures: Vector
-    cell_centre: Vector
+    pressures: Array
+    cell_centre: Array
 
 
 @dataclass(frozen=True)
@@ -57,8 +57,8 @@ class WorkspaceMap:
     plan: MapPlan
     table: CellTable
     lost: int
-    low: Vector
-    high: Vector
+    low: Array
+    high: Array
     path: Path | None = None
     evaluated: int = 0
 
@@ -78,17 +78,17 @@ class WorkspaceMap:
         return self.table.count
 
     @property
-    def best(self) -> Vector:
+    def best(self) -> Array:
         """Greatest stiffness (m, M) that a sample has in each direction and cell."""
         return self.table.best
 
     @property
-    def worst(self) -> Vector:
+    def worst(self) -> Array:
         """Least stiffness (m, M) that a sample has in each direction and cell."""
         return self.table.worst
 
     @property
-    def ratio(self) -> Vector:
+    def ratio(self) -> Array:
         """Ratio (m, M) of greatest to least stiffness: the range of choice at a place."""
         return np.asarray(self.best / self.worst)
 
@@ -108,7 +108,7 @@ class WorkspaceMap:
         return self.table.cells
 
     @property
-    def centres(self) -> Vector:
+    def centres(self) -> Array:
         """Centres (M, 3) of the cells in the base frame, in m."""
         return np.asarray(self.cells * self.plan.cell, dtype=np.float64)
 
@@ -130,7 +130,7 @@ class WorkspaceMap:
         x, y, z = (self.cells.max(axis=0) - self.first_cell + 1).tolist()
         return (x, y, z)
 
-    def pressures(self, sample: int) -> Vector:
+    def pressures(self, sample: int) -> Array:
         """Return the pressures (n,) of a sample in Pa."""
         return np.asarray(self.plan.sampling.pressures(int(sample), int(sample) + 1)[0])
 
@@ -153,7 +153,7 @@ class WorkspaceMap:
         return self._extreme(self.worst[direction], self.worst, self.worst_sample, direction)
 
     def _extreme(
-        self, ranks: Vector, values: Vector, samples: Numbers, direction: int
+        self, ranks: Array, values: Array, samples: Numbers, direction: int
     ) -> Extreme | None:
         if not len(self.table):
             return None

@@ -8,7 +8,7 @@ from time import monotonic
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from stiffopt.errors import FileError, InputError, require_package
 from stiffopt.model.arguments import checked_integer
@@ -23,7 +23,6 @@ from stiffopt.workspace.store import MapStore, is_vacant
 from stiffopt.workspace.table import CellTable, Gathering, MapPart
 from stiffopt.workspace.workers import Cluster, Threads, results
 
-Vector = NDArray[np.float64]
 Report = Callable[[int, int], None]
 
 

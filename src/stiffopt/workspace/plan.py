@@ -16,8 +16,9 @@ from typing import Any, Literal
 
 import casadi as ca
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from stiffopt.arrays import Array, Flags
 from stiffopt.directions import direction_name
 from stiffopt.errors import EquilibriumError, InputError, shown
 from stiffopt.model.arguments import (
@@ -33,8 +34,6 @@ from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.scene import Scene
 from stiffopt.model.shape import Shape
 from stiffopt.workspace.table import FARTHEST, CellTable, MapPart, cell_indices, cell_keys
-
-Vector = NDArray[np.float64]
 
 AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 """Default directions of a map."""
@@ -81,14 +80,14 @@ class Sampling(ABC):
         """Number of samples."""
 
     @abstractmethod
-    def shares(self, start: int, stop: int) -> Vector:
+    def shares(self, start: int, stop: int) -> Array:
         """Return samples start to stop - 1 as shares (k, n) of each channel's range, 0 to 1."""
 
     @abstractmethod
     def record(self) -> dict[str, Any]:
         """Return the parameters of the sampling, as plain data."""
 
-    def pressures(self, start: int, stop: int) -> Vector:
+    def pressures(self, start: int, stop: int) -> Array:
         """Return pressures (k, n) of samples start to stop - 1, in Pa."""
         lower, upper = np.array(self.lower), np.array(self.upper)
         return np.asarray(lower + (upper - lower) * self.shares(start, stop))
@@ -110,7 +109,7 @@ class QuasiRandom(Sampling):
         """Number of samples."""
         return self.count
 
-    def shares(self, start: int, stop: int) -> Vector:
+    def shares(self, start: int, stop: int) -> Array:
         """Return samples start to stop - 1 as shares (k, n) of the channels' ranges, in [0, 1)."""
         n = len(self.lower)
         steps = np.array(_golden_steps(n), dtype=np.uint64)
@@ -135,7 +134,7 @@ class Grid(Sampling):
         """Number of samples: levels to the power of the number of channels."""
         return int(self.levels ** len(self.lower))
 
-    def shares(self, start: int, stop: int) -> Vector:
+    def shares(self, start: int, stop: int) -> Array:
         """Return samples start to stop - 1 as shares (k, n) of each channel's range, 0 to 1."""
         left = np.arange(start, stop, dtype=np.int64)
         digits = np.empty((len(left), len(self.lower)))
@@ -167,22 +166,13 @@ def _shift(seed: int, channel: int) -> int:
 
 @dataclass(frozen=True)
 class MapPlan:
-    """Everything that determines the values of a map.
+    """Everything that determines the values of a map."""
 
-    Attributes
-    ----------
-    robot : the arm, with the load at its tip.
-    measures : the stiffness measures (m,), with unit directions.
-    sampling : the sampled pressures.
-    cell : edge length of a cell, in m.
-    scene : objects that the body keeps clear of, or None.
-    """
-
-    robot: Manipulator
-    measures: tuple[DirectionalMeasure, ...]
-    sampling: Sampling
-    cell: float
-    scene: Scene | None = None
+    robot: Manipulator  # the arm, with the load at its tip
+    measures: tuple[DirectionalMeasure, ...]  # the stiffness measures (m,), with unit directions
+    sampling: Sampling  # the sampled pressures
+    cell: float  # edge length of a cell, in m
+    scene: Scene | None = None  # objects that the body keeps clear of, or None
 
     @classmethod
     def of(
@@ -201,10 +191,7 @@ class MapPlan:
     ) -> "MapPlan":
         """Return the plan for the arguments of `map_workspace`, after checking them.
 
-        Raises
-        ------
-        InputError
-            One of them is wrong.
+        Raises `InputError`: one of them is wrong.
         """
         if not isinstance(robot, Manipulator):
             raise InputError(
@@ -270,20 +257,18 @@ class MapPlan:
             table=CellTable.of_samples(keys, stiffness, sample),
         )
 
-    def _is_clear(self, pressures: Vector) -> NDArray[np.bool_]:
+    def _is_clear(self, pressures: Array) -> Flags:
         """Return whether the body keeps the scene's clearance, at each of the pressures (k, n)."""
         assert self.scene is not None
-        clear: NDArray[np.bool_] = (
-            self.robot.clearance(pressures, self.scene) >= self.scene.clearance
-        )
+        clear: Flags = self.robot.clearance(pressures, self.scene) >= self.scene.clearance
         return clear
 
-    def _in_closed_form(self, pressures: Vector) -> tuple[Vector, Vector]:
+    def _in_closed_form(self, pressures: Array) -> tuple[Array, Array]:
         """Return positions (k, 3) and stiffnesses (m, k) of the arm without loads."""
         position, stiffness = self._function.many(pressures, self.robot.numbers, threads=1)
         return position[:, :, 0], np.ascontiguousarray(stiffness[:, :, 0].T)
 
-    def _at_equilibria(self, pressures: Vector) -> tuple[Vector, Vector]:
+    def _at_equilibria(self, pressures: Array) -> tuple[Array, Array]:
         """Return the same for the loaded arm; NaN where it has no equilibrium."""
         position = np.full((len(pressures), 3), np.nan)
         stiffness = np.full((len(self.measures), len(pressures)), np.nan)

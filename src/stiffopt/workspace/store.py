@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.errors import FileError, os_reason, require_package, shown
 from stiffopt.workspace.map import FILL, WorkspaceMap
 from stiffopt.workspace.table import CellTable, MapPart, cell_keys, merged
@@ -313,7 +314,7 @@ def _write_json(path: Path, data: dict[str, Any]) -> None:
     part.replace(path)
 
 
-def _plain(values: NDArray[np.float64]) -> list[float | None]:
+def _plain(values: Array) -> list[float | None]:
     return [float(value) if np.isfinite(value) else None for value in values]
 
 

@@ -12,9 +12,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.errors import InputError
 
-Vector = NDArray[np.float64]
 Numbers = NDArray[np.int64]
 
 _BITS = 20
@@ -31,8 +31,8 @@ class CellTable:
 
     key: Numbers  # (M,) packed indices of the cell, ascending
     count: Numbers  # (M,) number of samples
-    best: Vector  # (m, M) greatest stiffness
-    worst: Vector  # (m, M) least stiffness
+    best: Array  # (m, M) greatest stiffness
+    worst: Array  # (m, M) least stiffness
     best_sample: Numbers  # (m, M) lowest number of a sample with the greatest stiffness
     worst_sample: Numbers  # (m, M) likewise for the least
 
@@ -43,7 +43,7 @@ class CellTable:
         return cls(none, none, values, values, values.astype(np.int64), values.astype(np.int64))
 
     @classmethod
-    def of_samples(cls, key: Numbers, stiffness: Vector, sample: Numbers) -> "CellTable":
+    def of_samples(cls, key: Numbers, stiffness: Array, sample: Numbers) -> "CellTable":
         """Return the table of ascending samples in cells (k,), with stiffnesses (m, k)."""
         each = np.broadcast_to(sample, stiffness.shape)
         return _reduced(cls(key, np.ones(len(key), np.int64), stiffness, stiffness, each, each))
@@ -69,12 +69,12 @@ class MapPart(NamedTuple):
 
     blocks: int  # their number
     lost: int  # samples at which the arm has no stable equilibrium
-    low: Vector  # least coordinates (3,) of the tip, in m
-    high: Vector  # greatest coordinates (3,)
+    low: Array  # least coordinates (3,) of the tip, in m
+    high: Array  # greatest coordinates (3,)
     table: CellTable
 
 
-def cell_indices(position: Vector, cell: float) -> Numbers:
+def cell_indices(position: Array, cell: float) -> Numbers:
     """Return the indices (k, 3) of the cells that contain positions (k, 3)."""
     return np.asarray(np.floor(position / cell + 0.5), dtype=np.int64)
 
@@ -142,8 +142,8 @@ def _reduced(rows: CellTable) -> CellTable:
 
 
 def _least(
-    values: Vector, samples: Numbers, order: NDArray[np.intp], starts: Numbers, group: Numbers
-) -> tuple[Vector, Numbers]:
+    values: Array, samples: Numbers, order: NDArray[np.intp], starts: Numbers, group: Numbers
+) -> tuple[Array, Numbers]:
     """Return each group's least value (m, M) and the lowest sample that attains it."""
     values = values[:, order]
     least = np.minimum.reduceat(values, starts, axis=1)

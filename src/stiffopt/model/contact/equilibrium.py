@@ -7,9 +7,10 @@ from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Literal, NamedTuple, get_args
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from stiffopt import lie
+from stiffopt.arrays import Array
 from stiffopt.display import display_units
 from stiffopt.errors import EquilibriumError, InputError
 from stiffopt.model.arguments import check_choice, checked_measure
@@ -28,7 +29,6 @@ from stiffopt.model.screws import Wrench, checked_wrench
 if TYPE_CHECKING:
     from stiffopt.model.manipulator import Manipulator
 
-Vector = NDArray[np.float64]
 Approach = Literal["pressures", "objects"]
 Grip = Literal["sliding", "sticking"]
 
@@ -50,9 +50,9 @@ class Contact(NamedTuple):
 
     object: str
     at: float
-    force: Vector
-    position: Vector
-    normal: Vector
+    force: Array
+    position: Array
+    normal: Array
     max_force: float
 
 
@@ -66,7 +66,7 @@ class FrictionBounds(NamedTuple):
     """
 
     tip: float
-    forces: Vector
+    forces: Array
 
 
 class ContactEquilibrium:
@@ -106,12 +106,12 @@ class ContactEquilibrium:
     # -- shape ------------------------------------------------------------------------------
 
     @property
-    def tip_pose(self) -> Vector:
+    def tip_pose(self) -> Array:
         """Pose of the tip in the base frame, (4, 4)."""
         shape = self._arm.shape
         return np.asarray(lie.transform(shape.rotation[0], shape.position[0]))
 
-    def poses(self, at: ArrayLike) -> Vector:
+    def poses(self, at: ArrayLike) -> Array:
         """Return poses (k, 4, 4) at arc lengths (k,) at rest, in m."""
         wanted = np.asarray(at, dtype=float)
         shape, up = self._arm.shape, slice(None, None, -1)
@@ -122,7 +122,7 @@ class ContactEquilibrium:
         found[:, 3, 3] = 1
         return found
 
-    def backbone(self, n: int = 50) -> Vector:
+    def backbone(self, n: int = 50) -> Array:
         """Return points (n, 3) of the centre line, equally spaced at rest from base to tip."""
         wanted = np.linspace(0.0, self._arm.problem.rod.arm.length, n)
         return self._arm.shape.body(wanted)[0]
@@ -151,11 +151,11 @@ class ContactEquilibrium:
         ]
 
     @property
-    def normal_forces(self) -> Vector:
+    def normal_forces(self) -> Array:
         """Forces (contacts,) along the normals, in N; negative where a contact pulls."""
         return np.array([touch.normal_force for touch in self._arm.state.touches])
 
-    def line(self, at: Vector) -> tuple[Vector, Vector, Vector]:
+    def line(self, at: Array) -> tuple[Array, Array, Array]:
         """Return centre line (k, 3), unit tangents (k, 3) and radii (k,) at arc lengths (k,)."""
         body, length = self._arm.shape.body, self._arm.problem.rod.arm.length
         points, radii = body(at)
@@ -166,14 +166,14 @@ class ContactEquilibrium:
     # -- compliance -------------------------------------------------------------------------
 
     @property
-    def tip_compliance(self) -> Vector:
+    def tip_compliance(self) -> Array:
         """Tangent compliance (6, 6) of the braced tip, in tip axes, linear first.
 
         All contacts stay closed and slide without friction; see `compliance` for sticking ones.
         """
         return self.compliance("sliding")
 
-    def compliance(self, contacts: Grip = "sliding") -> Vector:
+    def compliance(self, contacts: Grip = "sliding") -> Array:
         """Return the tangent compliance (6, 6) of the tip, in tip axes, linear first.
 
         Parameters
@@ -191,7 +191,7 @@ class ContactEquilibrium:
         R = self._arm.shape.rotation[0]
         turn = np.zeros((6, 6))
         turn[:3, :3] = turn[3:, 3:] = R
-        found: Vector = turn.T @ per_wrench @ turn
+        found: Array = turn.T @ per_wrench @ turn
         if self._arm.state.condition.is_conservative and contacts == "sliding":
             found = (found + found.T) / 2  # symmetric up to the integrator's error
         return found
@@ -253,7 +253,7 @@ class ContactEquilibrium:
         normals = [arm.rows[j].point.normal for j in own]
         across = [np.linalg.svd(n[None])[2][1:] for n in normals]
 
-        def tangential(solution: Vector, moves: Vector) -> Vector:
+        def tangential(solution: Array, moves: Array) -> Array:
             """Changes (2k, e) of the tangential forces; a normal force turns with its normal."""
             found = [
                 axes
@@ -270,7 +270,7 @@ class ContactEquilibrium:
         right = np.zeros((len(system.matrix), 2 * len(own)))
         for i, first in enumerate(firsts):  # of the equations that the body does not slide
             right[first + 1 : first + 3, 2 * i : 2 * i + 2] = np.eye(2)
-        slid: Vector = np.asarray(np.linalg.solve(system.matrix, right), dtype=float)
+        slid: Array = np.asarray(np.linalg.solve(system.matrix, right), dtype=float)
         moves = system.linear.moves[..., :u] @ slid[:u]
         turn = system.linear.changes[0, TURN, :u] @ slid[:u]
         pressed = self._system_for("pressures", own)
@@ -290,26 +290,26 @@ class ContactEquilibrium:
     # -- derivatives ------------------------------------------------------------------------
 
     @cached_property
-    def _per_pressure(self) -> tuple[Vector, Vector, Vector]:
+    def _per_pressure(self) -> tuple[Array, Array, Array]:
         system = self._system_for("pressures")
         solution = system.solution()
         found = system.of_tip(solution)
         return found[:6], found[6:], solution[9 : system.linear.unknowns : 7]
 
     @property
-    def tip_jacobian(self) -> Vector:
+    def tip_jacobian(self) -> Array:
         """Twist of the tip in tip axes per pressure, (6, n), while the contacts stay closed."""
         R = self._arm.shape.rotation[0]
         twist = self._per_pressure[0]
         return np.concatenate([R.T @ twist[:3], R.T @ twist[3:]])
 
     @property
-    def force_gradients(self) -> Vector:
+    def force_gradients(self) -> Array:
         """Derivatives (contacts, n) of the normal forces by the pressures, in N/Pa."""
         return self._per_pressure[1]
 
     @property
-    def station_gradients(self) -> Vector:
+    def station_gradients(self) -> Array:
         """Derivatives (contacts, n) of the contacts' arc lengths by the pressures, in m/Pa."""
         return self._per_pressure[2]
 
@@ -321,7 +321,7 @@ class ContactEquilibrium:
         frame: Frame = "base",
         contacts: Grip = "sliding",
         step: float = 50.0,
-    ) -> Vector:
+    ) -> Array:
         """Return the derivative (n,) of `stiffness` by the pressures, contacts staying closed.
 
         Central differences over a step in Pa, of equilibria that are exact to rounding.

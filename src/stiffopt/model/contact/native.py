@@ -7,15 +7,13 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.errors import EquilibriumError
 from stiffopt.model.compiled import Library
 from stiffopt.model.contact.rod import Rod, RodNodes, RodSections, RodShape
 from stiffopt.model.contact.surface import ContactSurface, SurfacePoint
 from stiffopt.model.contact.system import ContactRow, Contacts
-
-Vector = NDArray[np.float64]
 
 MOST_CONTACTS = 24
 """Largest number of contacts, as in contact.c."""
@@ -179,7 +177,7 @@ class NativeContacts:
             setattr(shape, name, results[name])
         return outcome, Contacts(condition, shape.mesh, shape.nodes, tuple(moved)), shape, rows
 
-    def distances(self, surface: int, points: Vector) -> Vector:
+    def distances(self, surface: int, points: Array) -> Array:
         """Return the distances (k,) of points (k, 3) from a surface, in m."""
         points, found = np.ascontiguousarray(points), np.empty(len(points))
         address = ctypes.addressof(self._surfaces[surface])
@@ -197,7 +195,7 @@ class NativeShape(RodShape):
     def __init__(self, cdll: Any, problem: _Problem, keep: tuple[Any, ...]) -> None:
         self._cdll, self._problem, self._keep = cdll, problem, keep
 
-    def body(self, at: Vector) -> tuple[Vector, Vector]:
+    def body(self, at: Array) -> tuple[Array, Array]:
         """See `RodShape.body`."""
         at, points, radii = np.ascontiguousarray(at), np.empty((len(at), 3)), np.empty(len(at))
         self._cdll.stiffopt_contact_body(
@@ -205,7 +203,7 @@ class NativeShape(RodShape):
         )
         return points, radii
 
-    def between(self, other: RodShape, shares: Vector, at: Vector) -> Vector:
+    def between(self, other: RodShape, shares: Array, at: Array) -> Array:
         """See `RodShape.between`; turns and ways from node to node change evenly."""
         if not isinstance(other, NativeShape):
             return super().between(other, shares, at)
@@ -227,7 +225,7 @@ class NativeShape(RodShape):
             )
         )
 
-    def tangent(self) -> Vector:
+    def tangent(self) -> Array:
         """See `RodShape.tangent`."""
         found = np.empty((6 + self._problem.contacts, 6))
         address = ctypes.addressof(self._problem)

@@ -4,13 +4,11 @@ from collections.abc import Collection
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.model.contact.rod import TURN
 from stiffopt.model.contact.solve import ContactProblem
 from stiffopt.model.contact.system import LEAST_COMPLIANCE, Contacts, ContactSystem, LeaningArm
-
-Vector = NDArray[np.float64]
 
 _TILT = 0.5  # rad, largest turn of a contact's normal in a step of a push that slips
 _LARGEST_SWING = 0.2  # rad, largest turn of the tip in a step of a push
@@ -58,9 +56,9 @@ class _Tangent(NamedTuple):
     """
 
     system: ContactSystem
-    solution: Vector
-    rates: Vector
-    moves: Vector
+    solution: Array
+    rates: Array
+    moves: Array
     turn: float
     stiffness: float
 
@@ -68,7 +66,7 @@ class _Tangent(NamedTuple):
 class GrowingPush:
     """A push at the tip that grows from zero, along a unit direction (3,) in base axes."""
 
-    def __init__(self, problem: ContactProblem, direction: Vector, limit: float) -> None:
+    def __init__(self, problem: ContactProblem, direction: Array, limit: float) -> None:
         self._problem, self._direction, self._limit = problem, direction, limit
 
     def slip(self, arm: LeaningArm) -> ContactLoss:
@@ -216,7 +214,7 @@ class GrowingPush:
                 return ContactLoss(np.inf, None, None, "holds", begin, begin)
         return ContactLoss(force, None, None, "stalls", stiffness, 0.0)
 
-    def _rates(self, arm: LeaningArm) -> tuple[Vector, float, float]:
+    def _rates(self, arm: LeaningArm) -> tuple[Array, float, float]:
         """Return changes (k,) of normal forces and of the tip's turn per push; a stiffness."""
         found = arm.tangent[:, :3] @ self._direction
         stiffness = rigid_if_huge(float(self._direction @ found[:3]))
@@ -238,13 +236,13 @@ def rigid_if_huge(compliance: float) -> float:
     return 1 / compliance if abs(compliance) > _NO_COMPLIANCE else np.inf
 
 
-def _until_zero(own: Vector, slopes: Vector) -> Vector:
+def _until_zero(own: Array, slopes: Array) -> Array:
     """Return the pushes (k,) at which forces (k,) vanish; infinite for those that grow."""
-    until: Vector = np.divide(own, -slopes, out=np.full(len(own), np.inf), where=slopes < 0)
+    until: Array = np.divide(own, -slopes, out=np.full(len(own), np.inf), where=slopes < 0)
     return until
 
 
-def _forces(arm: LeaningArm) -> Vector:
+def _forces(arm: LeaningArm) -> Array:
     return np.array([touch.normal_force for touch in arm.state.touches])
 
 
@@ -280,7 +278,7 @@ def _first_loss(
     return first, lost, how
 
 
-def until_equal(a: Vector, b: Vector, c: float, d: float) -> float:
+def until_equal(a: Array, b: Array, c: float, d: float) -> float:
     """Return the least x > 0 at which ``|a + b x| = c + d x``; infinite if there is none."""
     square, double, rest = b @ b - d * d, a @ b - c * d, a @ a - c * c
     if c <= 0 or rest >= 0:

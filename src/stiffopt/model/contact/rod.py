@@ -16,14 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt import lie
+from stiffopt.arrays import Array
 from stiffopt.model.actuation import SectionGeometry
 from stiffopt.model.arm import Arm
 from stiffopt.model.batch import InterpretedFunction
 from stiffopt.model.codegen import dense
 from stiffopt.model.contact.steps import STEP_LENGTH, StepFunction
 from stiffopt.model.shooting import mass_per_length
-
-Vector = NDArray[np.float64]
 
 _STRETCHED = 1.3  # largest step before the mesh is rebuilt, over the longest of a new mesh
 
@@ -42,11 +41,11 @@ class Condition(NamedTuple):
     retreat : distance by which each surface is moved back, (objects,), in m.
     """
 
-    pressures: Vector
-    dead: Vector
-    follower: Vector
-    gravity: Vector
-    retreat: Vector
+    pressures: Array
+    dead: Array
+    follower: Array
+    gravity: Array
+    retreat: Array
 
     @property
     def is_conservative(self) -> bool:
@@ -80,28 +79,28 @@ class RodMesh(NamedTuple):
     node : node of each contact, (k,).
     """
 
-    at: Vector
+    at: Array
     segment: NDArray[np.int64]
     rigid: NDArray[np.bool_]
-    per_station: Vector
+    per_station: Array
     node: NDArray[np.int64]
 
 
 class RodNodes(NamedTuple):
     """Orientation (N + 1, 4) and moment (N + 1, 3) at the nodes, on their distal sides."""
 
-    quaternion: Vector
-    moment: Vector
+    quaternion: Array
+    moment: Array
 
 
 @dataclass(frozen=True)
 class RodSections:
     """Sections of S segments: strains (S, 6), compliances (S, 6, 6), radii and weights (S, 3)."""
 
-    strain: Vector
-    compliance: Vector
-    radius: Vector
-    weight: Vector
+    strain: Array
+    compliance: Array
+    radius: Array
+    weight: Array
 
 
 class Rod:
@@ -161,7 +160,7 @@ class Rod:
             self.mass[:, np.newaxis] * condition.gravity,
         )
 
-    def section_slopes(self, p: Vector) -> tuple[Vector, Vector, Vector]:
+    def section_slopes(self, p: Array) -> tuple[Array, Array, Array]:
         """Return derivatives of strains (S, 6, n), compliances (S, 6, 6, n) and radii (S, n)."""
         count = self.arm.n_segments
         found = self._section_slopes(p)[0]
@@ -187,7 +186,7 @@ class Rod:
             q.append(lie.quaternion_product(q[-1], step).tolist())
         return RodNodes(np.array(q[::-1]), np.zeros((len(mesh.at), 3)))
 
-    def moved(self, mesh: RodMesh, slides: Vector) -> RodMesh | None:
+    def moved(self, mesh: RodMesh, slides: Array) -> RodMesh | None:
         """Return the mesh after contacts (k,) have moved along the arm; None if it no longer fits.
 
         The number of steps is kept as long as possible, so that it does not change at every
@@ -200,7 +199,7 @@ class Rod:
         at = self.arm.length - np.concatenate([[0.0], np.cumsum(h)])
         return mesh._replace(at=at)
 
-    def mesh(self, stations: Vector) -> RodMesh:
+    def mesh(self, stations: Array) -> RodMesh:
         """Return a mesh with nodes at stations (k,)."""
         at, segment, rigid, per_station = [self.arm.length], [], [], []
         node = np.zeros(len(stations), dtype=np.int64)
@@ -243,8 +242,8 @@ def interpolated(nodes: RodNodes, old: RodMesh, new: RodMesh) -> RodNodes:
 class PointLoads(NamedTuple):
     """Forces (k, 3) on the centre line at the contacts, and moments (k, 3), in base axes."""
 
-    force: Vector
-    moment: Vector
+    force: Array
+    moment: Array
 
 
 class RodShape:
@@ -264,16 +263,16 @@ class RodShape:
     mesh: RodMesh
     nodes: RodNodes
     sections: RodSections
-    h: Vector
-    position: Vector
-    near: Vector
-    far: Vector
-    force_far: Vector
-    moment_far: Vector
-    J: Vector
+    h: Array
+    position: Array
+    near: Array
+    far: Array
+    force_far: Array
+    moment_far: Array
+    J: Array
 
     @cached_property
-    def rotation(self) -> Vector:
+    def rotation(self) -> Array:
         """Axes (N + 1, 3, 3) of the nodes."""
         return rotations(self.nodes.quaternion)
 
@@ -281,14 +280,14 @@ class RodShape:
         """Return whether it is stable under dead forces, where machine code can tell."""
         return None
 
-    def tangent(self) -> Vector | None:
+    def tangent(self) -> Array | None:
         """Return changes (6 + contacts, 6) along a wrench on the tip, where machine code can.
 
         Of the tip's place and turn in base axes, and of the normal forces; contacts slide.
         """
         return None
 
-    def body(self, at: Vector) -> tuple[Vector, Vector]:
+    def body(self, at: Array) -> tuple[Array, Array]:
         """Return points (k, 3) of the centre line at arc lengths (k,), and radii (k,) there."""
         marks = self.mesh.at
         i = np.clip(np.searchsorted(-marks, -at, side="right") - 1, 0, len(marks) - 2)
@@ -302,13 +301,13 @@ class RodShape:
         )
         return points, self.sections.radius[self.mesh.segment[i]]
 
-    def between(self, other: "RodShape", shares: Vector, at: Vector) -> Vector:
+    def between(self, other: "RodShape", shares: Array, at: Array) -> Array:
         """Return points (m, k, 3) of bodies at shares (m,) of the way to another shape.
 
         Both have the same mesh.  Without machine code, points move on straight lines.
         """
         first, last = self.body(at)[0], other.body(at)[0]
-        found: Vector = first + shares[:, None, None] * (last - first)
+        found: Array = first + shares[:, None, None] * (last - first)
         return found
 
 
@@ -415,7 +414,7 @@ class LinearRod(RodShape):
         self.moves = np.zeros((count + 1, 3, columns))
         self.moves[:-1] = -np.cumsum(ways[::-1], axis=0)[::-1]
 
-    def _steps(self, moment: Vector, weight: Vector) -> tuple[Vector, Vector, Vector, Vector]:
+    def _steps(self, moment: Array, weight: Array) -> tuple[Array, Array, Array, Array]:
         """Return ends (N, 10), their changes (N, 9, 10), and tangents (N, 3) at starts and ends."""
         mesh, sections, q = self.mesh, self.sections, self.nodes.quaternion[:-1]
         count = len(mesh.segment)
@@ -444,7 +443,7 @@ class LinearRod(RodShape):
 
     def tangent_change(
         self, j: int, loads: PointLoads, segment: int, rigid: bool
-    ) -> tuple[Vector, Vector]:
+    ) -> tuple[Array, Array]:
         """Return the mean (3,) of the tangents on both sides of a contact, and its change (3, c).
 
         Shear causes a kink of the centre line at a point force; the force does no work on a motion
@@ -476,16 +475,16 @@ class LinearRod(RodShape):
             change[:, self.unknowns :] += R @ by_section
         return mean, change
 
-    def bending(self, j: int, loads: PointLoads, segment: int) -> Vector:
+    def bending(self, j: int, loads: PointLoads, segment: int) -> Array:
         """Return the turn (3,) of the section per arc length at a contact, in base axes."""
         node = self.mesh.node[j]
         R, C = self.rotation[node], self.sections.compliance[segment]
         n = self.force_far[node] + loads.force[j] / 2
         wrench = np.concatenate([R.T @ n, R.T @ self.moment_far[node]])
-        turn: Vector = R @ (self.sections.strain[segment] + C @ wrench)[3:]
+        turn: Array = R @ (self.sections.strain[segment] + C @ wrench)[3:]
         return turn
 
-    def _per_pressure(self, condition: Condition, moment: Vector, weight: Vector) -> Vector:
+    def _per_pressure(self, condition: Condition, moment: Array, weight: Array) -> Array:
         """Return changes (N, 9, n) of the steps' ends by pressures, by finite differences."""
         assert self.section_slopes is not None
         strain, compliance, _ = self.section_slopes
@@ -516,12 +515,12 @@ class LinearRod(RodShape):
 # -- small algebra --------------------------------------------------------------------------------
 
 
-def hat(v: Vector) -> Vector:
+def hat(v: Array) -> Array:
     """Return the skew matrix of a vector (3,)."""
     return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
 
 
-def rotations(q: Vector) -> Vector:
+def rotations(q: Array) -> Array:
     """Return the rotations (k, 3, 3) of quaternions (k, 4) of any length."""
     w, x, y, z = q.T / np.linalg.norm(q, axis=1)
     rows = [
@@ -529,25 +528,25 @@ def rotations(q: Vector) -> Vector:
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
-    found: Vector = np.moveaxis(np.array(rows), 2, 0)
+    found: Array = np.moveaxis(np.array(rows), 2, 0)
     return found
 
 
-def turns_between(first: Vector, second: Vector) -> Vector:
+def turns_between(first: Array, second: Array) -> Array:
     """Return rotation vectors (k, 3), in base axes, between nearby quaternions (k, 4)."""
     w, v = first[:, :1], first[:, 1:]
     a, b = second[:, :1], second[:, 1:]
     real = (a * w)[:, 0] + (b * v).sum(1)
     imaginary = w * b - a * v - np.cross(b, v)
-    turn: Vector = 2 * imaginary / real[:, None]
+    turn: Array = 2 * imaginary / real[:, None]
     return turn
 
 
-def turned(q: Vector, turn: Vector) -> Vector:
+def turned(q: Array, turn: Array) -> Array:
     """Return unit quaternions (k, 4) turned by rotation vectors (k, 3) in base axes."""
     half = turn / 2
     w, v = q[:, :1], q[:, 1:]
     real = w[:, 0] - (half * v).sum(1)
     found = np.concatenate([real[:, None], v + w * half + np.cross(half, v)], axis=1)
-    unit: Vector = found / np.linalg.norm(found, axis=1, keepdims=True)
+    unit: Array = found / np.linalg.norm(found, axis=1, keepdims=True)
     return unit

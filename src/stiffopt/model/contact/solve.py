@@ -7,8 +7,8 @@ from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.model.contact.lines import SPACINGS, ContactLines
 from stiffopt.model.contact.native import CONVERGED, LOST, MOST_CONTACTS, NativeContacts
 from stiffopt.model.contact.rod import (
@@ -24,8 +24,6 @@ from stiffopt.model.contact.rod import (
 )
 from stiffopt.model.contact.surface import ContactSurface
 from stiffopt.model.contact.system import Contacts, ContactSystem, LeaningArm, Touch
-
-Vector = NDArray[np.float64]
 
 _LARGEST_TURN = 0.5  # rad, largest turn of a part of the arm in one correction; the rest is cut
 _FARTHEST_TURN = 1.5  # rad; if more were wanted, the equilibrium is not near
@@ -102,7 +100,7 @@ class ContactProblem:
         return None
 
     def _stepped(
-        self, system: ContactSystem, changes: Vector, solution: Vector
+        self, system: ContactSystem, changes: Array, solution: Array
     ) -> tuple[Contacts, float, bool]:
         """Return the state after changes (N + 1, 9) of nodes and (u,) of the unknowns.
 
@@ -122,7 +120,7 @@ class ContactProblem:
             nodes = interpolated(nodes, _at_moved(state, touches), mesh)
         return Contacts(state.condition, mesh, nodes, touches), slide, is_same
 
-    def pushed(self, system: ContactSystem, solution: Vector, push: Vector) -> LeaningArm | None:
+    def pushed(self, system: ContactSystem, solution: Array, push: Array) -> LeaningArm | None:
         """Find the equilibrium after a small push (6,) at the tip, with contacts that stick.
 
         Parameters
@@ -161,7 +159,7 @@ class ContactProblem:
         return None
 
     def _moved(
-        self, state: Contacts, system: ContactSystem, solution: Vector
+        self, state: Contacts, system: ContactSystem, solution: Array
     ) -> tuple[tuple[Touch, ...], float]:
         """Return the contacts after a correction, and how far along the arm they should move."""
         u = system.linear.unknowns
@@ -332,16 +330,16 @@ class ContactProblem:
         none = np.zeros(3)
         return Touch(surface, index, length if pinned else inside, pinned, none, 0.0, none)
 
-    def gaps(self, points: Vector, radii: Vector) -> Vector:
+    def gaps(self, points: Array, radii: Array) -> Array:
         """Return gaps (surfaces, k) to a body with points (k, 3) at the stations."""
         found = [self._gaps_of(j, points, radii, self.stations) for j in range(len(self.surfaces))]
         return np.array(found).reshape(len(found), len(points))
 
-    def _gaps_of(self, index: int, points: Vector, radii: Vector, at: Vector) -> Vector:
+    def _gaps_of(self, index: int, points: Array, radii: Array, at: Array) -> Array:
         """Return gaps (..., k) of a surface to bodies with points (..., k, 3)."""
         surface, native, rows = self.surfaces[index], self._native, points.reshape(-1, 3)
         values = surface.distances(rows) if native is None else native.distances(index, rows)
-        found: Vector = values.reshape(points.shape[:-1]) - radii
+        found: Array = values.reshape(points.shape[:-1]) - radii
         found[..., at < surface.begin] = np.inf
         return found
 
@@ -405,7 +403,7 @@ class ContactProblem:
             return way, None
         return way, found
 
-    def _until_entered(self, before: LeaningArm, after: LeaningArm) -> tuple[float, Vector, Vector]:
+    def _until_entered(self, before: LeaningArm, after: LeaningArm) -> tuple[float, Array, Array]:
         """Return how far an arm moves freely, and its points and gaps there, as `gaps` does."""
         radii, at = after.body[1], self.stations
         too_deep = -_DEEPEST * radii.min()
@@ -436,7 +434,7 @@ class ContactProblem:
         return float(np.clip((before + _ENTERED) / (before - gap), 0.1, 0.9))
 
     def _may_have_passed(
-        self, points: Vector, gaps: Vector, touched: Sequence[int], after: LeaningArm
+        self, points: Array, gaps: Array, touched: Sequence[int], after: LeaningArm
     ) -> bool:
         """Return whether the body may have passed through a surface that it did not touch.
 
@@ -505,7 +503,7 @@ def _at_moved(state: Contacts, touches: tuple[Touch, ...]) -> RodMesh:
     return state.mesh._replace(at=at)
 
 
-def dips(gaps: Vector) -> list[int]:
+def dips(gaps: Array) -> list[int]:
     """Return the local minima of gaps along an arm, except at its base."""
     low = np.isfinite(gaps[:-1]) & (gaps[:-1] > gaps[1:])
     low[:-1] &= gaps[1:-1] <= gaps[2:]

@@ -16,14 +16,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.model.contact.rod import hat
 
 if TYPE_CHECKING:
     from stiffopt.model.contact.system import LeaningArm
 
-Vector = NDArray[np.float64]
 
 _RIGID = 1e-3  # compliance of rigid pieces, as a share of that of their segment
 _FLATTEST = 1e-3  # 1/m, least second derivative of a gap along the arm
@@ -46,7 +45,7 @@ def is_stable(arm: LeaningArm) -> bool:
     return not (values.real <= -np.abs(values.imag)).any()
 
 
-def stiffness_left(arm: LeaningArm) -> Vector:
+def stiffness_left(arm: LeaningArm) -> Array:
     """Return the stiffness (k, k) in N/m of the motions that contacts leave free.
 
     Turns are scaled by the arm's length.
@@ -114,7 +113,7 @@ def stiffness_left(arm: LeaningArm) -> Vector:
     return np.asarray(K)
 
 
-def _slope_change(arm: LeaningArm, j: int, responses: list[Vector]) -> Vector:
+def _slope_change(arm: LeaningArm, j: int, responses: list[Array]) -> Array:
     """Return the change of the gap's slope at a contact by the poses of the nodes."""
     state, linear = arm.state, arm.shape
     node = int(state.mesh.node[j])

@@ -8,10 +8,9 @@ Runge-Kutta method of order four is sufficient: with steps of
 from functools import partial
 
 import casadi as ca
-import numpy as np
-from numpy.typing import NDArray
 
 from stiffopt import lie
+from stiffopt.arrays import Array
 from stiffopt.model.batch import BatchFunction, InterpretedFunction
 from stiffopt.model.codegen import dense
 from stiffopt.model.compiled import Library, library
@@ -19,8 +18,6 @@ from stiffopt.model.compiler import NATIVE
 from stiffopt.model.contact.surface import surface_functions
 from stiffopt.model.obstacles import OBSTACLES
 from stiffopt.model.shooting import slopes
-
-Vector = NDArray[np.float64]
 
 STEP_LENGTH = 1.5
 """Longest step, in outer radii of the segment at rest."""
@@ -57,7 +54,7 @@ class StepFunction:
         self._calls += 1
         return self._code
 
-    def __call__(self, *arguments: Vector) -> list[Vector]:
+    def __call__(self, *arguments: Array) -> list[Array]:
         """Take many steps; the arguments are those of `step_function`, with a leading axis."""
         if self.code is not None:
             return self.code.function(_NAME).many(*arguments, threads=1)

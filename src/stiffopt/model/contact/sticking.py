@@ -15,9 +15,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-Vector = NDArray[np.float64]
+from stiffopt.arrays import Array
 
 _ROUNDS = 10  # over the contacts, and of Newton's method at one
 _SAME = 1e-3  # share of the cone within which a force is on it
@@ -43,15 +42,15 @@ class Sticking(NamedTuple):
     """
 
     own: tuple[int, ...]
-    across: Vector
-    friction: Vector
-    per_pressure: Vector
-    per_push: Vector
-    per_slide: Vector
-    tip: Vector
-    normals: Vector
+    across: Array
+    friction: Array
+    per_pressure: Array
+    per_push: Array
+    per_slide: Array
+    tip: Array
+    normals: Array
 
-    def slides(self, forces: Vector) -> Vector:
+    def slides(self, forces: Array) -> Array:
         """Return the slides (2k,), in m, that tangential forces (2k,) withhold."""
         return np.asarray(-np.linalg.solve(self.per_slide, forces))
 
@@ -74,7 +73,7 @@ class Sticking(NamedTuple):
             normals=self.normals @ given,
         )
 
-    def bent(self) -> tuple[Vector, Vector]:
+    def bent(self) -> tuple[Array, Array]:
         """Return what tangential forces change, against an arm that slides freely.
 
         Of the tip's place and turn (6, 2k), and of all normal forces (contacts, 2k).
@@ -82,7 +81,7 @@ class Sticking(NamedTuple):
         slides = -self.slides(np.eye(len(self.per_slide)))
         return self.tip @ slides, self.normals @ slides
 
-    def slid_back(self, forces: Vector, normals: Vector) -> Vector:
+    def slid_back(self, forces: Array, normals: Array) -> Array:
         """Return the slides (2k,) that bring tangential forces (2k,) back to their cones.
 
         Along each force, as in ``t = t' + K s``, ``s_j = -lambda_j t_j`` and ``|t_j| = mu_j N_j``.
@@ -103,7 +102,7 @@ class Sticking(NamedTuple):
         return slides
 
 
-def _slide(force: Vector, most: float, K: Vector) -> Vector:
+def _slide(force: Array, most: float, K: Array) -> Array:
     """Return the slide (2,) of a contact whose force (2,) exceeds the most that friction holds.
 
     `K`: stiffness (2, 2) against slides, in N/m. Newton's method for the inverse of the force,
@@ -121,5 +120,5 @@ def _slide(force: Vector, most: float, K: Vector) -> Vector:
             break
         slope = float(left @ (stiffness / (1 + share * stiffness) * left)) / size**3
         share = max(share + (1 / most - 1 / size) / slope, 0.0)
-    found: Vector = -share * (axes @ left)
+    found: Array = -share * (axes @ left)
     return found

@@ -6,16 +6,14 @@ from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.model.batch import InterpretedFunction
 from stiffopt.model.codegen import dense
 from stiffopt.model.distances import MeasuredObject
 from stiffopt.model.obstacle import Obstacle
 from stiffopt.model.obstacles.mesh import Mesh
 from stiffopt.model.scene import SceneObject
-
-Vector = NDArray[np.float64]
 
 _STENCIL = 1.5  # half width of the smoothing of a grid's distances, in cubes
 
@@ -24,8 +22,8 @@ class SurfacePoint(NamedTuple):
     """Distance of a point in m, its gradient (3,) and its second derivatives (3, 3)."""
 
     distance: float
-    normal: Vector
-    curvature: Vector
+    normal: Array
+    curvature: Array
 
 
 class ContactSurface:
@@ -58,20 +56,20 @@ class ContactSurface:
     def _measured(self) -> MeasuredObject:
         return MeasuredObject(self._shape, self.begin)
 
-    def distances(self, points: Vector) -> Vector:
+    def distances(self, points: Array) -> Array:
         """Return distances (k,) of points (k, 3), in m."""
         if self._functions is None:
             return self._measured.distances(points).values
-        largest: Vector = self._of_pieces(points).max(axis=0)
+        largest: Array = self._of_pieces(points).max(axis=0)
         return largest
 
-    def _of_pieces(self, points: Vector) -> Vector:
+    def _of_pieces(self, points: Array) -> Array:
         """Return distances (pieces, k) of points (k, 3)."""
         assert self._functions is not None
         found = [self._functions[0].many(points, piece)[0][:, 0, 0] for piece in self.pieces]
         return np.array(found)
 
-    def at(self, point: Vector) -> SurfacePoint:
+    def at(self, point: Array) -> SurfacePoint:
         """Return the distance of one point (3,) with its derivatives."""
         if self._functions is None:
             return self._smoothed(point)
@@ -79,7 +77,7 @@ class ContactSurface:
         value, normal, curvature = self._functions[1](point, self.pieces[nearest])
         return SurfacePoint(float(value[0, 0]), normal[:, 0], curvature)
 
-    def _smoothed(self, point: Vector) -> SurfacePoint:
+    def _smoothed(self, point: Array) -> SurfacePoint:
         """Fit a quadratic to a grid's distances about the point, as the grid is not smooth."""
         assert isinstance(self._shape, Mesh)
         size = _STENCIL * self._shape.spacing

@@ -8,8 +8,8 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.model.contact.rod import (
     TURN,
     Condition,
@@ -27,7 +27,6 @@ from stiffopt.model.contact.surface import SurfacePoint
 if TYPE_CHECKING:
     from stiffopt.model.contact.solve import ContactProblem
 
-Vector = NDArray[np.float64]
 
 LEAST_COMPLIANCE = 1e-3  # allowed below zero, as a share of the largest: that of contacts on lines
 _FLATTEST = 1e-3  # 1/m; with less, a contact's place is undetermined
@@ -58,10 +57,10 @@ class Touch:
     range: int
     station: float
     pinned: bool
-    force: Vector
+    force: Array
     normal_force: float
-    drag: Vector
-    moment: Vector = field(default_factory=lambda: np.zeros(3))
+    drag: Array
+    moment: Array = field(default_factory=lambda: np.zeros(3))
     crossings: int = 0
     line: bool = False
 
@@ -82,7 +81,7 @@ class ContactRow:
     point: SurfacePoint
     radius: float
     gap: float
-    mean: Vector
+    mean: Array
     slope: float
 
 
@@ -102,7 +101,7 @@ class LeaningArm:
         rows: list[ContactRow],
     ) -> None:
         self.problem, self.state, self.shape, self.rows = problem, state, shape, rows
-        self._pushed: dict[tuple[int, ...], tuple[ContactSystem, Vector]] = {}
+        self._pushed: dict[tuple[int, ...], tuple[ContactSystem, Array]] = {}
 
     @cached_property
     def is_stable(self) -> bool:
@@ -127,7 +126,7 @@ class LeaningArm:
         return any(self.bend(j) < 2 * _FLAT for j, touch in touches if not touch.pinned)
 
     @cached_property
-    def tangent(self) -> Vector:
+    def tangent(self) -> Array:
         """Changes (6 + contacts, 6) along a wrench on the tip while contacts slide.
 
         Of the tip's place and turn and of the normal forces; all in base axes.
@@ -138,7 +137,7 @@ class LeaningArm:
         system, solution = self.pushed(())
         return system.of_tip(solution)
 
-    def pushed(self, sticking: Collection[int]) -> tuple[ContactSystem, Vector]:
+    def pushed(self, sticking: Collection[int]) -> tuple[ContactSystem, Array]:
         """Return the equations for a wrench on the tip, and their solution (u, 6).
 
         The contacts `sticking` roll without slipping. They are the same for all directions of a
@@ -151,12 +150,12 @@ class LeaningArm:
         return self._pushed[key]
 
     @cached_property
-    def body(self) -> tuple[Vector, Vector]:
+    def body(self) -> tuple[Array, Array]:
         """Points (k, 3) and radii (k,) of the body at the problem's stations, in m."""
         return self.shape.body(self.problem.stations)
 
     @cached_property
-    def gaps(self) -> Vector:
+    def gaps(self) -> Array:
         """Gaps of the surfaces (surfaces, k) at these stations, in m."""
         return self.problem.gaps(*self.body) + self.state.condition.retreat[:, None]
 
@@ -291,7 +290,7 @@ class ContactSystem(LeaningArm):
             if j in sticking:
                 self._stick(j)
 
-    def _row(self, j: int) -> tuple[ContactRow, Vector]:
+    def _row(self, j: int) -> tuple[ContactRow, Array]:
         """Return a contact's quantities, and the change (3, c) of the mean tangent."""
         state, linear = self.state, self.linear
         touch = state.touches[j]
@@ -303,7 +302,7 @@ class ContactSystem(LeaningArm):
         gap += surface.softness * touch.normal_force
         return ContactRow(point, radius, gap, mean, float(point.normal @ mean)), change
 
-    def _require(self, at: Any, change: Vector) -> None:
+    def _require(self, at: Any, change: Array) -> None:
         """Add equations that a change (..., c) is zero."""
         u = self.linear.unknowns
         self.matrix[at, :u] = change[..., :u]
@@ -340,16 +339,16 @@ class ContactSystem(LeaningArm):
             self.right[first, 0] += touch.normal_force - n @ touch.force
             self.right[moment, 0] += np.cross(lever, touch.force) - touch.moment
 
-    def solution(self) -> Vector:
+    def solution(self) -> Array:
         """Return the unknowns (u, e) for each extra."""
         return np.asarray(np.linalg.solve(self.matrix, self.right))
 
-    def of_tip(self, solution: Vector) -> Vector:
+    def of_tip(self, solution: Array) -> Array:
         """Return the changes (6 + contacts, e) of the tip's place and turn and normal forces."""
         changes, moves = self.along(solution)
         return np.concatenate([moves[0], changes[0, TURN], solution[self.linear.unknowns :]])
 
-    def along(self, solution: Vector) -> tuple[Vector, Vector]:
+    def along(self, solution: Array) -> tuple[Array, Array]:
         """Return changes (N + 1, 9, e) and moves (N + 1, 3, e) of the nodes."""
         linear, u = self.linear, self.linear.unknowns
         found = linear.changes[:, :, :u] @ solution[:u] + linear.changes[:, :, u:]

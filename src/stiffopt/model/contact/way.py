@@ -12,8 +12,8 @@ from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stiffopt.arrays import Array
 from stiffopt.errors import EquilibriumError
 from stiffopt.model.contact.sticking import Sticking
 from stiffopt.model.scene import Scene
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from stiffopt.model.contact.equilibrium import ContactEquilibrium
     from stiffopt.model.manipulator import Manipulator
 
-Vector = NDArray[np.float64]
 
 STATES = 61  # equilibria along the way
 TANGENTIAL = 1e-4  # m/N, compliance of a contact that sticks; an arm along itself has 40 times it
@@ -37,15 +36,17 @@ class Rubbing(NamedTuple):
     tangential : their forces (2k,), components along `Sticking.across`, in N.
     tip : by which these move the tip (3,), base axes, in m.
     normals : by which these change the normal forces of all contacts (contacts,), in N.
+    past : by which the pressures (n,) went past their end and came back, in Pa; None if not.
     """
 
     sticking: Sticking
-    tangential: Vector
-    tip: Vector
-    normals: Vector
+    tangential: Array
+    tip: Array
+    normals: Array
+    past: Array | None = None
 
 
-def states_from_rest(arm: Manipulator, scene: Scene, p: Vector) -> Iterator[ContactEquilibrium]:
+def states_from_rest(arm: Manipulator, scene: Scene, p: Array) -> Iterator[ContactEquilibrium]:
     """Yield equilibria from rest to pressures (n,), which grow in proportion.
 
     Raises
@@ -60,21 +61,30 @@ def states_from_rest(arm: Manipulator, scene: Scene, p: Vector) -> Iterator[Cont
 
 
 def rubbed(states: Iterable[ContactEquilibrium]) -> Rubbing:
-    """Return what friction does on a way, at its end.
-
-    A force belongs to the nearest contact with the same object at the next equilibrium.
+    """Return what friction does on a way, at its end; see `rubbings`.
 
     Raises
     ------
     EquilibriumError
         The arm touches nothing at the end.
     """
-    carried: list[tuple[str, float, Vector]] = []  # object, arc length, and tangential force (3,)
-    before: Vector | None = None
-    found: Rubbing | None = None
+    *_, found = None, *rubbings(states)
+    if found is None:
+        raise EquilibriumError("in smaller steps the arm comes to lean on nothing")
+    return found
+
+
+def rubbings(states: Iterable[ContactEquilibrium]) -> Iterator[Rubbing | None]:
+    """Yield what friction does on a way, at each of its equilibria; None without contact.
+
+    A force belongs to the nearest contact with the same object at the next equilibrium.
+    """
+    carried: list[tuple[str, float, Array]] = []  # object, arc length, and tangential force (3,)
+    before: Array | None = None
     for eq in states:
         if not eq.contacts:
-            carried, before, found = [], eq.pressures, None
+            carried, before = [], eq.pressures
+            yield None
             continue
         held = eq.sticking.softened(TANGENTIAL)
         own = [eq.contacts[j] for j in held.own]
@@ -92,7 +102,4 @@ def rubbed(states: Iterable[ContactEquilibrium]) -> Rubbing:
         parts = np.einsum("ki,kij->kj", forces.reshape(-1, 2), held.across)
         carried = [(each.object, each.at, part) for each, part in zip(own, parts, strict=True)]
         before = eq.pressures
-        found = Rubbing(held, forces, tip[:3] @ forces, normals @ forces)
-    if found is None:
-        raise EquilibriumError("in smaller steps the arm comes to lean on nothing")
-    return found
+        yield Rubbing(held, forces, tip[:3] @ forces, normals @ forces)

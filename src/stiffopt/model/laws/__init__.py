@@ -29,13 +29,7 @@ def _import_all() -> None:
 
 
 def law_class(name: str) -> type[StrainLaw]:
-    """Return the law of this name.
-
-    Raises
-    ------
-    InputError
-        There is none.
-    """
+    """Return the law of this name. Raises `InputError`: there is none."""
     laws = strain_laws()
     if name not in laws:
         *others, last = (shown(each) for each in laws)

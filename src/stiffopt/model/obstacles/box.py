@@ -6,8 +6,9 @@ import casadi as ca
 import numpy as np
 
 from stiffopt import lie
+from stiffopt.arrays import Array
 from stiffopt.directions import Quaternion
-from stiffopt.model.obstacle import Array, Obstacle, Point, Radius, from_box
+from stiffopt.model.obstacle import Obstacle, Point, Radius, from_box
 from stiffopt.schema import Vector
 
 

@@ -2,7 +2,8 @@
 
 import casadi as ca
 
-from stiffopt.model.obstacle import Array, BetweenEnds, from_segment, norm, rounded
+from stiffopt.arrays import Array
+from stiffopt.model.obstacle import BetweenEnds, from_segment, norm, rounded
 
 
 class Capsule(BetweenEnds):

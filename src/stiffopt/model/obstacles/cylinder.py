@@ -3,7 +3,8 @@
 import casadi as ca
 import numpy as np
 
-from stiffopt.model.obstacle import Array, BetweenEnds, from_box, norm, revolved
+from stiffopt.arrays import Array
+from stiffopt.model.obstacle import BetweenEnds, from_box, norm, revolved
 
 
 class Cylinder(BetweenEnds):

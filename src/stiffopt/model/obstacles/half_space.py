@@ -3,8 +3,9 @@
 import casadi as ca
 import numpy as np
 
+from stiffopt.arrays import Array
 from stiffopt.directions import Direction
-from stiffopt.model.obstacle import Array, Obstacle, Point, across
+from stiffopt.model.obstacle import Obstacle, Point, across
 
 
 class HalfSpace(Obstacle):

@@ -7,9 +7,18 @@ import casadi as ca
 import numpy as np
 from pydantic import AfterValidator
 
+from stiffopt.arrays import Array
 from stiffopt.model.description import RobotDescription
-from stiffopt.model.obstacle import Array, Obstacle, Point, Radius, from_segment, norm, revolved
-from stiffopt.schema import BadKeyError, Items
+from stiffopt.model.obstacle import (
+    Obstacle,
+    Point,
+    Radius,
+    check_width,
+    from_segment,
+    norm,
+    revolved,
+)
+from stiffopt.schema import Items
 
 
 def _at_least_two(points: tuple[tuple[float, ...], ...]) -> tuple[tuple[float, ...], ...]:
@@ -100,14 +109,7 @@ class InsideTube(Obstacle):
 
         See `Obstacle.check_against`.
         """
-        widest = max(segment.outer_radius for segment in robot.segments)
-        if self.radius < widest + clearance:
-            asked = f" with {clearance * 1e3:g} mm of clearance" if clearance else ""
-            raise BadKeyError(
-                f"{self.key}.radius",
-                f"{self.radius * 1e3:g} mm is too narrow for the arm, whose outer radius is "
-                f"{widest * 1e3:g} mm{asked}",
-            )
+        check_width(self, max(segment.outer_radius for segment in robot.segments), clearance)
         super().check_against(robot, clearance)
 
     def outline(self, size: float) -> list[Array]:

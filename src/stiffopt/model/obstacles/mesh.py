@@ -11,6 +11,7 @@ import numpy as np
 from pydantic import ValidationInfo, field_serializer, field_validator, model_validator
 
 from stiffopt import lie
+from stiffopt.arrays import Array
 from stiffopt.directions import Quaternion
 from stiffopt.errors import InputError
 from stiffopt.files import folder_of
@@ -23,7 +24,7 @@ from stiffopt.model.distance_grid import (
     read_surface,
     usual_spacing,
 )
-from stiffopt.model.obstacle import Array, Obstacle, Point, Radius, norm
+from stiffopt.model.obstacle import Obstacle, Point, Radius, norm
 from stiffopt.schema import BadKeyError
 
 _PLAUSIBLE = (0.02, 50.0)  # range of a mesh's extent over the arm's length

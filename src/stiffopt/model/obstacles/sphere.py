@@ -2,7 +2,8 @@
 
 import casadi as ca
 
-from stiffopt.model.obstacle import Array, Obstacle, Point, Radius, norm, rounded
+from stiffopt.arrays import Array
+from stiffopt.model.obstacle import Obstacle, Point, Radius, norm, rounded
 
 
 class Sphere(Obstacle):

@@ -2,10 +2,10 @@
 
 import casadi as ca
 
+from stiffopt.arrays import Array
 from stiffopt.directions import Direction
 from stiffopt.model.description import RobotDescription
-from stiffopt.model.obstacle import Array, Obstacle, Point, Radius, norm, revolved
-from stiffopt.schema import BadKeyError
+from stiffopt.model.obstacle import Obstacle, Point, Radius, check_width, norm, revolved
 
 
 class Trocar(Obstacle):
@@ -51,14 +51,7 @@ class Trocar(Obstacle):
 
     def check_against(self, robot: RobotDescription, clearance: float) -> None:
         """Require that the arm's end fits through; see `Obstacle.check_against`."""
-        width = robot.segments[-1].outer_radius
-        if self.radius < width + clearance:
-            asked = f" with {clearance * 1e3:g} mm of clearance" if clearance else ""
-            raise BadKeyError(
-                f"{self.key}.radius",
-                f"{self.radius * 1e3:g} mm is too narrow for the arm, whose outer radius is "
-                f"{width * 1e3:g} mm{asked}",
-            )
+        check_width(self, robot.segments[-1].outer_radius, clearance)
 
     def outline(self, size: float) -> list[Array]:
         """Return a flange about the opening; see `Obstacle.outline`."""

@@ -9,11 +9,12 @@ import casadi as ca
 from pydantic import Field, ValidationInfo, field_serializer, field_validator
 
 from stiffopt import lie
+from stiffopt.arrays import Array
 from stiffopt.directions import Direction, Frame
 from stiffopt.display import display_units
 from stiffopt.model.compliance import Boundary, Kind, held_stiffness
 from stiffopt.model.shape import FreeShape, stiffness_along
-from stiffopt.optimise.measure import Measure, Role, Vector
+from stiffopt.optimise.measure import Measure, Role
 from stiffopt.schema import JsonSchemaOfFile
 from stiffopt.units import (
     Ratio,
@@ -93,9 +94,9 @@ class StiffnessMeasure(Measure):
         vector = ", ".join(f"{round(value, 3) + 0.0:g}" for value in self.direction)
         return f"against {self.kind} {way} ({vector}), {self.frame} axes, {self.boundary}"
 
-    def stiffness_gradient(self, robot: Any, pressures: Vector) -> Vector | None:
+    def stiffness_gradient(self, robot: Any, pressures: Array) -> Array | None:
         """See `Measure.stiffness_gradient`."""
-        gradient: Vector = robot.stiffness_gradient(
+        gradient: Array = robot.stiffness_gradient(
             pressures, self.direction, self.kind, self.boundary, self.frame
         )
         return gradient

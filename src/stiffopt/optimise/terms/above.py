@@ -4,11 +4,11 @@ from typing import Annotated, Any, ClassVar
 
 import casadi as ca
 
+from stiffopt.arrays import Array
 from stiffopt.directions import Direction
 from stiffopt.display import display_units
-from stiffopt.optimise.term import Nearness, Term, Vector, numbers_shown
-from stiffopt.schema import Schema
-from stiffopt.schema import Vector as Three
+from stiffopt.optimise.term import Nearness, Term, numbers_shown
+from stiffopt.schema import Schema, Vector
 from stiffopt.units import Length, within
 
 
@@ -21,7 +21,7 @@ class Plane(Schema):
     normal : unit normal, towards the side where the tip stays.
     """
 
-    point: Three[Annotated[Length, within(1e3, "m")]]
+    point: Vector[Annotated[Length, within(1e3, "m")]]
     normal: Direction
 
 
@@ -64,7 +64,7 @@ class AboveTerm(Term):
         return f"{point} {unit}, normal {numbers_shown(self.value.normal)}"
 
     @classmethod
-    def moved_back(cls, value: Any, offset: Vector) -> Any:
+    def moved_back(cls, value: Any, offset: Array) -> Any:
         """See `Term.moved_back`."""
         pairs = zip(value.point, offset[:3], strict=True)
         return value.model_copy(update={"point": tuple(p - float(d) for p, d in pairs)})

@@ -6,8 +6,9 @@ from typing import Any, ClassVar
 import numpy as np
 
 from stiffopt import lie
+from stiffopt.arrays import Array
 from stiffopt.directions import Quaternion
-from stiffopt.optimise.term import Nearness, Term, Vector
+from stiffopt.optimise.term import Nearness, Term
 
 
 class OrientationTerm(Term):
@@ -40,7 +41,7 @@ class OrientationTerm(Term):
         return Nearness(offset=6 * factor, turn=turn, root=1.0, limit=limit)
 
     @classmethod
-    def moved_back(cls, value: Any, offset: Vector) -> Any:
+    def moved_back(cls, value: Any, offset: Array) -> Any:
         """See `Term.moved_back`."""
         back = lie.exp(np.concatenate([np.zeros(3), -offset[3:]]))[:3, :3]
         rotation = back @ lie.rotation_from_quaternion(np.array(value))

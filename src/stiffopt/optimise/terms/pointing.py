@@ -7,8 +7,9 @@ import casadi as ca
 import numpy as np
 
 from stiffopt import lie
+from stiffopt.arrays import Array
 from stiffopt.directions import Direction
-from stiffopt.optimise.term import Nearness, Term, Vector
+from stiffopt.optimise.term import Nearness, Term
 
 _ALIGNED = 1e-8  # squared sine of an angle below which its series is used
 
@@ -57,7 +58,7 @@ class PointingTerm(Term):
         return Nearness(offset=2 / math.pi**2, turn=turn, root=1.0, limit=limit)
 
     @classmethod
-    def moved_back(cls, value: Any, offset: Vector) -> Any:
+    def moved_back(cls, value: Any, offset: Array) -> Any:
         """See `Term.moved_back`."""
         back = lie.exp(np.concatenate([np.zeros(3), -offset[3:]]))[:3, :3]
         return tuple((back @ np.array(value)).tolist())

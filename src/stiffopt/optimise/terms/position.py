@@ -5,9 +5,9 @@ from typing import Annotated, Any, ClassVar
 
 from pydantic import AfterValidator, BeforeValidator, PlainSerializer
 
+from stiffopt.arrays import Array
 from stiffopt.display import display_units
 from stiffopt.optimise.term import Nearness, Term, Tolerance, numbers_shown
-from stiffopt.optimise.term import Vector as Numbers
 from stiffopt.schema import JsonSchemaOfFile, Vector
 from stiffopt.units import Length, format_quantity, within
 
@@ -79,7 +79,7 @@ class PositionTerm(Term):
         return f"{numbers_shown(self.value, unit)} {unit} within {self.words(self.radius)}"
 
     @classmethod
-    def moved_back(cls, value: Any, offset: Numbers) -> Any:
+    def moved_back(cls, value: Any, offset: Array) -> Any:
         """See `Term.moved_back`."""
         pairs = zip(value, offset[:3], strict=True)
         return tuple(None if axis is None else axis - float(shift) for axis, shift in pairs)

@@ -16,13 +16,12 @@ from contextlib import contextmanager, suppress
 from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import AfterValidator, Field
 
+from stiffopt.arrays import Array
 from stiffopt.errors import DeviceError, InputError, shown
 from stiffopt.rig.device import library
 
-Array = NDArray[np.float64]
 Terminals = Literal["default", "rse", "nrse", "differential", "pseudo-differential"]
 
 _RESERVED = -50103
@@ -77,16 +76,13 @@ _left: dict[str, deque[Any]] = defaultdict(deque)
 class Daqmx:
     """Connection to NI-DAQmx, which makes tasks; it first closes tasks left over from earlier.
 
+    Raises `DeviceError`: the server still does not answer, and tasks were left on it.
+
     Parameters
     ----------
     address : address of NI's gRPC device server; None: the driver on this machine.
     timeout : timeout of every call, in s.
     extra : stiffopt's extra with nidaqmx, for the message if it is missing.
-
-    Raises
-    ------
-    DeviceError
-        The server still does not answer, and tasks were left on it.
     """
 
     def __init__(self, address: str | None, timeout: float, extra: str) -> None:
@@ -265,10 +261,8 @@ class AnalogueOutput(_Task):
 class AnalogueInput(_Task):
     """Voltages, all read at once.
 
-    Parameters
-    ----------
-    shared : whether another task reads inputs of the same device. If so, reserve it only while
-        reading, which is slower.
+    `shared`: whether another task reads inputs of the same device. If so, reserve it only while
+    reading, which is slower.
     """
 
     def __init__(
@@ -359,13 +353,7 @@ class WatchdogTask(_Task):
         self.running = True
 
     def feed(self) -> None:
-        """Restart the timer.
-
-        Raises
-        ------
-        WatchdogExpiredError
-            It has expired.
-        """
+        """Restart the timer. Raises `WatchdogExpiredError`: it has expired."""
         with self._daq.errors("feeding the watchdog"):
             self._task.reset_timer()
 

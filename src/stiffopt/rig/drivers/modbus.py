@@ -15,9 +15,10 @@ from threading import RLock
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydantic import Field, model_validator
 
+from stiffopt.arrays import Array
 from stiffopt.errors import DeviceError, InputError
 from stiffopt.rig.device import library
 from stiffopt.rig.drivers.modbus_registers import (
@@ -38,7 +39,6 @@ from stiffopt.rig.interface import Clock, PressureLimits, PressureSupply, Supply
 from stiffopt.schema import BadKeyError, Items, Schema
 from stiffopt.units import Duration
 
-Array = NDArray[np.float64]
 Registers = dict[int, tuple[int, ...]]
 
 _WRITE, _READ, _TRIGGER = 24, 20, 23
@@ -513,12 +513,7 @@ def _insist(act: Callable[[], object]) -> None:
 
 
 class ModbusRefusedError(DeviceError):
-    """The device has refused the request.
-
-    Attributes
-    ----------
-    code : exception code of the protocol.
-    """
+    """The device has refused the request. `code`: exception code of the protocol."""
 
     def __init__(self, message: str, code: int) -> None:
         super().__init__(message)
@@ -585,17 +580,9 @@ class ModbusLine:
     def ask(self, what: str, function: str, *args: Any, **options: Any) -> Any:
         """Send one request and return the answer.
 
-        Parameters
-        ----------
-        what : the request in words, for messages.
-        function, args, options : method of pymodbus's client and its arguments.
-
-        Raises
-        ------
-        ModbusRefusedError
-            The device refuses.
-        DeviceError
-            It does not answer, or answers wrongly.
+        `what`: the request in words, for messages. `function`, `args`, `options`: method of
+        pymodbus's client and its arguments. Raises `ModbusRefusedError`: the device refuses;
+        `DeviceError`: it does not answer, or answers wrongly.
         """
         with self._lock:
             self.connect()

@@ -208,10 +208,8 @@ class ModbusDumpValve(Schema):
 class PressureRegister:
     """The registers of one pressure, and its encoding.
 
-    Attributes
-    ----------
-    address, table : of its first register.
-    type, word_order, scale : encoding of the pressure.
+    `address`, `table`: of its first register. `type`, `word_order`, `scale`: encoding of the
+    pressure.
     """
 
     address: int
@@ -243,10 +241,7 @@ class PressureRegister:
         0 is written whatever the limits are, and never as more than the highest limit if that is
         above 0.
 
-        Raises
-        ------
-        InputError
-            The pressure is not finite, or no count is within the limits.
+        Raises `InputError`: the pressure is not finite, or no count is within the limits.
         """
         if not math.isfinite(pressure):
             raise InputError(f"{pressure} is not a finite pressure")
@@ -290,10 +285,8 @@ class PressureRegister:
 class RegisterRun:
     """Contiguous registers, which one request reads or writes.
 
-    Attributes
-    ----------
-    table, start, count : their table, first address and number.
-    points : the pressures in them, by channel, counted from 0.
+    `table`, `start`, `count`: their table, first address and number. `points`: the pressures in
+    them, by channel, counted from 0.
     """
 
     table: str

@@ -6,9 +6,9 @@ from contextlib import ExitStack, suppress
 from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from stiffopt.arrays import Array
 from stiffopt.errors import DeviceError
 from stiffopt.rig.drivers.daqmx import (
     Address,
@@ -28,8 +28,6 @@ from stiffopt.rig.endpoints import tcp_endpoints
 from stiffopt.rig.interface import Clock, PressureLimits, PressureSupply, SupplySettings
 from stiffopt.schema import BadKeyError, Items, Pair, Schema
 from stiffopt.units import Duration, Pressure, Voltage
-
-Array = NDArray[np.float64]
 
 
 class _VoltageLine(Schema):

@@ -12,9 +12,10 @@ from contextlib import suppress
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydantic import Field, model_validator
 
+from stiffopt.arrays import Array
 from stiffopt.errors import DeviceError
 from stiffopt.model.description import RobotDescription
 from stiffopt.rig.device import MisfitError
@@ -36,8 +37,6 @@ from stiffopt.rig.endpoints import serial_endpoints
 from stiffopt.rig.interface import Clock, PressureLimits, PressureSupply, SupplySettings
 from stiffopt.schema import BadKeyError, Items, Schema
 from stiffopt.units import Duration, Pressure, PressureRate
-
-Array = NDArray[np.float64]
 
 _TRIES = 3  # of a request to vent
 _LARGEST = 32767 * UNIT
@@ -145,10 +144,7 @@ class OpenRegulatorSupply(PressureSupply):
     def statistics(self) -> dict[str, int]:
         """Return the board's counters since its start; see docs/open-regulator.md.
 
-        Raises
-        ------
-        DeviceError
-            It does not answer.
+        Raises `DeviceError`: it does not answer.
         """
         self._must_be_open()
         names = ("reset", "time_ms", "frames", "bad_frames", "refused", "vented", "longest_tick_us")

@@ -56,23 +56,14 @@ _ERRORS = {
 
 @dataclass(frozen=True)
 class Identity:
-    """The identity of a board, as it reports it.
+    """The identity of a board, as it reports it."""
 
-    Attributes
-    ----------
-    board : its number.
-    version : of the protocol.
-    firmware : its version.
-    channels : number of channels.
-    silence : time without a command after which it vents, in s.
-    max_pressure, max_slew : limits that it never exceeds, in Pa and Pa/s.
-    """
-
-    board: int
-    version: int
-    firmware: str
-    channels: int
-    silence: float
+    board: int  # its number
+    version: int  # of the protocol
+    firmware: str  # its version
+    channels: int  # number of channels
+    silence: float  # time without a command after which it vents, in s
+    # max_pressure, max_slew: limits that it never exceeds, in Pa and Pa/s
     max_pressure: float
     max_slew: float
 
@@ -187,10 +178,7 @@ class BoardLine:
     def ask(self, kind: int, payload: bytes = b"") -> bytes:
         """Send a request and return the payload of the answer.
 
-        Raises
-        ------
-        DeviceError
-            The board refuses, does not answer, or answers wrongly.
+        Raises `DeviceError`: the board refuses, does not answer, or answers wrongly.
         """
         body = self._exchange(kind, payload, self.board, self.timeout)
         if body[0] != VERSION:

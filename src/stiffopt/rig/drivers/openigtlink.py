@@ -9,10 +9,10 @@ import time
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from stiffopt import lie
+from stiffopt.arrays import Array
 from stiffopt.errors import DeviceError
 from stiffopt.rig.device import library
 from stiffopt.rig.interface import Clock, StreamedSettings, StreamedTracker
@@ -87,9 +87,7 @@ class OpenIGTLinkTracker(StreamedTracker):
 
     PLUS sends nothing for a tool that it does not see: only the age of the last sample shows it.
 
-    Attributes
-    ----------
-    heard : names of the devices in the messages; helpful if `OpenIGTLinkSettings.name` is wrong.
+    `heard`: names of the devices in the messages; helpful if `OpenIGTLinkSettings.name` is wrong.
     """
 
     def __init__(self, settings: OpenIGTLinkSettings, clock: Clock | None = None) -> None:
@@ -210,7 +208,7 @@ class OpenIGTLinkTracker(StreamedTracker):
             return None
         return message
 
-    def _take_matrix(self, captured: float, sensor: NDArray[np.float64]) -> None:
+    def _take_matrix(self, captured: float, sensor: Array) -> None:
         rotation = sensor[:3, :3]
         skew = np.abs(rotation.T @ rotation - np.eye(3)).max()
         if not (np.isfinite(sensor).all() and skew <= _SKEW and np.linalg.det(rotation) > 0):

@@ -152,10 +152,8 @@ class ZaberProbeSettings(ProbeSettings):
     ) -> ForceProbe:
         """Return the probe.
 
-        Parameters
-        ----------
-        clock : clock of the rig.
-        prompt : asks a person to do something and returns when it is done; None: on the terminal.
+        `clock`: clock of the rig. `prompt`: asks a person to do something and returns when it is
+        done; None: on the terminal.
         """
         return ZaberProbe(self, clock, prompt)
 
@@ -193,10 +191,7 @@ class ZaberProbe(ForceProbe):
     def align(self, direction: Iterable[float]) -> None:
         """Ask a person to mount the rail along a unit vector (3,) in the base frame; then tare.
 
-        Raises
-        ------
-        CommandError
-            The direction is not a unit vector.
+        Raises `CommandError`: the direction is not a unit vector.
         """
         self._must_be_open()
         axis = np.array(list(direction), dtype=float)
@@ -339,9 +334,7 @@ class ZaberProbe(ForceProbe):
 class ZaberStage:
     """The stage; positions are in m from its home.
 
-    Parameters
-    ----------
-    guard : called continually while the stage moves; if it raises, the stage is stopped.
+    `guard`: called continually while the stage moves; if it raises, the stage is stopped.
     """
 
     def __init__(self, settings: ZaberStageSettings, timeout: float, clock: Clock) -> None:
