@@ -171,7 +171,7 @@ class Bracing:
             return self._left * self._start
         rows = approach.pressures
         on_way = np.array([np.interp(self._time, approach.times, row) for row in rows.T])
-        share = min(self._time / approach.time_back(float(approach.times[-1])), 1.0)
+        share = min(self._time / approach.reached, 1.0)
         found: Array = on_way + share * self._change
         return found
 

@@ -270,7 +270,7 @@ def constant_curvature(task: BenchTask) -> dict[str, BenchErrors]:
     base = np.eye(4) if known is None else known.registration.tracker_in_base.inverse()
     ends = np.cumsum([0, *(segment.n_channels for segment in segments)])
     tolerances = task.robot.tolerances or Tolerances()
-    turns = START.turns if tolerances.base_turn > START.unknown_turn else (0.0,)
+    turns = (0.0,) if tolerances.has_known_turn else START.turns
 
     def tips(x: Array, p: Array) -> Array:
         turned = np.broadcast_to(Rotation.from_rotvec(x[:3]).as_matrix(), (len(p), 3, 3))

@@ -321,7 +321,7 @@ def _screened(setup: Setup, teller: _Teller) -> dict[str, float]:
     teller.begin("looking for a start")
     problem = setup.problem(STRUCTURES[1], setup.settings.start_rows)
     tolerances = setup.tolerances
-    turns = START.turns if tolerances.base_turn > START.unknown_turn else (0.0,)
+    turns = (0.0,) if tolerances.has_known_turn else START.turns
     starts = []
     for turn, modulus in itertools.product(turns, START.moduli):
         start = problem.start({})

@@ -304,7 +304,7 @@ class Comparer:
         self._stations = np.array(stations)
         self.low = np.maximum(description.pressure_min, 0.0)
         tolerances = description.tolerances or Tolerances()
-        self.any_turn = tolerances.base_turn > DETECTION.unknown_turn
+        self.any_turn = not tolerances.has_known_turn
         to_base = np.linalg.inv(base)
         self._pressures: list[Array] = []
         self._measured: list[Array] = []

@@ -132,8 +132,7 @@ class StartSettings:
     creep_times, creep_share : of its creep; times in s.
     bending_radius : smallest bending radius, in lengths of the segment.
     dead_band : as a share of the highest recorded pressure.
-    turns, unknown_turn : turns of the base from which fits start, in rad, if the tolerance of its
-        turn exceeds the latter.
+    turns : turns of the base from which fits start, in rad, if its turn is unknown.
     moduli : coordinates of the moduli from which fits start, in prior deviations.
     position_noise, angle_noise : expected model error in the first fit, in lengths of the arm and
         in rad.
@@ -149,7 +148,6 @@ class StartSettings:
     bending_radius: float = 0.6
     dead_band: float = 0.05
     turns: tuple[float, ...] = (0.0, 2 * np.pi / 3, -2 * np.pi / 3, np.pi)
-    unknown_turn: float = 0.5
     moduli: tuple[float, ...] = (0.0, -1.0, 1.0)
     position_noise: float = 0.01
     angle_noise: float = float(np.radians(3.0))
@@ -345,7 +343,6 @@ class DetectionSettings:
     tie : largest misfit of an accepted hypothesis, as a share of any rival's.
     rows : number of compared rows of all recordings together.
     softness : factors on pressures, for arms softer or stiffer than the robot file says.
-    unknown_turn : tolerance of the base's turn, in rad, beyond which the turn counts as unknown.
     moved : largest distance of the base from its place in the robot file, in lengths of the arm.
     few_channels : largest number of channels of which all orders are tried.
     off, frame : mean error of a log, in lengths of the arm, beyond which its frame is suspected to
@@ -375,7 +372,6 @@ class DetectionSettings:
     tie: float = 0.75
     rows: int = 120
     softness: tuple[float, ...] = (0.2, 0.35, 0.6, 1.0, 1.7, 3.0, 5.0)
-    unknown_turn: float = 0.5
     moved: float = 0.25
     few_channels: int = 3
     off: float = 0.1

@@ -409,6 +409,11 @@ class Tolerances(Schema):
     body_angle: Annotated[Angle, Field(gt=0)] = 0.2
     zero: Annotated[Length, Field(gt=0)] = 0.001
 
+    @property
+    def has_known_turn(self) -> bool:
+        """Whether the base's turn about the arm's axis is roughly known, to 0.5 rad."""
+        return self.base_turn <= 0.5
+
 
 class RobotDescription(Schema):
     """An arm: its segments from the base to the tip, what it carries and what drives it.
@@ -474,13 +479,14 @@ class RobotDescription(Schema):
 
     @property
     def has_known_vertical(self) -> bool:
-        """Whether the registration tells the vertical in the tracker's frame.
+        """Whether the direction of gravity in the tracker's frame is known.
 
-        Its tilt is known to 0.1 rad, and where gravity acts across the arm, its turn to 0.5 rad.
+        It is if the base's tilt there is known to 0.1 rad and, where gravity acts across the arm,
+        its turn to 0.5 rad.
         """
         given, gravity = self.tolerances or Tolerances(), np.array(self.gravity)
         across = float(np.hypot(*gravity[:2])) > 0.02 * float(np.linalg.norm(gravity))
-        return given.base_tilt <= 0.1 and not (across and given.base_turn > 0.5)
+        return given.base_tilt <= 0.1 and (given.has_known_turn or not across)
 
     @property
     def pressure_min(self) -> tuple[float, ...]:

@@ -86,6 +86,12 @@ def eased(
     return best
 
 
+def body_lines(arm: Manipulator, states: Sequence[ContactEquilibrium]) -> tuple[Array, Array]:
+    """Return stations (stations,) and the centre line there, in each state (k, stations, 3)."""
+    at = np.linspace(0.0, arm.length, _STATIONS)
+    return at, np.array([eq.poses(at)[:, :3, 3] for eq in states])
+
+
 def missing_clearance(
     arm: Manipulator, others: Scene, states: Sequence[ContactEquilibrium]
 ) -> float:
@@ -93,9 +99,8 @@ def missing_clearance(
 
     0 if it keeps clear of all within 0.1 mm, in all states.
     """
-    at = np.linspace(0.0, arm.length, _STATIONS)
+    at, lines = body_lines(arm, states)
     radii = arm.body_radius(np.zeros(arm.n_pressures), at)
-    lines = np.array([eq.poses(at)[:, :3, 3] for eq in states])  # (k, stations, 3)
     least = np.inf
     for item in measured_scene(others, arm.description).items:
         gaps = item.distances(lines.reshape(-1, 3)).values.reshape(lines.shape[:2]) - radii
@@ -148,8 +153,8 @@ def _is_allowed(eq: ContactEquilibrium, found: Rubbing | None) -> bool:
     if found is None:
         return False
     for own, force in eq.pressed():
-        most, rub = eq.contacts[own[0]].max_force, np.maximum(found.normals[own], 0.0).sum()
-        if force > most or force + rub > most * (1 + BRACE.rubbed):
+        most = eq.contacts[own[0]].max_force
+        if force > most or force + found.pressing(own) > most * (1 + BRACE.rubbed):
             return False
     return True
 

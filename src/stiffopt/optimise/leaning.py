@@ -416,7 +416,7 @@ class BracedProblem(PressureProblem):
                     f"the arm leans on '{each.object}' with {unit.text(force)}"
                     f"{more if doubt else ''}; at most {unit.text(each.max_force)} is allowed"
                 )
-            rub = 0.0 if rubbing is None else float(np.maximum(rubbing.normals[own], 0.0).sum())
+            rub = 0.0 if rubbing is None else rubbing.pressing(own)
             if force + rub > each.max_force * (1 + BRACE.rubbed):
                 yield (
                     f"friction on the way presses the arm on '{each.object}' with "

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -25,7 +26,7 @@ from stiffopt.model.contact.way import STATES, Rubbing, rubbed, states_from_rest
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.optimise.brace import kept_clear_of, leant_on, quoted
 from stiffopt.optimise.brace_uncertainty import BraceUncertainty
-from stiffopt.optimise.easing import eased, missing_clearance
+from stiffopt.optimise.easing import body_lines, eased, missing_clearance
 from stiffopt.optimise.settings import BRACE
 from stiffopt.optimise.solution import PressureSolution
 from stiffopt.optimise.task import Task
@@ -35,7 +36,6 @@ from stiffopt.paths.configurations import Unsolved, maximised
 SPEED = 0.02  # m/s, largest, of any part of the body
 FORCE_RATE = 0.1  # N/s, largest change of a contact's force
 GRADUAL = 1.0  # s, in which the way gets its speed or loses it
-_STATIONS = 41  # of the body
 _AS_STIFF = 0.05  # largest difference of stiffnesses in the same equilibrium
 _PUSH = 2e-3  # N, step of finite differences by a push at the tip
 _SAME_PRESSURE = 1.0  # Pa
@@ -85,6 +85,11 @@ class BraceApproach:
     contacts: tuple[Contact, ...]
     hold: Hold
     free_tips: Array
+
+    @cached_property
+    def reached(self) -> float:
+        """Time at which the way first reaches its end, in s."""
+        return self.time_back(float(self.times[-1]))
 
     def time_back(self, time: float) -> float:
         """Return when the way first has its pressures of a time, in s.
@@ -222,7 +227,7 @@ def least_times_along(
 
     Where the way turns, it slows down.
     """
-    lines = np.array([eq.poses(_stations(robot))[:, :3, 3] for eq in states])  # (k, stations, 3)
+    _, lines = body_lines(robot, states)
     moved = np.linalg.norm(np.diff(lines, axis=0), axis=-1).max(axis=1)
     forces = np.array([_largest(eq) for eq in states])
     pressures = np.array([eq.pressures for eq in states])
@@ -263,10 +268,6 @@ def _begun_gradually(times: Array) -> Array:
     Its share of the speed grows as t / T with T = `GRADUAL`, so that it is at t^2 / (2 T).
     """
     return np.where(times < GRADUAL / 2, np.sqrt(2 * GRADUAL * times), times + GRADUAL / 2)
-
-
-def _stations(robot: Manipulator) -> Array:
-    return np.linspace(0.0, robot.length, _STATIONS)
 
 
 def _hold(eq: ContactEquilibrium, deviations: Array, rubbing: Rubbing) -> Hold:

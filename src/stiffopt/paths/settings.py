@@ -27,7 +27,7 @@ class LaneSettings:
     last_knots: int = 8
     starts: int = 128  # number of samples that are brought to the target at each knot
     kept: int = 40  # largest number of configurations that are followed in either direction
-    # largest distance of new ones sought beside each, as a share of a channel's range
+    # largest distance from each at which new ones are sought, as a share of a channel's range
     aside: float = 0.15
     # smallest distance of a new one from the others, as a share of a channel's range
     apart: float = 0.1

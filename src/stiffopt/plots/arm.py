@@ -73,7 +73,7 @@ class ArmDrawing:
     # points (k, 3) that must be visible
     corners: list[Array] = field(default_factory=list, kw_only=True)
     handles: list[Any] = field(default_factory=list, kw_only=True)  # for a legend
-    # texts beside points, the most important first
+    # texts next to points, the most important first
     labels: list[Label] = field(default_factory=list, kw_only=True)
     # points (k, 3), close together, which labels avoid
     covered: list[Array] = field(default_factory=list, kw_only=True)

@@ -166,7 +166,7 @@ def draw_path(
     Parameters
     ----------
     axes : in 3-D, as for `draw_arm`.
-    path : the requested path, to draw beside the followed one.
+    path : the requested path, to draw together with the followed one.
     scene : the objects around the arm.
     view : (elevation, azimuth), see `draw_arm`.
     labelled : whether to label the point of least stiffness.

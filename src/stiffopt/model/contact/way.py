@@ -8,7 +8,7 @@ to these. The arm that they bend is that of the last equilibrium, to first order
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -44,6 +44,10 @@ class Rubbing(NamedTuple):
     tip: Array
     normals: Array
     past: Array | None = None
+
+    def pressing(self, contacts: Sequence[int]) -> float:
+        """Return by how much friction presses on contacts, in N; relief does not count."""
+        return float(np.maximum(self.normals[list(contacts)], 0.0).sum())
 
 
 def states_from_rest(arm: Manipulator, scene: Scene, p: Array) -> Iterator[ContactEquilibrium]:
