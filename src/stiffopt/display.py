@@ -117,8 +117,7 @@ class DisplayUnits:
         """
         for name, (si, _) in _USUAL.items():
             if si == unit:
-                found: DisplayUnit = getattr(self, name)
-                return found
+                return getattr(self, name)
         return DisplayUnit(_readable(unit or ""))
 
 

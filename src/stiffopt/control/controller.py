@@ -406,8 +406,7 @@ class TipController:
         """Return the motion of the tip per pressure (3, n), over its greatest one in a period."""
         if self._tip_speed is None or self._bracing is not None:
             return self._no_motion
-        motion: Array = self._arm.on_path(path).jacobian[:3] / (self._tip_speed * self._period)
-        return motion
+        return self._arm.on_path(path).jacobian[:3] / (self._tip_speed * self._period)
 
     def _bend(self, bent: BentMode | None) -> BentMode | None:
         """Let the estimator have the modes of the bent arm, and return them."""
@@ -458,8 +457,7 @@ class TipController:
             return plan
         # an arm that vibrates goes on for a while before its smooth path turns
         path = self._ways[0][0] if self._vibrates and self._ways else self._reference.path
-        goal: Array = path + pace * (plan - path)
-        return goal
+        return path + pace * (plan - path)
 
     def _feedforward(self, pressures: Array, last: Array) -> ControlOutput:
         """Command pressures (n,) without feedback: contacts change how the arm vibrates."""

@@ -177,8 +177,7 @@ class ArmObserver:
     def strained_ahead(self) -> Array:
         """`strained` (n,), with what the effective pressures change in a dead time, in Pa."""
         p = self.pressures
-        ahead: Array = self.strained + (p.effective_ahead - p.effective)
-        return ahead
+        return self.strained + (p.effective_ahead - p.effective)
 
     def on_path(self, pressures: Array) -> TipAt:
         """Return the model's tip at pressures (n,) on the reference's path."""

@@ -154,8 +154,7 @@ class Requests:
                 ) from None
             jacobians.append(at.pose[:3, :3] @ at.jacobian[:3])
         J = np.array(jacobians)
-        parts: Array = (J[1:] + J[:-1]) / 2 * np.diff(pressures, axis=0)[:, None, :]
-        return parts
+        return (J[1:] + J[:-1]) / 2 * np.diff(pressures, axis=0)[:, None, :]
 
     def _check_speed(self, times: Array, parts: Array) -> None:
         """Refuse waypoints at times (k,), in s, between which the arm would be too fast.

@@ -170,8 +170,7 @@ class Arm:
         """Return the cached item of this key, or make it; the cache is shared by all loads."""
         if key not in self._kept:
             self._kept[key] = make()
-        found: Kept = self._kept[key]
-        return found
+        return self._kept[key]
 
     # -- numerics ---------------------------------------------------------------------------
 

@@ -417,8 +417,7 @@ class Manipulator(Arm, ShownInNotebook):
         local = _in_local_axes(wrench, T_at, frame)
         if method == "first-order":
             C = self.tip_compliance(p) if at is None else self.compliance(p, at)
-            T: Array = T_at @ lie.exp(C @ local) @ lie.inverse(T_at) @ self.tip_pose(p)
-            return T
+            return T_at @ lie.exp(C @ local) @ lie.inverse(T_at) @ self.tip_pose(p)
         if method == "elementwise":
             if self.is_loaded:
                 raise InputError(

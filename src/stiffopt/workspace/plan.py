@@ -260,8 +260,7 @@ class MapPlan:
     def _is_clear(self, pressures: Array) -> Flags:
         """Return whether the body keeps the scene's clearance, at each of the pressures (k, n)."""
         assert self.scene is not None
-        clear: Flags = self.robot.clearance(pressures, self.scene) >= self.scene.clearance
-        return clear
+        return self.robot.clearance(pressures, self.scene) >= self.scene.clearance
 
     def _in_closed_form(self, pressures: Array) -> tuple[Array, Array]:
         """Return positions (k, 3) and stiffnesses (m, k) of the arm without loads."""
