@@ -300,12 +300,9 @@ class MapPlan:
     def _outputs(self, shape: Shape, _: Any) -> list[Any]:
         """Return the position (3, 1) of the tip and its stiffnesses (m, 1)."""
         stiffness = (
-            directional_stiffness(
-                shape.compliance, shape.rotation, ca.DM(measure.direction),
-                frame=measure.frame, kind=measure.kind, boundary=measure.boundary,
-            )
-            for measure in self.measures
-        )  # fmt: skip
+            directional_stiffness(shape.compliance, shape.rotation, ca.DM(d), frame, kind, boundary)
+            for d, kind, boundary, frame in self.measures
+        )
         return [shape.position, ca.vertcat(*stiffness)]
 
     # -- record on disk ---------------------------------------------------------------------
