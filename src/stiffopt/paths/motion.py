@@ -491,8 +491,7 @@ def _least_stiffness(robot: Manipulator, p: Array, measures: Sequence[StiffnessM
         for each in measures
     ]
     pairs = zip(measures, directions, strict=True)
-    found: Array = np.min([stiffness_of(C, d, each.kind, each.boundary) for each, d in pairs], 0)
-    return found
+    return np.min([stiffness_of(C, d, each.kind, each.boundary) for each, d in pairs], 0)
 
 
 def timed(way: Array, rates: Array) -> tuple[Array, Array]:
