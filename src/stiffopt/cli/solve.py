@@ -79,8 +79,9 @@ def solve(
         ),
     ] = None,
     post_force: Annotated[
-        str, option("FORCE", "Largest contact force on such a post or wall.")
-    ] = "0.3 N",
+        str | None,
+        option("FORCE", "Largest contact force on such a post or wall; 0.3 N unless given."),
+    ] = None,
     seed: SeedOption = 0,
     units: Units = None,
     quiet: Quiet = False,
