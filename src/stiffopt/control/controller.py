@@ -490,7 +490,6 @@ class TipController:
     def _brace(self, course: Bracing, now: float) -> Array | None:
         """Advance a brace; see `_plan`. The tip's offset is not compensated."""
         self._reference.slew_share = self._tuning.reference.slew_share
-        self.replanner.latest()  # otherwise the planner would seem slow
         before = course.pressures
         is_there = not self._is_held(now) and self._is_near(before)
         course.advance(min(now - self._computed_at, _HELD * self._period), is_there)
