@@ -347,6 +347,8 @@ class DetectionSettings:
     few_channels : largest number of channels of which all orders are tried.
     off, frame : mean error of a log, in lengths of the arm, beyond which its frame is suspected to
         differ from the calibration's; and the share of it that a correction may leave.
+    poses, apart : smallest number of poses by which a frame is judged, since two can be moved to
+        fit any others; and their distance, as a share of the range of effective pressures.
     known_turn : spread of the tip, in lengths of the arm, that determines a turn.
     ridge : added to the diagonal of the normal equations of regressions.
     clock_rows : number of rows in the regression for the clocks.
@@ -376,6 +378,8 @@ class DetectionSettings:
     few_channels: int = 3
     off: float = 0.1
     frame: float = 0.3
+    poses: int = 4
+    apart: float = 0.1
     known_turn: float = 0.02
     ridge: float = 0.01
     clock_rows: int = 600

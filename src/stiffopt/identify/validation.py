@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from stiffopt.arrays import Array
 from stiffopt.errors import StiffoptError
 from stiffopt.identify.detection import replaced
+from stiffopt.identify.discrepancy import centres
 from stiffopt.identify.error_model import held_for, in_turn, is_moving
 from stiffopt.identify.fit import fit
 from stiffopt.identify.problem import CalibrationProblem, Noise, Predicted, Sample
@@ -92,18 +93,26 @@ def _with_doubt(found: Comparison, length: float) -> Comparison:
 
 
 def _with_frames_found(setup: Setup, found: tuple[Comparison, ...]) -> tuple[Comparison, ...]:
-    """Return comparisons in which logs that are off only by their frame are moved to fit."""
+    """Return comparisons in which logs that are off only by their frame are moved to fit.
+
+    They are judged by different poses: where a log holds one pose for long, a motion of the frame
+    could replace whatever the model has wrong there. A frame that was moved, and not only turned by
+    quarters, moves all poses: none of them is predicted well without the motion.
+    """
     recordings = list(setup.recordings)
     length, words = setup.description.length, [""] * len(recordings)
+    poses = [_different(each) for each in found]
     for i, each in enumerate(found):
-        if each.errors.mean > DETECTION.off * length:
-            moved = replaced(recordings[i], each.measured, each.predicted, length)
-            recordings[i], words[i] = moved
+        if each.errors.mean > DETECTION.off * length and len(poses[i]) >= DETECTION.poses:
+            measured, predicted = each.measured[poses[i]], each.predicted[poses[i]]
+            recordings[i], words[i] = replaced(recordings[i], measured, predicted, length)
     if not any(words):
         return found
     again = list(compare(Setup.of(setup.description, recordings, (), setup.settings)))
     for i, (before, after) in enumerate(zip(found, again, strict=True)):
-        if not words[i] or after.errors.mean > DETECTION.frame * before.errors.mean:
+        then, now = before.distance[poses[i]], after.distance[poses[i]]
+        least = np.min if "moved" in words[i] else np.mean
+        if not words[i] or now.mean() > DETECTION.frame * least(then):
             again[i] = before
             continue
         remark = (
@@ -113,6 +122,16 @@ def _with_frames_found(setup: Setup, found: tuple[Comparison, ...]) -> tuple[Com
         )
         again[i] = replace(after, remarks=(*after.remarks, remark))
     return tuple(again)
+
+
+def _different(found: Comparison) -> NDArray[np.intp]:
+    """Return rows of a comparison whose tip was measured, at different effective pressures."""
+    seen = np.flatnonzero(np.isfinite(found.distance))
+    if not len(seen):
+        return seen
+    pressures = found.effective[seen]
+    apart = DETECTION.apart * float(np.ptp(pressures, axis=0).max())
+    return np.asarray(seen[centres(pressures, apart, DETECTION.rows)])
 
 
 def compare(
