@@ -350,6 +350,8 @@ class DetectionSettings:
     region, within : so is a log with less than a share `within` of its tips in the region of this
         probability.
     channel_rows : number of rows with which orders of channels are compared in a log that is off.
+    poses, apart : smallest number of poses by which a frame is judged, since two can be moved to
+        fit any others; and their distance, as a share of the range of effective pressures.
     known_turn : spread of the tip, in lengths of the arm, that determines a turn.
     ridge : added to the diagonal of the normal equations of regressions.
     clock_rows : number of rows in the regression for the clocks.
@@ -384,6 +386,8 @@ class DetectionSettings:
     region: float = 0.99
     within: float = 0.5
     channel_rows: int = 60
+    poses: int = 4
+    apart: float = 0.1
     known_turn: float = 0.02
     ridge: float = 0.01
     clock_rows: int = 600

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from stiffopt.arrays import Array
 from stiffopt.errors import StiffoptError
 from stiffopt.identify.detection import Hypothesis, later, of_channels, replaced, two_clocks
+from stiffopt.identify.discrepancy import centres
 from stiffopt.identify.error_model import held_for, in_turn, is_moving
 from stiffopt.identify.fit import fit
 from stiffopt.identify.problem import CalibrationProblem, Noise, Predicted, Sample
@@ -124,7 +125,8 @@ def _put_right(setup: Setup, found: tuple[Comparison, ...]) -> tuple[Comparison,
             limit = DETECTION.frame * before.errors.mean
             if result[i] is not before:
                 limit = min(limit, DETECTION.tie * result[i].errors.mean)
-            if remarks[i] and after.errors.mean <= limit:
+            believed = correct is not _with_frame_found or _moves_all(before, after, remarks[i])
+            if remarks[i] and believed and after.errors.mean <= limit:
                 remark = (
                     f"{remarks[i]}; the mean error is {after.errors.mean * 1e3:.1f} mm instead of "
                     f"{before.errors.mean * 1e3:.1f} mm"
@@ -136,10 +138,16 @@ def _put_right(setup: Setup, found: tuple[Comparison, ...]) -> tuple[Comparison,
 def _with_frame_found(
     setup: Setup, recording: Recording, found: Comparison
 ) -> tuple[Recording, str]:
-    """Return a recording moved to where the robot predicts its tip, and a remark on that."""
-    if "axes" in setup.settings.keep:
+    """Return a recording moved to where the robot predicts its tip, and a remark on that.
+
+    It is judged by different poses: where a log holds one pose for long, a motion of the frame
+    could replace whatever the model has wrong there.
+    """
+    poses = _different(found)
+    if "axes" in setup.settings.keep or len(poses) < DETECTION.poses:
         return recording, ""
-    moved, words = replaced(recording, found.measured, found.predicted, setup.description.length)
+    measured, predicted = found.measured[poses], found.predicted[poses]
+    moved, words = replaced(recording, measured, predicted, setup.description.length)
     return moved, (
         f"the frame of this log was defined anew: its poses are {words} (--keep axes leaves them); "
         "a log of another arm or with another order of channels may look so too"
@@ -190,6 +198,28 @@ def _with_channels_found(
     (corrected,) = best.applied([recording], low)
     told = best.told(description, [recording.name])
     return corrected, f"{told} (--keep {best.kind} leaves that as it was recorded)"
+
+
+def _moves_all(before: Comparison, after: Comparison, remark: str) -> bool:
+    """Whether the motion of a frame explains the error at all poses.
+
+    A frame that was moved, and not only turned by quarters, moves all poses: none of them is
+    predicted well without the motion.
+    """
+    poses = _different(before)
+    then, now = before.distance[poses], after.distance[poses]
+    least = np.min if "moved by" in remark else np.mean
+    return bool(now.mean() <= DETECTION.frame * least(then))
+
+
+def _different(found: Comparison) -> NDArray[np.intp]:
+    """Return rows of a comparison whose tip was measured, at different effective pressures."""
+    seen = np.flatnonzero(np.isfinite(found.distance))
+    if not len(seen):
+        return seen
+    pressures = found.effective[seen]
+    apart = DETECTION.apart * float(np.ptp(pressures, axis=0).max())
+    return np.asarray(seen[centres(pressures, apart, DETECTION.rows)])
 
 
 def compare(
