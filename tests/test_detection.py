@@ -208,12 +208,23 @@ def judged(robot: RobotDescription) -> RobotDescription:
     return robot.model_copy(update={"calibration": Calibration(errors=errors)})
 
 
+def turn_about_z(angle: float) -> Array:
+    cos, sin = np.cos(angle), np.sin(angle)
+    return np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
+
+
+def test_a_frame_that_is_turned_about_the_tip_at_rest_is_found_by_poses_in_many_directions() -> None:
+    log = log_of()
+    noise = np.random.default_rng(0).normal(scale=6e-4, size=log.tip_position.shape)
+    moved = turned(log, turn_about_z(np.radians(25))).tip_position + [2e-3, 0, 0] + noise
+    (found,) = validate(judged(arm()), [replace(log, tip_position=moved)])
+    assert "defined anew: its poses are turned by 25 deg about" in found.remarks[-1]
+    assert "moved by" in found.remarks[-1]
+
+
 def test_a_frame_that_is_turned_a_little_is_found_by_the_regions() -> None:
     robot, log = judged(arm()), log_of()
-    angle = np.radians(8)
-    about = np.array(
-        [[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]]
-    )
+    about = turn_about_z(np.radians(8))
     (found,) = validate(robot, [turned(log, about)])
     assert "defined anew: its poses are turned by 8 deg about" in found.remarks[-1]
     assert "moved by" not in found.remarks[-1]

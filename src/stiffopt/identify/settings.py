@@ -352,6 +352,8 @@ class DetectionSettings:
     channel_rows : number of rows with which orders of channels are compared in a log that is off.
     poses, apart : smallest number of poses by which a frame is judged, since two can be moved to
         fit any others; and their distance, as a share of the range of effective pressures.
+    in_line : spread of poses across a line, as a share of that along it, up to which they count as
+        poses on a line.
     known_turn : spread of the tip, in lengths of the arm, that determines a turn.
     ridge : added to the diagonal of the normal equations of regressions.
     clock_rows : number of rows in the regression for the clocks.
@@ -388,6 +390,7 @@ class DetectionSettings:
     channel_rows: int = 60
     poses: int = 4
     apart: float = 0.1
+    in_line: float = 0.3
     known_turn: float = 0.02
     ridge: float = 0.01
     clock_rows: int = 600

@@ -203,12 +203,16 @@ def _with_channels_found(
 def _moves_all(before: Comparison, after: Comparison, remark: str) -> bool:
     """Whether the motion of a frame explains the error at all poses.
 
-    A frame that was moved, and not only turned by quarters, moves all poses: none of them is
-    predicted well without the motion.
+    Poses on a line, as in one rise from rest, could be turned about the pose at rest to fit any
+    model. There a frame that was moved, and not only turned by quarters, has to move all of them:
+    none is predicted well without the motion.
     """
     poses = _different(before)
     then, now = before.distance[poses], after.distance[poses]
-    least = np.min if "moved by" in remark else np.mean
+    predicted = before.predicted[poses]
+    spread = np.linalg.svd(predicted - predicted.mean(axis=0), compute_uv=False)
+    in_line = spread[1] < DETECTION.in_line * spread[0]
+    least = np.min if in_line and "moved by" in remark else np.mean
     return bool(now.mean() <= DETECTION.frame * least(then))
 
 
