@@ -213,10 +213,11 @@ def turn_about_z(angle: float) -> Array:
     return np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
 
 
-def test_a_frame_that_is_turned_about_the_tip_at_rest_is_found_by_poses_in_many_directions() -> None:
+def test_a_frame_turned_about_the_tip_at_rest_is_found_by_poses_in_many_directions() -> None:
     log = log_of()
     noise = np.random.default_rng(0).normal(scale=6e-4, size=log.tip_position.shape)
-    moved = turned(log, turn_about_z(np.radians(25))).tip_position + [2e-3, 0, 0] + noise
+    moved = turned(log, turn_about_z(np.radians(25))).tip_position + noise
+    moved[:, 0] += 2e-3
     (found,) = validate(judged(arm()), [replace(log, tip_position=moved)])
     assert "defined anew: its poses are turned by 25 deg about" in found.remarks[-1]
     assert "moved by" in found.remarks[-1]
