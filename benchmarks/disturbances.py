@@ -42,9 +42,9 @@ from control_cases import DYNAMICS, Case, at_tip_speed, draw_case
 from control_runs import LoopRun
 from report import table
 from stiffopt import lie, load_robot
-from stiffopt.commissioning.commission import commission
+from stiffopt.commissioning.commission import evaluate
 from stiffopt.commissioning.expected import expected_steps
-from stiffopt.commissioning.procedure import DangerError
+from stiffopt.commissioning.procedure import DangerError, run_steps
 from stiffopt.control.controller import TipController
 from stiffopt.control.state import State
 from stiffopt.errors import CommandError, InputError
@@ -500,10 +500,11 @@ def run_commissioning(case: Case, row: Row) -> tuple[str, bool, float]:
         expected = expected_steps(rig.robot, rig.supply.limits)
         rest, tips = rig.world.plant.tip_pose()[:3, 3].copy(), []
         try:
-            found = commission(
+            readings = run_steps(
                 rig, expected, Path(folder), rate=1 / PERIOD, quick=True,
                 check=lambda: tips.append(rig.world.plant.tip_pose()[:3, 3].copy()),
             )  # fmt: skip
+            found = evaluate(rig, expected, readings, quick=True)
             first, fits = found.findings[0].text if found.findings else "nothing", found.fits
         except DangerError as error:
             first, fits = str(error), False

@@ -36,8 +36,9 @@ from control_cases import Case, Path8, draw_case, draw_path, settling_time
 from control_runs import Follow, run_path, started
 from report import table
 from stiffopt import RobotDescription, load_robot
-from stiffopt.commissioning.commission import commission, record_of
+from stiffopt.commissioning.commission import evaluate, record_of
 from stiffopt.commissioning.expected import expected_steps
+from stiffopt.commissioning.procedure import run_steps
 from stiffopt.commissioning.record import CommissioningRecord, with_measured_steps
 from stiffopt.control.controller import TipController
 from stiffopt.control.interface import Controller
@@ -78,7 +79,8 @@ def record_of_case(case: Case) -> CommissioningRecord:
     rig: Any = rig_for_programs(case.description.model_copy(update={"plant": plant}), case.robot)
     expected = expected_steps(rig.robot, rig.supply.limits)
     with TemporaryDirectory() as folder, rig:
-        return record_of(rig, commission(rig, expected, Path(folder), rate=100, quick=True))
+        readings = run_steps(rig, expected, Path(folder), rate=100, quick=True)
+        return record_of(rig, evaluate(rig, expected, readings, quick=True))
 
 
 def controller_of(

@@ -343,11 +343,40 @@ def test_a_motion_goes_to_rest_and_then_into_contact(solution, approach):
     assert found.stiffness[0] == pytest.approx(ROBOT.stiffness(start, [1, 0, 0]))
     assert found.stiffness[-1] == pytest.approx(solution.stiffness, rel=1e-3)
     assert found.stiffness[-1] > 4 * found.stiffness[0]
-    with pytest.raises(InputError, match="the only goal of a motion"):
-        stiffopt.plan_motion(ROBOT, TASK, start, slew=2e5)
+    for ends in ((TASK, TASK), (start, [TASK, start])):
+        with pytest.raises(InputError, match="the only goal of a motion, or its start"):
+            stiffopt.plan_motion(ROBOT, *ends, slew=2e5)
     given_up = stiffopt.plan_motion(ROBOT, start, TASK, slew=2e5, cancel=lambda: True)
     assert given_up.status == "failed"
     assert "cancelled" in given_up.message
+
+
+def test_a_motion_from_a_brace_lets_go_on_the_way_to_rest(solution, monkeypatch):
+    """It is the way into contact backwards, without what goes past its end, and then goes on."""
+    monkeypatch.setattr("stiffopt.paths.leaning.eased", None)  # which would go past it
+    goal = np.array([0.0, 0, 2e4, 0, 1e4, 0])
+    found = stiffopt.plan_motion(ROBOT, TASK, goal, slew=2e5, timeout=None)
+    assert found.found
+    assert "at the start it leans on 'post' with 0." in found.message
+    assert "lets go on the way to rest; from there on the body is at least" in found.message
+    assert found.pressures[0] == pytest.approx(solution.pressures)
+    assert found.pressures[-1] == pytest.approx(goal)
+    rest = int(np.argmin(np.abs(found.pressures).max(axis=1)))
+    assert np.abs(found.pressures[rest]).max() < 1e-6
+    lowered = found.pressures[: rest + 1, :].max(axis=1) / solution.pressures.max()
+    assert (np.diff(lowered) < 0).all()
+    assert found.pressures[: rest + 1] == pytest.approx(np.outer(lowered, solution.pressures))
+    assert (np.abs(np.diff(found.pressures, axis=0)).max(axis=1)
+            <= 2e5 * np.diff(found.times) * (1 + 1e-6)).all()  # fmt: skip
+    speeds = np.linalg.norm(np.diff(found.tip_poses[: rest + 1, :3, 3], axis=0), axis=1)
+    assert (speeds <= 0.02 * np.diff(found.times[: rest + 1]) * (1 + 1e-6)).all()
+    assert found.leans[0]
+    assert not found.leans[rest:].any()
+    assert found.equilibrium(len(found.times) - 1) is None
+    assert found.stiffness[0] == pytest.approx(solution.stiffness, rel=1e-3)
+    assert found.stiffness[-1] == pytest.approx(ROBOT.stiffness(goal, [1, 0, 0]))
+    with pytest.raises(InputError, match="leans on objects"):
+        found.trajectory()
 
 
 def test_the_picture_of_a_motion_shows_the_arm_in_contact(solution):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from functools import cache
 
@@ -21,12 +22,12 @@ from stiffopt.identify.detection import (
     without_drift,
 )
 from stiffopt.identify.recording import Recording
-from stiffopt.identify.settings import CalibrationSettings
+from stiffopt.identify.settings import CalibrationSettings, Finding
 from stiffopt.identify.setup import Setup, recordings_of
 from stiffopt.identify.tracker_faults import CUBE_ROTATIONS
 from stiffopt.identify.validation import validate
 from stiffopt.logs import Body, Log, read_log
-from stiffopt.model.calibration import Calibration
+from stiffopt.model.calibration import Calibration, ErrorModel
 from stiffopt.model.description import RobotDescription
 from stiffopt.model.history import Creep, History, Play
 from stiffopt.model.robot_files import load_description
@@ -164,15 +165,108 @@ def test_a_frame_that_was_defined_anew_is_found_when_a_model_is_validated() -> N
     assert "moved by" in found.remarks[-1]
 
 
-def test_a_model_that_is_wrong_is_not_excused_by_its_frame() -> None:
-    softer = log_of()
+def held(rest: int, rise: int = 1, rows: int = 300) -> Log:
+    """The log of an arm that is at rest for some rows, rises, then holds one pose."""
+    share = np.clip((np.arange(rows) - rest + 1) / rise, 0, 1)
+    pressures = share[:, np.newaxis] * [1e5, 0.5e5, 0.0]
+    return driven(pressures, np.linspace(0.0, 0.2 * rows, rows))
+
+
+@pytest.mark.parametrize("log", [log_of(), held(rest=1), held(rest=30), held(rest=1, rise=200)])
+def test_a_model_that_is_wrong_is_not_excused_by_its_frame(log: Log) -> None:
     stiff = calibrated(arm())
     material = stiff.segments[0].material.model_copy(update={"youngs_modulus": 400e3})
     segment = stiff.segments[0].model_copy(update={"material": material})
-    (found,) = validate(stiff.model_copy(update={"segments": (segment,)}), [softer])
+    (found,) = validate(stiff.model_copy(update={"segments": (segment,)}), [log])
     assert found.errors.mean > 9e-3
-    (remark,) = found.remarks  # and the frame is none of it
-    assert "whether the log is of the arm of this calibration" in remark
+    assert "whether the log is of the arm of this calibration" in found.remarks[-1]
+    assert not any("defined anew" in remark for remark in found.remarks)
+
+
+def test_exchanged_channels_in_one_rise_are_not_a_frame_that_was_moved() -> None:
+    log = held(rest=1, rise=200)
+    wrong = replace(log, commanded=np.roll(log.commanded, 1, axis=1))
+    (found,) = validate(calibrated(arm()), [wrong])
+    assert found.errors.mean < 1e-3
+    assert "--keep channels" in found.remarks[-1]
+    assert not any("defined anew" in remark for remark in found.remarks)
+
+
+def judged(robot: RobotDescription) -> RobotDescription:
+    """A calibrated robot that knows how far it is off: by half a millimetre."""
+    errors = ErrorModel(
+        residual=5e-4,
+        discrepancy=300.0,
+        reach=2e4,
+        gain=0.0,
+        degrees_of_freedom=6.0,
+        moving=(2e3,) * 3,
+        settled=(2e3,) * 3,
+        recorded=tuple(map(tuple, log_of().commanded[::10].tolist())),
+        spacing=1e4,
+    )
+    return robot.model_copy(update={"calibration": Calibration(errors=errors)})
+
+
+def turn_about_z(angle: float) -> Array:
+    cos, sin = np.cos(angle), np.sin(angle)
+    return np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
+
+
+def test_a_frame_turned_about_the_tip_at_rest_is_found_by_poses_in_many_directions() -> None:
+    log = log_of()
+    noise = np.random.default_rng(0).normal(scale=6e-4, size=log.tip_position.shape)
+    moved = turned(log, turn_about_z(np.radians(25))).tip_position + noise
+    moved[:, 0] += 2e-3
+    (found,) = validate(judged(arm()), [replace(log, tip_position=moved)])
+    assert "defined anew: its poses are turned by 25 deg about" in found.remarks[-1]
+    assert "moved by" in found.remarks[-1]
+
+
+def test_a_frame_that_is_turned_a_little_is_found_by_the_regions() -> None:
+    robot, log = judged(arm()), log_of()
+    about = turn_about_z(np.radians(8))
+    (found,) = validate(robot, [turned(log, about)])
+    assert "defined anew: its poses are turned by 8 deg about" in found.remarks[-1]
+    assert "moved by" not in found.remarks[-1]
+    assert found.errors.mean < 1e-3
+    (as_it_is,) = validate(robot, [turned(log, about)], CalibrationSettings(keep=("axes",)))
+    assert 3e-3 < as_it_is.errors.mean < 0.1 * robot.length
+    assert "of the tips lie within the regions of 99 %; look at" in as_it_is.remarks[-1]
+    (right,) = validate(robot, [log])
+    assert not right.remarks
+
+
+@pytest.mark.parametrize(
+    ("sources", "words", "kind"),
+    [
+        ([1, 0, 2], "channel 1 has the column of segment 1 channel 2", "channels"),
+        ([0, 1, 0], "channel 3 has the pressure of segment 1 channel 1, as if", "lines"),
+    ],
+)
+def test_wrong_channels_are_found_when_a_model_is_validated(
+    sources: list[int], words: str, kind: Finding
+) -> None:
+    robot, log = calibrated(arm()), log_of()
+    driven_by = np.argsort(sources) if kind == "channels" else sources
+    moved = driven(log.commanded[:, driven_by], log.time)
+    wrong = replace(log, tip_position=moved.tip_position)
+    (found,) = validate(robot, [wrong])
+    assert words in found.remarks[-1]
+    assert found.errors.mean < 1e-3
+    (kept,) = validate(robot, [wrong], CalibrationSettings(keep=(kind,)))
+    assert words not in " ".join(kept.remarks)
+
+
+def test_two_clocks_are_found_when_a_model_is_validated() -> None:
+    robot = calibrated(arm())
+    phase = np.linspace(0, 6 * np.pi, 600)[:, np.newaxis] - [0, 2 * np.pi / 3, 4 * np.pi / 3]
+    log = driven(5e4 * (1 - np.cos(phase)) * [[1.0, 0.9, 0.8]], np.arange(600) * 0.5)
+    (found,) = validate(robot, [shifted(log, 12.0)], CalibrationSettings())
+    assert "the tip moves 12 s after its pressures, as if they had two clocks" in found.remarks[-1]
+    assert found.errors.median < 1e-3
+    (kept,) = validate(robot, [shifted(log, 12.0)], CalibrationSettings(keep=("clock",)))
+    assert "clocks" not in " ".join(kept.remarks)
 
 
 # -- units -----------------------------------------------------------------------------------------
@@ -242,6 +336,21 @@ def test_logs_of_a_sequence_that_are_given_out_of_order_are_told(
         ]
         assert told == expected
         assert all(f"before {found[i - 1].name} begins" in found[i].remarks[-1] for i in told)
+
+
+@pytest.mark.skipif(not (UCL and MODULES), reason="the recordings are not there")
+@pytest.mark.parametrize("by", [-12.0, -5.0])
+def test_two_clocks_of_real_arms_are_made_one(by: float) -> None:
+    one = load_description("ucl-stiff-flop")
+    for log in map(read_log, [*UCL, *MODULES]):
+        if log.n != 3:
+            continue
+        late = [np.interp(log.time + by, log.time, each) for each in log.commanded.T]
+        (read,) = recordings_of(one, [replace(log, commanded=np.column_stack(late))], AS_RECORDED)
+        said = re.search(r"the tip moves (.*) s (after|before) its pressures", read.remarks[-1])
+        assert said
+        assert float(said[1]) == pytest.approx(abs(by), abs=1.0)
+        assert said[2] == "before"
 
 
 def test_an_arm_that_lags_has_one_clock() -> None:

@@ -17,10 +17,10 @@ from pydantic import BaseModel
 import stiffopt
 from examples import run_examples
 from stiffopt.commissioning.record import CommissioningRecord
-from stiffopt.experiments.poses import load_poses
+from stiffopt.experiments.poses import PosesFile, load_poses
 from stiffopt.identify.bench import load_bench
 from stiffopt.logs import read_log
-from stiffopt.model.calibration import Calibration, FittedParameter
+from stiffopt.model.calibration import Calibration, ErrorModel, FittedParameter
 from stiffopt.model.description import (
     Chambers,
     Compensation,
@@ -36,7 +36,10 @@ from stiffopt.model.description import (
 from stiffopt.model.history import Creep, History, Play
 from stiffopt.model.obstacles import OBSTACLES
 from stiffopt.model.scene import AllowedContact, Scene, SceneObject
+from stiffopt.optimise.brace import Brace
 from stiffopt.optimise.goal import MatchMatrix, MatchValue, StiffnessGoal
+from stiffopt.optimise.measures.directional import AtLeast
+from stiffopt.optimise.press import Press
 from stiffopt.optimise.target import Target, Tolerance
 from stiffopt.optimise.task import Load, PressureRange, Task
 from stiffopt.paths.path import Path as PathDescription
@@ -90,8 +93,9 @@ def driver_schemas() -> dict[type[BaseModel], None]:
 SCHEMAS: list[type[BaseModel]] = [
     *(RobotDescription, Segment, Chambers, Material, Compensation, RegulatorLimits),
     *(Corrections, History, Play, Creep, Recordings, TrackedBody, Tolerances),
-    *(Calibration, FittedParameter),
-    *(Task, Target, Tolerance, StiffnessGoal, MatchValue, MatchMatrix, Load, PressureRange),
+    *(Calibration, FittedParameter, ErrorModel),
+    *(Task, Target, Tolerance, StiffnessGoal, AtLeast, MatchValue, MatchMatrix),
+    *(Load, PressureRange, Press, Brace, PosesFile),
     *(Scene, SceneObject, AllowedContact, *OBSTACLES.values()),
     *schemas_of(PathDescription, "stiffopt.paths."),
     *(RigDescription, Safety, LogSettings, Registration, Placement),
@@ -104,6 +108,7 @@ SCHEMAS: list[type[BaseModel]] = [
 ]
 SECTIONS = {  # of files.md, by how the module of a schema begins; the first that fits
     "stiffopt.commissioning": "Commissioning record",
+    "stiffopt.experiments.poses": "Poses",
     "stiffopt.rig.drivers.modbus": "Driver modbus",
     "stiffopt.rig.drivers.nidaq": "Driver nidaq",
     "stiffopt.rig.drivers.aurora": "Drivers aurora and openigtlink",
@@ -176,6 +181,16 @@ def test_files_page_names_every_key(schema: type[BaseModel]) -> None:
         keys.discard("driver")
     missing = {key for key in keys if not re.search(rf"[`.]{key}[`.]", found[2])}
     assert not missing, f"'{title}' of docs/files.md does not describe {sorted(missing)}"
+
+
+def test_files_page_names_no_key_that_does_not_exist() -> None:
+    page = (ROOT / "docs" / "files.md").read_text(encoding="utf-8").partition("\n## Log\n")[0]
+    page = re.sub(r"^### Built-in robots\n.*?(?=^## )", "", page, flags=re.M | re.S)
+    cells = re.findall(r"^\| (`.*?) \|", page, re.M)
+    named = {key.rpartition(".")[2] for cell in cells for key in re.findall(r"`([^`]+)`", cell)}
+    known = {info.alias or name for each in SCHEMAS for name, info in each.model_fields.items()}
+    assert len(named) > 200
+    assert not named - known
 
 
 @pytest.mark.filterwarnings("ignore:the simulator is compiled")

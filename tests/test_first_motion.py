@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -59,8 +60,8 @@ def test_a_channel_that_comes_later_is_slow_until_the_tip_follows_it(
     assert first.is_over is responds
 
 
-def test_an_arm_that_may_be_fast_is_fast_at_once() -> None:
-    first = FirstMotion(None)
+def test_a_first_motion_without_bounds_is_fast_at_once() -> None:
+    first = FirstMotion(replace(TUNING, slew_share=math.inf, correction=math.inf))
     assert first.slew_share == math.inf
     assert first.largest_correction(BASE) == math.inf
 

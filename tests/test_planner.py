@@ -303,6 +303,15 @@ def test_slow_planner_is_an_alarm_until_it_answers(robot, in_process):
     assert planner.notices() == ()
 
 
+def test_an_answer_that_nobody_takes_does_not_seem_late(robot, in_process):
+    """While pressures are held, no plans are asked for."""
+    planner = in_process(patience=0.0)
+    wait_for(lambda: ready(planner))
+    planner.request(request(robot))
+    wait_for(planner._end.has_answer)
+    assert planner.notices() == ()
+
+
 def test_a_new_task_that_takes_its_time_is_said_to_do_so(robot, in_process):
     """Nothing is wrong, but the arm does not move, and somebody waits."""
     planner = in_process()

@@ -55,6 +55,7 @@ def test_stiffness_stands_beside_what_was_published(monkeypatch: pytest.MonkeyPa
     assert len(report.published.rows) == 6
     first, last = report.published.rows[0], report.published.rows[-1]
     assert first[:3] == ("0", "x", "0.19 +- 0.03")
+    assert first[3] == "0.2090 +- 0.0021"  # as many decimals as its interval, in any unit
     assert first[4] == "+10 %"
     assert last[:3] == ("1.5", "z", "0.18 +- 0.03")  # pushed along -z, the same line
     assert last[6] == "-1 %"

@@ -14,6 +14,8 @@ import stiffopt
 from cli_tasks import TWO, Write, lines, run, write_fixture  # noqa: F401
 from conftest import use_compiler
 from leaning_arm import few_starts as with_few_starts
+from stiffopt.cli.solve_report import _supports
+from stiffopt.cli.solved_task import SolvedTask, _with_supports
 from stiffopt.errors import InputError
 from stiffopt.optimise import supports
 from stiffopt.optimise.supports import SupportMap, suggest_supports
@@ -145,6 +147,17 @@ def test_the_command_prints_and_draws_it(
     )
 
 
+def test_what_is_softer_than_what_the_task_leans_on_is_no_help(found, monkeypatch):
+    monkeypatch.setattr("stiffopt.cli.solved_task.suggest_supports", lambda *_, **__: found)
+    first, second = found.supports[:2]
+    leaning = _with_supports(SolvedTask("task.yaml", ROBOT, second.solution), 0.3, seed=0)
+    assert leaning.supports.supports == (first,)
+    (text,) = (text for _, text in _supports(leaning.supports, leans=True))
+    assert f"{found.times(first):.3g} times as stiff as clear of all objects; touched" in text
+    free = _with_supports(SolvedTask("task.yaml", ROBOT, found.free), 0.3, seed=0)
+    assert free.supports.supports == found.supports
+
+
 def test_the_command_refuses_what_it_cannot_do(write: Write, tmp_path: Path) -> None:
     path = write("two.yaml", TWO[: TWO.index("stiffness")])
     result = run("--suggest-post", str(tmp_path / "post.png"), path)
@@ -154,3 +167,9 @@ def test_the_command_refuses_what_it_cannot_do(write: Write, tmp_path: Path) -> 
     result = run("--suggest-post", str(tmp_path / "post.png"), "--post-force", "3 mm", path)
     assert result.exit_code == 2
     assert "--post-force" in result.stderr
+    result = run("--suggest-post", str(tmp_path / "post.png"), "--post-force", "0 N", path)
+    assert result.exit_code == 2
+    assert "--post-force: must be greater than 0, not '0 N'" in result.stderr
+    result = run("--post-force", "0.1 N", path)
+    assert result.exit_code == 2
+    assert "--post-force: needs --suggest-post" in result.stderr

@@ -17,16 +17,6 @@ from typing import Any
 from stiffopt.errors import InputError, shown
 from stiffopt.units import unit_size
 
-__all__ = [
-    "FIGURES",
-    "PLAIN",
-    "VARIABLE",
-    "DisplayUnit",
-    "DisplayUnits",
-    "choose_units",
-    "display_units",
-]
-
 VARIABLE = "STIFFOPT_UNITS"
 """Environment variable with units, in the form of ``--units``."""
 
@@ -117,8 +107,7 @@ class DisplayUnits:
         """
         for name, (si, _) in _USUAL.items():
             if si == unit:
-                found: DisplayUnit = getattr(self, name)
-                return found
+                return getattr(self, name)
         return DisplayUnit(_readable(unit or ""))
 
 

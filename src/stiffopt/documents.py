@@ -20,8 +20,6 @@ import yaml
 
 from stiffopt.errors import FileError, InputError, Loc, dotted, os_reason, printable, shown
 
-__all__ = ["Document", "document_of", "read_document", "to_yaml", "write_file", "write_whole"]
-
 MAX_BYTES = 1_000_000
 MAX_DEPTH = 20
 _TOO_DEEP = f"is nested more than {MAX_DEPTH} levels deep"

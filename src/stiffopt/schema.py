@@ -17,17 +17,6 @@ from pydantic_core import ErrorDetails
 from stiffopt.errors import InputError, Loc, dotted, shown
 from stiffopt.units import QuantityKind, in_unit_of
 
-__all__ = [
-    "BadKeyError",
-    "Items",
-    "JsonSchemaOfFile",
-    "Pair",
-    "Schema",
-    "Vector",
-    "explain",
-    "items_of",
-]
-
 ItemT = TypeVar("ItemT")
 
 

@@ -24,39 +24,6 @@ from stiffopt.errors import InputError, shown
 if TYPE_CHECKING:
     import pint
 
-__all__ = [
-    "FROM_FILE",
-    "Acceleration",
-    "Angle",
-    "Density",
-    "Duration",
-    "Force",
-    "ForcePerVoltage",
-    "Frequency",
-    "Length",
-    "Mass",
-    "Moment",
-    "Number",
-    "Pressure",
-    "PressureRate",
-    "QuantityKind",
-    "Ratio",
-    "RotationalStiffness",
-    "Speed",
-    "TranslationalStiffness",
-    "Voltage",
-    "finite_number",
-    "format_quantity",
-    "get_ready",
-    "in_unit_of",
-    "parse_quantity",
-    "quantity_schema",
-    "read_from_file",
-    "unit_size",
-    "unit_suffix",
-    "within",
-]
-
 FROM_FILE = {"from_file": True}
 """Pydantic validation context of data from a file, in which quantities must have units."""
 

@@ -5,7 +5,7 @@ from typing import Annotated
 import typer
 
 from stiffopt.cli.exits import with_exit_code
-from stiffopt.cli.options import Json, Quiet, Units, option
+from stiffopt.cli.options import Json, Quiet, TimeoutOption, Units, option
 
 _CODES = """
 \b
@@ -133,7 +133,7 @@ def calibrate(
             "nothing is held back.",
         ),
     ] = False,
-    timeout: Annotated[str | None, option("TIME", "Stop after this time, as by Ctrl-C.")] = None,
+    timeout: TimeoutOption = None,
     sequence: Sequence = False,
     rezero: Rezero = False,
     pressures: Pressures = "commanded",

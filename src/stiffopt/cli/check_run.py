@@ -22,9 +22,10 @@ _FORMAT = re.compile(r"stiffopt-([a-z]+)/\d+")
 def check_files(paths: Sequence[str], *, as_json: bool, quiet: bool) -> int:
     """Check files, print their mistakes and return the exit code."""
     code = SOLVED
-    rigs = [path for path in paths if _is_rig(path)]
+    kinds = {path: _kind_of(path) for path in paths}
+    rigs = [path for path in paths if kinds[path] == "rig"]
     for path in paths:
-        kind, mistakes = check_file(path, rigs[0] if len(rigs) == 1 else None)
+        kind, mistakes = _checked(path, kinds[path], rigs[0] if len(rigs) == 1 else None)
         if mistakes:
             code = BAD_INPUT
         if as_json:
@@ -47,14 +48,20 @@ def _record(mistake: FileError) -> dict[str, Any]:
     }
 
 
-def check_file(path: str, rig: str | None = None) -> tuple[str, list[FileError]]:
-    """Return the kind of a file, empty if unknown, and its mistakes.
+def check_file(path: str) -> tuple[str, list[FileError]]:
+    """Return the kind of a file, empty if unknown, and its mistakes."""
+    return _checked(path, _kind_of(path), None)
+
+
+def _checked(path: str, found: str | FileError, rig: str | None) -> tuple[str, list[FileError]]:
+    """Do the same for a file whose kind, or why there is none, was found.
 
     A task for the robot of `rig`, a rig file, is compared with the scene there.
     """
-    kind = ""
+    if isinstance(found, FileError):
+        return "", [found, *found.others]
+    kind = found
     try:
-        kind = _kind_of(path)
         _CHECKS[kind](path)
         if kind == "task" and rig is not None:
             _check_on_rig(path, rig)
@@ -65,21 +72,17 @@ def check_file(path: str, rig: str | None = None) -> tuple[str, list[FileError]]
     return kind, []
 
 
-def _is_rig(path: str) -> bool:
-    try:
-        return _kind_of(path) == "rig"
-    except StiffoptError:
-        return False
-
-
-def _kind_of(path: str) -> str:
-    """Return the kind of a file by its ending, and of a YAML file by its format."""
+def _kind_of(path: str) -> str | FileError:
+    """Return the kind of a file by its ending, or of a YAML file by its format; else a mistake."""
     if _is_pipe(path):  # reading would block, and works only once
-        raise FileError(path, "is a pipe; expected a file")
+        return FileError(path, "is a pipe; expected a file")
     ending = Path(path).suffix.lower()
     if ending in (".csv", ".mcap"):
         return "log"
-    document = read_document(path)
+    try:
+        document = read_document(path)
+    except FileError as error:
+        return error
     given = document.data.get("format")
     match = _FORMAT.fullmatch(given) if isinstance(given, str) else None
     if match is not None and match[1] in _CHECKS:
@@ -87,11 +90,11 @@ def _kind_of(path: str) -> str:
     formats = [format_of(kind) for kind in _CHECKS if kind != "log"]
     expected = f"expected one of {', '.join(formats)}"
     if given is None:
-        raise FileError(path, f"has no 'format'; {expected}")
+        return FileError(path, f"has no 'format'; {expected}")
     near = difflib.get_close_matches(str(given), formats, n=1)
     hint = f"; did you mean '{near[0]}'?" if near else f"; {expected}"
     reason = f"{shown(given)} is no format of a file that people write{hint}"
-    raise document.error(("format",), reason)
+    return document.error(("format",), reason)
 
 
 def _is_pipe(path: str) -> bool:

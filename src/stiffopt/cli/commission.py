@@ -5,7 +5,7 @@ from typing import Annotated
 import typer
 
 from stiffopt.cli.exits import with_exit_code
-from stiffopt.cli.options import Json, Quiet, RigArgument, Units, option
+from stiffopt.cli.options import Json, NoPlot, Quiet, RigArgument, Units, option
 
 COMMISSION_EPILOG = """\
 \b
@@ -47,7 +47,7 @@ def commission(
             "log folder.",
         ),
     ] = None,
-    no_plot: Annotated[bool, typer.Option("--no-plot", help="Draw no figure.")] = False,
+    no_plot: NoPlot = False,
     as_json: Json = False,
     units: Units = None,
     quiet: Quiet = False,

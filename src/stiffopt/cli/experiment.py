@@ -5,7 +5,7 @@ from typing import Annotated
 import typer
 
 from stiffopt.cli.exits import with_exit_code
-from stiffopt.cli.options import Json, Quiet, RigArgument, Units, command_group, option
+from stiffopt.cli.options import Json, NoPlot, Quiet, RigArgument, Units, command_group, option
 
 experiment_app = command_group(help="Do the paper's experiments on a rig, real or simulated.")
 
@@ -51,7 +51,6 @@ Model = Annotated[
 Repetitions = Annotated[
     int | None, option("N", "Repetitions of all; by default 5.", min=1, max=1000)
 ]
-NoPlot = Annotated[bool, typer.Option("--no-plot", help="Draw no figure.")]
 
 
 @experiment_app.command(

@@ -1,5 +1,6 @@
 """Report experiments: on the terminal, as a Markdown page, and as JSON."""
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -253,4 +254,9 @@ def _estimate(estimate: SlopeEstimate | None) -> str:
     if estimate is None:
         return "no contact"
     unit = display_units().stiffness
-    return f"{unit.number(estimate.value, FIGURES)} +- {unit.number(estimate.half_width, '.2g')}"
+    half = unit.number(estimate.half_width, ".2g")
+    value = unit.number(estimate.value, FIGURES)
+    if 0 < float(half) < math.inf:  # no more decimals than its half width has
+        digits = max(1 - math.floor(math.log10(float(half))), 0)
+        value = f"{unit.of(estimate.value):.{digits}f}"
+    return f"{value} +- {half}"

@@ -4,7 +4,7 @@ from typing import Annotated, Any
 
 from stiffopt.cli.console import write_line
 from stiffopt.cli.exits import interruptible_work, with_exit_code
-from stiffopt.cli.options import Quiet, RobotArgument, command_group, option
+from stiffopt.cli.options import PressuresOption, Quiet, RobotArgument, command_group, option
 from stiffopt.cli.outputs import check_ending, check_writable
 
 export_app = command_group(help="Write an arm under pressure for other programs.")
@@ -30,10 +30,6 @@ Examples:
   stiffopt export mesh stiff-flop-2 --pressures '0.6, 0, 0.2, 0, 0, 0.4 bar' --out arm.stl
 {_CODES}"""
 
-Pressures = Annotated[
-    str, option("LIST", "Pressures of all channels, proximal segment first: '0.2, 0, 0.3 bar'.")
-]
-
 
 def _arm(robot: str, pressures: str) -> tuple[Any, Any]:
     from stiffopt.cli import quantities
@@ -46,7 +42,7 @@ def _arm(robot: str, pressures: str) -> tuple[Any, Any]:
 @with_exit_code
 def export_mjcf(
     robot: RobotArgument,
-    pressures: Pressures,
+    pressures: PressuresOption,
     out: Annotated[str | None, option("FILE.xml", "The file; by default it is printed.")] = None,
     pieces: Annotated[int | None, option("N", "Joints per segment; by default 12.")] = None,
     damping: Annotated[
@@ -82,7 +78,7 @@ def export_mjcf(
 @with_exit_code
 def export_mesh(
     robot: RobotArgument,
-    pressures: Pressures,
+    pressures: PressuresOption,
     out: Annotated[str, option("FILE.stl", "Or .obj or .ply.")],
     quiet: Quiet = False,
 ) -> None:

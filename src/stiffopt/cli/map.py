@@ -17,8 +17,10 @@ from stiffopt.cli.options import (
     BoundaryOption,
     FrameOption,
     Json,
+    PressuresOption,
     Quiet,
     RobotArgument,
+    TimeoutOption,
     Units,
     command_group,
     option,
@@ -81,7 +83,7 @@ def workspace(
     scheduler: Annotated[
         str | None, option("ADDRESS", "Use the workers of this Dask scheduler.")
     ] = None,
-    timeout: Annotated[str | None, option("TIME", "Stop after this time, as by Ctrl-C.")] = None,
+    timeout: TimeoutOption = None,
     plot: Annotated[str | None, option("FILE.png", "Draw sections through the workspace.")] = None,
     as_json: Json = False,
     overwrite: Annotated[
@@ -170,9 +172,7 @@ Examples:
 def contact(
     robot: RobotArgument,
     scene: Annotated[str, option("FILE", "A scene file.")],
-    pressures: Annotated[
-        str, option("LIST", "Pressures of all channels, proximal segment first: '0.2, 0, 0.3 bar'.")
-    ],
+    pressures: PressuresOption,
     plot: Annotated[str | None, option("FILE.png", "Draw the arm and its contacts.")] = None,
     as_json: Json = False,
     units: Units = None,

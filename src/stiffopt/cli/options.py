@@ -71,6 +71,14 @@ Units = Annotated[
         callback=show_in_units,
     ),
 ]
+PressuresOption = Annotated[
+    str, option("LIST", "Pressures of all channels, proximal segment first: '0.2, 0, 0.3 bar'.")
+]
+SeedOption = Annotated[
+    int, option("N", "Seed of the global search; the same gives the same answer.", min=0)
+]
+TimeoutOption = Annotated[str | None, option("TIME", "Stop after this time, as by Ctrl-C.")]
+NoPlot = Annotated[bool, typer.Option("--no-plot", help="Draw no figure.")]
 BoundaryOption = Annotated[str, option("BOUNDARY", "free, guided or clamped: how the tip is held.")]
 FrameOption = Annotated[str, option("FRAME", "base or tip: the axes of the directions.")]
 ViewOption = Annotated[

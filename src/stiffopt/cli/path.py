@@ -5,7 +5,7 @@ from typing import Annotated
 import typer
 
 from stiffopt.cli.exits import with_exit_code
-from stiffopt.cli.options import Quiet, Units, ViewOption, option
+from stiffopt.cli.options import Quiet, SeedOption, Units, ViewOption, option
 
 PATH_EPILOG = """\
 \b
@@ -61,9 +61,7 @@ def path(
         ),
     ] = None,
     view: ViewOption = None,
-    seed: Annotated[
-        int, option("N", "Seed of the global search; the same gives the same answer.", min=0)
-    ] = 0,
+    seed: SeedOption = 0,
     units: Units = None,
     quiet: Quiet = False,
 ) -> int:

@@ -66,7 +66,8 @@ def plan(
 
     The ends are pressures, proximal segment first, or task files; a task as a goal stands for any
     configuration that solves it. The motion reaches one of several goals. The pressures change no
-    faster than the rates allow. A way that is not straight needs the extra 'plan'.
+    faster than the rates allow. A way that is not straight needs the extra 'plan'. If the goal is a
+    task with 'brace', the arm comes to lean on its objects; if the start is one, it lets go first.
     """  # noqa: D205
     from stiffopt.cli.plan_run import PlanCommand  # here, so that --help waits for no numerics
 

@@ -69,7 +69,8 @@ class PlanCommand:
             progress(0, 0, "planning")
             scene, solution = self._plan()
         if as_json:
-            contacts = [each for eq in solution.equilibria[-1:] for each in eq.contacts]
+            end = solution.equilibria[-1] if solution.equilibria else None
+            contacts = () if end is None else end.contacts
             values = {**solution_values(solution), "contacts": list(map(contact_record, contacts))}
             write_json({"from": self.start, "to": self.goals, **values})
         elif not quiet:

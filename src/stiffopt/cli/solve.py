@@ -5,7 +5,7 @@ from typing import Annotated
 import typer
 
 from stiffopt.cli.exits import with_exit_code
-from stiffopt.cli.options import Quiet, Units, Version, ViewOption, option
+from stiffopt.cli.options import Quiet, SeedOption, Units, Version, ViewOption, option
 
 EXAMPLES = """\
 \b
@@ -79,11 +79,10 @@ def solve(
         ),
     ] = None,
     post_force: Annotated[
-        str, option("FORCE", "Largest contact force on such a post or wall.")
-    ] = "0.3 N",
-    seed: Annotated[
-        int, option("N", "Seed of the global search; the same gives the same answer.", min=0)
-    ] = 0,
+        str | None,
+        option("FORCE", "Largest contact force on such a post or wall; 0.3 N unless given."),
+    ] = None,
+    seed: SeedOption = 0,
     units: Units = None,
     quiet: Quiet = False,
     version: Version = False,

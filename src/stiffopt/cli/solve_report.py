@@ -72,7 +72,7 @@ def _lines(solved: SolvedTask) -> Iterable[Line]:
     if solved.front is not None:
         yield "trade-off", _front(solved)
     if solved.supports is not None:
-        yield from _supports(solved.supports)
+        yield from _supports(solved.supports, leans=bool(solved.solution.contacts))
 
 
 def _robot(solved: SolvedTask) -> str:
@@ -331,9 +331,10 @@ def _vented(solution: PressureSolution) -> set[str]:
     return {f"{description.channel_name(k)} min" for k, limit in enumerate(lower) if limit <= 0}
 
 
-def _supports(found: SupportMap) -> Iterable[Line]:
-    """Yield where a post or a wall would help, best first."""
+def _supports(found: SupportMap, *, leans: bool) -> Iterable[Line]:
+    """Yield where a post or a wall would help, best first; `leans`: whether the answer does."""
     length, unit = display_units().length, display_units().of_si(found.free.stiffness_unit)
+    than = " as clear of all objects" if leans else ""
     if not found.supports:
         yield "would help", "no post and no wall, of those that were tested"
     for number, each in enumerate(found.supports, start=1):
@@ -347,7 +348,7 @@ def _supports(found: SupportMap) -> Iterable[Line]:
             where = f"through {point} {length}, normal {normal}"
         yield (
             "" if number > 1 else "would help",
-            f"{number}. {each.kind}: {stiffness}, {found.times(each):.3g} times as stiff; "
+            f"{number}. {each.kind}: {stiffness}, {found.times(each):.3g} times as stiff{than}; "
             f"{each.touched}; {where}",
         )
 

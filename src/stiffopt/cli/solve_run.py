@@ -13,6 +13,7 @@ from stiffopt.cli.console import report_error, report_note, show, warnings_as_no
 from stiffopt.cli.exits import interruptible
 from stiffopt.cli.solved_task import SolvedTask, solve_file
 from stiffopt.display import display_units
+from stiffopt.errors import InputError, shown
 
 
 class TaskBatch(Batch[SolvedTask]):
@@ -28,12 +29,12 @@ class TaskBatch(Batch[SolvedTask]):
         quiet: bool,
         view: str | None = None,
         suggest_post: str | None = None,
-        post_force: str = "0.3 N",
+        post_force: str | None = None,
     ) -> None:
         written = (out, plot, suggest_post)
         super().__init__(as_json, quiet, writes_files=any(each is not None for each in written))
         self.suggest_post = suggest_post
-        self.post_force = quantities.quantity("--post-force", post_force, "N", "force")
+        self.post_force = _largest_force(suggest_post, post_force)
         self.out, self.plot, self.pareto, self.seed = out, plot, pareto, seed
         self.view = quantities.view(view)
 
@@ -62,8 +63,7 @@ class TaskBatch(Batch[SolvedTask]):
 
     def answer(self, file: str) -> SolvedTask:
         """See `Batch.answer`."""
-        force = None if self.suggest_post is None else self.post_force
-        return solve_file(file, seed=self.seed, pareto=self.pareto, post_force=force)
+        return solve_file(file, seed=self.seed, pareto=self.pareto, post_force=self.post_force)
 
     def take(self, answer: SolvedTask, seconds: float) -> None:
         """See `Batch.take`."""
@@ -88,3 +88,15 @@ class TaskBatch(Batch[SolvedTask]):
     def is_drawable(self, answer: SolvedTask) -> bool:
         """See `Batch.is_drawable`."""
         return answer.solution.pressures is not None
+
+
+def _largest_force(suggest_post: str | None, post_force: str | None) -> float | None:
+    """Return the largest force on a new post or wall, in N; None if none is to be suggested."""
+    if suggest_post is None:
+        if post_force is not None:
+            raise InputError("--post-force: needs --suggest-post FILE.png, whose post it is for")
+        return None
+    force = quantities.quantity("--post-force", post_force or "0.3 N", "N", "force")
+    if not force > 0:
+        raise InputError(f"--post-force: must be greater than 0, not {shown(post_force)}")
+    return force

@@ -11,7 +11,7 @@ from stiffopt.optimise.goal import StiffnessMeasure
 from stiffopt.optimise.pareto import pareto_front
 from stiffopt.optimise.solution import PressureSolution, judge
 from stiffopt.optimise.solver import PressureSolver, stiffness_blind
-from stiffopt.optimise.supports import SupportMap, suggest_supports
+from stiffopt.optimise.supports import SupportMap, suggest_supports, times
 from stiffopt.optimise.task import load_task
 
 
@@ -76,6 +76,9 @@ def _with_supports(answer: SolvedTask, force: float, seed: int) -> SolvedTask:
         found = suggest_supports(answer.robot, answer.solution.task, force, seed=seed)
     except (InputError, EquilibriumError) as error:
         return replace(answer, no_supports=str(error))
+    if answer.solution.contacts:  # what is softer than what the task leans on is no help
+        stiffer = [each for each in found.supports if times(each.solution, answer.solution) > 1]
+        found = replace(found, supports=tuple(stiffer))
     return replace(answer, supports=found)
 
 

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,7 +19,7 @@ from stiffopt.commissioning.explanation import (
     SetupExplanation,
 )
 from stiffopt.commissioning.findings import Finding, findings_of
-from stiffopt.commissioning.procedure import StepReadings, run_steps
+from stiffopt.commissioning.procedure import StepReadings
 from stiffopt.commissioning.record import (
     CommissioningRecord,
     RecordedChannel,
@@ -32,7 +30,6 @@ from stiffopt.commissioning.record import (
     fingerprints,
 )
 from stiffopt.commissioning.responses import Responses, responses_of
-from stiffopt.experiments.folder import Progress
 from stiffopt.rig.interface import Rig
 
 _DIGITS = 6  # significant digits in the record
@@ -65,43 +62,6 @@ class Commissioning:
         return all(finding.fits for finding in self.findings)
 
 
-def commission(
-    rig: Rig,
-    expected: ExpectedSteps,
-    folder: Path,
-    *,
-    rate: float,
-    quick: bool = False,
-    frequency: float | None = None,
-    progress: Progress = lambda done, total, text: None,
-    check: Callable[[], None] = lambda: None,
-) -> Commissioning:
-    """Move the channels of a rig one by one and find where the rig deviates from its files.
-
-    Parameters
-    ----------
-    rig : open.
-    expected : of `stiffopt.commissioning.expected.expected_steps`.
-    folder : gets the recording.
-    rate : rate of the commands, in Hz.
-    quick : hold the steps only briefly: under a minute for six channels, but slow leaks go
-        unnoticed.
-    frequency : of the tip's swing according to the model, in Hz; None if the model predicts none.
-    progress, check : as in `stiffopt.experiments.poses.run_poses`.
-
-    Raises
-    ------
-    DangerError
-        The tip moves as no sound arm can; the caller must close the rig, which vents it.
-    DeviceError
-        A device fails.
-    """
-    readings = run_steps(
-        rig, expected, folder, rate=rate, quick=quick, progress=progress, check=check
-    )
-    return evaluate(rig, expected, readings, quick=quick, frequency=frequency)
-
-
 def evaluate(
     rig: Rig,
     expected: ExpectedSteps,
@@ -110,7 +70,11 @@ def evaluate(
     quick: bool = False,
     frequency: float | None = None,
 ) -> Commissioning:
-    """Evaluate the readings of a commissioning; see `commission`."""
+    """Find in the readings of a commissioning where the rig deviates from its files.
+
+    `quick`: see `run_steps`. `frequency`: of the tip's swing according to the model, in Hz; None if
+    the model predicts none.
+    """
     responses = responses_of(readings)
     explainer = Explainer(expected, responses)
     best = explainer.best()

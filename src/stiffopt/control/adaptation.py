@@ -325,7 +325,7 @@ class Adaptation:
             if there is not None:
                 change = np.concatenate([there[0][:3, 3] - y, _turn(R, there[0][:3, :3])])
                 columns.append(change[:, None] / self._tuning.heavier)
-            columns.append(np.block([[np.eye(3), -_cross(y)], [np.zeros((3, 3)), np.eye(3)]]))
+            columns.append(np.block([[np.eye(3), -lie.hat(y)], [np.zeros((3, 3)), np.eye(3)]]))
             if self._frames == 12:
                 columns.append(np.asarray(axes))
             slopes[k] = np.hstack(columns)
@@ -419,12 +419,6 @@ def _parametric_arm(description: RobotDescription, keys: Sequence[str]) -> Param
 def _made(description: str, keys: tuple[str, ...]) -> ParametricArm:
     robot = RobotDescription.model_validate_json(description)
     return ParametricArm(robot, [Parameter(key) for key in keys])
-
-
-def _cross(v: Array) -> Array:
-    """Return the matrix (3, 3) of the cross product with a vector (3,)."""
-    x, y, z = v
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
 def _turn(before: Array, after: Array) -> Array:

@@ -172,8 +172,7 @@ class Bracing:
         rows = approach.pressures
         on_way = np.array([np.interp(self._time, approach.times, row) for row in rows.T])
         share = min(self._time / approach.reached, 1.0)
-        found: Array = on_way + share * self._change
-        return found
+        return on_way + share * self._change
 
     def begin(self, approach: BraceApproach, pressures: Array) -> None:
         """Go from pressures (n,) to rest, then along the approach."""
@@ -399,8 +398,7 @@ class Bracing:
         folds = math.log(max((t.creep_time + self._held) / began, 1.0))
         creep = t.unknown_creep * folds * float(np.linalg.norm(tip.jacobian[:3] @ pressures))
         push = self._push(C, rotation, change, creep)[0]
-        found: Array = np.maximum(-(self._per_push @ push), 0.0)
-        return found
+        return np.maximum(-(self._per_push @ push), 0.0)
 
     def _has_slid(
         self, elapsed: float, seen: Array, quaternion: Array | None, pressures: Array
@@ -451,8 +449,7 @@ class Bracing:
         assert self.approach is not None
         length = float(np.linalg.norm(self.approach.free_tips[0]))
         bent = float(off @ off) / (2 * length)
-        found: Array = (self._tuning.deviation**2 + bent**2) * np.eye(3)
-        return found
+        return (self._tuning.deviation**2 + bent**2) * np.eye(3)
 
     def _usual(self, rotation: Array) -> Array:
         """Return the covariance (3, 3) of pushes before the tip is seen, in N^2; base axes.
@@ -464,8 +461,7 @@ class Bracing:
         turns = {"base": np.eye(3), "tip": rotation}
         ways = np.array([turns[m.frame] @ m.direction for m in maximised(self.task)]).T
         along = ways @ np.linalg.pinv(ways)
-        found: Array = t.usual_push**2 * (share**2 * np.eye(3) + (1 - share**2) * along)
-        return found
+        return t.usual_push**2 * (share**2 * np.eye(3) + (1 - share**2) * along)
 
     @property
     def _per_push(self) -> Array:
@@ -499,8 +495,7 @@ class Bracing:
         """
         square = float(self._corrected @ self._corrected)
         share = -float(off @ self._corrected) / max(square, 1e-12)
-        found: Array = float(np.clip(share, -1.0, 1.0)) * self._corrected
-        return found
+        return float(np.clip(share, -1.0, 1.0)) * self._corrected
 
     def _rest_deviations(self, before: Array) -> Array:
         """Return the standard deviations (k,) of normal forces without a push, in N.
@@ -509,8 +504,7 @@ class Bracing:
         """
         assert self.approach is not None
         least, own = self._tuning.least_deviation * before, self.approach.hold.deviations
-        found: Array = np.maximum(own, least)
-        return found
+        return np.maximum(own, least)
 
     def _deviations(self, before: Array, change: Array) -> Array:
         """Return the standard deviations (k,) of the normal forces under the push, in N.
@@ -522,8 +516,7 @@ class Bracing:
         assert self.approach is not None
         G, response = self._per_push, self._tuning.response * change
         pushed = np.einsum("ki,ij,kj->k", G, self.covariance, G)
-        found: Array = np.sqrt(self._rest_deviations(before) ** 2 + pushed + response**2)
-        return found
+        return np.sqrt(self._rest_deviations(before) ** 2 + pushed + response**2)
 
     def _rest(self, before: Array, drift: Array, elapsed: float) -> None:
         """Judge whether the contacts hold while no push is felt; see `_judge`."""

@@ -120,8 +120,7 @@ class Channels:
     @property
     def last_followed(self) -> Array:
         """Readings (n,) with which channels last followed their commands, in Pa."""
-        value: Array = self._followed[2]
-        return value
+        return self._followed[2]
 
     def update(
         self, elapsed: float, command: Array, reading: Array, offset: Array, healthy: Array
@@ -224,8 +223,7 @@ class Channels:
             return self._made_up
         most = np.where(self.limited, np.inf, self._allowed)
         above = np.where(self.limited, np.inf, self._min_allowed)
-        part: Array = np.minimum(np.maximum(-self.shortfall, -most), above)
-        return part
+        return np.minimum(np.maximum(-self.shortfall, -most), above)
 
     def available(self) -> tuple[Array, Array]:
         """Return the lowest and highest pressures (n,) at which channels can settle, in Pa."""

@@ -34,6 +34,7 @@ from stiffopt.control.reference import Reference
 from stiffopt.control.replanning import Pursuit, Replanner
 from stiffopt.control.report import Report
 from stiffopt.control.requests import Requests
+from stiffopt.control.setup import ControlSetup
 from stiffopt.control.state import ControllerStatus, Severity
 from stiffopt.control.tip_errors import target_arrays
 from stiffopt.control.tip_feedback import TipFeedback
@@ -92,16 +93,15 @@ class TipController:
     ) -> None:
         self.robot, self.limits = robot, limits
         control, safety = control or ControlSettings(), safety or Safety()
-        self._tuning = tuning = tuning or ControlTuning()
+        self._tuning = tuning = (tuning or ControlTuning()).on_rig(control, safety)
         self._period, n = period, robot.n_pressures
         self._no_motion: Array = np.zeros((3, n))
         self._slew = slew = np.broadcast_to(np.asarray(slew, dtype=float), n).copy()
         if control.vibration != "auto":
             vibrates = control.vibration == "modelled"
         mode = BendingMode.of(robot.description) if vibrates else None
-        self._arm = ArmObserver(
-            robot, limits, slew, period, mode, control, safety, tuning, self._go_back
-        )
+        setup = ControlSetup(robot, limits, slew, period, control, safety, mode, scene, tuning)
+        self._arm = ArmObserver(setup, self._go_back)
         # models before the present one: the robot file's, and the newest ones
         self._earlier: list[Adapted] = []
         lag, dead_time = self._arm.pressures.lag, self._arm.pressures.dead_time
@@ -110,36 +110,21 @@ class TipController:
         )
         self._mode, self._vibrates = mode, mode is not None
         self._bent: BentMode | None = None  # modes that the estimator has
-        self._feedback = TipFeedback(
-            self._arm,
-            limits,
-            slew,
-            period,
-            mode,
-            control,
-            safety,
-            tuning.feedback,
-            tuning.motion_error,
-            tuning.step_error,
-        )
+        self._feedback = TipFeedback(setup, self._arm)
         # the latest places of the reference, with what feedback added to its commands
         self._ways: deque[tuple[Array, Array]] = deque(
             maxlen=max(1, round(tuning.reference.taken_back / period))
         )
-        self._first_motion = FirstMotion(tuning.first_motion if slow_first_motion else None)
-        sliding = replace(tuning.bracing.sliding, noise=control.tracker_noise)
-        bracing = replace(tuning.bracing, sliding=sliding)
-        own = replace(tuning, bracing=bracing)
-        self._requests = Requests(robot, limits, slew, scene, own, control.tip_speed)
+        unbounded = {} if slow_first_motion else {"slew_share": math.inf, "correction": math.inf}
+        self._first_motion = FirstMotion(replace(tuning.first_motion, **unbounded))
+        self._requests = Requests(setup)
         Planner = ProcessPlanner if plan_in_process else InlinePlanner
         self.replanner = Replanner(Planner(robot, scene), tuning.replanning, period, dead_time)
         self.forecast: Forecast | None = None
         if scene is not None:
             self.forecast = Forecast(Planner(robot, scene), tuning.forecast)
         self._lead = dead_time + 0.5 * period
-        self._report = Report(
-            robot, self._arm, self.replanner, tuning.feedback.max_offset * robot.length
-        )
+        self._report = Report(setup, self._arm, self.replanner)
         self._windows = WindowWatch(tuning.windows)
         self._adapts, self._tip_speed = control.adaptation != "none", control.tip_speed
         self.begin(0.0)
@@ -406,8 +391,7 @@ class TipController:
         """Return the motion of the tip per pressure (3, n), over its greatest one in a period."""
         if self._tip_speed is None or self._bracing is not None:
             return self._no_motion
-        motion: Array = self._arm.on_path(path).jacobian[:3] / (self._tip_speed * self._period)
-        return motion
+        return self._arm.on_path(path).jacobian[:3] / (self._tip_speed * self._period)
 
     def _bend(self, bent: BentMode | None) -> BentMode | None:
         """Let the estimator have the modes of the bent arm, and return them."""
@@ -458,8 +442,7 @@ class TipController:
             return plan
         # an arm that vibrates goes on for a while before its smooth path turns
         path = self._ways[0][0] if self._vibrates and self._ways else self._reference.path
-        goal: Array = path + pace * (plan - path)
-        return goal
+        return path + pace * (plan - path)
 
     def _feedforward(self, pressures: Array, last: Array) -> ControlOutput:
         """Command pressures (n,) without feedback: contacts change how the arm vibrates."""
@@ -507,7 +490,6 @@ class TipController:
     def _brace(self, course: Bracing, now: float) -> Array | None:
         """Advance a brace; see `_plan`. The tip's offset is not compensated."""
         self._reference.slew_share = self._tuning.reference.slew_share
-        self.replanner.latest()  # otherwise the planner would seem slow
         before = course.pressures
         is_there = not self._is_held(now) and self._is_near(before)
         course.advance(min(now - self._computed_at, _HELD * self._period), is_there)

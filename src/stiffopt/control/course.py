@@ -154,8 +154,7 @@ def _spline(knots: Array, rows: list[list[float]]) -> Callable[..., Array]:
         raise InputError(f"nothing smooth leads through the waypoints: {error}") from None
     if not np.isfinite(spline.c).all():
         raise InputError("nothing smooth leads through the waypoints; they are too close in time")
-    found: Callable[..., Array] = spline
-    return found
+    return spline
 
 
 def _checked(spline: Callable[..., Array], knots: Array) -> Callable[..., Array]:

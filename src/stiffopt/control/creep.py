@@ -74,14 +74,12 @@ class CreepEstimator:
     @property
     def shares(self) -> Array:
         """Shares (k,) that creep with the time constants of the tuning."""
-        shares: Array = self._mean[3:]
-        return shares
+        return self._mean[3:]
 
     @property
     def displacement(self) -> Array:
         """Displacement (3,) of the tip by the creep that is still to come, negative, in m."""
-        displacement: Array = self._phi @ self._mean[3:]
-        return displacement
+        return self._phi @ self._mean[3:]
 
     def rate_deviation(self, direction: Array) -> float:
         """Return the deviation of the tip's speed by creep along a direction (3,), in m/s."""

@@ -64,8 +64,7 @@ class _PastTip(NamedTuple):
     @property
     def static(self) -> Array:
         """Position (3,)."""
-        static: Array = self.motion[0]
-        return static
+        return self.motion[0]
 
 
 @dataclass(frozen=True)

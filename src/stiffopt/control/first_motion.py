@@ -23,16 +23,16 @@ class FirstMotion:
 
     Parameters
     ----------
-    tuning : speed of the first motion, and when it ends; None: it may be fast.
+    tuning : speed of the first motion, and when it ends.
     """
 
-    def __init__(self, tuning: FirstMotionTuning | None) -> None:
-        self._may_be_fast, self._tuning = tuning is None, tuning or FirstMotionTuning()
+    def __init__(self, tuning: FirstMotionTuning) -> None:
+        self._tuning = tuning
         self.begin()
 
     def begin(self) -> None:
         """Restart with a vented arm."""
-        self._responds = np.array(self._may_be_fast)  # of each channel (n,), once the tip is seen
+        self._responds = np.array(False)  # of each channel (n,), once the tip is seen
         # positions (n, 2, 3) of model and tip when each channel began to have a part in the motion
         self._starts: Array | None = None
         self._on_path: Array | None = None  # position (3,) of the model on the reference's path
@@ -47,8 +47,6 @@ class FirstMotion:
 
         `parts` (3, n) are the parts that the channels' pressures have in the model's way, in m.
         """
-        if self._may_be_fast:
-            return
         now, sizes = np.stack([modelled, seen]), np.sqrt((parts**2).sum(axis=0))
         if self._starts is None:
             self._starts = np.tile(now, (len(sizes), 1, 1))

@@ -58,13 +58,11 @@ class Friction:
 
     def sliding(self, pressures: Array) -> Array:
         """Return the normal forces (contacts,) of an arm that slides freely, in N."""
-        found: Array = self._hold.forces + self._hold.per_pressure @ (pressures - self._planned)
-        return found
+        return self._hold.forces + self._hold.per_pressure @ (pressures - self._planned)
 
     def normals(self, pressures: Array) -> Array:
         """Return the normal forces (contacts,) at pressures (n,), in N."""
-        found: Array = self.sliding(pressures) + self._normals @ self.forces
-        return found
+        return self.sliding(pressures) + self._normals @ self.forces
 
     def slid(self, push: Array, normals: Array) -> Array:
         """Return how far the contacts (k,) slide under a push (3,) at the tip, in m.
@@ -73,8 +71,7 @@ class Friction:
         """
         trial = self.forces + self._sticking.per_push @ push
         slides = self._sticking.slid_back(trial, normals + self.per_push @ push)
-        found: Array = np.linalg.norm(slides.reshape(-1, 2), axis=1)
-        return found
+        return np.linalg.norm(slides.reshape(-1, 2), axis=1)
 
     def left(self, way: Array, normals: Array) -> float:
         """Return the push in N along a unit vector (3,) at which a contact begins to slide."""

@@ -240,8 +240,7 @@ class MotionWatch:
         `changes` (k, 21 + n) are differences of samples; the Jacobian (3, n) is of the tip's
         position, base axes.
         """
-        own: Array = self._tuning.model_error * self._by_segments(changes, jacobian).sum(axis=1)
-        return own
+        return self._tuning.model_error * self._by_segments(changes, jacobian).sum(axis=1)
 
     def _by_segments(self, changes: Array, jacobian: Array) -> Array:
         """Return the lengths (k, segments) by which each segment moves the tip, in m."""
@@ -249,8 +248,7 @@ class MotionWatch:
             changes[:, _PRESSURES][:, channels] @ jacobian[:, channels].T
             for channels in self._segments
         ]
-        lengths: Array = np.sqrt((np.stack(motions, axis=1) ** 2).sum(axis=2))
-        return lengths
+        return np.sqrt((np.stack(motions, axis=1) ** 2).sum(axis=2))
 
     @property
     def _shares(self) -> Array:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -19,16 +18,14 @@ from stiffopt.control.motion_watch import MotionWatch
 from stiffopt.control.pressing import Pressing
 from stiffopt.control.regulators import PressureEstimator
 from stiffopt.control.replanning import AnyCourse
+from stiffopt.control.setup import ControlSetup
 from stiffopt.control.tip_errors import turn_of_a_push
 from stiffopt.control.touch import TouchEstimator
-from stiffopt.control.tuning import ControlTuning
-from stiffopt.control.vibration import BendingMode
 from stiffopt.errors import StiffoptError
 from stiffopt.model.description import RobotDescription
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.optimise.tip import TipAt, TipModel
-from stiffopt.rig.interface import PoseSample, PressureLimits, PressureReading
-from stiffopt.rig.settings import ControlSettings, Safety
+from stiffopt.rig.interface import PoseSample, PressureReading
 
 _MAX_STEPS = 50  # of the estimators in one tick, after a pause
 
@@ -38,8 +35,7 @@ class ArmObserver:
 
     Parameters
     ----------
-    robot, limits, slew, period, control, safety, tuning : see `TipController`; slew (n,), in Pa/s.
-    mode : the arm's first bending mode; None for an arm that does not vibrate.
+    setup : what it has in common with the other parts of the controller.
     go_back : called with pressures (n,) at which the model has no equilibrium; changes to a model
         that has one, by `change_robot`, and returns whether there is one.
 
@@ -54,32 +50,20 @@ class ArmObserver:
 
     def __init__(
         self,
-        robot: Manipulator,
-        limits: PressureLimits,
-        slew: Array,
-        period: float,
-        mode: BendingMode | None,
-        control: ControlSettings,
-        safety: Safety,
-        tuning: ControlTuning,
+        setup: ControlSetup,
         go_back: Callable[[Array], bool],
     ) -> None:
         self._go_back = go_back
-        n = robot.n_pressures
+        robot, control, tuning = setup.robot, setup.control, setup.tuning
+        period, slew, mode, n = setup.period, setup.slew, setup.mode, robot.n_pressures
         self._robot, self._period, self._tuning = robot, period, tuning
         self._frequency = control.frequency
-        tolerance = np.broadcast_to(np.asarray(safety.max_pressure_error, dtype=float), n)
-        self.channels = Channels(limits, slew, tolerance, tuning.regulators)
+        tolerance = np.broadcast_to(np.asarray(setup.safety.max_pressure_error, dtype=float), n)
+        self.channels = Channels(setup.limits, slew, tolerance, tuning.regulators)
         self.pressures = PressureEstimator(
             robot.description, control, period, slew, tuning.regulators, self.channels, tuning.lags
         )
-        filter_tuning = replace(
-            tuning.estimator,
-            noise=control.tracker_noise,
-            max_speed=safety.max_tip_speed,
-            damping=control.damping,
-        )
-        self.tip = TipEstimator(period, n, mode, filter_tuning)
+        self.tip = TipEstimator(period, n, mode, tuning.estimator)
         # the lag of a calibrated robot file includes the arm's own
         viscous = mode is not None and self.pressures.lags_are_regulators
         self._viscous_lag = tuning.estimator.viscous_lag if viscous else 0.0
@@ -87,15 +71,14 @@ class ArmObserver:
             [segment.n_channels for segment in robot.description.segments],
             vibrates=mode is not None,
             damping=control.damping,
-            tuning=replace(tuning.touch, noise=max(tuning.touch.noise, 2 * control.tracker_noise)),
+            tuning=tuning.touch,
             creep=CreepEstimator(
                 n,
                 any(s.history and s.history.creep for s in robot.description.segments),
-                replace(tuning.creep, noise=max(tuning.creep.noise, 2 * control.tracker_noise)),
+                tuning.creep,
             ),
         )
-        motion = replace(tuning.motion, scatter=control.tracker_noise)
-        self.watch = MotionWatch(robot.description, motion)
+        self.watch = MotionWatch(robot.description, tuning.motion)
         self.model: ArmModel | None = None
         self._now, self._modelled_at = 0.0, np.zeros(n)
 
@@ -177,8 +160,7 @@ class ArmObserver:
     def strained_ahead(self) -> Array:
         """`strained` (n,), with what the effective pressures change in a dead time, in Pa."""
         p = self.pressures
-        ahead: Array = self.strained + (p.effective_ahead - p.effective)
-        return ahead
+        return self.strained + (p.effective_ahead - p.effective)
 
     def on_path(self, pressures: Array) -> TipAt:
         """Return the model's tip at pressures (n,) on the reference's path."""

@@ -126,6 +126,7 @@ class ProcessPlanner:
 
     def notices(self) -> tuple[Notice, ...]:
         """Return whether planning has failed or takes too long."""
+        self._exchange()  # while pressures are held or the arm leans, nobody asks for plans
         busy_since = self._busy_since
         if self._failure:
             return (Notice("planner", self._failure, standing=True),)

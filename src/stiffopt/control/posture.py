@@ -67,8 +67,7 @@ class PostureCourse:
             np.concatenate([self._pressures[each], self._difference(each)])
             for each in (before, after)
         ]
-        found: Array = (1 - share) * ends[0] + share * ends[1]
-        return found
+        return (1 - share) * ends[0] + share * ends[1]
 
     def at(self, now: float) -> Target:
         """Return the first waypoint's target; all waypoints have targets of its kind."""

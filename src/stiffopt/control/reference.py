@@ -80,14 +80,12 @@ class Reference:
     @property
     def goal(self) -> Array:
         """Where the path comes to rest if the plan no longer changes (n + m,)."""
-        value: Array = self._states[0]
-        return value
+        return self._states[0]
 
     @property
     def path(self) -> Array:
         """The path now (n + m,)."""
-        value: Array = self.motion[0]
-        return value
+        return self.motion[0]
 
     def advance(self, plan: Array) -> None:
         """Take a step towards a plan (n + m,).
@@ -135,14 +133,12 @@ class VibrationFilter:
     @property
     def value(self) -> Array:
         """The average (m,)."""
-        value: Array = self.averages[0]
-        return value
+        return self.averages[0]
 
     @property
     def motion(self) -> Array:
         """Path and speed of the mode (2, m)."""
-        motion: Array = self.averages[1:]
-        return motion
+        return self.averages[1:]
 
     def advance(self, values: Array, omega: float) -> None:
         """Take in values (m,) with a vibration of `omega`, in rad/s; infinite: no vibration."""

@@ -161,8 +161,7 @@ class PressureEstimator:
 
 def _share(period: float, lag: Array) -> Array:
     """Return the shares (n,) of their way that pressures with lags (n,) go in a step."""
-    share: Array = 1 - np.exp(-period / np.maximum(lag, 1e-6))
-    return share
+    return 1 - np.exp(-period / np.maximum(lag, 1e-6))
 
 
 def _step(

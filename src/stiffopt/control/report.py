@@ -12,9 +12,9 @@ from stiffopt.control.interface import Notice
 from stiffopt.control.observer import ArmObserver
 from stiffopt.control.pressing import Pressing
 from stiffopt.control.replanning import Replanner
+from stiffopt.control.setup import ControlSetup
 from stiffopt.control.state import AdaptedNumber, ControllerStatus, Severity
 from stiffopt.control.tip_errors import TipErrors, target_arrays
-from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.uncertainty import NORMAL_QUANTILE
 from stiffopt.optimise.target import Target
 
@@ -26,18 +26,15 @@ class Report:
 
     Parameters
     ----------
-    robot : the model of the arm.
+    setup : what it has in common with the other parts of the controller.
     arm : the state of the arm.
     replanner : what is pursued, and the plans for it.
-    largest_offset : distance of the measured tip from the model's above which the model is wrong,
-        in m.
     """
 
-    def __init__(
-        self, robot: Manipulator, arm: ArmObserver, replanner: Replanner, largest_offset: float
-    ) -> None:
-        self._robot, self._arm, self._replanner = robot, arm, replanner
-        self._largest_offset = largest_offset
+    def __init__(self, setup: ControlSetup, arm: ArmObserver, replanner: Replanner) -> None:
+        self._n, self._arm, self._replanner = setup.robot.n_pressures, arm, replanner
+        # distance of the measured tip from the model's above which the model is wrong, in m
+        self._largest_offset = setup.tuning.feedback.max_offset * setup.robot.length
         self._errors = TipErrors()
         self._is_detuned = False  # whether the frequency is as far off as it may be
 
@@ -52,7 +49,7 @@ class Report:
         `now`: time, in s. `led`: on a trajectory of pressures, its present target and effective
         pressures (n,), in Pa.
         """
-        n, arm, pursuit = self._robot.n_pressures, self._arm, self._replanner.pursuit
+        n, arm, pursuit = self._n, self._arm, self._replanner.pursuit
         if arm.modelled is None:
             return ControllerStatus(plan=np.full(n, np.nan))
         estimate, sample, course = arm.tip.estimate, arm.tip.sample, pursuit.course

@@ -14,16 +14,14 @@ from stiffopt.control.course import Course
 from stiffopt.control.forecast import Forecast
 from stiffopt.control.pressing import Pressing
 from stiffopt.control.replanning import AnyCourse, Pursuit
-from stiffopt.control.tuning import ControlTuning
+from stiffopt.control.setup import ControlSetup
 from stiffopt.errors import EquilibriumError, InputError
 from stiffopt.model.manipulator import Manipulator
-from stiffopt.model.scene import Scene
 from stiffopt.optimise.press import Press
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import PressureRange, Task
 from stiffopt.optimise.tip import TipModel
 from stiffopt.paths.trajectory import Trajectory
-from stiffopt.rig.interface import PressureLimits
 
 _SLACK = 1e-3  # Pa, for rounding at limits
 _ROUNDING = 1e-6  # share of a speed
@@ -33,23 +31,13 @@ class Requests:
     """Turns requests into pursuits, for one arm on one rig.
 
     All methods raise `InputError` with the reason of a refusal, and change nothing.
-
-    `robot`, `limits`, `slew`, `scene`, `tuning`: see `TipController`; slew (n,), in Pa/s.
-    `tip_speed`: see `ControlSettings`.
     """
 
-    def __init__(
-        self,
-        robot: Manipulator,
-        limits: PressureLimits,
-        slew: Array,
-        scene: Scene | None,
-        tuning: ControlTuning,
-        tip_speed: float | None = None,
-    ) -> None:
-        self._tip_speed = math.inf if tip_speed is None else tip_speed
-        self._robot, self._limits, self._slew = robot, limits, slew
-        self._scene, self._tuning = scene, tuning
+    def __init__(self, setup: ControlSetup) -> None:
+        speed = setup.control.tip_speed
+        self._tip_speed = math.inf if speed is None else speed
+        self._robot, self._limits, self._slew = setup.robot, setup.limits, setup.slew
+        self._scene, self._tuning = setup.scene, setup.tuning
 
     def of_task(self, task: Task) -> Pursuit:
         """Return the pursuit of a task, which may press or brace."""
@@ -154,8 +142,7 @@ class Requests:
                 ) from None
             jacobians.append(at.pose[:3, :3] @ at.jacobian[:3])
         J = np.array(jacobians)
-        parts: Array = (J[1:] + J[:-1]) / 2 * np.diff(pressures, axis=0)[:, None, :]
-        return parts
+        return (J[1:] + J[:-1]) / 2 * np.diff(pressures, axis=0)[:, None, :]
 
     def _check_speed(self, times: Array, parts: Array) -> None:
         """Refuse waypoints at times (k,), in s, between which the arm would be too fast.

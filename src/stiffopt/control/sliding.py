@@ -119,8 +119,7 @@ class SlideEstimator:
     @property
     def slides(self) -> Array:
         """Slides (k, 2) along the surfaces, in m."""
-        found: Array = self._state[_FIRST:].reshape(-1, 2)
-        return found
+        return self._state[_FIRST:].reshape(-1, 2)
 
     def deviations(self) -> Array:
         """Return how many of its deviations (k,) each slide is."""

@@ -77,8 +77,7 @@ class _Ramp:
         place = self.progress(now) * last
         before = min(int(place), last - 1)
         after = place - before
-        left: Array = (1 - after) * self.stages[before] + after * self.stages[before + 1]
-        return left
+        return (1 - after) * self.stages[before] + after * self.stages[before + 1]
 
 
 class Supervisor:

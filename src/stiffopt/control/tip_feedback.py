@@ -19,11 +19,9 @@ from stiffopt.control.feedback import (
 from stiffopt.control.motion_error import MotionErrorEstimator
 from stiffopt.control.observer import ArmObserver
 from stiffopt.control.reference import Reference, VibrationFilter
-from stiffopt.control.tuning import FeedbackTuning, MotionErrorTuning
-from stiffopt.control.vibration import BendingMode, BentMode
+from stiffopt.control.setup import ControlSetup
+from stiffopt.control.vibration import BentMode
 from stiffopt.optimise.tip import TipAt
-from stiffopt.rig.interface import PressureLimits
-from stiffopt.rig.settings import ControlSettings, Safety
 
 
 class TipFeedback:
@@ -31,49 +29,36 @@ class TipFeedback:
 
     Parameters
     ----------
+    setup : what it has in common with the other parts of the controller.
     arm : the observer of the arm.
-    limits, slew, period, control, safety : see `TipController`; slew (n,), in Pa/s.
-    mode : the arm's first bending mode; None for an arm that does not vibrate.
-    tuning, motion_error, step_error : tuning of the feedback, and of what it learns on trajectories
-        and in steps.
 
     Attributes
     ----------
     saturated : flags (n,) of channels at a limit that keeps the tip from its target.
     """
 
-    def __init__(
-        self,
-        arm: ArmObserver,
-        limits: PressureLimits,
-        slew: Array,
-        period: float,
-        mode: BendingMode | None,
-        control: ControlSettings,
-        safety: Safety,
-        tuning: FeedbackTuning,
-        motion_error: MotionErrorTuning,
-        step_error: MotionErrorTuning,
-    ) -> None:
+    def __init__(self, setup: ControlSetup, arm: ArmObserver) -> None:
+        period, mode, damping = setup.period, setup.mode, setup.control.damping
+        slew, tuning, step_error = setup.slew, setup.tuning.feedback, setup.tuning.step_error
         self._arm, self._tuning = arm, tuning
         lag, dead_time = arm.pressures.lag, arm.pressures.dead_time
         # the offset and the position of the model's tip on the reference's path
-        self._averaged = VibrationFilter(period, control.damping, 9)
+        self._averaged = VibrationFilter(period, damping, 9)
         self._period, self._ended = period, step_error.ended
-        self._on_trajectories = MotionErrorEstimator(motion_error)
+        self._on_trajectories = MotionErrorEstimator(setup.tuning.motion_error)
         self._motion_error = self._in_steps = MotionErrorEstimator(step_error)
         self._gains = None
-        law = tracking_rows(len(slew), mode is not None, control.damping, dead_time, tuning)
+        law = tracking_rows(len(slew), mode is not None, damping, dead_time, tuning)
         if mode is not None:
-            self._gains = GainSchedule(period, lag, control.damping, tuning.effort)
+            self._gains = GainSchedule(period, lag, damping, tuning.effort)
             law = with_excess(law, mode.participation)
         self._allocation = Allocation(
             with_reference(with_offsets(law)),
-            limits.low,
-            limits.high,
+            setup.limits.low,
+            setup.limits.high,
             slew * period,
-            safety.max_tip_speed * period,
-            control.solver,
+            setup.safety.max_tip_speed * period,
+            setup.control.solver,
             tuning,
         )
 

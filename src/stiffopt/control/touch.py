@@ -283,8 +283,7 @@ class TouchEstimator:
         """Return displacements (3, s) of the model's tip by segment since the last sample, in m."""
         columns = jacobian * (pressures - self._pressures)
         self._pressures = pressures.copy()
-        moved: Array = np.add.reduceat(columns, self._ends, axis=1)
-        return moved
+        return np.add.reduceat(columns, self._ends, axis=1)
 
     def _process(self, elapsed: float, moved: Array, omega: float) -> tuple[Array, Array, Array]:
         """Return transition (7, 7), covariance (7, 7) of its noise, and change (3,) of u by motion.

@@ -7,9 +7,10 @@ regulators or the noise of the tracker, is in the rig file (`stiffopt.rig.settin
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from stiffopt.optimise.settings import BRACE
+from stiffopt.rig.settings import ControlSettings, Safety
 
 
 @dataclass(frozen=True)
@@ -668,3 +669,20 @@ class ControlTuning:
     touch: TouchTuning = field(default_factory=TouchTuning)
     pressing: PressingTuning = field(default_factory=PressingTuning)
     bracing: BracingTuning = field(default_factory=BracingTuning)
+
+    def on_rig(self, control: ControlSettings, safety: Safety) -> ControlTuning:
+        """Return the tuning with what the settings of a rig say: noise, speed and damping."""
+        noise = control.tracker_noise
+        return replace(
+            self,
+            estimator=replace(
+                self.estimator,
+                noise=noise,
+                max_speed=safety.max_tip_speed,
+                damping=control.damping,
+            ),
+            motion=replace(self.motion, scatter=noise),
+            creep=replace(self.creep, noise=max(self.creep.noise, 2 * noise)),
+            touch=replace(self.touch, noise=max(self.touch.noise, 2 * noise)),
+            bracing=replace(self.bracing, sliding=replace(self.bracing.sliding, noise=noise)),
+        )

@@ -130,8 +130,7 @@ class BentMode:
 
     def excess(self, participation: Array) -> Array:
         """Return by how much the Jacobian (3, n) exceeds that by shares (n,) of a straight arm."""
-        excess: Array = self.jacobian - self.plane @ (self.linear * participation)
-        return excess
+        return self.jacobian - self.plane @ (self.linear * participation)
 
 
 def _stations(robot: RobotDescription) -> tuple[Array, Array]:

@@ -383,8 +383,7 @@ def task_of(given: Any, robot: str) -> Task:
     if isinstance(request, TaskText):
         return _task_of_text(request.text, robot)
     _check_robot(request.robot, robot)
-    task: Task = request.read(robot=robot)
-    return task
+    return request.read(robot=robot)
 
 
 def _task_of_text(text: str, robot: str) -> Task:

@@ -72,7 +72,7 @@ class RecordedRun:
 
     def __getattr__(self, name: str) -> Array:
         try:
-            return self.__dict__["fields"][name]  # type: ignore[no-any-return]
+            return self.__dict__["fields"][name]
         except KeyError:
             raise AttributeError(f"a run has no '{name}'") from None
 

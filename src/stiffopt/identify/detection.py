@@ -28,15 +28,19 @@ from stiffopt.model.description import RobotDescription, Tolerances
 from stiffopt.model.history import lagged
 from stiffopt.model.manipulator import Manipulator
 
+SHOWN = 5e-4
+"""Shortest translation of a frame that is told, in m."""
+
 # -- clocks ----------------------------------------------------------------------------------------
 
 
 def on_one_clock(recording: Recording, span: Array) -> Recording:
     """Return the recording with its pressures shifted to the tracker's clock, if clocks differ.
 
-    The tip is regressed on the lagged pressures and their products at many time shifts. The best
-    shift is undone if an arm cannot have such a delay itself, and if its residual is a small share
-    of that at the best shift that an arm can have.
+    The tip is regressed on the lagged pressures and their products at many time shifts. Rows far
+    from the regression count less, so that neither jumps nor hysteresis hide a wrong shift. The
+    best shift is undone if an arm cannot have such a delay itself, and if its mean error is a small
+    enough share of that at the best shift that an arm can have.
 
     Parameters
     ----------
@@ -57,24 +61,34 @@ def on_one_clock(recording: Recording, span: Array) -> Recording:
 
     longest = min(DETECTION.clock_most, DETECTION.clock_share * float(time[-1] - time[0]))
     step = max(2 * float(np.median(np.diff(time))), 0.2)
-    usual = misfits(np.linspace(-step, DETECTION.clock_usual, 12)).min()
+    usual = misfits(np.linspace(-step, DETECTION.clock_usual, 25)).min()
     coarse = np.linspace(-longest, longest, DETECTION.clock_shifts)
     near = coarse[np.argmin(misfits(coarse))]
     fine = np.linspace(near - coarse[1] + coarse[0], near + coarse[1] - coarse[0], 21)
     found = misfits(fine)
     best, share = float(fine[np.argmin(found)]), float(found.min() / max(usual, 1e-9))
-    if -step <= best <= DETECTION.clock_usual or share > DETECTION.clock_overwhelming:
+    left = DETECTION.clock_early if best < 0 else DETECTION.clock_late
+    if -step <= best <= DETECTION.clock_usual or share > left:
         return recording
-    moved = [np.interp(time - best, time, column) for column in recording.pressures.T]
     remark = (
-        f"the tip moves {abs(best):.2g} s {'after' if best > 0 else 'before'} its pressures, as if "
-        f"they had two clocks: they are moved by that (a regression of the tip on them then misses "
-        f"it by {share * 100:.0f} % of what it does otherwise); --keep clock leaves them"
+        f"{two_clocks(best)} (a regression of the tip on them then misses it by "
+        f"{share * 100:.0f} % of what it does otherwise); --keep clock leaves them"
     )
-    return replace(
-        recording,
-        pressures=np.column_stack(moved),
-        remarks=(*recording.remarks, remark),
+    return replace(later(recording, best), remarks=(*recording.remarks, remark))
+
+
+def later(recording: Recording, shift: float) -> Recording:
+    """Return the recording with its pressures later by a shift in s."""
+    time = recording.time
+    moved = [np.interp(time - shift, time, column) for column in recording.pressures.T]
+    return replace(recording, pressures=np.column_stack(moved))
+
+
+def two_clocks(shift: float) -> str:
+    """Say that pressures were moved by a shift in s, as the beginning of a sentence."""
+    return (
+        f"the tip moves {abs(shift):.2g} s {'after' if shift > 0 else 'before'} its pressures, as "
+        "if they had two clocks: they are moved by that"
     )
 
 
@@ -91,9 +105,9 @@ def _quadratics(pressures: Array) -> Array:
 
 
 def _unexplained(pressures: Array, tip: Array) -> float:
-    """Return the RMS residual, in m, of positions (N, 3) regressed on quadratics of pressures."""
-    distances, _ = _regressed(_quadratics(pressures), tip)
-    return float(np.sqrt(np.mean(distances**2)))
+    """Return the mean error, in m, of positions (N, 3) regressed on quadratics of pressures."""
+    distances, _ = _regressed(_quadratics(pressures), tip, DETECTION.clock_rounds)
+    return float(distances.mean())
 
 
 def _regressed(known: Array, tip: Array, rounds: int = 1) -> tuple[Array, Array]:
@@ -221,11 +235,15 @@ class Hypothesis:
         """Return the corrected recordings; `low` (n,) is the pressure of a dead line."""
         found = []
         for each, turn in zip(recordings, self.turns, strict=True):
-            pressures = _driven(each.pressures, self.sources, low)
-            before = _driven(each.before[np.newaxis], self.sources, low)[0]
+            pressures = self.driven(each.pressures, low)
+            before = self.driven(each.before[np.newaxis], low)[0]
             driven = replace(each, pressures=pressures, before=before)
             found.append(_moved(driven, CUBE_ROTATIONS[turn], np.zeros(3)))
         return found
+
+    def driven(self, recorded: Array, low: Array) -> Array:
+        """Return the channels' pressures (N, n) from the recorded ones."""
+        return _driven(recorded, self.sources, low)
 
     def with_turns(self, turn: int) -> Hypothesis:
         """Return the hypothesis with the same turn of the axes for all recordings."""
@@ -296,9 +314,7 @@ class Comparer:
         stations: Sequence[float],
         recordings: Sequence[Recording],
     ) -> None:
-        self.nothing = Hypothesis(
-            None, "", tuple(range(description.n_pressures)), (0,) * len(recordings)
-        )
+        self.nothing = _no_error(description, len(recordings))
         light = description.model_copy(update={"gravity": (0.0, 0.0, 0.0), "calibration": None})
         self._arm = Manipulator(light)
         self._stations = np.array(stations)
@@ -422,7 +438,7 @@ def found_wrong(
     as_is = comparer.score(nothing)
     scored = [
         (comparer.score(each), each)
-        for each in (*_lines(description, nothing), *_orders(description, nothing))
+        for each in of_channels(description, len(nothing.turns))
         if each.kind not in keep
     ]
     worthy = [pair for pair in scored if pair[0] <= DETECTION.overwhelming * as_is]
@@ -443,6 +459,16 @@ def found_wrong(
 def _alike(one: Hypothesis, other: Hypothesis) -> bool:
     """Whether two hypotheses are the same, or both orders (perhaps differing by a turn)."""
     return one is other or one.kind == other.kind == "channels"
+
+
+def _no_error(description: RobotDescription, logs: int) -> Hypothesis:
+    return Hypothesis(None, "", tuple(range(description.n_pressures)), (0,) * logs)
+
+
+def of_channels(description: RobotDescription, logs: int) -> tuple[Hypothesis, ...]:
+    """Return the hypotheses of wrong lines, and of wrong orders of channels, in all logs."""
+    nothing = _no_error(description, logs)
+    return *_lines(description, nothing), *_orders(description, nothing)
 
 
 def _lines(description: RobotDescription, nothing: Hypothesis) -> Iterator[Hypothesis]:
@@ -535,6 +561,6 @@ def replaced(
     if DETECTION.overwhelming * miss(quarter, np.zeros(3)) < miss(rotation, shift):
         rotation, shift = quarter, np.zeros(3)
     words = f"turned {_turn_text(rotation)}"
-    if shift.any():
+    if np.linalg.norm(shift) > SHOWN:
         words += f" and moved by {np.linalg.norm(shift) * 1e3:.0f} mm"
     return _moved(recording, rotation, shift), words

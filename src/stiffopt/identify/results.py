@@ -330,9 +330,12 @@ def outliers(found: Fit) -> list[str]:
     for sample, (a, b) in zip(found.problem.samples, itertools.pairwise(starts), strict=True):
         if far[a:b].any():
             times = sample.recording.time[sample.rows][far[a:b]]
+            one = len(times) == 1
+            when = f"at {times[0]:.4g} s; it counts less"
+            if not one:
+                when = f"first at {times[0]:.4g} s, last at {times[-1]:.4g} s; they count less"
             remarks.append(
-                f"{sample.recording.name}: {far[a:b].sum()} of {b - a} rows are more than "
-                f"{REPORT.outlier:g} deviations from the model, first at {times[0]:.4g} s, "
-                f"last at {times[-1]:.4g} s; they count less"
+                f"{sample.recording.name}: {len(times)} of {b - a} rows {'is' if one else 'are'} "
+                f"more than {REPORT.outlier:g} deviations from the model, {when}"
             )
     return remarks

@@ -345,8 +345,15 @@ class DetectionSettings:
     softness : factors on pressures, for arms softer or stiffer than the robot file says.
     moved : largest distance of the base from its place in the robot file, in lengths of the arm.
     few_channels : largest number of channels of which all orders are tried.
-    off, frame : mean error of a log, in lengths of the arm, beyond which its frame is suspected to
+    off, frame : mean error of a log, in lengths of the arm, beyond which its set-up is suspected to
         differ from the calibration's; and the share of it that a correction may leave.
+    region, within : so is a log with less than a share `within` of its tips in the region of this
+        probability.
+    channel_rows : number of rows with which orders of channels are compared in a log that is off.
+    poses, apart : smallest number of poses by which a frame is judged, since two can be moved to
+        fit any others; and their distance, as a share of the range of effective pressures.
+    in_line : spread of poses across a line, as a share of that along it, up to which they count as
+        poses on a line.
     known_turn : spread of the tip, in lengths of the arm, that determines a turn.
     ridge : added to the diagonal of the normal equations of regressions.
     clock_rows : number of rows in the regression for the clocks.
@@ -354,7 +361,9 @@ class DetectionSettings:
     clock_usual : longest delay that the arm itself may have, in s.
     clock_most, clock_share : largest time shift that is tried, in s and as a share of the log.
     clock_shifts : number of shifts that are tried.
-    clock_overwhelming : as `overwhelming`, for the regression.
+    clock_rounds : of the robust regression.
+    clock_early, clock_late : largest share of the mean error that an accepted shift leaves, if the
+        tip moves before its pressures, and if it moves after them, as a slow arm does too.
     begins : time in s at the beginning of a log that does not tell where its tip is at rest.
     begins_near, begins_apart : a log begins at rest if the first tip's distance from where the arm
         rests is at most `begins_near` median errors of the regression, and that from where the
@@ -376,6 +385,12 @@ class DetectionSettings:
     few_channels: int = 3
     off: float = 0.1
     frame: float = 0.3
+    region: float = 0.99
+    within: float = 0.5
+    channel_rows: int = 60
+    poses: int = 4
+    apart: float = 0.1
+    in_line: float = 0.3
     known_turn: float = 0.02
     ridge: float = 0.01
     clock_rows: int = 600
@@ -383,8 +398,10 @@ class DetectionSettings:
     clock_usual: float = 2.0
     clock_most: float = 30.0
     clock_share: float = 0.2
-    clock_shifts: int = 61
-    clock_overwhelming: float = 0.3
+    clock_shifts: int = 121
+    clock_rounds: int = 3
+    clock_early: float = 0.75
+    clock_late: float = 0.6
     begins: float = 2.0
     begins_near: float = 2.0
     begins_apart: float = 3.0

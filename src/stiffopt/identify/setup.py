@@ -336,8 +336,7 @@ def chosen_rows(recording: Recording, limit: int) -> Rows:
     usable = np.flatnonzero(np.isfinite(recording.tracks[0].position).all(axis=1))
     if len(usable) <= limit:
         return usable
-    chosen: Rows = usable[np.linspace(0, len(usable) - 1, limit).round().astype(np.intp)]
-    return chosen
+    return usable[np.linspace(0, len(usable) - 1, limit).round().astype(np.intp)]
 
 
 def thinned(recording: Recording, wanted: Rows, span: Array) -> tuple[Recording, Rows]:

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from stiffopt.arrays import Array
 from stiffopt.errors import StiffoptError
-from stiffopt.identify.detection import replaced
+from stiffopt.identify.detection import Hypothesis, later, of_channels, replaced, two_clocks
+from stiffopt.identify.discrepancy import centres
 from stiffopt.identify.error_model import held_for, in_turn, is_moving
 from stiffopt.identify.fit import fit
 from stiffopt.identify.problem import CalibrationProblem, Noise, Predicted, Sample
@@ -30,6 +31,7 @@ from stiffopt.identify.setup import (
     recordings_of,
     sampled,
 )
+from stiffopt.identify.tracker_faults import norms
 from stiffopt.identify.unknowns import Unknowns
 from stiffopt.logs import StiffnessTable
 from stiffopt.model.compliance import Boundary
@@ -73,46 +75,155 @@ def validate(
     found = compare(setup)
     if description.calibration is None:
         return found
-    if "axes" not in settings.keep:
-        found = _with_frames_found(setup, found)
-    return tuple(_with_doubt(each, description.length) for each in found)
+    return tuple(_with_doubt(each, description.length) for each in _put_right(setup, found))
+
+
+def _is_off(found: Comparison, length: float) -> bool:
+    """Whether a log is farther from a calibrated robot than its calibration allows for."""
+    return found.errors.mean > DETECTION.off * length or _within(found) < DETECTION.within
+
+
+def _within(found: Comparison) -> float:
+    """Return the share of the tips within the region of 99 % with history; 1 if there is none."""
+    levels = found.levels if found.levels is not None else np.zeros(0)
+    known = levels[np.isfinite(levels)]
+    return float(np.mean(known <= DETECTION.region)) if len(known) else 1.0
 
 
 def _with_doubt(found: Comparison, length: float) -> Comparison:
     """Return the comparison with a calibrated robot, with a remark if it is far off."""
-    share = found.errors.mean / length
-    if share <= DETECTION.off:
+    if not _is_off(found, length):
         return found
+    share = found.errors.mean / length
+    what = f"the mean error is {100 * share:.0f} % of the arm's length"
+    if share <= DETECTION.off:
+        what = f"only {100 * _within(found):.0f} % of the tips lie within the regions of 99 %"
     remark = (
-        f"the mean error is {100 * share:.0f} % of the arm's length; look at whether the log is of "
-        "the arm of this calibration, the order of the channels (--channels), the frame (--frame), "
-        "and whether the pressures are those that the arm had"
+        f"{what}; look at whether the log is of the arm of this calibration, the order of the "
+        "channels (--channels), the frame (--frame), and whether the pressures are those that the "
+        "arm had, on the clock of the tip"
     )
     return replace(found, remarks=(*found.remarks, remark))
 
 
-def _with_frames_found(setup: Setup, found: tuple[Comparison, ...]) -> tuple[Comparison, ...]:
-    """Return comparisons in which logs that are off only by their frame are moved to fit."""
-    recordings = list(setup.recordings)
-    length, words = setup.description.length, [""] * len(recordings)
-    for i, each in enumerate(found):
-        if each.errors.mean > DETECTION.off * length:
-            moved = replaced(recordings[i], each.measured, each.predicted, length)
-            recordings[i], words[i] = moved
-    if not any(words):
-        return found
-    again = list(compare(Setup.of(setup.description, recordings, (), setup.settings)))
-    for i, (before, after) in enumerate(zip(found, again, strict=True)):
-        if not words[i] or after.errors.mean > DETECTION.frame * before.errors.mean:
-            again[i] = before
+def _put_right(setup: Setup, found: tuple[Comparison, ...]) -> tuple[Comparison, ...]:
+    """Return comparisons in which logs that are off only by their set-up are corrected.
+
+    Two clocks are one free number, and another order of channels, or a line, is none. So they are
+    believed instead of a moved frame if they leave clearly less.
+    """
+    result = list(found)
+    for correct in (_with_frame_found, _with_clock_found, _with_channels_found):
+        recordings, remarks = list(setup.recordings), [""] * len(found)
+        for i, each in enumerate(found):
+            if _is_off(each, setup.description.length):
+                recordings[i], remarks[i] = correct(setup, recordings[i], each)
+        if not any(remarks):
             continue
-        remark = (
-            f"the frame of this log was defined anew: its poses are {words[i]}, and the mean error "
-            f"is {after.errors.mean * 1e3:.1f} mm instead of {before.errors.mean * 1e3:.1f} mm "
-            "(--keep axes leaves them); a log of another arm may look so too"
-        )
-        again[i] = replace(after, remarks=(*after.remarks, remark))
-    return tuple(again)
+        again = compare(Setup.of(setup.description, recordings, (), setup.settings))
+        for i, (before, after) in enumerate(zip(found, again, strict=True)):
+            limit = DETECTION.frame * before.errors.mean
+            if result[i] is not before:
+                limit = min(limit, DETECTION.tie * result[i].errors.mean)
+            believed = correct is not _with_frame_found or _moves_all(before, after, remarks[i])
+            if remarks[i] and believed and after.errors.mean <= limit:
+                remark = (
+                    f"{remarks[i]}; the mean error is {after.errors.mean * 1e3:.1f} mm instead of "
+                    f"{before.errors.mean * 1e3:.1f} mm"
+                )
+                result[i] = replace(after, remarks=(*after.remarks, remark))
+    return tuple(result)
+
+
+def _with_frame_found(
+    setup: Setup, recording: Recording, found: Comparison
+) -> tuple[Recording, str]:
+    """Return a recording moved to where the robot predicts its tip, and a remark on that.
+
+    It is judged by different poses: where a log holds one pose for long, a motion of the frame
+    could replace whatever the model has wrong there.
+    """
+    poses = _different(found)
+    if "axes" in setup.settings.keep or len(poses) < DETECTION.poses:
+        return recording, ""
+    measured, predicted = found.measured[poses], found.predicted[poses]
+    moved, words = replaced(recording, measured, predicted, setup.description.length)
+    return moved, (
+        f"the frame of this log was defined anew: its poses are {words} (--keep axes leaves them); "
+        "a log of another arm or with another order of channels may look so too"
+    )
+
+
+def _with_clock_found(
+    setup: Setup, recording: Recording, found: Comparison
+) -> tuple[Recording, str]:
+    """Return a recording with the pressures on the tip's clock, and a remark on that."""
+    if "clock" in setup.settings.keep:
+        return recording, ""
+    time = found.time
+    longest = min(DETECTION.clock_most, DETECTION.clock_share * float(time[-1] - time[0]))
+
+    def miss(shift: float) -> float:
+        moved = [np.interp(time - shift, time, column) for column in found.predicted.T]
+        return float(np.nanmedian(norms(np.column_stack(moved) - found.measured)))
+
+    step = 2 * longest / (DETECTION.clock_shifts - 1)
+    near = min(np.linspace(-longest, longest, DETECTION.clock_shifts), key=miss)
+    shift = float(min(np.linspace(near - step, near + step, 21), key=miss))
+    return later(recording, shift), f"{two_clocks(shift)} (--keep clock leaves them)"
+
+
+def _with_channels_found(
+    setup: Setup, recording: Recording, found: Comparison
+) -> tuple[Recording, str]:
+    """Return a recording whose columns are those of other channels, and a remark on that.
+
+    The order, or the dead or shared line, is that with which the arm at rest at the pressures is
+    nearest to the tip.
+    """
+    description = setup.description
+    arm, low = Manipulator(description), np.maximum(description.pressure_min, 0.0)
+    seen = np.flatnonzero(np.isfinite(found.measured).all(axis=1))
+    rows = seen[np.linspace(0, len(seen) - 1, DETECTION.channel_rows).astype(int)]
+    tip, point = found.measured[rows], np.linalg.inv(setup.points[0].sensor)[:, 3]
+
+    def miss(hypothesis: Hypothesis) -> float:
+        poses = arm.tip_pose(hypothesis.driven(found.pressures[rows], low))
+        return float(np.median(np.linalg.norm((setup.base @ poses @ point)[:, :3] - tip, axis=1)))
+
+    tried = [each for each in of_channels(description, 1) if each.kind not in setup.settings.keep]
+    if not tried:
+        return recording, ""
+    best = min(tried, key=miss)
+    (corrected,) = best.applied([recording], low)
+    told = best.told(description, [recording.name])
+    return corrected, f"{told} (--keep {best.kind} leaves that as it was recorded)"
+
+
+def _moves_all(before: Comparison, after: Comparison, remark: str) -> bool:
+    """Whether the motion of a frame explains the error at all poses.
+
+    Poses on a line, as in one rise from rest, could be turned about the pose at rest to fit any
+    model. There a frame that was moved, and not only turned by quarters, has to move all of them:
+    none is predicted well without the motion.
+    """
+    poses = _different(before)
+    then, now = before.distance[poses], after.distance[poses]
+    predicted = before.predicted[poses]
+    spread = np.linalg.svd(predicted - predicted.mean(axis=0), compute_uv=False)
+    in_line = spread[1] < DETECTION.in_line * spread[0]
+    least = np.min if in_line and "moved by" in remark else np.mean
+    return bool(now.mean() <= DETECTION.frame * least(then))
+
+
+def _different(found: Comparison) -> NDArray[np.intp]:
+    """Return rows of a comparison whose tip was measured, at different effective pressures."""
+    seen = np.flatnonzero(np.isfinite(found.distance))
+    if not len(seen):
+        return seen
+    pressures = found.effective[seen]
+    apart = DETECTION.apart * float(np.ptp(pressures, axis=0).max())
+    return np.asarray(seen[centres(pressures, apart, DETECTION.rows)])
 
 
 def compare(

@@ -22,8 +22,6 @@ from pydantic_core import core_schema
 from stiffopt.documents import write_whole
 from stiffopt.files import format_of
 
-__all__ = ["MODELS", "json_schema", "schema_file", "write_schema_files"]
-
 MODELS = {
     "robot": "stiffopt.model.description:RobotDescription",
     "task": "stiffopt.optimise.task:Task",

@@ -49,8 +49,7 @@ def _peer_class(settings: type[DeviceSettings]) -> type[DevicePeer[Any]]:
         raise InputError(
             f"the driver of {settings.__name__} cannot be used in the virtual lab: it has no peer"
         )
-    found: type[DevicePeer[Any]] = load(settings.peer)
-    return found
+    return load(settings.peer)
 
 
 class VirtualLab:

@@ -170,8 +170,7 @@ class Arm:
         """Return the cached item of this key, or make it; the cache is shared by all loads."""
         if key not in self._kept:
             self._kept[key] = make()
-        found: Kept = self._kept[key]
-        return found
+        return self._kept[key]
 
     # -- numerics ---------------------------------------------------------------------------
 
@@ -387,16 +386,12 @@ class Evaluator:
     def __init__(self, arm: Arm, function: BatchFunction) -> None:
         self._arm = arm
         self._function = function
-        self._state: EquilibriumState | None = None
+        # equilibrium at the last evaluation; None for an arm without loads
+        self.state: EquilibriumState | None = None
 
     def restart(self, state: EquilibriumState | None = None) -> None:
         """Forget the previous equilibrium, or continue from the given one."""
-        self._state = state
-
-    @property
-    def state(self) -> EquilibriumState | None:
-        """Equilibrium at the last evaluation; None for an arm without loads."""
-        return self._state
+        self.state = state
 
     def many(self, batch: Array, *parameters: Array) -> list[Array]:
         """Return outputs at checked pressures (N, n), without loads, each (N, rows, columns)."""
@@ -407,8 +402,8 @@ class Evaluator:
         checkpoint()
         parameters = parameters or (self._arm.numbers,)
         if self._arm.is_loaded:
-            self._state = self._arm.settle(p, self._state)
-            inputs = self._arm._equilibrium().arguments(self._state)
+            self.state = self._arm.settle(p, self.state)
+            inputs = self._arm._equilibrium().arguments(self.state)
         else:
             inputs = (p,)
         return self._function(*inputs, *parameters)

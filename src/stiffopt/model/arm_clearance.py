@@ -181,8 +181,7 @@ def _clearances(body: NativeBody) -> Callable[..., int]:
         _pointer, _pointer, _integer, _pointer, _pointer, _integer, _pointer, _pointer, _pointer,
         _pointer, _integer, _integer,
     ]  # fmt: skip
-    found: Callable[..., int] = function
-    return found
+    return function
 
 
 def _in_chunks(call: Callable[[int, int], int], count: int) -> None:

@@ -8,7 +8,7 @@ import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -19,6 +19,15 @@ from stiffopt.model.codegen import Signature
 _CHUNK = 4096  # rows that a thread takes at a time
 _BLOCK = 256  # rows that the VM evaluates at a time
 _SMALL_BLOCK = 16  # for fewer rows
+
+
+class _RowMemory(NamedTuple):
+    """Memory of a number of rows."""
+
+    inputs: Sequence[Array]  # contiguous
+    strides: Sequence[int]  # numbers from one row to the next, of each input; 0: it is shared
+    outputs: Sequence[Array]  # each (number, r, c)
+    number: int
 
 
 class BatchFunction(ABC):
@@ -65,7 +74,7 @@ class BatchFunction(ABC):
             strides.append(size if each else 0)
         outputs = [np.empty((count, *shape)) for shape in self.signature.outputs]
         if count:
-            self._evaluate(inputs, strides, outputs, count, threads)
+            self._evaluate(_RowMemory(inputs, strides, outputs, count), threads)
         return outputs
 
     @abstractmethod
@@ -73,15 +82,8 @@ class BatchFunction(ABC):
         """Fill `_results` from `_targets`."""
 
     @abstractmethod
-    def _evaluate(
-        self,
-        inputs: Sequence[Array],
-        strides: Sequence[int],
-        outputs: Sequence[Array],
-        count: int,
-        threads: int | None,
-    ) -> None:
-        """Fill outputs, each (count, r, c), from contiguous inputs."""
+    def _evaluate(self, rows: _RowMemory, threads: int | None) -> None:
+        """Fill the outputs of rows from their inputs."""
 
 
 class CompiledFunction(BatchFunction):
@@ -107,25 +109,18 @@ class CompiledFunction(BatchFunction):
         if self._rows(*self._call):
             raise ArithmeticError("compiled code failed")
 
-    def _evaluate(
-        self,
-        inputs: Sequence[Array],
-        strides: Sequence[int],
-        outputs: Sequence[Array],
-        count: int,
-        threads: int | None,
-    ) -> None:
-        arrays = _Pointers(inputs, strides, outputs)
+    def _evaluate(self, rows: _RowMemory, threads: int | None) -> None:
+        arrays = _Pointers(rows.inputs, rows.strides, rows.outputs)
         failures: list[int] = []
 
         def work(starts: Iterator[int]) -> None:
             own = _Work(self.signature)
             for start in starts:
-                end = min(start + _CHUNK, count)
+                end = min(start + _CHUNK, rows.number)
                 if self._rows(*arrays.addresses, start, end, *own.addresses):
                     failures.append(start)
 
-        in_parallel(work, range(0, count, _CHUNK), threads)
+        in_parallel(work, range(0, rows.number, _CHUNK), threads)
         if failures:
             raise ArithmeticError("compiled code failed")
 
@@ -143,14 +138,8 @@ class InterpretedFunction(BatchFunction):
     def _evaluate_one(self) -> None:
         self._single.evaluate()
 
-    def _evaluate(
-        self,
-        inputs: Sequence[Array],
-        strides: Sequence[int],
-        outputs: Sequence[Array],
-        count: int,
-        threads: int | None,
-    ) -> None:
+    def _evaluate(self, rows: _RowMemory, threads: int | None) -> None:
+        inputs, strides, outputs, count = rows
         with self._lock:
             size = _BLOCK if count >= _BLOCK else _SMALL_BLOCK
             if size not in self._blocks:
@@ -158,17 +147,18 @@ class InterpretedFunction(BatchFunction):
             block = self._blocks[size]
             shapes = self.signature.inputs
             for start in range(0, count, size):
-                rows = min(size, count - start)
+                filled = min(size, count - start)
                 for buffer, values, stride, shape in zip(
                     block.targets, inputs, strides, shapes, strict=True
                 ):
                     if stride:
-                        buffer[:rows] = values.reshape(count, *_own(shape))[start : start + rows]
+                        whole = values.reshape(count, *_own(shape))
+                        buffer[:filled] = whole[start : start + filled]
                     elif start == 0:
                         buffer[...] = values.reshape(_own(shape))
                 block.evaluate()
                 for output, result in zip(outputs, block.results, strict=True):
-                    output[start : start + rows] = result[:rows]
+                    output[start : start + filled] = result[:filled]
 
 
 class Buffer:

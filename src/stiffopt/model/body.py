@@ -101,8 +101,7 @@ class BodyShape:
 
     def _radii(self, p: Array, at: Array) -> Array:
         piece, _ = self._pieces.find(at)
-        found: Array = self._stations.radii(p)[:, self._pieces.section[piece]]
-        return found
+        return self._stations.radii(p)[:, self._pieces.section[piece]]
 
     def _evaluate(self, what: int, p: Array, at: Array) -> Array:
         """Return numbers (N, ...) of stations, by machine code if there is any."""

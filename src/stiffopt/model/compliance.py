@@ -161,8 +161,7 @@ def stiffness_of(C: Array, d: Array, kind: Kind, boundary: Boundary) -> Array:
     if boundary == "clamped":
         reaction = np.linalg.solve(C[..., other, other], C[..., other, own])
         block = block - C[..., own, other] @ reaction
-    found: Array = np.sum(d * np.linalg.solve(block, d), axis=(-2, -1))
-    return found
+    return np.sum(d * np.linalg.solve(block, d), axis=(-2, -1))
 
 
 def held_stiffness(

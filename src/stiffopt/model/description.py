@@ -512,8 +512,7 @@ class RobotDescription(Schema):
         if not known:
             return None
         rows = [np.broadcast_to(np.asarray(rates, float), self.n_pressures) for rates in known]
-        smallest: Array = np.min(rows, axis=0)
-        return smallest
+        return np.min(rows, axis=0)
 
     @property
     def channel_areas(self) -> tuple[float, ...]:

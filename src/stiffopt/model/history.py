@@ -481,8 +481,7 @@ class Memory:
         self._time = float(ends[-1])
         oldest = np.searchsorted(times, self._time - self._delays[-1], side="right") - 1
         self._times, self._commands = times[oldest:], commands[oldest:]
-        effective: Array = at_marks[np.searchsorted(marks, ends[1:]) - 1]
-        return effective
+        return at_marks[np.searchsorted(marks, ends[1:]) - 1]
 
     def _marks(self, times: Array, ends: Array) -> Array:
         """Return the ends of steps (m + 1,) and the times between when commands take effect."""

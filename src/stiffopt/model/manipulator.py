@@ -33,7 +33,7 @@ from stiffopt.model.history import NO_HISTORY
 from stiffopt.model.robot_files import load_description
 from stiffopt.model.scene import Scene
 from stiffopt.model.screws import Twist, Wrench, checked_wrench
-from stiffopt.model.shape import Shape, stiffness_along
+from stiffopt.model.shape import stiffness_along
 from stiffopt.model.uncertainty import TipUncertainty, Uncertainty
 from stiffopt.notebook import ShownInNotebook
 
@@ -417,8 +417,7 @@ class Manipulator(Arm, ShownInNotebook):
         local = _in_local_axes(wrench, T_at, frame)
         if method == "first-order":
             C = self.tip_compliance(p) if at is None else self.compliance(p, at)
-            T: Array = T_at @ lie.exp(C @ local) @ lie.inverse(T_at) @ self.tip_pose(p)
-            return T
+            return T_at @ lie.exp(C @ local) @ lie.inverse(T_at) @ self.tip_pose(p)
         if method == "elementwise":
             if self.is_loaded:
                 raise InputError(
@@ -526,16 +525,8 @@ _cached_measure = lru_cache(maxsize=256)(checked_measure)
 
 
 def _stiffness_of(measure: DirectionalMeasure) -> Values:
-    def value(shape: Shape) -> Any:
-        return stiffness_along(
-            shape,
-            ca.DM(measure.direction),
-            frame=measure.frame,
-            kind=measure.kind,
-            boundary=measure.boundary,
-        )
-
-    return value
+    direction, kind, boundary, frame = measure
+    return lambda shape: stiffness_along(shape, ca.DM(direction), frame, kind, boundary)
 
 
 def _in_local_axes(wrench: "ArrayLike | Wrench", T: Array, frame: Frame) -> Array:

@@ -261,8 +261,7 @@ def revolved(origin: Any, axis: Any, heights: Any, radii: Any) -> Array:
     ring = np.outer(first, np.cos(angle)) + np.outer(second, np.sin(angle))  # (3, _SIDES + 1)
     along = np.multiply.outer(axis, np.asarray(heights, dtype=float))  # (3, rows)
     centres = np.asarray(origin, dtype=float)[:, None] + along
-    surface: Array = centres[:, :, None] + np.asarray(radii)[None, :, None] * ring[:, None, :]
-    return surface
+    return centres[:, :, None] + np.asarray(radii)[None, :, None] * ring[:, None, :]
 
 
 def rounded(start: Any, end: Any, radius: float) -> Array:

@@ -98,15 +98,10 @@ class ParametricArm:
 
         They are (N, n) by pressures, (N, k) by coordinates and (N, 3) by gravity.
         """
+        direction, kind, boundary, frame = measure
 
         def outputs(shape: Shape) -> list[ca.SX | ca.MX]:
-            k = stiffness_along(
-                shape,
-                ca.DM(measure.direction),
-                frame=measure.frame,
-                kind=measure.kind,
-                boundary=measure.boundary,
-            )
+            k = stiffness_along(shape, ca.DM(direction), frame, kind, boundary)
             by_gravity = shape.gravity_jacobian(k) if isinstance(shape, Chain) else ca.SX(1, 3)
             return [k, shape.total_jacobian(k), by_gravity]
 

@@ -106,8 +106,7 @@ class FreeStations:
         A = (own + _at_pieces(before, piece).reshape(-1, 6, 6)).reshape(count, len(at), 6, 6)
         X = np.tile(np.eye(6), (count, len(at), 1, 1))
         X[..., :3, 3:] = -_hat(self._along(function("along"), strains, starts, at)[0][..., :3])
-        found: Array = X[:, s] @ A[:, np.minimum(s, t)] @ np.swapaxes(X[:, t], -1, -2)
-        return found
+        return X[:, s] @ A[:, np.minimum(s, t)] @ np.swapaxes(X[:, t], -1, -2)
 
     def radii(self, p: Array) -> Array:
         """Return the radius of each piece, (N, pieces)."""
@@ -278,8 +277,7 @@ def _transforms(axes: Array, positions: Array) -> Array:
 
 def _at_pieces(values: Array, piece: Places) -> Array:
     """Return columns (N k, r) of values (N, r, pieces)."""
-    found: Array = np.swapaxes(values[:, :, piece], 1, 2).reshape(-1, values.shape[1])
-    return found
+    return np.swapaxes(values[:, :, piece], 1, 2).reshape(-1, values.shape[1])
 
 
 def _hat(v: Array) -> Array:

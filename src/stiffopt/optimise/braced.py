@@ -91,8 +91,7 @@ def _moved_by_contact(
     at_contact, to_tip = C[rows, station, :3, :3], C[rows, len(at) + station, :, :3]
     yielding = np.einsum("ni,nij,nj->n", n, at_contact, n)
     force = depth / np.maximum(yielding, _LEAST_YIELDING)
-    moved: Array = np.einsum("nij,nj,n->ni", to_tip, n, force)
-    return moved
+    return np.einsum("nij,nj,n->ni", to_tip, n, force)
 
 
 def _displaced(poses: Array, twists: Array) -> Array:

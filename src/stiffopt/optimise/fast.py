@@ -44,8 +44,7 @@ def _mirrored(settings: Any) -> ctypes.Structure:
     values = settings._asdict() if isinstance(settings, Effort) else asdict(settings)
     fields = [(name, kinds[type(value)]) for name, value in values.items()]
     kind = type(type(settings).__name__, (ctypes.Structure,), {"_fields_": fields})
-    found: ctypes.Structure = kind(**values)
-    return found
+    return kind(**values)
 
 
 _REACH_SETTINGS, _DESCENT_SETTINGS, _CLOSEST_SETTINGS, _EFFORT = map(

@@ -167,8 +167,7 @@ def _pushed_back(problem: PressureProblem, x: Array, rise: Array) -> Flags:
     If such a step gained nothing, there is a kink at the limit, as in the norm law where a segment
     is unpressurised.
     """
-    pushed: Flags = (rise > 0) & ((x <= problem.lower) | (x >= problem.upper))
-    return pushed
+    return (rise > 0) & ((x <= problem.lower) | (x >= problem.upper))
 
 
 def _last_step(problem: PressureProblem, here: _Place, d: Array, price: float) -> _Place:

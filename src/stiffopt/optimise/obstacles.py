@@ -175,8 +175,7 @@ class Obstacles:
     def exact_rows(self, arm: Manipulator, p: Array) -> list[float]:
         """Return rows (k,) for judging, each with the exact least distance of the whole arm."""
         distances = arm.clearances(p, self.scene).distances[list(self.row_objects)]
-        found: list[float] = (OBSTACLES.margin - (distances - self.scene.clearance)).tolist()
-        return found
+        return (OBSTACLES.margin - (distances - self.scene.clearance)).tolist()
 
     def touched(self, rows: list[float]) -> list[str]:
         """Return the names of objects within `OBSTACLES.touching` of the clearance."""

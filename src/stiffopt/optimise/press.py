@@ -125,5 +125,4 @@ def soft_directions(compliance: Array) -> Array:
     """Return the projection (3, 3) on the directions in which a tip of this compliance is soft."""
     sizes, axes = np.linalg.eigh(compliance)
     soft = axes[:, sizes > SOFT_SHARE * sizes[-1]]
-    projection: Array = soft @ soft.T
-    return projection
+    return soft @ soft.T

@@ -114,8 +114,7 @@ class _Weights:
         answer = solve_qp(np.ascontiguousarray(H), np.zeros(count), total, low, high)
         if answer is None:
             return None
-        found: Array = np.maximum(answer[0], 0.0) * scale * np.array(self._sizes)
-        return found
+        return np.maximum(answer[0], 0.0) * scale * np.array(self._sizes)
 
 
 def _slope(

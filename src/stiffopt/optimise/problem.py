@@ -58,10 +58,8 @@ class Ball:
     def pull(self) -> Array:
         """Gradient (n,) of the error; the error must not be zero."""
         if self.constraint.one_sided:
-            row: Array = self.jacobian[0]
-            return row
-        gradient: Array = self.residual / self.error @ self.jacobian
-        return gradient
+            return self.jacobian[0]
+        return self.residual / self.error @ self.jacobian
 
 
 class ProgramPoint:
@@ -430,8 +428,7 @@ class Bounding:
 def floor_bounds(goal: StiffnessGoal | None) -> Array:
     """Return the lower bounds (f,) on the logarithms of a goal's floors, with some margin."""
     values = [floor.value for floor in goal.at_least] if goal is not None else []
-    bounds: Array = np.log(np.array(values)) + DESCENT.floor_margin
-    return bounds
+    return np.log(np.array(values)) + DESCENT.floor_margin
 
 
 def _one(point: ProgramPoint) -> float:

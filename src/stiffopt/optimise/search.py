@@ -252,8 +252,7 @@ def _intrusion(problem: PressureProblem, x: Array) -> float:
 def _first_at_same_place(x: Array) -> list[int]:
     """Return for each of the pressures (N, n) the index of the first that is nearly equal."""
     same_place = np.abs(x[:, np.newaxis] - x).max(axis=2) < DESCENT.next_to
-    first: list[int] = same_place.argmax(axis=1).tolist()
-    return first
+    return same_place.argmax(axis=1).tolist()
 
 
 def _rank_of_start(problem: PressureProblem, x: Array) -> float:

@@ -306,8 +306,7 @@ class PressureSolution(ShownInNotebook):
         -----
         Where `weakly_active` names a constraint, the derivative holds on one side only.
         """
-        gradient: Array = self._derivatives.gradient(of, by)
-        return gradient
+        return self._derivatives.gradient(of, by)
 
     @property
     def weakly_active(self) -> tuple[str, ...]:
@@ -315,8 +314,7 @@ class PressureSolution(ShownInNotebook):
 
         `gradient` then holds only on the side on which the active constraints stay the same.
         """
-        weak: tuple[str, ...] = self._derivatives.weak
-        return weak
+        return self._derivatives.weak
 
     @cached_property
     def _derivatives(self) -> Any:
@@ -409,8 +407,7 @@ class PressureSolution(ShownInNotebook):
         """Tip orientation (w, x, y, z), w >= 0."""
         if self.tip_pose is None:
             return None
-        quaternion: Array = lie.quaternion_from_rotation(self.tip_pose[:3, :3])
-        return quaternion
+        return lie.quaternion_from_rotation(self.tip_pose[:3, :3])
 
 
 class Judgement(NamedTuple):

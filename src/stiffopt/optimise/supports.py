@@ -140,7 +140,8 @@ def suggest_supports(
     ----------
     robot : Manipulator
     task : Task
-        It maximises a stiffness against translation.  A `brace` of it only gives the margin.
+        It maximises a stiffness against translation.  A `brace` of it only gives the margin, and
+        the arm keeps clear of its objects.
     max_force : float
         Largest contact force, in N.
     seed, timeout, cancel :

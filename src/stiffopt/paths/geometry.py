@@ -119,16 +119,14 @@ class SplineCurve(Curve):
 
     def at(self, lengths: ArrayLike) -> Array:
         """See `Curve.at`."""
-        found: Array = self._spline(self._parameters(lengths))
-        return found
+        return self._spline(self._parameters(lengths))
 
     def tangents(self, lengths: ArrayLike) -> Array:
         """See `Curve.tangents`."""
         return _unit(self._slope(self._parameters(lengths)))
 
     def _parameters(self, lengths: ArrayLike) -> Array:
-        found: Array = np.interp(np.asarray(lengths, float), self._lengths, self._dense)
-        return found
+        return np.interp(np.asarray(lengths, float), self._lengths, self._dense)
 
 
 def arc_through(start: Array, via: Array, end: Array) -> ArcCurve | None:

@@ -3,7 +3,7 @@
 All pressures grow in proportion, as in the definition of equilibria in contact
 (`Manipulator.contact_equilibrium`). Each equilibrium along the way is found from the one before. If
 they do not end in the wanted one, the motion is refused. Where friction would keep the tip from its
-target, the way goes on past its end, and comes back (`eased`). Played backwards from where it first
+target, the way goes on past its end, and comes back (`eased`). Backwards from where it first
 reaches its end, it releases the contact.
 """
 

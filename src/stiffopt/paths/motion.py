@@ -15,6 +15,7 @@ from stiffopt.display import display_units
 from stiffopt.errors import EquilibriumError, InputError, StoppedError
 from stiffopt.model.compiled import Stopwatch
 from stiffopt.model.compliance import stiffness_of
+from stiffopt.model.contact.equilibrium import ContactEquilibrium
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.motion_clearance import MOTION_ERROR, ClearMotions
 from stiffopt.model.scene import Scene
@@ -77,7 +78,8 @@ def plan_motion(
     ----------
     robot : Manipulator
     start : (n,) or Task
-        Pressures in Pa, or a task, which stands for its solution.
+        Pressures in Pa, or a task, which stands for its solution.  If that leans, the motion
+        releases the contact on the way to rest, and goes on from there.
     goal : (n,) or Task, or several of them
         A task stands for all configurations that solve it: the stiffest and others.  The motion
         goes to the stiffest with a clear straight way; if there is none, to whichever the trees
@@ -116,16 +118,19 @@ def plan_motion(
         A search is needed, and OMPL is not installed.
     """
     goals = several(goal)
-    if any(isinstance(each, Task) and each.brace is not None for each in (start, *goals)):
-        if not (len(goals) == 1 and isinstance(goals[0], Task) and goals[0].brace is not None):
+    braced = [each for each in (start, *goals) if isinstance(each, Task) and each.brace is not None]
+    if braced:
+        if len(braced) > 1 or (braced[0] is not start and len(goals) > 1):
             raise InputError(
-                "a task with 'brace' can be the only goal of a motion, and not its start; to "
-                "release the contact, play the motion into it backwards"
+                "a task with 'brace' must be the only goal of a motion, or its start, and not both"
             )
-        task = goals[0] if scene is None else goals[0].model_copy(update={"scene": scene})
+        task = braced[0] if scene is None else braced[0].model_copy(update={"scene": scene})
         options: dict[str, Any] = {"clearance": clearance, "load": load, "seed": seed}
+        options |= {"slew": slew, "timeout": timeout}
         with giving_up(None, cancel):
-            return _leaning(robot, start, task, slew, options | {"timeout": timeout})
+            if braced[0] is start:
+                return _releasing(robot, task, goals, options)
+            return _leaning(robot, start, task, options)
     watch = Stopwatch()
     request = MotionRequest.of(robot, start, goal, scene, clearance, slew, load, seed)
     timings: dict[str, float] = {}
@@ -168,9 +173,7 @@ def _with_margin(request: MotionRequest, timings: dict[str, float]) -> tuple[_Pl
     )
 
 
-def _leaning(
-    robot: Manipulator, start: End, goal: Task, slew: Any, options: dict[str, Any]
-) -> PathSolution:
+def _leaning(robot: Manipulator, start: End, goal: Task, options: dict[str, Any]) -> PathSolution:
     """Plan a motion to a task with a brace: to rest, and from there into contact.
 
     Down to rest the body keeps clear of the scene, unless it leans on an object at the start or
@@ -181,9 +184,9 @@ def _leaning(
     rest = np.zeros(robot.n_pressures)
     lies = touches_at(robot, goal, rest)
     if found.pressures is None or not (found.contacts or lies):
-        return plan_motion(robot, start, goal.unbraced, slew=slew, **options)
+        return plan_motion(robot, start, goal.unbraced, **options)
     own = {name: value for name, value in options.items() if name != "timeout"}
-    request = MotionRequest.of(robot, start, rest, goal.scene, slew=slew, **own)
+    request = MotionRequest.of(robot, start, rest, goal.scene, **own)
     measures = maximised(goal)
     if not found.found:
         return request.without_answer(found.message, "unreachable")
@@ -195,7 +198,7 @@ def _leaning(
         if lies or begins_in_contact:
             down = _down_in_contact(robot, goal, request)
         else:
-            down = plan_motion(robot, start, rest, scene=goal.scene, slew=slew, **options)
+            down = plan_motion(robot, start, rest, scene=goal.scene, **options)
             if not down.found:
                 return down
             down = replace(down, stiffness=_least_stiffness(robot, down.pressures, measures))
@@ -204,13 +207,9 @@ def _leaning(
     except StoppedError as reason:
         return request.without_answer(str(reason), "failed")
     times = gradual(least_times_along(robot, states, request.slew))
-    end, way, unit = states[-1], states[1:], display_units().force
-    leant = " and ".join(
-        f"'{end.contacts[on[0]].object}' with {unit.text(force, '.3g')}"
-        for on, force in end.pressed()
-    )
-    message = f"from rest on into contact: at the end it leans on {leant}; played backwards the "
-    message += "motion releases the contact"
+    way, leant = states[1:], _leant_on(states[-1])
+    message = f"from rest on into contact: at the end it leans on {leant}; a motion that has the "
+    message += "task as its start releases the contact"
     if not leant:
         message = "from rest, where the arm lies on an object, to a posture that is clear of it"
     return replace(
@@ -225,6 +224,60 @@ def _leaning(
         equilibria=(*down.equilibria, *way),
         timings=down.timings | watch.timings(),
         confidence=f"{down.confidence}; the equilibria in contact were followed from rest",
+    )
+
+
+def _releasing(
+    robot: Manipulator, start: Task, goals: list[End], options: dict[str, Any]
+) -> PathSolution:
+    """Plan a motion from a task with a brace: to rest, out of contact, and from there to a goal.
+
+    All pressures fall in proportion, by the speed and the rate of force with which an arm leans.
+    """
+    watch = Stopwatch()
+    found = solve_pressure(robot, start)
+    if found.pressures is None or not found.contacts:
+        return plan_motion(robot, start.unbraced, goals, scene=start.scene, **options)
+    rest = np.zeros(robot.n_pressures)
+    own = {name: value for name, value in options.items() if name != "timeout"}
+    request = MotionRequest.of(robot, start, rest, start.scene, **own)
+    if not found.found:
+        return request.without_answer(found.message, "unreachable")
+    try:
+        states = way_from_rest(robot, start, found.pressures)[::-1]
+    except Unsolved as reason:
+        return request.without_answer(str(reason), "unreachable")
+    on = plan_motion(robot, rest, goals, scene=start.scene, **options)
+    if not on.found:
+        return on
+    times = gradual(least_times_along(robot, states, request.slew))
+    measures, later = maximised(start), on.pressures[1:]
+    message = f"at the start it leans on {_leant_on(states[0])}, and lets go on the way to rest"
+    stiffness = np.array([stiffness_leaning(eq, start) for eq in states])
+    if len(later):
+        message += f"; from there on {on.message}" if on.message else ""
+        stiffness = np.concatenate([stiffness, _least_stiffness(robot, later, measures)])
+    return replace(
+        on,
+        message=message,
+        times=np.concatenate([times, times[-1] + on.times[1:]]),
+        pressures=np.concatenate([[eq.pressures for eq in states], later]),
+        tip_poses=np.concatenate([[eq.tip_pose for eq in states], on.tip_poses[1:]]),
+        stiffness=stiffness,
+        stiffness_unit=measures[0].unit,
+        clearance=None,
+        equilibria=(*states, *[None] * len(later)),
+        timings=on.timings | watch.timings(),
+        confidence=f"the equilibria in contact were followed from rest; {on.confidence}",
+    )
+
+
+def _leant_on(eq: ContactEquilibrium) -> str:
+    """Return what an arm leans on, and with which force; empty if on nothing."""
+    unit = display_units().force
+    return " and ".join(
+        f"'{eq.contacts[on[0]].object}' with {unit.text(force, '.3g')}"
+        for on, force in eq.pressed()
     )
 
 
@@ -491,8 +544,7 @@ def _least_stiffness(robot: Manipulator, p: Array, measures: Sequence[StiffnessM
         for each in measures
     ]
     pairs = zip(measures, directions, strict=True)
-    found: Array = np.min([stiffness_of(C, d, each.kind, each.boundary) for each, d in pairs], 0)
-    return found
+    return np.min([stiffness_of(C, d, each.kind, each.boundary) for each, d in pairs], 0)
 
 
 def timed(way: Array, rates: Array) -> tuple[Array, Array]:

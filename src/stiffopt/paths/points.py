@@ -176,8 +176,7 @@ class PathTasks:
         """Return the sampled pressures (count, n) whose tips are nearest to a point's target."""
         table = self._prepared.samples
         distances = table.distances(self.programs[index].terms, self.robot.length)
-        near: Array = table.pressures[table.nearest_first(distances, count)]
-        return near
+        return table.pressures[table.nearest_first(distances, count)]
 
     # -- local optima -----------------------------------------------------------------------
 

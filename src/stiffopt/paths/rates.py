@@ -14,8 +14,7 @@ def least_times(pressures: ArrayLike, slew: ArrayLike) -> Array:
     In s: ``max_i |p_{k+1,i} - p_{k,i}| / slew_i``.
     """
     steps = np.abs(np.diff(np.asarray(pressures, float), axis=0))
-    times: Array = (steps / np.asarray(slew, float)).max(axis=1)
-    return times
+    return (steps / np.asarray(slew, float)).max(axis=1)
 
 
 def step_limits(times: ArrayLike, slew: ArrayLike) -> Array:

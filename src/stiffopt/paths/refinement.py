@@ -251,8 +251,7 @@ class _Window:
         H = np.stack(columns, axis=2)
         values, vectors = np.linalg.eigh((H + H.swapaxes(1, 2)) / 2)
         values = np.maximum(values, 1e-6)
-        convex: Array = (vectors * values[:, np.newaxis, :]) @ vectors.swapaxes(1, 2)
-        return convex
+        return (vectors * values[:, np.newaxis, :]) @ vectors.swapaxes(1, 2)
 
     # -- the convex program ---------------------------------------------------------------------
 

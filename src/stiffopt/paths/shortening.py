@@ -54,8 +54,7 @@ def _without_corners(way: Array, is_clear: IsClear) -> Array:
             ahead -= 1
         here = ahead
         kept.append(here)
-    found: Array = way[kept]
-    return found
+    return way[kept]
 
 
 def _marks(way: Array, scale: Array) -> Array:

@@ -51,8 +51,9 @@ class PathSolution(ShownInNotebook):
         In m and rad; None where not asked for.
     clearance : ndarray (N,) or None
         Smallest distance between body and scene, in m; None without a scene.
-    equilibria : tuple of ContactEquilibrium
-        Of a motion into contact: those of its last points, from rest on; else empty.
+    equilibria : tuple of ContactEquilibrium or None
+        Of a motion into or out of contact: those of its last points, from rest on, or of all; None
+        where the arm is on its way clear of the scene.  Else empty.
     first_failure : int or None
         Index of the first point that cannot be solved, or of the last from which no way on was
         found.
@@ -75,7 +76,7 @@ class PathSolution(ShownInNotebook):
     position_errors: Array | None = None
     angle_errors: Array | None = None
     clearance: Array | None = None
-    equilibria: tuple[ContactEquilibrium, ...] = ()
+    equilibria: tuple[ContactEquilibrium | None, ...] = ()
     first_failure: int | None = None
     confidence: str = ""
     timings: dict[str, float] = field(default_factory=dict)
@@ -101,7 +102,7 @@ class PathSolution(ShownInNotebook):
     @property
     def leans(self) -> Flags:
         """Flags (N,) of the points at which the arm is in contact."""
-        own = [bool(eq.contacts) for eq in self.equilibria]
+        own = [eq is not None and bool(eq.contacts) for eq in self.equilibria]
         return np.array([False] * (len(self.times) - len(own)) + own)
 
     @property

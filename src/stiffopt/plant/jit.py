@@ -89,4 +89,4 @@ def jit(function: FunctionT) -> FunctionT:
         compiled = compile_it(**options)(function)
     finally:
         config.CACHE_DIR = before
-    return compiled  # type: ignore[no-any-return]
+    return compiled

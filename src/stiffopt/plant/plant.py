@@ -159,8 +159,7 @@ class Plant:
 
     def tip_pose(self) -> Array:
         """Pose of the tip (4, 4) in the nominal base frame."""
-        tip: Array = self.poses()[-1]
-        return tip
+        return self.poses()[-1]
 
     def poses(self) -> Array:
         """Poses (m, 4, 4) of the nodes from the base to the tip, in the nominal base frame."""

@@ -326,8 +326,7 @@ def contact_force(loads: RodLoads, depth: float) -> float:
     """Return the force of the plate on the tip at a depth, N: ``k max(depth, 0)``, rounded at 0."""
     if loads.plate_stiffness == 0:
         return 0.0
-    rounded: float = 0.5 * loads.plate_stiffness * (depth + math.hypot(depth, _SOFT))
-    return rounded
+    return 0.5 * loads.plate_stiffness * (depth + math.hypot(depth, _SOFT))
 
 
 @jit

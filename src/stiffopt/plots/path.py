@@ -203,8 +203,9 @@ def draw_path(
         _label_stiffness(drawing, solution, tips)
     if scene is not None:
         drawing.draw_objects(scene)
-    if solution.equilibria:
-        draw_forces(drawing, solution.equilibria[-1])
+    end = solution.equilibria[-1] if solution.equilibria else None
+    if end is not None:
+        draw_forces(drawing, end)
     return drawing.finish(view)
 
 

@@ -22,11 +22,6 @@ def limit_of(solution: PressureSolution, channel: str) -> str:
     return next(sides, "")
 
 
-def unit_text(unit: str | None) -> str:
-    """Return the name of the display unit for an SI unit."""
-    return display_units().of_si(unit).name
-
-
 def stiffness_text(value: float, unit: str | None) -> str:
     """Format a stiffness, given in an SI unit, in its display unit with four figures."""
     return display_units().of_si(unit).text(value, FIGURES)

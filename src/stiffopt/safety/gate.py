@@ -314,8 +314,7 @@ class SafetyGate:
             return wanted
         # the force is convex along the step, so this share of it never exceeds the limit
         share = max(0.0, self._max_force - least) / (most - least)
-        shortened: Array = fallen + share * (wanted - fallen)
-        return shortened
+        return fallen + share * (wanted - fallen)
 
     def _force(self, pressures: Array) -> float:
         return total_force(pressures, self._areas)

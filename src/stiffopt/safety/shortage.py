@@ -78,8 +78,7 @@ class Shortage:
         self._for = np.where((follows, nothing), self._for + elapsed, 0.0)
         within = np.array([[self._time], [max(self._time, MONITOR.nothing_time)]])
         follows, nothing = self._for >= within * (1 - 1e-9)
-        leaking: Flags = follows | nothing
-        return leaking
+        return follows | nothing
 
 
 class SupplyLine:

@@ -260,8 +260,7 @@ class MapPlan:
     def _is_clear(self, pressures: Array) -> Flags:
         """Return whether the body keeps the scene's clearance, at each of the pressures (k, n)."""
         assert self.scene is not None
-        clear: Flags = self.robot.clearance(pressures, self.scene) >= self.scene.clearance
-        return clear
+        return self.robot.clearance(pressures, self.scene) >= self.scene.clearance
 
     def _in_closed_form(self, pressures: Array) -> tuple[Array, Array]:
         """Return positions (k, 3) and stiffnesses (m, k) of the arm without loads."""
@@ -301,12 +300,9 @@ class MapPlan:
     def _outputs(self, shape: Shape, _: Any) -> list[Any]:
         """Return the position (3, 1) of the tip and its stiffnesses (m, 1)."""
         stiffness = (
-            directional_stiffness(
-                shape.compliance, shape.rotation, ca.DM(measure.direction),
-                frame=measure.frame, kind=measure.kind, boundary=measure.boundary,
-            )
-            for measure in self.measures
-        )  # fmt: skip
+            directional_stiffness(shape.compliance, shape.rotation, ca.DM(d), frame, kind, boundary)
+            for d, kind, boundary, frame in self.measures
+        )
         return [shape.position, ca.vertcat(*stiffness)]
 
     # -- record on disk ---------------------------------------------------------------------

@@ -96,8 +96,7 @@ class Threads(AbstractContextManager["Threads"]):
 
     def result(self, future: Any) -> MapPart:
         """Return the result of a future that is done."""
-        found: MapPart = future.result()
-        return found
+        return future.result()
 
     def check(self) -> None:
         """Do nothing: threads do not get lost."""
@@ -166,8 +165,7 @@ class Cluster(AbstractContextManager["Cluster"]):
                 "install the same version of stiffopt everywhere"
             )
         self._seen = monotonic()
-        result: MapPart = block
-        return result
+        return block
 
     def check(self) -> None:
         """Raise `ClusterError` if no result can come any more; distributed first reconnects."""

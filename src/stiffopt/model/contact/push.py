@@ -238,8 +238,7 @@ def rigid_if_huge(compliance: float) -> float:
 
 def _until_zero(own: Array, slopes: Array) -> Array:
     """Return the pushes (k,) at which forces (k,) vanish; infinite for those that grow."""
-    until: Array = np.divide(own, -slopes, out=np.full(len(own), np.inf), where=slopes < 0)
-    return until
+    return np.divide(own, -slopes, out=np.full(len(own), np.inf), where=slopes < 0)
 
 
 def _forces(arm: LeaningArm) -> Array:

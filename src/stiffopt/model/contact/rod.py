@@ -307,8 +307,7 @@ class RodShape:
         Both have the same mesh.  Without machine code, points move on straight lines.
         """
         first, last = self.body(at)[0], other.body(at)[0]
-        found: Array = first + shares[:, None, None] * (last - first)
-        return found
+        return first + shares[:, None, None] * (last - first)
 
 
 class LinearRod(RodShape):
@@ -481,8 +480,7 @@ class LinearRod(RodShape):
         R, C = self.rotation[node], self.sections.compliance[segment]
         n = self.force_far[node] + loads.force[j] / 2
         wrench = np.concatenate([R.T @ n, R.T @ self.moment_far[node]])
-        turn: Array = R @ (self.sections.strain[segment] + C @ wrench)[3:]
-        return turn
+        return R @ (self.sections.strain[segment] + C @ wrench)[3:]
 
     def _per_pressure(self, condition: Condition, moment: Array, weight: Array) -> Array:
         """Return changes (N, 9, n) of the steps' ends by pressures, by finite differences."""
@@ -528,8 +526,7 @@ def rotations(q: Array) -> Array:
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
-    found: Array = np.moveaxis(np.array(rows), 2, 0)
-    return found
+    return np.moveaxis(np.array(rows), 2, 0)
 
 
 def turns_between(first: Array, second: Array) -> Array:
@@ -538,8 +535,7 @@ def turns_between(first: Array, second: Array) -> Array:
     a, b = second[:, :1], second[:, 1:]
     real = (a * w)[:, 0] + (b * v).sum(1)
     imaginary = w * b - a * v - np.cross(b, v)
-    turn: Array = 2 * imaginary / real[:, None]
-    return turn
+    return 2 * imaginary / real[:, None]
 
 
 def turned(q: Array, turn: Array) -> Array:
@@ -548,5 +544,4 @@ def turned(q: Array, turn: Array) -> Array:
     w, v = q[:, :1], q[:, 1:]
     real = w[:, 0] - (half * v).sum(1)
     found = np.concatenate([real[:, None], v + w * half + np.cross(half, v)], axis=1)
-    unit: Array = found / np.linalg.norm(found, axis=1, keepdims=True)
-    return unit
+    return found / np.linalg.norm(found, axis=1, keepdims=True)

@@ -120,5 +120,4 @@ def _slide(force: Array, most: float, K: Array) -> Array:
             break
         slope = float(left @ (stiffness / (1 + share * stiffness) * left)) / size**3
         share = max(share + (1 / most - 1 / size) / slope, 0.0)
-    found: Array = -share * (axes @ left)
-    return found
+    return -share * (axes @ left)

@@ -60,8 +60,7 @@ class ContactSurface:
         """Return distances (k,) of points (k, 3), in m."""
         if self._functions is None:
             return self._measured.distances(points).values
-        largest: Array = self._of_pieces(points).max(axis=0)
-        return largest
+        return self._of_pieces(points).max(axis=0)
 
     def _of_pieces(self, points: Array) -> Array:
         """Return distances (pieces, k) of points (k, 3)."""

@@ -96,10 +96,9 @@ class StiffnessMeasure(Measure):
 
     def stiffness_gradient(self, robot: Any, pressures: Array) -> Array | None:
         """See `Measure.stiffness_gradient`."""
-        gradient: Array = robot.stiffness_gradient(
+        return robot.stiffness_gradient(
             pressures, self.direction, self.kind, self.boundary, self.frame
         )
-        return gradient
 
 
 class _ValuedMeasure(StiffnessMeasure):

@@ -256,8 +256,7 @@ class OpenRegulatorSupply(PressureSupply):
         return self._measured(self._report())
 
     def _measured(self, status: Status) -> Array:
-        readings: Array = np.array(status.readings, dtype=float)[self._outputs] * UNIT
-        return readings
+        return np.array(status.readings, dtype=float)[self._outputs] * UNIT
 
     def _check_held(self) -> None:
         status = self._report()
