@@ -354,10 +354,6 @@ TranslationalStiffness = Annotated[
     float, _TRANSLATIONAL, _reader(_TRANSLATIONAL), _writer(_TRANSLATIONAL), _FINITE
 ]
 """In N/m."""
-RotationalStiffness = Annotated[
-    float, _ROTATIONAL, _reader(_ROTATIONAL), _writer(_ROTATIONAL), _FINITE
-]
-"""In N m/rad."""
 Duration = Annotated[float, _DURATION, _reader(_DURATION), _writer(_DURATION), _FINITE]
 """In s."""
 Frequency = Annotated[float, _FREQUENCY, _reader(_FREQUENCY), _writer(_FREQUENCY), _FINITE]
