@@ -222,6 +222,10 @@ def test_files_page_shows_a_log_that_can_be_read(tmp_path: Path) -> None:
         assert f"`{column}`" in page or re.match(r"pm?3_pa", column)
 
 
+def test_contact_page_example_prints_what_stands_below_it() -> None:
+    assert run_examples((ROOT / "docs" / "contact.md").read_text(encoding="utf-8"), "contact.md")
+
+
 def solve_pressure(*arguments: str) -> str:
     command = Path(sys.executable).with_name("solve-pressure")
     done = subprocess.run(
