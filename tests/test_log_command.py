@@ -62,6 +62,13 @@ def test_export_writes_log_v1_beside_the_run(
     assert ((log.time > 2.01) & (log.time < 2.46)).sum() > 5
 
 
+def test_a_recording_of_a_run_can_be_checked_but_is_no_log(run_file: Path, capsys: Any) -> None:
+    assert main(["check", str(run_file)]) == 0
+    assert "a log file without mistakes" in capsys.readouterr().out
+    assert main(["validate", "--robot", "stiff-flop-1", str(run_file)]) == 2
+    assert "'stiffopt log export' reads those of runs" in " ".join(capsys.readouterr().err.split())
+
+
 def test_export_overwrites_nothing(run_file: Path, tmp_path: Path, capsys: Any) -> None:
     out = tmp_path / "out.csv"
     assert main(["log", "export", str(run_file), "--csv", "--out", str(out), "--quiet"]) == 0
