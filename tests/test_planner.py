@@ -237,6 +237,31 @@ def test_plans_lead_to_another_configuration_slowly_and_on_the_target(robot):
     np.testing.assert_allclose(plan.pressures, stiffest, atol=100.0)
 
 
+def motions(robot, p, q):
+    """How far each channel moves the tip between two sets of pressures (n,), in m."""
+    jacobian = robot.tip_jacobian(0.5 * (p + q))[:3]
+    return np.linalg.norm(jacobian, axis=0) * np.abs(q - p)
+
+
+def test_an_arm_that_vibrates_goes_to_its_target_first_and_becomes_stiff_after(robot):
+    first = request(robot)
+    wanted = np.array(first.target.position[:2])
+    stiffest = Planning(robot).plan(first).pressures
+    here = 2 * PRESSURES - stiffest  # the straight line from here leads through softer ones
+    planning = Planning(robot)
+    plan = planning.plan(replace(first, here=here))
+    assert np.linalg.norm(tip(robot, plan.pressures)[1][:2] - wanted) < 1e-5
+    assert motions(robot, here, plan.pressures).max() < 0.1 * motions(robot, here, stiffest).max()
+    moved = []
+    for _ in range(400):
+        before, plan = plan.pressures, planning.plan(replace(first, here=here))
+        moved.append(motions(robot, before, plan.pressures).max())
+        assert np.linalg.norm(tip(robot, plan.pressures)[1][:2] - wanted) < 1e-5
+    assert max(moved) < 6e-4
+    assert sum(moved) > 5e-3
+    np.testing.assert_allclose(plan.pressures, stiffest, atol=100.0)
+
+
 def test_target_that_cannot_be_reached_has_a_plan_that_says_why(robot):
     asked = request(robot)
     far = asked.target.model_copy(update={"position": (0.2, 0.0, None)})

@@ -2,9 +2,11 @@
 
 The target is moved back by the tip's offset; the model has to reach the result. The optimiser then
 finds the pressures that are stiffest on the real arm, except for errors of the modelled stiffness.
-A plan is the local optimum next to the last plan. When the offset has changed much and the arm is
-at rest, all configurations are searched again; the arm changes to another one only if that is
-clearly better. For a target that is out of reach, the plan is the nearest configuration.
+An arm that vibrates first goes to a new target by the least motion of each channel, and from there
+slowly to the stiffest pressures. A plan is the local optimum next to the last plan. When the offset
+has changed much and the arm is at rest, all configurations are searched again; the arm changes to
+another one only if that is clearly better. For a target that is out of reach, the plan is the
+nearest configuration.
 
 While the tip presses on something, plans follow the target by the least change of pressures
 instead: the error of the model, from which a force must be told, is another one elsewhere, and an
@@ -67,7 +69,8 @@ class PlanRequest:
     adapted: Adapted | None = None  # the model that the offset refers to; None: the robot file's
     stay: bool = False  # whether to follow the target by the least change of the last pressures
     step: float = math.inf  # largest change of a pressure from the last plan, in Pa
-    # effective pressures (n,) of the reference now, whose modes are wanted, in Pa; empty: none are
+    # effective pressures (n,) of the reference now, in Pa, of an arm that vibrates: its modes there
+    # are wanted, and a new target is reached from there by the least motion; empty: neither
     here: Array = field(default_factory=lambda: np.zeros(0))
 
 
@@ -220,11 +223,13 @@ class Planning:
         if solution is not None and solution.pressures is not None:
             pressures = np.array(solution.pressures, dtype=float)
             stiffness = math.nan if solution.stiffness is None else float(solution.stiffness)
-            if last is not None and not request.search:
+            if last is None or request.search:
+                pressures = self._tip_first(request, task, target, pressures)
+            else:
                 if self._change is None and self._is_distant(last, pressures, target):
                     self._change = last.pressures, 0.0, pressures
                 if self._change is not None:
-                    pressures = self._toward(pressures, target)
+                    pressures = self._toward(request, last, pressures, target)
             self._last = Plan(
                 request.serial, pressures, request.offset, asked, True, stiffness, "",
                 adapted=request.adapted,
@@ -288,15 +293,40 @@ class Planning:
         reach = t.neighbourhood + t.neighbourhood_per_metre * displacement
         return float(np.max(np.abs(pressures - last.pressures))) > reach
 
-    def _toward(self, end: Array, target: Target) -> Array:
+    def _tip_first(
+        self, request: PlanRequest, task: Task, target: Target, stiffest: Array
+    ) -> Array:
+        """Return the pressures (n,) to which the arm goes before the stiffest ones (n,).
+
+        They bring the tip to its target by the least motion of each channel. On the straight line
+        to the stiffest ones the channels move the tip against each other, by several times its
+        way and as fast; so would the fault of one. The arm goes on from there as to another
+        configuration.
+        """
+        if not request.here.size or self._ways is not None:  # the way to the stiffest is checked
+            return stiffest
+        found, distance, angle = self._search.find(
+            target, self._limits, request.here, least_motion=True
+        )
+        tolerance = task.target.tolerance
+        if distance > tolerance.position or angle > tolerance.angle:
+            return stiffest
+        self._change = found, 0.0, stiffest
+        return found
+
+    def _toward(self, request: PlanRequest, last: Plan, end: Array, target: Target) -> Array:
         """Return pressures (n,) on the way to another configuration (n,): next to the target.
 
         On the straight line to it the tip would leave its target by millimetres, and by more in a
-        quick change, as feedback needs time for an offset that differs between them.
+        quick change, as feedback needs time for an offset that differs between them. So the change
+        is slower while the offset changes.
         """
         assert self._change is not None
         begin, share, _ = self._change
-        share += self._tuning.change_step / max(float(np.abs(end - begin).max()), _SLACK)
+        moved = self._tip.at(last.pressures).jacobian[:3] * (end - begin)
+        drift = float(np.linalg.norm((request.offset - last.offset)[:3]))
+        step = self._tuning.change_step * min(1.0, self._tuning.at_rest / max(drift, 1e-9))
+        share += step / max(float(np.linalg.norm(moved, axis=0).max()), step)
         if share >= 1:
             self._change = None
             return end
@@ -409,12 +439,18 @@ class NearestSearch:
         self._errors = TipErrors()
 
     def find(
-        self, target: Target, bounds: tuple[Array, Array], start: Array
+        self,
+        target: Target,
+        bounds: tuple[Array, Array],
+        start: Array,
+        *,
+        least_motion: bool = False,
     ) -> tuple[Array, float, float]:
         """Return a local optimum between the bounds (n,), from a start (n,), in Pa.
 
         Returns pressures (n,), and the position and angle errors there, in m and rad. The target is
-        the model's.
+        the model's. Of several optima it is the one with the least change of the pressures, or with
+        `least_motion` that of the tip by each channel, to first order.
         """
         tuning = self._tuning
         low, high = bounds[0] / _BAR, bounds[1] / _BAR
@@ -424,9 +460,13 @@ class NearestSearch:
             x, found = low, self._errors.weighted(target, self._tip.at(low * _BAR), self._lever)
         error, rows, distance, angle = found
         no_rows, max_step = np.zeros((0, len(x))), tuning.max_step / _BAR
+        effort = np.eye(len(x))
+        if least_motion:
+            squares = (self._tip.at(x * _BAR).jacobian[:3] ** 2).sum(axis=0)
+            effort = np.diag(squares / squares.mean())
         for _ in range(tuning.iterations):
             J = rows * _BAR
-            H = J.T @ J + tuning.regularisation**2 * np.eye(len(x))
+            H = J.T @ J + tuning.regularisation**2 * effort
             lower, upper = np.maximum(low - x, -max_step), np.minimum(high - x, max_step)
             step, *_ = daqp.solve(H * 1e6, J.T @ error * 1e6, no_rows, upper, lower)
             if step is None or not np.isfinite(step).all():
