@@ -28,6 +28,7 @@ from stiffopt.control.interface import ControlOutput, Notice, SampleCounts
 from stiffopt.control.linearised_tip import LeaningTip
 from stiffopt.control.observer import ArmObserver
 from stiffopt.control.planner import InlinePlanner, ProcessPlanner
+from stiffopt.control.planning import Plan
 from stiffopt.control.posture import PostureCourse
 from stiffopt.control.pressing import Phase, Pressing
 from stiffopt.control.reference import Reference
@@ -155,6 +156,9 @@ class TipController:
         self._windows.begin()
         self._led_to: Target | None = None  # present target of a trajectory of pressures
         self._ways.clear()
+        self._timed: Plan | None = None  # the plan of the next number
+        # share of the slew that the reference may take on the tip's way to a new target
+        self._share_to_target = math.inf
 
     def set_task(self, task: Task) -> None:
         """Pursue a task; see `Controller.set_task`."""
@@ -472,7 +476,26 @@ class TipController:
         )  # fmt: skip
         if isinstance(course, Bracing):
             return self._brace_planned(course, found, now)
+        self._take_time(replanner.plan)
+        reference.slew_share = np.fmin(reference.slew_share, self._share_to_target)
         return found
+
+    def _take_time(self, plan: Plan | None) -> None:
+        """Let the reference take a while for the tip's way to a new target.
+
+        That way is short in the space of pressures. If it were faster, stopping would leave more
+        vibration, and a channel that does not follow would move the tip off its way farther.
+        """
+        if plan is None or plan is self._timed:
+            return
+        if plan.tip_first:
+            tuning, n = self._tuning.reference, len(plan.pressures)
+            way = np.maximum(np.abs(plan.pressures - self._reference.goal[:n]), tuning.there)
+            least = tuning.periods_to_target * 2 * math.pi / self._arm.tip.omega
+            self._share_to_target = float((way / self._slew).max()) / least
+        elif self._timed is None or plan.target != self._timed.target:
+            self._share_to_target = math.inf
+        self._timed = plan
 
     def _brace_planned(self, course: Bracing, found: Array | None, now: float) -> Array | None:
         """Begin a brace once it is planned; until then the arm stays where it is."""

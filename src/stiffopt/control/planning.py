@@ -95,6 +95,7 @@ class Plan:
     estimate: Estimate | None = None  # of the model's numbers, if it is new
     approach: BraceApproach | None = None  # from rest until the arm leans on objects there
     bent: BentMode | None = None  # modes at the request's `here`, if they are new
+    tip_first: bool = False  # whether the arm goes on from there to the stiffest pressures
 
 
 class Planning:
@@ -233,6 +234,7 @@ class Planning:
             self._last = Plan(
                 request.serial, pressures, request.offset, asked, True, stiffness, "",
                 adapted=request.adapted,
+                tip_first=self._change is not None and self._change[1] == 0,
             )  # fmt: skip
         else:
             self._last = self._nearest(request, task, target, distant=self._refused > refused)
@@ -301,9 +303,10 @@ class Planning:
         They bring the tip to its target by the least motion of each channel. On the straight line
         to the stiffest ones the channels move the tip against each other, by several times its
         way and as fast; so would the fault of one. The arm goes on from there as to another
-        configuration.
+        configuration. On a rig with a scene, the way to the stiffest ones is the one that was
+        checked; a press begins at them.
         """
-        if not request.here.size or self._ways is not None:  # the way to the stiffest is checked
+        if not request.here.size or self._ways is not None or task.press is not None:
             return stiffest
         found, distance, angle = self._search.find(
             target, self._limits, request.here, least_motion=True

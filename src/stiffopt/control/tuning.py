@@ -123,6 +123,9 @@ class ReferenceTuning:
     rigid_rate: float = 100.0
     # share of the slew that the reference may take; the rest is for feedback
     slew_share: float = 0.9
+    # least time of the tip's way to a new target, before the arm becomes stiff, in periods of the
+    # vibration
+    periods_to_target: float = 0.5
     # motion over which the model on the reference is not linearised again; see `LinearisedTip`
     model_range: float = 0.07
     # time by which a doubted motion of an arm that vibrates is taken back, in s
