@@ -19,6 +19,7 @@ from stiffopt.control.planning import Planning, PlanRequest, model_target
 from stiffopt.control.vibration import BentMode
 from stiffopt.errors import StiffoptError
 from stiffopt.optimise.goal import StiffnessGoal, StiffnessMeasure
+from stiffopt.optimise.press import Press
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import PressureRange, Task
 
@@ -252,6 +253,7 @@ def test_an_arm_that_vibrates_goes_to_its_target_first_and_becomes_stiff_after(r
     plan = planning.plan(replace(first, here=here))
     assert np.linalg.norm(tip(robot, plan.pressures)[1][:2] - wanted) < 1e-5
     assert motions(robot, here, plan.pressures).max() < 0.1 * motions(robot, here, stiffest).max()
+    assert plan.tip_first
     moved = []
     for _ in range(400):
         before, plan = plan.pressures, planning.plan(replace(first, here=here))
@@ -259,6 +261,19 @@ def test_an_arm_that_vibrates_goes_to_its_target_first_and_becomes_stiff_after(r
         assert np.linalg.norm(tip(robot, plan.pressures)[1][:2] - wanted) < 1e-5
     assert max(moved) < 6e-4
     assert sum(moved) > 5e-3
+    assert not plan.tip_first
+    np.testing.assert_allclose(plan.pressures, stiffest, atol=100.0)
+    again = planning.plan(replace(first, search=True, here=stiffest))
+    np.testing.assert_allclose(again.pressures, stiffest, atol=100.0)  # not back to softer ones
+
+
+def test_a_press_begins_at_the_stiffest_pressures(robot):
+    first = request(robot)
+    stiffest = Planning(robot).plan(first).pressures
+    press = Press(force=0.03, direction=(1, 0, 0))
+    task = first.task.model_copy(update={"press": press})
+    plan = Planning(robot).plan(replace(first, task=task, here=2 * PRESSURES - stiffest))
+    assert not plan.tip_first
     np.testing.assert_allclose(plan.pressures, stiffest, atol=100.0)
 
 
