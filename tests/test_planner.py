@@ -268,11 +268,10 @@ def test_an_arm_that_vibrates_goes_to_its_target_first_and_becomes_stiff_after(r
 
 
 def test_a_press_begins_at_the_stiffest_pressures(robot):
-    first = request(robot)
-    stiffest = Planning(robot).plan(first).pressures
-    press = Press(force=0.03, direction=(1, 0, 0))
-    task = first.task.model_copy(update={"press": press})
-    plan = Planning(robot).plan(replace(first, task=task, here=2 * PRESSURES - stiffest))
+    first, press = request(robot), Press(force=0.03, direction=(1, 0, 0))
+    pressing = replace(first, task=first.task.model_copy(update={"press": press}))
+    stiffest = Planning(robot).plan(pressing).pressures
+    plan = Planning(robot).plan(replace(pressing, here=2 * PRESSURES - stiffest))
     assert not plan.tip_first
     np.testing.assert_allclose(plan.pressures, stiffest, atol=100.0)
 
