@@ -299,7 +299,7 @@ class PlanningTuning:
     # successive plans that refuse an optimum in another configuration before one takes it
     patience: int = 20
     # motion of the tip by one channel from plan to plan on the way to another configuration, in m
-    change_step: float = 5e-4
+    change_step: float = 3e-4
     bent_step: float = 3e3  # change of a pressure after which the modes are new, in Pa
     position_tolerance: float = 1e-5  # of plans, in m
     angle_tolerance: float = 1e-3  # of plans, in rad
