@@ -379,6 +379,53 @@ def test_a_motion_from_a_brace_lets_go_on_the_way_to_rest(solution, monkeypatch)
         found.trajectory()
 
 
+FREE = TASK.unbraced.model_copy(update={"scene": None})
+FAR = stiffopt.Scene(
+    objects=[{"name": "ball", "sphere": {"centre": (0.06, 0.06, 0.1), "radius": 7e-3}}]
+)
+
+
+@pytest.mark.parametrize("leaves", [True, False])
+def test_a_motion_with_a_brace_has_one_scene_with_what_the_arm_leans_on(leaves):
+    def plan(other, **options):
+        ends = (TASK, other) if leaves else (other, TASK)
+        return stiffopt.plan_motion(ROBOT, *ends, slew=2e5, timeout=None, **options)
+
+    with pytest.raises(InputError, match="have different scenes"):
+        plan(FREE.model_copy(update={"scene": FAR}))
+    with pytest.raises(InputError, match="no object 'post' in the scene; it has 'ball'"):
+        plan(np.zeros(6), scene=FAR)
+    with pytest.raises(InputError, match="scene must be a Scene"):
+        plan(np.zeros(6), scene="far")
+    same = TASK.scene.model_copy(update={"source": None})
+    for other in (FREE, FREE.model_copy(update={"scene": same})):
+        assert plan(other).leans[0 if leaves else -1]
+
+
+@pytest.mark.parametrize("leaves", [True, False])
+def test_a_motion_with_a_brace_has_its_load(leaves):
+    load = stiffopt.Load(force=(0.05, 0.0, 0.0))
+    heavy = FREE.model_copy(update={"load": load})
+    for other, given in ((heavy, None), (FREE, load), (np.zeros(6), load)):
+        ends = (TASK, other) if leaves else (other, TASK)
+        with pytest.raises(InputError, match="has that task's load"):
+            stiffopt.plan_motion(ROBOT, *ends, slew=2e5, load=given)
+
+
+def test_the_command_leaves_a_brace_in_its_own_scene(tmp_path, capsys):
+    braced, other = "problems/braced/post.yaml", tmp_path / "other.yaml"
+    text = "format: stiffopt-task/1\nrobot: stiff-flop-2\n"
+    text += "target: {position: [30 mm, -10 mm, 190 mm]}\n"
+    other.write_text(text)
+    arguments = ["plan", "--from", braced, "--to", str(other), "--slew", "2 bar/s"]
+    assert main(arguments) == 0
+    assert "it leans on 'post'" in " ".join(capsys.readouterr().out.split())
+    ball = "{name: ball, sphere: {centre: [60 mm, 60 mm, 100 mm], radius: 7 mm}}"
+    other.write_text(f"{text}scene: {{objects: [{ball}]}}\n")
+    assert main(arguments) == 2
+    assert "have different scenes" in " ".join(capsys.readouterr().err.split())
+
+
 def test_the_picture_of_a_motion_shows_the_arm_in_contact(solution):
     """The drawn centre line at the end is the braced one, and its force is labelled."""
     found = stiffopt.plan_motion(ROBOT, np.zeros(6), [TASK], slew=2e5)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import importlib
 import subprocess
 import sys
 from pathlib import Path
@@ -125,6 +126,8 @@ def test_names_are_imported_from_where_the_stub_has_them() -> None:
     assert len(in_stub) > 70
     assert in_stub == stiffopt._MODULE_OF
     assert set(in_stub) | {"__version__"} == set(stiffopt.__all__)
+    for name, module in in_stub.items():  # and no name of the package itself hides one of them
+        assert getattr(stiffopt, name) is getattr(importlib.import_module(str(module)), name)
 
 
 def test_modules_need_no_import_of_their_own() -> None:

@@ -170,6 +170,9 @@ def test_the_command_refuses_what_it_cannot_do(write: Write, tmp_path: Path) -> 
     result = run("--suggest-post", str(tmp_path / "post.png"), "--post-force", "0 N", path)
     assert result.exit_code == 2
     assert "--post-force: must be greater than 0, not '0 N'" in result.stderr
+    result = run("--suggest-post", str(tmp_path / "post.png"), "--post-force", "", path)
+    assert result.exit_code == 2
+    assert "--post-force" in result.stderr
     result = run("--post-force", "0.1 N", path)
     assert result.exit_code == 2
     assert "--post-force: needs --suggest-post" in result.stderr

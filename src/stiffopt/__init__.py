@@ -6,17 +6,17 @@ model to recordings, `open_rig` commands an arm, and `Client` talks to the daemo
 at its task. All quantities are in SI units.
 """
 
+import pkgutil
 import re
 from importlib import import_module
 from importlib.util import find_spec
-from pathlib import Path
 from typing import Any
 
 __version__ = "0.1.0"
 
 # Names are imported at their first use: NumPy, CasADi and pydantic take a quarter of a second, too
 # long for `--help` or a wrong option. The stub says where they come from.
-_STUB = Path(__file__).with_name("__init__.pyi").read_text(encoding="utf-8")
+_STUB = (pkgutil.get_data(__name__, "__init__.pyi") or b"").decode()
 _MODULE_OF = {name: module for module, name in re.findall(r"from (\S+) import (\w+) as", _STUB)}
 __all__ = sorted((*_MODULE_OF, "__version__"))
 

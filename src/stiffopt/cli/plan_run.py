@@ -86,17 +86,17 @@ class PlanCommand:
             each if isinstance(each, Task) else _pressures(robot, option, each)
             for option, each in zip(["--from"] + ["--to"] * len(self.goals), given, strict=True)
         ]
-        own = [each.scene for each in (*ends[1:], ends[0]) if isinstance(each, Task)]
-        scene = next((each for each in own if each is not None), None)
-        if self.scene is not None:
-            scene = load_scene(self.scene)
+        replacing = None if self.scene is None else load_scene(self.scene)
+        goals_first = [each for each in (*ends[1:], ends[0]) if isinstance(each, Task)]
+        scenes = (each.scene for each in goals_first if each.scene is not None)
+        scene = next(scenes, None) if replacing is None else replacing
         clearance = None
         if self.clearance is not None:
             clearance = quantity("--clearance", self.clearance, "m", "length")
             if clearance < 0:
                 raise InputError(f"--clearance: must be at least 0, not {shown(self.clearance)}")
         solution = plan_motion(
-            robot, ends[0], ends[1:], scene=scene, clearance=clearance, slew=self._slew(robot),
+            robot, ends[0], ends[1:], scene=replacing, clearance=clearance, slew=self._slew(robot),
             seed=self.seed, timeout=quantity("--timeout", self.timeout, "s", "time"),
         )  # fmt: skip
         if scene is not None and clearance is not None:

@@ -96,7 +96,8 @@ def _largest_force(suggest_post: str | None, post_force: str | None) -> float | 
         if post_force is not None:
             raise InputError("--post-force: needs --suggest-post FILE.png, whose post it is for")
         return None
-    force = quantities.quantity("--post-force", post_force or "0.3 N", "N", "force")
+    given = "0.3 N" if post_force is None else post_force
+    force = quantities.quantity("--post-force", given, "N", "force")
     if not force > 0:
         raise InputError(f"--post-force: must be greater than 0, not {shown(post_force)}")
     return force

@@ -347,9 +347,14 @@ class DetectionSettings:
     few_channels : largest number of channels of which all orders are tried.
     off, frame : mean error of a log, in lengths of the arm, beyond which its set-up is suspected to
         differ from the calibration's; and the share of it that a correction may leave.
-    region, within : so is a log with less than a share `within` of its tips in the region of this
-        probability.
+    region, within : a remark reports a log with less than a share `within` of its tips in the
+        region of this probability.
     channel_rows : number of rows with which orders of channels are compared in a log that is off.
+    poses, apart : smallest number of poses by which a frame is judged, since two can be moved to
+        fit any others; and their distance, as a share of the range of permitted pressures.
+    rest : largest pressure of a pose near rest, as a share of that range.
+    in_line : spread of poses across a line, as a share of that along it, up to which they count as
+        poses on a line.
     known_turn : spread of the tip, in lengths of the arm, that determines a turn.
     ridge : added to the diagonal of the normal equations of regressions.
     clock_rows : number of rows in the regression for the clocks.
@@ -384,6 +389,10 @@ class DetectionSettings:
     region: float = 0.99
     within: float = 0.5
     channel_rows: int = 60
+    poses: int = 4
+    apart: float = 0.1
+    rest: float = 0.15
+    in_line: float = 0.3
     known_turn: float = 0.02
     ridge: float = 0.01
     clock_rows: int = 600

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from stiffopt.arrays import Array
 from stiffopt.errors import StiffoptError
-from stiffopt.identify.detection import Hypothesis, later, of_channels, replaced, two_clocks
+from stiffopt.identify.detection import Hypothesis, of_channels, replaced
+from stiffopt.identify.discrepancy import centres
 from stiffopt.identify.error_model import held_for, in_turn, is_moving
 from stiffopt.identify.fit import fit
 from stiffopt.identify.problem import CalibrationProblem, Noise, Predicted, Sample
@@ -30,7 +31,6 @@ from stiffopt.identify.setup import (
     recordings_of,
     sampled,
 )
-from stiffopt.identify.tracker_faults import norms
 from stiffopt.identify.unknowns import Unknowns
 from stiffopt.logs import StiffnessTable
 from stiffopt.model.compliance import Boundary
@@ -108,61 +108,64 @@ def _with_doubt(found: Comparison, length: float) -> Comparison:
 def _put_right(setup: Setup, found: tuple[Comparison, ...]) -> tuple[Comparison, ...]:
     """Return comparisons in which logs that are off only by their set-up are corrected.
 
-    Two clocks are one free number, and another order of channels, or a line, is none. So they are
-    believed instead of a moved frame if they leave clearly less.
+    Another order of the channels, or a line that is dead or shared, has no free number, and a
+    moved frame has six. So it is tried first.
     """
-    result = list(found)
-    for correct in (_with_frame_found, _with_clock_found, _with_channels_found):
-        recordings, remarks = list(setup.recordings), [""] * len(found)
+    recordings, remarks = list(setup.recordings), [""] * len(found)
+    for correct in (_with_channels_found, _with_frame_found):
+        tried, words = list(recordings), [""] * len(found)
         for i, each in enumerate(found):
-            if _is_off(each, setup.description.length):
-                recordings[i], remarks[i] = correct(setup, recordings[i], each)
-        if not any(remarks):
+            if each.errors.mean > DETECTION.off * setup.description.length and not remarks[i]:
+                tried[i], words[i] = correct(setup, recordings[i], each)
+        if not any(words):
             continue
-        again = compare(Setup.of(setup.description, recordings, (), setup.settings))
+        again = compare(Setup.of(setup.description, tried, (), setup.settings))
         for i, (before, after) in enumerate(zip(found, again, strict=True)):
-            limit = DETECTION.frame * before.errors.mean
-            if result[i] is not before:
-                limit = min(limit, DETECTION.tie * result[i].errors.mean)
-            if remarks[i] and after.errors.mean <= limit:
-                remark = (
-                    f"{remarks[i]}; the mean error is {after.errors.mean * 1e3:.1f} mm instead of "
-                    f"{before.errors.mean * 1e3:.1f} mm"
-                )
-                result[i] = replace(after, remarks=(*after.remarks, remark))
+            frame = correct is _with_frame_found
+            if words[i] and _explains(setup.description, frame, before, after, words[i]):
+                recordings[i], remarks[i] = tried[i], words[i]
+    if not any(remarks):
+        return found
+    result = list(compare(Setup.of(setup.description, recordings, (), setup.settings)))
+    for i, (before, after) in enumerate(zip(found, result, strict=True)):
+        if remarks[i]:
+            remark = (
+                f"{remarks[i]}; the mean error is {after.errors.mean * 1e3:.1f} mm instead of "
+                f"{before.errors.mean * 1e3:.1f} mm"
+            )
+            result[i] = replace(after, remarks=(*after.remarks, remark))
     return tuple(result)
+
+
+def _explains(
+    description: RobotDescription, frame: bool, before: Comparison, after: Comparison, words: str
+) -> bool:
+    """Whether a correction, of the frame or else of the channels, explains what a log is off by."""
+    if after.errors.mean > DETECTION.frame * before.errors.mean:
+        return False
+    then, now = before.errors.angle, after.errors.angle
+    if then is not None and now is not None and now > then:
+        return False  # rather a sensor that sits elsewhere on the tip
+    return not frame or _moves_all(description, before, after, words)
 
 
 def _with_frame_found(
     setup: Setup, recording: Recording, found: Comparison
 ) -> tuple[Recording, str]:
-    """Return a recording moved to where the robot predicts its tip, and a remark on that."""
-    if "axes" in setup.settings.keep:
+    """Return a recording moved to where the robot predicts its tip, and a remark on that.
+
+    It is judged by different poses: where a log holds one pose for long, a motion of the frame
+    could replace whatever the model has wrong there.
+    """
+    poses = _different(setup.description, found)
+    if "axes" in setup.settings.keep or len(poses) < DETECTION.poses:
         return recording, ""
-    moved, words = replaced(recording, found.measured, found.predicted, setup.description.length)
+    measured, predicted = found.measured[poses], found.predicted[poses]
+    moved, words = replaced(recording, measured, predicted, setup.description.length)
     return moved, (
         f"the frame of this log was defined anew: its poses are {words} (--keep axes leaves them); "
         "a log of another arm or with another order of channels may look so too"
     )
-
-
-def _with_clock_found(
-    setup: Setup, recording: Recording, found: Comparison
-) -> tuple[Recording, str]:
-    """Return a recording with the pressures on the tip's clock, and a remark on that."""
-    if "clock" in setup.settings.keep:
-        return recording, ""
-    time = found.time
-    longest = min(DETECTION.clock_most, DETECTION.clock_share * float(time[-1] - time[0]))
-
-    def miss(shift: float) -> float:
-        moved = [np.interp(time - shift, time, column) for column in found.predicted.T]
-        return float(np.nanmedian(norms(np.column_stack(moved) - found.measured)))
-
-    step = 2 * longest / (DETECTION.clock_shifts - 1)
-    near = min(np.linspace(-longest, longest, DETECTION.clock_shifts), key=miss)
-    shift = float(min(np.linspace(near - step, near + step, 21), key=miss))
-    return later(recording, shift), f"{two_clocks(shift)} (--keep clock leaves them)"
 
 
 def _with_channels_found(
@@ -184,12 +187,45 @@ def _with_channels_found(
         return float(np.median(np.linalg.norm((setup.base @ poses @ point)[:, :3] - tip, axis=1)))
 
     tried = [each for each in of_channels(description, 1) if each.kind not in setup.settings.keep]
-    if not tried:
-        return recording, ""
-    best = min(tried, key=miss)
+    ranked = sorted((miss(each), k) for k, each in enumerate(tried))
+    if len(ranked) < 2 or ranked[0][0] > DETECTION.tie * ranked[1][0]:
+        return recording, ""  # not clearly better than the next one
+    best = tried[ranked[0][1]]
     (corrected,) = best.applied([recording], low)
     told = best.told(description, [recording.name])
     return corrected, f"{told} (--keep {best.kind} leaves that as it was recorded)"
+
+
+def _moves_all(
+    description: RobotDescription, before: Comparison, after: Comparison, remark: str
+) -> bool:
+    """Whether the motion of a frame explains the error at all poses.
+
+    Poses on a line, as in one rise from rest, could be turned about the pose at rest to fit any
+    model. There a frame that was moved, and not only turned by quarters, has to move all of them:
+    none is predicted well without the motion.
+    """
+    poses = _different(description, before)
+    then, now = before.distance[poses], after.distance[poses]
+    predicted = before.predicted[poses]
+    spread = np.linalg.svd(predicted - predicted.mean(axis=0), compute_uv=False)
+    in_line = spread[1] < DETECTION.in_line * spread[0]
+    least = np.min if in_line and "moved by" in remark else np.mean
+    return bool(now.mean() <= DETECTION.frame * least(then))
+
+
+def _different(description: RobotDescription, found: Comparison) -> NDArray[np.intp]:
+    """Return rows of a comparison whose tip was measured, at different effective pressures.
+
+    None if none of them is near rest, where the pose of every arm is known: elsewhere a frame could
+    replace a wrong modulus.
+    """
+    seen = np.flatnonzero(np.isfinite(found.distance))
+    span = float(np.max(np.subtract(description.pressure_max, description.pressure_min)))
+    pressures = found.effective[seen]
+    if not len(seen) or np.abs(pressures).max(axis=1).min() > DETECTION.rest * span:
+        return seen[:0]
+    return np.asarray(seen[centres(pressures, DETECTION.apart * span, DETECTION.rows)])
 
 
 def compare(

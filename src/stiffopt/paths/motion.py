@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from stiffopt.arrays import Array
 from stiffopt.display import display_units
-from stiffopt.errors import EquilibriumError, InputError, StoppedError
+from stiffopt.errors import EquilibriumError, InputError, StoppedError, shown
 from stiffopt.model.compiled import Stopwatch
 from stiffopt.model.compliance import stiffness_of
 from stiffopt.model.contact.equilibrium import ContactEquilibrium
@@ -44,6 +44,7 @@ from stiffopt.paths.rates import least_times
 from stiffopt.paths.shortening import rounded, shortened
 from stiffopt.paths.solution import PathSolution
 from stiffopt.paths.tree_search import TreeSearch
+from stiffopt.schema import BadKeyError
 
 _NEARLY_AS_STIFF = 0.95  # share of the best stiffness from which no stiffer goal is sought
 _MORE = 50  # motions checked for a stiffer goal, in addition to as many as for the first
@@ -89,14 +90,15 @@ def plan_motion(
         (`stiffopt.paths.leaning`); an arm that touches such an object at the
         start or at rest stays in contact on the way there.
     scene : Scene, optional
-        Replaces that of the tasks.  Without any, the way is straight.
+        Replaces that of the tasks.  Without any, the way is straight.  With a brace, it must have
+        the objects to lean on; if it is not given, tasks may not have different scenes.
     clearance : float, optional
         Required of the body, in m; by default that of the scene.  For a calibrated robot, the
         uncertainty of the tip is added (`Manipulator.tip_uncertainty`).
     slew : float or (n,), optional
         Largest rates of change in Pa/s, in addition to the robot's; one of the two must be known.
     load : Load, optional
-        At the tip all the way; replaces that of the tasks.
+        At the tip all the way; replaces that of the tasks.  With a brace, it must be that task's.
     seed : int
         Of the search.  The same seed gives the same motion, unless time ended the search.
     timeout : float, optional
@@ -113,7 +115,8 @@ def plan_motion(
     Raises
     ------
     InputError
-        An argument is invalid, pressures are outside the robot's limits, or tasks differ in load.
+        An argument is invalid, pressures are outside the robot's limits, or tasks differ in load,
+        or with a brace in scene.
     MissingExtraError
         A search is needed, and OMPL is not installed.
     """
@@ -124,8 +127,9 @@ def plan_motion(
             raise InputError(
                 "a task with 'brace' must be the only goal of a motion, or its start, and not both"
             )
-        task = braced[0] if scene is None else braced[0].model_copy(update={"scene": scene})
-        options: dict[str, Any] = {"clearance": clearance, "load": load, "seed": seed}
+        tasks = [each for each in (start, *goals) if isinstance(each, Task)]
+        task = _in_one_scene(braced[0], tasks, scene, load)
+        options: dict[str, Any] = {"clearance": clearance, "load": task.load, "seed": seed}
         options |= {"slew": slew, "timeout": timeout}
         with giving_up(None, cancel):
             if braced[0] is start:
@@ -173,6 +177,41 @@ def _with_margin(request: MotionRequest, timings: dict[str, float]) -> tuple[_Pl
     )
 
 
+def _in_one_scene(braced: Task, tasks: list[Task], scene: Scene | None, load: Load | None) -> Task:
+    """Return a task with a brace in the scene of its whole motion.
+
+    Refuse tasks that differ in scene or load, and a scene without what the arm leans on.
+    """
+    if load is not None and not isinstance(load, Load):
+        raise InputError(f"load must be a Load; got {shown(load)}")
+    loads = [each.tip_load for each in tasks] if load is None else [load]
+    if any(each != braced.load for each in loads):
+        raise InputError(
+            "a motion to or from a task with 'brace' has that task's load, or none if it has none, "
+            "all the way; give all its tasks the same load"
+        )
+    if scene is None:
+        own = [each.scene for each in tasks if each.scene is not None]
+        if any(
+            (each.clearance, each.objects) != (own[0].clearance, own[0].objects) for each in own
+        ):
+            raise InputError(
+                "the tasks of a motion to or from a task with 'brace' have different scenes; give "
+                "one scene with the objects of all"
+            )
+        scene = braced.scene
+    if not isinstance(scene, Scene):
+        raise InputError(f"scene must be a Scene, see load_scene; got {shown(scene)}")
+    assert braced.brace is not None
+    try:
+        braced.brace.check_objects(scene)
+    except BadKeyError as error:
+        raise InputError(
+            f"the scene of the motion does not suit the task with 'brace': {error}"
+        ) from None
+    return braced.model_copy(update={"scene": scene})
+
+
 def _leaning(robot: Manipulator, start: End, goal: Task, options: dict[str, Any]) -> PathSolution:
     """Plan a motion to a task with a brace: to rest, and from there into contact.
 
@@ -201,7 +240,9 @@ def _leaning(robot: Manipulator, start: End, goal: Task, options: dict[str, Any]
             down = plan_motion(robot, start, rest, scene=goal.scene, **options)
             if not down.found:
                 return down
-            down = replace(down, stiffness=_least_stiffness(robot, down.pressures, measures))
+            down = replace(
+                down, stiffness=_least_stiffness(request.robot, down.pressures, measures)
+            )
     except Unsolved as reason:
         return request.without_answer(str(reason), "unreachable")
     except StoppedError as reason:
@@ -256,7 +297,7 @@ def _releasing(
     stiffness = np.array([stiffness_leaning(eq, start) for eq in states])
     if len(later):
         message += f"; from there on {on.message}" if on.message else ""
-        stiffness = np.concatenate([stiffness, _least_stiffness(robot, later, measures)])
+        stiffness = np.concatenate([stiffness, _least_stiffness(request.robot, later, measures)])
     return replace(
         on,
         message=message,
