@@ -192,6 +192,17 @@ def test_exchanged_channels_in_one_rise_are_not_a_frame_that_was_moved() -> None
     assert not any("defined anew" in remark for remark in found.remarks)
 
 
+def test_other_channels_whose_pressures_the_arm_does_not_bear_are_not_suspected() -> None:
+    """Two channels at 4 bar, as on a shared line, would soften this arm to nothing."""
+    share = np.minimum(np.arange(300) / 200, 1)[:, np.newaxis]
+    log = driven(share * [4e5, 0.0, 0.0], np.linspace(0.0, 60.0, 300))
+    stiff = calibrated(arm())
+    wrong = replace(log, tip_position=log.tip_position * [-1.0, -1.0, 1.0])
+    (found,) = validate(stiff, [wrong])
+    assert found.errors.mean > 0.1 * stiff.length
+    assert "look at whether" in found.remarks[-1]
+
+
 def judged(robot: RobotDescription) -> RobotDescription:
     """A calibrated robot that knows how far it is off: by half a millimetre."""
     errors = ErrorModel(

@@ -106,6 +106,12 @@ def test_a_support_is_clear_of_the_arm_at_rest_and_leaves_the_scene_as_it_is(fou
         assert each.solution.task.scene.objects[0].name == "new post"
 
 
+def test_no_support_is_too_near_the_base():
+    far = {"name": "far", "sphere": {"centre": (0.4, 0.0, 0.1), "radius": 0.005}}
+    for each in suggest_supports(ROBOT, task(scene={"clearance": 0.03, "objects": [far]})).supports:
+        each.solution.task.scene.check_against(ROBOT.description)
+
+
 def test_tasks_for_which_nothing_can_be_suggested():
     with pytest.raises(InputError, match="stiffness against translation"):
         suggest_supports(ROBOT, task(stiffness=None))

@@ -70,25 +70,16 @@ def on_one_clock(recording: Recording, span: Array) -> Recording:
     left = DETECTION.clock_early if best < 0 else DETECTION.clock_late
     if -step <= best <= DETECTION.clock_usual or share > left:
         return recording
+    moved = [np.interp(time - best, time, column) for column in recording.pressures.T]
     remark = (
-        f"{two_clocks(best)} (a regression of the tip on them then misses it by "
-        f"{share * 100:.0f} % of what it does otherwise); --keep clock leaves them"
+        f"the tip moves {abs(best):.2g} s {'after' if best > 0 else 'before'} its pressures, as if "
+        f"they had two clocks: they are moved by that (a regression of the tip on them then misses "
+        f"it by {share * 100:.0f} % of what it does otherwise); --keep clock leaves them"
     )
-    return replace(later(recording, best), remarks=(*recording.remarks, remark))
-
-
-def later(recording: Recording, shift: float) -> Recording:
-    """Return the recording with its pressures later by a shift in s."""
-    time = recording.time
-    moved = [np.interp(time - shift, time, column) for column in recording.pressures.T]
-    return replace(recording, pressures=np.column_stack(moved))
-
-
-def two_clocks(shift: float) -> str:
-    """Say that pressures were moved by a shift in s, as the beginning of a sentence."""
-    return (
-        f"the tip moves {abs(shift):.2g} s {'after' if shift > 0 else 'before'} its pressures, as "
-        "if they had two clocks: they are moved by that"
+    return replace(
+        recording,
+        pressures=np.column_stack(moved),
+        remarks=(*recording.remarks, remark),
     )
 
 
@@ -528,7 +519,7 @@ def _turn_text(rotation: Array) -> str:
 
 def replaced(
     recording: Recording, measured: Array, predicted: Array, length: float
-) -> tuple[Recording, str]:
+) -> tuple[Recording, str, bool]:
     """Move a recording rigidly to where a calibrated model predicts its tip.
 
     Prefers a rotation of the cube without translation if it fits about as well.
@@ -541,7 +532,7 @@ def replaced(
 
     Returns
     -------
-    recording, words
+    recording, words, is_shifted
         The words describe the motion, as the end of a sentence.
     """
     seen = whole(measured)
@@ -561,6 +552,7 @@ def replaced(
     if DETECTION.overwhelming * miss(quarter, np.zeros(3)) < miss(rotation, shift):
         rotation, shift = quarter, np.zeros(3)
     words = f"turned {_turn_text(rotation)}"
-    if np.linalg.norm(shift) > SHOWN:
+    is_shifted = bool(np.linalg.norm(shift) > SHOWN)
+    if is_shifted:
         words += f" and moved by {np.linalg.norm(shift) * 1e3:.0f} mm"
-    return _moved(recording, rotation, shift), words
+    return _moved(recording, rotation, shift), words, is_shifted

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt.arrays import Array
-from stiffopt.errors import StiffoptError
+from stiffopt.errors import EquilibriumError, PressureError, StiffoptError
 from stiffopt.identify.detection import Hypothesis, of_channels, replaced
 from stiffopt.identify.discrepancy import centres
 from stiffopt.identify.error_model import held_for, in_turn, is_moving
@@ -77,11 +77,6 @@ def validate(
     return tuple(_with_doubt(each, description.length) for each in _put_right(setup, found))
 
 
-def _is_off(found: Comparison, length: float) -> bool:
-    """Whether a log is farther from a calibrated robot than its calibration allows for."""
-    return found.errors.mean > DETECTION.off * length or _within(found) < DETECTION.within
-
-
 def _within(found: Comparison) -> float:
     """Return the share of the tips within the region of 99 % with history; 1 if there is none."""
     levels = found.levels if found.levels is not None else np.zeros(0)
@@ -91,12 +86,13 @@ def _within(found: Comparison) -> float:
 
 def _with_doubt(found: Comparison, length: float) -> Comparison:
     """Return the comparison with a calibrated robot, with a remark if it is far off."""
-    if not _is_off(found, length):
+    share, within = found.errors.mean / length, _within(found)
+    if share > DETECTION.off:
+        what = f"the mean error is {100 * share:.0f} % of the arm's length"
+    elif within < DETECTION.within:
+        what = f"only {100 * within:.0f} % of the tips lie within the regions of 99 %"
+    else:
         return found
-    share = found.errors.mean / length
-    what = f"the mean error is {100 * share:.0f} % of the arm's length"
-    if share <= DETECTION.off:
-        what = f"only {100 * _within(found):.0f} % of the tips lie within the regions of 99 %"
     remark = (
         f"{what}; look at whether the log is of the arm of this calibration, the order of the "
         "channels (--channels), the frame (--frame), and whether the pressures are those that the "
@@ -105,25 +101,51 @@ def _with_doubt(found: Comparison, length: float) -> Comparison:
     return replace(found, remarks=(*found.remarks, remark))
 
 
+@dataclass(frozen=True, eq=False)
+class _Correction:
+    """A recording as it would be with another set-up, and a remark on that.
+
+    `poses`: rows at which it is judged; `moves_all`: whether it has to explain the error at each of
+    them, and not only their mean.
+    """
+
+    recording: Recording
+    remark: str
+    poses: NDArray[np.intp]
+    moves_all: bool = False
+
+    def explains(self, before: Comparison, after: Comparison) -> bool:
+        """Whether a log fits so much better with the correction that it is believed."""
+        if after.errors.mean > DETECTION.frame * before.errors.mean:
+            return False
+        then, now = before.errors.angle, after.errors.angle
+        if then is not None and now is not None and now > then:
+            return False  # rather a sensor that sits elsewhere on the tip
+        least = np.min if self.moves_all else np.mean
+        limit = DETECTION.frame * least(before.distance[self.poses])
+        return bool(after.distance[self.poses].mean() <= limit)
+
+
 def _put_right(setup: Setup, found: tuple[Comparison, ...]) -> tuple[Comparison, ...]:
     """Return comparisons in which logs that are off only by their set-up are corrected.
 
-    Another order of the channels, or a line that is dead or shared, has no free number, and a
-    moved frame has six. So it is tried first.
+    Other channels have no free number, and a moved frame has six. So channels are tried first.
     """
     recordings, remarks = list(setup.recordings), [""] * len(found)
     for correct in (_with_channels_found, _with_frame_found):
-        tried, words = list(recordings), [""] * len(found)
+        tried: dict[int, _Correction] = {}
         for i, each in enumerate(found):
             if each.errors.mean > DETECTION.off * setup.description.length and not remarks[i]:
-                tried[i], words[i] = correct(setup, recordings[i], each)
-        if not any(words):
+                correction = correct(setup, recordings[i], each)
+                if correction is not None:
+                    tried[i] = correction
+        if not tried:
             continue
-        again = compare(Setup.of(setup.description, tried, (), setup.settings))
-        for i, (before, after) in enumerate(zip(found, again, strict=True)):
-            frame = correct is _with_frame_found
-            if words[i] and _explains(setup.description, frame, before, after, words[i]):
-                recordings[i], remarks[i] = tried[i], words[i]
+        with_all = [tried[i].recording if i in tried else each for i, each in enumerate(recordings)]
+        again = compare(Setup.of(setup.description, with_all, (), setup.settings))
+        for i, correction in tried.items():
+            if correction.explains(found[i], again[i]):
+                recordings[i], remarks[i] = correction.recording, correction.remark
     if not any(remarks):
         return found
     result = list(compare(Setup.of(setup.description, recordings, (), setup.settings)))
@@ -137,81 +159,59 @@ def _put_right(setup: Setup, found: tuple[Comparison, ...]) -> tuple[Comparison,
     return tuple(result)
 
 
-def _explains(
-    description: RobotDescription, frame: bool, before: Comparison, after: Comparison, words: str
-) -> bool:
-    """Whether a correction, of the frame or else of the channels, explains what a log is off by."""
-    if after.errors.mean > DETECTION.frame * before.errors.mean:
-        return False
-    then, now = before.errors.angle, after.errors.angle
-    if then is not None and now is not None and now > then:
-        return False  # rather a sensor that sits elsewhere on the tip
-    return not frame or _moves_all(description, before, after, words)
-
-
-def _with_frame_found(
-    setup: Setup, recording: Recording, found: Comparison
-) -> tuple[Recording, str]:
-    """Return a recording moved to where the robot predicts its tip, and a remark on that.
+def _with_frame_found(setup: Setup, recording: Recording, found: Comparison) -> _Correction | None:
+    """Return a recording moved to where the robot predicts its tip; None if it is not suspected.
 
     It is judged by different poses: where a log holds one pose for long, a motion of the frame
-    could replace whatever the model has wrong there.
+    could replace whatever the model has wrong there. Poses on a line, as in one rise from rest,
+    could be turned about the pose at rest to fit any model. There a frame that was moved, and not
+    only turned, has to move all of them: none is predicted well without the motion.
     """
     poses = _different(setup.description, found)
     if "axes" in setup.settings.keep or len(poses) < DETECTION.poses:
-        return recording, ""
+        return None
     measured, predicted = found.measured[poses], found.predicted[poses]
-    moved, words = replaced(recording, measured, predicted, setup.description.length)
-    return moved, (
+    moved, words, is_shifted = replaced(recording, measured, predicted, setup.description.length)
+    remark = (
         f"the frame of this log was defined anew: its poses are {words} (--keep axes leaves them); "
         "a log of another arm or with another order of channels may look so too"
     )
+    spread = np.linalg.svd(predicted - predicted.mean(axis=0), compute_uv=False)
+    in_line = bool(spread[1] < DETECTION.in_line * spread[0])
+    return _Correction(moved, remark, poses, moves_all=in_line and is_shifted)
 
 
 def _with_channels_found(
     setup: Setup, recording: Recording, found: Comparison
-) -> tuple[Recording, str]:
-    """Return a recording whose columns are those of other channels, and a remark on that.
+) -> _Correction | None:
+    """Return a recording whose columns are those of other channels; None if it is unclear which.
 
     The order, or the dead or shared line, is that with which the arm at rest at the pressures is
-    nearest to the tip.
+    clearly nearest to the tip.
     """
     description = setup.description
     arm, low = Manipulator(description), np.maximum(description.pressure_min, 0.0)
-    seen = np.flatnonzero(np.isfinite(found.measured).all(axis=1))
+    seen = np.flatnonzero(np.isfinite(found.distance))
     rows = seen[np.linspace(0, len(seen) - 1, DETECTION.channel_rows).astype(int)]
     tip, point = found.measured[rows], np.linalg.inv(setup.points[0].sensor)[:, 3]
 
     def miss(hypothesis: Hypothesis) -> float:
-        poses = arm.tip_pose(hypothesis.driven(found.pressures[rows], low))
+        try:
+            poses = arm.tip_pose(hypothesis.driven(found.pressures[rows], low))
+        except (EquilibriumError, PressureError):  # the arm does not bear these pressures
+            return np.inf
         return float(np.median(np.linalg.norm((setup.base @ poses @ point)[:, :3] - tip, axis=1)))
 
     tried = [each for each in of_channels(description, 1) if each.kind not in setup.settings.keep]
     ranked = sorted((miss(each), k) for k, each in enumerate(tried))
-    if len(ranked) < 2 or ranked[0][0] > DETECTION.tie * ranked[1][0]:
-        return recording, ""  # not clearly better than the next one
+    is_clear = len(ranked) > 1 and ranked[0][0] <= DETECTION.tie * ranked[1][0]
+    if not is_clear or np.isinf(ranked[0][0]):
+        return None
     best = tried[ranked[0][1]]
     (corrected,) = best.applied([recording], low)
     told = best.told(description, [recording.name])
-    return corrected, f"{told} (--keep {best.kind} leaves that as it was recorded)"
-
-
-def _moves_all(
-    description: RobotDescription, before: Comparison, after: Comparison, remark: str
-) -> bool:
-    """Whether the motion of a frame explains the error at all poses.
-
-    Poses on a line, as in one rise from rest, could be turned about the pose at rest to fit any
-    model. There a frame that was moved, and not only turned by quarters, has to move all of them:
-    none is predicted well without the motion.
-    """
-    poses = _different(description, before)
-    then, now = before.distance[poses], after.distance[poses]
-    predicted = before.predicted[poses]
-    spread = np.linalg.svd(predicted - predicted.mean(axis=0), compute_uv=False)
-    in_line = spread[1] < DETECTION.in_line * spread[0]
-    least = np.min if in_line and "moved by" in remark else np.mean
-    return bool(now.mean() <= DETECTION.frame * least(then))
+    remark = f"{told} (--keep {best.kind} leaves that as it was recorded)"
+    return _Correction(corrected, remark, seen)
 
 
 def _different(description: RobotDescription, found: Comparison) -> NDArray[np.intp]:

@@ -37,6 +37,7 @@ from stiffopt.optimise.search import starts
 from stiffopt.optimise.solution import PressureSolution
 from stiffopt.optimise.solver import solve_pressure
 from stiffopt.optimise.task import Task
+from stiffopt.schema import BadKeyError
 
 Kind = Literal["post", "wall"]
 
@@ -170,9 +171,10 @@ def suggest_supports(
         for which, row, column in islice(_best(postures[0], known), _TESTS):
             there, name = postures[which], _free_name(task, kind)
             item = there.object(kind, row, column, name, max_force)
-            answer = solve_pressure(
-                robot, _leaning(task, item, margin), seed=seed, timeout=timeout, cancel=cancel
-            )
+            leaning = _leaning(task, item, margin)
+            if _is_at_base(robot, leaning, item):
+                continue
+            answer = solve_pressure(robot, leaning, seed=seed, timeout=timeout, cancel=cancel)
             places = [each.at for each in answer.contacts]
             if not places or max(places) > there.last or times(answer, free) < _WORTH:
                 continue
@@ -243,6 +245,16 @@ def _leaning(task: Task, item: SceneObject, margin: float) -> Task:
             "brace": Brace(objects=(item.name,), margin=margin),
         }
     )
+
+
+def _is_at_base(robot: Manipulator, task: Task, item: SceneObject) -> bool:
+    """Whether an object is nearer to the arm's base than the clearance of a task's scene."""
+    assert task.scene is not None
+    try:
+        item.shape.check_against(robot.description, task.scene.clearance)
+    except BadKeyError:
+        return True
+    return False
 
 
 class _Posture:

@@ -133,8 +133,12 @@ def approach_to(
     )
 
 
-def way_into_contact(robot: Manipulator, solution: PressureSolution) -> list[ContactEquilibrium]:
+def way_into_contact(
+    robot: Manipulator, solution: PressureSolution, *, is_eased: bool = True
+) -> list[ContactEquilibrium]:
     """Return the equilibria from rest to a braced solution.
+
+    `is_eased`: see `way_from_rest`.
 
     Raises
     ------
@@ -143,7 +147,7 @@ def way_into_contact(robot: Manipulator, solution: PressureSolution) -> list[Con
     """
     assert solution.tip_pose is not None
     assert solution.pressures is not None
-    states = way_from_rest(robot, solution.task, solution.pressures, is_eased=True)
+    states = way_from_rest(robot, solution.task, solution.pressures, is_eased=is_eased)
     end = states[-1]
     names, wanted = ({each.object for each in found.contacts} for found in (end, solution))
     apart = float(np.linalg.norm(end.tip_pose[:3, 3] - solution.tip_pose[:3, 3]))

@@ -219,7 +219,7 @@ def _leaning(robot: Manipulator, start: End, goal: Task, options: dict[str, Any]
     lies on one at rest.
     """
     watch = Stopwatch()
-    found = solve_pressure(robot, goal)
+    found = solve_pressure(robot, goal, seed=options["seed"])
     rest = np.zeros(robot.n_pressures)
     lies = touches_at(robot, goal, rest)
     if found.pressures is None or not (found.contacts or lies):
@@ -276,7 +276,7 @@ def _releasing(
     All pressures fall in proportion, by the speed and the rate of force with which an arm leans.
     """
     watch = Stopwatch()
-    found = solve_pressure(robot, start)
+    found = solve_pressure(robot, start, seed=options["seed"])
     if found.pressures is None or not found.contacts:
         return plan_motion(robot, start.unbraced, goals, scene=start.scene, **options)
     rest = np.zeros(robot.n_pressures)
@@ -285,7 +285,7 @@ def _releasing(
     if not found.found:
         return request.without_answer(found.message, "unreachable")
     try:
-        states = way_from_rest(robot, start, found.pressures)[::-1]
+        states = way_into_contact(robot, found, is_eased=False)[::-1]
     except Unsolved as reason:
         return request.without_answer(str(reason), "unreachable")
     on = plan_motion(robot, rest, goals, scene=start.scene, **options)
