@@ -349,20 +349,23 @@ def test_plans_of_a_change_lead_the_offset_as_feedback_is_late(robot):
     """By 8 plans, but feedback is told the offset itself; not if the target moves as well."""
     planning, asked, plan, _ = changing(robot)
     wanted, step = np.array(asked.target.position[:2]), np.array([4e-5, -2e-5, 0, 0, 0, 0])
-    for number in range(1, 51):
+    for number in range(1, 61):
         plan = planning.plan(replace(asked, offset=number * step))
     assert plan.tip_first
     off = tip(robot, plan.pressures)[1][:2] + plan.offset[:2] - wanted
     assert off == pytest.approx(-8 * step[:2], rel=0.05)
-    assert np.array_equal(plan.offset, 50 * step)
+    assert np.array_equal(plan.offset, 60 * step)
     near = asked.target.model_copy(update={"position": (*(wanted + 1e-4).tolist(), None)})
-    plan = planning.plan(replace(asked, offset=51 * step, target=near))
+    plan = planning.plan(replace(asked, offset=61 * step, target=near))
     off = tip(robot, plan.pressures)[1][:2] + plan.offset[:2] - wanted - 1e-4
     assert off == pytest.approx(0, abs=1e-5)
-    for _ in range(200):
-        plan = planning.plan(replace(asked, offset=51 * step))
+    for number in range(200):  # the change ends also while the target moves
+        near = near.model_copy(
+            update={"position": (wanted[0], wanted[1] + 1e-5 * (number % 2), None)}
+        )
+        plan = planning.plan(replace(asked, offset=61 * step, target=near))
     assert not plan.tip_first
-    off = tip(robot, plan.pressures)[1][:2] + plan.offset[:2] - wanted
+    off = tip(robot, plan.pressures)[1][:2] + plan.offset[:2] - near.position[:2]
     assert off == pytest.approx(0, abs=1e-5)
 
 

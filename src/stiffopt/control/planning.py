@@ -45,9 +45,7 @@ from stiffopt.paths.leaning import BraceApproach, approach_to
 
 _BAR = 1e5
 _SLACK = 100.0  # Pa, by which an answer may exceed its limits
-_REACHED = (
-    Tolerance()
-)  # errors of pressures that bring the tip to its target before the stiffest do
+_REACHED = Tolerance()  # of the tip that is at its target before the arm is stiff
 _EXACT = Tolerance(position=PlanningTuning.position_tolerance, angle=PlanningTuning.angle_tolerance)
 
 
@@ -368,21 +366,22 @@ class Planning:
         """Return by how much (6,) the offset changes until feedback has followed it.
 
         On a slow way to other pressures it changes steadily, and feedback is late by some plans.
-        At the end of the way the lead fades.
+        The lead begins later than the way: at first, plans still follow the offset of the motion
+        before. At the end of the way it fades.
         """
         change, last, tuning = self._change, self._last, self._tuning
-        if change is None or last is None or last.target != asked:
+        if change is None or last is None:
             return np.zeros(6)
-        moved = np.zeros(6) if change.over else request.offset - last.offset
+        stays = last.target == asked
+        moved = request.offset - last.offset if stays and not change.over else np.zeros(6)
         drift = change.drift + tuning.drift_share * (moved - change.drift)
         self._change = replace(change, drift=drift)
-        lead: Array = tuning.lead * self._growth(change) * drift
+        if not stays:
+            return np.zeros(6)
+        growth = min(1.0, max(0.0, change.plans / tuning.change_growth - 0.5))
+        lead: Array = tuning.lead * growth * drift
         size = float(np.linalg.norm(lead[:3]))
         return lead * min(1.0, tuning.longest_lead / max(size, 1e-9))
-
-    def _growth(self, change: _Change) -> float:
-        """Return the share of its size that a step of a change has."""
-        return min(1.0, (change.plans + 1) / self._tuning.change_growth)
 
     def _toward(
         self, request: PlanRequest, last: Plan, change: _Change, end: Array, target: Target
@@ -397,7 +396,7 @@ class Planning:
         tuning, way = self._tuning, end - last.pressures
         left = self._motion(last.pressures, way)
         drift = float(np.linalg.norm((request.offset - last.offset)[:3]))
-        step = tuning.change_step * self._growth(change)
+        step = tuning.change_step * min(1.0, (change.plans + 1) / tuning.change_growth)
         step *= min(1.0, tuning.at_rest / max(drift, 1e-9))
         comes_nearer = left < change.left - tuning.change_progress * step
         stalled = 0 if comes_nearer else change.stalled + (drift <= tuning.at_rest)

@@ -284,7 +284,7 @@ class WindowTuning:
 
 @dataclass(frozen=True)
 class PlanningTuning:
-    """When a plan may change to another configuration of the arm."""
+    """When a plan may change to other pressures for the same target, and how slowly."""
 
     # relative stiffness by which another configuration must be better; it doubles with each change
     advantage: float = 0.02
@@ -299,21 +299,21 @@ class PlanningTuning:
     # successive plans that refuse an optimum in another configuration before one takes it, or that
     # come no nearer to it on the way
     patience: int = 20
-    # motion of the tip by one channel from plan to plan on the way to another configuration, in m
+    # motion of the tip by one channel from plan to plan on the way to other pressures, in m; plans
+    # on that way until a step has this size; share of it by which the rest has to shrink
     change_step: float = 2.5e-4
-    # least stiffness when the tip is at its target first, as a share of the best
-    soft: float = 0.5
-    # steps in which such a way is looked for, and the longest one over their mean, without a jump
+    change_growth: int = 40
+    change_progress: float = 0.05
+    # steps in which such a way is looked for, and their longest one over their mean without a jump
     change_looks: int = 8
     change_jump: float = 3.0
-    change_growth: int = 40  # plans on such a way until a step has that size
-    # plans by which feedback is late on such a way, the share of a new change of the offset in
-    # their mean, and the largest lead for it, in m
+    # least stiffness when the tip is at its target first, as a share of the best
+    soft: float = 0.5
+    # plans by which feedback is late on such a way, share of the newest in the mean change of the
+    # offset, and longest lead for it, in m
     lead: float = 8.0
     drift_share: float = 0.15
     longest_lead: float = 1e-3
-    # share of that step by which the rest of such a way has to shrink, or it stalls
-    change_progress: float = 0.05
     bent_step: float = 3e3  # change of a pressure after which the modes are new, in Pa
     position_tolerance: float = 1e-5  # of plans, in m
     angle_tolerance: float = 1e-3  # of plans, in rad
