@@ -492,7 +492,7 @@ def test_the_motion_watch_compares_tip_and_pressures_of_the_same_time():
 
 
 def test_a_channel_that_acts_the_wrong_way_stops_at_the_pressure_at_which_it_followed():
-    bench = moving(rested=1.5, moved=0.3)
+    bench = moving(rested=3.0, moved=0.3)
     channels = bench.controller._arm.channels
     followed = float(channels.last_followed[1])
     channels.opposed = np.arange(bench.n) == 1
