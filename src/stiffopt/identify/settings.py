@@ -424,8 +424,8 @@ class DetectionSettings:
     drift_rounds: int = 8
     idle_rows: int = 1200
     idle_rounds: int = 4
-    idle_visible: float = 2.0
-    idle_shows: float = 0.3
+    idle_visible: float = 3.0
+    idle_shows: float = 0.2
     unit: float = 2.3
 
 
