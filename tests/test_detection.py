@@ -19,6 +19,7 @@ from stiffopt.identify.detection import (
     Found,
     found_wrong,
     idle_channels,
+    of_channels,
     on_one_clock,
     without_drift,
 )
@@ -124,6 +125,25 @@ def test_a_cycle_of_channels_within_one_segment_is_found(order: tuple[int, ...])
     (again,) = validate(calibrated(arm("stiff-flop-2")), [wrong])
     assert "the channels are in another order" in again.remarks[-1]
     assert again.errors.mean < 2e-3
+
+
+def test_nothing_is_corrected_where_the_arm_bears_none_of_the_pressures() -> None:
+    log = log_of()
+    beyond = replace(log, commanded=log.commanded * 20)
+    assert found_in(load_description("stiff-flop-1"), [beyond]) is None
+
+
+def test_orders_of_many_channels_are_few() -> None:
+    robot = load_description("stiff-flop-1")
+    for count, orders in ((4, 23), (8, 28)):  # all; each two exchanged
+        angles = tuple((2 * np.pi * np.arange(count) / count).tolist())
+        chambers = robot.segments[0].chambers.model_copy(update={"angles": angles, "radius": 1e-3})
+        channels = tuple((k + 1,) for k in range(count))
+        changes = {"chambers": chambers, "channels": channels, "corrections": None}
+        segment = robot.segments[0].model_copy(update=changes)
+        wide = robot.model_copy(update={"segments": (segment,)})
+        kinds = [each.kind for each in of_channels(wide, 1)]
+        assert kinds.count("channels") == orders
 
 
 def test_a_dead_line_near_the_tip_of_an_arm_under_its_weight_is_found() -> None:

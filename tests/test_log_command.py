@@ -88,6 +88,8 @@ def test_a_recording_that_was_cut_short_is_exported_as_far_as_it_goes(
     assert main(["log", "export", str(cut), "--csv"]) == 0
     assert "truncated" in capsys.readouterr().err
     assert 10 < len(read_log(tmp_path / "cut.csv")) < 150
+    assert main(["check", str(cut)]) == 2
+    assert "was truncated or damaged" in " ".join(capsys.readouterr().out.split())
     assert main(["log", "plot", str(cut)]) == 0
     assert (tmp_path / "cut.png").stat().st_size > 10_000
 

@@ -313,14 +313,22 @@ def test_a_task_that_demands_a_stiffness_has_it_on_arrival(robot):
         assert reached > 0.89 * stiffest.stiffness
 
 
-def test_plans_go_at_once_where_no_way_stays_at_the_target(robot, monkeypatch):
-    """Told before the change begins, or when it stalls while the tip rests."""
+def test_plans_go_straight_and_slowly_where_the_way_that_was_found_ends(robot, monkeypatch):
+    planning, asked, plan, stiffest = changing(robot)
+    stays = plan.pressures
+    monkeypatch.setattr(planning._search, "find", lambda *_: (stays, 0.0, 0.0))
+    for _ in range(planning._tuning.patience + 1):
+        assert np.array_equal(plan.pressures, stays)
+        plan = planning.plan(asked)
+    for _ in range(300):
+        before, plan = plan.pressures, planning.plan(asked)
+        assert motions(robot, before, plan.pressures).max() < 6e-4
+    np.testing.assert_allclose(plan.pressures, stiffest.pressures, atol=100.0)
+
+
+def test_plans_go_straight_at_once_where_no_way_stays_at_the_target(robot, monkeypatch):
     planning, asked, plan, stiffest = changing(robot)
     find = planning._search.find
-    monkeypatch.setattr(planning._search, "find", lambda *_: (plan.pressures, 0.0, 0.0))
-    for _ in range(planning._tuning.patience + 1):
-        assert np.array_equal(planning.plan(asked).pressures, plan.pressures)
-    np.testing.assert_allclose(planning.plan(asked).pressures, stiffest.pressures, atol=100.0)
 
     def jumps(target, limits, start, **options):
         if options:
@@ -343,6 +351,30 @@ def test_plans_go_on_evenly_if_the_stiffest_pressures_jump_meanwhile(robot):
         assert motions(robot, before, plan.pressures).max() < 6e-4
     best = Planning(robot).plan(replace(asked, low=np.zeros(3), high=high, here=np.zeros(0)))
     np.testing.assert_allclose(plan.pressures, best.pressures, atol=100.0)
+
+
+def test_plans_go_on_evenly_if_the_target_moves_a_little_meanwhile():
+    """An arm for which the rest of the way grows by that more than 20 plans make up for."""
+    arm = so.load_robot("stiff-flop-2")
+    rng = np.random.default_rng(31102)
+    here, there = (rng.uniform(0.1, 1.0, 6) * BAR for _ in range(2))
+    place, way = tip(arm, there)[1], rng.normal(size=3)
+    target, near = (
+        Target(position=tuple(p.tolist()))
+        for p in (place, place + 4.5e-3 * way / np.linalg.norm(way))
+    )
+    goal = StiffnessGoal(maximise=StiffnessMeasure(direction=(1.0, 0.0, 0.0)))
+    task = Task(robot="stiff-flop-2", target=target, stiffness=goal)
+    asked = PlanRequest(1, task, target, np.zeros(6), np.zeros(6), here=here)
+    planning = Planning(arm)
+    for _ in range(60):
+        plan = planning.plan(asked)
+    assert plan.tip_first
+    plan = planning.plan(replace(asked, target=near))
+    for _ in range(60):
+        before, plan = plan.pressures, planning.plan(replace(asked, target=near))
+        assert motions(arm, before, plan.pressures).max() < 6e-4
+    np.testing.assert_allclose(tip(arm, plan.pressures)[1], near.position, atol=1e-5)
 
 
 def test_plans_of_a_change_lead_the_offset_as_feedback_is_late(robot):

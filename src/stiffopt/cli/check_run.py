@@ -174,8 +174,11 @@ def _check_experiment(path: str) -> None:
 
 def _check_bench(path: str) -> None:
     from stiffopt.identify.bench import load_bench
+    from stiffopt.model.robot_files import load_description
 
-    load_bench(path)
+    bench, base = load_bench(path)
+    for arm in bench.arms:
+        load_description(arm.robot, base=base)
 
 
 def _check_commissioning(path: str) -> None:
@@ -188,7 +191,10 @@ def _check_log(path: str) -> None:
     if path.lower().endswith(".mcap"):
         from stiffopt.daemon.run_log import read_log_of_recording
 
-        read_log_of_recording(path)
+        _, is_whole = read_log_of_recording(path)
+        if not is_whole:
+            reason = "was truncated or damaged; 'stiffopt log export' writes its complete part"
+            raise FileError(path, reason)
         return
     from stiffopt.logs import read_log, read_stiffness_table
 

@@ -102,16 +102,17 @@ class Plan:
 
 
 @dataclass(frozen=True)
-class _Change:
+class _PostureChange:
     """A slow way to other pressures for the same target."""
 
     end: Array  # effective (n,), in Pa
     tip_first: tuple[float, ...] = ()  # see `Plan`
     plans: int = 0  # that have been made on it
-    over: bool = False  # whether the end is reached
+    over: bool = False  # whether the end has been reached
     drift: Array = field(default_factory=lambda: np.zeros(6))  # of the offset from plan to plan
     left: float = math.inf  # least rest of the way so far, as the tip's motion by one channel, in m
     stalled: int = 0  # successive plans that came no nearer
+    straight: bool = False  # whether plans lead straight to the end, as no other way was found
 
 
 class Planning:
@@ -127,7 +128,7 @@ class Planning:
         self._last: Plan | None = None
         self._searched_at: Array = np.zeros(6)
         self._advantage, self._refused = self._tuning.advantage, 0
-        self._change: _Change | None = None  # to another configuration, or after the tip
+        self._change: _PostureChange | None = None  # to another configuration, or after the tip
         self._leaning: tuple[int, Plan | None] = (-1, None)
 
     def _put(self, robot: Manipulator) -> None:
@@ -243,7 +244,7 @@ class Planning:
                 pressures = self._tip_first(request, task, target, pressures, stiffness)
             else:
                 if self._change is None and self._is_distant(last, pressures, target):
-                    self._change = _Change(pressures)
+                    self._change = _PostureChange(pressures)
                 if self._change is not None:
                     pressures = self._toward(request, last, self._change, pressures, target)
             self._last = Plan(
@@ -338,7 +339,7 @@ class Planning:
                 tip = self._tip.at(pressures)
                 if self._stiffness(tip.compliance, tip.pose[:3, :3]) < tuning.soft * best:
                     continue
-            self._change = _Change(stiffest, tuple(pressures.tolist()))
+            self._change = _PostureChange(stiffest, tuple(pressures.tolist()))
             return pressures
         return stiffest
 
@@ -380,42 +381,46 @@ class Planning:
             return np.zeros(6)
         growth = min(1.0, max(0.0, change.plans / tuning.change_growth - 0.5))
         lead: Array = tuning.lead * growth * drift
-        size = float(np.linalg.norm(lead[:3]))
+        angle = FeedbackTuning().lever * np.linalg.norm(lead[3:])
+        size = float(max(np.linalg.norm(lead[:3]), angle))
         return lead * min(1.0, tuning.longest_lead / max(size, 1e-9))
 
     def _toward(
-        self, request: PlanRequest, last: Plan, change: _Change, end: Array, target: Target
+        self, request: PlanRequest, last: Plan, change: _PostureChange, end: Array, target: Target
     ) -> Array:
         """Return pressures (n,) on the way to others (n,): next to the last, and at the target.
 
         On the straight line to them the tip would leave its target by millimetres, and by more in a
         quick change, as feedback needs time for an offset that differs between them. So the change
         is slower while the offset changes. If the way comes no nearer to its end, the arm goes
-        there at once.
+        there straight, as slowly, and feedback keeps the tip at its target.
         """
         tuning, way = self._tuning, end - last.pressures
         left = self._motion(last.pressures, way)
         drift = float(np.linalg.norm((request.offset - last.offset)[:3]))
         step = tuning.change_step * min(1.0, (change.plans + 1) / tuning.change_growth)
         step *= min(1.0, tuning.at_rest / max(drift, 1e-9))
-        comes_nearer = left < change.left - tuning.change_progress * step
-        stalled = 0 if comes_nearer else change.stalled + (drift <= tuning.at_rest)
-        if stalled > tuning.patience:
-            self._change = None
-            return end
-        self._change = replace(
+        goes_on = left < change.left - tuning.change_progress * step
+        if last.target != request.target or left > change.left + step:  # another way
+            goes_on, change = True, replace(change, straight=False)
+        stalled = 0 if goes_on else change.stalled + (drift <= tuning.at_rest)
+        change = replace(
             change,
             end=end,
             plans=change.plans + 1,
-            left=min(left, change.left),
+            left=left if goes_on else change.left,
             stalled=stalled,
+            straight=change.straight or stalled > tuning.patience,
             over=change.over or left <= step,
         )
-        if not self._change.over:
-            return self._search.find(target, self._limits, last.pressures + step / left * way)[0]
-        if float(np.linalg.norm(change.drift[:3])) < tuning.at_rest / 10:
-            self._change = None
-        return end
+        is_over = left <= step and float(np.linalg.norm(change.drift[:3])) < tuning.at_rest / 10
+        self._change = None if is_over else change
+        if left <= step:
+            return end
+        ahead = last.pressures + step / left * way
+        if change.straight:
+            return np.asarray(np.clip(ahead, *self._limits))
+        return self._search.find(target, self._limits, ahead)[0]
 
     def _better(
         self, request: PlanRequest, target: Target, solution: PressureSolution, last: Plan

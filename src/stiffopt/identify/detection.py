@@ -401,7 +401,7 @@ class Comparer:
 
     def _positions(self, pressures: Sequence[Array]) -> list[Array] | None:
         try:
-            return [self._arm.pose(p, self._stations)[:, :, :3, 3] for p in pressures]
+            return [self._arm.pose(p, self._stations)[:, :, :3, 3].copy() for p in pressures]
         except (EquilibriumError, PressureError):
             return None
 
@@ -464,6 +464,8 @@ def found_wrong(
     """
     nothing = comparer.nothing
     as_is = comparer.score(nothing)
+    if not np.isfinite(as_is):
+        return None
     tried = [each for each in of_channels(description, len(nothing.turns)) if each.kind not in keep]
     scored = [(comparer.score(each), each) for each in comparer.shortlist(tried)]
     worthy = [pair for pair in scored if pair[0] <= DETECTION.overwhelming * as_is]
@@ -521,14 +523,18 @@ def _lines(description: RobotDescription, nothing: Hypothesis) -> Iterator[Hypot
 
 
 def _orders(description: RobotDescription, nothing: Hypothesis) -> Iterator[Hypothesis]:
-    """Yield orders with two channels, the channels of a segment or whole segments exchanged."""
-    order = nothing.sources
+    """Yield orders with two channels exchanged, and those of a segment or of whole segments.
+
+    Of many channels or segments there are too many orders; then only two are exchanged.
+    """
+    order, few = nothing.sources, DETECTION.few
     orders = {_exchanged(len(order), i, j) for i in order for j in range(i)}
     ends = np.cumsum([0, *(segment.n_channels for segment in description.segments)]).tolist()
     own = [order[begin:end] for begin, end in pairwise(ends)]
-    orders |= {tuple(c for each in places for c in each) for places in permutations(own)}
+    places = permutations(own) if len(own) <= few else ()
+    orders |= {tuple(c for each in place for c in each) for place in places}
     for each in own:
-        for other in permutations(each):
+        for other in permutations(each) if len(each) <= few else ():
             orders.add((*order[: each[0]], *other, *order[each[-1] + 1 :]))
     for order in sorted(orders - {nothing.sources}):
         yield replace(nothing, kind="channels", sources=order)

@@ -346,6 +346,7 @@ class DetectionSettings:
     farther : softness with which the arm moves more than this many times as far as the tip did is
         not tried.
     shortlist : number of hypotheses that are compared with an arm under its weight.
+    few : largest number of channels of a segment, or of segments, of which all orders are tried.
     moved : largest distance of the base from its place in the robot file, in lengths of the arm.
     off, frame : mean error of a log, in lengths of the arm, beyond which its set-up is suspected to
         differ from the calibration's; and the share of it that a correction may leave.
@@ -391,6 +392,7 @@ class DetectionSettings:
     softness: tuple[float, ...] = (0.2, 0.35, 0.6, 1.0, 1.7, 3.0, 5.0)
     farther: float = 1.5
     shortlist: int = 6
+    few: int = 4
     moved: float = 0.25
     off: float = 0.1
     frame: float = 0.3
