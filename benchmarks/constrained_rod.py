@@ -17,7 +17,8 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from independent import Arm, rod_section
+from independent.arms import Arm
+from independent.sections import rod_section
 
 Array = Any
 Objects = Sequence[tuple[int, Sequence[float]]]  # see `pressed_rod.pressed`

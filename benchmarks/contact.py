@@ -34,7 +34,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 import stiffopt
-from independent import ARMS, Arm
+from independent.arms import ARMS, Arm
 from report import table
 from stiffopt.errors import EquilibriumError
 

@@ -21,7 +21,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from independent import Arm, rod_section
+from independent.arms import Arm
+from independent.sections import rod_section
 
 jax.config.update("jax_enable_x64", True)
 

@@ -17,18 +17,12 @@ import hypothesis
 import pytest
 
 LONGEST = (
-    *(
-        "test_fit",
-        "test_controller",
-        "test_touch",
-        "test_soak",
-        "test_commanding",
-        "test_detection",
-    ),
-    *("test_bracing", "test_bracing_loop", "test_brace", "test_workspace_resumed", "test_posture"),
-    *("test_calibrate_cli", "test_open_regulator", "test_ros_end_to_end", "test_run_command"),
-    *("test_lab", "test_commanding_processes", "test_supply_contract", "test_world"),
-)
+    "test_fit", "test_controller", "test_touch", "test_soak", "test_commanding", "test_detection",
+    "test_bracing_push", "test_bracing_loop", "test_brace", "test_workspace_resumed",
+    "test_posture", "test_calibrate_command", "test_open_regulator", "test_ros_end_to_end",
+    "test_run_command", "test_lab", "test_commanding_processes", "test_supply_contract",
+    "test_world",
+)  # fmt: skip
 LOOPBACK = ("127.0.0.1", "::1", "localhost")
 
 os.environ["MPLBACKEND"] = "Agg"

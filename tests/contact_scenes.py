@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 import stiffopt
-from independent import FLOP, Arm, rod_section
+from independent.arms import FLOP, Arm
+from independent.sections import rod_section
 from stiffopt.model.scene import Scene
 
 TWO = Arm((FLOP, FLOP))

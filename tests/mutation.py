@@ -29,7 +29,10 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 REVIEWED = Path(__file__).with_name("mutation_survivors.txt")
 PACKAGE = "stiffopt.safety"
-SHORT = {"gate": "tests/test_safety.py", "goal": "tests/test_goal.py"}
+SHORT = {
+    "gate": ["tests/test_safety.py"],
+    "goal": ["tests/test_goal.py", "tests/test_goal_checks.py", "tests/test_goal_supply.py"],
+}
 SAMPLE = [
     *(f"{PACKAGE}.gate.xǁSafetyGateǁ{name}__mutmut_*" for name in ("apply", "vent", "expire")),
     *(f"{PACKAGE}.goal.xǁGoalFollowerǁ{name}__mutmut_*" for name in ("tick", "fail")),
@@ -77,7 +80,9 @@ def copy(folder: Path, files: list[str], *, short: bool) -> None:
         names = files or list(SHORT)
         settings["only_mutate"] = [f"src/stiffopt/safety/{name}.py" for name in names]
     if short:
-        settings["pytest_add_cli_args_test_selection"] = list(SHORT.values())
+        settings["pytest_add_cli_args_test_selection"] = [
+            test for tests in SHORT.values() for test in tests
+        ]
     for name in ("src", "tests", *settings["also_copy"]):
         shutil.copytree(
             ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__", "*.pyc")

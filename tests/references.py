@@ -20,18 +20,10 @@ from scipy.linalg import eigh, expm
 from scipy.optimize import brentq
 from scipy.special import ellipe, ellipeinc, ellipk, ellipkinc
 
-from independent import (
-    Arm,
-    Load,
-    Tube,
-    bores,
-    hat,
-    hat6,
-    pressure_resultant,
-    shift,
-    silicone,
-    wrench_map,
-)
+from independent.arms import Arm, Tube
+from independent.motions import hat, hat6, shift, wrench_map
+from independent.rods import Load
+from independent.sections import bores, pressure_resultant, silicone
 
 Vector = NDArray[np.float64]
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from independent import ARMS, FLOP, Arm
+from independent.arms import ARMS, FLOP, Arm
 from stiffopt.errors import InputError
 from stiffopt.model.description import RobotDescription
 from stiffopt.model.manipulator import Manipulator

@@ -10,7 +10,10 @@ import numpy as np
 import pytest
 
 import stiffopt as so
-from independent import ARMS, FLOP, Arm, Load, hat, neo_hookean, rod_section, rod_tip, wrench_map
+from independent.arms import ARMS, FLOP, Arm, neo_hookean
+from independent.motions import hat, wrench_map
+from independent.rods import Load, rod_tip
+from independent.sections import rod_section
 from stiffopt import lie
 from stiffopt.errors import EquilibriumError, InputError, PressureError
 from stiffopt.model import body

@@ -377,6 +377,8 @@ def test_a_motion_from_a_brace_lets_go_on_the_way_to_rest(solution, monkeypatch)
     assert found.stiffness[-1] == pytest.approx(ROBOT.stiffness(goal, [1, 0, 0]))
     with pytest.raises(InputError, match="leans on objects"):
         found.trajectory()
+    wide = stiffopt.plan_motion(ROBOT, TASK, goal, clearance=0.04, timeout=None)
+    assert wide.message.startswith("at rest: the body is 25 mm too near 'post'")
 
 
 FREE = TASK.unbraced.model_copy(update={"scene": None})

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 import stiffopt
-from independent import ARMS, FLOP, Arm, discretise, neo_hookean
+from independent.arms import ARMS, FLOP, Arm, neo_hookean
+from independent.elements import discretise
 from stiffopt.errors import EquilibriumError, InputError, PressureError
 from stiffopt.model import arm_clearance
 from stiffopt.model.scene import Scene

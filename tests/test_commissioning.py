@@ -1,14 +1,11 @@
-"""Commissioning: faults of a set-up are found and named, usual arms fit, and danger stops it.
+"""Commissioning explains what it sees: faults of a set-up are named and corrected, usual arms fit.
 
-Most tests take what the tip does from the simulated arm at rest, without regulators and time: the
-explanation is what is tested. Some go through the rig, from the command line to the record.
+What the tip does is taken from the simulated arm at rest, without regulators and time.
 """
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
-from datetime import UTC, datetime, timedelta
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -17,41 +14,23 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from simulated_loop import Lab
 from stiffopt import lie
-from stiffopt.cli import commission_run
-from stiffopt.cli.main import main
-from stiffopt.commissioning import procedure, settings
 from stiffopt.commissioning.correction import corrections, write_corrected
 from stiffopt.commissioning.expected import ExpectedSteps, expected_steps, rotation_vectors
 from stiffopt.commissioning.explanation import Explainer, SetupExplanation
 from stiffopt.commissioning.findings import Finding, findings_of
-from stiffopt.commissioning.record import (
-    CommissioningRecord,
-    RecordedFinding,
-    commissioned_control,
-    commissioned_robot,
-    fingerprints,
-    load_record,
-    save_record,
-)
 from stiffopt.commissioning.responses import Responses
 from stiffopt.commissioning.timing import Delays, Swing, fit_swing
-from stiffopt.control.state import State
 from stiffopt.documents import read_document
-from stiffopt.errors import InputError
-from stiffopt.model.description import RobotDescription
 from stiffopt.model.robot_files import load_description
 from stiffopt.plant.plant import Plant
 from stiffopt.plant.settings import Mismatch, PlantLoad, PlantSettings
 from stiffopt.registration import Placement, Registration
-from stiffopt.rig.config import RigDescription, load_rig_description
+from stiffopt.rig.config import RigDescription
 from stiffopt.rig.interface import PressureLimits, Rig
-from stiffopt.rig.settings import ControlSettings
 from stiffopt.safety.rigs import rig_for_programs
 
 Array = NDArray[np.float64]
-
 COARSE = {"bending_degree": 2, "shear_degree": 1, "sub_intervals": 4}
 NOISE, ANGULAR_NOISE, SAMPLES = 5e-5, 1e-3, 80
 HANGING, SHORT = "stiff-flop-2-hanging", "stiff-flop-1"
@@ -166,7 +145,7 @@ def usual_arm(seed: int, **other: Any) -> Mismatch:
     )
 
 
-# -- what is explained -----------------------------------------------------------------------------
+# -- what is explained ----------------------------------------------------------------------------
 
 
 @pytest.mark.one_in(3)
@@ -312,198 +291,7 @@ def test_a_swing_is_fitted() -> None:
     assert fit_swing(still, 2e-5) is None
 
 
-# -- on the rig ------------------------------------------------------------------------------------
-
-PROCEDURE = replace(
-    settings.PROCEDURE, rest=1.0, first_hold=0.3, up=1.3, down=1.0, long=9.5, long_down=1.0
-)
-
-
-@pytest.fixture(autouse=True)
-def short_steps(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(procedure, "PROCEDURE", PROCEDURE)
-
-
-RIG = """\
-format: stiffopt-rig/1
-name: short
-robot: stiff-flop-1
-rate: 50 Hz
-supply: {{driver: simulated}}
-tracker: {{driver: simulated, noise: 0.03 mm}}
-log: {{folder: {folder}}}
-plant:
-  dynamics: quasi-static
-  faults: true
-  discretisation: {{bending_degree: 1, shear_degree: 0, sub_intervals: 3, step: 10 ms}}
-{more}"""
-
-
-def rig_file(folder: Path, more: str = "") -> Path:
-    path = folder / "rig.yaml"
-    path.write_text(RIG.format(folder=folder / "runs", more=more), encoding="utf-8")
-    return path
-
-
-def commissioned(path: Path, *options: str) -> int:
-    return main(["commission", str(path), "--quick", "-q", *options])
-
-
-@pytest.fixture
-def touched(monkeypatch: pytest.MonkeyPatch) -> Any:
-    """Change the rig of the next command by a function."""
-
-    def by(change: Any) -> None:
-        plain = commission_run.rig_of
-
-        def changed(path: str) -> Any:
-            rig, *rest = plain(path)
-            change(rig)
-            return (rig, *rest)
-
-        monkeypatch.setattr(commission_run, "rig_of", changed)
-
-    return by
-
-
-def swapped(rig: Any) -> None:
-    """Exchange the tubes of channels 1 and 2; the gauges are those of the regulators."""
-    world = rig.tracker._world
-    command, measured = world.command, world.measured
-    world.command = lambda p: command(np.asarray(p)[[1, 0, 2]])
-    world.measured = lambda: measured()[[1, 0, 2]]
-
-
-def test_a_rig_that_fits(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = rig_file(tmp_path)
-    assert commissioned(path, "--json", "--folder", str(tmp_path / "first")) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert told["fits"]
-    assert told["findings"] == []
-    assert told["channels"][0]["lag_up_s"] == pytest.approx(0.06, abs=0.01)
-    assert told["channels"][0]["displacement_m"][0] == pytest.approx(-3.2e-3, rel=0.1)
-    assert told["tracker"]["tip_delay_s"] == pytest.approx(0.01, abs=0.02)
-    assert told["tracker"]["noise_m"] == pytest.approx(3e-5, rel=0.2)
-    files = {each.name for each in (tmp_path / "first").iterdir()}
-    assert files >= {"record.yaml", "report.md", "commissioning.csv", "commissioning.png"}
-    assert main(["check", str(tmp_path / "rig.commissioning.yaml"), "-q"]) == 0
-    record = load_record(tmp_path / "rig.commissioning.yaml")
-    assert record.fits
-    assert record.age() < 600
-    description = load_rig_description(path)
-    robot = load_description("stiff-flop-1")
-    assert (record.rig_hash, record.robot_hash) == fingerprints(robot, description)
-
-
-def test_a_full_one_sees_slow_leaks(tmp_path: Path) -> None:
-    path = rig_file(tmp_path)
-    assert main(["commission", str(path), "--no-plot", "-q"]) == 0
-    record = load_record(tmp_path / "rig.commissioning.yaml")
-    assert not record.quick
-    drifts = [channel.drift for channel in record.channels]
-    assert all(drift is not None and -0.2 < drift < 0.02 for drift in drifts)  # it creeps on
-
-
-def test_a_swap_on_the_rig(
-    tmp_path: Path, touched: Any, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = rig_file(tmp_path)
-    touched(swapped)
-    assert main(["commission", str(path), "--quick", "--no-plot"]) == 6
-    told = capsys.readouterr().out
-    assert "channels 1 and 2 seem swapped" in told
-    assert "does NOT fit" in told
-    assert not load_record(tmp_path / "rig.commissioning.yaml").fits
-
-
-def test_set_points_that_are_swapped_are_no_leak(
-    tmp_path: Path, touched: Any, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Each gauge reads its own chamber, which has shown the other channel's step."""
-
-    def crossed(rig: Any) -> None:
-        command = rig.tracker._world.command
-        rig.tracker._world.command = lambda p: command(np.asarray(p)[[1, 0, 2]])
-
-    touched(crossed)
-    path = rig_file(tmp_path)
-    assert main(["commission", str(path), "--no-plot"]) == 6
-    told = capsys.readouterr().out
-    assert "channels 1 and 2 seem swapped" in told
-    assert "the gauge of channel 2 follows the command of channel 1" in told
-
-
-def test_the_corrected_rig_file_fits(
-    tmp_path: Path, touched: Any, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """The whole first day: a turned frame is found, corrected, and then nothing is wrong."""
-    more = (
-        "  mismatch: {registration: {orientation: [0.996194698, 0, 0, 0.087155743]}}\n"
-        "control: {tracker_noise: 0.01 mm}\n"
-    )
-    path, better = rig_file(tmp_path, more), tmp_path / "better.yaml"
-    assert commissioned(path, "--no-plot", "--out", str(better)) == 6
-    assert "tracker.registration.tracker_in_base, control.tracker_noise" in better.read_text()
-    # a simulated sensor is placed by the file, and would move with it
-    there = load_rig_description(path).tracker
-    touched(lambda rig: setattr(rig.tracker._world.camera, "settings", there))
-    folder = str(tmp_path / "again")
-    code = main(["commission", str(better), "--quick", "--no-plot", "--folder", folder])
-    assert code == 0, capsys.readouterr().out
-
-
-def test_danger_ends_it(tmp_path: Path, touched: Any, capsys: pytest.CaptureFixture[str]) -> None:
-    """An arm that moves much farther than any model of it, and one whose tracker jumps."""
-    path = rig_file(tmp_path, "  mismatch: {gain: [5, 5, 5]}\n")
-    assert commissioned(path, "--no-plot") == 5
-    told = capsys.readouterr().err
-    assert "the tip has moved by" in told
-    assert "the arm is vented" in told
-    (finding,) = load_record(tmp_path / "rig.commissioning.yaml").findings
-    assert "was stopped: the tip has moved" in finding.text
-
-    def jumping(rig: Any) -> None:
-        capture, camera = rig.tracker._world.camera.capture, rig.tracker._world.camera
-        camera.capture = lambda fault: capture("wrong" if camera.count > 100 else fault)
-
-    path = rig_file(tmp_path)
-    touched(jumping)
-    assert commissioned(path, "--no-plot", "--folder", str(tmp_path / "second")) == 5
-    assert "jumped by" in capsys.readouterr().err
-
-
-def test_a_shaken_arm_is_not_moved(tmp_path: Path, touched: Any) -> None:
-    touched(lambda rig: rig.tracker._world.inject("tracker", "shaking"))
-    assert commissioned(rig_file(tmp_path), "--no-plot") == 5
-    finding = load_record(tmp_path / "rig.commissioning.yaml").findings[0]
-    assert "though the arm is vented" in finding.text
-
-
-def test_bad_input(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = rig_file(tmp_path)
-    assert commissioned(path, "--out", str(path)) == 2
-    (tmp_path / "elsewhere").mkdir()
-    assert commissioned(path, "--out", str(tmp_path / "elsewhere" / "better.yaml")) == 2
-    assert "expected a place beside" in capsys.readouterr().err
-    assert not (tmp_path / "runs").exists()  # nothing has moved
-    nowhere = f"commissioning: {{record: {tmp_path / 'nowhere' / 'record.yaml'}}}\n"
-    path.write_text(path.read_text() + nowhere, encoding="utf-8")
-    assert commissioned(path) == 2
-    assert "the record cannot be written" in capsys.readouterr().err
-    path = rig_file(tmp_path)
-    (tmp_path / "experiment.yaml").touch()  # 'stiffopt commission' cannot continue one
-    assert commissioned(path, "--folder", str(tmp_path)) == 2
-    assert "is not empty" in capsys.readouterr().err
-    path.write_text(path.read_text().replace("tracker:", "# tracker:"), encoding="utf-8")
-    assert commissioned(path) == 2
-    assert "no tracker" in capsys.readouterr().err
-    bad = tmp_path / "bad.yaml"
-    bad.write_text("format: stiffopt-commissioning/1\ndate: today\n", encoding="utf-8")
-    assert main(["check", str(bad)]) == 2
-    assert "time zone" in capsys.readouterr().out
-
-
-# -- the corrected file ----------------------------------------------------------------------------
+# -- the corrected file ---------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -552,186 +340,3 @@ def test_a_registration_is_corrected() -> None:
     found = Placement(position=tuple(block["position"]), orientation=tuple(block["orientation"]))
     wanted = turned("z", 10.0).transform() @ turned("y", 80.0).transform()
     np.testing.assert_allclose(found.transform()[:3, :3], wanted[:3, :3], atol=0.02)
-
-
-# -- arming ----------------------------------------------------------------------------------------
-
-
-class Armed:
-    """A loop that may be armed, on a rig that was commissioned, and its record."""
-
-    def __init__(self, folder: Path, **record: Any) -> None:
-        self.path = folder / "record.yaml"
-        self.lab = Lab(ready=False, commissioning={"record": str(self.path), "required": True})
-        rig_hash, robot_hash = fingerprints(self.lab.rig.robot, self.lab.rig.settings)
-        place = tuple(self.lab.world.plant.tip_pose()[:3, 3].tolist())
-        tracker = {"position": place, "noise": 3e-5, "rate": 40.0, "latency": 0.025, "missing": 0.0}
-        channel = {
-            "displacement": (0, 0, 0), "expected": (0, 0, 0), "deviation": 0.0,
-            "gauge_offset": 0.0, "gauge_noise": 150.0,
-        }  # fmt: skip
-        values: dict[str, Any] = {
-            "date": datetime.now(UTC).isoformat(), "rig": "rig", "robot": "stiff-flop-1",
-            "rig_hash": rig_hash, "robot_hash": robot_hash, "fits": True,
-            "tracker": tracker, "channels": [channel] * 3,
-        }  # fmt: skip
-        for key, value in record.items():
-            old = values.get(key)
-            values[key] = {**(old or {}), **value} if isinstance(value, dict) else value
-        save_record(self.path, CommissioningRecord(**values))
-
-    def refused(self) -> str:
-        with pytest.raises(InputError) as refusal:
-            self.lab.arm()
-        return str(refusal.value)
-
-
-def test_arming_asks_for_a_record_that_fits(tmp_path: Path) -> None:
-    armed = Armed(tmp_path)
-    armed.lab.arm()
-    assert armed.lab.state is State.ACTIVE
-    armed = Armed(tmp_path)
-    armed.path.unlink()
-    assert "there is no record" in armed.refused()
-    assert "run 'stiffopt commission'" in armed.refused()
-    finding = RecordedFinding(text="channels 1 and 2 seem swapped", fits=False)
-    assert "seem swapped" in Armed(tmp_path, fits=False, findings=(finding,)).refused()
-    old = (datetime.now(UTC) - timedelta(hours=30)).isoformat()
-    assert "is 30 h old; at most 24 h" in Armed(tmp_path, date=old).refused()
-    assert "another robot file" in Armed(tmp_path, robot_hash="0" * 16).refused()
-    assert "another supply, tracker" in Armed(tmp_path, rig_hash="0" * 16).refused()
-    armed = Armed(tmp_path)
-    armed.path.write_text("format: stiffopt-commissioning/1\n", encoding="utf-8")
-    assert "cannot be read" in armed.refused()
-
-
-def test_arming_without_a_record_says_what_it_does_not_know(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """On a real rig always; on a simulated one if the vented tip is far from the model's."""
-
-    def warnings(off: float, *, real: bool, commissioned: bool = False) -> list[str]:
-        armed = Armed(tmp_path)
-        lab, tip = armed.lab, armed.lab.controller.tip
-        if not commissioned:
-            update = {"required": False, "record": str(tmp_path / "none.yaml")}
-            settings = lab.rig.settings
-            changed = settings.commissioning.model_copy(update=update)
-            lab.rig.settings = settings.model_copy(update={"commissioning": changed})
-        if real:
-            monkeypatch.setattr(type(lab.rig.settings.supply), "simulated", False)
-        lab.controller.tip = tip + np.array([off, 0.0, 0.0])
-        lab.arm()
-        monkeypatch.undo()
-        events, _ = lab.loop.events.since(0)
-        return [event.text for event in events if event.kind == "uncommissioned"]
-
-    assert warnings(2e-3, real=False) == []
-    assert warnings(6e-3, real=True, commissioned=True) == []
-    (told,) = warnings(2e-3, real=True)
-    assert "no record of a commissioning fits" in told
-    assert "run 'stiffopt commission'" in told.lower()
-    assert "is seen" not in told
-    for real in (False, True):
-        (told,) = warnings(6e-3, real=real)
-        assert "the vented tip is seen 6.0 mm from where the model has it" in told
-
-
-def test_the_loop_gets_the_swing_that_was_found(tmp_path: Path) -> None:
-    swing = {
-        "frequency": 1.7, "frequency_deviation": 1e-3, "damping": 0.035,
-        "damping_deviation": 1e-3, "amplitude": 3e-3,
-    }  # fmt: skip
-
-    def settings_with(armed: Armed, **control: Any) -> tuple[float | None, float]:
-        rig = armed.lab.rig
-        update = {"control": ControlSettings(**control)}
-        found = commissioned_control(rig.settings.model_copy(update=update), rig.robot)
-        return found.frequency, found.damping
-
-    assert settings_with(Armed(tmp_path, swing=swing)) == (1.7, 0.035)
-    # the rig file's own word counts more
-    assert settings_with(Armed(tmp_path, swing=swing), damping=0.06) == (1.7, 0.06)
-    assert settings_with(Armed(tmp_path, swing=swing), frequency=2.0) == (2.0, 0.035)
-    for changes in ({"fits": False}, {"robot_hash": "0" * 16}, {"swing": None}):
-        assert settings_with(Armed(tmp_path, **{"swing": swing} | changes)) == (None, 0.06)
-    armed = Armed(tmp_path)
-    armed.path.write_text("format: stiffopt-commissioning/1\n", encoding="utf-8")
-    assert settings_with(armed) == (None, 0.06)
-    armed.path.unlink()
-    assert settings_with(armed) == (None, 0.06)
-
-
-def test_the_loop_gets_the_modulus_and_the_gains_that_were_measured(tmp_path: Path) -> None:
-    """Elongation has no say."""
-    ways, factors = np.array([(4.0, 0.0), (-2.0, 3.0), (-2.0, -3.0)]) * 1e-3, (0.7, 0.8, 0.9)
-    channels = [
-        {"displacement": (*(f * way), 0.0), "expected": (*way, 5e-4), "deviation": 1e-5}
-        for f, way in zip(factors, ways, strict=True)
-    ]
-
-    def model_with(**record: Any) -> tuple[RobotDescription, RobotDescription]:
-        rig = Armed(tmp_path, **record).lab.rig
-        return rig.robot, commissioned_robot(rig.settings, rig.robot)
-
-    robot, found = model_with(channels=channels)
-    (before,), (after,) = robot.segments, found.segments
-    ratio = after.material.youngs_modulus / before.material.youngs_modulus
-    assert ratio == pytest.approx(1 / 0.8)
-    assert after.corrections is not None
-    assert after.corrections.gain == pytest.approx((7 / 8, 1.0, 9 / 8))
-    assert found.tolerances is not None
-    assert found.tolerances.youngs_modulus == 0.1
-    for changes in ({"fits": False}, {"robot_hash": "0" * 16}, {"channels": ()}):
-        robot, found = model_with(**{"channels": channels} | changes)
-        assert found is robot
-    still = [{**each, "expected": (0.0, 0.0, 5e-4)} for each in channels]
-    back = [{**channels[0], "displacement": (-1e-4, 0.0, 0.0)}, *channels[1:]]
-    for other in (still, back):
-        robot, found = model_with(channels=other)
-        assert found is robot
-
-
-def test_arming_compares_the_vented_arm_with_the_record(tmp_path: Path) -> None:
-    assert "from where it was" in Armed(tmp_path, tracker={"position": (0.01, 0, 0.09)}).refused()
-    armed = Armed(tmp_path)
-    armed.lab.world.camera.settings = armed.lab.world.camera.settings.model_copy(
-        update={"noise": 2e-4}
-    )
-    assert "mm and was 0.030 mm" in armed.refused()
-    armed = Armed(tmp_path)
-    armed.lab.world.inject("tracker", "slow")
-    armed.lab.loop.configure()
-    armed.lab.ticks(100)
-    assert "ms old when they come" in armed.refused()
-    armed = Armed(tmp_path)
-    measured = armed.lab.world.measured
-    armed.lab.world.measured = lambda: measured() + 6e3
-    assert "the gauge of channel 1 reads 0.06" in armed.refused()
-
-
-def test_nobody_arms_with_dead_gauges(tmp_path: Path) -> None:
-    lab = Lab(ready=False)
-    lab.world.measured = lambda: np.full(3, np.nan)
-    with pytest.raises(InputError, match="gauges of channels 1, 2, 3 read nothing"):
-        lab.arm()
-    lab = Lab(ready=False)
-    lab.world.measured = lambda: np.full(3, 1234.5)
-    with pytest.raises(InputError, match="the very same number 60 times"):
-        lab.arm()
-    lab = Lab(ready=False, supply={"noise": 0.0, "ripple": 0.0})
-    lab.arm()  # reads exactly 0, as a converter does that cannot say less
-    armed = Armed(tmp_path)
-    armed.lab.world.measured = lambda: np.zeros(3)
-    assert "the very same number" in armed.refused()  # it had noise when it was commissioned
-
-
-def test_a_record_that_is_not_required_counts_if_it_is_of_this_rig(tmp_path: Path) -> None:
-    for hashes, is_refused in (({}, True), ({"rig_hash": "0" * 16}, False)):
-        armed = Armed(tmp_path, fits=False, **hashes)
-        free = armed.lab.rig.settings.commissioning.model_copy(update={"required": None})
-        armed.lab.rig.settings = armed.lab.rig.settings.model_copy(update={"commissioning": free})
-        if is_refused:
-            assert "did not fit" in armed.refused()
-        else:
-            armed.lab.arm()

@@ -23,7 +23,8 @@ from contact_scenes import (
     robot,
     scene,
 )
-from independent import ARMS, FLOP, rod_section
+from independent.arms import ARMS, FLOP
+from independent.sections import rod_section
 from stiffopt.errors import EquilibriumError, InputError
 from stiffopt.model.contact.solve import ContactProblem
 from stiffopt.model.contact.stability import stiffness_left

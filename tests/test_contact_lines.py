@@ -8,15 +8,9 @@ import numpy as np
 import pytest
 
 import stiffopt
-from contact_scenes import (
-    REST,
-    TWO,
-    X,
-    robot,
-    scene,
-    table,
-)
-from independent import FLOP, rod_section
+from contact_scenes import REST, TWO, X, robot, scene, table
+from independent.arms import FLOP
+from independent.sections import rod_section
 from stiffopt.errors import EquilibriumError
 from stiffopt.model.contact.solve import ContactProblem
 from stiffopt.model.contact.surface import ContactSurface

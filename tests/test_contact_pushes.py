@@ -24,7 +24,8 @@ from contact_scenes import (
     scene,
     table,
 )
-from independent import ARMS, FLOP, rod_section
+from independent.arms import ARMS, FLOP
+from independent.sections import rod_section
 from stiffopt.errors import EquilibriumError
 
 PROBLEMS = Path(__file__).parents[1] / "problems"

@@ -408,6 +408,44 @@ def test_a_doubted_motion_stops_without_a_swing():
     assert swings[0] < 0.5 * swings[1]
 
 
+def test_the_tip_takes_its_time_to_a_new_target():
+    """Half a period of the vibration; what follows is not bounded."""
+    bench = moving(rested=3.0, moved=0.0)
+    controller = bench.controller
+    reference, goals, shares = controller._reference, [], []
+    begin = reference.goal[: bench.n]
+    for _ in range(round(1.0 / bench.period)):
+        bench.run(bench.period)
+        goals.append(reference.goal[: bench.n])
+        shares.append(np.min(reference.slew_share))
+    first = np.array(controller.replanner.plan.tip_first)
+    way = (np.abs(first - begin) / bench.slew).max()
+    gone = (np.abs(np.array(goals) - begin) / bench.slew).max(axis=1)
+    half = np.pi / controller._arm.tip.omega
+    assert way < 0.5 * half
+    assert bench.period * np.argmax(gone > 0.95 * way) == pytest.approx(0.95 * half, rel=0.15)
+    assert shares[0] < 0.5
+    assert shares[-1] == 0.9
+
+
+def test_the_tip_stays_while_the_arm_becomes_stiff_in_another_direction():
+    """Also if it is held for a while and goes on."""
+    bench = Bench(HANGING, "full")
+    position = bench.settled(duration=4.0)
+    task, before = bench.task(position=position), bench.command
+    axial = StiffnessGoal(maximise=StiffnessMeasure(direction=(0.0, 0.0, 1.0)))
+    bench.controller.set_task(task.model_copy(update={"stiffness": axial}))
+    errors = [bench.run(1.0, position), bench.run(0.3, position, steer=False)]
+    assert bench.controller.replanner.plan.tip_first
+    bench.controller.resume(bench.rig.clock.now())
+    errors.append(bench.run(8.0, position))
+    assert np.concatenate(errors).max() < 1.5e-3
+    assert np.abs(bench.command - before).max() > 0.3 * BAR
+    assert not bench.controller.replanner.plan.tip_first
+    standing = bench.controller.status(bench.rig.clock.now())
+    assert standing.stiffness == pytest.approx(standing.best_stiffness, rel=0.05)
+
+
 def test_touch_and_creep_get_tip_and_pressures_of_the_same_time():
     bench = moving(rested=2.0, moved=0.1, dynamics="quasi-static")
     arm, ways, errors = bench.controller._arm, [], []
@@ -454,7 +492,7 @@ def test_the_motion_watch_compares_tip_and_pressures_of_the_same_time():
 
 
 def test_a_channel_that_acts_the_wrong_way_stops_at_the_pressure_at_which_it_followed():
-    bench = moving(rested=1.5, moved=0.3)
+    bench = moving(rested=3.0, moved=0.3)
     channels = bench.controller._arm.channels
     followed = float(channels.last_followed[1])
     channels.opposed = np.arange(bench.n) == 1

@@ -5,7 +5,7 @@ import pytest
 
 import stiffopt as so
 from conftest import is_long
-from independent import body_twists, derivative
+from independent.motions import body_twists, derivative
 
 ROBOTS = ["stiff-flop-1", "stiff-flop-3", "stiff-flop-2-hanging"]
 

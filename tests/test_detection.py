@@ -18,6 +18,8 @@ from stiffopt.identify.detection import (
     Comparer,
     Found,
     found_wrong,
+    idle_channels,
+    of_channels,
     on_one_clock,
     without_drift,
 )
@@ -113,6 +115,46 @@ def test_exchanged_segments_are_found() -> None:
     assert (found.hypothesis.kind, found.hypothesis.sources) == ("channels", (3, 4, 5, 0, 1, 2))
 
 
+@pytest.mark.parametrize("order", [(1, 2, 0, 3, 4, 5), (0, 1, 2, 5, 3, 4)])
+def test_a_cycle_of_channels_within_one_segment_is_found(order: tuple[int, ...]) -> None:
+    log = log_of("stiff-flop-2", 6)
+    wrong = replace(log, commanded=log.commanded[:, np.argsort(order)])
+    found = found_in(load_description("stiff-flop-2"), [wrong])
+    assert found is not None
+    assert (found.hypothesis.kind, found.hypothesis.sources) == ("channels", order)
+    (again,) = validate(calibrated(arm("stiff-flop-2")), [wrong])
+    assert "the channels are in another order" in again.remarks[-1]
+    assert again.errors.mean < 2e-3
+
+
+def test_nothing_is_corrected_where_the_arm_bears_none_of_the_pressures() -> None:
+    log = log_of()
+    beyond = replace(log, commanded=log.commanded * 20)
+    assert found_in(load_description("stiff-flop-1"), [beyond]) is None
+
+
+def test_orders_of_many_channels_are_few() -> None:
+    robot = load_description("stiff-flop-1")
+    for count, orders in ((4, 23), (8, 28)):  # all; each two exchanged
+        angles = tuple((2 * np.pi * np.arange(count) / count).tolist())
+        chambers = robot.segments[0].chambers.model_copy(update={"angles": angles, "radius": 1e-3})
+        channels = tuple((k + 1,) for k in range(count))
+        changes = {"chambers": chambers, "channels": channels, "corrections": None}
+        segment = robot.segments[0].model_copy(update=changes)
+        wide = robot.model_copy(update={"segments": (segment,)})
+        kinds = [each.kind for each in of_channels(wide, 1)]
+        assert kinds.count("channels") == orders
+
+
+def test_a_dead_line_near_the_tip_of_an_arm_under_its_weight_is_found() -> None:
+    time, pressures = course(6, 60.0, highest=6e4, rate=1.0)
+    real = pressures * [1.0, 1.0, 1.0, 1.0, 1.0, 0.0]
+    wrong = replace(driven(real, time, "stiff-flop-2-hanging"), commanded=pressures)
+    found = found_in(load_description("stiff-flop-2-hanging"), [wrong])
+    assert found is not None
+    assert (found.hypothesis.kind, found.hypothesis.sources) == ("lines", (0, 1, 2, 3, 4, -1))
+
+
 @pytest.mark.parametrize(("source", "words"), [(-1, "is dead"), (2, "as if they shared a line")])
 def test_a_line_that_does_not_do_what_was_commanded_is_found(source: int, words: str) -> None:
     time, pressures = course(3, 60.0, rate=5.0)
@@ -123,6 +165,48 @@ def test_a_line_that_does_not_do_what_was_commanded_is_found(source: int, words:
     assert "segment 1 channel 2" in result.remarks[0]
     assert words in result.remarks[0]
     assert result.calibrated[0].errors.mean < 4e-3
+
+
+@cache
+def with_a_dead_line() -> Log:
+    """A log in which channel 2 does nothing, of a sensor that sits elsewhere than the file says."""
+    time, pressures = course(3, 120.0, rate=5.0)
+    sensor = np.eye(4)
+    sensor[:3, 3] = [0.1, 0.05, 0.0]
+    log = made_log(arm(), time, pressures * [1.0, 0.0, 1.0], sensor=sensor)
+    return replace(log, commanded=pressures)
+
+
+def test_a_channel_that_does_nothing_is_told_where_no_model_fits() -> None:
+    wrong = with_a_dead_line()
+    assert not found_in(load_description("stiff-flop-1"), [wrong])
+    result = calibrate("stiff-flop-1", [wrong], settings=CalibrationSettings(**FAST))
+    told = "the pressure of segment 1 channel 2 does not show in the tip"
+    (remark,) = (each for each in result.remarks if told in each)
+    assert "% if the line of segment 1 channel 2 is dead" in remark
+    (found,) = validate(calibrated(arm()), [wrong])
+    assert any(told in remark for remark in found.remarks)
+    keep = CalibrationSettings(keep=("lines",), **FAST)
+    kept = calibrate("stiff-flop-1", [wrong], settings=keep)
+    (also,) = validate(calibrated(arm()), [wrong], keep)
+    assert not any(told in remark for remark in (*kept.remarks, *also.remarks))
+
+
+def test_a_channel_that_follows_others_is_not_told_to_do_nothing() -> None:
+    time, pressures = course(3, 120.0, rate=5.0)
+    following = pressures.copy()
+    following[:, 1] = pressures[:, [0, 2]].mean(axis=1)
+    for real in (following, following * [1.0, 0.0, 1.0]):
+        log = replace(driven(real, time), commanded=following)
+        read = recordings_of(load_description("stiff-flop-1"), [log], AS_RECORDED)
+        assert not idle_channels(load_description("stiff-flop-1"), read)
+
+
+def test_channels_of_right_logs_do_something() -> None:
+    for name, n in (("stiff-flop-1", 3), ("stiff-flop-2", 6)):
+        robot = load_description(name)
+        for log in (log_of(name, n, 60.0), log_of(name, n, 20.0, seed=1)):
+            assert not idle_channels(robot, recordings_of(robot, [log], AS_RECORDED))
 
 
 @pytest.mark.parametrize("turn", range(0, 24, 5))
@@ -452,12 +536,15 @@ def test_recordings_of_real_arms_are_left_as_they_are() -> None:
         (read,) = recordings_of(one, [log], AS_RECORDED)
         np.testing.assert_array_equal(read.pressures, np.nan_to_num(log.commanded))
         assert not of_recordings(one, [read])
+        assert not idle_channels(one, [read])
         assert (without_drift(read) is read) == (path.name != "run_2022-10-20-ol-p2p.csv")
     robot = load_description("asu-two-segment")
     read = recordings_of(robot, list(ASU), AS_RECORDED)
     span = np.subtract(robot.pressure_max, robot.pressure_min)
     assert all(without_drift(on_one_clock(each, span)) is each for each in read)
     assert not of_recordings(robot, read)
+    assert not idle_channels(robot, read)
+    assert not any(idle_channels(robot, [each]) for each in read)
 
 
 @pytest.mark.skipif(not ASU, reason="the recordings are not there")

@@ -16,7 +16,10 @@ from pydantic import BaseModel
 
 import stiffopt
 from examples import run_examples
+from made_runs import BEGIN, snapshot
 from stiffopt.commissioning.record import CommissioningRecord
+from stiffopt.daemon.telemetry import about_run
+from stiffopt.daemon.topics import METADATA
 from stiffopt.experiments.poses import PosesFile, load_poses
 from stiffopt.identify.bench import load_bench
 from stiffopt.logs import read_log
@@ -35,6 +38,7 @@ from stiffopt.model.description import (
 )
 from stiffopt.model.history import Creep, History, Play
 from stiffopt.model.obstacles import OBSTACLES
+from stiffopt.model.robot_files import load_description
 from stiffopt.model.scene import AllowedContact, Scene, SceneObject
 from stiffopt.optimise.brace import Brace
 from stiffopt.optimise.goal import MatchMatrix, MatchValue, StiffnessGoal
@@ -193,6 +197,15 @@ def test_files_page_names_no_key_that_does_not_exist() -> None:
     assert not named - known
 
 
+def test_files_page_names_all_that_a_recording_says_of_its_run() -> None:
+    page = (ROOT / "docs" / "files.md").read_text(encoding="utf-8")
+    (part,) = re.findall(r"^## Recording of a run\n(.*?)(?=^## )", page, re.M | re.S)
+    about = about_run(load_description("stiff-flop-1"), "rig", snapshot(BEGIN), BEGIN, 0)
+    cells = " ".join(re.findall(r"^\| (`.*?) \|", part, re.M))
+    assert set(re.findall(r"`(\w+)`", cells)) == set(about)
+    assert all(f"`{name}`" in part for name in (METADATA, about["format"]))
+
+
 @pytest.mark.filterwarnings("ignore:the simulator is compiled")
 def test_rig_page_examples_print_what_stands_below_them(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(ROOT)
@@ -207,6 +220,10 @@ def test_files_page_shows_a_log_that_can_be_read(tmp_path: Path) -> None:
     assert (log.n, len(log)) == (3, 2)
     for column in log.layout.columns:
         assert f"`{column}`" in page or re.match(r"pm?3_pa", column)
+
+
+def test_contact_page_example_prints_what_stands_below_it() -> None:
+    assert run_examples((ROOT / "docs" / "contact.md").read_text(encoding="utf-8"), "contact.md")
 
 
 def solve_pressure(*arguments: str) -> str:

@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 
 import stiffopt as so
-from independent import ARMS, FLOP, PAIR, Arm, discretise, eq_9, neo_hookean, silicone
+from independent.arms import ARMS, FLOP, PAIR, Arm, eq_9, neo_hookean
+from independent.elements import discretise
+from independent.sections import silicone
 from stiffopt.model.actuation import SectionGeometry
 
 GOLDEN = [  # bar, tip x and z in mm, k_x k_y k_z in N/cm

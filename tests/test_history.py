@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
 from conftest import is_long
-from independent import FLOP
+from independent.arms import FLOP
 from stiffopt.errors import InputError
 from stiffopt.model.description import Segment
 from stiffopt.model.history import NO_HISTORY, Creep, History, Memory, Part, Play, part_of

@@ -364,6 +364,7 @@ def _until(terminal: int, pattern: str) -> str:
 
 
 TASK = "format: stiffopt-task/1\ntarget: {position: [0 mm, 0 mm, 1 mm]}\n"
+BENCH = "format: stiffopt-bench/1\narms:\n- name: one\n  train: [a.csv]\n  "
 RIG = "format: stiffopt-rig/1\nsupply: {driver: simulated}\n"
 BAD = """\
 format: stiffopt-task/1
@@ -410,7 +411,9 @@ def test_mistakes_for_programs() -> None:
     [
         ("a.yaml", "robot: x\n", "has no 'format'; expected one of stiffopt-robot/1"),
         ("a.yaml", "format: stiffopt-tsk/1\n", "did you mean 'stiffopt-task/1'?"),
-        ("a.yaml", "format: [1]\n", "is no format of a file that people write"),
+        ("a.yaml", "format: [1]\n", "is no format that can be checked; expected one of"),
+        ("a.yaml", "format: stiffopt-bench/1\narms: 3\n", "a.yaml:2: arms: expected a list"),
+        ("a.yaml", f"{BENCH}robot: stiff-flop-9\n", "there is no robot"),
         ("a.csv", "time_s,p1_pa\nx,y\n", "a.csv"),
         ("a.yaml", f"{TASK}robot: none.yaml\n", "there is no file"),
         ("a.yaml", f"{TASK}robot: stiff-flop-1\npressure: {{max: [1 bar]}}\n", "pressure.max"),

@@ -8,18 +8,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from independent import (
-    ARMS,
-    LOPSIDED,
-    Arm,
-    Tube,
-    body_twists,
-    derivative,
-    discretise,
-    five_exponentials,
-    neo_hookean,
-    rod_section,
-)
+from independent.arms import ARMS, LOPSIDED, Arm, Tube, neo_hookean
+from independent.elements import discretise, five_exponentials
+from independent.motions import body_twists, derivative
+from independent.sections import rod_section
 from stiffopt import lie
 from stiffopt.model.description import RobotDescription
 from stiffopt.model.kinematics import Actuation

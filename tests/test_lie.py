@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-from independent import derivative, hat6
+from independent.motions import derivative, hat6
 from stiffopt import lie
 
 Vector = NDArray[np.float64]

@@ -7,7 +7,7 @@ import pytest
 
 import stiffopt as so
 from conftest import is_long
-from independent import ARMS, FLOP, LOPSIDED, Arm, neo_hookean
+from independent.arms import ARMS, FLOP, LOPSIDED, Arm, neo_hookean
 from stiffopt.optimise import samples
 from stiffopt.optimise.prepared import prepared
 from stiffopt.optimise.problem import PressureProblem

@@ -62,6 +62,13 @@ def test_export_writes_log_v1_beside_the_run(
     assert ((log.time > 2.01) & (log.time < 2.46)).sum() > 5
 
 
+def test_a_recording_of_a_run_can_be_checked_but_is_no_log(run_file: Path, capsys: Any) -> None:
+    assert main(["check", str(run_file)]) == 0
+    assert "a log file without mistakes" in capsys.readouterr().out
+    assert main(["validate", "--robot", "stiff-flop-1", str(run_file)]) == 2
+    assert "'stiffopt log export' reads those of runs" in " ".join(capsys.readouterr().err.split())
+
+
 def test_export_overwrites_nothing(run_file: Path, tmp_path: Path, capsys: Any) -> None:
     out = tmp_path / "out.csv"
     assert main(["log", "export", str(run_file), "--csv", "--out", str(out), "--quiet"]) == 0
@@ -81,6 +88,8 @@ def test_a_recording_that_was_cut_short_is_exported_as_far_as_it_goes(
     assert main(["log", "export", str(cut), "--csv"]) == 0
     assert "truncated" in capsys.readouterr().err
     assert 10 < len(read_log(tmp_path / "cut.csv")) < 150
+    assert main(["check", str(cut)]) == 2
+    assert "was truncated or damaged" in " ".join(capsys.readouterr().out.split())
     assert main(["log", "plot", str(cut)]) == 0
     assert (tmp_path / "cut.png").stat().st_size > 10_000
 

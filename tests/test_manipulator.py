@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 import stiffopt as so
-from independent import ARMS, derivative, discretise, hat, wrench_map
+from independent.arms import ARMS
+from independent.elements import discretise
+from independent.motions import derivative, hat, wrench_map
 
 FREE = so.load_robot("stiff-flop-2")
 ROBOTS = {

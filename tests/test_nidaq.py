@@ -18,6 +18,7 @@ import pytest
 from pydantic import ValidationError
 
 from fake_bench import FakeBench
+from running import wait_for
 from stiffopt.errors import CommandError, DeviceError, InputError, MissingExtraError
 from stiffopt.lab.nidaq_peer import DaqServer, NidaqPeer
 from stiffopt.rig.drivers.daqmx import (
@@ -66,15 +67,6 @@ def channels(**changes: Any) -> list[dict[str, Any]]:
         else:
             made[0][key] = value
     return made
-
-
-def wait_for(condition: Callable[[], bool], limit: float = 5.0) -> bool:
-    give_up = time.monotonic() + limit
-    while not condition():
-        if time.monotonic() > give_up:
-            return False
-        time.sleep(0.005)
-    return True
 
 
 @pytest.fixture
@@ -257,7 +249,7 @@ def test_the_watchdog_empties_the_arm_when_the_software_is_silent(
             last = time.monotonic()
             supply.command([1e5, 1e5])
         assert not bench.valve_open
-        assert wait_for(lambda: bench.valve_open)
+        wait_for(lambda: bench.valve_open, 5)
         assert time.monotonic() - last > 0.49
         with pytest.raises(DeviceError, match=r"watchdog has opened the dump valve.*0.5 s"):
             supply.command([1e5, 1e5])
@@ -304,7 +296,7 @@ def test_the_watchdog_acts_when_the_connection_is_lost(started: Any, bench: Fake
     bench.faults["supply"] = "off"
     with pytest.raises(DeviceError, match=r"has not answered for 0.5 s"):
         supply.close()
-    assert wait_for(lambda: bench.valve_open)
+    wait_for(lambda: bench.valve_open, 5)
     assert not bench.pressures_in_arm.any()
 
 
@@ -313,7 +305,7 @@ def test_a_watchdog_that_has_expired_before_is_cleared(started: Any, bench: Fake
     lost = Daqmx(supply._settings.grpc, 1.0, "nidaq")  # a program that died on the job
     watchdog = WatchdogTask(lost, VALVE["line"], 0.02, high=False)
     watchdog.start()
-    assert wait_for(lambda: bench.valve_open)
+    wait_for(lambda: bench.valve_open, 5)
     watchdog.close()
     lost.close()
     with supply:

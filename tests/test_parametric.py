@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from independent import body_twists, derivative
+from independent.motions import body_twists, derivative
 from stiffopt.model.arguments import DirectionalMeasure, checked_measure
 from stiffopt.model.description import Corrections, RobotDescription
 from stiffopt.model.manipulator import Manipulator

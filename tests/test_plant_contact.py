@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import stiffopt
-from independent import FLOP, Arm
+from independent.arms import FLOP, Arm
 from references import beam
 from stiffopt.errors import FileError, InputError
 from stiffopt.plant import contact

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike, NDArray
 
-from independent import FLOP, Arm, turn_z
+from independent.arms import FLOP, Arm
+from independent.motions import turn_z
 from references import free_tip
 from stiffopt.control.channels import Channels
 from stiffopt.control.regulators import PressureEstimator

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from conftest import is_long
-from independent import FLOP, Arm, planar_tip
+from independent.arms import FLOP, Arm
+from independent.rods import planar_tip
 from pyelastica_peer import relax
 from references import beam
 from stiffopt.model.description import RobotDescription

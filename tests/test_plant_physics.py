@@ -14,8 +14,10 @@ import numpy as np
 import pytest
 
 from conftest import is_long
-from independent import ARMS, FLOP, Arm, Tube, planar_tip, rod_tip, silicone
-from independent import Load as Reference
+from independent.arms import ARMS, FLOP, Arm, Tube
+from independent.rods import Load as Reference
+from independent.rods import planar_tip, rod_tip
+from independent.sections import silicone
 from references import (
     Column,
     Jenkin,

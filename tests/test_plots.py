@@ -17,10 +17,12 @@ import stiffopt
 from conftest import is_long
 from examples import run_examples
 from stiffopt import plots
+from stiffopt.cli.main import main
 from stiffopt.display import display_units
 from stiffopt.model.obstacles import OBSTACLES
 from stiffopt.optimise.solution import PressureSolution
 from stiffopt.plots.contact import plot_contact
+from stiffopt.plots.view import ViewAngles
 
 MAXIMISE = {"maximise": {"direction": (1, 0, 0)}}
 
@@ -221,6 +223,17 @@ def test_a_view_is_asked_for_in_radians_or_with_a_unit() -> None:
     for wrong in (("30 deg",), "30 deg", ("100 deg", "0 deg"), ("1 mm", "2 mm"), (np.nan, 0.0)):
         with pytest.raises(stiffopt.InputError, match=r"view|angle|finite"):
             plots.plot_solution(arm, solution, view=wrong)
+
+
+def test_help_and_page_say_the_default_view(capsys: pytest.CaptureFixture[str]) -> None:
+    main(["solve", "--help"])
+    shown = " ".join(capsys.readouterr().out.split())
+    page = (Path(__file__).parent.parent / "docs" / "command.md").read_text(encoding="utf-8")
+    for name in ("stiff-flop-2", "stiff-flop-2-hanging"):
+        view = ViewAngles.of(stiffopt.load_robot(name))
+        angles = f"'{np.degrees(view.elevation):g} deg, {np.degrees(view.azimuth):g} deg'"
+        assert angles in shown
+        assert angles in page
 
 
 TASKS: dict[str, dict[str, Any]] = {

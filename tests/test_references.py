@@ -6,14 +6,9 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from independent import (
-    FLOP,
-    Arm,
-    Load,
-    planar_tip,
-    rod_tip,
-    silicone,
-)
+from independent.arms import FLOP, Arm
+from independent.rods import Load, planar_tip, rod_tip
+from independent.sections import silicone
 from references import (
     Beam,
     Column,

@@ -15,6 +15,7 @@ from typing import Any
 import pytest
 
 from fake_supply import FakeSupply, HandClock
+from running import wait_for
 from stiffopt.errors import DeviceError
 from stiffopt.safety import rescue
 from stiffopt.safety.claim import Claim
@@ -78,13 +79,6 @@ def watching() -> Iterator[Callable[..., GuardWatch]]:
     for watch in made:
         watch.stop(PATIENCE)
         assert not watch._thread.is_alive()
-
-
-def wait_for(condition: Callable[[], Any]) -> None:
-    end = time.monotonic() + PATIENCE
-    while not condition():
-        assert time.monotonic() < end, "that did not happen in time"
-        time.sleep(0.001)
 
 
 def free(supply: FakeSupply) -> bool:

@@ -16,9 +16,10 @@ pytest.importorskip("coverage", reason="coverage is not installed; it is part of
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "src" / "stiffopt"
+GOALS = tuple(f"tests/test_goal{part}.py" for part in ("", "_checks", "_supply"))
 GUARDING = {
-    "safety/gate.py": ("tests/test_safety.py", "tests/test_claim.py", "tests/test_goal.py"),
-    "safety/goal.py": ("tests/test_goal.py",),
+    "safety/gate.py": ("tests/test_safety.py", "tests/test_claim.py", *GOALS),
+    "safety/goal.py": GOALS,
     "safety/claim.py": ("tests/test_claim.py",),
     "safety/guard.py": tuple(f"tests/test_guard{part}.py" for part in ("", "_goals", "_program")),
     "safety/rescue.py": ("tests/test_rescue.py",),

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from independent import FLOP, Arm, centre_line, rod_tip
+from independent.arms import FLOP, Arm
+from independent.rods import centre_line, rod_tip
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 pytest.importorskip("coal")

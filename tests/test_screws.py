@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
-from independent import hat6
+from independent.motions import hat6
 from stiffopt.errors import InputError
 from stiffopt.model.screws import Twist, Wrench
 

@@ -9,19 +9,10 @@ from scipy.special import ellipk, ellipkinc
 
 import stiffopt as so
 from conftest import is_long
-from independent import (
-    ARMS,
-    FLOP,
-    LOPSIDED,
-    Arm,
-    DiscreteRod,
-    Load,
-    Tube,
-    neo_hookean,
-    planar_tip,
-    rod_section,
-    rod_tip,
-)
+from independent.arms import ARMS, FLOP, LOPSIDED, Arm, Tube, neo_hookean
+from independent.energies import DiscreteRod
+from independent.rods import Load, planar_tip, rod_tip
+from independent.sections import rod_section
 
 HANGING = (0.0, 0.0, 9.81)
 SLENDER = Tube(length=0.3, factors=None)

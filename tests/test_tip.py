@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import stiffopt as so
-from independent import ARMS, CROSS, FLOP, LOPSIDED, Arm, neo_hookean
+from independent.arms import ARMS, CROSS, FLOP, LOPSIDED, Arm, neo_hookean
 from stiffopt import lie
 from stiffopt.errors import EquilibriumError, PressureError
 from stiffopt.optimise.tip import TipModel

@@ -9,7 +9,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from running import COMMAND
+from running import COMMAND, wait_for
 from stiffopt.errors import DeviceError, GuardTripped
 from stiffopt.files import save_file
 from stiffopt.lab.virtual import VirtualLab
@@ -50,13 +50,6 @@ def vent(rig: Path, *options: str, timeout: float = BOUND) -> tuple[int, str, st
     )
     assert "Traceback" not in done.stderr
     return done.returncode, done.stdout, " ".join(done.stderr.split())
-
-
-def wait_for(condition: Callable[[], Any], timeout: float = 20.0) -> None:
-    end = time.monotonic() + timeout
-    while not condition():
-        assert time.monotonic() < end, "that did not happen in time"
-        time.sleep(0.002)
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ import pytest
 from scipy.linalg import eigh
 
 import stiffopt as so
-from independent import FLOP, Arm
+from independent.arms import FLOP, Arm
 from stiffopt.control.vibration import BendingMode, BentMode
 from stiffopt.model.robot_files import load_description
 from stiffopt.plant.plant import Plant

@@ -34,7 +34,7 @@ sys.path[:0] = [str(HERE), str(HERE.parent / "tests")]
 
 import numpy as np  # noqa: E402
 
-from independent import centre_line  # noqa: E402
+from independent.rods import centre_line  # noqa: E402
 from scenes.ipopt import Ipopt  # noqa: E402
 from scenes.judge import clearances  # noqa: E402
 from scenes.scene_tasks import ARMS, CLEARANCE, RADIUS, Case, random_case  # noqa: E402

@@ -2,7 +2,7 @@
 
 Solid bodies and meshes are measured by coal, from capsules along the line: the smallest distances
 of a fine tube.  Coal knows no inside of a tube and no ring: these are formulas on many points.  The
-line itself is that of tests/independent.py.
+line itself is that of tests/independent/rods.py.
 """
 
 from functools import cache

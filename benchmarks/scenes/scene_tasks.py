@@ -15,7 +15,7 @@ import trimesh
 from numpy.typing import NDArray
 
 import tasks
-from independent import FLOP, Arm
+from independent.arms import FLOP, Arm
 from scenes.judge import distances
 from stiffopt import Manipulator, Scene, StiffnessGoal, Target, Task, solve_pressure
 

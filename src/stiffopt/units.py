@@ -17,7 +17,8 @@ from functools import cache, lru_cache
 from numbers import Real
 from typing import TYPE_CHECKING, Annotated, Any
 
-from pydantic import AfterValidator, BeforeValidator, Field, PlainSerializer, ValidationInfo
+from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo
+from pydantic_core import core_schema
 
 from stiffopt.errors import InputError, shown
 
@@ -55,9 +56,30 @@ class QuantityKind:
     example: str
     written: str
 
+    def __get_pydantic_core_schema__(self, *_: Any) -> core_schema.CoreSchema:
+        """Return how such a quantity is read, and written by ``model_dump(mode="json")``."""
+        return core_schema.with_info_before_validator_function(
+            self._read,
+            core_schema.float_schema(allow_inf_nan=False),
+            serialization=core_schema.plain_serializer_function_ser_schema(
+                self._write, return_schema=core_schema.str_schema(), when_used="json"
+            ),
+        )
+
     def __get_pydantic_json_schema__(self, *_: Any) -> dict[str, Any]:
         """Return the JSON Schema of such a quantity in a file."""
         return quantity_schema(self.what, self.example)
+
+    def _read(self, value: Any, info: ValidationInfo) -> float:
+        """Read text with its unit, or in code a number in SI."""
+        if isinstance(value, str) or read_from_file(info):
+            if isinstance(value, float) and not math.isfinite(value):
+                raise InputError(f"{value} is not a finite number")
+            return parse_quantity(value, self.unit, self.what)
+        return finite_number(value)
+
+    def _write(self, value: float) -> str:
+        return format_quantity(value, self.unit, self.written)
 
 
 _LENGTH = QuantityKind("m", "length", "90 mm", "mm")
@@ -287,28 +309,6 @@ def _ratio(value: Any) -> float:
     return parse_quantity(value, "", "ratio") if isinstance(value, str) else finite_number(value)
 
 
-def _reader(kind: QuantityKind) -> BeforeValidator:
-    """Return the validator of a kind: text with its unit, or in code a number in SI."""
-
-    def read(value: Any, info: ValidationInfo) -> float:
-        if isinstance(value, str) or read_from_file(info):
-            if isinstance(value, float) and not math.isfinite(value):
-                raise InputError(f"{value} is not a finite number")
-            return parse_quantity(value, kind.unit, kind.what)
-        return finite_number(value)
-
-    return BeforeValidator(read)
-
-
-def _writer(kind: QuantityKind) -> PlainSerializer:
-    """Return the serializer of a kind, which ``model_dump(mode="json")`` uses to write text."""
-
-    def write(value: float) -> str:
-        return format_quantity(value, kind.unit, kind.written)
-
-    return PlainSerializer(write, return_type=str, when_used="json")
-
-
 def within(limit: float, unit: str) -> AfterValidator:
     """Return the validator that rejects magnitudes beyond a limit, both in SI."""
 
@@ -328,45 +328,20 @@ Number = Annotated[float, BeforeValidator(finite_number), _FINITE]
 """A finite number that has no unit."""
 Ratio = Annotated[float, BeforeValidator(_ratio, json_schema_input_type=float | str), _FINITE]
 """A finite number that has no unit and may be written in per cent."""
-Length = Annotated[float, _LENGTH, _reader(_LENGTH), _writer(_LENGTH), _FINITE]
-"""In m."""
-Angle = Annotated[float, _ANGLE, _reader(_ANGLE), _writer(_ANGLE), _FINITE]
-"""In rad."""
-Pressure = Annotated[float, _PRESSURE, _reader(_PRESSURE), _writer(_PRESSURE), _FINITE]
-"""In Pa, gauge."""
-PressureRate = Annotated[
-    float, _PRESSURE_RATE, _reader(_PRESSURE_RATE), _writer(_PRESSURE_RATE), _FINITE
-]
-"""In Pa/s."""
-Mass = Annotated[float, _MASS, _reader(_MASS), _writer(_MASS), _FINITE]
-"""In kg."""
-Density = Annotated[float, _DENSITY, _reader(_DENSITY), _writer(_DENSITY), _FINITE]
-"""In kg/m^3."""
-Acceleration = Annotated[
-    float, _ACCELERATION, _reader(_ACCELERATION), _writer(_ACCELERATION), _FINITE
-]
-"""In m/s^2."""
-Force = Annotated[float, _FORCE, _reader(_FORCE), _writer(_FORCE), _FINITE]
-"""In N."""
-Moment = Annotated[float, _MOMENT, _reader(_MOMENT), _writer(_MOMENT), _FINITE]
-"""In N m."""
-TranslationalStiffness = Annotated[
-    float, _TRANSLATIONAL, _reader(_TRANSLATIONAL), _writer(_TRANSLATIONAL), _FINITE
-]
-"""In N/m."""
-RotationalStiffness = Annotated[
-    float, _ROTATIONAL, _reader(_ROTATIONAL), _writer(_ROTATIONAL), _FINITE
-]
-"""In N m/rad."""
-Duration = Annotated[float, _DURATION, _reader(_DURATION), _writer(_DURATION), _FINITE]
-"""In s."""
-Frequency = Annotated[float, _FREQUENCY, _reader(_FREQUENCY), _writer(_FREQUENCY), _FINITE]
-"""In Hz."""
-Speed = Annotated[float, _SPEED, _reader(_SPEED), _writer(_SPEED), _FINITE]
-"""In m/s."""
-Voltage = Annotated[float, _VOLTAGE, _reader(_VOLTAGE), _writer(_VOLTAGE), _FINITE]
-"""In V."""
-ForcePerVoltage = Annotated[
-    float, _FORCE_PER_VOLTAGE, _reader(_FORCE_PER_VOLTAGE), _writer(_FORCE_PER_VOLTAGE), _FINITE
-]
-"""In N/V."""
+
+# Each in the SI unit of its kind; pressures are gauge pressures.
+Length = Annotated[float, _LENGTH]
+Angle = Annotated[float, _ANGLE]
+Pressure = Annotated[float, _PRESSURE]
+PressureRate = Annotated[float, _PRESSURE_RATE]
+Mass = Annotated[float, _MASS]
+Density = Annotated[float, _DENSITY]
+Acceleration = Annotated[float, _ACCELERATION]
+Force = Annotated[float, _FORCE]
+Moment = Annotated[float, _MOMENT]
+TranslationalStiffness = Annotated[float, _TRANSLATIONAL]
+Duration = Annotated[float, _DURATION]
+Frequency = Annotated[float, _FREQUENCY]
+Speed = Annotated[float, _SPEED]
+Voltage = Annotated[float, _VOLTAGE]
+ForcePerVoltage = Annotated[float, _FORCE_PER_VOLTAGE]

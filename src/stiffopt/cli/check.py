@@ -31,10 +31,10 @@ def check(
 ) -> int:
     """Check files without using them: all mistakes at once, one per line, with file, line and key.
 
-    Robot, task, path, scene and rig files are checked together with the files that they name; logs
-    (.csv, .mcap) are read. It is a mistake if a rig with a tracker could never be armed by
-    'stiffopt run'. Beside one rig file, tasks for its robot are compared with its scene too.
-    Nothing is solved and no device is touched.
+    A file is checked together with the files that it names; recordings (.csv, .mcap) are read. A
+    rig file with a tracker has a mistake if 'stiffopt run' could never arm the rig. If one rig file
+    is given, tasks for its robot must also suit its scene. Nothing is solved and no device is
+    touched.
     """
     from stiffopt.cli.check_run import check_files  # here, so that --help waits for no numerics
 

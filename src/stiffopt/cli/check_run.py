@@ -93,7 +93,7 @@ def _kind_of(path: str) -> str | FileError:
         return FileError(path, f"has no 'format'; {expected}")
     near = difflib.get_close_matches(str(given), formats, n=1)
     hint = f"; did you mean '{near[0]}'?" if near else f"; {expected}"
-    reason = f"{shown(given)} is no format of a file that people write{hint}"
+    reason = f"{shown(given)} is no format that can be checked{hint}"
     return document.error(("format",), reason)
 
 
@@ -172,6 +172,15 @@ def _check_experiment(path: str) -> None:
     load_poses(path)
 
 
+def _check_bench(path: str) -> None:
+    from stiffopt.identify.bench import load_bench
+    from stiffopt.model.robot_files import load_description
+
+    bench, base = load_bench(path)
+    for arm in bench.arms:
+        load_description(arm.robot, base=base)
+
+
 def _check_commissioning(path: str) -> None:
     from stiffopt.commissioning.record import load_record
 
@@ -180,9 +189,12 @@ def _check_commissioning(path: str) -> None:
 
 def _check_log(path: str) -> None:
     if path.lower().endswith(".mcap"):
-        from stiffopt.logs import read_mcap_log
+        from stiffopt.daemon.run_log import read_log_of_recording
 
-        read_mcap_log(path)
+        _, is_whole = read_log_of_recording(path)
+        if not is_whole:
+            reason = "was truncated or damaged; 'stiffopt log export' writes its complete part"
+            raise FileError(path, reason)
         return
     from stiffopt.logs import read_log, read_stiffness_table
 
@@ -202,6 +214,7 @@ _CHECKS: dict[str, Callable[[str], None]] = {
     "scene": _check_scene,
     "rig": _check_rig,
     "experiment": _check_experiment,
+    "bench": _check_bench,
     "commissioning": _check_commissioning,
     "log": _check_log,
 }

@@ -15,7 +15,7 @@ import typer
 
 from stiffopt.cli.console import report_error, report_note, warnings_as_notes, write_line
 from stiffopt.cli.exits import ENDING_SIGNALS, FAULT, SOLVED, handled, with_exit_code
-from stiffopt.cli.options import Units, option
+from stiffopt.cli.options import RigArgument, Units, option
 from stiffopt.errors import InputError
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ Exit codes:
 
 @with_exit_code
 def lab(
-    rig: Annotated[str, typer.Argument(metavar="RIG", help="A rig file.")],
+    rig: RigArgument,
     out: Annotated[
         str | None, option("FILE", "Write the rig file here instead of printing it.")
     ] = None,

@@ -84,6 +84,8 @@ FrameOption = Annotated[str, option("FRAME", "base or tip: the axes of the direc
 ViewOption = Annotated[
     str | None,
     option(
-        "ANGLES", "Viewpoint of --plot: elevation, and azimuth about z from x, '20 deg, -60 deg'."
+        "ANGLES",
+        "Viewpoint of --plot: elevation, and azimuth about z from x; by default '14 deg, -66 deg', "
+        "of an arm that hangs '14 deg, 66 deg'.",
     ),
 ]

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from stiffopt.cli.exits import with_exit_code
-from stiffopt.cli.options import Units, option
+from stiffopt.cli.options import RigArgument, Units, option
 
 RUN_EPILOG = """\
 \b
@@ -28,7 +28,7 @@ Exit codes:
 
 @with_exit_code
 def run(
-    rig: Annotated[str, typer.Argument(metavar="RIG", help="A rig file.")],
+    rig: RigArgument,
     task: Annotated[
         str | None, option("TASK", "A task file to pursue once armed; needs --arm.")
     ] = None,

@@ -156,7 +156,11 @@ def _brace(solution: PressureSolution) -> Iterable[Line]:
         text = f"any push along {where} up to {units.force.text(BRACE.largest_push, 'g')}"
         if np.isfinite(loss.force):
             text = f"{units.force.text(loss.force, '.3g')} along {where}: then "
-            text += f"'{printable(loss.object)}' {loss.how}" if loss.object else f"it {loss.how}"
+            if loss.object:
+                left = units.stiffness.text(loss.stiffness_after, ".3g")
+                text += f"'{printable(loss.object)}' {loss.how}, which leaves {left}"
+            else:
+                text += f"it {loss.how}"
         yield "" if number else "holds", f"{text}{grip and f' ({grip.strip()})'}"
     if solution.limited_by:
         yield "limited by", printable(", ".join(solution.limited_by))

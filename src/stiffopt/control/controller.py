@@ -155,6 +155,7 @@ class TipController:
         self._windows.begin()
         self._led_to: Target | None = None  # present target of a trajectory of pressures
         self._ways.clear()
+        self._begin_way()
 
     def set_task(self, task: Task) -> None:
         """Pursue a task; see `Controller.set_task`."""
@@ -274,6 +275,7 @@ class TipController:
         self._reference.begin(np.concatenate([here + pressures.history_offset, offset]))
         self._feedback.resume()
         self._ways.clear()
+        self._begin_way()
         self._at_rest = False
 
     def observe(
@@ -472,7 +474,36 @@ class TipController:
         )  # fmt: skip
         if isinstance(course, Bracing):
             return self._brace_planned(course, found, now)
+        if course is None:
+            reference.slew_share = np.fmin(reference.slew_share, self._share_to_target())
         return found
+
+    def _begin_way(self) -> None:
+        """Begin anew with the tip's way to its target, if there is one."""
+        self._tip_first: tuple[float, ...] = ()  # of the way under way, see `Plan`
+        # the rest of that way, in s at the full slew, and the share of the slew for it
+        self._way_left, self._way_share = 0.0, math.inf
+        self._way_at: Array = np.zeros(0)  # where the reference was at the last tick (n,)
+
+    def _share_to_target(self) -> float:
+        """Return the share of the slew that the reference may take on the tip's way to a target.
+
+        That way is short in the space of pressures. If it were faster, stopping would leave more
+        vibration, and a channel that does not follow would move the tip off its way farther. The
+        bound ends when the reference has moved as far as the way is.
+        """
+        plan, reference = self.replanner.plan, self._reference
+        path = reference.path[: self.robot.n_pressures]
+        if plan is not None and plan.tip_first and plan.tip_first != self._tip_first:
+            self._tip_first, tuning = plan.tip_first, self._tuning.reference
+            ways = plan.pressures - np.stack([path, reference.goal[: len(path)]])
+            sizes = (np.maximum(np.abs(ways), tuning.there) / self._slew).max(axis=1).tolist()
+            least = tuning.periods_to_target * 2 * math.pi / self._arm.tip.omega
+            self._way_left, self._way_share = sizes[0], sizes[1] / least
+        elif self._way_left > 0:
+            self._way_left -= float((np.abs(path - self._way_at) / self._slew).max())
+        self._way_at = path
+        return self._way_share if self._way_left > 0 else math.inf
 
     def _brace_planned(self, course: Bracing, found: Array | None, now: float) -> Array | None:
         """Begin a brace once it is planned; until then the arm stays where it is."""

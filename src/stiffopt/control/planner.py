@@ -257,7 +257,7 @@ class PlanningEnd:
         if isinstance(answer, Plan):
             names = (
                 *("reached", "stiffness", "message", "far", "short", "blocked", "doubt"),
-                *("deviation", "estimate", "approach"),
+                *("deviation", "estimate", "approach", "tip_first"),
             )
             news: dict[str, Any] = {name: getattr(answer, name) for name in names}
             bent = answer.bent  # the tick receives it, so its arrays are lists as well

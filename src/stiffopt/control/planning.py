@@ -2,9 +2,11 @@
 
 The target is moved back by the tip's offset; the model has to reach the result. The optimiser then
 finds the pressures that are stiffest on the real arm, except for errors of the modelled stiffness.
-A plan is the local optimum next to the last plan. When the offset has changed much and the arm is
-at rest, all configurations are searched again; the arm changes to another one only if that is
-clearly better. For a target that is out of reach, the plan is the nearest configuration.
+An arm that vibrates first goes to a new target by the least motion of each channel, and from there
+slowly to the stiffest pressures. A plan is the local optimum next to the last plan. When the offset
+has changed much and the arm is at rest, all configurations are searched again; the arm changes to
+another one only if that is clearly better. For a target that is out of reach, the plan is the
+nearest configuration.
 
 While the tip presses on something, plans follow the target by the least change of pressures
 instead: the error of the model, from which a force must be told, is another one elsewhere, and an
@@ -43,6 +45,7 @@ from stiffopt.paths.leaning import BraceApproach, approach_to
 
 _BAR = 1e5
 _SLACK = 100.0  # Pa, by which an answer may exceed its limits
+_REACHED = Tolerance()  # of the tip that is at its target before the arm is stiff
 _EXACT = Tolerance(position=PlanningTuning.position_tolerance, angle=PlanningTuning.angle_tolerance)
 
 
@@ -67,7 +70,8 @@ class PlanRequest:
     adapted: Adapted | None = None  # the model that the offset refers to; None: the robot file's
     stay: bool = False  # whether to follow the target by the least change of the last pressures
     step: float = math.inf  # largest change of a pressure from the last plan, in Pa
-    # effective pressures (n,) of the reference now, whose modes are wanted, in Pa; empty: none are
+    # effective pressures (n,) of the reference now, in Pa, of an arm that vibrates: its modes there
+    # are wanted, and a new target is reached from there by the least motion; empty: neither
     here: Array = field(default_factory=lambda: np.zeros(0))
 
 
@@ -92,6 +96,23 @@ class Plan:
     estimate: Estimate | None = None  # of the model's numbers, if it is new
     approach: BraceApproach | None = None  # from rest until the arm leans on objects there
     bent: BentMode | None = None  # modes at the request's `here`, if they are new
+    # effective pressures (n,), in Pa, that bring the tip to its target first, while plans lead from
+    # there to the stiffest ones; empty otherwise
+    tip_first: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True)
+class _PostureChange:
+    """A slow way to other pressures for the same target."""
+
+    end: Array  # effective (n,), in Pa
+    tip_first: tuple[float, ...] = ()  # see `Plan`
+    plans: int = 0  # that have been made on it
+    over: bool = False  # whether the end has been reached
+    drift: Array = field(default_factory=lambda: np.zeros(6))  # of the offset from plan to plan
+    left: float = math.inf  # least rest of the way so far, as the tip's motion by one channel, in m
+    stalled: int = 0  # successive plans that came no nearer
+    straight: bool = False  # whether plans lead straight to the end, as no other way was found
 
 
 class Planning:
@@ -107,8 +128,7 @@ class Planning:
         self._last: Plan | None = None
         self._searched_at: Array = np.zeros(6)
         self._advantage, self._refused = self._tuning.advantage, 0
-        # way to another configuration: its begin (n,), the share that is done, and its end (n,)
-        self._change: tuple[Array, float, Array] | None = None
+        self._change: _PostureChange | None = None  # to another configuration, or after the tip
         self._leaning: tuple[int, Plan | None] = (-1, None)
 
     def _put(self, robot: Manipulator) -> None:
@@ -196,12 +216,12 @@ class Planning:
             self._solver = PressureSolver(self._robot, task.model_copy(update={"target": exact}))
             self._is_compiled = self._solver.compile()
             self._stiffness = stiffness_function(task)
-        target = model_target(asked, request.offset)
         self._limits = self._effective_limits(request)
         last, refused = request.last or self._last, self._refused
         self._last = last
-        if request.search or request.stay:
+        if request.search or request.stay or request.step < math.inf:
             self._change = None
+        target = model_target(asked, request.offset + self._lead(request, asked))
         if last is not None and request.step < math.inf:
             bounds = last.pressures - request.step, last.pressures + request.step
             self._limits = np.clip(bounds[0], *self._limits), np.clip(bounds[1], *self._limits)
@@ -213,23 +233,27 @@ class Planning:
             self._last = self._nearest(request, task, target, distant=False)
             return self._last
         elif self._change is not None:
-            solution = self._solve(target, self._change[2])
+            solution = self._solve(target, self._change.end)
         else:
             solution = self._next_to(last, target)
             solution = self._better(request, target, solution, last) if solution else None
         if solution is not None and solution.pressures is not None:
             pressures = np.array(solution.pressures, dtype=float)
             stiffness = math.nan if solution.stiffness is None else float(solution.stiffness)
-            if last is not None and not request.search:
+            if last is None or request.search:
+                pressures = self._tip_first(request, task, target, pressures, stiffness)
+            else:
                 if self._change is None and self._is_distant(last, pressures, target):
-                    self._change = last.pressures, 0.0, pressures
+                    self._change = _PostureChange(pressures)
                 if self._change is not None:
-                    pressures = self._toward(pressures, target)
+                    pressures = self._toward(request, last, self._change, pressures, target)
             self._last = Plan(
                 request.serial, pressures, request.offset, asked, True, stiffness, "",
                 adapted=request.adapted,
+                tip_first=() if self._change is None else self._change.tip_first,
             )  # fmt: skip
         else:
+            self._change = None
             self._last = self._nearest(request, task, target, distant=self._refused > refused)
         return self._last
 
@@ -288,21 +312,115 @@ class Planning:
         reach = t.neighbourhood + t.neighbourhood_per_metre * displacement
         return float(np.max(np.abs(pressures - last.pressures))) > reach
 
-    def _toward(self, end: Array, target: Target) -> Array:
-        """Return pressures (n,) on the way to another configuration (n,): next to the target.
+    def _tip_first(
+        self, request: PlanRequest, task: Task, target: Target, stiffest: Array, best: float
+    ) -> Array:
+        """Return the pressures (n,) to which the arm goes before the stiffest ones (n,).
 
-        On the straight line to it the tip would leave its target by millimetres, and by more in a
-        quick change, as feedback needs time for an offset that differs between them.
+        They bring the tip to its target by the least motion of each channel. On the straight line
+        to the stiffest ones the channels move the tip against each other, by several times its
+        way and as fast; so would the fault of one. The arm goes on from there as to another
+        configuration, or from the first place on that way that has a share of the stiffness `best`.
+
+        A task that demands a stiffness, or a press, needs the stiffest pressures at once. On a rig
+        with a scene the way to them is the one that was checked.
         """
-        assert self._change is not None
-        begin, share, _ = self._change
-        share += self._tuning.change_step / max(float(np.abs(end - begin).max()), _SLACK)
-        if share >= 1:
-            self._change = None
+        goal, tuning = task.stiffness, self._tuning
+        demands = task.press is not None or (goal is not None and (goal.at_least or goal.match))
+        if not request.here.size or self._ways is not None or demands:
+            return stiffest
+        found, distance, angle = self._search.find(
+            target, self._limits, request.here, least_motion=True
+        )
+        if distance > _REACHED.position or angle > _REACHED.angle:
+            return stiffest
+        for pressures in self._way_on(target, found, stiffest):
+            if self._stiffness is not None:
+                tip = self._tip.at(pressures)
+                if self._stiffness(tip.compliance, tip.pose[:3, :3]) < tuning.soft * best:
+                    continue
+            self._change = _PostureChange(stiffest, tuple(pressures.tolist()))
+            return pressures
+        return stiffest
+
+    def _way_on(self, target: Target, begin: Array, end: Array) -> list[Array]:
+        """Return pressures (n,) on a way from some to others that stays at the target.
+
+        The way is looked for in a few steps, each to the point of the target that is next to a
+        share of the rest. If there is none, one of the steps is a jump; then nothing is returned.
+        """
+        count, way = self._tuning.change_looks, [begin]
+        longest = self._tuning.change_jump * self._motion(begin, end - begin) / count
+        for rest in range(count, 0, -1):
+            here = way[-1]
+            way.append(self._search.find(target, self._limits, here + (end - here) / rest)[0])
+            if self._motion(here, way[-1] - here) > longest:
+                return []
+        return way[:-1]
+
+    def _motion(self, here: Array, change: Array) -> float:
+        """Return how far a change of pressures (n,) moves the tip by one channel at most, in m."""
+        moved = self._tip.at(here).jacobian[:3] * change
+        return float(np.linalg.norm(moved, axis=0).max())
+
+    def _lead(self, request: PlanRequest, asked: Target) -> Array:
+        """Return by how much (6,) the offset changes until feedback has followed it.
+
+        On a slow way to other pressures it changes steadily, and feedback is late by some plans.
+        The lead begins later than the way: at first, plans still follow the offset of the motion
+        before. At the end of the way it fades.
+        """
+        change, last, tuning = self._change, self._last, self._tuning
+        if change is None or last is None:
+            return np.zeros(6)
+        stays = last.target == asked
+        moved = request.offset - last.offset if stays and not change.over else np.zeros(6)
+        drift = change.drift + tuning.drift_share * (moved - change.drift)
+        self._change = replace(change, drift=drift)
+        if not stays:
+            return np.zeros(6)
+        growth = min(1.0, max(0.0, change.plans / tuning.change_growth - 0.5))
+        lead: Array = tuning.lead * growth * drift
+        angle = FeedbackTuning().lever * np.linalg.norm(lead[3:])
+        size = float(max(np.linalg.norm(lead[:3]), angle))
+        return lead * min(1.0, tuning.longest_lead / max(size, 1e-9))
+
+    def _toward(
+        self, request: PlanRequest, last: Plan, change: _PostureChange, end: Array, target: Target
+    ) -> Array:
+        """Return pressures (n,) on the way to others (n,): next to the last, and at the target.
+
+        On the straight line to them the tip would leave its target by millimetres, and by more in a
+        quick change, as feedback needs time for an offset that differs between them. So the change
+        is slower while the offset changes. If the way comes no nearer to its end, the arm goes
+        there straight, as slowly, and feedback keeps the tip at its target.
+        """
+        tuning, way = self._tuning, end - last.pressures
+        left = self._motion(last.pressures, way)
+        drift = float(np.linalg.norm((request.offset - last.offset)[:3]))
+        step = tuning.change_step * min(1.0, (change.plans + 1) / tuning.change_growth)
+        step *= min(1.0, tuning.at_rest / max(drift, 1e-9))
+        goes_on = left < change.left - tuning.change_progress * step
+        if last.target != request.target or left > change.left + step:  # another way
+            goes_on, change = True, replace(change, straight=False)
+        stalled = 0 if goes_on else change.stalled + (drift <= tuning.at_rest)
+        change = replace(
+            change,
+            end=end,
+            plans=change.plans + 1,
+            left=left if goes_on else change.left,
+            stalled=stalled,
+            straight=change.straight or stalled > tuning.patience,
+            over=change.over or left <= step,
+        )
+        is_over = left <= step and float(np.linalg.norm(change.drift[:3])) < tuning.at_rest / 10
+        self._change = None if is_over else change
+        if left <= step:
             return end
-        self._change = begin, share, end
-        found, _, _ = self._search.find(target, self._limits, begin + share * (end - begin))
-        return found
+        ahead = last.pressures + step / left * way
+        if change.straight:
+            return np.asarray(np.clip(ahead, *self._limits))
+        return self._search.find(target, self._limits, ahead)[0]
 
     def _better(
         self, request: PlanRequest, target: Target, solution: PressureSolution, last: Plan
@@ -409,12 +527,18 @@ class NearestSearch:
         self._errors = TipErrors()
 
     def find(
-        self, target: Target, bounds: tuple[Array, Array], start: Array
+        self,
+        target: Target,
+        bounds: tuple[Array, Array],
+        start: Array,
+        *,
+        least_motion: bool = False,
     ) -> tuple[Array, float, float]:
         """Return a local optimum between the bounds (n,), from a start (n,), in Pa.
 
         Returns pressures (n,), and the position and angle errors there, in m and rad. The target is
-        the model's.
+        the model's. Of several optima it is the one with the least change of the pressures, or with
+        `least_motion` that of the tip by each channel, to first order.
         """
         tuning = self._tuning
         low, high = bounds[0] / _BAR, bounds[1] / _BAR
@@ -424,9 +548,13 @@ class NearestSearch:
             x, found = low, self._errors.weighted(target, self._tip.at(low * _BAR), self._lever)
         error, rows, distance, angle = found
         no_rows, max_step = np.zeros((0, len(x))), tuning.max_step / _BAR
+        effort = np.eye(len(x))
+        if least_motion:
+            squares = (self._tip.at(x * _BAR).jacobian[:3] ** 2).sum(axis=0)
+            effort = np.diag(squares / squares.mean())
         for _ in range(tuning.iterations):
             J = rows * _BAR
-            H = J.T @ J + tuning.regularisation**2 * np.eye(len(x))
+            H = J.T @ J + tuning.regularisation**2 * effort
             lower, upper = np.maximum(low - x, -max_step), np.minimum(high - x, max_step)
             step, *_ = daqp.solve(H * 1e6, J.T @ error * 1e6, no_rows, upper, lower)
             if step is None or not np.isfinite(step).all():

@@ -240,7 +240,7 @@ class ControllerStatus:
     best_stiffness: Annotated[
         float,
         _stiffness(
-            "stiffness of the plan, in the same direction",
+            "stiffness to which the plans lead, in the same direction",
             key="best_stiffness",
             metric="best_stiffness",
         ),

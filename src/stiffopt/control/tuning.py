@@ -123,6 +123,9 @@ class ReferenceTuning:
     rigid_rate: float = 100.0
     # share of the slew that the reference may take; the rest is for feedback
     slew_share: float = 0.9
+    # least time of the tip's way to a new target, before the arm becomes stiff, in periods of the
+    # vibration
+    periods_to_target: float = 0.5
     # motion over which the model on the reference is not linearised again; see `LinearisedTip`
     model_range: float = 0.07
     # time by which a doubted motion of an arm that vibrates is taken back, in s
@@ -281,7 +284,7 @@ class WindowTuning:
 
 @dataclass(frozen=True)
 class PlanningTuning:
-    """When a plan may change to another configuration of the arm."""
+    """When a plan may change to other pressures for the same target, and how slowly."""
 
     # relative stiffness by which another configuration must be better; it doubles with each change
     advantage: float = 0.02
@@ -293,10 +296,24 @@ class PlanningTuning:
     neighbourhood: float = 2e4
     # growth of that distance per metre of a target's displacement, in Pa/m
     neighbourhood_per_metre: float = 2e7
-    # successive plans that refuse an optimum in another configuration before one takes it
+    # successive plans that refuse an optimum in another configuration before one takes it, or that
+    # come no nearer to it on the way
     patience: int = 20
-    # change of a pressure from plan to plan on the way to another configuration, in Pa
-    change_step: float = 7e2
+    # motion of the tip by one channel from plan to plan on the way to other pressures, in m; plans
+    # on that way until a step has this size; share of it by which the rest has to shrink
+    change_step: float = 2.5e-4
+    change_growth: int = 40
+    change_progress: float = 0.05
+    # steps in which such a way is looked for, and their longest one over their mean without a jump
+    change_looks: int = 8
+    change_jump: float = 3.0
+    # least stiffness when the tip is at its target first, as a share of the best
+    soft: float = 0.5
+    # plans by which feedback is late on such a way, share of the newest in the mean change of the
+    # offset, and longest lead for it, in m
+    lead: float = 8.0
+    drift_share: float = 0.15
+    longest_lead: float = 1e-3
     bent_step: float = 3e3  # change of a pressure after which the modes are new, in Pa
     position_tolerance: float = 1e-5  # of plans, in m
     angle_tolerance: float = 1e-3  # of plans, in rad

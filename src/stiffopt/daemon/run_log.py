@@ -141,7 +141,7 @@ def _run_of_contents(path: str | os.PathLike[str], found: McapContents) -> Recor
         raise FileError(path, "has no complete message of a run; it was truncated too early")
     try:
         return _run(about, found)
-    except (KeyError, ValueError, TypeError) as error:
+    except (AttributeError, KeyError, MemoryError, OverflowError, ValueError, TypeError) as error:
         raise FileError(path, f"is damaged: {error}") from None
 
 

@@ -15,7 +15,14 @@ import numpy as np
 from stiffopt import lie
 from stiffopt.arrays import Array
 from stiffopt.errors import InputError, PressureError, StoppedError
-from stiffopt.identify.detection import Comparer, Hypothesis, found_wrong, without_drift
+from stiffopt.identify.detection import (
+    Comparer,
+    Hypothesis,
+    best_lines,
+    found_wrong,
+    idle_channels,
+    without_drift,
+)
 from stiffopt.identify.error_model import covariance_with, error_model, kept_unknowns
 from stiffopt.identify.fit import Fit, fit
 from stiffopt.identify.folds import held_back
@@ -348,7 +355,7 @@ def _put_right(setup: Setup, teller: _Teller) -> Setup:
     comparer = Comparer(description, setup.base, stations, recordings)
     found = found_wrong(comparer, description, setup.settings.keep)
     if found is None:
-        return setup
+        return _with_idle_channels(setup, comparer)
     told = found.hypothesis.told(description, [each.name for each in recordings])
     remark = (
         f"{told}; the robot file's arm then misses the tip by {found.then * 1e3:.1f} mm instead of "
@@ -356,6 +363,18 @@ def _put_right(setup: Setup, teller: _Teller) -> Setup:
         "that as it was recorded"
     )
     return replace(_under(setup, found.hypothesis, comparer.low), found=(remark,))
+
+
+def _with_idle_channels(setup: Setup, comparer: Comparer) -> Setup:
+    """Return the setup with a remark on each channel that does nothing."""
+    if "lines" in setup.settings.keep:
+        return setup
+    description = setup.description
+    remarks = [
+        f"{words}; the robot file's arm leaves {best_lines(comparer, description, k)}"
+        for k, words in idle_channels(description, setup.recordings).items()
+    ]
+    return replace(setup, found=(*setup.found, *remarks))
 
 
 def _under(setup: Setup, hypothesis: Hypothesis, low: Array) -> Setup:

@@ -5,20 +5,21 @@ Turned axes of the tracker, a wrong order of channels, and dead or shared lines 
 all logs. A hypothesis is scored by how well the robot file's arm then follows the tip, when it may
 be softer or stiffer, scaled and moved a little. (A fit cannot judge this: with enough numbers it
 also follows a wrong recording.) Where the evidence is not overwhelming, recordings stay unchanged.
+A channel that does nothing is told even then.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import permutations
+from itertools import pairwise, permutations
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt import lie
 from stiffopt.arrays import Array
-from stiffopt.errors import PressureError
+from stiffopt.errors import EquilibriumError, PressureError
 from stiffopt.identify.discrepancy import smooth_functions
 from stiffopt.identify.recording import Recording, Track
 from stiffopt.identify.settings import DETECTION, SAMPLING, Finding
@@ -292,7 +293,7 @@ class Comparer:
     Parameters
     ----------
     description : RobotDescription
-        Its weight and history are ignored.
+        Its history is ignored.
     base : pose (4, 4) of the base in the recordings' frame, according to the robot file.
     stations : arc lengths in m of the tracks, the tip first.
     recordings : sequence of Recording
@@ -306,8 +307,8 @@ class Comparer:
         recordings: Sequence[Recording],
     ) -> None:
         self.nothing = _no_error(description, len(recordings))
-        light = description.model_copy(update={"gravity": (0.0, 0.0, 0.0), "calibration": None})
-        self._arm = Manipulator(light)
+        self._given = description, base, stations, recordings
+        self._arm = Manipulator(description.model_copy(update={"calibration": None}))
         self._stations = np.array(stations)
         self.low = np.maximum(description.pressure_min, 0.0)
         tolerances = description.tolerances or Tolerances()
@@ -325,19 +326,36 @@ class Comparer:
             self._measured.append(np.stack([t.position[rows] for t in each.tracks], axis=1))
         self._from_frame = to_base[:3, :3], to_base[:3, 3]
         self._kept: dict[tuple[int, ...], list[list[Array]]] = {}
+        self._softness = self._possible()
 
     def score(self, hypothesis: Hypothesis) -> float:
-        """Return the RMS distance in m between the tracks and the best matching arm."""
+        """Return the RMS distance in m between the tracks and the best matching arm.
+
+        Infinite if the arm does not bear the pressures.
+        """
         measured = [
             self._in_base(each, CUBE_ROTATIONS[turn])
             for each, turn in zip(self._measured, hypothesis.turns, strict=True)
         ]
-        return min(
+        scores = (
             float(
                 np.sqrt(np.mean([self._square(m, q) for m, q in zip(measured, each, strict=True)]))
             )
             for each in self._predicted(hypothesis.sources)
         )
+        return min(scores, default=np.inf)
+
+    def shortlist(self, hypotheses: Sequence[Hypothesis]) -> Sequence[Hypothesis]:
+        """Return the hypotheses that are best without weight, which takes far less time; else all.
+
+        Without it, the right one of a heavy arm is among the best, though it leaves much.
+        """
+        description, base, stations, recordings = self._given
+        if not any(description.gravity):
+            return hypotheses
+        weightless = description.model_copy(update={"gravity": (0.0, 0.0, 0.0)})
+        light = Comparer(weightless, base, stations, recordings)
+        return sorted(hypotheses, key=light.score)[: DETECTION.shortlist]
 
     def of_turns(self, sources: tuple[int, ...]) -> Array:
         """Return the RMS distance (logs, 24) of each recording under each rotation of its axes."""
@@ -356,21 +374,35 @@ class Comparer:
         rotation, origin = self._from_frame
         return np.asarray(positions @ turn.T @ rotation.T + origin)
 
+    def _possible(self) -> list[float]:
+        """Return the factors on pressures with which the arm does not move much farther than seen.
+
+        Equilibria of an arm that is far too soft under its weight would take most of the time.
+        """
+        most = DETECTION.farther * _spread(self._measured)
+        found: list[float] = []
+        for factor in sorted(DETECTION.softness):
+            predicted = self._positions([factor * each for each in self._pressures])
+            if predicted is None or (found and _spread(predicted) > most):
+                break
+            found.append(factor)
+        return found
+
     def _predicted(self, sources: tuple[int, ...]) -> list[list[Array]]:
         """Return predicted tracks (N, k, 3) of each recording, per softness that the law allows."""
         if sources not in self._kept:
             driven = [_driven(each, sources, self.low) for each in self._pressures]
             self._kept[sources] = [
                 found
-                for factor in DETECTION.softness
+                for factor in self._softness
                 if (found := self._positions([factor * each for each in driven])) is not None
             ]
         return self._kept[sources]
 
     def _positions(self, pressures: Sequence[Array]) -> list[Array] | None:
         try:
-            return [self._arm.pose(p, self._stations)[:, :, :3, 3] for p in pressures]
-        except PressureError:
+            return [self._arm.pose(p, self._stations)[:, :, :3, 3].copy() for p in pressures]
+        except (EquilibriumError, PressureError):
             return None
 
     def _square(self, measured: Array, predicted: Array) -> float:
@@ -393,6 +425,11 @@ class Comparer:
             total += float(np.mean(np.abs(rest - moved[0] - 1j * moved[1]) ** 2))
             total += float(np.mean((high - moved[2]) ** 2))
         return total / len(lateral)
+
+
+def _spread(tracks: Sequence[Array]) -> float:
+    """Return the RMS distance of tracks (N, k, 3) of several logs from their mean."""
+    return float(np.linalg.norm(np.concatenate(tracks).std(axis=0)))
 
 
 def _factor(pairs: Sequence[tuple[NDArray[np.complex128], NDArray[np.complex128]]]) -> complex:
@@ -427,11 +464,10 @@ def found_wrong(
     """
     nothing = comparer.nothing
     as_is = comparer.score(nothing)
-    scored = [
-        (comparer.score(each), each)
-        for each in of_channels(description, len(nothing.turns))
-        if each.kind not in keep
-    ]
+    if not np.isfinite(as_is):
+        return None
+    tried = [each for each in of_channels(description, len(nothing.turns)) if each.kind not in keep]
+    scored = [(comparer.score(each), each) for each in comparer.shortlist(tried)]
     worthy = [pair for pair in scored if pair[0] <= DETECTION.overwhelming * as_is]
     if "axes" not in keep:
         turns = _turns(comparer.of_turns(nothing.sources))
@@ -445,6 +481,18 @@ def found_wrong(
     if any(then > DETECTION.tie * each for each in rivals):
         return None
     return Found(best, as_is, then)
+
+
+def best_lines(comparer: Comparer, description: RobotDescription, channel: int) -> str:
+    """Name the two best hypotheses of the line of a channel, as the end of a sentence."""
+    nothing = comparer.nothing
+    as_is = comparer.score(nothing)
+    ranked = sorted(
+        (comparer.score(each) / as_is, each.words)
+        for each in _lines(description, nothing)
+        if each.sources[channel] != channel
+    )
+    return " and ".join(f"{share * 100:.0f} % if {words}" for share, words in ranked[:2])
 
 
 def _alike(one: Hypothesis, other: Hypothesis) -> bool:
@@ -475,15 +523,19 @@ def _lines(description: RobotDescription, nothing: Hypothesis) -> Iterator[Hypot
 
 
 def _orders(description: RobotDescription, nothing: Hypothesis) -> Iterator[Hypothesis]:
-    """Yield orders of channels: all if few; else with two channels or whole segments exchanged."""
-    n = description.n_pressures
-    if n <= DETECTION.few_channels:
-        orders = set(permutations(range(n)))
-    else:
-        orders = {_exchanged(n, i, j) for i in range(n) for j in range(i)}
-        ends = np.cumsum([0, *(segment.n_channels for segment in description.segments)]).tolist()
-        for places in permutations(range(description.n_segments)):
-            orders.add(tuple(c for k in places for c in range(ends[k], ends[k + 1])))
+    """Yield orders with two channels exchanged, and those of a segment or of whole segments.
+
+    Of many channels or segments there are too many orders; then only two are exchanged.
+    """
+    order, few = nothing.sources, DETECTION.few
+    orders = {_exchanged(len(order), i, j) for i in order for j in range(i)}
+    ends = np.cumsum([0, *(segment.n_channels for segment in description.segments)]).tolist()
+    own = [order[begin:end] for begin, end in pairwise(ends)]
+    places = permutations(own) if len(own) <= few else ()
+    orders |= {tuple(c for each in place for c in each) for place in places}
+    for each in own:
+        for other in permutations(each) if len(each) <= few else ():
+            orders.add((*order[: each[0]], *other, *order[each[-1] + 1 :]))
     for order in sorted(orders - {nothing.sources}):
         yield replace(nothing, kind="channels", sources=order)
 
@@ -512,6 +564,79 @@ def _turn_text(rotation: Array) -> str:
     angle = float(np.linalg.norm(vector))
     axis = ", ".join(f"{each + 0.0:.2g}" for each in np.round(vector / max(angle, 1e-9), 2))
     return f"by {np.degrees(angle):.0f} deg about ({axis})"
+
+
+# -- channels that do nothing ----------------------------------------------------------------------
+
+
+def idle_channels(description: RobotDescription, recordings: Sequence[Recording]) -> dict[int, str]:
+    """Return the channels (from 0) whose recorded pressure does not show in the tip, in words.
+
+    Needs no model that fits: the tip is regressed on the lagged pressures and their products, with
+    and without those of channel k, which leaves RMS distances d and d_k. The tips that the robot
+    file's arm has at these pressures, regressed without channel k, are off by e_k: a channel that
+    only follows the others has a small e_k and cannot be judged. With the share of this that shows,
+
+        s_k = sqrt(max(d_k^2 - d^2, 0)) / e_k,
+
+    and the median s of the other channels of its segment, channel k is idle if s_k is a small share
+    of s, and if s e_k, what it should show, is clearly more than d. Rows far from the regression,
+    as in fast motions, count less throughout.
+    """
+    span = np.subtract(description.pressure_max, description.pressure_min)
+    pressures, tip = _evenly(recordings, DETECTION.idle_rows)
+    arm = Manipulator(
+        description.model_copy(update={"gravity": (0.0, 0.0, 0.0), "calibration": None})
+    )
+    try:
+        expected = arm.tip_pose(pressures)[:, :3, 3]
+    except PressureError:
+        return {}
+    count = len(span)
+    known = _quadratics(pressures / span)
+    distances, _ = _regressed(known, tip, DETECTION.idle_rounds)
+    weight = 1 / np.sqrt(1 + (distances / max(float(np.median(distances)), 1e-9)) ** 2)
+
+    def off(known: Array, positions: Array) -> float:
+        left, _ = _regressed(known * weight[:, np.newaxis], positions * weight[:, np.newaxis])
+        return float(np.sqrt((left**2).sum() / (weight**2).sum()))
+
+    everything = off(known, tip)
+    others = [_quadratics(np.delete(pressures / span, k, axis=1)) for k in range(count)]
+    without = np.array([off(each, tip) for each in others])
+    should = np.array([max(off(each, expected), 1e-12) for each in others])
+    shown = np.sqrt(np.maximum(without**2 - everything**2, 0)) / should
+    found: dict[int, str] = {}
+    first = 0
+    for segment in description.segments:
+        own = range(first, first := first + segment.n_channels)
+        for k in own:
+            usual = float(np.median([shown[j] for j in own if j != k] or [0.0]))
+            visible = usual * should[k]
+            is_known = visible >= DETECTION.idle_visible * everything
+            if not is_known or shown[k] > DETECTION.idle_shows * usual:
+                continue
+            found[k] = (
+                f"the pressure of {description.channel_name(k)} does not show in the tip, as if "
+                "its line were dead or another channel's: a regression on the other pressures "
+                f"misses the tip by {without[k] * 1e3:.1f} mm, with this one by "
+                f"{everything * 1e3:.1f} mm; if it acted as the others of its segment, the first "
+                f"would be {np.hypot(everything, visible) * 1e3:.1f} mm; look at its valve, its "
+                "line and its column (--keep lines leaves this out)"
+            )
+    return found
+
+
+def _evenly(recordings: Sequence[Recording], count: int) -> tuple[Array, Array]:
+    """Return lagged pressures (N, n) and tips (N, 3) of rows spread evenly over each recording."""
+    pressures, tips = [], []
+    for each in recordings:
+        seen = np.flatnonzero(whole(each.tracks[0].position))
+        most = min(max(count // len(recordings), 8), len(seen))
+        rows = seen[np.linspace(0, len(seen) - 1, most).astype(int)]
+        pressures.append(lagged_pressures(each.time, each.pressures, DETECTION.clock_lag)[rows])
+        tips.append(each.tracks[0].position[rows])
+    return np.concatenate(pressures), np.concatenate(tips)
 
 
 # -- a frame that was defined anew -----------------------------------------------------------------

@@ -343,8 +343,11 @@ class DetectionSettings:
     tie : largest misfit of an accepted hypothesis, as a share of any rival's.
     rows : number of compared rows of all recordings together.
     softness : factors on pressures, for arms softer or stiffer than the robot file says.
+    farther : softness with which the arm moves more than this many times as far as the tip did is
+        not tried.
+    shortlist : number of hypotheses that are compared with an arm under its weight.
+    few : largest number of channels of a segment, or of segments, of which all orders are tried.
     moved : largest distance of the base from its place in the robot file, in lengths of the arm.
-    few_channels : largest number of channels of which all orders are tried.
     off, frame : mean error of a log, in lengths of the arm, beyond which its set-up is suspected to
         differ from the calibration's; and the share of it that a correction may leave.
     region, within : a remark reports a log with less than a share `within` of its tips in the
@@ -375,6 +378,11 @@ class DetectionSettings:
         as a share of their range; and share of the parts that must do so.
     drift_left : largest share of the median error that an accepted drift leaves.
     drift_rounds : of the robust regression.
+    idle_rows, idle_rounds : number of rows in the regression for channels that do nothing, and of
+        its robust rounds.
+    idle_visible : a channel is judged if what it should add to the regression's RMS error is at
+        least this many times that error.
+    idle_shows : largest share of that which a channel that does nothing shows.
     unit : largest factor between the arm's observed and expected motion with the right unit.
     """
 
@@ -382,8 +390,10 @@ class DetectionSettings:
     tie: float = 0.75
     rows: int = 120
     softness: tuple[float, ...] = (0.2, 0.35, 0.6, 1.0, 1.7, 3.0, 5.0)
+    farther: float = 1.5
+    shortlist: int = 6
+    few: int = 4
     moved: float = 0.25
-    few_channels: int = 3
     off: float = 0.1
     frame: float = 0.3
     region: float = 0.99
@@ -414,6 +424,10 @@ class DetectionSettings:
     drift_spread: float = 0.5
     drift_left: float = 0.7
     drift_rounds: int = 8
+    idle_rows: int = 1200
+    idle_rounds: int = 4
+    idle_visible: float = 3.0
+    idle_shows: float = 0.2
     unit: float = 2.3
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from stiffopt.arrays import Array
 from stiffopt.errors import EquilibriumError, PressureError, StiffoptError
-from stiffopt.identify.detection import Hypothesis, of_channels, replaced
+from stiffopt.identify.detection import Hypothesis, idle_channels, of_channels, replaced
 from stiffopt.identify.discrepancy import centres
 from stiffopt.identify.error_model import held_for, in_turn, is_moving
 from stiffopt.identify.fit import fit
@@ -73,8 +73,26 @@ def validate(
     setup = Setup.of(description, recordings, (), settings)
     found = compare(setup)
     if description.calibration is None:
-        return found
-    return tuple(_with_doubt(each, description.length) for each in _put_right(setup, found))
+        return _with_idle_channels(setup, found, found)
+    found = _with_idle_channels(setup, found, _put_right(setup, found))
+    return tuple(_with_doubt(each, description.length) for each in found)
+
+
+def _with_idle_channels(
+    setup: Setup, recorded: Sequence[Comparison], found: Sequence[Comparison]
+) -> tuple[Comparison, ...]:
+    """Return comparisons with a remark on each channel that does nothing in a log.
+
+    Not if the log's channels were corrected, which may be the reason.
+    """
+    if "lines" in setup.settings.keep:
+        return tuple(found)
+    return tuple(
+        replace(each, remarks=(*each.remarks, *idle_channels(setup.description, [log]).values()))
+        if np.array_equal(before.pressures, each.pressures)
+        else each
+        for log, before, each in zip(setup.recordings, recorded, found, strict=True)
+    )
 
 
 def _within(found: Comparison) -> float:

@@ -119,7 +119,10 @@ def log_of_contents(path: str | os.PathLike[str], found: McapContents) -> Log:
     """Return the log in the contents of an MCAP file; raises as `read_mcap_log`."""
     name = os.fspath(path)
     if LOG_METADATA not in found.metadata:
-        raise FileError(name, "is no MCAP recording of stiffopt")
+        raise FileError(
+            name,
+            "is no MCAP recording of an experiment; 'stiffopt log export' reads those of runs",
+        )
     try:
         layout = LogLayout.of_columns(name, found.metadata[LOG_METADATA]["columns"].split(","))
         rows = list(_whole_rows(found, layout))

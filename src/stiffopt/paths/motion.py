@@ -438,7 +438,7 @@ class _Planner:
     def _check(self, name: str, p: Array) -> None:
         """Refuse an end that is not clear."""
         if self.motions is not None and not self.is_clear(np.stack([p, p])):
-            raise Unsolved(f"{name}: {self._in_the_way(p)}")
+            raise Unsolved(f"{name if p.any() else 'at rest'}: {self._in_the_way(p)}")
 
     def _in_the_way(self, p: Array) -> str:
         """Describe the nearest object at pressures (n,) and the missing clearance."""
