@@ -14,9 +14,13 @@ import pytest
 from made_runs import BEGIN, PERIOD, FakeLoop, N, event, samples_between, snapshot, ticks, tip_at
 from stiffopt.cli.main import main
 from stiffopt.control.state import Alarm, Severity, State
+from stiffopt.daemon import run_log
 from stiffopt.daemon.run_errors import ErrorStatistics, RunStages
 from stiffopt.daemon.run_log import RecordedRun, RunSpan, read_run
+from stiffopt.daemon.topics import FORMAT, METADATA
+from stiffopt.errors import FileError
 from stiffopt.logs import LogLayout, LogRow, McapLogWriter, read_log
+from stiffopt.logs.mcap_file import McapContents
 from stiffopt.plots.run import error_lines
 from test_telemetry import recorded
 
@@ -103,6 +107,14 @@ def test_a_recording_of_an_experiment_is_exported_too(tmp_path: Path) -> None:
     assert main(["log", "export", str(path), "--csv"]) == 0
     log = read_log(tmp_path / "experiment.csv")
     np.testing.assert_allclose(log.tip_position[:, 0], 0.001 * np.arange(30), atol=1e-9)
+
+
+def test_a_message_that_is_no_object_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    about = {"format": FORMAT, "start_s": "0", "channels": "3"}
+    found = McapContents({METADATA: about}, [("/pressure", [])])
+    monkeypatch.setattr(run_log, "read_mcap", lambda _: found)
+    with pytest.raises(FileError, match="is damaged"):
+        read_run("odd.mcap")
 
 
 def test_bad_input_is_one_sentence(

@@ -221,7 +221,7 @@ class Planning:
         self._last = last
         if request.search or request.stay or request.step < math.inf:
             self._change = None
-        target = model_target(asked, request.offset + self._lead(request, asked))
+        target = model_target(asked, request.offset + self._lead(request))
         if last is not None and request.step < math.inf:
             bounds = last.pressures - request.step, last.pressures + request.step
             self._limits = np.clip(bounds[0], *self._limits), np.clip(bounds[1], *self._limits)
@@ -363,7 +363,7 @@ class Planning:
         moved = self._tip.at(here).jacobian[:3] * change
         return float(np.linalg.norm(moved, axis=0).max())
 
-    def _lead(self, request: PlanRequest, asked: Target) -> Array:
+    def _lead(self, request: PlanRequest) -> Array:
         """Return by how much (6,) the offset changes until feedback has followed it.
 
         On a slow way to other pressures it changes steadily, and feedback is late by some plans.
@@ -373,7 +373,7 @@ class Planning:
         change, last, tuning = self._change, self._last, self._tuning
         if change is None or last is None:
             return np.zeros(6)
-        stays = last.target == asked
+        stays = last.target == request.target
         moved = request.offset - last.offset if stays and not change.over else np.zeros(6)
         drift = change.drift + tuning.drift_share * (moved - change.drift)
         self._change = replace(change, drift=drift)

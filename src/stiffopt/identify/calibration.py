@@ -371,7 +371,7 @@ def _with_idle_channels(setup: Setup, comparer: Comparer) -> Setup:
         return setup
     description = setup.description
     remarks = [
-        f"{words}; the robot file's arm leaves {best_lines(comparer, description, k)}"
+        words + best_lines(comparer, description, k)
         for k, words in idle_channels(description, setup.recordings).items()
     ]
     return replace(setup, found=(*setup.found, *remarks))

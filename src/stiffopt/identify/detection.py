@@ -353,8 +353,7 @@ class Comparer:
         description, base, stations, recordings = self._given
         if not any(description.gravity):
             return hypotheses
-        weightless = description.model_copy(update={"gravity": (0.0, 0.0, 0.0)})
-        light = Comparer(weightless, base, stations, recordings)
+        light = Comparer(_weightless(description), base, stations, recordings)
         return sorted(hypotheses, key=light.score)[: DETECTION.shortlist]
 
     def of_turns(self, sources: tuple[int, ...]) -> Array:
@@ -427,6 +426,11 @@ class Comparer:
         return total / len(lateral)
 
 
+def _weightless(description: RobotDescription) -> RobotDescription:
+    """Return the arm of a robot file without its weight, and without what it was calibrated to."""
+    return description.model_copy(update={"gravity": (0.0, 0.0, 0.0), "calibration": None})
+
+
 def _spread(tracks: Sequence[Array]) -> float:
     """Return the RMS distance of tracks (N, k, 3) of several logs from their mean."""
     return float(np.linalg.norm(np.concatenate(tracks).std(axis=0)))
@@ -484,15 +488,21 @@ def found_wrong(
 
 
 def best_lines(comparer: Comparer, description: RobotDescription, channel: int) -> str:
-    """Name the two best hypotheses of the line of a channel, as the end of a sentence."""
+    """Name the two best hypotheses of the line of a channel, as the end of a sentence.
+
+    Empty if the arm does not bear the pressures under its weight.
+    """
     nothing = comparer.nothing
     as_is = comparer.score(nothing)
+    if not np.isfinite(as_is):
+        return ""
     ranked = sorted(
         (comparer.score(each) / as_is, each.words)
         for each in _lines(description, nothing)
         if each.sources[channel] != channel
     )
-    return " and ".join(f"{share * 100:.0f} % if {words}" for share, words in ranked[:2])
+    best = " and ".join(f"{share * 100:.0f} % if {words}" for share, words in ranked[:2])
+    return f"; the robot file's arm leaves {best}"
 
 
 def _alike(one: Hypothesis, other: Hypothesis) -> bool:
@@ -585,11 +595,8 @@ def idle_channels(description: RobotDescription, recordings: Sequence[Recording]
     """
     span = np.subtract(description.pressure_max, description.pressure_min)
     pressures, tip = _evenly(recordings, DETECTION.idle_rows)
-    arm = Manipulator(
-        description.model_copy(update={"gravity": (0.0, 0.0, 0.0), "calibration": None})
-    )
     try:
-        expected = arm.tip_pose(pressures)[:, :3, 3]
+        expected = Manipulator(_weightless(description)).tip_pose(pressures)[:, :3, 3]
     except PressureError:
         return {}
     count = len(span)

@@ -133,7 +133,7 @@ class _Correction:
     moves_all: bool = False
 
     def explains(self, before: Comparison, after: Comparison) -> bool:
-        """Whether a log fits so much better with the correction that it is believed."""
+        """Whether the correction takes away most of the error of a log."""
         if after.errors.mean > DETECTION.frame * before.errors.mean:
             return False
         then, now = before.errors.angle, after.errors.angle
