@@ -14,15 +14,8 @@ from made_logs import course, made_log
 from recordings import ASU, UCL, recordings
 from stiffopt.errors import FileError
 from stiffopt.identify.calibration import calibrate
-from stiffopt.identify.detection import (
-    Comparer,
-    Found,
-    found_wrong,
-    idle_channels,
-    of_channels,
-    on_one_clock,
-    without_drift,
-)
+from stiffopt.identify.detection import idle_channels, on_one_clock, without_drift
+from stiffopt.identify.hypotheses import Comparer, Found, found_wrong, of_channels
 from stiffopt.identify.recording import Recording
 from stiffopt.identify.settings import CalibrationSettings, Finding
 from stiffopt.identify.setup import Setup, recordings_of

@@ -341,6 +341,7 @@ class DetectionSettings:
     ----------
     overwhelming : largest share of the misfit that an accepted hypothesis leaves.
     tie : largest misfit of an accepted hypothesis, as a share of any rival's.
+    faults : largest number of faults that are corrected, one after another.
     rows : number of compared rows of all recordings together.
     softness : factors on pressures, for arms softer or stiffer than the robot file says.
     farther : softness with which the arm moves more than this many times as far as the tip did is
@@ -388,6 +389,7 @@ class DetectionSettings:
 
     overwhelming: float = 0.5
     tie: float = 0.75
+    faults: int = 4
     rows: int = 120
     softness: tuple[float, ...] = (0.2, 0.35, 0.6, 1.0, 1.7, 3.0, 5.0)
     farther: float = 1.5

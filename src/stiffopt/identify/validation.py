@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 
 from stiffopt.arrays import Array
 from stiffopt.errors import EquilibriumError, PressureError, StiffoptError
-from stiffopt.identify.detection import Hypothesis, idle_channels, of_channels, replaced
+from stiffopt.identify.detection import idle_channels
 from stiffopt.identify.discrepancy import centres
 from stiffopt.identify.error_model import held_for, in_turn, is_moving
 from stiffopt.identify.fit import fit
+from stiffopt.identify.hypotheses import Hypothesis, of_channels, replaced
 from stiffopt.identify.problem import CalibrationProblem, Noise, Predicted, Sample
 from stiffopt.identify.recording import Recording
 from stiffopt.identify.results import Comparison
