@@ -9,11 +9,11 @@ wrongly while the sweeps and two rounds are simulated; the other faults are made
 ``--validate``, the robot file is fitted to right sweeps and two rounds, and the fault is in the
 third round, as `validate` reads it.
 
-Prints a table in Markdown for each rig. A fault is told *rightly* if its correction, or both
-corrections of two faults, and nothing else are told; *as idle* if only a remark says that a channel
-does nothing, and it is one that does nothing; *wrongly* if anything else is told. "Left" is the
-share of the misfit to the robot file's arm, with ``--validate`` of the mean error, that the
-corrections which were told rightly leave.
+Prints a table in Markdown for each rig. A fault is told *rightly* if its correction, or both of two
+faults, and nothing else are told; *in part* if one of two is, or if only a remark says that a
+channel does nothing which does nothing; *wrongly* if anything else is told. "Left" is the share of
+the misfit to the robot file's arm, with ``--validate`` of the mean error, that corrections which
+were told rightly leave.
 """
 
 from __future__ import annotations
@@ -46,7 +46,8 @@ Logs = list[tuple[str, Log]]
 UNITS = {"kPa": 1e3, "psi": 6894.757, "bar": 1e5}
 FITTED = 1 + DESIGNED  # logs: the sweeps and the rounds as in the experiment
 LEFT = re.compile(r"(?:misses the tip by|the mean error is) ([\d.]+) mm instead of ([\d.]+) mm")
-COLUMNS = ("fault", "cases", "rightly", "as idle", "wrongly", "nothing", "left, %")
+LIST = re.compile(", (?:and )?(?=segment|the line)")
+COLUMNS = ("fault", "cases", "rightly", "in part", "wrongly", "nothing", "left, %")
 
 
 @dataclass(frozen=True)
@@ -95,8 +96,8 @@ def order(robot: RobotDescription, sources: Sequence[int]) -> Fault:
     """The channels are in another order."""
     name = robot.channel_name
     wrong = [(k, j) for k, j in enumerate(sources) if k != j]
-    words = ", ".join(f"{name(k)} has the column of {name(j)}" for k, j in wrong)
-    return Fault(tuple(sources), told=(f"in another order: {words}",))
+    told = tuple(f"{name(k)} has the column of {name(j)}" for k, j in wrong)
+    return Fault(tuple(sources), told=told)
 
 
 def dead_line(robot: RobotDescription, rng: np.random.Generator) -> Fault:
@@ -306,14 +307,14 @@ def judged(fault: Fault, remarks: Sequence[str]) -> tuple[str, float]:
     found = [LEFT.search(each) for each in told]
     shares = [float(each[1]) / float(each[2]) for each in found if each]
     if not told:
-        return ("rightly" if not fault.told else "nothing"), float("nan")
-    if all("does not show" in each for each in told):
-        named = [any(f"of {idle} does not" in each for idle in fault.idle) for each in told]
-        return ("as idle" if all(named) else "wrongly"), float("nan")
-    right = [any(words in each for words in fault.told) for each in told]
+        return ("nothing" if fault.told else "rightly"), float("nan")
+    known = [*fault.told, *(f"of {channel} does not show" for channel in fault.idle)]
+    parts = [part for each in told for part in LIST.split(each)]
+    if not all(any(words in part for words in known) for part in parts):
+        return "wrongly", float("nan")
     complete = all(any(words in each for each in told) for words in fault.told)
     share = float(np.prod(shares)) if shares else float("nan")
-    return ("rightly" if all(right) and complete else "wrongly"), share
+    return ("rightly" if complete else "in part"), share
 
 
 def row(name: str, found: Sequence[tuple[str, float]]) -> tuple[str, ...]:

@@ -14,6 +14,7 @@ from made_logs import course, made_log
 from recordings import ASU, UCL, recordings
 from stiffopt.errors import FileError
 from stiffopt.identify.calibration import calibrate
+from stiffopt.identify.correction import put_right
 from stiffopt.identify.detection import idle_channels, on_one_clock, without_drift
 from stiffopt.identify.hypotheses import Comparer, Found, found_wrong, of_channels
 from stiffopt.identify.recording import Recording
@@ -69,6 +70,11 @@ def found_in(robot: RobotDescription, logs: list[Log]) -> Found | None:
     return of_recordings(robot, recordings_of(robot, list(logs), AS_RECORDED))
 
 
+def corrected(robot: RobotDescription, logs: list[Log]) -> Setup:
+    recordings = recordings_of(robot, list(logs), AS_RECORDED)
+    return put_right(Setup.of(robot, recordings, (), AS_RECORDED))
+
+
 def of_recordings(robot: RobotDescription, read: list[Recording]) -> Found | None:
     setup = Setup.of(robot, read, (), AS_RECORDED)
     stations = [robot.length if each.at is None else each.at for each in setup.points]
@@ -118,6 +124,49 @@ def test_a_cycle_of_channels_within_one_segment_is_found(order: tuple[int, ...])
     (again,) = validate(calibrated(arm("stiff-flop-2")), [wrong])
     assert "the channels are in another order" in again.remarks[-1]
     assert again.errors.mean < 2e-3
+
+
+@pytest.mark.parametrize("order", [(1, 2, 0, 4, 3, 5), (0, 2, 1, 5, 3, 4)])
+def test_an_order_in_each_of_two_segments_is_found(order: tuple[int, ...]) -> None:
+    log = log_of("stiff-flop-2", 6)
+    wrong = replace(log, commanded=log.commanded[:, np.argsort(order)])
+    setup = corrected(load_description("stiff-flop-2"), [wrong])
+    assert setup.description.recordings is not None
+    assert setup.description.recordings.channels == tuple(k + 1 for k in order)
+
+
+def test_two_wrong_lines_are_found_of_which_each_alone_leaves_much() -> None:
+    time, pressures = course(6, 60.0, rate=5.0)
+    real = pressures.copy()
+    real[:, 3], real[:, 5] = 0.0, pressures[:, 2]
+    wrong = replace(driven(real, time, "stiff-flop-2"), commanded=pressures)
+    robot = load_description("stiff-flop-2")
+    found = found_in(robot, [wrong])
+    assert found is not None
+    assert (found.hypothesis.kind, found.hypothesis.sources) == ("lines", (0, 1, 2, -1, 4, 2))
+    told = found.hypothesis.told(robot, ["a log"])
+    assert "the line of segment 2 channel 1 is dead" in told
+    assert ", and segment 2 channel 3 has" in told or ", and the line" in told
+
+
+def test_after_a_correction_the_logs_are_looked_at_again() -> None:
+    time, pressures = course(3, 60.0, rate=5.0)
+    real = pressures * [1.0, 1.0, 0.0]
+    wrong = turned(replace(driven(real, time), commanded=pressures), CUBE_ROTATIONS[9])
+    axes, line = corrected(load_description("stiff-flop-1"), [wrong]).found
+    assert "axes are turned" in axes
+    assert line.startswith("with that corrected, the line of segment 1 channel 3 is dead")
+
+
+def test_a_line_that_was_corrected_is_told_once() -> None:
+    time, pressures = course(6, 60.0, highest=6e4, rate=1.0)
+    for source in (-1, 2):
+        real = pressures.copy()
+        real[:, 5] = 0.0 if source < 0 else pressures[:, source]
+        wrong = replace(driven(real, time, "stiff-flop-2-hanging"), commanded=pressures)
+        setup = corrected(load_description("stiff-flop-2-hanging"), [wrong])
+        np.testing.assert_allclose(setup.recordings[0].pressures, real)
+        assert len(setup.found) == 1
 
 
 def test_nothing_is_corrected_where_the_arm_bears_none_of_the_pressures() -> None:
