@@ -292,7 +292,8 @@ class Validated:
         """Remarks on the first round that was not fitted."""
         if (rig, seed) not in self._fitted:
             robot, right = recorded(rig, seed, Fault(), slice(0, FITTED))
-            self._fitted[rig, seed] = calibrate(robot, right, settings=QUICK).robot
+            quick = QUICK.quick(is_loaded=any(robot.gravity))
+            self._fitted[rig, seed] = calibrate(robot, right, settings=quick).robot
         _, faulty = recorded(rig, seed, fault, slice(FITTED, FITTED + 1))
         try:
             (found,) = validate(self._fitted[rig, seed], faulty, QUICK)

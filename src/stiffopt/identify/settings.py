@@ -12,7 +12,7 @@ from stiffopt.schema import Items, Schema
 from stiffopt.units import Duration
 
 Finding = Literal["units", "clock", "drift", "axes", "channels", "lines"]
-"""Errors of recordings that are corrected automatically (`stiffopt.identify.detection`)."""
+"""Errors of recordings that are corrected automatically (`stiffopt.identify.correction`)."""
 
 
 @dataclass(frozen=True)
@@ -335,7 +335,7 @@ class ReportSettings:
 
 @dataclass(frozen=True)
 class DetectionSettings:
-    """Evidence needed to correct a recording (`stiffopt.identify.detection`).
+    """Evidence needed to correct a recording (`stiffopt.identify.detection`, `hypotheses`).
 
     Attributes
     ----------
@@ -346,7 +346,8 @@ class DetectionSettings:
     softness : factors on pressures, for arms softer or stiffer than the robot file says.
     farther : softness with which the arm moves more than this many times as far as the tip did is
         not tried.
-    shortlist : number of hypotheses that are compared with an arm under its weight.
+    shortlist : number of hypotheses that are compared with an arm under its weight, and of those of
+        a kind of which each is tried together with another one.
     few : largest number of channels of a segment, or of segments, of which all orders are tried.
     moved : largest distance of the base from its place in the robot file, in lengths of the arm.
     off, frame : mean error of a log, in lengths of the arm, beyond which its set-up is suspected to
