@@ -10,10 +10,10 @@ wrongly while the sweeps and two rounds are simulated; the other faults are made
 third round, as `validate` reads it.
 
 Prints a table in Markdown for each rig. A fault is told *rightly* if its correction, or both of two
-faults, and nothing else are told; *in part* if one of two is, or if only a remark says that a
-channel does nothing which does nothing; *wrongly* if anything else is told. "Left" is the share of
-the misfit to the robot file's arm, with ``--validate`` of the mean error, that corrections which
-were told rightly leave.
+faults, and nothing else are told; *in part* if one of two is, or if a remark or an error only says
+what is wrong, such as a channel that does nothing; *wrongly* if anything else is told. "Left" is
+the share of the misfit to the robot file's arm, with ``--validate`` of the mean error, that
+corrections which were told rightly leave.
 """
 
 from __future__ import annotations
@@ -47,6 +47,7 @@ UNITS = {"kPa": 1e3, "psi": 6894.757, "bar": 1e5}
 FITTED = 1 + DESIGNED  # logs: the sweeps and the rounds as in the experiment
 LEFT = re.compile(r"(?:misses the tip by|the mean error is) ([\d.]+) mm instead of ([\d.]+) mm")
 LIST = re.compile(", (?:and )?(?=segment|the line)")
+MARKS = ("--keep", "look at", "expected Pa")  # of remarks and errors about the set-up
 COLUMNS = ("fault", "cases", "rightly", "in part", "wrongly", "nothing", "left, %")
 
 
@@ -60,13 +61,13 @@ class Fault:
         None if the channels are right.
     edited : turns right logs into faulty ones.
     told : what the remarks should contain, one part each.
-    idle : channels whose recorded pressures do nothing, in words.
+    hints : what a remark or an error may contain that says what is wrong, but corrects nothing.
     """
 
     sources: tuple[int, ...] | None = None
     edited: Callable[[Logs], Logs] = list
     told: tuple[str, ...] = ()
-    idle: tuple[str, ...] = ()
+    hints: tuple[str, ...] = ()
 
 
 # -- faults ----------------------------------------------------------------------------------------
@@ -80,16 +81,16 @@ def nothing(robot: RobotDescription, rng: np.random.Generator) -> Fault:
 def lines(robot: RobotDescription, dead: Sequence[int], shared: Sequence[tuple[int, int]]) -> Fault:
     """Lines of some channels are dead; of some pairs the first has the pressure of the second."""
     name, sources = robot.channel_name, list(range(robot.n_pressures))
-    told, idle = [], []
+    told, hints = [], []
     for k in dead:
         sources[k] = -1
         told.append(f"the line of {name(k)} is dead")
-        idle.append(name(k))
+        hints.append(f"of {name(k)} does not show")
     for k, other in shared:
         sources[k] = other
         told.append(f"{name(k)} has the pressure of {name(other)}")
-        idle.append(name(k))
-    return Fault(tuple(sources), told=tuple(told), idle=tuple(idle))
+        hints.append(f"of {name(k)} does not show")
+    return Fault(tuple(sources), told=tuple(told), hints=tuple(hints))
 
 
 def order(robot: RobotDescription, sources: Sequence[int]) -> Fault:
@@ -189,6 +190,7 @@ def units(robot: RobotDescription, rng: np.random.Generator) -> Fault:
             (name, replace(log, commanded=log.commanded / UNITS[unit])) for name, log in right
         ],
         told=(f"the pressures are in {unit}",),
+        hints=(f"the pressures look like {unit}",),
     )
 
 
@@ -304,12 +306,12 @@ class Validated:
 
 def judged(fault: Fault, remarks: Sequence[str]) -> tuple[str, float]:
     """How a fault was told, and the share of the misfit that its corrections leave."""
-    told = [each for each in remarks if "--keep" in each or "look at" in each]
+    told = [each for each in remarks if any(mark in each for mark in MARKS)]
     found = [LEFT.search(each) for each in told]
     shares = [float(each[1]) / float(each[2]) for each in found if each]
     if not told:
         return ("nothing" if fault.told else "rightly"), float("nan")
-    known = [*fault.told, *(f"of {channel} does not show" for channel in fault.idle)]
+    known = (*fault.told, *fault.hints)
     parts = [part for each in told for part in LIST.split(each)]
     if not all(any(words in part for words in known) for part in parts):
         return "wrongly", float("nan")

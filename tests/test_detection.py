@@ -427,6 +427,14 @@ def test_pressures_in_other_units_are_found(unit: str, factor: float) -> None:
         recordings_of(robot, [wrong], CalibrationSettings(keep=("units",)))
 
 
+def test_other_units_are_found_of_an_arm_that_its_weight_straightens() -> None:
+    time, pressures = course(6, 60.0, highest=6e4, rate=1.0)
+    log = driven(pressures, time, "stiff-flop-2-hanging")
+    robot = load_description("stiff-flop-2-hanging")
+    (read,) = recordings_of(robot, [replace(log, commanded=pressures / 1e3)], AS_RECORDED)
+    np.testing.assert_allclose(read.pressures, pressures, atol=1e-6)
+
+
 def test_a_unit_that_is_not_clear_is_refused() -> None:
     log = log_of()
     wrong = replace(log, commanded=log.commanded / 2.5e3)  # between kPa and psi
