@@ -369,6 +369,19 @@ def test_a_log_outside_its_regions_has_a_remark() -> None:
     assert not right.remarks
 
 
+def test_a_dead_line_that_moves_the_tip_a_little_is_found_outside_the_regions() -> None:
+    robot, pressures = judged(arm()), log_of().commanded * [1.0, 1.0, 0.12]
+    log = driven(pressures, log_of().time)
+    real = driven(pressures * [1.0, 1.0, 0.0], log.time)
+    (found,) = validate(robot, [replace(log, tip_position=real.tip_position)])
+    assert "the line of segment 1 channel 3 is dead" in found.remarks[-1]
+    assert found.errors.mean < 1e-3
+    before = np.linalg.norm(log.tip_position - real.tip_position, axis=1).mean()
+    assert 1e-3 < before < 0.1 * robot.length
+    (right,) = validate(robot, [log])
+    assert not right.remarks
+
+
 def test_one_pose_that_moves_a_little_shows_no_moved_frame() -> None:
     stiff = calibrated(arm())
     material = stiff.segments[0].material.model_copy(update={"youngs_modulus": 400e3})

@@ -354,6 +354,7 @@ class DetectionSettings:
         differ from the calibration's; and the share of it that a correction may leave.
     region, within : a remark reports a log with less than a share `within` of its tips in the
         region of this probability.
+    outside : with less than this share in it, a log is suspected to have other channels.
     channel_rows : number of rows with which orders of channels are compared in a log that is off.
     poses, apart : smallest number of poses by which a frame is judged, since two can be moved to
         fit any others; and their distance, as a share of the range of permitted pressures.
@@ -401,6 +402,7 @@ class DetectionSettings:
     frame: float = 0.3
     region: float = 0.99
     within: float = 0.5
+    outside: float = 0.9
     channel_rows: int = 60
     poses: int = 4
     apart: float = 0.1

@@ -148,13 +148,15 @@ class _Correction:
 def _put_right(setup: Setup, found: tuple[Comparison, ...]) -> tuple[Comparison, ...]:
     """Return comparisons in which logs that are off only by their set-up are corrected.
 
-    Other channels have no free number, and a moved frame has six. So channels are tried first.
+    Other channels have no free number, and a moved frame has six. So channels are tried first, and
+    also for logs that are less far off, but outside their regions.
     """
     recordings, remarks = list(setup.recordings), [""] * len(found)
-    for correct in (_with_channels_found, _with_frame_found):
+    for correct, outside in ((_with_channels_found, DETECTION.outside), (_with_frame_found, 0.0)):
         tried: dict[int, _Correction] = {}
         for i, each in enumerate(found):
-            if each.errors.mean > DETECTION.off * setup.description.length and not remarks[i]:
+            is_off = each.errors.mean > DETECTION.off * setup.description.length
+            if (is_off or _within(each) < outside) and not remarks[i]:
                 correction = correct(setup, recordings[i], each)
                 if correction is not None:
                     tried[i] = correction
