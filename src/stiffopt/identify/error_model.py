@@ -239,8 +239,9 @@ class _Fold:
 
 def _even_variance(moves: Array, fit: Fit) -> Array:
     """Return the variance (M,) of each axis of the tip, in m^2, by `squared_moves` (M, n)."""
+    span = recorded_range(commanded(fit.problem.samples))
     memory = [
-        (segment.history or NO_HISTORY).remembered_shares(segment.n_channels)
+        (segment.history or NO_HISTORY).remembered_shares(segment.n_channels, span)
         for segment in fit.robot.segments
     ]
     samples, starts = fit.problem.samples, fit.problem.starts[:-1]

@@ -208,7 +208,8 @@ def even_variance(moves: Array, before: Array, memory: Array) -> Array:
     ----------
     moves : by the discrepancy at the pressures of now, as `squared_moves` (..., N, n).
     before : their mean where the arm was before, as `fading_mean` (..., N, n).
-    memory : share (n,) of each channel's pressure that acts through the model's hysteresis.
+    memory : share (n,) of each channel's pressure that is still a former one by the model's
+        hysteresis (`History.remembered_shares`).
     """
     share = memory + (1 - memory) * _MORE_MEMORY
     return np.asarray(((1 - share) ** 2 * moves + share**2 * before).sum(axis=-1) / 3)

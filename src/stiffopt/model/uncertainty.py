@@ -324,9 +324,11 @@ class Uncertainty:
 
     @cached_property
     def _memory(self) -> Array:
-        """Shares (n,) of the channels' pressures that act through hysteresis."""
+        """Shares (n,) of the channels' pressures that are still former ones."""
+        errors = self._calibration.errors
+        span = np.inf if errors is None else errors.range
         shares = [
-            (segment.history or NO_HISTORY).remembered_shares(segment.n_channels)
+            (segment.history or NO_HISTORY).remembered_shares(segment.n_channels, span)
             for segment in self._description.segments
         ]
         return np.concatenate(shares)
