@@ -408,6 +408,31 @@ def test_a_doubted_motion_stops_without_a_swing():
     assert swings[0] < 0.5 * swings[1]
 
 
+@pytest.mark.parametrize("is_of_arm", [False, True])
+def test_what_feedback_added_is_taken_back_without_a_swing(is_of_arm):
+    """It stays if only the arm is doubted."""
+    bench = Bench(HANGING, "full")
+    bench.settled(duration=4.0)
+    controller = bench.controller
+    more = np.array([0.3, 0.0, 0.0, 0.2, 0.0, 0.0]) * BAR
+    path, added = controller._ways[0]
+    controller._ways[0] = path, added + more
+    offset = controller._arm.pressures.command_offset
+    now_added = bench.command - (controller._reference.command - offset)
+    back = path[: bench.n] - offset + (now_added if is_of_arm else added + more)
+    controller._arm.watch.doubt = Doubt("slip", "made up", is_of_arm=is_of_arm)
+    tips = []
+    for _ in range(200):
+        stopping = controller.stop(bench.rig.clock.now())
+        bench.command = bench.command if stopping is None else stopping
+        bench.run(bench.period, steer=False)
+        tips.append(bench.tip[:3, 3].copy())
+    way, swing = np.linalg.norm(tips[-1] - tips[0]), np.linalg.norm(np.ptp(tips[100:], axis=0))
+    assert swing < max(0.2 * way, 5e-4)
+    assert stopping is None
+    assert bench.command == pytest.approx(back, abs=0.06 * BAR)
+
+
 def test_the_tip_takes_its_time_to_a_new_target():
     """Half a period of the vibration; what follows is not bounded."""
     bench = moving(rested=3.0, moved=0.0)

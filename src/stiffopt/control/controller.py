@@ -155,6 +155,7 @@ class TipController:
         self._windows.begin()
         self._led_to: Target | None = None  # present target of a trajectory of pressures
         self._ways.clear()
+        self._back_to: Array | None = None  # goal of the reference that stops a doubted motion
         self._begin_way()
 
     def set_task(self, task: Task) -> None:
@@ -275,6 +276,7 @@ class TipController:
         self._reference.begin(np.concatenate([here + pressures.history_offset, offset]))
         self._feedback.resume()
         self._ways.clear()
+        self._back_to = None
         self._begin_way()
         self._at_rest = False
 
@@ -406,19 +408,29 @@ class TipController:
         """Stop a doubted motion; see `Controller.stop`.
 
         The reference goes back to where it was a while before. On its smooth path the arm does not
-        begin to vibrate, as it would if its commands froze. What feedback adds becomes what it was
-        then, since it may have followed a sensor that is wrong. A channel that moves against its
-        command gets the pressure at which it last followed: even reversed it goes back to that.
+        begin to vibrate, as it would if its commands froze. What feedback adds goes back on the
+        same path, since it may have followed a sensor that is wrong; it stays if only the arm is
+        doubted. A channel that moves against its command gets the pressure at which it last
+        followed: even reversed it goes back to that.
         """
         channels, last = self._arm.channels, self._arm.pressures.command
-        is_doubted = self._arm.watch.doubt is not None or channels.opposed.any()
+        reference, offset = self._reference, self._arm.pressures.command_offset
+        doubt = self._arm.watch.doubt
+        is_doubted = doubt is not None or channels.opposed.any()
         if not self._vibrates or not is_doubted or not self._ways:
             return None
-        goal = self._ways[0][0]
-        if self._is_near(goal[: len(last)]):
+        if self._back_to is None:
+            added = last - (reference.command - offset)
+            reference.shift_pressures(added)
+            path, added_then = self._ways[0]
+            stays = doubt is not None and doubt.is_of_arm
+            back = added if stays else added_then
+            self._back_to = path + np.concatenate([back, np.zeros(6)])
+        if self._is_near(self._back_to[: len(last)]):
             return None
-        self._reference.advance(goal)
-        command = np.where(channels.opposed, channels.last_followed, self._without_feedback)
+        reference.advance(self._back_to)
+        command = reference.command - offset
+        command = np.where(channels.opposed, channels.last_followed, command)
         return self._feedforward(command, last).pressures
 
     @property
