@@ -14,10 +14,14 @@ from scipy.spatial.transform import Rotation
 
 import stiffopt as so
 from running import wait_for
+from stiffopt.control.forecast import Forecast, Present
 from stiffopt.control.planner import InlinePlanner, ProcessPlanner
 from stiffopt.control.planning import Planning, PlanRequest, model_target
+from stiffopt.control.replanning import Pursuit
+from stiffopt.control.tuning import ForecastTuning
 from stiffopt.control.vibration import BentMode
 from stiffopt.errors import StiffoptError
+from stiffopt.model.scene import Scene
 from stiffopt.optimise.goal import StiffnessGoal, StiffnessMeasure
 from stiffopt.optimise.press import Press
 from stiffopt.optimise.target import Target
@@ -311,6 +315,44 @@ def test_a_task_that_demands_a_stiffness_has_it_on_arrival(robot):
         assert plan.tip_first == ()
         reached = robot.stiffness(plan.pressures, direction=[1, 0, 0])
         assert reached > 0.89 * stiffest.stiffness
+
+
+@pytest.mark.parametrize("share", [0.02, 0.98])
+def test_on_a_rig_with_a_scene_the_tip_goes_first_where_that_keeps_clear(robot, share):
+    """Under a plate, to which the straight line comes less near than the tip's way."""
+    first, here = request(robot), np.array([1.0, 0.3, 0.3]) * BAR
+    stiffest = Planning(robot).plan(first).pressures
+    way = np.array(Planning(robot).plan(replace(first, here=here)).tip_first)
+    plate = {"half_space": {"point": (0, 0, 0.12), "normal": (0, 0, -1)}}
+    scene = Scene(objects=[{"name": "plate", **plate}])
+    gaps = [float(robot.clearance(p, scene)) for p in (way, here)]
+    assert gaps[0] < gaps[1] - 1e-3
+    clearance = gaps[0] + share * (gaps[1] - gaps[0])
+    asked = replace(first, here=here, way=np.stack([here, here]))
+    with_plate = Planning(robot, scene.model_copy(update={"clearance": clearance}))
+    plan = with_plate.plan(asked)
+    assert not plan.blocked
+    goal = way if share < 0.5 else stiffest
+    np.testing.assert_allclose(plan.pressures, goal, atol=100.0)
+
+
+@pytest.mark.parametrize("vibrates", [True, False])
+def test_a_forecast_plans_the_way_that_the_arm_will_go(robot, vibrates, monkeypatch):
+    first, here = request(robot), np.array([1.0, 0.3, 0.3]) * BAR
+    far = {"name": "far", "sphere": {"centre": (0.5, 0.5, 0.5), "radius": 0.01}}
+    planner = InlinePlanner(robot, Scene(objects=[far]))
+    asked, ask = [], planner.request
+    monkeypatch.setattr(planner, "request", lambda made: (asked.append(made), ask(made)))
+    forecast = Forecast(planner, ForecastTuning())
+    rotation, position = tip(robot, here)
+    limits = robot.pressure_min, robot.pressure_max
+    forecast.present = Present(
+        Pursuit(), None, np.stack([here, here]), np.zeros(6), np.zeros(3), limits, None,
+        position, rotation, vibrates,
+    )  # fmt: skip
+    forecast.check(Pursuit.of(first.task, first.task))
+    assert bool(planner.latest().tip_first) is vibrates
+    assert np.array_equal(asked[0].here, here if vibrates else [])
 
 
 def test_plans_go_straight_and_slowly_where_the_way_that_was_found_ends(robot, monkeypatch):

@@ -315,7 +315,7 @@ class TipController:
         return Present(
             replanner.pursuit, replanner.plan, self._way(now), self._arm.tip.offset,
             self._arm.pressures.command_offset, self._arm.channels.available(), replanner.adapted,
-            estimate.position, estimate.rotation,
+            estimate.position, estimate.rotation, self._vibrates,
         )  # fmt: skip
 
     def _way(self, now: float) -> Array:

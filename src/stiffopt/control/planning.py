@@ -175,10 +175,9 @@ class Planning:
         plan = replace(plan, doubt=self._robot.description.extrapolation(plan.pressures))
         if request.here.size:
             plan = replace(plan, bent=self._bent(request.here))
-        if self._ways is None or not len(request.way) or plan.approach or plan.blocked:
+        if plan.approach or plan.blocked:
             return plan
-        blocked = self._ways.blocked(np.vstack([request.way, plan.pressures]))
-        return replace(plan, blocked=blocked)
+        return replace(plan, blocked=self._blocked(request, plan.pressures))
 
     def _bent(self, here: Array) -> BentMode | None:
         """Return the modes at pressures (n,); None where they are those of the last call."""
@@ -219,7 +218,7 @@ class Planning:
         self._limits = self._effective_limits(request)
         last, refused = request.last or self._last, self._refused
         self._last = last
-        if request.search or request.stay or request.step < math.inf:
+        if request.search or request.stay or request.last or request.step < math.inf:
             self._change = None
         target = model_target(asked, request.offset + self._lead(request))
         if last is not None and request.step < math.inf:
@@ -323,25 +322,37 @@ class Planning:
         configuration, or from the first place on that way that has a share of the stiffness `best`.
 
         A task that demands a stiffness, or a press, needs the stiffest pressures at once. On a rig
-        with a scene the way to them is the one that was checked.
+        with a scene the arm goes there straight if it would come too near to the scene otherwise.
         """
         goal, tuning = task.stiffness, self._tuning
         demands = task.press is not None or (goal is not None and (goal.at_least or goal.match))
-        if not request.here.size or self._ways is not None or demands:
+        if not request.here.size or demands:
             return stiffest
         found, distance, angle = self._search.find(
             target, self._limits, request.here, least_motion=True
         )
         if distance > _REACHED.position or angle > _REACHED.angle:
             return stiffest
-        for pressures in self._way_on(target, found, stiffest):
-            if self._stiffness is not None:
-                tip = self._tip.at(pressures)
-                if self._stiffness(tip.compliance, tip.pose[:3, :3]) < tuning.soft * best:
-                    continue
-            self._change = _PostureChange(stiffest, tuple(pressures.tolist()))
-            return pressures
-        return stiffest
+        way = self._way_on(target, found, stiffest)
+        while way and self._is_soft(way[0], tuning.soft * best):
+            way = way[1:]
+        if not way or self._blocked(request, *way, stiffest):
+            return stiffest
+        self._change = _PostureChange(stiffest, tuple(way[0].tolist()))
+        return way[0]
+
+    def _is_soft(self, pressures: Array, least: float) -> bool:
+        """Return whether the task's stiffness at pressures (n,) is less than `least`."""
+        if self._stiffness is None:
+            return False
+        tip = self._tip.at(pressures)
+        return self._stiffness(tip.compliance, tip.pose[:3, :3]) < least
+
+    def _blocked(self, request: PlanRequest, *pressures: Array) -> str:
+        """Return why the request's way and on to pressures (n,) is not clear of the scene."""
+        if self._ways is None or not len(request.way):
+            return ""
+        return self._ways.blocked(np.vstack([request.way, *pressures]))
 
     def _way_on(self, target: Target, begin: Array, end: Array) -> list[Array]:
         """Return pressures (n,) on a way from some to others that stays at the target.
