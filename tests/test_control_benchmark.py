@@ -19,6 +19,7 @@ import calibration
 import control
 import control_cases
 import control_runs
+import disturbances
 import regions
 import setup_faults
 from conftest import is_long
@@ -184,6 +185,25 @@ def test_settling_ends_where_the_tip_comes_near_for_good():
     assert settling_time(times, errors, 1.0) == pytest.approx(6.0)
     errors[95] = 1.1e-3  # so late that nobody knows whether it stays
     assert settling_time(times, errors, 1.0) == np.inf
+
+
+def test_an_arm_in_use_has_a_line_with_what_the_loop_causes_and_its_settling(monkeypatch):
+    """The way of the tip is 1 s on a straight line; the line that is kinked leaves it by 3 mm."""
+    goal = np.array([0.1, 0.0, 0.0])
+    ticks = round(disturbances.AFTER / disturbances.PERIOD)
+    way = goal * np.minimum(1.0, np.arange(ticks)[:, None] * disturbances.PERIOD)
+
+    def run(case, row, dynamics, *, in_use, frozen=False):
+        assert in_use
+        if "kinked" in row.name and not frozen:
+            return disturbances.Outcome(0.5, "slip", way + np.array([0, 3e-3, 0]), "inactive")
+        return disturbances.Outcome(np.inf, "", way, "active")
+
+    monkeypatch.setattr(disturbances, "run_row", run)
+    case = SimpleNamespace(seed=7, aims=(None, SimpleNamespace(position=goal)))
+    rows = [row for row in disturbances.ROWS if "line behind a gauge" in row.name]
+    line = disturbances._in_use(case, rows, "full")
+    assert line == ["7", "0.0 (not told)", "3.0 (0.50, slip)", "1.00"]
 
 
 # -- calibration ------------------------------------------------------------------------------
