@@ -157,6 +157,7 @@ class CorrectionTuning:
 
     least: float = 2e-3  # of the tip's position at rest, in m
     share: float = 0.2  # of the latest motion of the tip on the reference, added to it
+    most: float = 5e-3  # of the sum, in m: what feedback does at most must stay below 10 mm
     time: float = 1.0  # of the latest motion, as plans follow the offset, in s
     release: float = 0.01  # growth once the arm is stiff, in m/s
 
