@@ -84,13 +84,15 @@ def test_corrections_are_bounded_by_the_latest_motion_and_released_slowly():
     assert bound.largest == math.inf
     bound.take(np.zeros(3), applies=True)
     assert bound.largest == 2e-3
-    bound.take(np.array([0.03, 0.0, 0.0]), applies=True)
-    assert bound.largest == pytest.approx(8e-3)
-    for _ in range(500):
-        bound.take(np.array([0.03, 0.0, 0.0]), applies=True)
+    bound.take(np.array([0.01, 0.0, 0.0]), applies=True)
+    assert bound.largest == pytest.approx(4e-3)
+    bound.take(np.array([0.05, 0.0, 0.0]), applies=True)
+    assert bound.largest == pytest.approx(5e-3)
+    for _ in range(600):
+        bound.take(np.array([0.05, 0.0, 0.0]), applies=True)
     assert bound.largest == pytest.approx(2e-3, rel=0.03)
     for _ in range(100):
-        bound.take(np.array([0.03, 0.0, 0.0]), applies=False)
+        bound.take(np.array([0.05, 0.0, 0.0]), applies=False)
     assert bound.largest == pytest.approx(12e-3, rel=0.02)
     bound.begin()
     assert bound.largest == math.inf
