@@ -126,7 +126,7 @@ class ReferenceTuning:
     # the tip's way to a new target, before the arm becomes stiff: its least time in periods of the
     # vibration, and the greatest mean speed of the tip by any channel, in m/s
     periods_to_target: float = 0.5
-    channel_speed: float = 0.08
+    channel_speed: float = 0.065
     # motion over which the model on the reference is not linearised again; see `LinearisedTip`
     model_range: float = 0.07
     # time by which a doubted motion of an arm that vibrates is taken back, in s
