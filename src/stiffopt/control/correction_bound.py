@@ -51,4 +51,4 @@ class CorrectionBound:
         self._before = before + self._period / tuning.time * way
         self._released = 0.0 if applies else self._released + tuning.release * self._period
         bound = tuning.least + tuning.share * float(np.linalg.norm(way))
-        self.largest = bound + self._released
+        self.largest = min(bound, tuning.most) + self._released

@@ -126,7 +126,7 @@ class ReferenceTuning:
     # the tip's way to a new target, before the arm becomes stiff: its least time in periods of the
     # vibration, and the greatest mean speed of the tip by any channel, in m/s
     periods_to_target: float = 0.5
-    channel_speed: float = 0.08
+    channel_speed: float = 0.065
     # motion over which the model on the reference is not linearised again; see `LinearisedTip`
     model_range: float = 0.07
     # time by which a doubted motion of an arm that vibrates is taken back, in s
@@ -157,6 +157,7 @@ class CorrectionTuning:
 
     least: float = 2e-3  # of the tip's position at rest, in m
     share: float = 0.2  # of the latest motion of the tip on the reference, added to it
+    most: float = 5e-3  # of the sum, in m: what feedback does at most must stay below 10 mm
     time: float = 1.0  # of the latest motion, as plans follow the offset, in s
     release: float = 0.01  # growth once the arm is stiff, in m/s
 
