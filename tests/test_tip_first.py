@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from stiffopt.control.correction_bound import CorrectionBound
+from stiffopt.control.planning import Planning
 from stiffopt.control.replanning import Pursuit, Replanner
 from stiffopt.control.tuning import ControlTuning, CorrectionTuning, ReplanningTuning
 from stiffopt.control.way_to_target import WayToTarget
@@ -134,3 +135,15 @@ def test_a_push_is_met_slowly_only_while_the_arm_becomes_stiff(changes):
     bench.run(0.6)
     way = np.linalg.norm(arm.at_waypoint(bench.command).pose[:3, 3] - before)
     assert way < 4.5e-3 if changes else way > 7e-3
+
+
+def test_a_push_is_met_in_full_where_the_way_to_stiffness_is_blocked(monkeypatch):
+    """No plan follows the offset there, so the bound would leave the tip off for good."""
+    bench = Bench(HANGING, "full")
+    position = bench.settled(duration=1.0)
+    monkeypatch.setattr(Planning, "_blocked", lambda *_: "a made-up post is in the way")
+    bench.run(0.2)
+    assert bench.controller.replanner.plan.tip_first
+    assert [notice.kind for notice in bench.controller.notices()] == ["blocked"]
+    bench.rig.world.plant.set_load(PlantLoad(force=(0.05, 0.0, 0.0)))
+    assert bench.run(3.0, position)[-1] < 1e-3

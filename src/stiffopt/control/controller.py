@@ -373,8 +373,8 @@ class TipController:
         tip = self._arm.on_path(reference.path[:n])
         if now - self._went_back_at > self._tuning.adaptation.blind_time:
             self._arm.watch.intend(now, tip.pose[:3, 3] + reference.path[n : n + 3])
-        course, newest = self.replanner.pursuit.course, self.replanner.plan
-        is_bounded = course is None and newest is not None and bool(newest.tip_first)
+        course = self.replanner.pursuit.course
+        is_bounded = course is None and self.replanner.stiffens
         self._correction.take(tip.pose[:3, 3], applies=is_bounded)
         if self._arm.channels.pace == 0 and self._ways and moves:
             return self._feedforward(self._without_feedback, last)

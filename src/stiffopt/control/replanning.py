@@ -234,6 +234,11 @@ class Replanner:
         """The newest plan, unless it is of the task before."""
         return self.plan if self.plan is not None and self.plan.serial == self._serial else None
 
+    @property
+    def stiffens(self) -> bool:
+        """Whether plans lead from the tip's target to stiffness, and the arm may follow them."""
+        return self.plan is not None and bool(self.plan.tip_first) and not self._blocked
+
     def go_on_with(self, adapted: Adapted, change: Array) -> None:
         """Plan with an adapted model, whose offset differs by a change (6,)."""
         self.adapted = adapted
