@@ -47,6 +47,7 @@ UNITS = {"kPa": 1e3, "psi": 6894.757, "bar": 1e5}
 FITTED = 1 + DESIGNED  # logs: the sweeps and the rounds as in the experiment
 LEFT = re.compile(r"(?:misses the tip by|the mean error is) ([\d.]+) mm instead of ([\d.]+) mm")
 LIST = re.compile(", (?:and )?(?=segment|the line)")
+AGAIN = "with that corrected, "  # how the remark on a further fault begins
 MARKS = ("--keep", "look at", "expected Pa")  # of remarks and errors about the set-up
 COLUMNS = ("fault", "cases", "rightly", "in part", "wrongly", "nothing", "left, %")
 
@@ -312,7 +313,7 @@ def judged(fault: Fault, remarks: Sequence[str]) -> tuple[str, float]:
     if not told:
         return ("nothing" if fault.told else "rightly"), float("nan")
     known = (*fault.told, *fault.hints)
-    parts = [part for each in told for part in LIST.split(each)]
+    parts = [part for each in told for part in LIST.split(each.removeprefix(AGAIN))]
     if not all(any(words in part for words in known) for part in parts):
         return "wrongly", float("nan")
     complete = all(any(words in each for each in told) for words in fault.told)

@@ -269,6 +269,9 @@ def test_what_is_told_of_faults_is_judged():
     both = dead.format(", and segment 2 channel 2 has the pressure of segment 2 channel 3")
     idle = "the pressure of segment {} channel 1 does not show in the tip (--keep lines)"
     assert setup_faults.judged(fault, [both]) == ("rightly", 0.25)
+    then = "with that corrected, segment 2 channel 2 has the pressure of segment 2 channel 3; "
+    then += "the robot file's arm then misses the tip by 1.0 mm instead of 2.0 mm; --keep lines"
+    assert setup_faults.judged(fault, [dead.format(""), then]) == ("rightly", 0.125)
     assert setup_faults.judged(fault, [dead.format("")])[0] == "in part"
     assert setup_faults.judged(fault, [idle.format(1)])[0] == "in part"
     assert setup_faults.judged(setup_faults.lines(robot, [0], []), [both])[0] == "wrongly"

@@ -25,7 +25,7 @@ from stiffopt.identify.tracker_faults import CUBE_ROTATIONS
 from stiffopt.identify.validation import validate
 from stiffopt.logs import Body, Log, read_log
 from stiffopt.model.calibration import Calibration, ErrorModel
-from stiffopt.model.description import RobotDescription
+from stiffopt.model.description import Corrections, RobotDescription
 from stiffopt.model.history import Creep, History, Play
 from stiffopt.model.robot_files import load_description
 
@@ -148,6 +148,22 @@ def test_two_wrong_lines_are_found_of_which_each_alone_leaves_much() -> None:
     told = found.hypothesis.told(robot, ["a log"])
     assert "the line of segment 2 channel 1 is dead" in told
     assert ", and segment 2 channel 3 has" in told or ", and the line" in told
+
+
+def test_a_pair_that_is_hardly_better_than_one_line_is_not_taken() -> None:
+    """A circle of an arm whose channels differ: some pair of lines leaves 36 % of the misfit."""
+    robot = load_description("stiff-flop-2")
+    gains, lags = ((1.2, 1.4, 0.8), (1.0, 0.7, 0.9)), (0.4, 0.2)
+    segments = [
+        each.model_copy(update={"corrections": Corrections(gain=g), "history": History(lag=lag)})
+        for each, g, lag in zip(robot.segments, gains, lags, strict=True)
+    ]
+    time = np.arange(0.0, 60.0, 0.2)
+    angles = np.array([0.0, 2.09, 4.19, -0.9, 1.79, 3.39])
+    pressures = 2.1e4 * (1 + np.cos(2 * np.pi * time[:, None] / 20 - angles))
+    pressures *= np.minimum(1, time[:, None] / 5)
+    right = robot.model_copy(update={"segments": tuple(segments)})
+    assert not found_in(robot, [made_log(right, time, pressures)])
 
 
 def test_after_a_correction_the_logs_are_looked_at_again() -> None:

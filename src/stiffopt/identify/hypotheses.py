@@ -322,26 +322,30 @@ def found_wrong(
     """Return the error of a comparer's recordings; None if there is none or it is unclear which.
 
     A hypothesis must leave a small share of the misfit, and clearly less than any other kind. If
-    none leaves so little, pairs of them are tried, since each alone may leave much.
+    none leaves so little, pairs of them are tried, since each alone may leave much. There are so
+    many that one of them often fits better by chance: they are measured by the best single one.
     """
     nothing = comparer.nothing
     as_is = comparer.score(nothing)
     if not np.isfinite(as_is):
         return None
 
-    def worthy(tried: Sequence[Hypothesis]) -> list[tuple[float, Hypothesis]]:
-        scored = [(comparer.score(each), each) for each in comparer.shortlist(tried)]
-        return [pair for pair in scored if pair[0] <= DETECTION.overwhelming * as_is]
+    def scored(tried: Sequence[Hypothesis]) -> list[tuple[float, Hypothesis]]:
+        return [(comparer.score(each), each) for each in comparer.shortlist(tried)]
 
     single = comparer.distinct(of_channels(description, len(nothing.turns)))
     single = [each for each in single if each.kind not in keep]
-    found = worthy(single)
+    alone = scored(single)
+    found = [pair for pair in alone if pair[0] <= DETECTION.overwhelming * as_is]
     if "axes" not in keep:
         turns = _turns(comparer.of_turns(nothing.sources))
         if any(turns):
             turned = replace(nothing, kind="axes", turns=turns)
             found.append((comparer.score(turned), turned))
-    found = found or worthy(comparer.distinct(_pairs(comparer.ranked(single))))
+    if not found:
+        least = min([as_is, *(score for score, _ in alone)])
+        two = scored(comparer.distinct(_pairs(comparer.ranked(single))))
+        found = [pair for pair in two if pair[0] <= DETECTION.overwhelming * least]
     if not found:
         return None
     then, best = min(found, key=lambda pair: pair[0])
