@@ -38,6 +38,7 @@ class CorrectionBound:
     def begin(self) -> None:
         """Restart at rest, without a bound."""
         self._before: Array | None = None  # mean place of the tip on the reference lately (3,)
+        self._longest = 0.0  # of these motions lately, in m
         self._released, self.largest = math.inf, math.inf
 
     def take(self, on_path: Array, *, applies: bool) -> None:
@@ -50,5 +51,7 @@ class CorrectionBound:
         way = on_path - before
         self._before = before + self._period / tuning.time * way
         self._released = 0.0 if applies else self._released + tuning.release * self._period
-        bound = tuning.least + tuning.share * float(np.linalg.norm(way))
-        self.largest = min(bound, tuning.most) + self._released
+        moved = float(np.linalg.norm(way))
+        self._longest = max(moved, self._longest * (1 - self._period / tuning.long_time))
+        most = max(tuning.most, tuning.share_of_long * self._longest)
+        self.largest = min(tuning.least + tuning.share * moved, most) + self._released

@@ -126,7 +126,7 @@ class ReferenceTuning:
     # the tip's way to a new target, before the arm becomes stiff: its least time in periods of the
     # vibration, and the greatest mean speed of the tip by any channel, in m/s
     periods_to_target: float = 0.5
-    channel_speed: float = 0.065
+    channel_speed: float = 0.08
     # motion over which the model on the reference is not linearised again; see `LinearisedTip`
     model_range: float = 0.07
     # time by which a doubted motion of an arm that vibrates is taken back, in s
@@ -157,7 +157,11 @@ class CorrectionTuning:
 
     least: float = 2e-3  # of the tip's position at rest, in m
     share: float = 0.2  # of the latest motion of the tip on the reference, added to it
-    most: float = 5e-3  # of the sum, in m: what feedback does at most must stay below 10 mm
+    # largest sum, in m: what feedback does must stay below 10 mm; of a long motion a share instead,
+    # since a wrong modulus is off by a share; time for which such a motion counts, in s
+    most: float = 5e-3
+    share_of_long: float = 0.17
+    long_time: float = 5.0
     time: float = 1.0  # of the latest motion, as plans follow the offset, in s
     release: float = 0.01  # growth once the arm is stiff, in m/s
 
