@@ -84,8 +84,8 @@ def test_corrections_are_bounded_by_the_latest_motion_and_released_slowly():
     bound.take(np.zeros(3), applies=False)
     assert bound.largest == math.inf
     bound.take(np.zeros(3), applies=True)
-    assert bound.largest == 2e-3
-    bound.take(np.array([0.01, 0.0, 0.0]), applies=True)
+    assert bound.largest == 3e-3
+    bound.take(np.array([0.005, 0.0, 0.0]), applies=True)
     assert bound.largest == pytest.approx(4e-3)
     bound.take(np.array([0.025, 0.0, 0.0]), applies=True)
     assert bound.largest == pytest.approx(5e-3)
@@ -93,13 +93,13 @@ def test_corrections_are_bounded_by_the_latest_motion_and_released_slowly():
     assert bound.largest == pytest.approx(15e-3, rel=0.03)
     for _ in range(100):
         bound.take(np.array([0.09, 0.0, 0.0]), applies=True)
-    assert bound.largest == pytest.approx(8.6e-3, rel=0.03)  # 0.37 of the motion is left
+    assert bound.largest == pytest.approx(9.6e-3, rel=0.03)  # 0.37 of the motion is left
     for _ in range(600):
         bound.take(np.array([0.09, 0.0, 0.0]), applies=True)
-    assert bound.largest == pytest.approx(2e-3, rel=0.03)
+    assert bound.largest == pytest.approx(3e-3, rel=0.03)
     for _ in range(100):
         bound.take(np.array([0.09, 0.0, 0.0]), applies=False)
-    assert bound.largest == pytest.approx(12e-3, rel=0.02)
+    assert bound.largest == pytest.approx(13e-3, rel=0.02)
     bound.begin()
     assert bound.largest == math.inf
 
@@ -139,7 +139,7 @@ def test_a_push_is_met_slowly_only_while_the_arm_becomes_stiff(changes):
     bench.rig.world.plant.set_load(PlantLoad(force=(0.04, 0.0, 0.0)))
     bench.run(0.6)
     way = np.linalg.norm(arm.at_waypoint(bench.command).pose[:3, 3] - before)
-    assert way < 4.5e-3 if changes else way > 7e-3
+    assert way < 5.5e-3 if changes else way > 7e-3
 
 
 def test_a_push_is_met_in_full_where_the_way_to_stiffness_is_blocked(monkeypatch):

@@ -155,7 +155,7 @@ class FirstMotionTuning:
 class CorrectionTuning:
     """Bound of corrections while the arm becomes stiff (`CorrectionBound`)."""
 
-    least: float = 2e-3  # of the tip's position at rest, in m
+    least: float = 3e-3  # of the tip's position at rest, in m
     share: float = 0.2  # of the latest motion of the tip on the reference, added to it
     # largest sum, in m: what feedback does must stay below 10 mm; of a long motion a share instead,
     # since a wrong modulus is off by a share; time for which such a motion counts, in s
