@@ -1,6 +1,7 @@
 """Measure which faults the control loop detects on simulated arms; pushes must not be detected.
 
     python benchmarks/disturbances.py --cases 4 --seed 500
+    python benchmarks/disturbances.py --in-use --rows narrow kinked --cases 4 --seed 500 700
     python benchmarks/disturbances.py --commission --cases 4 --seed 500
 
 Arms and targets are those of `control_cases.py`; the controller has the nominal robot file. In each
@@ -10,16 +11,19 @@ that detected the fault, and as what; longest time from its beginning to detecti
 only show in motion, from the second target; negative if it was detected before; for leaks, from
 the moment when the channel has pressure to lose, a command above 0.2 bar, or 0.03 bar for a burst);
 two largest distances of the tip over all runs, in mm, until it is vented; and the state in the end.
-The first
-distance is from the way that the tip takes without a fault (but with a push that the row has too).
-The second is what the loop causes of it: the distance from that way and from the one on which the
-fault alone takes the tip, with the commands frozen from its beginning. They differ where a chamber
-bursts or leaks, or something pushes the arm; all that follows from commands after the beginning of
-the fault counts, also before the fault is visible. A push or a payload must not be detected as a
-fault. Below each row on the way, both distances of each run, and what was told. With `--in-use`,
-motions are fast from the beginning, as of an arm that has moved since it was armed. With
-`--commission`, `stiffopt commission --quick` looks for the faults of the set-up instead: its first
-finding, whether it permits arming, and how far the tip moved from rest.
+The first distance is from the way that the tip takes without a fault (but with a push that the row
+has too). The second is what the loop causes of it: the distance from that way and from the one on
+which the fault alone takes the tip, with the commands frozen from its beginning. They differ where
+a chamber bursts or leaks, or something pushes the arm; all that follows from commands after the
+beginning of the fault counts, also before the fault is visible. A push or a payload must not be
+detected as a fault. Below each row on the way, both distances of each run, and what was told.
+
+With `--in-use`, motions are fast from the beginning, as of an arm that has moved since it was
+armed. The table then has a line for each arm and a column for each row: what the loop causes, in
+mm, and when it was told, as what; and last the time to the second target without a fault, until the
+tip stays within 1 mm. With `--commission`, `stiffopt commission --quick` looks for the faults of
+the set-up instead: its first finding, whether it permits arming, and how far the tip moved from
+rest.
 """
 
 from __future__ import annotations
@@ -38,8 +42,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from control_baselines import PERIOD
-from control_cases import DYNAMICS, Case, at_tip_speed, draw_case
-from control_runs import LoopRun
+from control_cases import DYNAMICS, Case, at_tip_speed, draw_case, settling_time
+from control_runs import STAYS, LoopRun
 from report import table
 from stiffopt import lie, load_robot
 from stiffopt.commissioning.commission import evaluate
@@ -523,28 +527,19 @@ def _commissioned(cases: list[Case], rows: list[Row]) -> list[list[str]]:
     return lines
 
 
-def _looped(cases: list[Case], rows: list[Row], dynamics: str, in_use: bool) -> list[list[str]]:
+def _looped(cases: list[Case], rows: list[Row], dynamics: str) -> list[list[str]]:
     """Lines of the table of the control loop."""
     lines = []
-    usual = [run_row(case, ROWS[-1], dynamics, in_use=in_use).tips for case in cases]
+    usual = [run_row(case, ROWS[-1], dynamics) for case in cases]
     for row in rows:
-        found = [run_row(case, row, dynamics, in_use=in_use) for case in cases]
-        ways = usual
-        if row.usual is not None:
-            alone = replace(ROWS[-1], begin=row.usual)
-            ways = [run_row(case, alone, dynamics, in_use=in_use).tips for case in cases]
+        pairs = zip(cases, usual, strict=True)
+        judged = [_judged(case, row, dynamics, alone) for case, alone in pairs]
+        found = [outcome for outcome, _, _ in judged]
         noticed = [outcome for outcome in found if outcome.kind]
         kinds = Counter(outcome.kind for outcome in noticed)
         ends = Counter(outcome.end for outcome in found)
-        off = [
-            (
-                _farthest(outcome.tips, way),
-                _farthest(outcome.tips, _with_fault(case, row, dynamics, way, in_use)),
-            )
-            for case, way, outcome in zip(cases, ways, found, strict=True)
-            if len(outcome.tips)
-        ]
-        whole, caused = np.max([(0.0, 0.0), *off], axis=0)
+        off = [each[1:] for each in judged]
+        whole, caused = np.max(off, axis=0)
         lines.append([
             row.name,
             f"{len(noticed)} of {len(found)}{'' if row.is_fault else ' (none should)'}",
@@ -558,6 +553,37 @@ def _looped(cases: list[Case], rows: list[Row], dynamics: str, in_use: bool) -> 
         words = sorted({outcome.words[:160] for outcome in found})
         print(lines[-1], each, *words, sep="\n    ", flush=True)
     return lines
+
+
+def _in_use(case: Case, rows: list[Row], dynamics: str) -> list[str]:
+    """Line of the table of arms in use."""
+    usual = run_row(case, ROWS[-1], dynamics, in_use=True)
+    line = [str(case.seed)]
+    for row in rows:
+        found, _, caused = _judged(case, row, dynamics, usual, in_use=True)
+        told = f"{found.told:.2f}, {found.kind}" if found.kind else "not told"
+        line.append(f"{1e3 * caused:.1f} ({told})")
+        print(case.seed, row.name, line[-1], found.end, found.words[:160], sep="; ", flush=True)
+    ticks = round(AFTER / PERIOD)
+    errors = np.linalg.norm(usual.tips[-ticks:] - case.aims[1].position, axis=1)
+    settled = settling_time(PERIOD * (1 + np.arange(ticks)), errors, STAYS)
+    return [*line, f"{settled:.2f}" if np.isfinite(settled) else "never"]
+
+
+def _judged(
+    case: Case, row: Row, dynamics: str, usual: Outcome, in_use: bool = False
+) -> tuple[Outcome, float, float]:
+    """Outcome of a row, the tip's largest distance from its way, and what the loop causes of it.
+
+    `usual`: without a fault; the distances are in m.
+    """
+    outcome = run_row(case, row, dynamics, in_use=in_use)
+    if not len(outcome.tips):
+        return outcome, 0.0, 0.0
+    if row.usual is not None:
+        usual = run_row(case, replace(ROWS[-1], begin=row.usual), dynamics, in_use=in_use)
+    alone = _with_fault(case, row, dynamics, usual.tips, in_use)
+    return outcome, _farthest(outcome.tips, usual.tips), _farthest(outcome.tips, alone)
 
 
 def _with_fault(case: Case, row: Row, dynamics: str, way: Array, in_use: bool) -> Array:
@@ -577,14 +603,14 @@ def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--cases", type=int, default=2)
-    parser.add_argument("--seed", type=int, default=500)
+    parser.add_argument("--seed", type=int, nargs="+", default=[500], help="of the first arms")
     parser.add_argument("--dynamics", choices=DYNAMICS, nargs="+", default=list(DYNAMICS))
     parser.add_argument("--rows", nargs="+", help="only rows whose name has one of these words")
     parser.add_argument("--commission", action="store_true", help="look for faults of the set-up")
-    parser.add_argument("--in-use", action="store_true", help="fast from the beginning")
+    parser.add_argument("--in-use", action="store_true", help="fast from the start; a line an arm")
     parser.add_argument("--tip-speed", type=float, help="`control.tip_speed` of the rig, in m/s")
     arguments = parser.parse_args()
-    seeds = range(arguments.seed, arguments.seed + arguments.cases)
+    seeds = [first + case for first in arguments.seed for case in range(arguments.cases)]
     drawn = [draw_case(seed, 2, ranked=False) for seed in seeds]
     cases = [at_tip_speed(case, arguments.tip_speed) for case in drawn]
     words = arguments.rows or [""]
@@ -594,8 +620,13 @@ def main() -> None:
         print("\n".join(table(["what", "refused", "way, mm", "first finding"], lines)))
         return
     head = ["what", "noticed", "as", "told, s", "off its way, mm", "by the loop, mm", "ends"]
+    if arguments.in_use:
+        head = ["arm", *(row.name for row in rows), "settling, s"]
     for dynamics in arguments.dynamics:
-        lines = _looped(cases, rows, dynamics, arguments.in_use)
+        if arguments.in_use:
+            lines = [_in_use(case, rows, dynamics) for case in cases]
+        else:
+            lines = _looped(cases, rows, dynamics)
         print(f"\n### plant: {dynamics}\n", *table(head, lines), sep="\n")
 
 

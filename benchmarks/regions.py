@@ -1,6 +1,6 @@
 """Measure how often the tips of calibrated simulated arms lie in the regions of their predictions.
 
-    python benchmarks/regions.py [--first SEED] [--arms N] [--rig NAME] [--auto]
+    python benchmarks/regions.py [--first SEED] [--arms N] [--rig NAME] [--auto] [--undriven]
 
 Each seed gives another arm: mismatch (of every second one as `Spread` says, of the others as the
 rig file says), silicone (drawn for two of four), lag and dead time. It is simulated without inertia
@@ -8,9 +8,10 @@ and with simple regulators, at a second of processor time. Its logs are one swee
 and 15 rounds of six held poses, one after another: two as in `experiment kinematics`, then 13 of
 poses that each arm draws. All readings of one pose say little more than one of them does, and a
 round is simulated sooner than another arm is fitted. Robot files are fitted to the sweeps and two
-rounds, and to the sweeps alone, so that all rounds are extrapolated. Prints the share of readings
-of the other rounds within the regions of 50, 68, 90, 95 and 99 %, all arms together, with 95 %
-intervals by a bootstrap over arms.
+rounds, and to the sweeps alone, so that all rounds are extrapolated. With `--undriven` the last
+channel has no pressure in these logs, so that what it does is extrapolated. Prints the share of
+readings of the other rounds within the regions of 50, 68, 90, 95 and 99 %, all arms together, with
+95 % intervals by a bootstrap over arms.
 """
 
 from __future__ import annotations
@@ -121,12 +122,16 @@ def made(rig: str, seed: int) -> tuple[RobotDescription, Arm]:
     return robot, Arm(Plant(robot, settings), rng, rng.uniform(0.1, 0.3), rng.uniform(0.02, 0.08))
 
 
-def logs(robot: RobotDescription, arm: Arm) -> Iterator[tuple[str, Log]]:
-    """The sweeps of all channels, then the rounds of held poses."""
+def logs(robot: RobotDescription, arm: Arm, undriven: bool = False) -> Iterator[tuple[str, Log]]:
+    """The sweeps of all channels, then the rounds of held poses.
+
+    `undriven`: the last channel has no pressure in sweeps and designed rounds.
+    """
     n = robot.n_pressures
+    driven = np.where(np.arange(n) == n - 1, not undriven, 1.0)
     rest, teeth = np.zeros(n), [peak * own for own in np.eye(n) for peak in PEAKS]
     knots = np.array([rest, *(p for tooth in teeth for p in (tooth, rest))])
-    yield "sweeps", arm.recorded(HALF_TOOTH * np.arange(len(knots)), knots)
+    yield "sweeps", arm.recorded(HALF_TOOTH * np.arange(len(knots)), knots * driven)
     designed = spread_pressures(DESIGNED * ROUND, rest, robot.pressure_max)
     for number in range(ROUNDS):
         poses = designed[number * ROUND : (number + 1) * ROUND]
@@ -138,7 +143,8 @@ def logs(robot: RobotDescription, arm: Arm) -> Iterator[tuple[str, Log]]:
             times.append(times[-1] + way / arm.rng.uniform(2e4, 6e4))
             times.append(times[-1] + arm.rng.uniform(2.5, 6.0))
             visited += [pose, pose]
-        yield f"round {number + 1}", arm.recorded(np.array(times), np.array(visited))
+        own = driven if number < DESIGNED else 1.0
+        yield f"round {number + 1}", arm.recorded(np.array(times), np.array(visited) * own)
 
 
 def intervals(arms: list[list[Comparison]], kind: str) -> Array:
@@ -175,12 +181,13 @@ def main() -> int:
     parser.add_argument("--arms", type=int, default=40)
     parser.add_argument("--rig", choices=list(CASES), default="sim")
     parser.add_argument("--auto", action="store_true", help="default settings: models are compared")
+    parser.add_argument("--undriven", action="store_true", help="the last channel is not recorded")
     given = parser.parse_args()
     settings = CalibrationSettings(sequence=True) if given.auto else QUICK
     found: dict[str, list[list[Comparison]]] = {"sweeps and two rounds": [], "sweeps alone": []}
     for seed in range(given.first, given.first + given.arms):
         robot, arm = made(given.rig, seed)
-        recorded = list(logs(robot, arm))
+        recorded = list(logs(robot, arm, given.undriven))
         for (_, arms), fitted in zip(found.items(), (3, 1), strict=True):
             result = calibrate(robot, recorded[:fitted], settings=settings)
             arms.append(list(validate(result.robot, recorded, settings)[fitted:]))

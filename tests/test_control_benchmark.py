@@ -19,6 +19,9 @@ import calibration
 import control
 import control_cases
 import control_runs
+import disturbances
+import regions
+import setup_faults
 from conftest import is_long
 from control_baselines import CONTROLLERS, Gains, IntegralFeedback
 from control_cases import DIRECTIONS, STEPS, draw_case, draw_path, settling_time, with_true_file
@@ -184,6 +187,25 @@ def test_settling_ends_where_the_tip_comes_near_for_good():
     assert settling_time(times, errors, 1.0) == np.inf
 
 
+def test_an_arm_in_use_has_a_line_with_what_the_loop_causes_and_its_settling(monkeypatch):
+    """The way of the tip is 1 s on a straight line; the line that is kinked leaves it by 3 mm."""
+    goal = np.array([0.1, 0.0, 0.0])
+    ticks = round(disturbances.AFTER / disturbances.PERIOD)
+    way = goal * np.minimum(1.0, np.arange(ticks)[:, None] * disturbances.PERIOD)
+
+    def run(case, row, dynamics, *, in_use, frozen=False):
+        assert in_use
+        if "kinked" in row.name and not frozen:
+            return disturbances.Outcome(0.5, "slip", way + np.array([0, 3e-3, 0]), "inactive")
+        return disturbances.Outcome(np.inf, "", way, "active")
+
+    monkeypatch.setattr(disturbances, "run_row", run)
+    case = SimpleNamespace(seed=7, aims=(None, SimpleNamespace(position=goal)))
+    rows = [row for row in disturbances.ROWS if "line behind a gauge" in row.name]
+    line = disturbances._in_use(case, rows, "full")
+    assert line == ["7", "0.0 (not told)", "3.0 (0.50, slip)", "1.00"]
+
+
 # -- calibration ------------------------------------------------------------------------------
 
 
@@ -227,6 +249,37 @@ def test_a_file_with_the_true_values_hangs_as_the_arm_does_from_its_tilted_base(
     errors = found.values["settled"]  # % of length
     assert np.max(errors["true"]) < 0.01
     assert np.min(errors["not tilted"]) > 1
+
+
+@pytest.mark.parametrize("name", ["none", "dead line", "axes of one log"])
+def test_faults_of_a_set_up_are_told_rightly(name):
+    robot, _ = regions.made("sim", 41900)
+    fault = setup_faults.FAULTS[name](robot, np.random.default_rng(0))
+    remarks = setup_faults.told_in_calibration("sim", 41900, fault)
+    how, left = setup_faults.judged(fault, remarks)
+    assert how == "rightly"
+    assert name == "none" or left < 0.5
+
+
+def test_what_is_told_of_faults_is_judged():
+    robot = calibration.described(calibration.CASES["two-segment"], 0)[1]
+    fault = setup_faults.lines(robot, [0], [(4, 5)])
+    dead = "the line of segment 1 channel 1 is dead{}; the robot file's arm then misses the tip by "
+    dead += "2.0 mm instead of 8.0 mm, however soft it is; --keep lines leaves that"
+    both = dead.format(", and segment 2 channel 2 has the pressure of segment 2 channel 3")
+    idle = "the pressure of segment {} channel 1 does not show in the tip (--keep lines)"
+    assert setup_faults.judged(fault, [both]) == ("rightly", 0.25)
+    then = "with that corrected, segment 2 channel 2 has the pressure of segment 2 channel 3; "
+    then += "the robot file's arm then misses the tip by 1.0 mm instead of 2.0 mm; --keep lines"
+    assert setup_faults.judged(fault, [dead.format(""), then]) == ("rightly", 0.125)
+    assert setup_faults.judged(fault, [dead.format("")])[0] == "in part"
+    assert setup_faults.judged(fault, [idle.format(1)])[0] == "in part"
+    assert setup_faults.judged(setup_faults.lines(robot, [0], []), [both])[0] == "wrongly"
+    assert setup_faults.judged(fault, [idle.format(2)])[0] == "wrongly"
+    assert setup_faults.judged(fault, ["3 rows count less"])[0] == "nothing"
+    assert setup_faults.row("two", [("rightly", 0.25), ("wrongly", 0.5)])[1:] == (
+        "2", "1", "0", "1", "0", "25 to 25",
+    )  # fmt: skip
 
 
 @pytest.mark.long

@@ -16,7 +16,6 @@ import pytest
 import stiffopt as so
 from conftest import is_long
 from stiffopt.control.controller import TipController
-from stiffopt.control.motion_watch import Doubt
 from stiffopt.errors import InputError
 from stiffopt.model.calibration import Calibration, ErrorModel
 from stiffopt.model.robot_files import load_description, save_robot
@@ -384,68 +383,6 @@ def moving(*, rested: float, moved: float, dynamics: str = "full") -> Bench:
     return bench
 
 
-def test_a_doubted_motion_stops_without_a_swing():
-    """Twice less at least than if the commands just stay."""
-    swings = []
-    for stops in (True, False):
-        bench = moving(rested=3.0, moved=0.35)
-        steered = bench.controller._arm.watch
-        steered.doubt = Doubt("no-response", "made up")
-        for _ in range(80 if stops else 0):
-            before = bench.command
-            stopping = bench.controller.stop(bench.rig.clock.now())
-            if stopping is None:
-                break
-            bench.command = stopping
-            bench.run(bench.period, steer=False)
-            assert np.all(np.abs(bench.command - before) <= bench.slew * bench.period + 1e-3)
-        bench.run(0.2, steer=False)
-        tips = []
-        for _ in range(60):
-            bench.run(bench.period, steer=False)
-            tips.append(bench.tip[:3, 3].copy())
-        swings.append(np.linalg.norm(np.ptp(np.array(tips), axis=0)))
-    assert swings[0] < 0.5 * swings[1]
-
-
-def test_the_tip_takes_its_time_to_a_new_target():
-    """Half a period of the vibration; what follows is not bounded."""
-    bench = moving(rested=3.0, moved=0.0)
-    controller = bench.controller
-    reference, goals, shares = controller._reference, [], []
-    begin = reference.goal[: bench.n]
-    for _ in range(round(1.0 / bench.period)):
-        bench.run(bench.period)
-        goals.append(reference.goal[: bench.n])
-        shares.append(np.min(reference.slew_share))
-    first = np.array(controller.replanner.plan.tip_first)
-    way = (np.abs(first - begin) / bench.slew).max()
-    gone = (np.abs(np.array(goals) - begin) / bench.slew).max(axis=1)
-    half = np.pi / controller._arm.tip.omega
-    assert way < 0.5 * half
-    assert bench.period * np.argmax(gone > 0.95 * way) == pytest.approx(0.95 * half, rel=0.15)
-    assert shares[0] < 0.5
-    assert shares[-1] == 0.9
-
-
-def test_the_tip_stays_while_the_arm_becomes_stiff_in_another_direction():
-    """Also if it is held for a while and goes on."""
-    bench = Bench(HANGING, "full")
-    position = bench.settled(duration=4.0)
-    task, before = bench.task(position=position), bench.command
-    axial = StiffnessGoal(maximise=StiffnessMeasure(direction=(0.0, 0.0, 1.0)))
-    bench.controller.set_task(task.model_copy(update={"stiffness": axial}))
-    errors = [bench.run(1.0, position), bench.run(0.3, position, steer=False)]
-    assert bench.controller.replanner.plan.tip_first
-    bench.controller.resume(bench.rig.clock.now())
-    errors.append(bench.run(8.0, position))
-    assert np.concatenate(errors).max() < 1.5e-3
-    assert np.abs(bench.command - before).max() > 0.3 * BAR
-    assert not bench.controller.replanner.plan.tip_first
-    standing = bench.controller.status(bench.rig.clock.now())
-    assert standing.stiffness == pytest.approx(standing.best_stiffness, rel=0.05)
-
-
 def test_touch_and_creep_get_tip_and_pressures_of_the_same_time():
     bench = moving(rested=2.0, moved=0.1, dynamics="quasi-static")
     arm, ways, errors = bench.controller._arm, [], []
@@ -489,19 +426,6 @@ def test_the_motion_watch_compares_tip_and_pressures_of_the_same_time():
     tips = np.array([arm.at_waypoint(row[21:]).pose[:3, 3] for row in rows])
     assert np.linalg.norm(np.diff(rows[:, 4:7], axis=0), axis=1).max() > 1.5e-3
     assert np.linalg.norm(tips - rows[:, 4:7], axis=1).max() < 2e-4
-
-
-def test_a_channel_that_acts_the_wrong_way_stops_at_the_pressure_at_which_it_followed():
-    bench = moving(rested=3.0, moved=0.3)
-    channels = bench.controller._arm.channels
-    followed = float(channels.last_followed[1])
-    channels.opposed = np.arange(bench.n) == 1
-    for _ in range(20):
-        bench.command = bench.controller.stop(bench.rig.clock.now())
-        bench.run(bench.period, steer=False)
-        channels.opposed = np.arange(bench.n) == 1
-        channels._followed[2, 1] = followed
-    assert bench.command[1] == pytest.approx(followed, abs=1.0)
 
 
 def test_readings_that_are_not_there():

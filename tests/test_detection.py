@@ -13,16 +13,11 @@ from numpy.typing import NDArray
 from made_logs import course, made_log
 from recordings import ASU, UCL, recordings
 from stiffopt.errors import FileError
+from stiffopt.identify import correction
 from stiffopt.identify.calibration import calibrate
-from stiffopt.identify.detection import (
-    Comparer,
-    Found,
-    found_wrong,
-    idle_channels,
-    of_channels,
-    on_one_clock,
-    without_drift,
-)
+from stiffopt.identify.correction import put_right
+from stiffopt.identify.detection import idle_channels, on_one_clock, without_drift
+from stiffopt.identify.hypotheses import Comparer, Found, found_wrong, of_channels
 from stiffopt.identify.recording import Recording
 from stiffopt.identify.settings import CalibrationSettings, Finding
 from stiffopt.identify.setup import Setup, recordings_of
@@ -30,7 +25,7 @@ from stiffopt.identify.tracker_faults import CUBE_ROTATIONS
 from stiffopt.identify.validation import validate
 from stiffopt.logs import Body, Log, read_log
 from stiffopt.model.calibration import Calibration, ErrorModel
-from stiffopt.model.description import RobotDescription
+from stiffopt.model.description import Corrections, RobotDescription
 from stiffopt.model.history import Creep, History, Play
 from stiffopt.model.robot_files import load_description
 
@@ -74,6 +69,11 @@ def turned(log: Log, rotation: Array) -> Log:
 def found_in(robot: RobotDescription, logs: list[Log]) -> Found | None:
     """What is wrong with all of these logs."""
     return of_recordings(robot, recordings_of(robot, list(logs), AS_RECORDED))
+
+
+def corrected(robot: RobotDescription, logs: list[Log]) -> Setup:
+    recordings = recordings_of(robot, list(logs), AS_RECORDED)
+    return put_right(Setup.of(robot, recordings, (), AS_RECORDED))
 
 
 def of_recordings(robot: RobotDescription, read: list[Recording]) -> Found | None:
@@ -125,6 +125,67 @@ def test_a_cycle_of_channels_within_one_segment_is_found(order: tuple[int, ...])
     (again,) = validate(calibrated(arm("stiff-flop-2")), [wrong])
     assert "the channels are in another order" in again.remarks[-1]
     assert again.errors.mean < 2e-3
+
+
+@pytest.mark.parametrize("order", [(1, 2, 0, 4, 3, 5), (0, 2, 1, 5, 3, 4)])
+def test_an_order_in_each_of_two_segments_is_found(order: tuple[int, ...]) -> None:
+    log = log_of("stiff-flop-2", 6)
+    wrong = replace(log, commanded=log.commanded[:, np.argsort(order)])
+    setup = corrected(load_description("stiff-flop-2"), [wrong])
+    assert setup.description.recordings is not None
+    assert setup.description.recordings.channels == tuple(k + 1 for k in order)
+
+
+def test_two_wrong_lines_are_found_of_which_each_alone_leaves_much() -> None:
+    time, pressures = course(6, 60.0, rate=5.0)
+    real = pressures.copy()
+    real[:, 3], real[:, 5] = 0.0, pressures[:, 2]
+    wrong = replace(driven(real, time, "stiff-flop-2"), commanded=pressures)
+    robot = load_description("stiff-flop-2")
+    found = found_in(robot, [wrong])
+    assert found is not None
+    assert (found.hypothesis.kind, found.hypothesis.sources) == ("lines", (0, 1, 2, -1, 4, 2))
+    told = found.hypothesis.told(robot, ["a log"])
+    assert "the line of segment 2 channel 1 is dead" in told
+    assert ", and segment 2 channel 3 has" in told or ", and the line" in told
+
+
+def test_a_pair_that_is_hardly_better_than_one_line_is_not_taken() -> None:
+    """A circle of an arm whose channels differ: some pair of lines leaves 36 % of the misfit."""
+    robot = load_description("stiff-flop-2")
+    gains, lags = ((1.2, 1.4, 0.8), (1.0, 0.7, 0.9)), (0.4, 0.2)
+    segments = [
+        each.model_copy(update={"corrections": Corrections(gain=g), "history": History(lag=lag)})
+        for each, g, lag in zip(robot.segments, gains, lags, strict=True)
+    ]
+    time = np.arange(0.0, 60.0, 0.2)
+    angles = np.array([0.0, 2.09, 4.19, -0.9, 1.79, 3.39])
+    pressures = 2.1e4 * (1 + np.cos(2 * np.pi * time[:, None] / 20 - angles))
+    pressures *= np.minimum(1, time[:, None] / 5)
+    right = robot.model_copy(update={"segments": tuple(segments)})
+    assert not found_in(robot, [made_log(right, time, pressures)])
+
+
+def test_after_a_correction_the_logs_are_looked_at_again() -> None:
+    time, pressures = course(3, 60.0, rate=5.0)
+    real = pressures * [1.0, 1.0, 0.0]
+    wrong = turned(replace(driven(real, time), commanded=pressures), CUBE_ROTATIONS[9])
+    axes, line = corrected(load_description("stiff-flop-1"), [wrong]).found
+    assert "axes are turned" in axes
+    assert line.startswith("with that corrected, the line of segment 1 channel 3 is dead")
+
+
+def test_a_line_that_was_corrected_is_told_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its column is constant then, and does not show in the tip either."""
+    idle = {1: "the second does nothing", 2: "the third does nothing"}
+    monkeypatch.setattr(correction, "idle_channels", lambda *_: idle)
+    time, pressures = course(3, 60.0, rate=5.0)
+    wrong = replace(driven(pressures * [1.0, 1.0, 0.0], time), commanded=pressures)
+    setup = corrected(load_description("stiff-flop-1"), [wrong])
+    np.testing.assert_array_equal(setup.recordings[0].pressures[:, 2], 0.0)
+    line, other = setup.found
+    assert line.startswith("the line of segment 1 channel 3 is dead")
+    assert other.startswith("the second does nothing")
 
 
 def test_nothing_is_corrected_where_the_arm_bears_none_of_the_pressures() -> None:
@@ -327,6 +388,19 @@ def test_a_log_outside_its_regions_has_a_remark() -> None:
     assert not right.remarks
 
 
+def test_a_dead_line_that_moves_the_tip_a_little_is_found_outside_the_regions() -> None:
+    robot, pressures = judged(arm()), log_of().commanded * [1.0, 1.0, 0.12]
+    log = driven(pressures, log_of().time)
+    real = driven(pressures * [1.0, 1.0, 0.0], log.time)
+    (found,) = validate(robot, [replace(log, tip_position=real.tip_position)])
+    assert "the line of segment 1 channel 3 is dead" in found.remarks[-1]
+    assert found.errors.mean < 1e-3
+    before = np.linalg.norm(log.tip_position - real.tip_position, axis=1).mean()
+    assert 1e-3 < before < 0.1 * robot.length
+    (right,) = validate(robot, [log])
+    assert not right.remarks
+
+
 def test_one_pose_that_moves_a_little_shows_no_moved_frame() -> None:
     stiff = calibrated(arm())
     material = stiff.segments[0].material.model_copy(update={"youngs_modulus": 400e3})
@@ -383,6 +457,14 @@ def test_pressures_in_other_units_are_found(unit: str, factor: float) -> None:
     assert f"the pressures are in {unit}, not Pa" in read.remarks[0]
     with pytest.raises(FileError, match="expected Pa"):
         recordings_of(robot, [wrong], CalibrationSettings(keep=("units",)))
+
+
+def test_other_units_are_found_of_an_arm_that_its_weight_straightens() -> None:
+    time, pressures = course(6, 60.0, highest=6e4, rate=1.0)
+    log = driven(pressures, time, "stiff-flop-2-hanging")
+    robot = load_description("stiff-flop-2-hanging")
+    (read,) = recordings_of(robot, [replace(log, commanded=pressures / 1e3)], AS_RECORDED)
+    np.testing.assert_allclose(read.pressures, pressures, atol=1e-6)
 
 
 def test_a_unit_that_is_not_clear_is_refused() -> None:

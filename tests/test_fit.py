@@ -279,6 +279,32 @@ def test_noise_is_found_beside_errors_that_rows_share(rho: float) -> None:
     assert np.mean(noise**2 * independent) == pytest.approx(true, rel=0.2)
 
 
+def test_an_undriven_channel_does_not_give_way_to_the_bound_on_the_modulus() -> None:
+    """An arm that stiffens further than is allowed, of which one channel was never driven."""
+    stiffening = {"modulus_per_pressure": 0.8, "modulus_law": "exponential", "area": 1.2}
+    segment = ONE.segments[0]
+    assert segment.compensation is not None
+    compensation = segment.compensation.model_copy(update=stiffening)
+    arm = ONE.model_copy(
+        update={"segments": (segment.model_copy(update={"compensation": compensation}),)}
+    )
+    time, pressures = course(3, 60.0, 5, highest=1.4e5)
+    pressures[:, 2] = 0.0
+    log = made_log(arm, time, pressures, noise=1e-4)
+    unknown = compensation.model_copy(update={"modulus_per_pressure": 0.0})
+    begun = arm.model_copy(
+        update={"segments": (segment.model_copy(update={"compensation": unknown}),)}
+    )
+    result = calibrate(begun, [("a.csv", log)], settings=settings("static"))
+    found = result.robot.segments[0]
+    assert found.corrections is not None
+    assert found.compensation is not None
+    change = found.compensation.modulus_per_pressure / found.material.youngs_modulus
+    largest = change * np.linalg.norm(arm.pressure_max)
+    assert largest == pytest.approx(FIT.most_stiffening, rel=0.05)  # the bound is at work
+    assert found.corrections.gain[2] == pytest.approx(1.0, abs=0.01)
+
+
 KNOWN = ONE.model_copy(
     update={"tolerances": Tolerances(modulus_per_pressure=0.03, youngs_modulus=0.15, share=0.05)}
 )

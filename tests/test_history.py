@@ -543,3 +543,24 @@ def test_what_a_history_refuses(mistake: dict[str, Any], message: str) -> None:
 def test_shares_just_below_one_are_fine() -> None:
     history = History(play=[Play(width=1e4, share=0.6)], creep=[Creep(time=2, share=0.399)])
     assert history.memory_at(0.0) == pytest.approx(0.999)
+
+
+def test_a_play_keeps_a_former_pressure_unless_the_next_one_drags_it_along() -> None:
+    span, width = 1e5, 2e4
+    pressures = np.random.default_rng(3).uniform(0, span, 20000)
+    held, kept = width, 0
+    for p in pressures:
+        after = np.clip(held, p - width, p + width)
+        kept += after == held
+        held = after
+    share = kept / len(pressures)
+    play = Play(width=width, share=0.3)
+    history = History(play=(play,), memory=(1.0, 0.5))
+    assert history.remembered_shares(2, span) == pytest.approx(
+        [0.3 * share, 0.15 * share], rel=0.03
+    )
+    # a wide play, and creep, keep all of it
+    history = History(play=(play,), creep=(Creep(time=5.0, share=0.1),))
+    assert history.remembered_shares(1, 3e4) == pytest.approx([0.4])
+    bending = play.model_copy(update={"of": "bending"})
+    assert History(play=(play, bending)).remembered_shares(1, 3e4) == pytest.approx([0.6])

@@ -362,6 +362,7 @@ def test_an_arm_that_moves_less_or_farther_than_modelled_is_no_slipped_sensor(
         take(watch, time, response * way, way, offset)
     assert watch.doubt is not None
     assert watch.doubt.kind == "weak"
+    assert watch.doubt.is_of_arm
     assert f"{response:.2f} times as far" in watch.doubt.text
     assert words in watch.doubt.text
 

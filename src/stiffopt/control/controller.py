@@ -20,6 +20,7 @@ from stiffopt.arrays import Array
 from stiffopt.control.adaptation import Adapted
 from stiffopt.control.bracing import BracePhase, Bracing
 from stiffopt.control.checks import refusing
+from stiffopt.control.correction_bound import CorrectionBound
 from stiffopt.control.course import Course
 from stiffopt.control.first_motion import FirstMotion
 from stiffopt.control.forecast import Forecast, Present
@@ -40,6 +41,7 @@ from stiffopt.control.tip_errors import target_arrays
 from stiffopt.control.tip_feedback import TipFeedback
 from stiffopt.control.tuning import ControlTuning
 from stiffopt.control.vibration import BendingMode, BentMode
+from stiffopt.control.way_to_target import WayToTarget
 from stiffopt.control.windows import WindowWatch
 from stiffopt.errors import InputError
 from stiffopt.model.manipulator import Manipulator
@@ -117,6 +119,8 @@ class TipController:
         )
         unbounded = {} if slow_first_motion else {"slew_share": math.inf, "correction": math.inf}
         self._first_motion = FirstMotion(replace(tuning.first_motion, **unbounded))
+        self._way_to_target = WayToTarget(setup, self._arm)
+        self._correction = CorrectionBound(tuning.correction, period)
         self._requests = Requests(setup)
         Planner = ProcessPlanner if plan_in_process else InlinePlanner
         self.replanner = Replanner(Planner(robot, scene), tuning.replanning, period, dead_time)
@@ -155,7 +159,9 @@ class TipController:
         self._windows.begin()
         self._led_to: Target | None = None  # present target of a trajectory of pressures
         self._ways.clear()
-        self._begin_way()
+        self._back_to: Array | None = None  # goal of the reference that stops a doubted motion
+        self._way_to_target.begin()
+        self._correction.begin()
 
     def set_task(self, task: Task) -> None:
         """Pursue a task; see `Controller.set_task`."""
@@ -275,7 +281,9 @@ class TipController:
         self._reference.begin(np.concatenate([here + pressures.history_offset, offset]))
         self._feedback.resume()
         self._ways.clear()
-        self._begin_way()
+        self._back_to = None
+        self._way_to_target.begin()
+        self._correction.begin()
         self._at_rest = False
 
     def observe(
@@ -307,7 +315,7 @@ class TipController:
         return Present(
             replanner.pursuit, replanner.plan, self._way(now), self._arm.tip.offset,
             self._arm.pressures.command_offset, self._arm.channels.available(), replanner.adapted,
-            estimate.position, estimate.rotation,
+            estimate.position, estimate.rotation, self._vibrates,
         )  # fmt: skip
 
     def _way(self, now: float) -> Array:
@@ -365,9 +373,11 @@ class TipController:
         tip = self._arm.on_path(reference.path[:n])
         if now - self._went_back_at > self._tuning.adaptation.blind_time:
             self._arm.watch.intend(now, tip.pose[:3, 3] + reference.path[n : n + 3])
+        course = self.replanner.pursuit.course
+        is_bounded = course is None and self.replanner.stiffens
+        self._correction.take(tip.pose[:3, 3], applies=is_bounded)
         if self._arm.channels.pace == 0 and self._ways and moves:
             return self._feedforward(self._without_feedback, last)
-        course = self.replanner.pursuit.course
         bent = self._bend(None if isinstance(course, PostureCourse) else self.replanner.bent)
         self._led_to = None
         if isinstance(course, PostureCourse):
@@ -381,7 +391,7 @@ class TipController:
             goal,
             self._arm.channels.commands(reference.path[:n], *self._permitted, goal),
             None if isinstance(course, PostureCourse | Pressing) else course is not None,
-            self._first_motion.largest_correction(tip.pose[:3, 3]),
+            min(self._first_motion.largest_correction(tip.pose[:3, 3]), self._correction.largest),
             bent,
         )
         if command is None:
@@ -406,19 +416,29 @@ class TipController:
         """Stop a doubted motion; see `Controller.stop`.
 
         The reference goes back to where it was a while before. On its smooth path the arm does not
-        begin to vibrate, as it would if its commands froze. What feedback adds becomes what it was
-        then, since it may have followed a sensor that is wrong. A channel that moves against its
-        command gets the pressure at which it last followed: even reversed it goes back to that.
+        begin to vibrate, as it would if its commands froze. What feedback adds goes back on the
+        same path, since it may have followed a sensor that is wrong; it stays if only the arm is
+        doubted. A channel that moves against its command gets the pressure at which it last
+        followed: even reversed it goes back to that.
         """
         channels, last = self._arm.channels, self._arm.pressures.command
-        is_doubted = self._arm.watch.doubt is not None or channels.opposed.any()
+        reference, offset = self._reference, self._arm.pressures.command_offset
+        doubt = self._arm.watch.doubt
+        is_doubted = doubt is not None or channels.opposed.any()
         if not self._vibrates or not is_doubted or not self._ways:
             return None
-        goal = self._ways[0][0]
-        if self._is_near(goal[: len(last)]):
+        if self._back_to is None:
+            added = last - (reference.command - offset)
+            reference.shift_pressures(added)
+            path, added_then = self._ways[0]
+            stays = doubt is not None and doubt.is_of_arm
+            back = added if stays else added_then
+            self._back_to = path + np.concatenate([back, np.zeros(6)])
+        if self._is_near(self._back_to[: len(last)]):
             return None
-        self._reference.advance(goal)
-        command = np.where(channels.opposed, channels.last_followed, self._without_feedback)
+        reference.advance(self._back_to)
+        command = reference.command - offset
+        command = np.where(channels.opposed, channels.last_followed, command)
         return self._feedforward(command, last).pressures
 
     @property
@@ -471,39 +491,14 @@ class TipController:
             now, self._offset, self._arm.pressures.command_offset, estimator.omega,
             reference.delay, self._arm.channels.available(), way, self._windows.windows,
             reference.path[: self.robot.n_pressures] if self._vibrates else None,
+            self._correction.largest,
         )  # fmt: skip
         if isinstance(course, Bracing):
             return self._brace_planned(course, found, now)
         if course is None:
-            reference.slew_share = np.fmin(reference.slew_share, self._share_to_target())
+            share = self._way_to_target.slew_share(replanner.plan, reference)
+            reference.slew_share = np.fmin(reference.slew_share, share)
         return found
-
-    def _begin_way(self) -> None:
-        """Begin anew with the tip's way to its target, if there is one."""
-        self._tip_first: tuple[float, ...] = ()  # of the way under way, see `Plan`
-        # the rest of that way, in s at the full slew, and the share of the slew for it
-        self._way_left, self._way_share = 0.0, math.inf
-        self._way_at: Array = np.zeros(0)  # where the reference was at the last tick (n,)
-
-    def _share_to_target(self) -> float:
-        """Return the share of the slew that the reference may take on the tip's way to a target.
-
-        That way is short in the space of pressures. If it were faster, stopping would leave more
-        vibration, and a channel that does not follow would move the tip off its way farther. The
-        bound ends when the reference has moved as far as the way is.
-        """
-        plan, reference = self.replanner.plan, self._reference
-        path = reference.path[: self.robot.n_pressures]
-        if plan is not None and plan.tip_first and plan.tip_first != self._tip_first:
-            self._tip_first, tuning = plan.tip_first, self._tuning.reference
-            ways = plan.pressures - np.stack([path, reference.goal[: len(path)]])
-            sizes = (np.maximum(np.abs(ways), tuning.there) / self._slew).max(axis=1).tolist()
-            least = tuning.periods_to_target * 2 * math.pi / self._arm.tip.omega
-            self._way_left, self._way_share = sizes[0], sizes[1] / least
-        elif self._way_left > 0:
-            self._way_left -= float((np.abs(path - self._way_at) / self._slew).max())
-        self._way_at = path
-        return self._way_share if self._way_left > 0 else math.inf
 
     def _brace_planned(self, course: Bracing, found: Array | None, now: float) -> Array | None:
         """Begin a brace once it is planned; until then the arm stays where it is."""

@@ -39,6 +39,7 @@ class Present:
     adapted: Adapted | None  # the present model
     position: Array  # of the tip (3,)
     rotation: Array  # (3, 3)
+    vibrates: bool
 
 
 class Forecast:
@@ -117,7 +118,7 @@ class Forecast:
         request = PlanRequest(
             self._serial, pursuit.task, target, here.offset.copy(), here.pressure_offset,
             search or fresh or last is None, *here.available, way=way, last=last,
-            adapted=here.adapted,
+            adapted=here.adapted, here=way[0] if here.vibrates else np.zeros(0),
         )  # fmt: skip
         plan = self._answer(request)
         _refuse_blocked(plan)

@@ -48,11 +48,13 @@ class Doubt:
     kind : ``no-response``, ``slip``, ``weak``, ``drift`` or ``swing``.
     text : the likeliest causes and what to do, for people.
     undo : share of the latest motion that a hold should undo.
+    is_of_arm : whether only the arm is doubted: the sensor shows where the tip is.
     """
 
     kind: str
     text: str
     undo: float = 1.0
+    is_of_arm: bool = False
 
 
 class _Miss(NamedTuple):
@@ -387,6 +389,7 @@ class MotionWatch:
                 f"file is too {'high' if share > 0 else 'low'}, the chambers do not get the "
                 "pressures that the gauges read, or channels are swapped; run 'stiffopt "
                 "commission'",
+                is_of_arm=True,
             )
         return self._slipped(distance)
 

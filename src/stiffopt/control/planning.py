@@ -26,6 +26,7 @@ import numpy as np
 
 from stiffopt.arrays import Array
 from stiffopt.control.adaptation import Adapted, Estimate, Learning, Window
+from stiffopt.control.posture_change import PostureChanges
 from stiffopt.control.tip_errors import TipErrors, stiffness_function
 from stiffopt.control.tuning import AdaptationTuning, FeedbackTuning, NearestTuning, PlanningTuning
 from stiffopt.control.vibration import BentMode
@@ -101,20 +102,6 @@ class Plan:
     tip_first: tuple[float, ...] = ()
 
 
-@dataclass(frozen=True)
-class _PostureChange:
-    """A slow way to other pressures for the same target."""
-
-    end: Array  # effective (n,), in Pa
-    tip_first: tuple[float, ...] = ()  # see `Plan`
-    plans: int = 0  # that have been made on it
-    over: bool = False  # whether the end has been reached
-    drift: Array = field(default_factory=lambda: np.zeros(6))  # of the offset from plan to plan
-    left: float = math.inf  # least rest of the way so far, as the tip's motion by one channel, in m
-    stalled: int = 0  # successive plans that came no nearer
-    straight: bool = False  # whether plans lead straight to the end, as no other way was found
-
-
 class Planning:
     """Makes plans for an arm, each starting from the last one."""
 
@@ -128,7 +115,8 @@ class Planning:
         self._last: Plan | None = None
         self._searched_at: Array = np.zeros(6)
         self._advantage, self._refused = self._tuning.advantage, 0
-        self._change: _PostureChange | None = None  # to another configuration, or after the tip
+        # to another configuration, or after the tip is at its target
+        self._changes = PostureChanges(self._tip, self._search, self._tuning)
         self._leaning: tuple[int, Plan | None] = (-1, None)
 
     def _put(self, robot: Manipulator) -> None:
@@ -146,6 +134,7 @@ class Planning:
             return
         self._adapted = adapted = request.adapted
         self._put(self._original if adapted is None else Manipulator(adapted.description))
+        self._changes.use(self._tip, self._search)
         if self._last is not None:
             self._searched_at = self._searched_at + request.offset - self._last.offset
             self._last = replace(self._last, offset=request.offset)
@@ -175,10 +164,9 @@ class Planning:
         plan = replace(plan, doubt=self._robot.description.extrapolation(plan.pressures))
         if request.here.size:
             plan = replace(plan, bent=self._bent(request.here))
-        if self._ways is None or not len(request.way) or plan.approach or plan.blocked:
+        if plan.approach or plan.blocked:
             return plan
-        blocked = self._ways.blocked(np.vstack([request.way, plan.pressures]))
-        return replace(plan, blocked=blocked)
+        return replace(plan, blocked=self._blocked(request, plan.pressures))
 
     def _bent(self, here: Array) -> BentMode | None:
         """Return the modes at pressures (n,); None where they are those of the last call."""
@@ -210,7 +198,7 @@ class Planning:
         if request.serial != self._serial:
             self._serial, self._last, self._solver = request.serial, None, None
             self._bent_at = np.full(self._robot.n_pressures, np.inf)
-            self._change = None
+            self._changes.end()
         if self._solver is None or self._last is None:
             exact = asked.model_copy(update={"tolerance": _EXACT})
             self._solver = PressureSolver(self._robot, task.model_copy(update={"target": exact}))
@@ -219,9 +207,11 @@ class Planning:
         self._limits = self._effective_limits(request)
         last, refused = request.last or self._last, self._refused
         self._last = last
-        if request.search or request.stay or request.step < math.inf:
-            self._change = None
-        target = model_target(asked, request.offset + self._lead(request))
+        if request.search or request.stay or request.last or request.step < math.inf:
+            self._changes.end()
+        if last is not None:
+            self._changes.note(request, last)
+        target = model_target(asked, request.offset + self._changes.lead)
         if last is not None and request.step < math.inf:
             bounds = last.pressures - request.step, last.pressures + request.step
             self._limits = np.clip(bounds[0], *self._limits), np.clip(bounds[1], *self._limits)
@@ -232,8 +222,8 @@ class Planning:
         elif request.stay:
             self._last = self._nearest(request, task, target, distant=False)
             return self._last
-        elif self._change is not None:
-            solution = self._solve(target, self._change.end)
+        elif self._changes.to is not None:
+            solution = self._solve(target, self._changes.to)
         else:
             solution = self._next_to(last, target)
             solution = self._better(request, target, solution, last) if solution else None
@@ -243,17 +233,17 @@ class Planning:
             if last is None or request.search:
                 pressures = self._tip_first(request, task, target, pressures, stiffness)
             else:
-                if self._change is None and self._is_distant(last, pressures, target):
-                    self._change = _PostureChange(pressures)
-                if self._change is not None:
-                    pressures = self._toward(request, last, self._change, pressures, target)
+                if self._changes.to is None and self._is_distant(last, pressures, target):
+                    self._changes.begin(pressures)
+                if self._changes.to is not None:
+                    pressures = self._changes.next(request, last, pressures, target, self._limits)
             self._last = Plan(
                 request.serial, pressures, request.offset, asked, True, stiffness, "",
                 adapted=request.adapted,
-                tip_first=() if self._change is None else self._change.tip_first,
+                tip_first=self._changes.tip_first,
             )  # fmt: skip
         else:
-            self._change = None
+            self._changes.end()
             self._last = self._nearest(request, task, target, distant=self._refused > refused)
         return self._last
 
@@ -323,104 +313,37 @@ class Planning:
         configuration, or from the first place on that way that has a share of the stiffness `best`.
 
         A task that demands a stiffness, or a press, needs the stiffest pressures at once. On a rig
-        with a scene the way to them is the one that was checked.
+        with a scene the arm goes there straight if it would come too near to the scene otherwise.
         """
         goal, tuning = task.stiffness, self._tuning
         demands = task.press is not None or (goal is not None and (goal.at_least or goal.match))
-        if not request.here.size or self._ways is not None or demands:
+        if not request.here.size or demands:
             return stiffest
         found, distance, angle = self._search.find(
             target, self._limits, request.here, least_motion=True
         )
         if distance > _REACHED.position or angle > _REACHED.angle:
             return stiffest
-        for pressures in self._way_on(target, found, stiffest):
-            if self._stiffness is not None:
-                tip = self._tip.at(pressures)
-                if self._stiffness(tip.compliance, tip.pose[:3, :3]) < tuning.soft * best:
-                    continue
-            self._change = _PostureChange(stiffest, tuple(pressures.tolist()))
-            return pressures
-        return stiffest
+        way = self._changes.way_on(target, self._limits, found, stiffest)
+        while way and self._is_soft(way[0], tuning.soft * best):
+            way = way[1:]
+        if not way or self._blocked(request, *way, stiffest):
+            return stiffest
+        self._changes.begin(stiffest, tuple(way[0].tolist()))
+        return way[0]
 
-    def _way_on(self, target: Target, begin: Array, end: Array) -> list[Array]:
-        """Return pressures (n,) on a way from some to others that stays at the target.
+    def _is_soft(self, pressures: Array, least: float) -> bool:
+        """Return whether the task's stiffness at pressures (n,) is less than `least`."""
+        if self._stiffness is None:
+            return False
+        tip = self._tip.at(pressures)
+        return self._stiffness(tip.compliance, tip.pose[:3, :3]) < least
 
-        The way is looked for in a few steps, each to the point of the target that is next to a
-        share of the rest. If there is none, one of the steps is a jump; then nothing is returned.
-        """
-        count, way = self._tuning.change_looks, [begin]
-        longest = self._tuning.change_jump * self._motion(begin, end - begin) / count
-        for rest in range(count, 0, -1):
-            here = way[-1]
-            way.append(self._search.find(target, self._limits, here + (end - here) / rest)[0])
-            if self._motion(here, way[-1] - here) > longest:
-                return []
-        return way[:-1]
-
-    def _motion(self, here: Array, change: Array) -> float:
-        """Return how far a change of pressures (n,) moves the tip by one channel at most, in m."""
-        moved = self._tip.at(here).jacobian[:3] * change
-        return float(np.linalg.norm(moved, axis=0).max())
-
-    def _lead(self, request: PlanRequest) -> Array:
-        """Return by how much (6,) the offset changes until feedback has followed it.
-
-        On a slow way to other pressures it changes steadily, and feedback is late by some plans.
-        The lead begins later than the way: at first, plans still follow the offset of the motion
-        before. At the end of the way it fades.
-        """
-        change, last, tuning = self._change, self._last, self._tuning
-        if change is None or last is None:
-            return np.zeros(6)
-        stays = last.target == request.target
-        moved = request.offset - last.offset if stays and not change.over else np.zeros(6)
-        drift = change.drift + tuning.drift_share * (moved - change.drift)
-        self._change = replace(change, drift=drift)
-        if not stays:
-            return np.zeros(6)
-        growth = min(1.0, max(0.0, change.plans / tuning.change_growth - 0.5))
-        lead: Array = tuning.lead * growth * drift
-        angle = FeedbackTuning().lever * np.linalg.norm(lead[3:])
-        size = float(max(np.linalg.norm(lead[:3]), angle))
-        return lead * min(1.0, tuning.longest_lead / max(size, 1e-9))
-
-    def _toward(
-        self, request: PlanRequest, last: Plan, change: _PostureChange, end: Array, target: Target
-    ) -> Array:
-        """Return pressures (n,) on the way to others (n,): next to the last, and at the target.
-
-        On the straight line to them the tip would leave its target by millimetres, and by more in a
-        quick change, as feedback needs time for an offset that differs between them. So the change
-        is slower while the offset changes. If the way comes no nearer to its end, the arm goes
-        there straight, as slowly, and feedback keeps the tip at its target.
-        """
-        tuning, way = self._tuning, end - last.pressures
-        left = self._motion(last.pressures, way)
-        drift = float(np.linalg.norm((request.offset - last.offset)[:3]))
-        step = tuning.change_step * min(1.0, (change.plans + 1) / tuning.change_growth)
-        step *= min(1.0, tuning.at_rest / max(drift, 1e-9))
-        goes_on = left < change.left - tuning.change_progress * step
-        if last.target != request.target or left > change.left + step:  # another way
-            goes_on, change = True, replace(change, straight=False)
-        stalled = 0 if goes_on else change.stalled + (drift <= tuning.at_rest)
-        change = replace(
-            change,
-            end=end,
-            plans=change.plans + 1,
-            left=left if goes_on else change.left,
-            stalled=stalled,
-            straight=change.straight or stalled > tuning.patience,
-            over=change.over or left <= step,
-        )
-        is_over = left <= step and float(np.linalg.norm(change.drift[:3])) < tuning.at_rest / 10
-        self._change = None if is_over else change
-        if left <= step:
-            return end
-        ahead = last.pressures + step / left * way
-        if change.straight:
-            return np.asarray(np.clip(ahead, *self._limits))
-        return self._search.find(target, self._limits, ahead)[0]
+    def _blocked(self, request: PlanRequest, *pressures: Array) -> str:
+        """Return why the request's way and on to pressures (n,) is not clear of the scene."""
+        if self._ways is None or not len(request.way):
+            return ""
+        return self._ways.blocked(np.vstack([request.way, *pressures]))
 
     def _better(
         self, request: PlanRequest, target: Target, solution: PressureSolution, last: Plan

@@ -68,6 +68,12 @@ class Reference:
         self._states[:, n:] += change
         self.motion[0, n:] += change
 
+    def shift_pressures(self, change: Array) -> None:
+        """Add a change (n,) to the pressures, along the whole path."""
+        n = len(change)
+        self._states[:, :n] += change
+        self.motion[0, :n] += change
+
     def set_lag(self, lag: float) -> None:
         """Change the regulators' lag, in s; without a jump if the path rests."""
         self._lag = lag

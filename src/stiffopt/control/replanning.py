@@ -179,6 +179,7 @@ class Replanner:
         way: Array | None = None,
         windows: tuple[Window, ...] = (),
         here: Array | None = None,
+        most: float = math.inf,
     ) -> Array | None:
         """Request a plan when it is time; return the newest.
 
@@ -194,6 +195,7 @@ class Replanner:
             more than a little starts a search of all configurations.
         way : see `PlanRequest`; None without a scene.
         windows, here : see `PlanRequest`; `here` is None for an arm that does not vibrate.
+        most : largest change of the tip's position, in m, that plans begin to follow at once.
         """
         task, target = self.pursuit.task, self.pursuit.target
         interval = self._tuning.interval
@@ -212,7 +214,9 @@ class Replanner:
             # The offset depends on the posture. Plans follow it slowly, feedback at once.
             time = max(self._tuning.offset_time, self._tuning.offset_periods / omega)
             share = 1.0 if search else -math.expm1(-interval / time)
-            self._offset = self._offset + share * (offset - self._offset)
+            ahead = offset - self._offset
+            bound = min(1.0, most / max(float(np.linalg.norm(ahead[:3])), 1e-9))
+            self._offset = self._offset + share * bound * ahead
             stay = isinstance(course, Pressing) and course.phase is not Phase.GOING
             request = PlanRequest(
                 self._serial, task, target, self._offset.copy(), pressure_offset, search,
@@ -229,6 +233,11 @@ class Replanner:
     def current(self) -> Plan | None:
         """The newest plan, unless it is of the task before."""
         return self.plan if self.plan is not None and self.plan.serial == self._serial else None
+
+    @property
+    def stiffens(self) -> bool:
+        """Whether plans lead from the tip's target to stiffness, and the arm may follow them."""
+        return self.plan is not None and bool(self.plan.tip_first) and not self._blocked
 
     def go_on_with(self, adapted: Adapted, change: Array) -> None:
         """Plan with an adapted model, whose offset differs by a change (6,)."""

@@ -123,9 +123,10 @@ class ReferenceTuning:
     rigid_rate: float = 100.0
     # share of the slew that the reference may take; the rest is for feedback
     slew_share: float = 0.9
-    # least time of the tip's way to a new target, before the arm becomes stiff, in periods of the
-    # vibration
+    # the tip's way to a new target, before the arm becomes stiff: its least time in periods of the
+    # vibration, and the greatest mean speed of the tip by any channel, in m/s
     periods_to_target: float = 0.5
+    channel_speed: float = 0.08
     # motion over which the model on the reference is not linearised again; see `LinearisedTip`
     model_range: float = 0.07
     # time by which a doubted motion of an arm that vibrates is taken back, in s
@@ -148,6 +149,21 @@ class FirstMotionTuning:
     # largest correction by feedback at first, in m, and its growth with the reference's way
     correction: float = 0.5e-3
     correction_share: float = 0.2
+
+
+@dataclass(frozen=True)
+class CorrectionTuning:
+    """Bound of corrections while the arm becomes stiff (`CorrectionBound`)."""
+
+    least: float = 3e-3  # of the tip's position at rest, in m
+    share: float = 0.2  # of the latest motion of the tip on the reference, added to it
+    # largest sum, in m: what feedback does must stay below 10 mm; of a long motion a share instead,
+    # since a wrong modulus is off by a share; time for which such a motion counts, in s
+    most: float = 5e-3
+    share_of_long: float = 0.17
+    long_time: float = 5.0
+    time: float = 1.0  # of the latest motion, as plans follow the offset, in s
+    release: float = 0.01  # growth once the arm is stiff, in m/s
 
 
 @dataclass(frozen=True)
@@ -671,6 +687,7 @@ class ControlTuning:
     reference: ReferenceTuning = field(default_factory=ReferenceTuning)
     first_motion: FirstMotionTuning = field(default_factory=FirstMotionTuning)
     feedback: FeedbackTuning = field(default_factory=FeedbackTuning)
+    correction: CorrectionTuning = field(default_factory=CorrectionTuning)
     motion_error: MotionErrorTuning = field(default_factory=MotionErrorTuning)
     # of a step, which goes one way and soon ends: its offsets count more, for smaller changes
     step_error: MotionErrorTuning = field(

@@ -15,14 +15,8 @@ import numpy as np
 from stiffopt import lie
 from stiffopt.arrays import Array
 from stiffopt.errors import InputError, PressureError, StoppedError
-from stiffopt.identify.detection import (
-    Comparer,
-    Hypothesis,
-    best_lines,
-    found_wrong,
-    idle_channels,
-    without_drift,
-)
+from stiffopt.identify.correction import inverse_placement, put_right
+from stiffopt.identify.detection import without_drift
 from stiffopt.identify.error_model import covariance_with, error_model, kept_unknowns
 from stiffopt.identify.fit import Fit, fit
 from stiffopt.identify.folds import held_back
@@ -53,7 +47,6 @@ from stiffopt.identify.structures import (
     best,
     other_laws,
 )
-from stiffopt.identify.tracker_faults import CUBE_ROTATIONS
 from stiffopt.identify.unknowns import BASE
 from stiffopt.identify.validation import compare
 from stiffopt.logs import StiffnessTable
@@ -64,7 +57,7 @@ from stiffopt.model.history import NO_HISTORY
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.parameters import Parameter, with_values
 from stiffopt.model.stopping import Cancel, checkpoint, giving_up
-from stiffopt.registration import Placement, Registration
+from stiffopt.registration import Registration
 
 Progress = Callable[[float, float, str], None]
 
@@ -170,7 +163,10 @@ def calibrate(
             recordings = recordings_of(description, logs, settings)
             if "drift" not in settings.keep:
                 recordings = [without_drift(each) for each in recordings]
-            setup = _put_right(Setup.of(description, recordings, read, settings), teller)
+            setup = Setup.of(description, recordings, read, settings)
+            if recordings:
+                teller.begin("checking how the logs were recorded")
+                setup = put_right(setup)
             if not recordings:  # tables alone: trust the robot file's poses
                 teller.begin("fitting the stiffness")
                 alone = ModelStructure(
@@ -342,61 +338,6 @@ def _screened(setup: Setup, teller: _Teller) -> dict[str, float]:
     return problem.named(fit(problem, starts, teller, rounds=1, most=most).x)
 
 
-def _put_right(setup: Setup, teller: _Teller) -> Setup:
-    """Return the setup with faults of the recordings corrected where the evidence is overwhelming.
-
-    See `stiffopt.identify.detection`.
-    """
-    recordings, description = setup.recordings, setup.description
-    if not recordings:
-        return setup
-    teller.begin("checking how the logs were recorded")
-    stations = [description.length if each.at is None else each.at for each in setup.points]
-    comparer = Comparer(description, setup.base, stations, recordings)
-    found = found_wrong(comparer, description, setup.settings.keep)
-    if found is None:
-        return _with_idle_channels(setup, comparer)
-    told = found.hypothesis.told(description, [each.name for each in recordings])
-    remark = (
-        f"{told}; the robot file's arm then misses the tip by {found.then * 1e3:.1f} mm instead of "
-        f"{found.as_is * 1e3:.1f} mm, however soft it is; --keep {found.hypothesis.kind} leaves "
-        "that as it was recorded"
-    )
-    return replace(_under(setup, found.hypothesis, comparer.low), found=(remark,))
-
-
-def _with_idle_channels(setup: Setup, comparer: Comparer) -> Setup:
-    """Return the setup with a remark on each channel that does nothing."""
-    if "lines" in setup.settings.keep:
-        return setup
-    description = setup.description
-    remarks = [
-        words + best_lines(comparer, description, k)
-        for k, words in idle_channels(description, setup.recordings).items()
-    ]
-    return replace(setup, found=(*setup.found, *remarks))
-
-
-def _under(setup: Setup, hypothesis: Hypothesis, low: Array) -> Setup:
-    """Return the setup corrected as a hypothesis says.
-
-    The robot file stores an order of channels, and a turn of the axes if all logs share it.
-    """
-    given = setup.description.recordings or Recordings()
-    recordings = hypothesis.applied(setup.recordings, low)
-    if hypothesis.kind == "channels":
-        columns = given.channels or tuple(range(1, len(hypothesis.sources) + 1))
-        given = given.model_copy(update={"channels": tuple(columns[k] for k in hypothesis.sources)})
-    elif hypothesis.kind == "axes" and len(set(hypothesis.turns)) == 1:  # of the tracker
-        recordings = hypothesis.with_turns(0).applied(setup.recordings, low)
-        turn = lie.transform(CUBE_ROTATIONS[hypothesis.turns[0]], np.zeros(3))
-        places = {"tracker_in_base": _inverse_placement(np.linalg.inv(turn) @ setup.base)}
-        registration = given.registration.model_copy(update=places)
-        given = given.model_copy(update={"registration": registration})
-    description = setup.description.model_copy(update={"recordings": given})
-    return Setup.of(description, recordings, setup.tables, setup.settings)
-
-
 def _final(
     setup: Setup, structure: ModelStructure, near: Mapping[str, float], teller: _Teller
 ) -> Fit:
@@ -500,14 +441,14 @@ def _robot(setup: Setup, found: Fit, errors: ErrorModel | None) -> RobotDescript
         moves = x * problem.scale
         base_in_tracker = problem.base_in_tracker @ _motion(moves[base])
         places = {
-            point.name: _inverse_placement(_motion(moves[own]) @ point.sensor)
+            point.name: inverse_placement(_motion(moves[own]) @ point.sensor)
             for point, own in zip(problem.points, sensors, strict=True)
         }
         recordings = Recordings(
             channels=given.channels,
             frame=given.frame,
             registration=Registration(
-                tracker_in_base=_inverse_placement(base_in_tracker),
+                tracker_in_base=inverse_placement(base_in_tracker),
                 tip_in_sensor=places["tip"],
             ),
             bodies={
@@ -650,12 +591,3 @@ def _motion(twist: Array) -> Array:
     full = np.zeros(6)
     full[: len(twist)] = twist
     return np.asarray(lie.exp(full))
-
-
-def _inverse_placement(transform: Array) -> Placement:
-    """Return the inverse of a transform (4, 4), rounded for a file."""
-    found = Placement.of(np.asarray(np.linalg.inv(transform), dtype=float))
-    return Placement(
-        position=tuple(round(x, 8) for x in found.position),
-        orientation=tuple(round(q, 8) for q in found.orientation),
-    )

@@ -34,7 +34,7 @@ from stiffopt.model.codegen import dense
 from stiffopt.model.compliance import Boundary
 from stiffopt.model.description import RobotDescription
 from stiffopt.model.history import NO_HISTORY
-from stiffopt.model.parameters import varied, with_values
+from stiffopt.model.parameters import Parameter, varied, with_values
 from stiffopt.model.parametric import ParametricArm
 
 Begin = Literal["rest", "previous", "unknown"]
@@ -291,7 +291,8 @@ class CalibrationProblem:
         coordinates = ca.SX.sym("coordinates", len(self._parameters))
         robot = varied(self.description, self._parameters, coordinates)
         outputs: list[ca.SX] = []
-        for value in (_excess(robot), self._met_by_a_quick_push(robot, coordinates)):
+        excess = _excess(robot, self.description)
+        for value in (excess, self._met_by_a_quick_push(robot, coordinates)):
             outputs += [value, ca.jacobian(value, coordinates)]
         return InterpretedFunction(dense(ca.Function("parameters", [coordinates], outputs)))
 
@@ -510,16 +511,17 @@ class CalibrationProblem:
         return value, slope
 
 
-def _excess(robot: RobotDescription) -> ca.SX:
+def _excess(robot: RobotDescription, before: RobotDescription) -> ca.SX:
     """Return penalties (n + s,) on a symbolic robot outside sensible bounds, in deviations.
 
     There are two bounds. The shares of each channel's history may not add up to the whole pressure.
     Pressures within the robot's limits may neither take nearly all of a segment's modulus nor, with
-    an exponential law, raise it so far that more pressure would bend the arm less.
+    an exponential law, raise it so far that more pressure would bend the arm less. No gain counts
+    as smaller than `before`: that of a channel that was never driven would give way.
     """
     limits = iter(np.maximum(np.abs(robot.pressure_min), np.abs(robot.pressure_max)).tolist())
     memory, modulus = [], []
-    for segment in robot.segments:
+    for s, segment in enumerate(robot.segments):
         history, compensation = segment.history or NO_HISTORY, segment.compensation
         corrections = segment.corrections
         assert compensation is not None
@@ -529,7 +531,9 @@ def _excess(robot: RobotDescription) -> ca.SX:
         acting = []
         for c in range(segment.n_channels):
             memory.append((history.memory_of(c) * shares - FIT.most_memory) / FIT.memory_slack)
-            acting.append(corrections.gain[c] * most[c] + ca.fabs(corrections.offset[c]))
+            known = Parameter(f"segments[{s}].corrections.gain[{c}]").value(before)
+            gain = ca.fmax(known, corrections.gain[c])
+            acting.append(gain * most[c] + ca.fabs(corrections.offset[c]))
         change = compensation.modulus_per_pressure * ca.norm_2(ca.vertcat(*acting))
         change = change / segment.material.youngs_modulus  # largest relative change of the modulus
         if compensation.modulus_law == "linear":

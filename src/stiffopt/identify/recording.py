@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt.arrays import Array
-from stiffopt.errors import FileError, InputError, shown
+from stiffopt.errors import EquilibriumError, FileError, InputError, PressureError, shown
 from stiffopt.identify.settings import DETECTION, PLAUSIBLE
 from stiffopt.identify.tracker_faults import (
     MEDIAN_NORM,
@@ -385,7 +385,7 @@ def _mm(length: float) -> str:
 def _unit(pressures: Array, tip: Array, description: RobotDescription) -> str | None:
     """Return the unit of pressures (N, n) that are too small for Pa, or None if it is unclear.
 
-    With the right unit, the robot file's arm moves about as far as the tip did.
+    With the right unit, the robot file's arm under its weight moves about as far as the tip did.
     """
     limit = np.maximum(np.abs(description.pressure_min), np.abs(description.pressure_max))
     share = float(np.max(np.max(np.abs(pressures), axis=0) / limit))
@@ -394,14 +394,15 @@ def _unit(pressures: Array, tip: Array, description: RobotDescription) -> str | 
         return None
     rows = seen[np.linspace(0, len(seen) - 1, min(len(seen), DETECTION.rows)).astype(int)]
     moved = np.sqrt(np.var(tip[rows], axis=0).sum())
-    arm = Manipulator(
-        description.model_copy(update={"gravity": (0.0, 0.0, 0.0), "calibration": None})
-    )
+    arm = Manipulator(description.model_copy(update={"calibration": None}))
     fitting = []
     for unit, factor in _PRESSURE_UNITS.items():
         if share * factor > 1 + PLAUSIBLE.beyond:
             continue
-        expected = arm.tip_pose(factor * pressures[rows])[:, :3, 3]
+        try:
+            expected = arm.tip_pose(factor * pressures[rows])[:, :3, 3]
+        except (EquilibriumError, PressureError):  # the arm does not bear these pressures
+            continue
         ratio = np.sqrt(np.var(expected, axis=0).sum()) / max(moved, 1e-9)
         if 1 / DETECTION.unit < ratio < DETECTION.unit:
             fitting.append(unit)

@@ -12,7 +12,7 @@ from stiffopt.schema import Items, Schema
 from stiffopt.units import Duration
 
 Finding = Literal["units", "clock", "drift", "axes", "channels", "lines"]
-"""Errors of recordings that are corrected automatically (`stiffopt.identify.detection`)."""
+"""Errors of recordings that are corrected automatically (`stiffopt.identify.correction`)."""
 
 
 @dataclass(frozen=True)
@@ -335,23 +335,26 @@ class ReportSettings:
 
 @dataclass(frozen=True)
 class DetectionSettings:
-    """Evidence needed to correct a recording (`stiffopt.identify.detection`).
+    """Evidence needed to correct a recording (`stiffopt.identify.detection`, `hypotheses`).
 
     Attributes
     ----------
     overwhelming : largest share of the misfit that an accepted hypothesis leaves.
     tie : largest misfit of an accepted hypothesis, as a share of any rival's.
+    faults : largest number of faults that are corrected, one after another.
     rows : number of compared rows of all recordings together.
     softness : factors on pressures, for arms softer or stiffer than the robot file says.
     farther : softness with which the arm moves more than this many times as far as the tip did is
         not tried.
-    shortlist : number of hypotheses that are compared with an arm under its weight.
+    shortlist : number of hypotheses that are compared with an arm under its weight, and of those of
+        a kind of which each is tried together with another one.
     few : largest number of channels of a segment, or of segments, of which all orders are tried.
     moved : largest distance of the base from its place in the robot file, in lengths of the arm.
     off, frame : mean error of a log, in lengths of the arm, beyond which its set-up is suspected to
         differ from the calibration's; and the share of it that a correction may leave.
     region, within : a remark reports a log with less than a share `within` of its tips in the
         region of this probability.
+    outside : with less than this share in it, a log is suspected to have other channels.
     channel_rows : number of rows with which orders of channels are compared in a log that is off.
     poses, apart : smallest number of poses by which a frame is judged, since two can be moved to
         fit any others; and their distance, as a share of the range of permitted pressures.
@@ -388,6 +391,7 @@ class DetectionSettings:
 
     overwhelming: float = 0.5
     tie: float = 0.75
+    faults: int = 4
     rows: int = 120
     softness: tuple[float, ...] = (0.2, 0.35, 0.6, 1.0, 1.7, 3.0, 5.0)
     farther: float = 1.5
@@ -398,6 +402,7 @@ class DetectionSettings:
     frame: float = 0.3
     region: float = 0.99
     within: float = 0.5
+    outside: float = 0.9
     channel_rows: int = 60
     poses: int = 4
     apart: float = 0.1

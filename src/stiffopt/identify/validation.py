@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 
 from stiffopt.arrays import Array
 from stiffopt.errors import EquilibriumError, PressureError, StiffoptError
-from stiffopt.identify.detection import Hypothesis, idle_channels, of_channels, replaced
+from stiffopt.identify.detection import idle_channels
 from stiffopt.identify.discrepancy import centres
 from stiffopt.identify.error_model import held_for, in_turn, is_moving
 from stiffopt.identify.fit import fit
+from stiffopt.identify.hypotheses import Hypothesis, of_channels, replaced
 from stiffopt.identify.problem import CalibrationProblem, Noise, Predicted, Sample
 from stiffopt.identify.recording import Recording
 from stiffopt.identify.results import Comparison
@@ -147,13 +148,15 @@ class _Correction:
 def _put_right(setup: Setup, found: tuple[Comparison, ...]) -> tuple[Comparison, ...]:
     """Return comparisons in which logs that are off only by their set-up are corrected.
 
-    Other channels have no free number, and a moved frame has six. So channels are tried first.
+    Other channels have no free number, and a moved frame has six. So channels are tried first, and
+    also for logs that are less far off, but outside their regions.
     """
     recordings, remarks = list(setup.recordings), [""] * len(found)
-    for correct in (_with_channels_found, _with_frame_found):
+    for correct, outside in ((_with_channels_found, DETECTION.outside), (_with_frame_found, 0.0)):
         tried: dict[int, _Correction] = {}
         for i, each in enumerate(found):
-            if each.errors.mean > DETECTION.off * setup.description.length and not remarks[i]:
+            is_off = each.errors.mean > DETECTION.off * setup.description.length
+            if (is_off or _within(each) < outside) and not remarks[i]:
                 correction = correct(setup, recordings[i], each)
                 if correction is not None:
                     tried[i] = correction

@@ -199,19 +199,22 @@ def squared_moves(per_pressure: Array, variances: Array) -> Array:
     return np.asarray(variances * (per_pressure**2).sum(axis=1))
 
 
-def even_variance(moves: Array, before: Array, memory: Array) -> Array:
+def even_variance(moves: Array, before: Array, memory: Array, kept: Array) -> Array:
     """Return the variance (..., N) of each axis of the tip, in m^2, the same for all directions.
 
     An arm with hysteresis answers to former pressures too, and to what the model has wrong there.
+    How much it does is uncertain: a fit may take creep for play. So the present pressures count as
+    if plays followed them, and the former ones as if they did not.
 
     Parameters
     ----------
     moves : by the discrepancy at the pressures of now, as `squared_moves` (..., N, n).
     before : their mean where the arm was before, as `fading_mean` (..., N, n).
-    memory : share (n,) of each channel's pressure that acts through the model's hysteresis.
+    memory, kept : shares (n,) of each channel's pressure that act through the model's hysteresis,
+        and that are still former ones (`History.remembered_shares`).
     """
-    share = memory + (1 - memory) * _MORE_MEMORY
-    return np.asarray(((1 - share) ** 2 * moves + share**2 * before).sum(axis=-1) / 3)
+    most, least = (share + (1 - share) * _MORE_MEMORY for share in (memory, kept))
+    return np.asarray(((1 - least) ** 2 * moves + most**2 * before).sum(axis=-1) / 3)
 
 
 def fading_mean(time: Array, moves: Array) -> Array:

@@ -201,10 +201,24 @@ class History(Schema):
         of_rest = (1 + softening * c * most) * share / (1 - (1 - share) / left)
         return min(max((of_rest - 1) / (c * most), 0.0), 1.0)
 
-    def remembered_shares(self, n_channels: int) -> Array:
-        """Return the shares (c,) of the channels' pressures that act through play and creep."""
+    def remembered_shares(self, n_channels: int, span: float = 0.0) -> Array:
+        """Return the shares (c,) of the channels' pressures that are still former ones.
+
+        Pressures move within a range of `span` Pa. A play of half-width w keeps a former pressure
+        with the probability 2 w / span that the next one lies within w of it; otherwise it follows.
+        A creep keeps all of it for a time; by default plays do so too.
+        """
+        of_elongation, of_bending = (
+            sum(
+                part.share
+                * (2 * part.width / max(span, 2 * part.width) if isinstance(part, Play) else 1)
+                for part in self.parts
+                if part.of != other
+            )
+            for other in ("bending", "elongation")
+        )
         memory = np.array([self.memory_of(channel) for channel in range(n_channels)])
-        return np.asarray(max(self.shares) * memory)
+        return np.asarray(max(of_elongation, of_bending) * memory)
 
     @property
     def n_states(self) -> int:

@@ -251,7 +251,7 @@ class Uncertainty:
         before = self._typical_moves if time is None else fading_mean(time, moves)
         errors = self._calibration.errors
         residual = self._calibration.position_residual if errors is None else errors.residual
-        discrepancy = even_variance(moves, before, self._memory)
+        discrepancy = even_variance(moves, before, *self._memory)
         if effective is None:
             moved = moving if moving is not None else np.zeros(len(pressures), dtype=bool)
             ways = self._remembered(pressures, per_pressure, held)
@@ -324,12 +324,16 @@ class Uncertainty:
 
     @cached_property
     def _memory(self) -> Array:
-        """Shares (n,) of the channels' pressures that act through hysteresis."""
-        shares = [
-            (segment.history or NO_HISTORY).remembered_shares(segment.n_channels)
-            for segment in self._description.segments
+        """Shares (2, n) of the channels' pressures, as `even_variance` takes them."""
+        errors = self._calibration.errors
+        spans = (0.0, 0.0 if errors is None else errors.range)
+        segments = [
+            (each.history or NO_HISTORY, each.n_channels) for each in self._description.segments
         ]
-        return np.concatenate(shares)
+        return np.array([
+            np.concatenate([history.remembered_shares(n, span) for history, n in segments])
+            for span in spans
+        ])  # fmt: skip
 
     @cached_property
     def _delays(self) -> Array:

@@ -1,0 +1,94 @@
+"""Correct the errors that `stiffopt.identify.detection` finds in how logs were recorded."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import replace
+
+import numpy as np
+
+from stiffopt import lie
+from stiffopt.arrays import Array
+from stiffopt.identify.detection import idle_channels
+from stiffopt.identify.hypotheses import Comparer, Hypothesis, best_lines, found_wrong
+from stiffopt.identify.settings import DETECTION
+from stiffopt.identify.setup import Setup
+from stiffopt.identify.tracker_faults import CUBE_ROTATIONS
+from stiffopt.model.description import Recordings
+from stiffopt.registration import Placement
+
+
+def put_right(setup: Setup) -> Setup:
+    """Return the setup with faults of the recordings corrected where the evidence is overwhelming.
+
+    After each correction it looks again for another fault. A remark in `found` reports each, and
+    each channel that does nothing.
+    """
+    comparer, lines = _comparer(setup), set[int]()
+    for _ in range(DETECTION.faults):
+        found = found_wrong(comparer, setup.description, setup.settings.keep)
+        if found is None:
+            break
+        told = found.hypothesis.told(setup.description, [each.name for each in setup.recordings])
+        remark = (
+            f"{'with that corrected, ' if setup.found else ''}{told}; the robot file's arm then "
+            f"misses the tip by {found.then * 1e3:.1f} mm instead of {found.as_is * 1e3:.1f} mm, "
+            f"however soft it is; --keep {found.hypothesis.kind} leaves that as it was recorded"
+        )
+        corrected = _under(setup, found.hypothesis, comparer.low)
+        setup = replace(corrected, found=(*setup.found, remark))
+        comparer = _comparer(setup)
+        if found.hypothesis.kind == "lines":
+            lines |= {*found.hypothesis.wrong, *found.hypothesis.wrong.values()}
+    return _with_idle_channels(setup, comparer, lines)
+
+
+def _comparer(setup: Setup) -> Comparer:
+    length = setup.description.length
+    stations = [length if each.at is None else each.at for each in setup.points]
+    return Comparer(setup.description, setup.base, stations, setup.recordings)
+
+
+def _with_idle_channels(setup: Setup, comparer: Comparer, corrected: Collection[int]) -> Setup:
+    """Return the setup with a remark on each channel that does nothing.
+
+    Channels (from 0) whose lines were corrected are not judged: their pressures follow others.
+    """
+    if "lines" in setup.settings.keep:
+        return setup
+    description = setup.description
+    remarks = [
+        words + best_lines(comparer, description, k)
+        for k, words in idle_channels(description, setup.recordings).items()
+        if k not in corrected
+    ]
+    return replace(setup, found=(*setup.found, *remarks))
+
+
+def _under(setup: Setup, hypothesis: Hypothesis, low: Array) -> Setup:
+    """Return the setup corrected as a hypothesis says.
+
+    The robot file stores an order of channels, and a turn of the axes if all logs share it.
+    """
+    given = setup.description.recordings or Recordings()
+    recordings = hypothesis.applied(setup.recordings, low)
+    if hypothesis.kind == "channels":
+        columns = given.channels or tuple(range(1, len(hypothesis.sources) + 1))
+        given = given.model_copy(update={"channels": tuple(columns[k] for k in hypothesis.sources)})
+    elif hypothesis.kind == "axes" and len(set(hypothesis.turns)) == 1:  # of the tracker
+        recordings = hypothesis.with_turns(0).applied(setup.recordings, low)
+        turn = lie.transform(CUBE_ROTATIONS[hypothesis.turns[0]], np.zeros(3))
+        places = {"tracker_in_base": inverse_placement(np.linalg.inv(turn) @ setup.base)}
+        registration = given.registration.model_copy(update=places)
+        given = given.model_copy(update={"registration": registration})
+    description = setup.description.model_copy(update={"recordings": given})
+    return Setup.of(description, recordings, setup.tables, setup.settings)
+
+
+def inverse_placement(transform: Array) -> Placement:
+    """Return the inverse of a transform (4, 4), rounded for a file."""
+    found = Placement.of(np.asarray(np.linalg.inv(transform), dtype=float))
+    return Placement(
+        position=tuple(round(x, 8) for x in found.position),
+        orientation=tuple(round(q, 8) for q in found.orientation),
+    )

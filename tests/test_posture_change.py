@@ -1,0 +1,279 @@
+"""Plans that change the posture: tip first, slowly on to the stiffest pressures, and when not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import stiffopt as so
+from stiffopt.control.forecast import Forecast, Present
+from stiffopt.control.planner import InlinePlanner
+from stiffopt.control.planning import Planning, PlanRequest, model_target
+from stiffopt.control.replanning import Pursuit
+from stiffopt.control.tuning import ForecastTuning
+from stiffopt.model.scene import Scene
+from stiffopt.optimise.goal import StiffnessGoal, StiffnessMeasure
+from stiffopt.optimise.press import Press
+from stiffopt.optimise.target import Target
+from stiffopt.optimise.task import Task
+from test_planner import BAR, PRESSURES, ROBOT, request, tip
+
+
+@pytest.fixture(scope="module")
+def robot():
+    return so.load_robot(ROBOT)
+
+
+def test_plans_lead_to_another_configuration_slowly_and_on_the_target(robot):
+    planning, first = Planning(robot), request(robot)
+    plan, wanted = planning.plan(first), np.array(first.target.position[:2])
+    stiffest, moved = plan.pressures, []
+    away = 2 * PRESSURES - stiffest  # on the other side, and on the target by the search
+    begin, _, _ = planning._search.find(
+        model_target(first.target, np.zeros(6)), planning._limits, away
+    )
+    assert np.abs(stiffest - begin).max() > 2.5e4
+    plan = planning.plan(replace(first, search=False, last=replace(plan, pressures=begin)))
+    before = begin
+    for _ in range(400):
+        moved.append(np.abs(plan.pressures - before).max())
+        assert np.linalg.norm(tip(robot, plan.pressures)[1][:2] - wanted) < 1e-5
+        before, plan = plan.pressures, planning.plan(replace(first, search=False))
+    assert max(moved) < 3e3
+    np.testing.assert_allclose(plan.pressures, stiffest, atol=100.0)
+
+
+def motions(robot, p, q):
+    """How far each channel moves the tip between two sets of pressures (n,), in m."""
+    jacobian = robot.tip_jacobian(0.5 * (p + q))[:3]
+    return np.linalg.norm(jacobian, axis=0) * np.abs(q - p)
+
+
+def test_an_arm_that_vibrates_goes_to_its_target_first_and_becomes_stiff_after(robot):
+    first = request(robot)
+    wanted = np.array(first.target.position[:2])
+    stiffest = Planning(robot).plan(first).pressures
+    here = 2 * PRESSURES - stiffest  # the straight line from here leads through softer ones
+    planning = Planning(robot)
+    plan = planning.plan(replace(first, here=here))
+    assert np.linalg.norm(tip(robot, plan.pressures)[1][:2] - wanted) < 1e-5
+    assert motions(robot, here, plan.pressures).max() < 0.1 * motions(robot, here, stiffest).max()
+    assert plan.tip_first
+    moved = []
+    for _ in range(400):
+        before, plan = plan.pressures, planning.plan(replace(first, here=here))
+        moved.append(motions(robot, before, plan.pressures).max())
+        assert np.linalg.norm(tip(robot, plan.pressures)[1][:2] - wanted) < 1e-5
+    assert max(moved) < 4e-4
+    assert sum(moved) > 5e-3
+    assert not plan.tip_first
+    np.testing.assert_allclose(plan.pressures, stiffest, atol=100.0)
+    again = planning.plan(replace(first, search=True, here=stiffest))
+    np.testing.assert_allclose(again.pressures, stiffest, atol=100.0)  # not back to softer ones
+
+
+def changing(robot, plans=10):
+    """A request of an arm that vibrates, its planning after some plans, and the stiffest plan."""
+    first = request(robot)
+    stiffest = Planning(robot).plan(first)
+    planning, asked = Planning(robot), replace(first, here=2 * PRESSURES - stiffest.pressures)
+    for _ in range(plans):
+        plan = planning.plan(asked)
+    assert plan.tip_first
+    assert np.abs(stiffest.pressures - plan.pressures).max() > 2e4
+    return planning, asked, plan, stiffest
+
+
+def test_the_tip_is_not_led_to_its_target_by_soft_pressures(robot):
+    first = request(robot, p=np.array([0.8, 0.05, 0.05]) * BAR)
+    asked = replace(first, here=np.array([1.0, 0.3, 0.3]) * BAR)
+    stiffest = Planning(robot).plan(first)
+    least = Planning(robot).plan(asked)
+    soft = robot.stiffness(least.pressures, direction=[1, 0, 0]) / stiffest.stiffness
+    for share in (0.93, 0.97):
+        planning = Planning(robot)
+        planning._tuning = replace(planning._tuning, soft=share)
+        plan = planning.plan(asked)
+        reached = robot.stiffness(plan.pressures, direction=[1, 0, 0]) / stiffest.stiffness
+        assert soft < share < reached < share + 0.03
+        off = tip(robot, plan.pressures)[1][:2] - first.target.position[:2]
+        assert np.linalg.norm(off) < 1e-5
+        assert plan.tip_first
+
+
+def test_a_task_that_demands_a_stiffness_has_it_on_arrival(robot):
+    first = request(robot)
+    stiffest = Planning(robot).plan(first)
+    asked = replace(first, here=2 * PRESSURES - stiffest.pressures)
+    assert Planning(robot).plan(asked).tip_first
+    measure = {"direction": (1, 0, 0)}
+    for goal in (
+        {"maximise": measure, "at_least": measure | {"value": 0.9 * stiffest.stiffness}},
+        {"match": measure | {"value": 0.97 * stiffest.stiffness}},
+    ):
+        task = first.task.model_copy(update={"stiffness": StiffnessGoal.model_validate(goal)})
+        plan = Planning(robot).plan(replace(asked, task=task))
+        assert plan.tip_first == ()
+        reached = robot.stiffness(plan.pressures, direction=[1, 0, 0])
+        assert reached > 0.89 * stiffest.stiffness
+
+
+@pytest.mark.parametrize("share", [0.02, 0.98])
+def test_on_a_rig_with_a_scene_the_tip_goes_first_where_that_keeps_clear(robot, share):
+    """Under a plate, to which the straight line comes less near than the tip's way."""
+    first, here = request(robot), np.array([1.0, 0.3, 0.3]) * BAR
+    stiffest = Planning(robot).plan(first).pressures
+    way = np.array(Planning(robot).plan(replace(first, here=here)).tip_first)
+    plate = {"half_space": {"point": (0, 0, 0.12), "normal": (0, 0, -1)}}
+    scene = Scene(objects=[{"name": "plate", **plate}])
+    gaps = [float(robot.clearance(p, scene)) for p in (way, here)]
+    assert gaps[0] < gaps[1] - 1e-3
+    clearance = gaps[0] + share * (gaps[1] - gaps[0])
+    asked = replace(first, here=here, way=np.stack([here, here]))
+    with_plate = Planning(robot, scene.model_copy(update={"clearance": clearance}))
+    plan = with_plate.plan(asked)
+    assert not plan.blocked
+    goal = way if share < 0.5 else stiffest
+    np.testing.assert_allclose(plan.pressures, goal, atol=100.0)
+
+
+@pytest.mark.parametrize("vibrates", [True, False])
+def test_a_forecast_plans_the_way_that_the_arm_will_go(robot, vibrates, monkeypatch):
+    first, here = request(robot), np.array([1.0, 0.3, 0.3]) * BAR
+    far = {"name": "far", "sphere": {"centre": (0.5, 0.5, 0.5), "radius": 0.01}}
+    planner = InlinePlanner(robot, Scene(objects=[far]))
+    asked, ask = [], planner.request
+    monkeypatch.setattr(planner, "request", lambda made: (asked.append(made), ask(made)))
+    forecast = Forecast(planner, ForecastTuning())
+    rotation, position = tip(robot, here)
+    limits = robot.pressure_min, robot.pressure_max
+    forecast.present = Present(
+        Pursuit(), None, np.stack([here, here]), np.zeros(6), np.zeros(3), limits, None,
+        position, rotation, vibrates,
+    )  # fmt: skip
+    forecast.check(Pursuit.of(first.task, first.task))
+    assert bool(planner.latest().tip_first) is vibrates
+    assert np.array_equal(asked[0].here, here if vibrates else [])
+
+
+def test_plans_go_straight_and_slowly_where_the_way_that_was_found_ends(robot, monkeypatch):
+    planning, asked, plan, stiffest = changing(robot)
+    stays = plan.pressures
+    monkeypatch.setattr(planning._search, "find", lambda *_: (stays, 0.0, 0.0))
+    for _ in range(planning._tuning.patience + 1):
+        assert np.array_equal(plan.pressures, stays)
+        plan = planning.plan(asked)
+    for _ in range(300):
+        before, plan = plan.pressures, planning.plan(asked)
+        assert motions(robot, before, plan.pressures).max() < 6e-4
+    np.testing.assert_allclose(plan.pressures, stiffest.pressures, atol=100.0)
+
+
+def test_plans_go_straight_at_once_where_no_way_stays_at_the_target(robot, monkeypatch):
+    planning, asked, plan, stiffest = changing(robot)
+    find = planning._search.find
+
+    def jumps(target, limits, start, **options):
+        if options:
+            return find(target, limits, start, **options)
+        nearer = np.abs(start - stiffest.pressures).max() < np.abs(start - plan.pressures).max()
+        return (stiffest if nearer else plan).pressures, 0.0, 0.0
+
+    monkeypatch.setattr(planning._search, "find", jumps)
+    again = planning.plan(replace(asked, search=True))
+    assert again.tip_first == ()
+    np.testing.assert_allclose(again.pressures, stiffest.pressures, atol=100.0)
+
+
+def test_plans_go_on_evenly_if_the_stiffest_pressures_jump_meanwhile(robot):
+    planning, asked, plan, stiffest = changing(robot)
+    high = np.full(3, 1.5 * BAR)
+    high[np.argmax(stiffest.pressures)] = plan.pressures[np.argmax(stiffest.pressures)] + 5e3
+    for _ in range(120):
+        before, plan = plan.pressures, planning.plan(replace(asked, low=np.zeros(3), high=high))
+        assert motions(robot, before, plan.pressures).max() < 6e-4
+    best = Planning(robot).plan(replace(asked, low=np.zeros(3), high=high, here=np.zeros(0)))
+    np.testing.assert_allclose(plan.pressures, best.pressures, atol=100.0)
+
+
+def test_plans_go_on_evenly_if_the_target_moves_a_little_meanwhile():
+    """An arm for which the rest of the way grows by that more than 20 plans make up for."""
+    arm = so.load_robot("stiff-flop-2")
+    rng = np.random.default_rng(31102)
+    here, there = (rng.uniform(0.1, 1.0, 6) * BAR for _ in range(2))
+    place, way = tip(arm, there)[1], rng.normal(size=3)
+    target, near = (
+        Target(position=tuple(p.tolist()))
+        for p in (place, place + 4.5e-3 * way / np.linalg.norm(way))
+    )
+    goal = StiffnessGoal(maximise=StiffnessMeasure(direction=(1.0, 0.0, 0.0)))
+    task = Task(robot="stiff-flop-2", target=target, stiffness=goal)
+    asked = PlanRequest(1, task, target, np.zeros(6), np.zeros(6), here=here)
+    planning = Planning(arm)
+    for _ in range(60):
+        plan = planning.plan(asked)
+    assert plan.tip_first
+    plan = planning.plan(replace(asked, target=near))
+    for _ in range(60):
+        before, plan = plan.pressures, planning.plan(replace(asked, target=near))
+        assert motions(arm, before, plan.pressures).max() < 6e-4
+    np.testing.assert_allclose(tip(arm, plan.pressures)[1], near.position, atol=1e-5)
+
+
+def test_plans_of_a_change_lead_the_offset_as_feedback_is_late(robot):
+    """By 8 plans, but feedback is told the offset itself; not if the target moves as well."""
+    planning, asked, plan, _ = changing(robot)
+    wanted, step = np.array(asked.target.position[:2]), np.array([4e-5, -2e-5, 0, 0, 0, 0])
+    for number in range(1, 61):
+        plan = planning.plan(replace(asked, offset=number * step))
+    assert plan.tip_first
+    off = tip(robot, plan.pressures)[1][:2] + plan.offset[:2] - wanted
+    assert off == pytest.approx(-8 * step[:2], rel=0.05)
+    assert np.array_equal(plan.offset, 60 * step)
+    near = asked.target.model_copy(update={"position": (*(wanted + 1e-4).tolist(), None)})
+    plan = planning.plan(replace(asked, offset=61 * step, target=near))
+    off = tip(robot, plan.pressures)[1][:2] + plan.offset[:2] - wanted - 1e-4
+    assert off == pytest.approx(0, abs=1e-5)
+    for number in range(200):  # the change ends also while the target moves
+        near = near.model_copy(
+            update={"position": (wanted[0], wanted[1] + 1e-5 * (number % 2), None)}
+        )
+        plan = planning.plan(replace(asked, offset=61 * step, target=near))
+    assert not plan.tip_first
+    off = tip(robot, plan.pressures)[1][:2] + plan.offset[:2] - near.position[:2]
+    assert off == pytest.approx(0, abs=1e-5)
+
+
+def test_what_is_planned_after_a_loss_is_not_led_by_an_earlier_change(robot):
+    planning, asked, plan, stiffest = changing(robot)
+    plan = replace(plan, pressures=stiffest.pressures + 2e3)  # the arm is elsewhere by now
+    for _ in range(3):
+        plan = planning.plan(replace(asked, last=plan, step=5e3))
+        assert not plan.tip_first
+    np.testing.assert_allclose(plan.pressures, stiffest.pressures, atol=100.0)
+
+
+def test_a_target_that_was_out_of_reach_is_met_again_from_the_last_plan(robot):
+    planning, asked, plan, stiffest = changing(robot)
+    out = replace(asked, low=np.zeros(3), high=np.full(3, 0.1 * BAR))
+    for _ in range(3):
+        plan = planning.plan(out)
+        assert not plan.reached
+    away = plan.pressures
+    plan = planning.plan(asked)
+    begin = planning._search.find(asked.target, planning._limits, away)[0]
+    np.testing.assert_allclose(plan.pressures, begin, atol=100.0)
+    for _ in range(400):
+        plan = planning.plan(asked)
+    np.testing.assert_allclose(plan.pressures, stiffest.pressures, atol=100.0)
+
+
+def test_a_press_begins_at_the_stiffest_pressures(robot):
+    first, press = request(robot), Press(force=0.03, direction=(1, 0, 0))
+    pressing = replace(first, task=first.task.model_copy(update={"press": press}))
+    stiffest = Planning(robot).plan(pressing).pressures
+    plan = Planning(robot).plan(replace(pressing, here=2 * PRESSURES - stiffest))
+    assert not plan.tip_first
+    np.testing.assert_allclose(plan.pressures, stiffest, atol=100.0)
