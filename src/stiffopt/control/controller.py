@@ -429,7 +429,7 @@ class TipController:
             return None
         if self._back_to is None:
             added = last - (reference.command - offset)
-            reference.shift_pressures(added)
+            reference.shift(np.concatenate([added, np.zeros(6)]))
             path, added_then = self._ways[0]
             stays = doubt is not None and doubt.is_of_arm
             back = added if stays else added_then
@@ -555,7 +555,7 @@ class TipController:
 
     def _shift(self, change: Array) -> None:
         """Shift reference and feedback by a change of the offset (6,), without a jump."""
-        self._reference.shift(change)
+        self._reference.shift(np.concatenate([np.zeros(self.robot.n_pressures), change]))
         self._feedback.shift(change)
 
     def _press(self, now: float) -> None:

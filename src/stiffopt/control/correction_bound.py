@@ -1,4 +1,4 @@
-"""How much feedback and plans correct at once while plans lead from the tip's target to stiffness.
+"""How much feedback and plans correct at once until the arm has its stiffest pressures.
 
 A chamber behind a narrow or kinked line does not get the pressure that its gauge shows. The tip
 lacks what that pressure should have done, which looks like an offset, as by a push. If feedback and

@@ -63,16 +63,9 @@ class Reference:
         self.motion = np.concatenate([self._states[-1:], np.zeros((_LAGS - 1, len(values)))])
 
     def shift(self, change: Array) -> None:
-        """Add a change (m,) to the numbers that belong to the pressures, along the whole path."""
-        n = self._states.shape[1] - len(change)
-        self._states[:, n:] += change
-        self.motion[0, n:] += change
-
-    def shift_pressures(self, change: Array) -> None:
-        """Add a change (n,) to the pressures, along the whole path."""
-        n = len(change)
-        self._states[:, :n] += change
-        self.motion[0, :n] += change
+        """Add a change (n + m,) to the pressures and their numbers, along the whole path."""
+        self._states += change
+        self.motion[0] += change
 
     def set_lag(self, lag: float) -> None:
         """Change the regulators' lag, in s; without a jump if the path rests."""

@@ -236,7 +236,7 @@ class Replanner:
 
     @property
     def stiffens(self) -> bool:
-        """Whether plans lead from the tip's target to stiffness, and the arm may follow them."""
+        """Whether the arm, with its tip at the target, is on its way to the stiffest pressures."""
         return self.plan is not None and bool(self.plan.tip_first) and not self._blocked
 
     def go_on_with(self, adapted: Adapted, change: Array) -> None:

@@ -1,4 +1,4 @@
-"""Correct the errors that `stiffopt.identify.detection` finds in how logs were recorded."""
+"""Correct the errors that logs share, as `stiffopt.identify.hypotheses` finds them."""
 
 from __future__ import annotations
 

@@ -52,7 +52,7 @@ from stiffopt.model.calibration import (
     recorded_range,
     squared_moves,
 )
-from stiffopt.model.history import NO_HISTORY
+from stiffopt.model.uncertainty import memory_shares
 
 Rows = NDArray[np.bool_]
 
@@ -240,13 +240,6 @@ class _Fold:
 def _even_variance(moves: Array, fit: Fit) -> Array:
     """Return the variance (M,) of each axis of the tip, in m^2, by `squared_moves` (M, n)."""
     span = recorded_range(commanded(fit.problem.samples))
-    memory, kept = (
-        np.concatenate([
-            (segment.history or NO_HISTORY).remembered_shares(segment.n_channels, within)
-            for segment in fit.robot.segments
-        ])
-        for within in (0.0, span)
-    )  # fmt: skip
     samples, starts = fit.problem.samples, fit.problem.starts[:-1]
     breaks = [
         start for each, start in zip(samples, starts, strict=True) if each.begin != "previous"
@@ -254,7 +247,7 @@ def _even_variance(moves: Array, fit: Fit) -> Array:
     time = in_turn([each.recording.time[each.rows] for each in samples])
     runs = zip(np.split(time, breaks[1:]), np.split(moves, breaks[1:]), strict=True)
     before = np.concatenate([fading_mean(*run) for run in runs])
-    return even_variance(moves, before, memory, kept)
+    return even_variance(moves, before, *memory_shares(fit.robot, span))
 
 
 def in_turn(times: Sequence[Array]) -> Array:

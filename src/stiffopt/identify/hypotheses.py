@@ -387,7 +387,7 @@ def best_lines(comparer: Comparer, description: RobotDescription, channel: int) 
 
 
 def _alike(one: Hypothesis, other: Hypothesis) -> bool:
-    """Whether two hypotheses are the same, or both orders (perhaps differing by a turn)."""
+    """Return True if two hypotheses are the same one, or if both are orders of channels."""
     return one is other or one.kind == other.kind == "channels"
 
 

@@ -134,7 +134,7 @@ class _Correction:
     moves_all: bool = False
 
     def explains(self, before: Comparison, after: Comparison) -> bool:
-        """Whether the correction takes away most of the error of a log."""
+        """Return True if a log's error is much smaller after the correction than before."""
         if after.errors.mean > DETECTION.frame * before.errors.mean:
             return False
         then, now = before.errors.angle, after.errors.angle

@@ -326,14 +326,7 @@ class Uncertainty:
     def _memory(self) -> Array:
         """Shares (2, n) of the channels' pressures, as `even_variance` takes them."""
         errors = self._calibration.errors
-        spans = (0.0, 0.0 if errors is None else errors.range)
-        segments = [
-            (each.history or NO_HISTORY, each.n_channels) for each in self._description.segments
-        ]
-        return np.array([
-            np.concatenate([history.remembered_shares(n, span) for history, n in segments])
-            for span in spans
-        ])  # fmt: skip
+        return memory_shares(self._description, 0.0 if errors is None else errors.range)
 
     @cached_property
     def _delays(self) -> Array:
@@ -550,6 +543,20 @@ def _shape(moves: Array, covariance: Array) -> tuple[Array, Array]:
     variance = squares.var(axis=1) + np.einsum("nij,nji->n", 4 * bounded + 2 * rest, rest)
     trace, square = np.einsum("nii->n", rest), np.einsum("nij,nji->n", rest, rest)
     return np.asarray(18 / variance), np.asarray((trace**2 + 2 * square) / 15)
+
+
+def memory_shares(robot: RobotDescription, span: float) -> Array:
+    """Return shares (2, n) of the channels' pressures, as `even_variance` takes them.
+
+    `span`, in Pa, is the range within which pressures move; see `History.remembered_shares`.
+    """
+    return np.array([
+        np.concatenate([
+            (segment.history or NO_HISTORY).remembered_shares(segment.n_channels, within)
+            for segment in robot.segments
+        ])
+        for within in (0.0, span)
+    ])  # fmt: skip
 
 
 def squared_radius(level: float, degrees_of_freedom: float, shape: float = 3.0) -> float:

@@ -248,7 +248,7 @@ def _leaning(task: Task, item: SceneObject, margin: float) -> Task:
 
 
 def _is_at_base(robot: Manipulator, task: Task, item: SceneObject) -> bool:
-    """Whether an object is too near to the arm's base: within the clearance of the task's scene."""
+    """Return True if the arm's base is nearer to an object than the scene's clearance allows."""
     assert task.scene is not None
     try:
         item.shape.check_against(robot.description, task.scene.clearance)
