@@ -164,6 +164,8 @@ class CorrectionTuning:
     long_time: float = 5.0
     time: float = 1.0  # of the latest motion, as plans follow the offset, in s
     release: float = 0.01  # growth once the arm is stiff, in m/s
+    # time after its motion in which an arm that does not vibrate is still bounded, in s
+    rests: float = 0.2
 
 
 @dataclass(frozen=True)
@@ -382,14 +384,14 @@ class PushTuning:
 
     time: float = 0.3  # in which it displaces the tip, in s
     # for which changes of pressure move an arm that vibrates, and after which they begin to, in s
-    acting: float = 0.7
+    acting: float = 0.6
     late: float = 0.1
-    steady: float = 0.2  # time at the beginning in which the speed of a steady change is seen, in s
+    steady: float = 0.3  # time at the beginning in which the speed of a steady change is seen, in s
     least: float = 2e-3  # least displacement, in m
     moves: float = 0.3  # least share of it by which the tip moves
     # displacement over all that the pressures can have moved the tip, and length added to that, in
     # m: for faults that was 1.5 at most
-    share: float = 1.75
+    share: float = 1.6
     noise: float = 1e-3
     # turn of the tip by a push: its least size, in rad; share of it that may be missing; multiple
     # of it up to which a push may turn the tip further
@@ -712,6 +714,9 @@ class ControlTuning:
     first_motion: FirstMotionTuning = field(default_factory=FirstMotionTuning)
     feedback: FeedbackTuning = field(default_factory=FeedbackTuning)
     correction: CorrectionTuning = field(default_factory=CorrectionTuning)
+    rigid_correction: CorrectionTuning = field(
+        default_factory=lambda: CorrectionTuning(share=0.25, most=math.inf, release=0.02)
+    )
     motion_error: MotionErrorTuning = field(default_factory=MotionErrorTuning)
     # of a step, which goes one way and soon ends: its offsets count more, for smaller changes
     step_error: MotionErrorTuning = field(
