@@ -142,28 +142,6 @@ def test_a_push_is_met_slowly_only_while_the_arm_becomes_stiff(changes):
     assert way < 5.5e-3 if changes else way > 7e-3
 
 
-def test_an_arm_without_inertia_makes_up_for_a_late_tracker_only_by_some_millimetres():
-    """What lags behind looks like an offset; it is bounded in motion, and met in full at rest."""
-    bench = Bench(HANGING, "quasi-static")
-    bench.settled(duration=3.0)
-    arm, controller, ways = bench.controller._arm, bench.controller, []
-    bench.rig.world.inject("tracker", "lagging")
-    bench.run(4.0)
-    place = bench.pose_at(np.array([0.2, 0.9, 0.6, 0.5, 0.3, 0.2]) * BAR)[:3, 3]
-    controller._arm.watch.begin()
-    controller.set_task(bench.task(position=tuple(map(float, place))))
-    for _ in range(40):
-        bench.run(bench.period)
-        meant = arm.at_waypoint(controller._reference.path[: bench.n]).pose[:3, 3]
-        ways.append(np.linalg.norm(arm.at_waypoint(bench.command).pose[:3, 3] - meant))
-    assert controller._correction.largest < 15e-3
-    assert max(ways) < 15e-3
-    bench.run(2.0, steer=False)
-    controller.set_task(bench.task(position=tuple(map(float, bench.tip[:3, 3]))))
-    bench.run(1.0)
-    assert controller._correction.largest > 15e-3
-
-
 def test_a_push_is_met_in_full_where_the_way_to_stiffness_is_blocked(monkeypatch):
     """No plan follows the offset there, so the bound would leave the tip off for good."""
     bench = Bench(HANGING, "full")

@@ -164,8 +164,6 @@ class CorrectionTuning:
     long_time: float = 5.0
     time: float = 1.0  # of the latest motion, as plans follow the offset, in s
     release: float = 0.01  # growth once the arm is stiff, in m/s
-    # time after its motion in which an arm that does not vibrate is still bounded, in s
-    rests: float = 0.2
 
 
 @dataclass(frozen=True)
@@ -714,9 +712,6 @@ class ControlTuning:
     first_motion: FirstMotionTuning = field(default_factory=FirstMotionTuning)
     feedback: FeedbackTuning = field(default_factory=FeedbackTuning)
     correction: CorrectionTuning = field(default_factory=CorrectionTuning)
-    rigid_correction: CorrectionTuning = field(
-        default_factory=lambda: CorrectionTuning(share=0.25, most=math.inf, release=0.02)
-    )
     motion_error: MotionErrorTuning = field(default_factory=MotionErrorTuning)
     # of a step, which goes one way and soon ends: its offsets count more, for smaller changes
     step_error: MotionErrorTuning = field(
