@@ -12,8 +12,8 @@ import pytest
 
 from simulated_loop import PERIOD, TASK, Lab
 from stiffopt.control.interface import Notice
+from stiffopt.control.noticing_tuning import TrackerTuning
 from stiffopt.control.state import State
-from stiffopt.control.tuning import TrackerTuning
 from stiffopt.errors import CommandError, InputError
 from stiffopt.model.robot_files import load_description
 from stiffopt.optimise.target import Target

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from conftest import is_long
 from stiffopt.control.interface import SampleCounts
+from stiffopt.control.noticing_tuning import TrackerTuning
 from stiffopt.control.tracker_watch import Sight, TrackerWatch
-from stiffopt.control.tuning import TrackerTuning
 from stiffopt.model.history import History
 from stiffopt.model.robot_files import load_description
 from stiffopt.rig.interface import PoseSample, PressureLimits, PressureReading
