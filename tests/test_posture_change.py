@@ -9,8 +9,9 @@ import pytest
 
 import stiffopt as so
 from stiffopt.control.forecast import Forecast, Present
+from stiffopt.control.plan import PlanRequest
 from stiffopt.control.planner import InlinePlanner
-from stiffopt.control.planning import Planning, PlanRequest, model_target
+from stiffopt.control.planning import Planning, model_target
 from stiffopt.control.replanning import Pursuit
 from stiffopt.control.tuning import ForecastTuning
 from stiffopt.model.scene import Scene

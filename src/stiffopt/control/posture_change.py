@@ -9,17 +9,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from stiffopt.arrays import Array
+from stiffopt.control.nearest_search import NearestSearch
+from stiffopt.control.plan import Plan, PlanRequest
 from stiffopt.control.tuning import FeedbackTuning, PlanningTuning
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.tip import TipModel
-
-if TYPE_CHECKING:
-    from stiffopt.control.planning import NearestSearch, Plan, PlanRequest
 
 
 @dataclass(frozen=True)
