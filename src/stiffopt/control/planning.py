@@ -238,10 +238,22 @@ class Planning:
             self._refused = 0
             return solution
         self._refused += 1
-        if self._refused <= self._tuning.patience:
+        is_due = self._refused % (self._tuning.patience + 1) == 0
+        if not is_due or not self._leads_to(last, solution, target):
             return None
         self._refused = 0
         return solution
+
+    def _leads_to(self, last: Plan, solution: PressureSolution, target: Target) -> bool:
+        """Return whether the arm may go from the last plan to another configuration.
+
+        Without a way that stays at the target the tip would leave it, by centimetres for seconds.
+        It may go all the same if it is not at the target now.
+        """
+        here, there = last.pressures, np.asarray(solution.pressures)
+        _, distance, angle = self._search.find(target, self._limits, here)
+        is_off = distance > _REACHED.position or angle > _REACHED.angle
+        return is_off or bool(self._changes.way_on(target, self._limits, here, there))
 
     def _is_distant(self, last: Plan, pressures: Array, target: Target) -> bool:
         """Return True if pressures (n,) are too far from the last plan for one configuration."""
@@ -310,6 +322,8 @@ class Planning:
         if other is None or other.pressures is None:
             return solution
         if (other.stiffness or 0.0) <= (1 + self._advantage) * (solution.stiffness or 0.0):
+            return solution
+        if not self._leads_to(last, other, target):
             return solution
         self._advantage *= 2
         return other

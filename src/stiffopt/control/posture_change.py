@@ -132,7 +132,7 @@ class PostureChanges:
         """Return the next pressures (n,) on the way to others (n,), in Pa.
 
         The change is slower while the offset changes. If the way comes no nearer to its end, the
-        arm goes there straight, as slowly, and feedback keeps the tip at its target.
+        arm goes there straight, as slowly.
         """
         change, tuning, way = self._change, self._tuning, end - last.pressures
         assert change is not None  # there is a change under way
