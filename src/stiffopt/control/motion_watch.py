@@ -29,8 +29,8 @@ from typing import NamedTuple
 import numpy as np
 
 from stiffopt.arrays import Array
+from stiffopt.control.noticing_tuning import DriftScale, MotionTuning
 from stiffopt.control.tip_errors import turn_of_a_push
-from stiffopt.control.tuning import DriftScale, MotionTuning
 from stiffopt.model.description import RobotDescription
 from stiffopt.optimise.tip import TipAt
 
