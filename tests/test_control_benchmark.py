@@ -88,6 +88,15 @@ def test_a_case_is_what_the_bars_say_and_its_truth_is_that_of_the_arm():
     assert choice.least < case.truth.stiffness(aim.drawn, direction) < choice.most * (1 + 1e-9)
 
 
+def test_arms_and_steps_may_be_other_ones():
+    given = {"robot_file": "stiff-flop-2", "modulus": 0.85, "steps": (0.05, 0.11)}
+    case = draw_case(3, targets=1, ranked=False, **given)
+    assert case.believed.name == "stiff-flop-2"
+    assert case.description.plant.mismatch.modulus == (0.85, 0.85)
+    step = case.aims[0].position - case.arm().settled(np.zeros(6))
+    assert 0.05 <= np.linalg.norm(step) <= 0.11
+
+
 def test_feedback_beats_the_model_alone_and_the_table_says_so(short_steps):
     case = drawn()
 

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from stiffopt import lie
 from stiffopt.control.motion_watch import Doubt, MotionWatch
+from stiffopt.control.noticing_tuning import MotionTuning
 from stiffopt.control.tip_errors import turn_of_a_push
-from stiffopt.control.tuning import MotionTuning
 from stiffopt.model.manipulator import load_robot
 from stiffopt.optimise.tip import TipModel
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from stiffopt.control.noticing_tuning import PushTuning
 from stiffopt.control.push_watch import PushWatch
 from stiffopt.control.tip_errors import turn_of_a_push
-from stiffopt.control.tuning import PushTuning
 from stiffopt.model.manipulator import load_robot
 from stiffopt.optimise.tip import TipModel
 from stiffopt.plant.settings import PlantLoad

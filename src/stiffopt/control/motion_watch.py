@@ -29,9 +29,9 @@ from typing import NamedTuple
 import numpy as np
 
 from stiffopt.arrays import Array
+from stiffopt.control.noticing_tuning import DriftScale, MotionTuning
 from stiffopt.control.push_watch import PushWatch
 from stiffopt.control.tip_errors import turn_of_a_push
-from stiffopt.control.tuning import DriftScale, MotionTuning
 from stiffopt.model.description import RobotDescription
 from stiffopt.optimise.tip import TipAt
 
@@ -324,8 +324,9 @@ class MotionWatch:
             )
         return Doubt(
             "no-response",
-            f"{text} in another direction: channels are swapped, the tracker's frame is turned, "
-            "the sensor has slipped, or something pushes the arm; run 'stiffopt commission'",
+            f"{text} in another direction: channels are swapped, one does not get its pressure, the "
+            "tracker's frame is turned, the sensor has slipped, or something pushes the arm; run "
+            "'stiffopt commission'",
         )
 
     def _notice_push(self, jacobian: Array, turning: TipAt | None) -> None:

@@ -15,8 +15,8 @@ import math
 import numpy as np
 
 from stiffopt.arrays import Array
+from stiffopt.control.noticing_tuning import PushTuning
 from stiffopt.control.tip_errors import turn_of_a_push
-from stiffopt.control.tuning import PushTuning
 from stiffopt.optimise.tip import TipAt
 
 
