@@ -30,6 +30,7 @@ import numpy as np
 
 from stiffopt.arrays import Array
 from stiffopt.control.noticing_tuning import DriftScale, MotionTuning
+from stiffopt.control.push_watch import PushWatch
 from stiffopt.control.tip_errors import turn_of_a_push
 from stiffopt.model.description import RobotDescription
 from stiffopt.optimise.tip import TipAt
@@ -66,6 +67,10 @@ class _Miss(NamedTuple):
     error: float  # of the model, as a share of the motion by the segments
 
 
+def _share_of(miss: _Miss) -> float:
+    return miss.share
+
+
 class MotionWatch:
     """Compares the tip's motion with that of the model and of the reference.
 
@@ -75,6 +80,8 @@ class MotionWatch:
         The arm.
     tuning :
         Sizes and times of the tests.
+    vibrates :
+        Whether the arm has inertia.
 
     Attributes
     ----------
@@ -83,7 +90,9 @@ class MotionWatch:
         certain.
     """
 
-    def __init__(self, robot: RobotDescription, tuning: MotionTuning) -> None:
+    def __init__(
+        self, robot: RobotDescription, tuning: MotionTuning, *, vibrates: bool = True
+    ) -> None:
         self._tuning = tuning
         self._min_motion = max(tuning.least_motion, tuning.least_motion_share * robot.length)
         ends = np.cumsum([segment.n_channels for segment in robot.segments]).tolist()
@@ -92,6 +101,7 @@ class MotionWatch:
         self._kept = round(longest / tuning.spacing) + 2
         width = _PRESSURES.start + ends[-1]  # of a row; see `_TIME` and the others
         self._rows: Array = np.empty((2 * self._kept, width))
+        self._pushes = PushWatch(tuning.pushes, vibrates=vibrates)
         self.begin()
 
     def begin(self) -> None:
@@ -105,6 +115,7 @@ class MotionWatch:
         self._path = 0.0  # length of the way of r, in m
         self._intended: deque[tuple[float, Array]] = deque(maxlen=self._kept)
         self._swings = [_Swings(self._tuning) for _ in range(3)]
+        self._pushes.begin()
         self.doubt: Doubt | None = None
         self.pace = 1.0
         # motion of the tip by each segment so far, in m; largest error of the model in it, as a
@@ -116,6 +127,7 @@ class MotionWatch:
         """Continue after a pause in which the arm was not controlled, or not seen."""
         self._intended.clear()
         self._unproven.clear()
+        self._pushes.begin()
         self._misses = 0
         self._slips.clear()
         self._jumps.clear()
@@ -194,7 +206,8 @@ class MotionWatch:
         for axis, error in zip(self._swings, (seen - intended).tolist(), strict=True):
             axis.take(_Turn(time, error, self._path))
         jacobian = tip.pose[:3, :3] @ tip.jacobian[:3]
-        self.doubt = self._no_response(jacobian, tip.pose[:3, 2])
+        turning = None if turned is None else tip
+        self.doubt = self._no_response(jacobian, tip.pose[:3, 2], turning)
         if turned is None:
             self._known_from = math.inf
             self._jumps.clear()
@@ -202,7 +215,6 @@ class MotionWatch:
             self._known_from = min(self._known_from, time)
         if self._known_from <= time:
             self.doubt = self.doubt or self._slip(jacobian, tip)
-        turning = None if turned is None else tip
         if turning is not None:
             self.doubt = self.doubt or self._jump(jacobian, turning)
         self.doubt = self.doubt or self._drift(jacobian, turning) or self._swing()
@@ -275,20 +287,26 @@ class MotionWatch:
             self._error = max(self._error, error)
             self._verified += moved
 
-    def _no_response(self, jacobian: Array, axis: Array) -> Doubt | None:
+    def _no_response(self, jacobian: Array, axis: Array, turning: TipAt | None) -> Doubt | None:
         """Test whether the tip has not moved although the model has, or has moved elsewhere.
 
         Motion is compared in space, and then without its part along the tip's axis (3,), so that a
-        long elongation does not hide a wrong direction across it.
+        long elongation does not hide a wrong direction across it. After a push in motion it is
+        compared again without what the push explains, as the turn shows it.
         """
         rows, missed = self._since(self._tuning.response_window), None
+        self._notice_push(jacobian, turning)
         ways = rows[-1, _PREDICTED] - rows[:-1, _PREDICTED]
         if ((ways**2).sum(axis=1) > self._min_motion**2).any():  # projections are no longer
             across = np.eye(3) - np.outer(axis, axis)
             steps = self._by_segments(np.diff(rows, axis=0), jacobian)
             found = [self._missed(rows, steps, P) for P in (np.eye(3), across)]
-            missed = max(found, key=lambda miss: miss.share)
+            missed = max(found, key=_share_of)
             self._learn(float(rows[-1, _TIME]), found[0].error, steps[-1])
+            if turning is not None and self._pushes.acts(float(rows[-1, _TIME])):
+                rest = self._without_push(rows, turning)
+                left = [self._missed(rest, steps, P) for P in (np.eye(3), across)]
+                missed = min(missed, max(left, key=_share_of), key=_share_of)
         share = 0.0 if missed is None else missed.share
         usual = self._tuning.usual_share
         self.pace = min(max((1 - share) / (1 - usual), 0.0), 1.0)
@@ -306,9 +324,27 @@ class MotionWatch:
             )
         return Doubt(
             "no-response",
-            f"{text} in another direction: channels are swapped, the tracker's frame is turned, "
-            "the sensor has slipped, or something pushes the arm; run 'stiffopt commission'",
+            f"{text} in another direction: channels are swapped, one does not get its pressure, the "
+            "tracker's frame is turned, the sensor has slipped, or something pushes the arm; run "
+            "'stiffopt commission'",
         )
+
+    def _notice_push(self, jacobian: Array, turning: TipAt | None) -> None:
+        """Look for a push that begins or ends while the pressures change."""
+        if turning is None:
+            return
+        rows = self._since(self._tuning.pushes.acting)
+        seen, turned = rows[:, _SEEN], rows[:, _TURNED]
+        away, pressures = seen - rows[:, _PREDICTED], rows[:, _PRESSURES]
+        if self._pushes.take(rows[:, _TIME], seen, away, turned, pressures, jacobian, turning):
+            self._forget()
+
+    def _without_push(self, rows: Array, turning: TipAt) -> Array:
+        """Return samples (k, 21 + n) without the displacement by a push, as the turn shows it."""
+        rest = rows.copy()
+        away = rows[:, _SEEN] - rows[:, _PREDICTED]
+        rest[:, _SEEN] += self._pushes.displacements(away, rows[:, _TURNED], turning)
+        return rest
 
     def _missed(self, rows: Array, by_segments: Array, P: Array) -> _Miss:
         """Return where the model's way and the seen one, projected by P (3, 3), fit least.

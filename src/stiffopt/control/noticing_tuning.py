@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 
 @dataclass(frozen=True)
@@ -37,6 +37,29 @@ class DriftScale:
 
 
 @dataclass(frozen=True)
+class PushTuning:
+    """When a displacement of the tip in motion is a push (`PushWatch`)."""
+
+    time: float = 0.3  # in which it displaces the tip, in s
+    # for which changes of pressure move an arm that vibrates, and after which they begin to, in s
+    acting: float = 0.6
+    late: float = 0.1
+    steady: float = 0.3  # time at the beginning in which the speed of a steady change is seen, in s
+    least: float = 2e-3  # least displacement, in m
+    moves: float = 0.3  # least share of it by which the tip moves
+    # displacement over all that the pressures can have moved the tip, and length added to that, in
+    # m: for faults that was 1.5 at most
+    share: float = 1.6
+    noise: float = 1e-3
+    # turn of the tip by a push: its least size, in rad; share of it that may be missing; multiple
+    # of it up to which a push may turn the tip further
+    least_turn: float = 0.02
+    turn: float = 0.3
+    further: float = 2.0
+    lasts: float = 1.0  # time after that in which the arm swings, in s
+
+
+@dataclass(frozen=True)
 class MotionTuning:
     """Thresholds for doubting the tip's motion (`MotionWatch`)."""
 
@@ -52,6 +75,7 @@ class MotionTuning:
     # again: a payload may change its response
     push: float = 8e-4
     push_time: float = 0.25
+    pushes: PushTuning = field(default_factory=PushTuning)  # of pushes in motion
     noise: float = 1e-3  # of a measured motion, in m
     scatter: float = 5e-5  # standard deviation of a tracked position in each axis, in m
     # shortest way for a test of the response: in m, and as a share of the arm's length

@@ -78,7 +78,7 @@ class ArmObserver:
                 tuning.creep,
             ),
         )
-        self.watch = MotionWatch(robot.description, tuning.motion)
+        self.watch = MotionWatch(robot.description, tuning.motion, vibrates=mode is not None)
         self.model: ArmModel | None = None
         self._now, self._modelled_at = 0.0, np.zeros(n)
 
