@@ -120,7 +120,7 @@ class TipController:
         unbounded = {} if slow_first_motion else {"slew_share": math.inf, "correction": math.inf}
         self._first_motion = FirstMotion(replace(tuning.first_motion, **unbounded))
         self._way_to_target = WayToTarget(setup, self._arm)
-        self._correction = CorrectionBound(tuning.correction, period)
+        self._correction = CorrectionBound(tuning.correction, period, vibrates=vibrates)
         self._requests = Requests(setup)
         Planner = ProcessPlanner if plan_in_process else InlinePlanner
         self.replanner = Replanner(Planner(robot, scene), tuning.replanning, period, dead_time)
@@ -374,8 +374,8 @@ class TipController:
         if now - self._went_back_at > self._tuning.adaptation.blind_time:
             self._arm.watch.intend(now, tip.pose[:3, 3] + reference.path[n : n + 3])
         course = self.replanner.pursuit.course
-        is_bounded = course is None and self.replanner.stiffens
-        self._correction.take(tip.pose[:3, 3], applies=is_bounded)
+        is_bounded = self.replanner.stiffens if self._vibrates else moves
+        self._correction.take(tip.pose[:3, 3], applies=course is None and is_bounded)
         if self._arm.channels.pace == 0 and self._ways and moves:
             return self._feedforward(self._without_feedback, last)
         bent = self._bend(None if isinstance(course, PostureCourse) else self.replanner.bent)

@@ -155,7 +155,7 @@ class FirstMotionTuning:
 
 @dataclass(frozen=True)
 class CorrectionTuning:
-    """Bound of corrections while the arm becomes stiff (`CorrectionBound`)."""
+    """Bound of corrections while the arm goes to its pressures (`CorrectionBound`)."""
 
     least: float = 3e-3  # of the tip's position at rest, in m
     share: float = 0.2  # of the latest motion of the tip on the reference, added to it
@@ -165,7 +165,9 @@ class CorrectionTuning:
     share_of_long: float = 0.17
     long_time: float = 5.0
     time: float = 1.0  # of the latest motion, as plans follow the offset, in s
-    release: float = 0.01  # growth once the arm is stiff, in m/s
+    # growth once the bound does not apply, with and without inertia, in m/s
+    release: float = 0.01
+    release_without_inertia: float = 0.02
 
 
 @dataclass(frozen=True)
