@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from stiffopt.control.noticing_tuning import PushTuning
+from stiffopt.control.motion_watch import MotionWatch
+from stiffopt.control.noticing_tuning import MotionTuning, PushTuning
 from stiffopt.control.push_watch import PushWatch
 from stiffopt.control.tip_errors import turn_of_a_push
 from stiffopt.model.manipulator import load_robot
@@ -105,3 +106,15 @@ def test_a_push_that_begins_or_ends_with_a_new_target_is_not_doubted(ends: bool)
     bench.controller.set_task(bench.task(position=tuple(map(float, place))))
     bench.run(1.5)
     assert bench.controller._arm.watch.doubt is None
+
+
+@pytest.mark.parametrize("again", [False, True])
+def test_the_swings_before_a_push_do_not_count(monkeypatch, again: bool) -> None:
+    """An arm that goes on to be shaken does swing."""
+    watch = MotionWatch(load_robot("stiff-flop-2-hanging").description, MotionTuning())
+    monkeypatch.setattr(watch._pushes, "acts", lambda _: again)
+    monkeypatch.setattr(watch._pushes, "take", lambda *_: True)
+    before, place = watch._swings, TIP.pose[:3, 3]
+    watch.intend(0.0, place)
+    watch.take(0.0, place, place, np.zeros(6), np.full(6, 4e4), TIP, turned=np.zeros(3))
+    assert (watch._swings is before) is again

@@ -324,9 +324,9 @@ class MotionWatch:
             )
         return Doubt(
             "no-response",
-            f"{text} in another direction: channels are swapped, one does not get its pressure, the "
-            "tracker's frame is turned, the sensor has slipped, or something pushes the arm; run "
-            "'stiffopt commission'",
+            f"{text} in another direction: channels are swapped, one does not get its pressure, "
+            "the tracker's frame is turned, the sensor has slipped, or something pushes the arm; "
+            "run 'stiffopt commission'",
         )
 
     def _notice_push(self, jacobian: Array, turning: TipAt | None) -> None:
@@ -336,8 +336,11 @@ class MotionWatch:
         rows = self._since(self._tuning.pushes.acting)
         seen, turned = rows[:, _SEEN], rows[:, _TURNED]
         away, pressures = seen - rows[:, _PREDICTED], rows[:, _PRESSURES]
+        acted = self._pushes.acts(float(rows[-1, _TIME]))
         if self._pushes.take(rows[:, _TIME], seen, away, turned, pressures, jacobian, turning):
             self._forget()
+            if not acted:  # the arm swings anew
+                self._swings = [_Swings(self._tuning) for _ in range(3)]
 
     def _without_push(self, rows: Array, turning: TipAt) -> Array:
         """Return samples (k, 21 + n) without the displacement by a push, as the turn shows it."""
