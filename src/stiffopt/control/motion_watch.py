@@ -471,8 +471,9 @@ class MotionWatch:
         return Doubt(
             "slip",
             f"the tip seems to have been displaced by {1e3 * distance:.1f} mm without being "
-            "turned, which no push or payload does: the sensor has slipped, or tracker or base "
-            "have been moved; run 'stiffopt commission'",
+            "turned, which no push or payload does: the sensor has slipped, tracker or base have "
+            "been moved, or, after a motion, a line is kinked or the tracker late; run "
+            "'stiffopt commission'",
         )
 
     def _missed_turn(self, bent: Array, turned: Array) -> float:
@@ -506,8 +507,9 @@ class MotionWatch:
                 return Doubt(
                     "drift",
                     f"the tip seems to move on at {1e3 * speed:.1f} mm/s although its pressures do "
-                    "not explain it: the sensor slips or has come off, the tracker drifts, or "
-                    "something pushes the arm; look at it, then set the task again",
+                    "not explain it: the sensor slips or has come off, the tracker drifts, "
+                    "something pushes the arm, or, after a motion, a line is kinked; look at it, "
+                    "then set the task again",
                 )
         return None
 
