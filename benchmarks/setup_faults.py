@@ -183,6 +183,26 @@ def frame_of_one_log(robot: RobotDescription, rng: np.random.Generator) -> Fault
     return Fault(edited=in_one(int(rng.integers(FITTED)), turn, shift), told=("defined anew",))
 
 
+def body_of_one_log(robot: RobotDescription, rng: np.random.Generator) -> Fault:
+    """The tip's body was defined anew in one log, turned by 20 to 60 degrees and moved by 20 mm."""
+    axis, far = rng.normal(size=(2, 3))
+    angle, which = np.radians(rng.uniform(20, 60)), int(rng.integers(FITTED))
+    turn = Rotation.from_rotvec(angle * axis / np.linalg.norm(axis))
+    shift = 0.02 * far / np.linalg.norm(far)
+
+    def anew(log: Log) -> Log:
+        assert log.tip_quaternion is not None
+        body = Rotation.from_quat(log.tip_quaternion, scalar_first=True)
+        return replace(
+            log,
+            tip_position=log.tip_position + body.apply(shift),
+            tip_quaternion=(body * turn).as_quat(scalar_first=True),
+        )
+
+    told = "the body 'tip' was defined anew"
+    return Fault(edited=lambda right: one_changed(right, which, anew), told=(told,))
+
+
 def units(robot: RobotDescription, rng: np.random.Generator) -> Fault:
     """The pressures of all logs have another unit."""
     unit = list(UNITS)[int(rng.integers(len(UNITS)))]
@@ -243,6 +263,7 @@ FAULTS: dict[str, Callable[[RobotDescription, np.random.Generator], Fault]] = {
     "frame of one log": frame_of_one_log,
     "units": units,
     "clocks": clocks,
+    "body of one log": body_of_one_log,
 }
 ONLY_CALIBRATED = ("axes",)  # `validate` sees one log: the same as `axes of one log`
 

@@ -10,6 +10,7 @@ import numpy as np
 from stiffopt import lie
 from stiffopt.arrays import Array
 from stiffopt.identify.detection import idle_channels
+from stiffopt.identify.frames import FrameComparer, MovedFrame
 from stiffopt.identify.hypotheses import Comparer, Hypothesis, best_lines, found_wrong
 from stiffopt.identify.settings import DETECTION
 from stiffopt.identify.setup import Setup
@@ -26,21 +27,45 @@ def put_right(setup: Setup) -> Setup:
     """
     comparer, lines = _comparer(setup), set[int]()
     for _ in range(DETECTION.faults):
+        again = "with that corrected, " if setup.found else ""
         found = found_wrong(comparer, setup.description, setup.settings.keep)
-        if found is None:
+        corrected = setup if found is None else _under(setup, found.hypothesis, comparer.low)
+        frame = None
+        if found is None or len(set(found.hypothesis.turns)) > 1:
+            frame = _moved_frame(setup, corrected)
+        if frame is not None:
+            recordings = frame.motion.applied(setup.recordings)
+            corrected = Setup.of(setup.description, recordings, setup.tables, setup.settings)
+            told = f"{frame.told(setup.recordings)}; --keep axes leaves it as it was recorded"
+        elif found is not None:
+            told = (
+                f"{found.hypothesis.told(setup.description, [e.name for e in setup.recordings])}; "
+                f"the robot file's arm then misses the tip by {found.then * 1e3:.1f} mm instead of "
+                f"{found.as_is * 1e3:.1f} mm, however soft it is; --keep {found.hypothesis.kind} "
+                "leaves that as it was recorded"
+            )
+            if found.hypothesis.kind == "lines":
+                lines |= {*found.hypothesis.wrong, *found.hypothesis.wrong.values()}
+        else:
             break
-        told = found.hypothesis.told(setup.description, [each.name for each in setup.recordings])
-        remark = (
-            f"{'with that corrected, ' if setup.found else ''}{told}; the robot file's arm then "
-            f"misses the tip by {found.then * 1e3:.1f} mm instead of {found.as_is * 1e3:.1f} mm, "
-            f"however soft it is; --keep {found.hypothesis.kind} leaves that as it was recorded"
-        )
-        corrected = _under(setup, found.hypothesis, comparer.low)
-        setup = replace(corrected, found=(*setup.found, remark))
+        setup = replace(corrected, found=(*setup.found, again + told))
         comparer = _comparer(setup)
-        if found.hypothesis.kind == "lines":
-            lines |= {*found.hypothesis.wrong, *found.hypothesis.wrong.values()}
     return _with_idle_channels(setup, comparer, lines)
+
+
+def _moved_frame(setup: Setup, corrected: Setup) -> MovedFrame | None:
+    """Return the motion of some logs that undoes a new definition of their frame or of a body.
+
+    None if there is none, or if logs that are corrected otherwise, as by quarter turns of the axes,
+    fit nearly as well.
+    """
+    if "axes" in setup.settings.keep or len(setup.recordings) < 2:
+        return None
+    found = FrameComparer(setup).found()
+    if found is None or corrected is setup:
+        return found
+    left = FrameComparer(corrected).score()
+    return found if found.score < DETECTION.overwhelming * left else None
 
 
 def _comparer(setup: Setup) -> Comparer:

@@ -361,6 +361,11 @@ class DetectionSettings:
     rest : largest pressure of a pose near rest, as a share of that range.
     in_line : spread of poses across a line, as a share of that along it, up to which they count as
         poses on a line.
+    frame_softness : factors on pressures of the arm with which logs are compared with each other.
+    frame_ridge : of the correction of its shape, relative to one of the whole length in each row.
+    frame_lever : distance from a body's origin, in lengths of the arm, of the points on its axes by
+        which poses are compared.
+    frame_angle : by how much orientations may fit worse after a motion of the frame, in rad.
     known_turn : spread of the tip, in lengths of the arm, that determines a turn.
     ridge : added to the diagonal of the normal equations of regressions.
     clock_rows : number of rows in the regression for the clocks.
@@ -408,6 +413,10 @@ class DetectionSettings:
     apart: float = 0.1
     rest: float = 0.15
     in_line: float = 0.3
+    frame_softness: tuple[float, ...] = (1.0, 0.6, 1.7)
+    frame_ridge: float = 0.01
+    frame_lever: float = 0.25
+    frame_angle: float = float(np.radians(3.0))
     known_turn: float = 0.02
     ridge: float = 0.01
     clock_rows: int = 600

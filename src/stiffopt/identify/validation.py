@@ -16,7 +16,8 @@ from stiffopt.identify.detection import idle_channels
 from stiffopt.identify.discrepancy import centres
 from stiffopt.identify.error_model import held_for, in_turn, is_moving
 from stiffopt.identify.fit import fit
-from stiffopt.identify.hypotheses import Hypothesis, of_channels, replaced
+from stiffopt.identify.frames import replaced
+from stiffopt.identify.hypotheses import Hypothesis, of_channels
 from stiffopt.identify.problem import CalibrationProblem, Noise, Predicted, Sample
 from stiffopt.identify.recording import Recording
 from stiffopt.identify.results import Comparison
