@@ -23,7 +23,7 @@ from stiffopt.errors import EquilibriumError, PressureError
 from stiffopt.identify.detection import lagged_pressures
 from stiffopt.identify.discrepancy import centres
 from stiffopt.identify.hypotheses import Hypothesis, moved, of_channels, turn_text
-from stiffopt.identify.recording import Recording, Track
+from stiffopt.identify.recording import FRAME, Recording, Track
 from stiffopt.identify.settings import DETECTION
 from stiffopt.identify.setup import Setup
 from stiffopt.identify.tracker_faults import CUBE_ROTATIONS, mean_rotation, whole
@@ -60,14 +60,14 @@ class Motion:
 
     def _moved(self, recording: Recording) -> Recording:
         if self.track is None:
-            return moved(recording, self.rotation, self.shift)
+            return replace(moved(recording, self.rotation, self.shift), anew=FRAME)
         own = recording.tracks[self.track]
         assert own.rotation is not None
         turned = Track(
             own.name, own.position + own.rotation @ self.shift, own.rotation @ self.rotation
         )
         tracks = (*recording.tracks[: self.track], turned, *recording.tracks[self.track + 1 :])
-        return replace(recording, tracks=tracks)
+        return replace(recording, tracks=tracks, anew=own.name)
 
     def told(self, recordings: Sequence[Recording]) -> str:
         """Describe the motion, as the beginning of a sentence."""

@@ -134,6 +134,8 @@ class StartSettings:
     dead_band : as a share of the highest recorded pressure.
     turns : turns of the base from which fits start, in rad, if its turn is unknown.
     moduli : coordinates of the moduli from which fits start, in prior deviations.
+    anew_position, anew_angle : prior deviations of a log's frame or body after it was found to be
+        defined anew, and moved back, in lengths of the arm and in rad.
     position_noise, angle_noise : expected model error in the first fit, in lengths of the arm and
         in rad.
     """
@@ -149,6 +151,8 @@ class StartSettings:
     dead_band: float = 0.05
     turns: tuple[float, ...] = (0.0, 2 * np.pi / 3, -2 * np.pi / 3, np.pi)
     moduli: tuple[float, ...] = (0.0, -1.0, 1.0)
+    anew_position: float = 0.05
+    anew_angle: float = float(np.radians(5.0))
     position_noise: float = 0.01
     angle_noise: float = float(np.radians(3.0))
 
