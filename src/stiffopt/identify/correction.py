@@ -10,8 +10,8 @@ import numpy as np
 from stiffopt import lie
 from stiffopt.arrays import Array
 from stiffopt.identify.detection import idle_channels
-from stiffopt.identify.frames import FrameComparer, MovedFrame
-from stiffopt.identify.hypotheses import Comparer, Hypothesis, best_lines, found_wrong
+from stiffopt.identify.frames import FrameComparer, MovedFrame, OtherChannels
+from stiffopt.identify.hypotheses import Comparer, Found, Hypothesis, best_lines, found_wrong
 from stiffopt.identify.settings import DETECTION
 from stiffopt.identify.setup import Setup
 from stiffopt.identify.tracker_faults import CUBE_ROTATIONS
@@ -30,9 +30,11 @@ def put_right(setup: Setup) -> Setup:
         again = "with that corrected, " if setup.found else ""
         found = found_wrong(comparer, setup.description, setup.settings.keep)
         corrected = setup if found is None else _under(setup, found.hypothesis, comparer.low)
-        frame = None
-        if found is None or len(set(found.hypothesis.turns)) > 1:
-            frame = _moved_frame(setup, corrected)
+        frame = _moved_frame(setup, found)
+        if isinstance(frame, OtherChannels):
+            told = frame.told(setup.description, setup.recordings)
+            setup = replace(setup, found=(*setup.found, again + told))
+            break
         if frame is not None:
             recordings = frame.motion.applied(setup.recordings)
             corrected = Setup.of(setup.description, recordings, setup.tables, setup.settings)
@@ -53,19 +55,29 @@ def put_right(setup: Setup) -> Setup:
     return _with_idle_channels(setup, comparer, lines)
 
 
-def _moved_frame(setup: Setup, corrected: Setup) -> MovedFrame | None:
+def _moved_frame(setup: Setup, found: Found | None) -> MovedFrame | OtherChannels | None:
     """Return the motion of some logs that undoes a new definition of their frame or of a body.
 
-    None if there is none, or if logs that are corrected otherwise, as by quarter turns of the axes,
-    fit nearly as well.
+    None if there is none, or if a correction that was found otherwise explains the logs about as
+    well. Quarter turns of some logs explain them if neither a motion nor other channels in these
+    logs fit far better.
     """
-    if "axes" in setup.settings.keep or len(setup.recordings) < 2:
+    turns = () if found is None else found.hypothesis.turns
+    of_all = found is not None and len(set(turns)) == 1
+    if "axes" in setup.settings.keep or len(setup.recordings) < 2 or of_all:
         return None
-    found = FrameComparer(setup).found()
-    if found is None or corrected is setup:
-        return found
-    left = FrameComparer(corrected).score()
-    return found if found.score < DETECTION.overwhelming * left else None
+    comparer = FrameComparer(setup)
+    frame = comparer.found()
+    if found is None:
+        return frame
+    turned = comparer.turned(turns)
+    if isinstance(frame, MovedFrame) and frame.score < DETECTION.overwhelming * turned.score():
+        return frame
+    logs = tuple(i for i, turn in enumerate(turns) if turn)
+    channels = comparer.other_channels(logs)
+    if channels is not None and channels.left < DETECTION.tie * turned.left(logs):
+        return channels
+    return None
 
 
 def _comparer(setup: Setup) -> Comparer:

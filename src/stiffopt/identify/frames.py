@@ -12,6 +12,7 @@ evidence is not overwhelming, nothing is moved.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -27,6 +28,7 @@ from stiffopt.identify.recording import FRAME, Recording, Track
 from stiffopt.identify.settings import DETECTION
 from stiffopt.identify.setup import Setup
 from stiffopt.identify.tracker_faults import CUBE_ROTATIONS, mean_rotation, whole
+from stiffopt.model.description import RobotDescription
 from stiffopt.model.manipulator import Manipulator
 
 SHOWN = 5e-4
@@ -85,6 +87,10 @@ def motion_text(rotation: Array, shift: Array) -> str:
     if np.linalg.norm(shift) > SHOWN:
         words += f" and moved by {np.linalg.norm(shift) * 1e3:.0f} mm"
     return words
+
+
+NOWHERE = Motion((), None, np.eye(3), np.zeros(3))
+"""Moves no log."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,6 +184,32 @@ class MovedFrame:
         return words
 
 
+@dataclass(frozen=True, eq=False)
+class OtherChannels:
+    """Logs that have other channels than the others do, or other lines, rather than a moved frame.
+
+    `as_is`, `then`: mean misses of the tip without and with these; `left`: of its pose; `score`: as
+    of `FrameComparer`; in m.
+    """
+
+    logs: tuple[int, ...]
+    hypothesis: Hypothesis
+    as_is: float
+    then: float
+    left: float
+    score: float
+
+    def told(self, description: RobotDescription, recordings: Sequence[Recording]) -> str:
+        """Describe it, as a sentence."""
+        names = ", ".join(recordings[i].name for i in self.logs)
+        return (
+            f"{names} differs from the other logs: {self.hypothesis.told(description, ())}; the "
+            f"arm fitted to the others then misses the tip by {self.then * 1e3:.1f} mm instead of "
+            f"{self.as_is * 1e3:.1f} mm. This is not corrected: look at the columns of this log, "
+            "or leave it out"
+        )
+
+
 class FrameComparer:
     """Compares logs with each other, by the robot file's arm with a shape that is fitted to some.
 
@@ -230,11 +262,28 @@ class FrameComparer:
             return None
 
     def score(self) -> float:
-        """Return the RMS miss of the logs as they are by the arm fitted to all of them, in m."""
+        """Return the RMS miss of all logs by the arm fitted to them, in m."""
         everything = range(len(self._pressures))
-        nowhere = Motion((), None, np.eye(3), np.zeros(3))
-        scores = [self._tried(poses, everything, nowhere).score for poses in self._predicted]
+        scores = [self._tried(each, everything, NOWHERE).score for each in self._predicted]
         return min(scores, default=np.inf)
+
+    def turned(self, turns: Sequence[int]) -> FrameComparer:
+        """Return the comparer of the logs whose axes are turned; see `Hypothesis.turns`."""
+        self._predicted  # noqa: B018 - which is the same for both
+        other, to_base = copy(self), np.asarray(np.linalg.inv(self._setup.base))
+        motions = [Motion((i,), None, CUBE_ROTATIONS[k], np.zeros(3)) for i, k in enumerate(turns)]
+        other._recorded = [
+            _in_motion(self._between(motion, to_base), own)
+            for motion, own in zip(motions, self._recorded, strict=True)
+        ]
+        return other
+
+    def left(self, logs: tuple[int, ...]) -> float:
+        """Return the mean miss of some logs by the arm fitted to the others, in m."""
+        rest = [i for i in range(len(self._pressures)) if i not in logs]
+        tried = [self._tried(each, rest, NOWHERE) for each in self._predicted]
+        best = min(tried, key=lambda each: each.score)
+        return self._mean(best, best.recorded, self._off, logs)
 
     # the shape of the arm ----------------------------------------------------------------------
 
@@ -390,8 +439,11 @@ class FrameComparer:
                             tried[motion.track] = replace(found, softness=softness)
                 yield from tried.values()
 
-    def found(self) -> MovedFrame | None:
-        """Return the motion that the evidence proves; None if there is none or it is unclear."""
+    def found(self) -> MovedFrame | OtherChannels | None:
+        """Return the motion that the evidence proves; None if there is none or it is unclear.
+
+        Channels that explain the same logs as well are returned instead.
+        """
         ranked = sorted(self._all_tried(), key=lambda each: each.score)
         if not ranked or self.score() * DETECTION.tie < ranked[0].score:
             return None
@@ -401,23 +453,32 @@ class FrameComparer:
             same = each.motion.track == best.motion.track
             if same and set(each.motion.logs) == everything - set(best.motion.logs):
                 best = min(best, each, key=lambda either: either.far)  # the file's frame stays
+            elif each.motion.logs == best.motion.logs:
+                left, other = (self._mean(one, one.after, self._off) for one in (best, each))
+                if left > DETECTION.tie * other:
+                    return None
             elif best.score > DETECTION.tie * each.score:
                 return None
-        if not self._explains(best) or self._is_like_channels(best):
+        if not self._explains(best):
             return None
+        channels = self.other_channels(best.motion.logs, best.softness)
+        if channels is not None and best.score > DETECTION.tie * channels.score:
+            return channels
         tips = [self._mean(best, poses, _tip_distances) for poses in (best.recorded, best.after)]
         turned = [self._mean(best, poses, _angles) for poses in (best.recorded, best.after)]
-        motion = self._in_recordings(best.motion)
+        motion = self._between(best.motion, self._setup.base)
         return MovedFrame(motion, tips[0], tips[1], turned[0], turned[1], best.score)
 
     @staticmethod
     def _mean(
-        tried: _Tried, poses: Sequence[_Poses], measure: Callable[[_Poses, _Poses], Array]
+        tried: _Tried,
+        poses: Sequence[_Poses],
+        measure: Callable[[_Poses, _Poses], Array],
+        logs: Sequence[int] = (),
     ) -> float:
         """Return the mean of a measure between poses and the expected ones, over the moved logs."""
-        return float(
-            np.concatenate([measure(poses[i], tried.expected[i]) for i in tried.motion.logs]).mean()
-        )
+        logs = logs or tried.motion.logs
+        return float(np.concatenate([measure(poses[i], tried.expected[i]) for i in logs]).mean())
 
     def _explains(self, tried: _Tried) -> bool:
         """Return True if a motion is the reason why its logs are far off, at different poses.
@@ -455,33 +516,37 @@ class FrameComparer:
             and then <= turned + DETECTION.frame_angle
         )
 
-    def _is_like_channels(self, tried: _Tried) -> bool:
-        """Return True if other channels, or another line, in the same logs explain them as well."""
-        description, logs = self._setup.description, tried.motion.logs
-        low = np.maximum(description.pressure_min, 0.0)
-        factor, poses = DETECTION.frame_softness[tried.softness], self._predicted[tried.softness]
-        rest = [i for i in range(len(poses)) if i not in logs]
-        nowhere = Motion((), None, np.eye(3), np.zeros(3))
+    def other_channels(self, logs: tuple[int, ...], softness: int = 0) -> OtherChannels | None:
+        """Return the other channels, or line, that some logs alone are most likely to have.
 
-        def score(hypothesis: Hypothesis) -> float:
-            driven = [hypothesis.driven(self._pressures[i], low) for i in logs]
-            found = self._poses(factor, driven)
+        `softness` is the index of the factor on pressures. None if the arm bears none of these.
+        """
+        description = self._setup.description
+        low, factor = np.maximum(description.pressure_min, 0.0), DETECTION.frame_softness[softness]
+        rest = [i for i in range(len(self._pressures)) if i not in logs]
+        as_is = self._tried(self._predicted[softness], rest, NOWHERE)
+        tips = self._mean(as_is, as_is.recorded, _tip_distances, logs)
+        best: OtherChannels | None = None
+        for hypothesis in of_channels(description, 1):
+            found = self._poses(factor, [hypothesis.driven(self._pressures[i], low) for i in logs])
             if found is None:
-                return np.inf
-            other = list(poses)
+                continue
+            poses = list(self._predicted[softness])
             for i, each in zip(logs, found, strict=True):
-                other[i] = each
-            return self._tried(other, rest, nowhere).score
+                poses[i] = each
+            tried = self._tried(poses, rest, NOWHERE)
+            left = self._mean(tried, tried.recorded, self._off, logs)
+            if best is None or left < best.left:
+                then = self._mean(tried, tried.recorded, _tip_distances, logs)
+                best = OtherChannels(logs, hypothesis, tips, then, left, tried.score)
+        return best
 
-        return any(
-            tried.score > DETECTION.tie * score(each) for each in of_channels(description, 1)
-        )
-
-    def _in_recordings(self, motion: Motion) -> Motion:
-        """Return a motion in the frame of the recordings instead of the base."""
+    @staticmethod
+    def _between(motion: Motion, place: Array) -> Motion:
+        """Return a motion in the frame in which the present one has this place (4, 4)."""
         if motion.track is not None:
             return motion
-        turn, origin = self._setup.base[:3, :3], self._setup.base[:3, 3]
+        turn, origin = place[:3, :3], place[:3, 3]
         rotation = turn @ motion.rotation @ turn.T
         return replace(
             motion, rotation=rotation, shift=turn @ motion.shift + origin - rotation @ origin
