@@ -341,7 +341,7 @@ def found_wrong(
             found.append((comparer.score(turned), turned))
     if not found:
         least = min([as_is, *(score for score, _ in alone)])
-        two = scored(comparer.distinct(_pairs(comparer.ranked(single))))
+        two = scored(comparer.distinct(pairs(comparer.ranked(single), DETECTION.shortlist)))
         found = [pair for pair in two if pair[0] <= DETECTION.overwhelming * least]
     if not found:
         return None
@@ -352,12 +352,15 @@ def found_wrong(
     return Found(best, as_is, then)
 
 
-def _pairs(ranked: Sequence[Hypothesis]) -> list[Hypothesis]:
-    """Return two lines, or two orders one after the other, of which one of each is a good one."""
+def pairs(ranked: Sequence[Hypothesis], good: int) -> list[Hypothesis]:
+    """Return two lines, or two orders one after the other, of which one is among the `good` best.
+
+    `ranked` are single ones, the best first.
+    """
     known, found = {each.sources for each in ranked}, []
     for kind in ("lines", "channels"):
         alone = [each for each in ranked if each.kind == kind]
-        for one, other in product(alone[: DETECTION.shortlist], alone):
+        for one, other in product(alone[:good], alone):
             both = one.with_lines(other) if kind == "lines" else one.with_order(other)
             if both is not None and both.sources not in known:
                 known.add(both.sources)

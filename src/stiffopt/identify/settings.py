@@ -359,7 +359,9 @@ class DetectionSettings:
     region, within : a remark reports a log with less than a share `within` of its tips in the
         region of this probability.
     outside : with less than this share in it, a log is suspected to have other channels.
-    channel_rows : number of rows with which orders of channels are compared in a log that is off.
+    channel_rows, channel_step : number of rows with which orders of channels are compared in a log
+        that is off; the best of them are found by every `channel_step`-th of these.
+    paired : number of hypotheses of each kind that are tried together with another one there.
     poses, apart : smallest number of poses by which a frame is judged, since two can be moved to
         fit any others; and their distance, as a share of the range of permitted pressures.
     rest : largest pressure of a pose near rest, as a share of that range.
@@ -413,6 +415,8 @@ class DetectionSettings:
     within: float = 0.5
     outside: float = 0.9
     channel_rows: int = 60
+    channel_step: int = 3
+    paired: int = 3
     poses: int = 4
     apart: float = 0.1
     rest: float = 0.15
