@@ -10,10 +10,10 @@ wrongly while the sweeps and two rounds are simulated; the other faults are made
 third round, as `validate` reads it.
 
 Prints a table in Markdown for each rig. A fault is told *rightly* if its correction, or both of two
-faults, and nothing else are told; *in part* if one of two is, or if a remark or an error only says
-what is wrong, such as a channel that does nothing; *wrongly* if anything else is told. "Left" is
-the share of the misfit to the robot file's arm, with ``--validate`` of the mean error, that
-corrections which were told rightly leave.
+faults, and nothing else are told (an order of one log is told without a correction); *in part* if
+one of two is, or if a remark or an error only says what is wrong, such as a channel that does
+nothing; *wrongly* if anything else is told. "Left" is the share of the misfit to the robot file's
+arm, with ``--validate`` of the mean error, that corrections which were told rightly leave.
 """
 
 from __future__ import annotations

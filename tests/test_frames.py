@@ -141,6 +141,17 @@ def test_a_log_of_another_arm_is_not_excused_by_its_frame(change: Change, turns:
     assert not any("anew" in each for each in told(load_description("stiff-flop-1"), wrong))
 
 
+@pytest.mark.parametrize("turns", [True, False])
+def test_channels_in_another_order_in_one_log_are_told_instead_of_a_turn(turns: bool) -> None:
+    robot = load_description("stiff-flop-1")
+    wrong = with_one([log_of(seed=seed, turns=turns) for seed in range(3)], 1, reordered)
+    (remark,) = told(robot, wrong)
+    assert remark.startswith("log 2 differs from the other logs, as if the channels are in another")
+    assert "segment 1 channel 1 has the column of segment 1 channel 3" in remark
+    assert "This is not corrected" in remark
+    assert not any("differs" in each for each in told(robot, wrong, keep=("channels",)))
+
+
 def test_the_fit_finds_the_rest_of_the_motion() -> None:
     # the arm that finds a motion is less exact than the model that is then fitted
     robot = load_description("stiff-flop-1")

@@ -142,14 +142,14 @@ class _Tried:
     ----------
     motion : in the frame of the base; None if the logs are left as they are.
     logs : which were not fitted.
-    softness : index of the factor on pressures.
+    softness : factor on pressures.
     expected, recorded, after : poses in each log: by the arm, as recorded, and after the motion.
     score : RMS distance of points on the bodies, as a mean over all logs, in m.
     far : mean distance by which the fit moves the tip of the robot file's arm, in m.
     """
 
     motion: Motion
-    softness: int
+    softness: float
     expected: list[_Poses]
     recorded: list[_Poses]
     after: list[_Poses]
@@ -203,10 +203,10 @@ class OtherChannels:
         """Describe it, as a sentence."""
         names = ", ".join(recordings[i].name for i in self.logs)
         return (
-            f"{names} differs from the other logs: {self.hypothesis.told(description, ())}; the "
-            f"arm fitted to the others then misses the tip by {self.then * 1e3:.1f} mm instead of "
-            f"{self.as_is * 1e3:.1f} mm. This is not corrected: look at the columns of this log, "
-            "or leave it out"
+            f"{names} differs from the other logs, as if {self.hypothesis.told(description, ())}; "
+            f"the arm fitted to the others then misses the tip by {self.then * 1e3:.1f} mm instead "
+            f"of {self.as_is * 1e3:.1f} mm. This is not corrected: look at the columns of this "
+            "log, and at its frame, or leave it out"
         )
 
 
@@ -250,21 +250,21 @@ class FrameComparer:
             self._recorded.append(_Poses(position @ to_base[:3, :3].T + to_base[:3, 3], rotation))
 
     @cached_property
-    def _predicted(self) -> list[list[Array]]:
+    def _predicted(self) -> dict[float, list[Array]]:
         """Return poses (N, stations, 4, 4) of the arm in each log, for each softness it bears."""
-        found = (self._poses(factor, self._pressures) for factor in DETECTION.frame_softness)
-        return [each for each in found if each is not None]
+        found = {each: self._poses(each, self._pressures) for each in DETECTION.frame_softness}
+        return {softness: poses for softness, poses in found.items() if poses is not None}
 
-    def _poses(self, factor: float, pressures: Sequence[Array]) -> list[Array] | None:
+    def _poses(self, softness: float, pressures: Sequence[Array]) -> list[Array] | None:
         try:
-            return [self._arm.pose(factor * p, self._stations).copy() for p in pressures]
+            return [self._arm.pose(softness * p, self._stations).copy() for p in pressures]
         except (EquilibriumError, PressureError):
             return None
 
     def score(self) -> float:
         """Return the RMS miss of all logs by the arm fitted to them, in m."""
         everything = range(len(self._pressures))
-        scores = [self._tried(each, everything, NOWHERE).score for each in self._predicted]
+        scores = [self._tried(each, everything, NOWHERE).score for each in self._predicted.values()]
         return min(scores, default=np.inf)
 
     def turned(self, turns: Sequence[int]) -> FrameComparer:
@@ -281,7 +281,7 @@ class FrameComparer:
     def left(self, logs: tuple[int, ...]) -> float:
         """Return the mean miss of some logs by the arm fitted to the others, in m."""
         rest = [i for i in range(len(self._pressures)) if i not in logs]
-        tried = [self._tried(each, rest, NOWHERE) for each in self._predicted]
+        tried = [self._tried(each, rest, NOWHERE) for each in self._predicted.values()]
         best = min(tried, key=lambda each: each.score)
         return self._mean(best, best.recorded, self._off, logs)
 
@@ -373,7 +373,7 @@ class FrameComparer:
             for i in fitted
         ]
         score, far = float(np.sqrt(np.mean(squares))), float(np.mean(tips))
-        return _Tried(motion, 0, expected, recorded, after, score, far)
+        return _Tried(motion, 1.0, expected, recorded, after, score, far)
 
     def _off(self, one: _Poses, other: _Poses) -> Array:
         """Return the RMS distances (N,) of points on the bodies between two poses, in m."""
@@ -425,7 +425,7 @@ class FrameComparer:
                 logs = tuple(range(begin, end))
                 rest = [i for i in range(count) if i not in logs]
                 tried: dict[int | None, _Tried] = {}
-                for softness, poses in enumerate(self._predicted):
+                for softness, poses in self._predicted.items():
                     expected = self._expected(poses, rest)
                     motions = [self._of_frame(logs, expected)]
                     motions += [
@@ -516,19 +516,23 @@ class FrameComparer:
             and then <= turned + DETECTION.frame_angle
         )
 
-    def other_channels(self, logs: tuple[int, ...], softness: int = 0) -> OtherChannels | None:
+    def other_channels(self, logs: tuple[int, ...], softness: float = 1.0) -> OtherChannels | None:
         """Return the other channels, or line, that some logs alone are most likely to have.
 
-        `softness` is the index of the factor on pressures. None if the arm bears none of these.
+        `softness` is the factor on pressures. None if the arm does not bear them, or if these
+        channels explain little.
         """
-        description = self._setup.description
-        low, factor = np.maximum(description.pressure_min, 0.0), DETECTION.frame_softness[softness]
+        description, keep = self._setup.description, self._setup.settings.keep
+        if softness not in self._predicted:
+            return None
+        low = np.maximum(description.pressure_min, 0.0)
         rest = [i for i in range(len(self._pressures)) if i not in logs]
         as_is = self._tried(self._predicted[softness], rest, NOWHERE)
         tips = self._mean(as_is, as_is.recorded, _tip_distances, logs)
         best: OtherChannels | None = None
         for hypothesis in of_channels(description, 1):
-            found = self._poses(factor, [hypothesis.driven(self._pressures[i], low) for i in logs])
+            driven = [hypothesis.driven(self._pressures[i], low) for i in logs]
+            found = None if hypothesis.kind in keep else self._poses(softness, driven)
             if found is None:
                 continue
             poses = list(self._predicted[softness])
@@ -539,7 +543,7 @@ class FrameComparer:
             if best is None or left < best.left:
                 then = self._mean(tried, tried.recorded, _tip_distances, logs)
                 best = OtherChannels(logs, hypothesis, tips, then, left, tried.score)
-        return best
+        return best if best and best.then < DETECTION.overwhelming * best.as_is else None
 
     @staticmethod
     def _between(motion: Motion, place: Array) -> Motion:
@@ -563,7 +567,7 @@ def _turning(track: Track) -> NDArray[np.bool_]:
 def _is_turning(track: Track) -> bool:
     """Return True if the orientation is known in most of the rows in which the position is."""
     seen = whole(track.position)
-    return bool(np.mean(_turning(track)[seen]) > 0.5)
+    return bool(np.sum(_turning(track)[seen]) > 0.8 * np.sum(seen))
 
 
 def _in_motion(motion: Motion, poses: _Poses) -> _Poses:
