@@ -26,9 +26,6 @@ from stiffopt.identify.tracker_faults import CUBE_ROTATIONS, whole
 from stiffopt.model.description import RobotDescription, Tolerances
 from stiffopt.model.manipulator import Manipulator
 
-SHOWN = 5e-4
-"""Shortest translation of a frame that is told, in m."""
-
 
 @dataclass(frozen=True)
 class Hypothesis:
@@ -55,7 +52,7 @@ class Hypothesis:
             pressures = self.driven(each.pressures, low)
             before = self.driven(each.before[np.newaxis], low)[0]
             driven = replace(each, pressures=pressures, before=before)
-            found.append(_moved(driven, CUBE_ROTATIONS[turn], np.zeros(3)))
+            found.append(moved(driven, CUBE_ROTATIONS[turn], np.zeros(3)))
         return found
 
     def driven(self, recorded: Array, low: Array) -> Array:
@@ -98,7 +95,7 @@ class Hypothesis:
         if self.kind == "lines":
             return self.words
         turned = {
-            name: _turn_text(CUBE_ROTATIONS[turn])
+            name: turn_text(CUBE_ROTATIONS[turn])
             for name, turn in zip(names, self.turns, strict=True)
             if turn
         }
@@ -118,7 +115,7 @@ def _driven(recorded: Array, sources: Sequence[int], low: Array) -> Array:
     return np.column_stack(columns)
 
 
-def _moved(recording: Recording, rotation: Array, shift: Array) -> Recording:
+def moved(recording: Recording, rotation: Array, shift: Array) -> Recording:
     """Rotate (3, 3) a recording's poses about the origin of its frame, and shift them (3,)."""
     tracks = tuple(
         Track(
@@ -344,7 +341,7 @@ def found_wrong(
             found.append((comparer.score(turned), turned))
     if not found:
         least = min([as_is, *(score for score, _ in alone)])
-        two = scored(comparer.distinct(_pairs(comparer.ranked(single))))
+        two = scored(comparer.distinct(pairs(comparer.ranked(single), DETECTION.shortlist)))
         found = [pair for pair in two if pair[0] <= DETECTION.overwhelming * least]
     if not found:
         return None
@@ -355,12 +352,15 @@ def found_wrong(
     return Found(best, as_is, then)
 
 
-def _pairs(ranked: Sequence[Hypothesis]) -> list[Hypothesis]:
-    """Return two lines, or two orders one after the other, of which one of each is a good one."""
+def pairs(ranked: Sequence[Hypothesis], good: int) -> list[Hypothesis]:
+    """Return two lines, or two orders one after the other, of which one is among the `good` best.
+
+    `ranked` are single ones, the best first.
+    """
     known, found = {each.sources for each in ranked}, []
     for kind in ("lines", "channels"):
         alone = [each for each in ranked if each.kind == kind]
-        for one, other in product(alone[: DETECTION.shortlist], alone):
+        for one, other in product(alone[:good], alone):
             both = one.with_lines(other) if kind == "lines" else one.with_order(other)
             if both is not None and both.sources not in known:
                 known.add(both.sources)
@@ -449,53 +449,9 @@ def _turns(scores: Array) -> tuple[int, ...]:
     )
 
 
-def _turn_text(rotation: Array) -> str:
+def turn_text(rotation: Array) -> str:
     """Describe a rotation, as the end of a sentence."""
     vector = np.asarray(lie.log(lie.transform(rotation, np.zeros(3))))[3:]
     angle = float(np.linalg.norm(vector))
     axis = ", ".join(f"{each + 0.0:.2g}" for each in np.round(vector / max(angle, 1e-9), 2))
     return f"by {np.degrees(angle):.0f} deg about ({axis})"
-
-
-# -- a frame that was defined anew -----------------------------------------------------------------
-
-
-def replaced(
-    recording: Recording, measured: Array, predicted: Array, length: float
-) -> tuple[Recording, str, bool]:
-    """Move a recording rigidly to where a calibrated model predicts its tip.
-
-    Prefers a rotation of the cube without translation if it fits about as well.
-
-    Parameters
-    ----------
-    recording : Recording
-    measured, predicted : (N, 3), in m.
-    length : of the arm, in m.
-
-    Returns
-    -------
-    recording, words, is_shifted
-        The words describe the motion, as the end of a sentence.
-    """
-    seen = whole(measured)
-    x, y = measured[seen], predicted[seen]
-
-    def miss(rotation: Array, shift: Array) -> float:
-        return float(np.linalg.norm(x @ rotation.T + shift - y, axis=1).mean())
-
-    quarter = min(CUBE_ROTATIONS, key=lambda rotation: miss(rotation, np.zeros(3)))
-    turned = x @ quarter.T
-    centre = turned.mean(axis=0)
-    spread = (y - y.mean(axis=0)).T @ (turned - centre)
-    weight = len(x) * (DETECTION.known_turn * length) ** 2  # keeps undetermined turns at zero
-    u, _, vt = np.linalg.svd(spread + weight * np.eye(3))
-    rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt @ quarter
-    shift = y.mean(axis=0) - rotation @ x.mean(axis=0)
-    if DETECTION.overwhelming * miss(quarter, np.zeros(3)) < miss(rotation, shift):
-        rotation, shift = quarter, np.zeros(3)
-    words = f"turned {_turn_text(rotation)}"
-    is_shifted = bool(np.linalg.norm(shift) > SHOWN)
-    if is_shifted:
-        words += f" and moved by {np.linalg.norm(shift) * 1e3:.0f} mm"
-    return _moved(recording, rotation, shift), words, is_shifted
