@@ -336,8 +336,9 @@ class MotionWatch:
         rows = self._since(self._tuning.pushes.acting)
         seen, turned = rows[:, _SEEN], rows[:, _TURNED]
         away, pressures = seen - rows[:, _PREDICTED], rows[:, _PRESSURES]
-        acted = self._pushes.acts(float(rows[-1, _TIME]))
-        if self._pushes.take(rows[:, _TIME], seen, away, turned, pressures, jacobian, turning):
+        swings, times = rows[:, _FREE], rows[:, _TIME]
+        acted = self._pushes.acts(float(times[-1]))
+        if self._pushes.take(times, seen, away, turned, pressures, swings, jacobian, turning):
             self._forget()
             if not acted:  # the arm swings anew
                 self._swings = [_Swings(self._tuning) for _ in range(3)]

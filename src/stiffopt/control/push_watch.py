@@ -48,6 +48,7 @@ class PushWatch:
         away: Array,
         turned: Array,
         pressures: Array,
+        swings: Array,
         jacobian: Array,
         tip: TipAt,
     ) -> bool:
@@ -63,6 +64,8 @@ class PushWatch:
             The same (k, 3) and rotations (k, 3), relative to the model's tip, in m and rad.
         pressures :
             Effective pressures (k, n), in Pa.
+        swings :
+            Amplitudes (k,) of the vibration that the pressures do not drive, in m.
         jacobian :
             Of the tip's position (3, n), base axes, in m/Pa.
         tip :
@@ -81,7 +84,8 @@ class PushWatch:
         acting = slice(max(2, int(times.searchsorted(now - self._late, "right"))))
         moved = self._moved(times[acting], pressures[acting])
         by_channels = np.sqrt((jacobian**2).sum(axis=0)) * moved
-        if size < tuning.share * (float(by_channels.sum()) + tuning.noise):
+        by_swing = 2 * float(swings[first + farthest])  # from one side to the other
+        if size < tuning.share * (float(by_channels.sum()) + tuning.noise) + by_swing:
             return False
         bent = turn_of_a_push(tip) @ ways[farthest]
         missing = float(np.linalg.norm(turned[-1] - turned[first + farthest] - bent))
