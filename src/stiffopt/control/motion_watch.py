@@ -333,7 +333,11 @@ class MotionWatch:
         """Look for a push that begins or ends while the pressures change."""
         if turning is None:
             return
-        rows = self._since(self._tuning.pushes.acting)
+        acting = self._tuning.pushes.acting
+        rows = self._since(acting)
+        unseen = rows[0, _TIME] - (rows[-1, _TIME] - acting)
+        if len(rows) < self._count and unseen > self._tuning.longest_pause:
+            return  # pressures may have changed in a pause
         seen, turned = rows[:, _SEEN], rows[:, _TURNED]
         away, pressures = seen - rows[:, _PREDICTED], rows[:, _PRESSURES]
         swings, times = rows[:, _FREE], rows[:, _TIME]

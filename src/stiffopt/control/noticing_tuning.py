@@ -48,7 +48,7 @@ class PushTuning:
     least: float = 2e-3  # least displacement, in m
     moves: float = 0.3  # least share of it by which the tip moves
     # displacement over all that the pressures can have moved the tip, and length added to that, in
-    # m: for faults that was 1.5 at most
+    # m; or over the swing that the arm has already. For faults that was 1.5 at most
     share: float = 1.6
     noise: float = 1e-3
     # turn of the tip by a push: its least size, in rad; share of it that may be missing; multiple

@@ -84,8 +84,8 @@ class PushWatch:
         acting = slice(max(2, int(times.searchsorted(now - self._late, "right"))))
         moved = self._moved(times[acting], pressures[acting])
         by_channels = np.sqrt((jacobian**2).sum(axis=0)) * moved
-        by_swing = 2 * float(swings[first + farthest])  # from one side to the other
-        if size < tuning.share * (float(by_channels.sum()) + tuning.noise) + by_swing:
+        by_swing = 2 * float(swings[first])  # from one side to the other
+        if size < tuning.share * max(float(by_channels.sum()) + tuning.noise, by_swing):
             return False
         bent = turn_of_a_push(tip) @ ways[farthest]
         missing = float(np.linalg.norm(turned[-1] - turned[first + farthest] - bent))
