@@ -85,11 +85,14 @@ def test_a_push_displaces_the_tip_before_pressures_can(displaced: Samples, is_pu
     assert not watch.acts(now + 1.1)
 
 
-def test_pressures_move_an_arm_without_inertia_at_once() -> None:
+def test_pressures_move_an_arm_at_once_that_has_no_inertia_or_vibrates_fast() -> None:
     late = samples(8e-3, 0.0)
     late.pressures[-3:] += 8e-3 / np.linalg.norm(J, axis=0).sum()
     assert PushWatch(PushTuning(), vibrates=True).take(*late, J, TIP)
     assert not PushWatch(PushTuning(), vibrates=False).take(*late, J, TIP)
+    quick = PushWatch(PushTuning(), vibrates=True)
+    quick.omega = 30.0
+    assert not quick.take(*late, J, TIP)
 
 
 @pytest.mark.parametrize("turn", [1.0, 1.5])

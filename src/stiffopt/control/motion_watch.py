@@ -164,6 +164,7 @@ class MotionWatch:
         turned: Array | None,
         swings: tuple[float, float] = (0.0, 0.0),
         deviation: float = 0.0,
+        omega: float = 0.0,
     ) -> None:
         """Take in a sample of the tracker.
 
@@ -186,6 +187,8 @@ class MotionWatch:
             Amplitudes of the vibration that the pressures drive, and of the free one, in m.
         deviation :
             Standard deviation of the offset's position along an axis, in m.
+        omega :
+            Of the vibration, in rad/s.
         """
         intended = self._intended_at(time)
         if intended is None or self._is_early(time) or self.doubt is not None:
@@ -207,6 +210,7 @@ class MotionWatch:
             axis.take(_Turn(time, error, self._path))
         jacobian = tip.pose[:3, :3] @ tip.jacobian[:3]
         turning = None if turned is None else tip
+        self._pushes.omega = omega
         self.doubt = self._no_response(jacobian, tip.pose[:3, 2], turning)
         if turned is None:
             self._known_from = math.inf
