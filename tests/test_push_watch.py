@@ -33,16 +33,24 @@ class Samples(NamedTuple):
     away: Array
     turned: Array
     pressures: Array
+    swings: Array
 
 
 def samples(
-    way: float, channels: float, *, turn: float = 1.0, lies: bool = False, rate: float = 0.0
+    way: float,
+    channels: float,
+    *,
+    turn: float = 1.0,
+    lies: bool = False,
+    rate: float = 0.0,
+    swing: float = 0.0,
 ) -> Samples:
     """A tip that is displaced in the last 0.15 s, while all channels move it by a length in sum.
 
     `way`, in m, is the displacement; `channels`, in m, the motion by the pressures until 0.1 s ago;
     `turn` the multiple of the turn of a push with that displacement; `lies`: the tip lies still,
-    and the model moves instead; `rate`: a steady motion by all channels in sum, in m/s.
+    and the model moves instead; `rate`: a steady motion by all channels in sum, in m/s; `swing`:
+    the amplitude of the arm's vibration, in m.
     """
     grows = np.clip((TIMES - TIMES[-1]) / 0.15 + 1, 0, 1)[:, None]
     away = way * grows * ASIDE
@@ -51,7 +59,7 @@ def samples(
     length = np.linalg.norm(J, axis=0).sum()
     moves = np.clip((TIMES - TIMES[-1] + 0.1) / 0.1 + 1, 0, 1)
     pressures = np.outer((channels * moves + rate * TIMES) / length, np.ones(6))
-    return Samples(TIMES, seen, away, turn * pushed, pressures)
+    return Samples(TIMES, seen, away, turn * pushed, pressures, np.full(len(TIMES), swing))
 
 
 @pytest.mark.parametrize(
@@ -64,6 +72,8 @@ def samples(
         (samples(8e-3, 0.0, turn=-1.0), False),
         (samples(8e-3, 0.0, lies=True), False),  # the sensor has come off
         (samples(1e-3, 0.0), False),
+        (samples(8e-3, 0.0, swing=1e-3), True),
+        (samples(8e-3, 0.0, swing=4e-3), False),  # the arm swings back
         (samples(8e-3, 0.0, rate=10e-3), True),  # the arm changes its posture all the time
     ],
 )
@@ -75,11 +85,14 @@ def test_a_push_displaces_the_tip_before_pressures_can(displaced: Samples, is_pu
     assert not watch.acts(now + 1.1)
 
 
-def test_pressures_move_an_arm_without_inertia_at_once() -> None:
+def test_pressures_move_an_arm_at_once_that_has_no_inertia_or_vibrates_fast() -> None:
     late = samples(8e-3, 0.0)
     late.pressures[-3:] += 8e-3 / np.linalg.norm(J, axis=0).sum()
     assert PushWatch(PushTuning(), vibrates=True).take(*late, J, TIP)
     assert not PushWatch(PushTuning(), vibrates=False).take(*late, J, TIP)
+    quick = PushWatch(PushTuning(), vibrates=True)
+    quick.omega = 30.0
+    assert not quick.take(*late, J, TIP)
 
 
 @pytest.mark.parametrize("turn", [1.0, 1.5])
@@ -118,3 +131,16 @@ def test_the_swings_before_a_push_do_not_count(monkeypatch, again: bool) -> None
     watch.intend(0.0, place)
     watch.take(0.0, place, place, np.zeros(6), np.full(6, 4e4), TIP, turned=np.zeros(3))
     assert (watch._swings is before) is again
+
+
+@pytest.mark.parametrize("pause", [0.0, 0.5])
+def test_no_push_is_told_after_a_pause_in_which_pressures_may_have_changed(pause: float) -> None:
+    watch = MotionWatch(load_robot("stiff-flop-2-hanging").description, MotionTuning())
+    pushed, place = samples(8e-3, 0.0), TIP.pose[:3, 3]
+    for i, time in enumerate(TIMES - pause * (TIMES < 0.35)):
+        watch.intend(time, place)
+        seen = place + pushed.away[i]
+        watch.take(
+            time, seen, place, np.zeros(6), pushed.pressures[i], TIP, turned=pushed.turned[i]
+        )
+    assert watch._pushes.acts(float(TIMES[-1])) is (pause == 0)

@@ -164,6 +164,7 @@ class MotionWatch:
         turned: Array | None,
         swings: tuple[float, float] = (0.0, 0.0),
         deviation: float = 0.0,
+        omega: float = 0.0,
     ) -> None:
         """Take in a sample of the tracker.
 
@@ -186,6 +187,8 @@ class MotionWatch:
             Amplitudes of the vibration that the pressures drive, and of the free one, in m.
         deviation :
             Standard deviation of the offset's position along an axis, in m.
+        omega :
+            Of the vibration, in rad/s.
         """
         intended = self._intended_at(time)
         if intended is None or self._is_early(time) or self.doubt is not None:
@@ -207,6 +210,7 @@ class MotionWatch:
             axis.take(_Turn(time, error, self._path))
         jacobian = tip.pose[:3, :3] @ tip.jacobian[:3]
         turning = None if turned is None else tip
+        self._pushes.omega = omega
         self.doubt = self._no_response(jacobian, tip.pose[:3, 2], turning)
         if turned is None:
             self._known_from = math.inf
@@ -333,11 +337,16 @@ class MotionWatch:
         """Look for a push that begins or ends while the pressures change."""
         if turning is None:
             return
-        rows = self._since(self._tuning.pushes.acting)
+        acting = self._tuning.pushes.acting
+        rows = self._since(acting)
+        unseen = rows[0, _TIME] - (rows[-1, _TIME] - acting)
+        if len(rows) < self._count and unseen > self._tuning.longest_pause:
+            return  # pressures may have changed in a pause
         seen, turned = rows[:, _SEEN], rows[:, _TURNED]
         away, pressures = seen - rows[:, _PREDICTED], rows[:, _PRESSURES]
-        acted = self._pushes.acts(float(rows[-1, _TIME]))
-        if self._pushes.take(rows[:, _TIME], seen, away, turned, pressures, jacobian, turning):
+        swings, times = rows[:, _FREE], rows[:, _TIME]
+        acted = self._pushes.acts(float(times[-1]))
+        if self._pushes.take(times, seen, away, turned, pressures, swings, jacobian, turning):
             self._forget()
             if not acted:  # the arm swings anew
                 self._swings = [_Swings(self._tuning) for _ in range(3)]

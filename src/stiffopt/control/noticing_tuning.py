@@ -44,11 +44,12 @@ class PushTuning:
     # for which changes of pressure move an arm that vibrates, and after which they begin to, in s
     acting: float = 0.6
     late: float = 0.1
+    slow: float = 12.0  # above which it is less, as the inverse square, in rad/s
     steady: float = 0.3  # time at the beginning in which the speed of a steady change is seen, in s
     least: float = 2e-3  # least displacement, in m
     moves: float = 0.3  # least share of it by which the tip moves
     # displacement over all that the pressures can have moved the tip, and length added to that, in
-    # m: for faults that was 1.5 at most
+    # m; or over the swing that the arm has already. For faults that was 1.5 at most
     share: float = 1.6
     noise: float = 1e-3
     # turn of the tip by a push: its least size, in rad; share of it that may be missing; multiple

@@ -203,6 +203,7 @@ class ArmObserver:
         self.watch.take(
             sample.time, sample.position - pushed, predicted, self.tip.offset, captured,
             tip, turned=turned, swings=self.tip.swings, deviation=self.tip.deviation,
+            omega=self.tip.omega,
         )  # fmt: skip
 
     def lean_on(self, leaning: LeaningTip | None) -> Array:

@@ -27,10 +27,15 @@ class PushWatch:
     ----------
     tuning : thresholds of a push.
     vibrates : whether the arm has inertia, so that it moves later than its pressures change.
+
+    Attributes
+    ----------
+    omega : of the arm's vibration, in rad/s; the faster it is, the sooner it moves. Set from outside.
     """
 
     def __init__(self, tuning: PushTuning, *, vibrates: bool) -> None:
         self._tuning, self._late = tuning, tuning.late if vibrates else 0.0
+        self.omega = 0.0
         self.begin()
 
     def begin(self) -> None:
@@ -48,6 +53,7 @@ class PushWatch:
         away: Array,
         turned: Array,
         pressures: Array,
+        swings: Array,
         jacobian: Array,
         tip: TipAt,
     ) -> bool:
@@ -63,6 +69,8 @@ class PushWatch:
             The same (k, 3) and rotations (k, 3), relative to the model's tip, in m and rad.
         pressures :
             Effective pressures (k, n), in Pa.
+        swings :
+            Amplitudes (k,) of the vibration that the pressures do not drive, in m.
         jacobian :
             Of the tip's position (3, n), base axes, in m/Pa.
         tip :
@@ -78,10 +86,12 @@ class PushWatch:
             return False
         if math.dist(seen[-1], seen[first + farthest]) < tuning.moves * size:
             return False  # a tip that lies still has not been pushed
-        acting = slice(max(2, int(times.searchsorted(now - self._late, "right"))))
+        late = self._late * min(1.0, (tuning.slow / max(self.omega, 1e-9)) ** 2)
+        acting = slice(max(2, int(times.searchsorted(now - late, "right"))))
         moved = self._moved(times[acting], pressures[acting])
         by_channels = np.sqrt((jacobian**2).sum(axis=0)) * moved
-        if size < tuning.share * (float(by_channels.sum()) + tuning.noise):
+        by_swing = 2 * float(swings[first])  # from one side to the other
+        if size < tuning.share * max(float(by_channels.sum()) + tuning.noise, by_swing):
             return False
         bent = turn_of_a_push(tip) @ ways[farthest]
         missing = float(np.linalg.norm(turned[-1] - turned[first + farthest] - bent))
