@@ -46,6 +46,7 @@ class PushTuning:
     late: float = 0.1
     slow: float = 12.0  # above which it is less, as the inverse square, in rad/s
     steady: float = 0.3  # time at the beginning in which the speed of a steady change is seen, in s
+    steady_share: float = 0.7  # of such a change that counts; times `share` it is more than all
     least: float = 2e-3  # least displacement, in m
     moves: float = 0.3  # least share of it by which the tip moves
     # displacement over all that the pressures can have moved the tip, and length added to that, in

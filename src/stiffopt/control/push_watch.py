@@ -30,7 +30,7 @@ class PushWatch:
 
     Attributes
     ----------
-    omega : of the arm's vibration, in rad/s; the faster it is, the sooner it moves. Set from outside.
+    omega : of the arm's vibration, in rad/s; the faster it is, the sooner the arm moves.
     """
 
     def __init__(self, tuning: PushTuning, *, vibrates: bool) -> None:
@@ -104,13 +104,14 @@ class PushWatch:
     def _moved(self, times: Array, pressures: Array) -> Array:
         """Return how far each pressure (n,) has moved to displace the tip lately, in Pa.
 
-        A slow change that has gone on at one speed counts with the time of a push alone.
+        A slow change that has gone on at one speed counts with the time of a push alone, and less,
+        as the arm does not swing with it.
         """
         tuning = self._tuning
         begun = max(1, int(times.searchsorted(times[0] + tuning.steady, "right")) - 1)
         rates = (pressures[begun] - pressures[0]) / (times[begun] - times[0])
         away = pressures - rates * (times - times[0])[:, None]
-        moved: Array = np.ptp(away, axis=0) + np.abs(rates) * tuning.time
+        moved: Array = np.ptp(away, axis=0) + tuning.steady_share * np.abs(rates) * tuning.time
         return np.minimum(moved, np.ptp(pressures, axis=0))
 
     def displacements(self, away: Array, turned: Array, tip: TipAt) -> Array:
