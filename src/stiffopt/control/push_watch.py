@@ -30,7 +30,7 @@ class PushWatch:
 
     Attributes
     ----------
-    omega : of the arm's vibration, in rad/s; the faster it is, the sooner the arm moves.
+    omega : of the arm's vibration, in rad/s, for its owner to set; a faster arm moves sooner.
     """
 
     def __init__(self, tuning: PushTuning, *, vibrates: bool) -> None:
