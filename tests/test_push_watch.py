@@ -99,11 +99,21 @@ def test_pressures_move_an_arm_at_once_that_has_no_inertia_or_vibrates_fast() ->
 @pytest.mark.parametrize("turn", [1.0, 1.5])
 def test_the_turn_shows_the_displacement_by_a_push(turn: float) -> None:
     """A moment, or a force below the tip, turns it further."""
-    pushed = samples(8e-3, 0.0, turn=turn)
     watch = PushWatch(PushTuning(), vibrates=True)
+    assert watch.take(*samples(8e-3, 0.0), J, TIP)
+    pushed = samples(8e-3, 0.0, turn=turn)
     found = watch.displacements(pushed.away, pushed.turned, TIP)
     soft = np.linalg.pinv(turn_of_a_push(TIP)) @ turn_of_a_push(TIP)
     assert found == pytest.approx((pushed.away[-1] - pushed.away) @ soft.T, abs=1e-9)
+
+
+def test_a_push_explains_no_more_than_it_was_seen_to_do() -> None:
+    """An arm that is caught by a wall meanwhile is turned by it as well."""
+    watch = PushWatch(PushTuning(), vibrates=True)
+    assert watch.take(*samples(8e-3, 0.0), J, TIP)
+    caught = samples(40e-3, 0.0)
+    found = watch.displacements(caught.away, caught.turned, TIP)
+    assert np.linalg.norm(found[0]) == pytest.approx(1.2 * 8e-3, rel=1e-3)
 
 
 @pytest.mark.usefixtures("compiled")

@@ -59,6 +59,8 @@ class PushTuning:
     turn: float = 0.3
     further: float = 2.0
     lasts: float = 1.0  # time after that in which the arm swings, in s
+    # multiple of its largest displacement, when recognised, that it explains later
+    grows: float = 1.2
 
 
 @dataclass(frozen=True)

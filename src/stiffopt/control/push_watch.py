@@ -40,7 +40,7 @@ class PushWatch:
 
     def begin(self) -> None:
         """Restart without a push."""
-        self._until = -math.inf
+        self._until, self._size = -math.inf, 0.0
 
     def acts(self, now: float) -> bool:
         """Return whether a push has begun or ended lately, at a time in s."""
@@ -98,6 +98,7 @@ class PushWatch:
         expected = float(np.linalg.norm(bent))
         if expected < tuning.least_turn or missing > tuning.turn * expected:
             return False
+        self._size = max(size, self._size if self.acts(now) else 0.0)
         self._until = now + tuning.lasts
         return True
 
@@ -117,11 +118,15 @@ class PushWatch:
     def displacements(self, away: Array, turned: Array, tip: TipAt) -> Array:
         """Return the displacements (k, 3) that pushes explain of those from the last sample, in m.
 
-        A push may turn the tip further than a force at the tip with that displacement would.
+        A push may turn the tip further than a force at the tip with that displacement would. What
+        is much larger than it was when recognised has another cause, a wall for example.
         """
         turn = turn_of_a_push(tip)
         bent, turns = (away[-1] - away) @ turn.T, turned[-1] - turned
         shares = (bent * turns).sum(axis=1) / np.maximum((bent**2).sum(axis=1), 1e-12)
         by_push = turns @ np.linalg.pinv(turn, rcond=1e-6).T
         explained: Array = by_push / np.clip(shares, 1.0, self._tuning.further)[:, None]
+        sizes = np.linalg.norm(explained, axis=1)
+        most = self._tuning.grows * self._size
+        explained *= np.minimum(1.0, most / np.maximum(sizes, 1e-9))[:, None]
         return explained
