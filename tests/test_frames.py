@@ -13,13 +13,14 @@ from scipy.spatial.transform import Rotation
 
 from made_logs import course, made_log
 from recordings import UCL
+from stiffopt.errors import FileError
 from stiffopt.identify.calibration import calibrate
 from stiffopt.identify.correction import put_right
 from stiffopt.identify.settings import CalibrationSettings, Finding
 from stiffopt.identify.setup import Setup, recordings_of
 from stiffopt.identify.validation import validate
-from stiffopt.logs import Log, read_log
-from stiffopt.model.description import RobotDescription
+from stiffopt.logs import Body, Log, read_log
+from stiffopt.model.description import Recordings, RobotDescription, TrackedBody
 from stiffopt.model.robot_files import load_description
 
 Array = NDArray[np.float64]
@@ -150,6 +151,19 @@ def test_channels_in_another_order_in_one_log_are_told_instead_of_a_turn(turns: 
     assert "segment 1 channel 1 has the column of segment 1 channel 3" in remark
     assert "This is not corrected" in remark
     assert not any("differs" in each for each in told(robot, wrong, keep=("channels",)))
+
+
+def test_a_body_that_is_lost_in_a_log_is_told() -> None:
+    robot = load_description("stiff-flop-1")
+    bodies = Recordings(bodies={"mid": TrackedBody(at=robot.length / 2)})
+    logs = [
+        replace(each, bodies={"mid": Body(0.5 * each.tip_position)})
+        for each in (log_of(seed=seed, turns=False) for seed in range(2))
+    ]
+    nowhere = Body(np.full_like(logs[1].tip_position, np.nan))
+    logs[1] = replace(logs[1], bodies={"mid": nowhere})
+    with pytest.raises(FileError, match=r"log 2: no row has readings of all .*tip, mid"):
+        told(robot.model_copy(update={"recordings": bodies}), logs)
 
 
 def test_the_fit_finds_the_rest_of_the_motion() -> None:

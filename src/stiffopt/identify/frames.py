@@ -23,7 +23,7 @@ from stiffopt.arrays import Array
 from stiffopt.errors import EquilibriumError, PressureError
 from stiffopt.identify.detection import lagged_pressures
 from stiffopt.identify.discrepancy import centres
-from stiffopt.identify.hypotheses import Hypothesis, moved, of_channels, turn_text
+from stiffopt.identify.hypotheses import Hypothesis, moved, of_channels, rows_with_all, turn_text
 from stiffopt.identify.recording import FRAME, Recording, Track
 from stiffopt.identify.settings import DETECTION
 from stiffopt.identify.setup import Setup
@@ -33,6 +33,8 @@ from stiffopt.model.manipulator import Manipulator
 
 SHOWN = 5e-4
 """Shortest translation of a frame that is told, in m."""
+Tracks = tuple[Track, ...]
+"""Poses in the rows of a log, the tip's first, in the frame of the recordings."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,21 +57,22 @@ class Motion:
 
     def applied(self, recordings: Sequence[Recording]) -> list[Recording]:
         """Return the recordings, with those of the logs moved."""
+        anew = FRAME if self.track is None else recordings[0].tracks[self.track].name
         return [
-            self._moved(recording) if i in self.logs else recording
-            for i, recording in enumerate(recordings)
+            replace(each, tracks=self.of(each.tracks), anew=anew) if i in self.logs else each
+            for i, each in enumerate(recordings)
         ]
 
-    def _moved(self, recording: Recording) -> Recording:
+    def of(self, tracks: Tracks) -> Tracks:
+        """Return the poses of a log after the motion."""
         if self.track is None:
-            return replace(moved(recording, self.rotation, self.shift), anew=FRAME)
-        own = recording.tracks[self.track]
+            return moved(tracks, self.rotation, self.shift)
+        own = tracks[self.track]
         assert own.rotation is not None
         turned = Track(
             own.name, own.position + own.rotation @ self.shift, own.rotation @ self.rotation
         )
-        tracks = (*recording.tracks[: self.track], turned, *recording.tracks[self.track + 1 :])
-        return replace(recording, tracks=tracks, anew=own.name)
+        return (*tracks[: self.track], turned, *tracks[self.track + 1 :])
 
     def told(self, recordings: Sequence[Recording]) -> str:
         """Describe the motion, as the beginning of a sentence."""
@@ -93,43 +96,43 @@ NOWHERE = Motion((), None, np.eye(3), np.zeros(3))
 """Moves no log."""
 
 
-@dataclass(frozen=True, eq=False)
-class _Poses:
-    """Poses of all tracks in the rows of a log: (N, k, 3), in m, and k times (N, 3, 3) or None."""
-
-    position: Array
-    rotation: tuple[Array | None, ...]
-
-    def points(self, lever: float) -> Array:
-        """Return the origins of the bodies, and points on their axes at a distance: (N, m, 3)."""
-        found = [self.position]
-        for k, rotation in enumerate(self.rotation):
-            if rotation is not None:
-                found.append(self.position[:, k, np.newaxis] + lever * rotation.swapaxes(1, 2))
-        return np.concatenate(found, axis=1)
-
-    def turned_like(self, other: _Poses) -> _Poses:
-        """Return the poses with that rotation of the cube in each body's axes that is nearest."""
-        turned: list[Array | None] = []
-        for own, expected in zip(self.rotation, other.rotation, strict=True):
-            if own is not None and expected is not None:
-                between = np.einsum("nji,njk->ik", expected, own)
-                best = np.argmax(np.einsum("ij,gji->g", between, CUBE_ROTATIONS))
-                own = own @ CUBE_ROTATIONS[best]
-            turned.append(own)
-        return replace(self, rotation=tuple(turned))
+def _points(tracks: Sequence[Track], lever: float) -> Array:
+    """Return the origins of the bodies, and points on their axes at a distance: (N, m, 3)."""
+    found = []
+    for each in tracks:
+        origin = each.position[:, np.newaxis]
+        found.append(origin)
+        if each.rotation is not None:
+            found.append(origin + lever * each.rotation.swapaxes(1, 2))
+    return np.concatenate(found, axis=1)
 
 
-def _tip_distances(one: _Poses, other: _Poses) -> Array:
+def _turned_like(tracks: Tracks, expected: Tracks) -> Tracks:
+    """Return poses with that rotation of the cube in each body's axes that is nearest."""
+    return tuple(
+        own
+        if own.rotation is None or other.rotation is None
+        else replace(own, rotation=own.rotation @ _nearest_cube(own.rotation, other.rotation))
+        for own, other in zip(tracks, expected, strict=True)
+    )
+
+
+def _nearest_cube(own: Array, expected: Array) -> Array:
+    """Return the rotation of the cube that brings rotations (N, 3, 3) nearest to others."""
+    between = np.einsum("nji,njk->ik", expected, own)
+    return CUBE_ROTATIONS[np.argmax(np.einsum("ij,gji->g", between, CUBE_ROTATIONS))]
+
+
+def _tip_distances(one: Tracks, other: Tracks) -> Array:
     """Return the distances (N,) of the tips of two poses, in m."""
-    return np.asarray(np.linalg.norm(one.position[:, 0] - other.position[:, 0], axis=1))
+    return np.asarray(np.linalg.norm(one[0].position - other[0].position, axis=1))
 
 
-def _angles(one: _Poses, other: _Poses) -> Array:
+def _angles(one: Tracks, other: Tracks) -> Array:
     """Return the angles (N,) between the tips of two poses, in rad; zero if they are not known."""
-    own, expected = one.rotation[0], other.rotation[0]
+    own, expected = one[0].rotation, other[0].rotation
     if own is None or expected is None:
-        return np.zeros(len(one.position))
+        return np.zeros(len(one[0].position))
     cosine = (np.einsum("nij,nij->n", own, expected) - 1) / 2
     return np.asarray(np.arccos(np.clip(cosine, -1, 1)))
 
@@ -140,7 +143,7 @@ class _Tried:
 
     Attributes
     ----------
-    motion : in the frame of the base; None if the logs are left as they are.
+    motion : `NOWHERE` if the logs are left as they are.
     logs : which were not fitted.
     softness : factor on pressures.
     expected, recorded, after : poses in each log: by the arm, as recorded, and after the motion.
@@ -150,16 +153,16 @@ class _Tried:
 
     motion: Motion
     softness: float
-    expected: list[_Poses]
-    recorded: list[_Poses]
-    after: list[_Poses]
+    expected: list[Tracks]
+    recorded: list[Tracks]
+    after: list[Tracks]
     score: float
     far: float
 
 
 @dataclass(frozen=True, eq=False)
 class MovedFrame:
-    """An accepted motion, in the frame of the recordings.
+    """An accepted motion.
 
     `as_is`, `then`: mean misses of the tip without it and with it, in m; `turned_as_is`,
     `turned_then`: of its orientation, in rad; `score`: see `FrameComparer`.
@@ -221,43 +224,54 @@ class FrameComparer:
     def __init__(self, setup: Setup) -> None:
         description = setup.description
         self._setup, self._length = setup, description.length
+        self._lever = DETECTION.frame_lever * description.length
         self._arm = Manipulator(description.model_copy(update={"calibration": None}))
-        tracks = [description.length if each.at is None else each.at for each in setup.points]
+        stations = [description.length if each.at is None else each.at for each in setup.points]
         ends = np.cumsum([segment.length for segment in description.segments])
-        self._stations, self._tracks = np.array([*tracks, *ends]), len(tracks)
+        self._stations, self._tracks = np.array([*stations, *ends]), len(stations)
         self._turns = [
             point.turns and all(_is_turning(each.tracks[k]) for each in setup.recordings)
             for k, point in enumerate(setup.points)
         ]
-        to_base = np.linalg.inv(setup.base)
         self._pressures: list[Array] = []
-        self._recorded: list[_Poses] = []
+        self._recorded: list[Tracks] = []
         count = max(DETECTION.rows // len(setup.recordings), 8)
         for each in setup.recordings:
-            seen = np.flatnonzero(np.logical_and.reduce([
-                whole(t.position) & (_turning(t) if turns else True)
+            tracks = [
+                t if turns else replace(t, rotation=None)
                 for t, turns in zip(each.tracks, self._turns, strict=True)
-            ]))  # fmt: skip
-            rows = seen[np.unique(np.linspace(0, len(seen) - 1, count).astype(int))]
+            ]
+            seen = [
+                whole(t.position) & (_turning(t) if turns else True)
+                for t, turns in zip(tracks, self._turns, strict=True)
+            ]
+            rows = rows_with_all(each, seen, count)
             self._pressures.append(
                 lagged_pressures(each.time, each.pressures, DETECTION.clock_lag)[rows]
             )
-            position = np.stack([t.position[rows] for t in each.tracks], axis=1)
-            rotation = tuple(
-                to_base[:3, :3] @ t.rotation[rows] if t.rotation is not None and turns else None
-                for t, turns in zip(each.tracks, self._turns, strict=True)
-            )
-            self._recorded.append(_Poses(position @ to_base[:3, :3].T + to_base[:3, 3], rotation))
+            self._recorded.append(tuple(
+                replace(
+                    t,
+                    position=t.position[rows],
+                    rotation=None if t.rotation is None else t.rotation[rows],
+                )
+                for t in tracks
+            ))  # fmt: skip
 
     @cached_property
     def _predicted(self) -> dict[float, list[Array]]:
-        """Return poses (N, stations, 4, 4) of the arm in each log, for each softness it bears."""
+        """Return poses (N, stations, 4, 4) of the arm in each log, for each softness it bears.
+
+        They are in the frame of the recordings.
+        """
         found = {each: self._poses(each, self._pressures) for each in DETECTION.frame_softness}
         return {softness: poses for softness, poses in found.items() if poses is not None}
 
     def _poses(self, softness: float, pressures: Sequence[Array]) -> list[Array] | None:
         try:
-            return [self._arm.pose(softness * p, self._stations).copy() for p in pressures]
+            return [
+                self._setup.base @ self._arm.pose(softness * p, self._stations) for p in pressures
+            ]
         except (EquilibriumError, PressureError):
             return None
 
@@ -270,11 +284,10 @@ class FrameComparer:
     def turned(self, turns: Sequence[int]) -> FrameComparer:
         """Return the comparer of the logs whose axes are turned; see `Hypothesis.turns`."""
         self._predicted  # noqa: B018 - which is the same for both
-        other, to_base = copy(self), np.asarray(np.linalg.inv(self._setup.base))
-        motions = [Motion((i,), None, CUBE_ROTATIONS[k], np.zeros(3)) for i, k in enumerate(turns)]
+        other = copy(self)
         other._recorded = [
-            _in_motion(self._between(motion, to_base), own)
-            for motion, own in zip(motions, self._recorded, strict=True)
+            moved(own, CUBE_ROTATIONS[turn], np.zeros(3))
+            for own, turn in zip(self._recorded, turns, strict=True)
         ]
         return other
 
@@ -287,26 +300,25 @@ class FrameComparer:
 
     # the shape of the arm ----------------------------------------------------------------------
 
-    def _expected(self, poses: list[Array], fitted: Sequence[int]) -> list[_Poses]:
+    def _expected(self, poses: list[Array], fitted: Sequence[int]) -> list[Tracks]:
         """Return the poses that an arm fitted to some logs has in all of them.
 
         Each track's position is that of the robot file's arm and a linear function of where its
         segments end; a ridge keeps the arm as it is in directions that were not recorded. Turns
         of base and sensor follow from the orientations.
         """
-        known = [
-            np.hstack([np.ones((len(p), 1)), p[:, self._tracks :, :3, 3].reshape(len(p), -1)])
-            for p in poses
+        ends = [
+            (p[:, self._tracks :, :3, 3] - self._setup.base[:3, 3]) / self._length for p in poses
         ]
-        scale = np.r_[1.0, np.full(known[0].shape[1] - 1, 1 / self._length)]
-        known = [each * scale for each in known]
-        ridge = DETECTION.frame_ridge * np.r_[0.01, np.ones(len(scale) - 1)]
-        positions, rotations = [], []
+        known = [np.hstack([np.ones((len(each), 1)), each.reshape(len(each), -1)]) for each in ends]
+        size = known[0].shape[1]
+        ridge = DETECTION.frame_ridge * np.r_[0.01, np.ones(size - 1)]
+        found = []  # of each track, its poses in each log
         for k in range(self._tracks):
             features = np.concatenate([known[i] for i in fitted])
             own = np.concatenate([poses[i][:, k, :3, 3] for i in fitted])
-            off = np.concatenate([self._recorded[i].position[:, k] for i in fitted]) - own
-            weight, coefficients = np.ones(len(off)), np.zeros((len(scale), 3))
+            off = np.concatenate([self._recorded[i][k].position for i in fitted]) - own
+            weight, coefficients = np.ones(len(off)), np.zeros((size, 3))
             for _ in range(DETECTION.clock_rounds):
                 weighted = features * weight[:, np.newaxis]
                 normal = weighted.T @ features + len(off) * np.diag(ridge)
@@ -314,25 +326,24 @@ class FrameComparer:
                 distance = np.linalg.norm(off - features @ coefficients, axis=1)
                 median = max(float(np.median(distance)), 1e-9)
                 weight = 1 / np.sqrt(1 + (distance / median) ** 2)
-            positions.append(
-                [p[:, k, :3, 3] + f @ coefficients for p, f in zip(poses, known, strict=True)]
-            )
             start = _nearest_rotation(
                 own, own + features @ coefficients, DETECTION.known_turn * self._length
             )
-            rotations.append(self._expected_rotations(poses, fitted, k, start))
-        return [
-            _Poses(np.stack(position, axis=1), rotation)
-            for position, rotation in zip(
-                zip(*positions, strict=True), zip(*rotations, strict=True), strict=True
+            rotations = self._expected_rotations(poses, fitted, k, start)
+            name = self._recorded[0][k].name
+            found.append(
+                [
+                    Track(name, p[:, k, :3, 3] + each @ coefficients, rotation)
+                    for p, each, rotation in zip(poses, known, rotations, strict=True)
+                ]
             )
-        ]
+        return list(zip(*found, strict=True))
 
     def _expected_rotations(
         self, poses: list[Array], fitted: Sequence[int], k: int, base: Array
     ) -> list[Array | None]:
         """Return the orientations ``B Q S`` of a track in all logs, with Q those of the arm."""
-        recorded = [self._recorded[i].rotation[k] for i in fitted]
+        recorded = [self._recorded[i][k].rotation for i in fitted]
         own = [p[:, k, :3, :3] for p in poses]
         measured = [each for each in recorded if each is not None]
         if not measured:
@@ -340,12 +351,10 @@ class FrameComparer:
         sensor = mean_rotation(own[fitted[0]].swapaxes(1, 2) @ base.T @ measured[0])
         arm = np.concatenate([own[i] for i in fitted])
         for _ in range(DETECTION.clock_rounds):
-            like = []
-            for i, each in zip(fitted, measured, strict=True):
-                between = np.einsum("nji,njk->ik", base @ own[i] @ sensor, each)
-                best = np.argmax(np.einsum("ij,gji->g", between, CUBE_ROTATIONS))
-                like.append(each @ CUBE_ROTATIONS[best])
-            known = np.concatenate(like)
+            known = np.concatenate([
+                each @ _nearest_cube(each, base @ own[i] @ sensor)
+                for i, each in zip(fitted, measured, strict=True)
+            ])  # fmt: skip
             sensor = mean_rotation(arm.swapaxes(1, 2) @ base.T @ known)
             base = mean_rotation(known @ (arm @ sensor).swapaxes(1, 2))
         return [base @ each @ sensor for each in own]
@@ -357,44 +366,41 @@ class FrameComparer:
         poses: list[Array],
         fitted: Sequence[int],
         motion: Motion,
-        expected: list[_Poses] | None = None,
+        expected: list[Tracks] | None = None,
     ) -> _Tried:
         """Return what a motion leaves."""
         expected = self._expected(poses, fitted) if expected is None else expected
-        recorded = [
-            own.turned_like(other) for own, other in zip(self._recorded, expected, strict=True)
-        ]
+        recorded = [_turned_like(*each) for each in zip(self._recorded, expected, strict=True)]
         after = list(recorded)
         for i in motion.logs:
-            after[i] = _in_motion(motion, self._recorded[i]).turned_like(expected[i])
+            after[i] = _turned_like(motion.of(self._recorded[i]), expected[i])
         squares = [np.mean(self._off(a, e) ** 2) for a, e in zip(after, expected, strict=True)]
         tips = [
-            np.linalg.norm(expected[i].position[:, 0] - poses[i][:, 0, :3, 3], axis=1).mean()
+            np.linalg.norm(expected[i][0].position - poses[i][:, 0, :3, 3], axis=1).mean()
             for i in fitted
         ]
         score, far = float(np.sqrt(np.mean(squares))), float(np.mean(tips))
         return _Tried(motion, 1.0, expected, recorded, after, score, far)
 
-    def _off(self, one: _Poses, other: _Poses) -> Array:
+    def _off(self, one: Tracks, other: Tracks) -> Array:
         """Return the RMS distances (N,) of points on the bodies between two poses, in m."""
-        lever = DETECTION.frame_lever * self._length
-        apart = one.points(lever) - other.points(lever)
+        apart = _points(one, self._lever) - _points(other, self._lever)
         return np.asarray(np.sqrt((apart**2).sum(axis=2).mean(axis=1)))
 
-    def _of_frame(self, logs: tuple[int, ...], expected: list[_Poses]) -> Motion:
+    def _of_frame(self, logs: tuple[int, ...], expected: list[Tracks]) -> Motion:
         """Return the motion of all tracks that brings logs nearest to the expected poses.
 
         Flips of the bodies may leave all orientations of a log turned by one rotation of the cube.
         """
-        lever, known = DETECTION.frame_lever * self._length, DETECTION.known_turn * self._length
-        target = np.concatenate([expected[i].points(lever).reshape(-1, 3) for i in logs])
+        known = DETECTION.known_turn * self._length
+        target = np.concatenate([_points(expected[i], self._lever).reshape(-1, 3) for i in logs])
         best, least = (np.eye(3), np.zeros(3)), np.inf
         for cube in CUBE_ROTATIONS if any(self._turns) else CUBE_ROTATIONS[:1]:
-            source = np.concatenate([
-                replace(own, rotation=tuple(None if r is None else r @ cube for r in own.rotation))
-                .points(lever).reshape(-1, 3)
+            turned = [
+                [t if t.rotation is None else replace(t, rotation=t.rotation @ cube) for t in own]
                 for own in (self._recorded[i] for i in logs)
-            ])  # fmt: skip
+            ]
+            source = np.concatenate([_points(own, self._lever).reshape(-1, 3) for own in turned])
             rotation = _nearest_rotation(source, target, known)
             shift = target.mean(axis=0) - rotation @ source.mean(axis=0)
             left = float(np.mean((source @ rotation.T + shift - target) ** 2))
@@ -402,16 +408,16 @@ class FrameComparer:
                 best, least = (rotation, shift), left
         return Motion(logs, None, *best)
 
-    def _of_body(self, logs: tuple[int, ...], k: int, expected: list[_Poses]) -> Motion:
+    def _of_body(self, logs: tuple[int, ...], k: int, expected: list[Tracks]) -> Motion:
         """Return the motion of a track in its own axes that brings it nearest to the expected."""
         own, wanted, off = [], [], []
         for i in logs:
-            rotation, other = self._recorded[i].rotation[k], expected[i].rotation[k]
-            assert rotation is not None
-            assert other is not None
-            own.append(rotation)
-            wanted.append(other)
-            off.append(expected[i].position[:, k] - self._recorded[i].position[:, k])
+            recorded, other = self._recorded[i][k], expected[i][k]
+            assert recorded.rotation is not None
+            assert other.rotation is not None
+            own.append(recorded.rotation)
+            wanted.append(other.rotation)
+            off.append(other.position - recorded.position)
         rotation = np.concatenate(own)
         turn = mean_rotation(rotation.swapaxes(1, 2) @ np.concatenate(wanted))
         shift = np.einsum("nji,nj->i", rotation, np.concatenate(off)) / len(rotation)
@@ -466,14 +472,13 @@ class FrameComparer:
             return channels
         tips = [self._mean(best, poses, _tip_distances) for poses in (best.recorded, best.after)]
         turned = [self._mean(best, poses, _angles) for poses in (best.recorded, best.after)]
-        motion = self._between(best.motion, self._setup.base)
-        return MovedFrame(motion, tips[0], tips[1], turned[0], turned[1], best.score)
+        return MovedFrame(best.motion, tips[0], tips[1], turned[0], turned[1], best.score)
 
     @staticmethod
     def _mean(
         tried: _Tried,
-        poses: Sequence[_Poses],
-        measure: Callable[[_Poses, _Poses], Array],
+        poses: Sequence[Tracks],
+        measure: Callable[[Tracks, Tracks], Array],
         logs: Sequence[int] = (),
     ) -> float:
         """Return the mean of a measure between poses and the expected ones, over the moved logs."""
@@ -503,7 +508,7 @@ class FrameComparer:
         turned, then = (
             self._mean(tried, poses, _angles) for poses in (tried.recorded, tried.after)
         )
-        tips = np.concatenate([tried.expected[i].position[:, 0] for i in logs])[rows]
+        tips = np.concatenate([tried.expected[i][0].position for i in logs])[rows]
         spread = np.linalg.svd(tips - tips.mean(axis=0), compute_uv=False)
         in_line = spread[1] < DETECTION.in_line * spread[0]
         off = DETECTION.off * self._length
@@ -545,17 +550,6 @@ class FrameComparer:
                 best = OtherChannels(logs, hypothesis, tips, then, left, tried.score)
         return best if best and best.then < DETECTION.overwhelming * best.as_is else None
 
-    @staticmethod
-    def _between(motion: Motion, place: Array) -> Motion:
-        """Return a motion in the frame in which the present one has this place (4, 4)."""
-        if motion.track is not None:
-            return motion
-        turn, origin = place[:3, :3], place[:3, 3]
-        rotation = turn @ motion.rotation @ turn.T
-        return replace(
-            motion, rotation=rotation, shift=turn @ motion.shift + origin - rotation @ origin
-        )
-
 
 def _turning(track: Track) -> NDArray[np.bool_]:
     """Return in which rows (N,) a track's orientation is known."""
@@ -568,19 +562,6 @@ def _is_turning(track: Track) -> bool:
     """Return True if the orientation is known in most of the rows in which the position is."""
     seen = whole(track.position)
     return bool(np.sum(_turning(track)[seen]) > 0.8 * np.sum(seen))
-
-
-def _in_motion(motion: Motion, poses: _Poses) -> _Poses:
-    """Return poses in the frame of the base after a motion in it."""
-    if motion.track is None:
-        rotation = tuple(None if r is None else motion.rotation @ r for r in poses.rotation)
-        return _Poses(poses.position @ motion.rotation.T + motion.shift, rotation)
-    position, rotations = poses.position.copy(), list(poses.rotation)
-    own = rotations[motion.track]
-    assert own is not None
-    position[:, motion.track] += own @ motion.shift
-    rotations[motion.track] = own @ motion.rotation
-    return _Poses(position, tuple(rotations))
 
 
 def _nearest_rotation(source: Array, target: Array, known: float) -> Array:
@@ -626,4 +607,5 @@ def replaced(
     if DETECTION.overwhelming * miss(quarter, np.zeros(3)) < miss(rotation, shift):
         rotation, shift = quarter, np.zeros(3)
     is_shifted = bool(np.linalg.norm(shift) > SHOWN)
-    return moved(recording, rotation, shift), motion_text(rotation, shift), is_shifted
+    tracks = moved(recording.tracks, rotation, shift)
+    return replace(recording, tracks=tracks), motion_text(rotation, shift), is_shifted

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from stiffopt import lie
 from stiffopt.arrays import Array
-from stiffopt.errors import EquilibriumError, PressureError
+from stiffopt.errors import EquilibriumError, FileError, PressureError
 from stiffopt.identify.detection import lagged_pressures, weightless
 from stiffopt.identify.recording import Recording, Track
 from stiffopt.identify.settings import DETECTION, Finding
@@ -51,8 +51,8 @@ class Hypothesis:
         for each, turn in zip(recordings, self.turns, strict=True):
             pressures = self.driven(each.pressures, low)
             before = self.driven(each.before[np.newaxis], low)[0]
-            driven = replace(each, pressures=pressures, before=before)
-            found.append(moved(driven, CUBE_ROTATIONS[turn], np.zeros(3)))
+            tracks = moved(each.tracks, CUBE_ROTATIONS[turn], np.zeros(3))
+            found.append(replace(each, pressures=pressures, before=before, tracks=tracks))
         return found
 
     def driven(self, recorded: Array, low: Array) -> Array:
@@ -115,17 +115,37 @@ def _driven(recorded: Array, sources: Sequence[int], low: Array) -> Array:
     return np.column_stack(columns)
 
 
-def moved(recording: Recording, rotation: Array, shift: Array) -> Recording:
-    """Rotate (3, 3) a recording's poses about the origin of its frame, and shift them (3,)."""
-    tracks = tuple(
+def moved(tracks: Sequence[Track], rotation: Array, shift: Array) -> tuple[Track, ...]:
+    """Rotate (3, 3) poses about the origin of their frame, and shift them (3,)."""
+    return tuple(
         Track(
             track.name,
             track.position @ rotation.T + shift,
             None if track.rotation is None else rotation @ track.rotation,
         )
-        for track in recording.tracks
+        for track in tracks
     )
-    return replace(recording, tracks=tracks)
+
+
+def rows_with_all(
+    recording: Recording, seen: Sequence[NDArray[np.bool_]], count: int
+) -> NDArray[np.intp]:
+    """Return about `count` evenly spread rows of a recording, in which each track is `seen` (N,).
+
+    Raises
+    ------
+    FileError
+        If there is none.
+    """
+    rows = np.flatnonzero(np.logical_and.reduce(seen))
+    if not len(rows):
+        names = ", ".join(track.name for track in recording.tracks)
+        raise FileError(
+            recording.name,
+            f"no row has readings of all tracked points ({names}); leave out this log, or the body "
+            "in the robot file",
+        )
+    return rows[np.unique(np.linspace(0, len(rows) - 1, count).astype(int))]
 
 
 class Comparer:
@@ -159,8 +179,7 @@ class Comparer:
         self._measured: list[Array] = []
         count = max(DETECTION.rows // len(recordings), 8)
         for each in recordings:
-            seen = np.flatnonzero(np.logical_and.reduce([whole(t.position) for t in each.tracks]))
-            rows = seen[np.unique(np.linspace(0, len(seen) - 1, count).astype(int))]
+            rows = rows_with_all(each, [whole(t.position) for t in each.tracks], count)
             self._pressures.append(
                 lagged_pressures(each.time, each.pressures, DETECTION.clock_lag)[rows]
             )

@@ -197,7 +197,7 @@ def _with_frame_found(setup: Setup, recording: Recording, found: Comparison) -> 
     moved, words, is_shifted = replaced(recording, measured, predicted, setup.description.length)
     remark = (
         f"the frame of this log was defined anew: its poses are {words} (--keep axes leaves them); "
-        "a log of another arm or with another order of channels may look so too"
+        "a body that was defined anew, another arm or another order of channels may look so too"
     )
     spread = np.linalg.svd(predicted - predicted.mean(axis=0), compute_uv=False)
     in_line = bool(spread[1] < DETECTION.in_line * spread[0])
