@@ -74,7 +74,10 @@ def _moved_frame(setup: Setup, found: Found | None) -> MovedFrame | OtherChannel
     if isinstance(frame, MovedFrame) and frame.score < DETECTION.overwhelming * turned.score():
         return frame
     logs = tuple(i for i, turn in enumerate(turns) if turn)
-    channels = comparer.other_channels(logs)
+    if isinstance(frame, OtherChannels) and frame.logs == logs:
+        channels: OtherChannels | None = frame
+    else:
+        channels = comparer.other_channels(logs)
     if channels is not None and channels.left < DETECTION.tie * turned.left(logs):
         return channels
     return None
