@@ -424,6 +424,7 @@ class MotionWatch:
             if not self._slips and missing < tuning.bends * size and size > least_turn:
                 self._bends_until = now + tuning.slip_window
             wrong = missing > max(tuning.slip * size, least_turn) and now > self._bends_until
+            wrong = wrong and not self._turns_as_pushed(rows, tip, distance)
         if not wrong:
             self._slips.clear()
             return None
@@ -440,6 +441,22 @@ class MotionWatch:
                 is_of_arm=True,
             )
         return self._slipped(distance)
+
+    def _turns_as_pushed(self, rows: Array, tip: TipAt, distance: float) -> bool:
+        """Return whether some push by a distance, in m, or more is measured in samples (k, 21 + n).
+
+        The estimated turn follows a push later than the estimated displacement if the arm is just
+        becoming stiff.
+        """
+        ways, turn = rows[-1] - rows, turn_of_a_push(tip)
+        moved = ways[:, _SEEN] - ways[:, _PREDICTED]
+        far = np.flatnonzero((moved**2).sum(axis=1) > distance**2)
+        most = self._tuning.slip_of_large
+        return any(
+            self._missed_turn(turn @ moved[k], ways[k, _TURNED])
+            < most * float(np.linalg.norm(turn @ moved[k]))
+            for k in far
+        )
 
     def _lasts(self, missing: deque[float]) -> bool:
         """Return True if enough successive samples lacked the rotation that a push causes.
