@@ -152,6 +152,7 @@ class TipController:
         self._moved_at = -math.inf  # last time at which the reference moved
         self._computed_at = now
         self._adapted_at = -math.inf  # last adaptation of the model since the last request
+        self._adopted_at = -math.inf  # last change of the model
         self._untold: list[Notice] = []  # events since the last call of `notices`
         self._went_back_at = -math.inf  # last return to an earlier model
         self._watched_at = -math.inf  # last check whether the tip rests
@@ -374,7 +375,10 @@ class TipController:
         if now - self._went_back_at > self._tuning.adaptation.blind_time:
             self._arm.watch.intend(now, tip.pose[:3, 3] + reference.path[n : n + 3])
         course = self.replanner.pursuit.course
-        is_bounded = self.replanner.stiffens if self._vibrates else moves
+        if self._vibrates:
+            is_bounded = self.replanner.stiffens
+        else:  # feedback makes up at once for a model that has just been adapted
+            is_bounded = moves and now - self._adopted_at > self._tuning.adaptation.calm_time
         self._correction.take(tip.pose[:3, 3], applies=course is None and is_bounded)
         if self._arm.channels.pace == 0 and self._ways and moves:
             return self._feedforward(self._without_feedback, last)
@@ -637,7 +641,7 @@ class TipController:
     def _adopt(self, adapted: Adapted, change: Array) -> None:
         """Go on with a model, whose offset of the tip differs by a change (6,)."""
         self._shift(change)
-        self._adapted_at = self._now
+        self._adapted_at = self._adopted_at = self._now
         self.replanner.go_on_with(adapted, change)
 
     def _has_arrived(self) -> bool:
