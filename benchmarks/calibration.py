@@ -13,8 +13,8 @@ all its keys, whose remaining error is that of the model:
 - stiffness: prediction over measurement by the probe, minus 1.
 
 Prints a table in Markdown for each arm, over all its seeds. ``control.py --robot-file`` measures
-the effect of calibrated files on targets; tests/test_fit.py checks whether true values lie inside
-their intervals.
+the effect of calibrated files on targets; tests/test_intervals.py checks whether true values lie
+inside their intervals.
 """
 
 from __future__ import annotations

@@ -9,7 +9,8 @@ one; one that stiffopt's calibration made from a recording of that arm (some min
 ``--keep`` stores it, so that a run can be resumed); or one with the arm's true values, as far as it
 has keys for them. With ``--payload`` the tip carries more than the robot file says; with ``--loop``
 the whole control loop with its safety gate runs, not the controller alone; with ``--paths``
-figures-of-eight are followed instead of targets.
+figures-of-eight are followed instead of targets. ``--robot``, ``--modulus`` and ``--steps`` draw
+other arms and steps: another robot file, a certain error of the modulus, longer ways.
 
 Metrics: settling to 1 mm, for good, over the ideal: the settling time of an open-loop step to the
 arm's own stiffest pressures, without inertia, creep and hysteresis. Steady: mean error of the last
@@ -39,6 +40,7 @@ import numpy as np
 from control_baselines import CONTROLLERS
 from control_cases import (
     DYNAMICS,
+    STEPS,
     Case,
     at_tip_speed,
     draw_case,
@@ -66,9 +68,11 @@ def one_case(
     paths: bool,
     in_loop: bool,
     tip_speed: float | None,
+    drawn: dict[str, Any],
 ) -> list[Step | Follow]:
     """All that one arm has to show."""
-    case = with_file(draw_case(seed, 1 if paths else targets, payload), robot_file, keep)
+    case = draw_case(seed, 1 if paths else targets, payload, **drawn)
+    case = with_file(case, robot_file, keep)
     case = at_tip_speed(case, tip_speed)
     found: list[Step | Follow] = []
     path = draw_path(case) if paths else None
@@ -209,6 +213,11 @@ def main() -> int:
     parser.add_argument("--paths", action="store_true", help="figures-of-eight, not targets")
     parser.add_argument("--loop", action="store_true", help="in the whole control loop")
     parser.add_argument("--tip-speed", type=float, help="`control.tip_speed` of the rig, in m/s")
+    parser.add_argument("--robot", help="nominal robot file, if not that of the rig")
+    parser.add_argument("--modulus", type=float, help="of the arms, over that of the file")
+    parser.add_argument(
+        "--steps", type=float, nargs=2, default=STEPS, help="between two targets, least and most, m"
+    )
     parser.add_argument("--jobs", type=int, default=1, help="processes")
     parser.add_argument("--out", type=Path, help="JSON file for all that was measured")
     given = parser.parse_args()
@@ -218,6 +227,7 @@ def main() -> int:
         one_case, dynamics=given.dynamics, targets=given.targets, controllers=given.controller,
         payload=given.payload, robot_file=given.robot_file, keep=given.keep, paths=given.paths,
         in_loop=given.loop, tip_speed=given.tip_speed,
+        drawn={"robot_file": given.robot, "modulus": given.modulus, "steps": given.steps},
     )  # fmt: skip
     found: list[Any] = []
     for part in in_processes(work, seeds, given.jobs):

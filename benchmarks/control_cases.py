@@ -32,6 +32,7 @@ from stiffopt import (
     save_robot,
 )
 from stiffopt.model.robot_files import load_description
+from stiffopt.model.scene import Scene
 from stiffopt.optimise.tip import TipModel
 from stiffopt.plant.devices import SimulatedRig
 from stiffopt.plant.plant import Plant
@@ -158,7 +159,21 @@ def at_tip_speed(case: Case, speed: float | None) -> Case:
     return replace(case, description=case.description.model_copy(update={"control": control}))
 
 
-def draw_case(seed: int, targets: int = 3, payload: float = 0.0, *, ranked: bool = True) -> Case:
+def beside(case: Case, scene: Scene) -> Case:
+    """The case whose controller keeps clear of a scene."""
+    return replace(case, description=case.description.model_copy(update={"scene": scene}))
+
+
+def draw_case(
+    seed: int,
+    targets: int = 3,
+    payload: float = 0.0,
+    *,
+    ranked: bool = True,
+    robot_file: str | None = None,
+    modulus: float | None = None,
+    steps: tuple[float, float] = STEPS,
+) -> Case:
     """Draw an arm and targets for it; the controller gets the nominal robot file.
 
     Parameters
@@ -167,18 +182,26 @@ def draw_case(seed: int, targets: int = 3, payload: float = 0.0, *, ranked: bool
     targets : how many; their directions take turns, the first one changes with the seed.
     payload : mass at the tip that nobody knows of, beside the 20 g of the robot file, in kg.
     ranked : whether to find each target's stiffest pressures and ideal time, which takes a minute.
+    robot_file : nominal one, if not that of the rig.
+    modulus : of all segments, over that of the file; None: drawn.
+    steps : least and greatest distance between two targets, in m.
     """
     rig = load_rig_description(RIG)
+    if robot_file is not None:
+        rig = rig.model_copy(update={"robot": robot_file})
     robot = load_description(rig.robot)
     rng = np.random.default_rng([seed, 6])
-    plant = PlantSettings(mismatch=_mismatch(robot, rng), seed=seed, payload=payload)
+    mismatch = _mismatch(robot, rng)
+    if modulus is not None:
+        mismatch = mismatch.model_copy(update={"modulus": (modulus,) * robot.n_segments})
+    plant = PlantSettings(mismatch=mismatch, seed=seed, payload=payload)
     tracker = rig.tracker.model_copy(update={"noise": 5e-5})
     rig = rig.model_copy(update={"plant": plant, "tracker": tracker})
-    truth = TrueModel(robot, plant.mismatch, payload)
+    truth = TrueModel(robot, mismatch, payload)
     arm = Arm(robot, plant, truth)
     kinds = list(DIRECTIONS)
     aims: list[Aim] = []
-    for k, (position, drawn) in enumerate(places(arm, targets, rng)):
+    for k, (position, drawn) in enumerate(places(arm, targets, rng, steps)):
         kind = kinds[(seed + k) % len(kinds)]
         stiffest = arm.stiffest(position, DIRECTIONS[kind], drawn, rng) if ranked else drawn
         aims.append(Aim(position, kind, drawn, stiffest, np.nan))
@@ -190,14 +213,16 @@ def draw_case(seed: int, targets: int = 3, payload: float = 0.0, *, ranked: bool
     return replace(case, aims=tuple(timed))
 
 
-def places(arm: Arm, count: int, rng: np.random.Generator) -> list[tuple[Array, Array]]:
+def places(
+    arm: Arm, count: int, rng: np.random.Generator, steps: tuple[float, float] = STEPS
+) -> list[tuple[Array, Array]]:
     """Positions (3,) at rest and their pressures, each a step from the last one."""
     last = arm.settled(np.zeros(len(arm.high)))
     found: list[tuple[Array, Array]] = []
     while len(found) < count:
         pressures = rng.uniform(0, UP_TO, len(arm.high)) * arm.high
         place = arm.settled(pressures)
-        if STEPS[0] <= np.linalg.norm(place - last) <= STEPS[1]:
+        if steps[0] <= np.linalg.norm(place - last) <= steps[1]:
             found.append((place, pressures))
             last = place
     return found

@@ -21,9 +21,10 @@ detected as a fault. Below each row on the way, both distances of each run, and 
 With `--in-use`, motions are fast from the beginning, as of an arm that has moved since it was
 armed. The table then has a line for each arm and a column for each row: what the loop causes, in
 mm, and when it was told, as what; and last the time to the second target without a fault, until the
-tip stays within 1 mm. With `--commission`, `stiffopt commission --quick` looks for the faults of
-the set-up instead: its first finding, whether it permits arming, and how far the tip moved from
-rest.
+tip stays within 1 mm. With `--post`, the controller keeps clear of a post beside the arm, which
+leaves room for every motion. With `--commission`, `stiffopt commission --quick` looks for the
+faults of the set-up instead: its first finding, whether it permits arming, and how far the tip
+moved from rest.
 """
 
 from __future__ import annotations
@@ -42,10 +43,10 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from control_baselines import PERIOD
-from control_cases import DYNAMICS, Case, at_tip_speed, draw_case, settling_time
+from control_cases import DYNAMICS, Case, at_tip_speed, beside, draw_case, settling_time
 from control_runs import STAYS, LoopRun
 from report import table
-from stiffopt import lie, load_robot
+from stiffopt import Scene, lie, load_robot
 from stiffopt.commissioning.commission import evaluate
 from stiffopt.commissioning.expected import expected_steps
 from stiffopt.commissioning.procedure import DangerError, run_steps
@@ -57,6 +58,10 @@ from stiffopt.safety.rigs import gated_rig
 
 Array = NDArray[np.float64]
 
+POST = Scene(
+    clearance=1e-3,
+    objects=[{"name": "post", "sphere": {"centre": (0.2, 0.2, 0.1), "radius": 0.008}}],
+)
 REST, BEFORE = 3.0, 4.0  # s: at the first target, and with the fault there
 AFTER, END = 3.0, 16.0  # s: at the second target, and until a hold has ended
 DOUBTS = (
@@ -93,6 +98,7 @@ class Row:
     shows_in_motion : whether it can be noticed only while the tip is to move.
     is_fault : whether it is to be noticed.
     noise : of the tracker, in m, if not as usual.
+    then : lets more begin, or end, at the moment of the second target.
     usual : the part of it that is no fault, with which the tip takes the way to compare with.
     shows_above : command of channel 2 above which it can be noticed, in Pa: an empty channel does
         not leak.
@@ -104,6 +110,7 @@ class Row:
     shows_in_motion: bool = False
     is_fault: bool = True
     noise: float = 5e-5
+    then: Callable[[Any], object] = lambda rig: None
     usual: Callable[[Any], object] | None = None
     shows_above: float = 0.0
 
@@ -383,6 +390,20 @@ ROWS = (
     Row("a push of 30 mN halfway along", _push_halfway(0.03), is_fault=False),
     Row("a push of 50 mN", _push(0.0, -0.05, 0.0), is_fault=False),
     Row("a push that grows by 20 mN/s to 60 mN", _slow_push(0.02, 0.06), is_fault=False),
+    Row(
+        "a push of 30 mN at the moment of a target",
+        _nothing,
+        is_fault=False,
+        shows_in_motion=True,
+        then=_push(0.03, 0.0, 0.0),
+    ),
+    Row(
+        "a push of 30 mN until the moment of a target",
+        _push(0.03, 0.0, 0.0),
+        is_fault=False,
+        shows_in_motion=True,
+        then=_push(0.0, 0.0, 0.0),
+    ),
     Row("a payload of 10 g", _push(0.0, 0.0, 0.0981), is_fault=False),
     Row("tracker noise of 0.15 mm", _nothing, is_fault=False, noise=1.5e-4),
     Row("nothing", _nothing, is_fault=False),
@@ -426,7 +447,7 @@ def run_row(
     controller = TipController(
         load_robot(case.believed), rig.supply.limits, rig.slew, period=PERIOD,
         control=rig.settings.control, safety=rig.settings.safety, vibrates=dynamics == "full",
-        slow_first_motion=not in_use,
+        slow_first_motion=not in_use, scene=case.description.scene,
     )  # fmt: skip
     run = LoopRun(rig, controller, case.point)
     try:
@@ -444,11 +465,14 @@ def run_row(
             began = begin = rig.clock.now()
             row.begin(rig)
             if frozen:
-                return Outcome(np.inf, "", _tips_alone(rig, BEFORE + AFTER), "frozen")
+                before, _ = _tips_alone(rig, BEFORE), row.then(rig)
+                alone = np.concatenate([before, _tips_alone(rig, AFTER)])
+                return Outcome(np.inf, "", alone, "frozen")
             traces = [*traces[: row.name == "nothing"], run.go(BEFORE)]
         if run.loop.snapshot().state is State.ACTIVE:
             if row.shows_in_motion:
                 begin = rig.clock.now()
+            row.then(rig)
             _try_task(run, case, 1)
             traces.append(run.go(AFTER))
         if row.shows_above:
@@ -609,10 +633,13 @@ def main() -> None:
     parser.add_argument("--commission", action="store_true", help="look for faults of the set-up")
     parser.add_argument("--in-use", action="store_true", help="fast from the start; a line an arm")
     parser.add_argument("--tip-speed", type=float, help="`control.tip_speed` of the rig, in m/s")
+    parser.add_argument("--post", action="store_true", help="with a scene: a post beside the arm")
     arguments = parser.parse_args()
     seeds = [first + case for first in arguments.seed for case in range(arguments.cases)]
     drawn = [draw_case(seed, 2, ranked=False) for seed in seeds]
     cases = [at_tip_speed(case, arguments.tip_speed) for case in drawn]
+    if arguments.post:
+        cases = [beside(case, POST) for case in cases]
     words = arguments.rows or [""]
     rows = [row for row in ROWS if any(word in row.name for word in words)]
     if arguments.commission:

@@ -1,6 +1,7 @@
 """Measure how often the tips of calibrated simulated arms lie in the regions of their predictions.
 
     python benchmarks/regions.py [--first SEED] [--arms N] [--rig NAME] [--auto] [--undriven]
+    python benchmarks/regions.py --recordings DIR
 
 Each seed gives another arm: mismatch (of every second one as `Spread` says, of the others as the
 rig file says), silicone (drawn for two of four), lag and dead time. It is simulated without inertia
@@ -12,6 +13,11 @@ rounds, and to the sweeps alone, so that all rounds are extrapolated. With `--un
 channel has no pressure in these logs, so that what it does is extrapolated. Prints the share of
 readings of the other rounds within the regions of 50, 68, 90, 95 and 99 %, all arms together, with
 95 % intervals by a bootstrap over arms.
+
+With `--recordings` the arms are the real ones of `stiffopt bench recordings`, calibrated with their
+strain law by default settings. The 55 mm arm is also fitted to its circle, and the test runs of
+both fits are pooled. The intervals are those of `stiffopt validate`, by a bootstrap over blocks of
+two minutes.
 """
 
 from __future__ import annotations
@@ -20,6 +26,7 @@ import argparse
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +36,10 @@ from calibration import CASES, described
 from report import table
 from stiffopt import CalibrationSettings, Log, RobotDescription, calibrate, validate
 from stiffopt.experiments.coverage import spread_pressures
+from stiffopt.identify.bench import load_bench
 from stiffopt.identify.results import LEVELS, Comparison, coverage
+from stiffopt.logs import read_log
+from stiffopt.model.robot_files import load_description
 from stiffopt.plant.plant import Plant
 from stiffopt.plant.settings import (
     Discretisation,
@@ -49,6 +59,7 @@ HALF_TOOTH = 2.2  # s
 ROUNDS, ROUND, DESIGNED = 15, 6, 2  # rounds, poses in each, rounds as in the experiment
 NOISE, ANGLE_NOISE = 1e-4, 3e-3  # m, rad
 DRAWS = 2000  # of the bootstrap over arms
+CIRCLE = "ucl_stiff_flop_55mm/run_2022-10-20_16-07-29.csv"
 QUICK = CalibrationSettings(
     sequence=True, structure="hysteresis", strain_law="keep", rows=800, trial_rows=400,
     start_evaluations=10,
@@ -159,11 +170,32 @@ def intervals(arms: list[list[Comparison]], kind: str) -> Array:
     return np.asarray(np.quantile(shares, (0.025, 0.975), axis=0))
 
 
-def markdown(title: str, arms: list[list[Comparison]]) -> str:
-    """Table of the coverage of all arms together."""
+def of_recordings(folder: Path) -> Iterator[tuple[str, list[Comparison]]]:
+    """Yield each real arm's name and its test runs, compared with fits to others of its runs."""
+    bench, base = load_bench()
+    for arm in bench.arms:
+        splits = [(arm.train, arm.test)] if arm.test else []
+        if CIRCLE in arm.test:
+            others = (*arm.train, *(name for name in arm.test if name != CIRCLE))
+            splits.append(((CIRCLE,), others))
+        settings = CalibrationSettings(sequence=arm.sequence, strain_law="keep")
+        found: list[Comparison] = []
+        for train, test in splits:
+            fitted, tested = (
+                [(name, read_log(folder / name)) for name in names] for names in (train, test)
+            )
+            robot = load_description(arm.robot, base=base)
+            result = calibrate(robot, fitted, settings=settings)
+            found += validate(result.robot, tested, settings)
+        if found:
+            yield arm.name, found
+
+
+def markdown(title: str, arms: list[list[Comparison]], *, is_one: bool = False) -> str:
+    """Table of the coverage of all arms together, or of one arm (`is_one`) by itself."""
     found, rows = [each for arm in arms for each in arm], []
     for name, each in coverage(found).items():
-        ends = 100 * intervals(arms, name).T
+        ends = 100 * (np.array(each.intervals) if is_one else intervals(arms, name).T)
         cells = [f"{100 * share:.0f} ({low:.0f} to {high:.0f})"
                  for share, (low, high) in zip(each.shares, ends, strict=True)]  # fmt: skip
         rows.append((name, str(each.n), *cells))
@@ -182,7 +214,12 @@ def main() -> int:
     parser.add_argument("--rig", choices=list(CASES), default="sim")
     parser.add_argument("--auto", action="store_true", help="default settings: models are compared")
     parser.add_argument("--undriven", action="store_true", help="the last channel is not recorded")
+    parser.add_argument("--recordings", type=Path, metavar="DIR", help="of real arms instead")
     given = parser.parse_args()
+    if given.recordings is not None:
+        for name, runs in of_recordings(given.recordings):
+            print(markdown(name, [runs], is_one=True), end="\n\n", flush=True)
+        return 0
     settings = CalibrationSettings(sequence=True) if given.auto else QUICK
     found: dict[str, list[list[Comparison]]] = {"sweeps and two rounds": [], "sweeps alone": []}
     for seed in range(given.first, given.first + given.arms):

@@ -10,10 +10,10 @@ wrongly while the sweeps and two rounds are simulated; the other faults are made
 third round, as `validate` reads it.
 
 Prints a table in Markdown for each rig. A fault is told *rightly* if its correction, or both of two
-faults, and nothing else are told; *in part* if one of two is, or if a remark or an error only says
-what is wrong, such as a channel that does nothing; *wrongly* if anything else is told. "Left" is
-the share of the misfit to the robot file's arm, with ``--validate`` of the mean error, that
-corrections which were told rightly leave.
+faults, and nothing else are told (an order of one log is told without a correction); *in part* if
+one of two is, or if a remark or an error only says what is wrong, such as a channel that does
+nothing; *wrongly* if anything else is told. "Left" is the share of the misfit to the robot file's
+arm, with ``--validate`` of the mean error, that corrections which were told rightly leave.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from report import table
 from stiffopt import InputError, Log, RobotDescription, calibrate, validate
 from stiffopt.identify.correction import put_right
 from stiffopt.identify.detection import without_drift
-from stiffopt.identify.hypotheses import Hypothesis
+from stiffopt.identify.hypotheses import Hypothesis, turn_text
 from stiffopt.identify.setup import Setup, recordings_of
 from stiffopt.identify.tracker_faults import CUBE_ROTATIONS
 
@@ -61,7 +61,7 @@ class Fault:
     sources : for each channel, the channel (from 0) whose column has its pressures; -1 for none.
         None if the channels are right.
     edited : turns right logs into faulty ones.
-    told : what the remarks should contain, one part each.
+    told : what the remarks should contain, one part each, in one of the wordings between bars.
     hints : what a remark or an error may contain that says what is wrong, but corrects nothing.
     """
 
@@ -164,7 +164,8 @@ def axes_of_one_log(robot: RobotDescription, rng: np.random.Generator) -> Fault:
     """The body was defined anew in one log, with axes turned by quarter turns."""
     turn, which = int(rng.integers(1, 24)), int(rng.integers(FITTED))
     told = turned(robot, tuple(turn if k == which else 0 for k in range(FITTED)))
-    return Fault(edited=in_one(which, CUBE_ROTATIONS[turn].T), told=(told,))
+    anew = f"its poses are turned {turn_text(CUBE_ROTATIONS[turn])}"  # as `validate` tells it
+    return Fault(edited=in_one(which, CUBE_ROTATIONS[turn].T), told=(f"{told}|{anew}",))
 
 
 def turned(robot: RobotDescription, turns: tuple[int, ...]) -> str:
@@ -181,6 +182,39 @@ def frame_of_one_log(robot: RobotDescription, rng: np.random.Generator) -> Fault
     turn = Rotation.from_rotvec(angle * axis / np.linalg.norm(axis)).as_matrix()
     shift = 0.02 * far / np.linalg.norm(far)
     return Fault(edited=in_one(int(rng.integers(FITTED)), turn, shift), told=("defined anew",))
+
+
+def body_of_one_log(robot: RobotDescription, rng: np.random.Generator) -> Fault:
+    """The tip's body was defined anew in one log, turned by 20 to 60 degrees and moved by 20 mm."""
+    axis, far = rng.normal(size=(2, 3))
+    angle, which = np.radians(rng.uniform(20, 60)), int(rng.integers(FITTED))
+    turn = Rotation.from_rotvec(angle * axis / np.linalg.norm(axis))
+    shift = 0.02 * far / np.linalg.norm(far)
+
+    def anew(log: Log) -> Log:
+        assert log.tip_quaternion is not None
+        body = Rotation.from_quat(log.tip_quaternion, scalar_first=True)
+        return replace(
+            log,
+            tip_position=log.tip_position + body.apply(shift),
+            tip_quaternion=(body * turn).as_quat(scalar_first=True),
+        )
+
+    told = "the body 'tip' was defined anew"
+    return Fault(edited=lambda right: one_changed(right, which, anew), told=(told,))
+
+
+def order_of_one_log(robot: RobotDescription, rng: np.random.Generator) -> Fault:
+    """The channels of a segment have each other's columns in a circle, in one log."""
+    found = cycle(robot, rng)
+    sources, which = list(found.sources or ()), int(rng.integers(FITTED))
+
+    def reordered(log: Log) -> Log:
+        commanded = log.commanded.copy()
+        commanded[:, sources] = log.commanded
+        return replace(log, commanded=commanded)
+
+    return Fault(edited=lambda right: one_changed(right, which, reordered), told=found.told)
 
 
 def units(robot: RobotDescription, rng: np.random.Generator) -> Fault:
@@ -243,6 +277,8 @@ FAULTS: dict[str, Callable[[RobotDescription, np.random.Generator], Fault]] = {
     "frame of one log": frame_of_one_log,
     "units": units,
     "clocks": clocks,
+    "body of one log": body_of_one_log,
+    "order of one log": order_of_one_log,
 }
 ONLY_CALIBRATED = ("axes",)  # `validate` sees one log: the same as `axes of one log`
 
@@ -312,11 +348,14 @@ def judged(fault: Fault, remarks: Sequence[str]) -> tuple[str, float]:
     shares = [float(each[1]) / float(each[2]) for each in found if each]
     if not told:
         return ("nothing" if fault.told else "rightly"), float("nan")
-    known = (*fault.told, *fault.hints)
+    known = [words for each in (*fault.told, *fault.hints) for words in each.split("|")]
     parts = [part for each in told for part in LIST.split(each.removeprefix(AGAIN))]
     if not all(any(words in part for words in known) for part in parts):
         return "wrongly", float("nan")
-    complete = all(any(words in each for each in told) for words in fault.told)
+    complete = all(
+        any(words in each for each in told for words in wordings.split("|"))
+        for wordings in fault.told
+    )
     share = float(np.prod(shares)) if shares else float("nan")
     return ("rightly" if complete else "in part"), share
 

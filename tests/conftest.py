@@ -21,7 +21,7 @@ LONGEST = (
     "test_bracing_push", "test_bracing_loop", "test_brace", "test_workspace_resumed",
     "test_posture", "test_calibrate_command", "test_open_regulator", "test_ros_end_to_end",
     "test_run_command", "test_lab", "test_commanding_processes", "test_supply_contract",
-    "test_world",
+    "test_world", "test_intervals",
 )  # fmt: skip
 LOOPBACK = ("127.0.0.1", "::1", "localhost")
 
@@ -131,6 +131,25 @@ def compiled(code_cache: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Machine code instead of the CasADi VM; not optimised but in the long form, to save time."""
     use_compiler(monkeypatch, code_cache)
     return code_cache
+
+
+@pytest.fixture(scope="module")
+def organ(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A dented body in mm, of triangles, as an STL file."""
+    np, trimesh = pytest.importorskip("numpy"), pytest.importorskip("trimesh")
+    body = trimesh.creation.icosphere(3, 20.0)
+    up = body.vertices[:, 2:] / 20.0
+    body.vertices *= 1.0 - 0.35 * np.exp(-4 * (up - 1) ** 2) + 0.2 * up
+    path = tmp_path_factory.mktemp("mesh") / "organ.stl"
+    body.export(path)
+    return path
+
+
+@pytest.fixture
+def kept_grids(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Grids of meshes are kept for all tests of this run, and nowhere else."""
+    folder = tmp_path_factory.getbasetemp() / "grids"
+    monkeypatch.setenv("STIFFOPT_CACHE_DIR", str(folder))
 
 
 @pytest.fixture(autouse=True)

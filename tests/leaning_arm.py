@@ -13,7 +13,7 @@ import pytest
 
 import stiffopt
 from stiffopt.control.bracing import BracePhase, Bracing
-from stiffopt.control.tuning import BracingTuning
+from stiffopt.control.contact_tuning import BracingTuning
 from stiffopt.optimise import braced
 from stiffopt.optimise.settings import BRACE, Effort
 from stiffopt.optimise.solution import PressureSolution

@@ -19,9 +19,9 @@ from leaning_arm import (
     settled,
 )
 from stiffopt.control.bracing import BracePhase, Bracing
+from stiffopt.control.contact_tuning import BracingTuning
 from stiffopt.control.friction import Friction
 from stiffopt.control.linearised_tip import LeaningTip
-from stiffopt.control.tuning import BracingTuning
 
 
 def test_it_goes_to_rest_leans_holds_and_goes_back(approach):

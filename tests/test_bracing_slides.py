@@ -19,9 +19,9 @@ from leaning_arm import (
 )
 from stiffopt import lie
 from stiffopt.control.bracing import BracePhase
+from stiffopt.control.contact_tuning import SlidingTuning
 from stiffopt.control.friction import Friction
 from stiffopt.control.sliding import SlideEstimator
-from stiffopt.control.tuning import SlidingTuning
 from stiffopt.paths.leaning import BraceApproach
 
 

@@ -20,6 +20,7 @@ from stiffopt.identify.settings import FIT
 from stiffopt.identify.structures import STRUCTURES, ModelStructure
 from stiffopt.identify.unknowns import (
     Unknowns,
+    anew_unknowns,
     history_unknowns,
     placement_unknowns,
     shape_unknowns,
@@ -78,6 +79,7 @@ class Case:
     bodies: bool = False
     turns: bool = False
     tables: bool = False
+    anew: tuple[str | None, ...] = (None, None, None)
 
 
 CASES = {
@@ -85,6 +87,9 @@ CASES = {
     "one segment with a table": Case("stiff-flop-1", 20, 12, ("unknown",), tables=True),
     "two segments in sequence": Case(
         "stiff-flop-2", 25, 15, ("unknown", "previous", "previous"), bodies=True, turns=True
+    ),
+    "frame and body defined anew": Case(
+        "stiff-flop-1", 20, 12, ("rest", "rest", "rest"), turns=True, anew=(None, "frame", "tip")
     ),
     "hanging": Case(
         "stiff-flop-2-hanging", 40, 5, ("unknown",), bodies=True, turns=True, tables=True
@@ -113,6 +118,7 @@ def problem_of(case: Case) -> CalibrationProblem:
     samples = []
     for i, begin in enumerate(case.begins):
         made = recording(n, case.count, 20 + i, bodies, case.turns)
+        made = replace(made, anew=case.anew[i])
         rows = np.unique(random.integers(0, case.count, case.rows))
         samples.append(Sample(made, rows, random.uniform(0.5, 1.0, len(rows)), begin))
     points = [TrackedPoint("tip", None, lie.exp(random.normal(0, 0.01, 6)), case.turns)]
@@ -129,7 +135,14 @@ def problem_of(case: Case) -> CalibrationProblem:
             tuple(placement_unknowns("sensor", np.full(3, 2e-3), np.full(3, 0.05), case.turns))
             for _ in points
         ),
-        zeros=tuple(tuple(zero_unknowns(s.recording.name, known)) for s in samples),
+        zeros=tuple(
+            tuple(
+                anew_unknowns(s.recording.name, description.length)
+                if s.recording.anew
+                else zero_unknowns(s.recording.name, known)
+            )
+            for s in samples
+        ),
         sides=tuple(
             tuple(side_unknowns(description, s.recording.name)) if s.begin == "unknown" else ()
             for s in samples

@@ -7,7 +7,8 @@ import pytest
 
 import stiffopt as so
 from stiffopt.control.channels import Channels
-from stiffopt.control.planning import Planning, PlanRequest
+from stiffopt.control.plan import PlanRequest
+from stiffopt.control.planning import Planning
 from stiffopt.control.regulators import PressureEstimator
 from stiffopt.control.tuning import RegulatorTuning
 from stiffopt.errors import InputError

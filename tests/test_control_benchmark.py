@@ -25,6 +25,7 @@ import setup_faults
 from conftest import is_long
 from control_baselines import CONTROLLERS, Gains, IntegralFeedback
 from control_cases import DIRECTIONS, STEPS, draw_case, draw_path, settling_time, with_true_file
+from stiffopt.identify.results import Comparison
 from stiffopt.model.description import Recordings
 from stiffopt.model.manipulator import load_robot
 from stiffopt.plant.plant import Plant
@@ -86,6 +87,15 @@ def test_a_case_is_what_the_bars_say_and_its_truth_is_that_of_the_arm():
         assert case.truth.position(p) == pytest.approx(case.truth.position(aim.drawn), abs=1e-4)
         assert case.truth.stiffness(p, direction) == pytest.approx(value)
     assert choice.least < case.truth.stiffness(aim.drawn, direction) < choice.most * (1 + 1e-9)
+
+
+def test_arms_and_steps_may_be_other_ones():
+    given = {"robot_file": "stiff-flop-2", "modulus": 0.85, "steps": (0.05, 0.11)}
+    case = draw_case(3, targets=1, ranked=False, **given)
+    assert case.believed.name == "stiff-flop-2"
+    assert case.description.plant.mismatch.modulus == (0.85, 0.85)
+    step = case.aims[0].position - case.arm().settled(np.zeros(6))
+    assert 0.05 <= np.linalg.norm(step) <= 0.11
 
 
 def test_feedback_beats_the_model_alone_and_the_table_says_so(short_steps):
@@ -249,6 +259,38 @@ def test_a_file_with_the_true_values_hangs_as_the_arm_does_from_its_tilted_base(
     errors = found.values["settled"]  # % of length
     assert np.max(errors["true"]) < 0.01
     assert np.min(errors["not tilted"]) > 1
+
+
+def test_the_55_mm_arm_is_calibrated_by_its_training_run_and_by_its_circle(monkeypatch):
+    """Each fit is tested with the other runs, and all of these are pooled."""
+    fits, tests, compared = [], [], Comparison(
+        "", np.arange(600.0), *[np.zeros((600, 3))] * 5, None, *np.ones((2, 600), dtype=bool),
+        *[np.repeat([0.4, 0.6], 300)] * 2, (),
+    )  # fmt: skip
+
+    def names(logs):
+        return [Path(name).stem[-6:] for name, _ in logs]
+
+    def calibrated(robot, logs, *, settings):
+        fits.append((names(logs), settings.sequence))
+        return SimpleNamespace(robot=robot)
+
+    def tested(robot, logs, settings):
+        tests.append(names(logs))
+        return [compared] * len(logs)
+
+    monkeypatch.setattr(regions, "read_log", lambda path: path)
+    monkeypatch.setattr(regions, "calibrate", calibrated)
+    monkeypatch.setattr(regions, "validate", tested)
+    found = dict(regions.of_recordings(Path("somewhere")))
+    assert list(found) == ["ucl-58", "ucl-55", "asu"]  # two modules have no test run
+    assert fits[1:3] == [(["ol-p2p"], False), (["-07-29"], False)]
+    assert tests[1:3] == [["cl-p2p", "-07-29"], ["ol-p2p", "cl-p2p"]]
+    assert len(found["ucl-55"]) == 4
+    assert fits[3] == ([f"apr4_{number}" for number in range(1, 6)], True)  # one after another
+    told = regions.markdown("ucl-55", [found["ucl-55"]], is_one=True)
+    (row,) = (line for line in told.splitlines() if line.startswith("| with history |"))
+    assert row.startswith("| with history | 2400 | 50 (30 to 68) | 100 (100 to 100) |")
 
 
 @pytest.mark.parametrize("name", ["none", "dead line", "axes of one log"])

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from stiffopt.control.contact_tuning import CreepTuning
 from stiffopt.control.creep import CreepEstimator
-from stiffopt.control.tuning import CreepTuning
 
 Array = NDArray[np.float64]
 

@@ -443,6 +443,28 @@ def test_wrong_channels_are_found_when_a_model_is_validated(
     assert words not in " ".join(kept.remarks)
 
 
+@pytest.mark.parametrize(
+    ("sources", "words"),
+    [
+        ([0, -1, 2, 3, 4, 3], ["segment 1 channel 2 is dead", "segment 2 channel 3 has the press"]),
+        ([1, 2, 0, 3, 5, 4], ["channel 1 has the column of segment 1 channel 2", "segment 2 chan"]),
+    ],
+)
+def test_two_wrong_lines_or_orders_are_found_when_a_model_is_validated(
+    sources: list[int], words: list[str]
+) -> None:
+    robot, log = calibrated(arm("stiff-flop-2")), log_of("stiff-flop-2", 6)
+    every = np.column_stack([log.commanded, np.zeros(len(log.time))])
+    if -1 in sources:
+        tip = driven(every[:, sources], log.time, "stiff-flop-2").tip_position
+        wrong = replace(log, tip_position=tip)
+    else:
+        wrong = replace(log, commanded=log.commanded[:, np.argsort(sources)])
+    (found,) = validate(robot, [wrong])
+    assert all(each in found.remarks[-1] for each in words)
+    assert found.errors.mean < 1e-3
+
+
 # -- units -----------------------------------------------------------------------------------------
 
 

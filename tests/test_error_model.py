@@ -186,14 +186,41 @@ def test_bad_probabilities_are_refused() -> None:
             known.semi_axes_at(level)
 
 
-def test_pressures_that_change_make_a_larger_region() -> None:
-    arm = Manipulator(ONE.model_copy(update={"calibration": Calibration(errors=KNOWN)}))
-    held, moving = (arm.tip_uncertainty(CIRCLE[0], moving=each) for each in (False, True))
-    slopes = arm.tip_pose(CIRCLE[0])[:3, :3] @ arm.tip_jacobian(CIRCLE[0])[:3]
-    np.testing.assert_allclose(moving.hysteresis, 3e3**2 * slopes @ slopes.T, rtol=1e-9)
+@pytest.mark.parametrize(
+    ("p", "independent"),
+    [((0.0, 0.0, 0.0), (0, 0, 0)), ((9e4, 0.0, 5e4), (0, 0, 0.5)), ((5e4,) * 3, (0.5,) * 3)],
+)
+def test_pressures_that_change_make_a_larger_region(
+    p: tuple[float, ...], independent: tuple[float, ...]
+) -> None:
+    """The lag is along the ways on which the arm comes there; where they are short, there is more.
+
+    That is `independent` of the other channels, in shares of what was recorded.
+    """
+    recorded = Calibration(errors=KNOWN, pressure_min=(0.0,) * 3, pressure_max=(1e5,) * 3)
+    arm = Manipulator(ONE.model_copy(update={"calibration": recorded}))
+    held, moving = (arm.tip_uncertainty(p, moving=each) for each in (False, True))
+    grid = np.stack(np.meshgrid(*[1e5 * (np.arange(100) + 0.5) / 100] * 3), axis=-1).reshape(-1, 3)
+    ways = (grid - p) * 3e3 / np.sqrt(1e5**2 / 6)  # two pressures drawn differ by that, RMS
+    lag = ways.T @ ways / len(ways) + 3e3**2 * np.diag(independent)
+    slopes = arm.tip_pose(p)[:3, :3] @ arm.tip_jacobian(p)[:3]
+    expected = slopes @ lag @ slopes.T
+    np.testing.assert_allclose(moving.hysteresis, expected, atol=1e-3 * expected.max())
     assert not held.hysteresis.any()  # this arm has no play
     assert held.discrepancy.any()
     np.testing.assert_allclose(held.discrepancy, 0.9 * moving.discrepancy, rtol=1e-9)
+
+
+def test_a_channel_that_was_hardly_driven_does_not_lag_more_than_it_was_seen_to() -> None:
+    errors = KNOWN.model_copy(update={"moving": (3e3, 3e3, 0.0)})
+    recorded = Calibration(errors=errors, pressure_min=(0.0,) * 3, pressure_max=(1e5, 1e5, 0.0))
+    robot = ONE.model_copy(update={"calibration": recorded})
+    found, p = Uncertainty(robot), np.array([[0.0, 2e4, 6e4]])
+    slopes = Manipulator(ONE).tip_pose(p[0])[:3, :3] @ Manipulator(ONE).tip_jacobian(p[0])[:3]
+    moving = found.errors(p, moving=np.ones(1, dtype=bool)).hysteresis[0]
+    by_pressure = np.linalg.solve(slopes, np.linalg.solve(slopes, moving).T)
+    assert (np.abs(by_pressure[2]) < 1.0).all()
+    assert by_pressure[0, 0] == pytest.approx(2 * 3e3**2, rel=1e-6)
 
 
 def test_a_discrepancy_moves_the_tip_as_far_in_all_directions() -> None:

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from stiffopt import lie
 from stiffopt.control.motion_watch import Doubt, MotionWatch
+from stiffopt.control.noticing_tuning import MotionTuning
 from stiffopt.control.tip_errors import turn_of_a_push
-from stiffopt.control.tuning import MotionTuning
 from stiffopt.model.manipulator import load_robot
 from stiffopt.optimise.tip import TipModel
 
@@ -334,6 +334,23 @@ def test_a_displacement_that_turns_nothing_is_a_slip(turned: float) -> None:
     assert doubt is not None
     assert doubt.kind == "slip"
     assert "sensor has slipped" in doubt.text
+
+
+@pytest.mark.parametrize("measured", [0.0, 0.9])
+def test_a_push_whose_estimated_turn_comes_late_is_no_slip(measured: float) -> None:
+    """The arm is becoming stiff; but the tip is measured to turn by a share of a push's turn."""
+    pushed = ROBOT.loaded_tip_pose(P, [*TIP.pose[:3, :3] @ [0.01, 0.004, 0.0], 0.0, 0.0, 0.0])
+    moved = pushed[:3, 3] - TIP.pose[:3, 3]
+    turn = lie.log(pushed @ np.linalg.inv(TIP.pose))[3:]
+    watch = MotionWatch(ROBOT.description, MotionTuning())
+    for time in np.arange(0.0, 2.5, FRAME):
+        offset = np.concatenate([step(1.0)(time) * moved, step(0.9, at=1.2, lag=0.4)(time) * turn])
+        watch.intend(time, np.zeros(3))
+        seen = step(1.0, lag=0.05)(time)
+        watch.take(
+            time, seen * moved, np.zeros(3), offset, np.zeros(6), TIP, turned=seen * measured * turn
+        )
+    assert (watch.doubt is None) is (measured > 0)
 
 
 @pytest.mark.parametrize(("known_after", "is_doubted"), [(0.1, True), (0.4, False)])

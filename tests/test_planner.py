@@ -14,8 +14,9 @@ from scipy.spatial.transform import Rotation
 
 import stiffopt as so
 from running import wait_for
+from stiffopt.control.plan import PlanRequest
 from stiffopt.control.planner import InlinePlanner, ProcessPlanner
-from stiffopt.control.planning import Planning, PlanRequest, model_target
+from stiffopt.control.planning import Planning, model_target
 from stiffopt.control.vibration import BentMode
 from stiffopt.errors import StiffoptError
 from stiffopt.optimise.goal import StiffnessGoal, StiffnessMeasure

@@ -17,8 +17,8 @@ import pytest
 import stiffopt as so
 from stiffopt.control import planner as planner_module
 from stiffopt.control.adaptation import Learning, Window
+from stiffopt.control.plan import Plan, PlanRequest
 from stiffopt.control.planner import PlannerEnd, PlanningEnd, ProcessPlanner
-from stiffopt.control.planning import Plan, PlanRequest
 from stiffopt.control.tuning import AdaptationTuning
 from stiffopt.control.vibration import BentMode
 from stiffopt.optimise.goal import StiffnessGoal, StiffnessMeasure

@@ -9,8 +9,9 @@ import pytest
 
 import stiffopt as so
 from stiffopt.control.forecast import Forecast, Present
+from stiffopt.control.plan import PlanRequest
 from stiffopt.control.planner import InlinePlanner
-from stiffopt.control.planning import Planning, PlanRequest, model_target
+from stiffopt.control.planning import Planning, model_target
 from stiffopt.control.replanning import Pursuit
 from stiffopt.control.tuning import ForecastTuning
 from stiffopt.model.scene import Scene
@@ -43,6 +44,31 @@ def test_plans_lead_to_another_configuration_slowly_and_on_the_target(robot):
         before, plan = plan.pressures, planning.plan(replace(first, search=False))
     assert max(moved) < 3e3
     np.testing.assert_allclose(plan.pressures, stiffest, atol=100.0)
+
+
+def test_the_tip_does_not_leave_its_target_for_a_configuration_without_a_way_to_it(monkeypatch):
+    """On the straight line to it, the tip would be centimetres off for many seconds."""
+    robot = so.load_robot("stiff-flop-2")
+    here = np.array([0.672, 0.211, 0.0, 0.703, 0.0, 0.0]) * BAR
+    stiffer = np.array([1.407, 0.192, 0.0, 0.0, 1.458, 1.5]) * BAR
+    there, offset = tip(robot, here)[1], np.array([5e-3, 0.0, 0.0, 0.0, 0.0, 0.0])
+    axial = StiffnessGoal(maximise=StiffnessMeasure(direction=(0.0, 0.0, 1.0)))
+    target = Target(position=tuple((there + offset[:3]).tolist()))
+    task = Task(robot="stiff-flop-2", target=target, stiffness=axial)
+    planning, still = Planning(robot), PlanRequest(1, task, target, offset, np.zeros(6))
+    solve = planning._solve
+
+    def found(target, guess):
+        return solve(target, stiffer if guess is None else guess)
+
+    first = planning.plan(replace(still, offset=np.zeros(6), search=True))
+    monkeypatch.setattr(planning, "_solve", found)
+    plan = planning.plan(replace(still, last=replace(first, pressures=here, offset=offset)))
+    assert planning._solve(model_target(target, offset), None).stiffness > 1.1 * plan.stiffness
+    for _ in range(80):
+        assert np.linalg.norm(tip(robot, plan.pressures)[1] - there) < 1e-4
+        plan = planning.plan(still)
+    assert plan.reached
 
 
 def motions(robot, p, q):

@@ -105,6 +105,23 @@ def test_all_that_is_permitted_is_done(system: SimpleNamespace) -> None:
     assert report.notice.startswith("real-time: SCHED_FIFO 70, other threads favoured, memory")
 
 
+def test_a_thread_that_ends_meanwhile_is_left_out(
+    system: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    threads = os.listdir("/proc/self/task")
+
+    def nice_of(which: int, thread: int) -> int:
+        if thread == 2**30:
+            raise ProcessLookupError(3, "No such process")
+        return system.nice.get(thread, 0)
+
+    monkeypatch.setattr(os, "getpriority", nice_of)
+    monkeypatch.setattr(os, "listdir", lambda path: [str(2**30), *threads])
+    with real_time(70) as report:
+        assert set(system.nice) == set(map(int, threads))
+    assert "other threads favoured" in report.granted
+
+
 def test_what_is_not_permitted_is_told(
     system: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -12,7 +12,7 @@ from scipy.optimize import lsq_linear
 
 import stiffopt
 from stiffopt.control.bracing import BracePhase, Bracing
-from stiffopt.control.tuning import BracingTuning
+from stiffopt.control.contact_tuning import BracingTuning
 from stiffopt.errors import EquilibriumError
 from stiffopt.model.contact import way
 from stiffopt.model.contact.equilibrium import ContactEquilibrium

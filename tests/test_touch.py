@@ -14,12 +14,17 @@ from scipy.integrate import solve_ivp
 
 from conftest import is_long
 from stiffopt import Press, StiffnessGoal, StiffnessMeasure, Target, Task, load_robot, load_task
+from stiffopt.control.contact_tuning import (
+    CreepTuning,
+    ObstructionTuning,
+    PressingTuning,
+    TouchTuning,
+)
 from stiffopt.control.controller import TipController
 from stiffopt.control.creep import CreepEstimator
 from stiffopt.control.obstruction import ObstructionWatch
 from stiffopt.control.pressing import Phase, Pressing
 from stiffopt.control.touch import TipForce, TouchEstimator, _vibration
-from stiffopt.control.tuning import CreepTuning, ObstructionTuning, PressingTuning, TouchTuning
 from stiffopt.control.vibration import transition
 from stiffopt.errors import InputError
 from stiffopt.model.robot_files import load_description

@@ -37,11 +37,11 @@ from typing import NamedTuple
 import numpy as np
 
 from stiffopt.arrays import Array
+from stiffopt.control.contact_tuning import BracingTuning
 from stiffopt.control.friction import Friction
 from stiffopt.control.interface import Notice
 from stiffopt.control.sliding import SlideEstimator
 from stiffopt.control.state import HeldContact, Severity
-from stiffopt.control.tuning import BracingTuning
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import Task
 from stiffopt.optimise.tip import TipAt

@@ -28,7 +28,7 @@ import math
 import numpy as np
 
 from stiffopt.arrays import Array
-from stiffopt.control.tuning import CreepTuning
+from stiffopt.control.contact_tuning import CreepTuning
 
 _FAR = 25.0  # squared distance in deviations of a sample that is no creep
 _UNLIKELY = 3.0  # deviations of a share from what is believed that no arm has

@@ -16,8 +16,8 @@ import numpy as np
 from stiffopt.arrays import Array
 from stiffopt.control.adaptation import Adapted
 from stiffopt.control.course import Course
+from stiffopt.control.plan import Plan, PlanRequest
 from stiffopt.control.planner import InlinePlanner, ProcessPlanner
-from stiffopt.control.planning import Plan, PlanRequest
 from stiffopt.control.replanning import Pursuit, is_far
 from stiffopt.control.request_queue import current_requester
 from stiffopt.control.tuning import ForecastTuning, ReplanningTuning

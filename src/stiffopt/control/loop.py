@@ -14,10 +14,10 @@ import numpy as np
 from stiffopt.control.checks import check_target, check_task, check_trajectory, refusing
 from stiffopt.control.interface import Controller
 from stiffopt.control.lifecycle import EventBuffer
+from stiffopt.control.noticing_tuning import SupervisionTuning
 from stiffopt.control.request_queue import RequestQueue, current_requester
 from stiffopt.control.state import ControllerStatus, Snapshot, State, Timing
 from stiffopt.control.supervisor import Supervisor
-from stiffopt.control.tuning import SupervisionTuning
 from stiffopt.control.ways import ClearanceWatch
 from stiffopt.errors import CommandError, InputError
 from stiffopt.model.arguments import checked_integer

@@ -29,8 +29,9 @@ from typing import NamedTuple
 import numpy as np
 
 from stiffopt.arrays import Array
+from stiffopt.control.noticing_tuning import DriftScale, MotionTuning
+from stiffopt.control.push_watch import PushWatch
 from stiffopt.control.tip_errors import turn_of_a_push
-from stiffopt.control.tuning import DriftScale, MotionTuning
 from stiffopt.model.description import RobotDescription
 from stiffopt.optimise.tip import TipAt
 
@@ -66,6 +67,10 @@ class _Miss(NamedTuple):
     error: float  # of the model, as a share of the motion by the segments
 
 
+def _share_of(miss: _Miss) -> float:
+    return miss.share
+
+
 class MotionWatch:
     """Compares the tip's motion with that of the model and of the reference.
 
@@ -75,6 +80,8 @@ class MotionWatch:
         The arm.
     tuning :
         Sizes and times of the tests.
+    vibrates :
+        Whether the arm has inertia.
 
     Attributes
     ----------
@@ -83,7 +90,9 @@ class MotionWatch:
         certain.
     """
 
-    def __init__(self, robot: RobotDescription, tuning: MotionTuning) -> None:
+    def __init__(
+        self, robot: RobotDescription, tuning: MotionTuning, *, vibrates: bool = True
+    ) -> None:
         self._tuning = tuning
         self._min_motion = max(tuning.least_motion, tuning.least_motion_share * robot.length)
         ends = np.cumsum([segment.n_channels for segment in robot.segments]).tolist()
@@ -92,6 +101,7 @@ class MotionWatch:
         self._kept = round(longest / tuning.spacing) + 2
         width = _PRESSURES.start + ends[-1]  # of a row; see `_TIME` and the others
         self._rows: Array = np.empty((2 * self._kept, width))
+        self._pushes = PushWatch(tuning.pushes, vibrates=vibrates)
         self.begin()
 
     def begin(self) -> None:
@@ -105,6 +115,7 @@ class MotionWatch:
         self._path = 0.0  # length of the way of r, in m
         self._intended: deque[tuple[float, Array]] = deque(maxlen=self._kept)
         self._swings = [_Swings(self._tuning) for _ in range(3)]
+        self._pushes.begin()
         self.doubt: Doubt | None = None
         self.pace = 1.0
         # motion of the tip by each segment so far, in m; largest error of the model in it, as a
@@ -116,6 +127,7 @@ class MotionWatch:
         """Continue after a pause in which the arm was not controlled, or not seen."""
         self._intended.clear()
         self._unproven.clear()
+        self._pushes.begin()
         self._misses = 0
         self._slips.clear()
         self._jumps.clear()
@@ -152,6 +164,7 @@ class MotionWatch:
         turned: Array | None,
         swings: tuple[float, float] = (0.0, 0.0),
         deviation: float = 0.0,
+        omega: float = 0.0,
     ) -> None:
         """Take in a sample of the tracker.
 
@@ -174,6 +187,8 @@ class MotionWatch:
             Amplitudes of the vibration that the pressures drive, and of the free one, in m.
         deviation :
             Standard deviation of the offset's position along an axis, in m.
+        omega :
+            Of the vibration, in rad/s.
         """
         intended = self._intended_at(time)
         if intended is None or self._is_early(time) or self.doubt is not None:
@@ -194,7 +209,9 @@ class MotionWatch:
         for axis, error in zip(self._swings, (seen - intended).tolist(), strict=True):
             axis.take(_Turn(time, error, self._path))
         jacobian = tip.pose[:3, :3] @ tip.jacobian[:3]
-        self.doubt = self._no_response(jacobian, tip.pose[:3, 2])
+        turning = None if turned is None else tip
+        self._pushes.omega = omega
+        self.doubt = self._no_response(jacobian, tip.pose[:3, 2], turning)
         if turned is None:
             self._known_from = math.inf
             self._jumps.clear()
@@ -202,7 +219,6 @@ class MotionWatch:
             self._known_from = min(self._known_from, time)
         if self._known_from <= time:
             self.doubt = self.doubt or self._slip(jacobian, tip)
-        turning = None if turned is None else tip
         if turning is not None:
             self.doubt = self.doubt or self._jump(jacobian, turning)
         self.doubt = self.doubt or self._drift(jacobian, turning) or self._swing()
@@ -275,20 +291,26 @@ class MotionWatch:
             self._error = max(self._error, error)
             self._verified += moved
 
-    def _no_response(self, jacobian: Array, axis: Array) -> Doubt | None:
+    def _no_response(self, jacobian: Array, axis: Array, turning: TipAt | None) -> Doubt | None:
         """Test whether the tip has not moved although the model has, or has moved elsewhere.
 
         Motion is compared in space, and then without its part along the tip's axis (3,), so that a
-        long elongation does not hide a wrong direction across it.
+        long elongation does not hide a wrong direction across it. After a push in motion it is
+        compared again without what the push explains, as the turn shows it.
         """
         rows, missed = self._since(self._tuning.response_window), None
+        self._notice_push(jacobian, turning)
         ways = rows[-1, _PREDICTED] - rows[:-1, _PREDICTED]
         if ((ways**2).sum(axis=1) > self._min_motion**2).any():  # projections are no longer
             across = np.eye(3) - np.outer(axis, axis)
             steps = self._by_segments(np.diff(rows, axis=0), jacobian)
             found = [self._missed(rows, steps, P) for P in (np.eye(3), across)]
-            missed = max(found, key=lambda miss: miss.share)
+            missed = max(found, key=_share_of)
             self._learn(float(rows[-1, _TIME]), found[0].error, steps[-1])
+            if turning is not None and self._pushes.acts(float(rows[-1, _TIME])):
+                rest = self._without_push(rows, turning)
+                left = [self._missed(rest, steps, P) for P in (np.eye(3), across)]
+                missed = min(missed, max(left, key=_share_of), key=_share_of)
         share = 0.0 if missed is None else missed.share
         usual = self._tuning.usual_share
         self.pace = min(max((1 - share) / (1 - usual), 0.0), 1.0)
@@ -306,9 +328,35 @@ class MotionWatch:
             )
         return Doubt(
             "no-response",
-            f"{text} in another direction: channels are swapped, the tracker's frame is turned, "
-            "the sensor has slipped, or something pushes the arm; run 'stiffopt commission'",
+            f"{text} in another direction: channels are swapped, one does not get its pressure, "
+            "the tracker's frame is turned, the sensor has slipped, or something pushes the arm; "
+            "run 'stiffopt commission'",
         )
+
+    def _notice_push(self, jacobian: Array, turning: TipAt | None) -> None:
+        """Look for a push that begins or ends while the pressures change."""
+        if turning is None:
+            return
+        acting = self._tuning.pushes.acting
+        rows = self._since(acting)
+        unseen = rows[0, _TIME] - (rows[-1, _TIME] - acting)
+        if len(rows) < self._count and unseen > self._tuning.longest_pause:
+            return  # pressures may have changed in a pause
+        seen, turned = rows[:, _SEEN], rows[:, _TURNED]
+        away, pressures = seen - rows[:, _PREDICTED], rows[:, _PRESSURES]
+        swings, times = rows[:, _FREE], rows[:, _TIME]
+        acted = self._pushes.acts(float(times[-1]))
+        if self._pushes.take(times, seen, away, turned, pressures, swings, jacobian, turning):
+            self._forget()
+            if not acted:  # the arm swings anew
+                self._swings = [_Swings(self._tuning) for _ in range(3)]
+
+    def _without_push(self, rows: Array, turning: TipAt) -> Array:
+        """Return samples (k, 21 + n) without the displacement by a push, as the turn shows it."""
+        rest = rows.copy()
+        away = rows[:, _SEEN] - rows[:, _PREDICTED]
+        rest[:, _SEEN] += self._pushes.displacements(away, rows[:, _TURNED], turning)
+        return rest
 
     def _missed(self, rows: Array, by_segments: Array, P: Array) -> _Miss:
         """Return where the model's way and the seen one, projected by P (3, 3), fit least.
@@ -376,6 +424,7 @@ class MotionWatch:
             if not self._slips and missing < tuning.bends * size and size > least_turn:
                 self._bends_until = now + tuning.slip_window
             wrong = missing > max(tuning.slip * size, least_turn) and now > self._bends_until
+            wrong = wrong and not self._turns_as_pushed(rows, tip, distance)
         if not wrong:
             self._slips.clear()
             return None
@@ -392,6 +441,22 @@ class MotionWatch:
                 is_of_arm=True,
             )
         return self._slipped(distance)
+
+    def _turns_as_pushed(self, rows: Array, tip: TipAt, distance: float) -> bool:
+        """Return whether some push by a distance, in m, or more is measured in samples (k, 21 + n).
+
+        The estimated turn follows a push later than the estimated displacement if the arm is just
+        becoming stiff.
+        """
+        ways, turn = rows[-1] - rows, turn_of_a_push(tip)
+        moved = ways[:, _SEEN] - ways[:, _PREDICTED]
+        far = np.flatnonzero((moved**2).sum(axis=1) > distance**2)
+        most = self._tuning.slip_of_large
+        return any(
+            self._missed_turn(turn @ moved[k], ways[k, _TURNED])
+            < most * float(np.linalg.norm(turn @ moved[k]))
+            for k in far
+        )
 
     def _lasts(self, missing: deque[float]) -> bool:
         """Return True if enough successive samples lacked the rotation that a push causes.
@@ -432,8 +497,9 @@ class MotionWatch:
         return Doubt(
             "slip",
             f"the tip seems to have been displaced by {1e3 * distance:.1f} mm without being "
-            "turned, which no push or payload does: the sensor has slipped, or tracker or base "
-            "have been moved; run 'stiffopt commission'",
+            "turned, which no push or payload does: the sensor has slipped, tracker or base have "
+            "been moved, or, after a motion, a line is kinked or the tracker late; run "
+            "'stiffopt commission'",
         )
 
     def _missed_turn(self, bent: Array, turned: Array) -> float:
@@ -467,8 +533,9 @@ class MotionWatch:
                 return Doubt(
                     "drift",
                     f"the tip seems to move on at {1e3 * speed:.1f} mm/s although its pressures do "
-                    "not explain it: the sensor slips or has come off, the tracker drifts, or "
-                    "something pushes the arm; look at it, then set the task again",
+                    "not explain it: the sensor slips or has come off, the tracker drifts, "
+                    "something pushes the arm, or, after a motion, a line is kinked; look at it, "
+                    "then set the task again",
                 )
         return None
 

@@ -78,7 +78,7 @@ class ArmObserver:
                 tuning.creep,
             ),
         )
-        self.watch = MotionWatch(robot.description, tuning.motion)
+        self.watch = MotionWatch(robot.description, tuning.motion, vibrates=mode is not None)
         self.model: ArmModel | None = None
         self._now, self._modelled_at = 0.0, np.zeros(n)
 
@@ -203,6 +203,7 @@ class ArmObserver:
         self.watch.take(
             sample.time, sample.position - pushed, predicted, self.tip.offset, captured,
             tip, turned=turned, swings=self.tip.swings, deviation=self.tip.deviation,
+            omega=self.tip.omega,
         )  # fmt: skip
 
     def lean_on(self, leaning: LeaningTip | None) -> Array:

@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 
 from stiffopt.arrays import Array
-from stiffopt.control.tuning import ObstructionTuning
+from stiffopt.control.contact_tuning import ObstructionTuning
 
 
 class ObstructionWatch:

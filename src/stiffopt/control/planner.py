@@ -26,7 +26,8 @@ from typing import Any
 import numpy as np
 
 from stiffopt.control.interface import Notice
-from stiffopt.control.planning import Plan, Planning, PlanRequest
+from stiffopt.control.plan import Plan, PlanRequest
+from stiffopt.control.planning import Planning
 from stiffopt.control.state import Severity
 from stiffopt.control.vibration import BentMode
 from stiffopt.errors import SlowWarning, StiffoptError

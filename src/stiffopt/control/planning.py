@@ -19,15 +19,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
-import daqp
 import numpy as np
 
 from stiffopt.arrays import Array
-from stiffopt.control.adaptation import Adapted, Estimate, Learning, Window
+from stiffopt.control.adaptation import Adapted, Learning
+from stiffopt.control.nearest_search import NearestSearch
+from stiffopt.control.plan import Plan, PlanRequest
 from stiffopt.control.posture_change import PostureChanges
-from stiffopt.control.tip_errors import TipErrors, stiffness_function
+from stiffopt.control.tip_errors import stiffness_function
 from stiffopt.control.tuning import AdaptationTuning, FeedbackTuning, NearestTuning, PlanningTuning
 from stiffopt.control.vibration import BentMode
 from stiffopt.control.ways import Ways
@@ -42,64 +43,11 @@ from stiffopt.optimise.target import Target, Tolerance
 from stiffopt.optimise.task import PressureRange, Task
 from stiffopt.optimise.tip import TipModel
 from stiffopt.paths.configurations import Unsolved
-from stiffopt.paths.leaning import BraceApproach, approach_to
+from stiffopt.paths.leaning import approach_to
 
-_BAR = 1e5
 _SLACK = 100.0  # Pa, by which an answer may exceed its limits
 _REACHED = Tolerance()  # of the tip that is at its target before the arm is stiff
 _EXACT = Tolerance(position=PlanningTuning.position_tolerance, angle=PlanningTuning.angle_tolerance)
-
-
-@dataclass(frozen=True)
-class PlanRequest:
-    """Everything that a plan depends on."""
-
-    serial: int  # number of the task; a plan for an earlier one is discarded
-    task: Task | None  # stiffness goal and limits; None: only check the way
-    target: Target | None  # replaces the task's own
-    offset: Array  # tip pose relative to the model's (6,), m and rad (rotation vector), base axes
-    pressure_offset: Array  # effective pressures relative to commands (n,), in Pa
-    search: bool = False  # whether to search all configurations, as for a new target
-    # lowest and highest effective pressures (n,) that the channels can have, in Pa, within the
-    # task's limits; empty: the task's limits
-    low: Array = field(default_factory=lambda: np.zeros(0))
-    high: Array = field(default_factory=lambda: np.zeros(0))
-    # with a scene: effective pressures (k, n) on the way to the plan, in Pa
-    way: Array = field(default_factory=lambda: np.zeros((0, 0)))
-    last: Plan | None = None  # replaces the planner's own last plan
-    windows: tuple[Window, ...] = ()  # of the tip at rest, for adaptation
-    adapted: Adapted | None = None  # the model that the offset refers to; None: the robot file's
-    stay: bool = False  # whether to follow the target by the least change of the last pressures
-    step: float = math.inf  # largest change of a pressure from the last plan, in Pa
-    # effective pressures (n,) of the reference now, in Pa, of an arm that vibrates: its modes there
-    # are wanted, and a new target is reached from there by the least motion; empty: neither
-    here: Array = field(default_factory=lambda: np.zeros(0))
-
-
-@dataclass(frozen=True)
-class Plan:
-    """Pressures for a target; serial, offset and target are those of the request."""
-
-    serial: int
-    pressures: Array  # effective (n,), in Pa
-    offset: Array  # of the tip (6,), for which the plan was made
-    target: Target | None
-    reached: bool  # whether the model reaches the target, here or in a distant configuration
-    stiffness: float  # along the task's first direction; NaN if it has none
-    message: str  # how far the model stays from a target that is not reached
-    blocked: str = ""  # why the way to the plan is not clear of the scene
-    doubt: str = ""  # a warning if the model extrapolates there
-    far: bool = False  # whether it is the pose that is not reached, not only the stiffness
-    # from its tip to the target, in m, of a plan that follows a target by the least change
-    short: tuple[float, ...] = (0.0, 0.0, 0.0)
-    adapted: Adapted | None = None  # the model that it was made with, as in the request
-    deviation: float = math.nan  # of the stiffness there, relative
-    estimate: Estimate | None = None  # of the model's numbers, if it is new
-    approach: BraceApproach | None = None  # from rest until the arm leans on objects there
-    bent: BentMode | None = None  # modes at the request's `here`, if they are new
-    # effective pressures (n,), in Pa, that bring the tip to its target first, while plans lead from
-    # there to the stiffest ones; empty otherwise
-    tip_first: tuple[float, ...] = ()
 
 
 class Planning:
@@ -290,10 +238,22 @@ class Planning:
             self._refused = 0
             return solution
         self._refused += 1
-        if self._refused <= self._tuning.patience:
+        is_due = self._refused % (self._tuning.patience + 1) == 0
+        if not is_due or not self._leads_to(last, solution, target):
             return None
         self._refused = 0
         return solution
+
+    def _leads_to(self, last: Plan, solution: PressureSolution, target: Target) -> bool:
+        """Return whether the arm may go from the last plan to another configuration.
+
+        Without a way that stays at the target the tip would leave it, by centimetres for seconds.
+        It may go all the same if it is not at the target now.
+        """
+        here, there = last.pressures, np.asarray(solution.pressures)
+        _, distance, angle = self._search.find(target, self._limits, here)
+        is_off = distance > _REACHED.position or angle > _REACHED.angle
+        return is_off or bool(self._changes.way_on(target, self._limits, here, there))
 
     def _is_distant(self, last: Plan, pressures: Array, target: Target) -> bool:
         """Return True if pressures (n,) are too far from the last plan for one configuration."""
@@ -362,6 +322,8 @@ class Planning:
         if other is None or other.pressures is None:
             return solution
         if (other.stiffness or 0.0) <= (1 + self._advantage) * (solution.stiffness or 0.0):
+            return solution
+        if not self._leads_to(last, other, target):
             return solution
         self._advantage *= 2
         return other
@@ -436,71 +398,3 @@ def model_target(target: Target, offset: Array) -> Target:
     The offset (6,) is that of `PlanRequest`.
     """
     return target.moved_back(offset).model_copy(update={"tolerance": _EXACT})
-
-
-class NearestSearch:
-    """Finds the pressures nearest to a target that is out of reach, fast enough for the loop.
-
-    It minimises the squared pose error by Gauss-Newton, within the limits of pressure. A lever, in
-    m/rad, converts angles, as in feedback.
-    """
-
-    def __init__(self, tip: TipModel, lever: float, tuning: NearestTuning) -> None:
-        self._tip, self._lever, self._tuning = tip, lever, tuning
-        self._errors = TipErrors()
-
-    def find(
-        self,
-        target: Target,
-        bounds: tuple[Array, Array],
-        start: Array,
-        *,
-        least_motion: bool = False,
-    ) -> tuple[Array, float, float]:
-        """Return a local optimum between the bounds (n,), from a start (n,), in Pa.
-
-        Returns pressures (n,), and the position and angle errors there, in m and rad. The target is
-        the model's. Of several optima it is the one with the least change of the pressures, or with
-        `least_motion` that of the tip by each channel, to first order.
-        """
-        tuning = self._tuning
-        low, high = bounds[0] / _BAR, bounds[1] / _BAR
-        x = np.clip(start / _BAR, low, high)
-        found = self._error(target, x)
-        if found is None:  # an answer of another model
-            x, found = low, self._errors.weighted(target, self._tip.at(low * _BAR), self._lever)
-        error, rows, distance, angle = found
-        no_rows, max_step = np.zeros((0, len(x))), tuning.max_step / _BAR
-        effort = np.eye(len(x))
-        if least_motion:
-            squares = (self._tip.at(x * _BAR).jacobian[:3] ** 2).sum(axis=0)
-            effort = np.diag(squares / squares.mean())
-        for _ in range(tuning.iterations):
-            J = rows * _BAR
-            H = J.T @ J + tuning.regularisation**2 * effort
-            lower, upper = np.maximum(low - x, -max_step), np.minimum(high - x, max_step)
-            step, *_ = daqp.solve(H * 1e6, J.T @ error * 1e6, no_rows, upper, lower)
-            if step is None or not np.isfinite(step).all():
-                break
-            share, value = 1.0, float(error @ error)
-            while share > 1e-3:
-                trial = np.clip(x + share * np.asarray(step), low, high)
-                found = self._error(target, trial)
-                if found is not None and float(found[0] @ found[0]) < value:
-                    break
-                share *= 0.5
-            else:
-                break
-            x = trial
-            error, rows, distance, angle = found
-            if math.sqrt(value) - float(np.linalg.norm(error)) < tuning.progress:
-                break
-        result: Array = x * _BAR
-        return result, distance, angle
-
-    def _error(self, target: Target, x: Array) -> tuple[Array, Array, float, float] | None:
-        """Return the error at x (n,), in bar, as `TipErrors.weighted`; None: no equilibrium."""
-        try:
-            return self._errors.weighted(target, self._tip.at(x * _BAR), self._lever)
-        except StiffoptError:
-            return None

@@ -9,17 +9,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from stiffopt.arrays import Array
+from stiffopt.control.nearest_search import NearestSearch
+from stiffopt.control.plan import Plan, PlanRequest
 from stiffopt.control.tuning import FeedbackTuning, PlanningTuning
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.tip import TipModel
-
-if TYPE_CHECKING:
-    from stiffopt.control.planning import NearestSearch, Plan, PlanRequest
 
 
 @dataclass(frozen=True)
@@ -134,7 +132,7 @@ class PostureChanges:
         """Return the next pressures (n,) on the way to others (n,), in Pa.
 
         The change is slower while the offset changes. If the way comes no nearer to its end, the
-        arm goes there straight, as slowly, and feedback keeps the tip at its target.
+        arm goes there straight, as slowly.
         """
         change, tuning, way = self._change, self._tuning, end - last.pressures
         assert change is not None  # there is a change under way

@@ -22,12 +22,12 @@ from enum import StrEnum
 import numpy as np
 
 from stiffopt.arrays import Array
+from stiffopt.control.contact_tuning import PressingTuning
 from stiffopt.control.creep import CreepEstimator
 from stiffopt.control.interface import Notice
 from stiffopt.control.obstruction import ObstructionWatch
 from stiffopt.control.state import Severity
 from stiffopt.control.touch import TipForce
-from stiffopt.control.tuning import PressingTuning
 from stiffopt.optimise.press import FELT_FORCE, FELT_SHARE, Feeling, Press
 from stiffopt.optimise.target import Target
 

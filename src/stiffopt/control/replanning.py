@@ -14,8 +14,9 @@ from stiffopt.control.bracing import Bracing
 from stiffopt.control.course import Course
 from stiffopt.control.feedback import prescribed_components
 from stiffopt.control.interface import Notice
+from stiffopt.control.plan import Plan, PlanRequest
 from stiffopt.control.planner import InlinePlanner, ProcessPlanner
-from stiffopt.control.planning import Plan, PlanRequest, nearest_words
+from stiffopt.control.planning import nearest_words
 from stiffopt.control.posture import PostureCourse
 from stiffopt.control.pressing import Phase, Pressing
 from stiffopt.control.tip_errors import stiffness_function, target_arrays

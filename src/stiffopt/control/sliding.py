@@ -20,8 +20,8 @@ import numpy as np
 
 from stiffopt import lie
 from stiffopt.arrays import Array
+from stiffopt.control.contact_tuning import SlidingTuning
 from stiffopt.control.friction import Friction
-from stiffopt.control.tuning import SlidingTuning
 from stiffopt.paths.leaning import BraceApproach
 
 _ERROR, _CREEP, _PUSH, _FIRST = slice(0, 6), slice(6, 12), slice(12, 15), 15  # in the state

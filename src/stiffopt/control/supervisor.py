@@ -23,9 +23,9 @@ from stiffopt.control.checks import highest_pressures, refusing
 from stiffopt.control.gauge_watch import GaugeWatch
 from stiffopt.control.interface import Controller, ControlOutput
 from stiffopt.control.lifecycle import Alarms, EventBuffer, Lifecycle
+from stiffopt.control.noticing_tuning import SupervisionTuning
 from stiffopt.control.state import Severity, State
 from stiffopt.control.tracker_watch import Sight, TrackerWatch
-from stiffopt.control.tuning import SupervisionTuning
 from stiffopt.control.ways import ClearanceWatch
 from stiffopt.errors import CommandError, DeviceError, GuardTripped, InputError, StiffoptError
 from stiffopt.optimise.target import Target

@@ -35,10 +35,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt.arrays import Array
+from stiffopt.control.contact_tuning import CreepTuning, TouchTuning
 from stiffopt.control.creep import CreepEstimator
 from stiffopt.control.formula import Formula
 from stiffopt.control.principal import principal_axes
-from stiffopt.control.tuning import CreepTuning, TouchTuning
 from stiffopt.optimise.press import SOFT_SHARE
 from stiffopt.optimise.tip import TipAt
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from stiffopt.arrays import Array
 from stiffopt.control.interface import SampleCounts
-from stiffopt.control.tuning import TrackerTuning
+from stiffopt.control.noticing_tuning import TrackerTuning
 from stiffopt.rig.interface import PoseSample
 from stiffopt.rig.settings import Safety
 

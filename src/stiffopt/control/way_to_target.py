@@ -12,7 +12,7 @@ import numpy as np
 
 from stiffopt.arrays import Array
 from stiffopt.control.observer import ArmObserver
-from stiffopt.control.planning import Plan
+from stiffopt.control.plan import Plan
 from stiffopt.control.reference import Reference
 from stiffopt.control.setup import ControlSetup
 

@@ -10,7 +10,8 @@ import numpy as np
 from stiffopt import lie
 from stiffopt.arrays import Array
 from stiffopt.identify.detection import idle_channels
-from stiffopt.identify.hypotheses import Comparer, Hypothesis, best_lines, found_wrong
+from stiffopt.identify.frames import FrameComparer, MovedFrame, OtherChannels
+from stiffopt.identify.hypotheses import Comparer, Found, Hypothesis, best_lines, found_wrong
 from stiffopt.identify.settings import DETECTION
 from stiffopt.identify.setup import Setup
 from stiffopt.identify.tracker_faults import CUBE_ROTATIONS
@@ -26,21 +27,60 @@ def put_right(setup: Setup) -> Setup:
     """
     comparer, lines = _comparer(setup), set[int]()
     for _ in range(DETECTION.faults):
+        again = "with that corrected, " if setup.found else ""
         found = found_wrong(comparer, setup.description, setup.settings.keep)
-        if found is None:
+        corrected = setup if found is None else _under(setup, found.hypothesis, comparer.low)
+        frame = _moved_frame(setup, found)
+        if isinstance(frame, OtherChannels):
+            told = frame.told(setup.description, setup.recordings)
+            setup = replace(setup, found=(*setup.found, again + told))
             break
-        told = found.hypothesis.told(setup.description, [each.name for each in setup.recordings])
-        remark = (
-            f"{'with that corrected, ' if setup.found else ''}{told}; the robot file's arm then "
-            f"misses the tip by {found.then * 1e3:.1f} mm instead of {found.as_is * 1e3:.1f} mm, "
-            f"however soft it is; --keep {found.hypothesis.kind} leaves that as it was recorded"
-        )
-        corrected = _under(setup, found.hypothesis, comparer.low)
-        setup = replace(corrected, found=(*setup.found, remark))
+        if frame is not None:
+            recordings = frame.motion.applied(setup.recordings)
+            corrected = Setup.of(setup.description, recordings, setup.tables, setup.settings)
+            told = f"{frame.told(setup.recordings)}; --keep axes leaves it as it was recorded"
+        elif found is not None:
+            told = (
+                f"{found.hypothesis.told(setup.description, [e.name for e in setup.recordings])}; "
+                f"the robot file's arm then misses the tip by {found.then * 1e3:.1f} mm instead of "
+                f"{found.as_is * 1e3:.1f} mm, however soft it is; --keep {found.hypothesis.kind} "
+                "leaves that as it was recorded"
+            )
+            if found.hypothesis.kind == "lines":
+                lines |= {*found.hypothesis.wrong, *found.hypothesis.wrong.values()}
+        else:
+            break
+        setup = replace(corrected, found=(*setup.found, again + told))
         comparer = _comparer(setup)
-        if found.hypothesis.kind == "lines":
-            lines |= {*found.hypothesis.wrong, *found.hypothesis.wrong.values()}
     return _with_idle_channels(setup, comparer, lines)
+
+
+def _moved_frame(setup: Setup, found: Found | None) -> MovedFrame | OtherChannels | None:
+    """Return the motion of some logs that undoes a new definition of their frame or of a body.
+
+    None if there is none, or if a correction that was found otherwise explains the logs about as
+    well. Quarter turns of some logs explain them if neither a motion nor other channels in these
+    logs fit far better.
+    """
+    turns = () if found is None else found.hypothesis.turns
+    of_all = found is not None and len(set(turns)) == 1
+    if "axes" in setup.settings.keep or len(setup.recordings) < 2 or of_all:
+        return None
+    comparer = FrameComparer(setup)
+    frame = comparer.found()
+    if found is None:
+        return frame
+    turned = comparer.turned(turns)
+    if isinstance(frame, MovedFrame) and frame.score < DETECTION.overwhelming * turned.score():
+        return frame
+    logs = tuple(i for i, turn in enumerate(turns) if turn)
+    if isinstance(frame, OtherChannels) and frame.logs == logs:
+        channels: OtherChannels | None = frame
+    else:
+        channels = comparer.other_channels(logs)
+    if channels is not None and channels.left < DETECTION.tie * turned.left(logs):
+        return channels
+    return None
 
 
 def _comparer(setup: Setup) -> Comparer:

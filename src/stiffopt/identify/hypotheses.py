@@ -18,16 +18,13 @@ from numpy.typing import NDArray
 
 from stiffopt import lie
 from stiffopt.arrays import Array
-from stiffopt.errors import EquilibriumError, PressureError
+from stiffopt.errors import EquilibriumError, FileError, PressureError
 from stiffopt.identify.detection import lagged_pressures, weightless
 from stiffopt.identify.recording import Recording, Track
 from stiffopt.identify.settings import DETECTION, Finding
 from stiffopt.identify.tracker_faults import CUBE_ROTATIONS, whole
 from stiffopt.model.description import RobotDescription, Tolerances
 from stiffopt.model.manipulator import Manipulator
-
-SHOWN = 5e-4
-"""Shortest translation of a frame that is told, in m."""
 
 
 @dataclass(frozen=True)
@@ -54,8 +51,8 @@ class Hypothesis:
         for each, turn in zip(recordings, self.turns, strict=True):
             pressures = self.driven(each.pressures, low)
             before = self.driven(each.before[np.newaxis], low)[0]
-            driven = replace(each, pressures=pressures, before=before)
-            found.append(_moved(driven, CUBE_ROTATIONS[turn], np.zeros(3)))
+            tracks = moved(each.tracks, CUBE_ROTATIONS[turn], np.zeros(3))
+            found.append(replace(each, pressures=pressures, before=before, tracks=tracks))
         return found
 
     def driven(self, recorded: Array, low: Array) -> Array:
@@ -98,7 +95,7 @@ class Hypothesis:
         if self.kind == "lines":
             return self.words
         turned = {
-            name: _turn_text(CUBE_ROTATIONS[turn])
+            name: turn_text(CUBE_ROTATIONS[turn])
             for name, turn in zip(names, self.turns, strict=True)
             if turn
         }
@@ -118,17 +115,37 @@ def _driven(recorded: Array, sources: Sequence[int], low: Array) -> Array:
     return np.column_stack(columns)
 
 
-def _moved(recording: Recording, rotation: Array, shift: Array) -> Recording:
-    """Rotate (3, 3) a recording's poses about the origin of its frame, and shift them (3,)."""
-    tracks = tuple(
+def moved(tracks: Sequence[Track], rotation: Array, shift: Array) -> tuple[Track, ...]:
+    """Rotate (3, 3) poses about the origin of their frame, and shift them (3,)."""
+    return tuple(
         Track(
             track.name,
             track.position @ rotation.T + shift,
             None if track.rotation is None else rotation @ track.rotation,
         )
-        for track in recording.tracks
+        for track in tracks
     )
-    return replace(recording, tracks=tracks)
+
+
+def rows_with_all(
+    recording: Recording, seen: Sequence[NDArray[np.bool_]], count: int
+) -> NDArray[np.intp]:
+    """Return about `count` evenly spread rows of a recording, in which each track is `seen` (N,).
+
+    Raises
+    ------
+    FileError
+        If there is none.
+    """
+    rows = np.flatnonzero(np.logical_and.reduce(seen))
+    if not len(rows):
+        names = ", ".join(track.name for track in recording.tracks)
+        raise FileError(
+            recording.name,
+            f"no row has readings of all tracked points ({names}); leave out this log, or the body "
+            "in the robot file",
+        )
+    return rows[np.unique(np.linspace(0, len(rows) - 1, count).astype(int))]
 
 
 class Comparer:
@@ -162,8 +179,7 @@ class Comparer:
         self._measured: list[Array] = []
         count = max(DETECTION.rows // len(recordings), 8)
         for each in recordings:
-            seen = np.flatnonzero(np.logical_and.reduce([whole(t.position) for t in each.tracks]))
-            rows = seen[np.unique(np.linspace(0, len(seen) - 1, count).astype(int))]
+            rows = rows_with_all(each, [whole(t.position) for t in each.tracks], count)
             self._pressures.append(
                 lagged_pressures(each.time, each.pressures, DETECTION.clock_lag)[rows]
             )
@@ -344,7 +360,7 @@ def found_wrong(
             found.append((comparer.score(turned), turned))
     if not found:
         least = min([as_is, *(score for score, _ in alone)])
-        two = scored(comparer.distinct(_pairs(comparer.ranked(single))))
+        two = scored(comparer.distinct(pairs(comparer.ranked(single), DETECTION.shortlist)))
         found = [pair for pair in two if pair[0] <= DETECTION.overwhelming * least]
     if not found:
         return None
@@ -355,12 +371,15 @@ def found_wrong(
     return Found(best, as_is, then)
 
 
-def _pairs(ranked: Sequence[Hypothesis]) -> list[Hypothesis]:
-    """Return two lines, or two orders one after the other, of which one of each is a good one."""
+def pairs(ranked: Sequence[Hypothesis], good: int) -> list[Hypothesis]:
+    """Return two lines, or two orders one after the other, of which one is among the `good` best.
+
+    `ranked` are single ones, the best first.
+    """
     known, found = {each.sources for each in ranked}, []
     for kind in ("lines", "channels"):
         alone = [each for each in ranked if each.kind == kind]
-        for one, other in product(alone[: DETECTION.shortlist], alone):
+        for one, other in product(alone[:good], alone):
             both = one.with_lines(other) if kind == "lines" else one.with_order(other)
             if both is not None and both.sources not in known:
                 known.add(both.sources)
@@ -449,53 +468,9 @@ def _turns(scores: Array) -> tuple[int, ...]:
     )
 
 
-def _turn_text(rotation: Array) -> str:
+def turn_text(rotation: Array) -> str:
     """Describe a rotation, as the end of a sentence."""
     vector = np.asarray(lie.log(lie.transform(rotation, np.zeros(3))))[3:]
     angle = float(np.linalg.norm(vector))
     axis = ", ".join(f"{each + 0.0:.2g}" for each in np.round(vector / max(angle, 1e-9), 2))
     return f"by {np.degrees(angle):.0f} deg about ({axis})"
-
-
-# -- a frame that was defined anew -----------------------------------------------------------------
-
-
-def replaced(
-    recording: Recording, measured: Array, predicted: Array, length: float
-) -> tuple[Recording, str, bool]:
-    """Move a recording rigidly to where a calibrated model predicts its tip.
-
-    Prefers a rotation of the cube without translation if it fits about as well.
-
-    Parameters
-    ----------
-    recording : Recording
-    measured, predicted : (N, 3), in m.
-    length : of the arm, in m.
-
-    Returns
-    -------
-    recording, words, is_shifted
-        The words describe the motion, as the end of a sentence.
-    """
-    seen = whole(measured)
-    x, y = measured[seen], predicted[seen]
-
-    def miss(rotation: Array, shift: Array) -> float:
-        return float(np.linalg.norm(x @ rotation.T + shift - y, axis=1).mean())
-
-    quarter = min(CUBE_ROTATIONS, key=lambda rotation: miss(rotation, np.zeros(3)))
-    turned = x @ quarter.T
-    centre = turned.mean(axis=0)
-    spread = (y - y.mean(axis=0)).T @ (turned - centre)
-    weight = len(x) * (DETECTION.known_turn * length) ** 2  # keeps undetermined turns at zero
-    u, _, vt = np.linalg.svd(spread + weight * np.eye(3))
-    rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt @ quarter
-    shift = y.mean(axis=0) - rotation @ x.mean(axis=0)
-    if DETECTION.overwhelming * miss(quarter, np.zeros(3)) < miss(rotation, shift):
-        rotation, shift = quarter, np.zeros(3)
-    words = f"turned {_turn_text(rotation)}"
-    is_shifted = bool(np.linalg.norm(shift) > SHOWN)
-    if is_shifted:
-        words += f" and moved by {np.linalg.norm(shift) * 1e3:.0f} mm"
-    return _moved(recording, rotation, shift), words, is_shifted

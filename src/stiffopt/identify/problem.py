@@ -20,11 +20,18 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt import lie
 from stiffopt.arrays import Array
 from stiffopt.identify.discrepancy import Systematic, smooth_functions
 from stiffopt.identify.past import Past, Start, pause_between
-from stiffopt.identify.recording import Recording
-from stiffopt.identify.sensing import Readings, gravity_in_base, readings
+from stiffopt.identify.recording import FRAME, Recording
+from stiffopt.identify.sensing import (
+    Readings,
+    gravity_in_base,
+    in_frame_anew,
+    of_body_anew,
+    readings,
+)
 from stiffopt.identify.settings import FIT
 from stiffopt.identify.unknowns import Unknowns
 from stiffopt.logs import StiffnessTable
@@ -417,14 +424,24 @@ class CalibrationProblem:
                 return total
 
             moved = slope(seen.per_twist)
-            place = seen.position.copy()
-            for own, begin, end in zip(zeros, starts[:-1], starts[1:], strict=False):
-                if own.stop > own.start:
-                    place[begin:end] += coordinates[own]
-                    moved[begin:end, :, own] += np.eye(3)
             turned = None if seen.turn_per_twist is None else slope(seen.turn_per_twist)
+            place = seen.position.copy()
+            turn = None if seen.turn is None else seen.turn.copy()
+            for i, own in enumerate(zeros):
+                rows, values = slice(starts[i], starts[i + 1]), coordinates[own]
+                if not values.size:
+                    continue
+                known = None if rotation is None else rotation[rows]
+                by, by_turn = self._by_zero(i, point.name, place[rows], known)
+                if self.samples[i].recording.anew == FRAME:
+                    moved[rows] += lie.hat(values[3:]) @ moved[rows]
+                place[rows] += by @ values
+                moved[rows, :, own] += by
+                if turn is not None and turned is not None:
+                    turn[rows] += by_turn @ values
+                    turned[rows, :, own] += by_turn
             poses.append(found.transforms)
-            read.append(replace(seen, position=place))
+            read.append(replace(seen, position=place, turn=turn))
             errors.append(position - place)
             acting.append(seen.per_twist[:, :, :6] @ found.per_pressure)
             slopes.append((moved, turned))
@@ -432,6 +449,20 @@ class CalibrationProblem:
             effective, rates, tuple(poses), tuple(read), tuple(errors), tuple(acting)
         )
         return predicted, slopes
+
+    def _by_zero(
+        self, sample: int, point: str, position: Array, rotation: Array | None
+    ) -> tuple[Array, Array]:
+        """Return derivatives (N, 3, m) of a point's position and turn by the zero of a sample."""
+        anew = self.samples[sample].recording.anew
+        if anew == FRAME:
+            return in_frame_anew(position - self.base_in_tracker[:3, 3], rotation)
+        if anew == point and rotation is not None:
+            return of_body_anew(rotation)
+        zero = np.eye(3) if anew is None else np.zeros((3, 6))
+        return np.broadcast_to(zero, (len(position), *zero.shape)), np.zeros(
+            (len(position), *zero.shape)
+        )
 
     def _effective(self, coordinates: Array, sides: Sequence[slice]) -> tuple[Array, Array, Array]:
         """Return effective pressures (M, n), their rates (M, n), and derivatives (M, n, d)."""

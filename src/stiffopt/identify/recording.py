@@ -36,6 +36,8 @@ from stiffopt.model.manipulator import Manipulator
 Rows = NDArray[np.bool_]
 
 _PRESSURE_UNITS = {"MPa": 1e6, "bar": 1e5, "psi": 6894.757, "kPa": 1e3, "mbar": 1e2}
+FRAME = "frame"
+"""What was defined anew in a log, if not a body; see `Recording`."""
 _TIP = "tip"
 _UNUSED = "these are not used"
 
@@ -69,6 +71,8 @@ class Recording:
         if the log begins with a commanded step that the measured pressures have yet to follow.
     tracks : the tip first.
     remarks : findings and how each was handled, one sentence each.
+    anew : "frame" or the name of a track if its definition was new in this log, so that its poses
+        were moved to about where it was before.
     """
 
     name: str
@@ -77,6 +81,7 @@ class Recording:
     before: Array
     tracks: tuple[Track, ...]
     remarks: tuple[str, ...]
+    anew: str | None = None
 
     def track(self, name: str) -> Track:
         """Return the track of this name; raise `FileError` if there is none."""

@@ -74,6 +74,30 @@ def readings(
     return Readings(position[..., 0], per_twist, turn[..., 0], turn_per_twist)
 
 
+def in_frame_anew(position: Array, measured: Array | None) -> tuple[Array, Array]:
+    """Return slopes (N, 3, 6) of positions and turns by a small twist of the tracker's frame.
+
+    Parameters
+    ----------
+    position : (N, 3), from the origin of the twist, in m.
+    measured : (N, 3, 3), orientations of the sensor; None if they are not known.
+    """
+    count = len(position)
+    along = np.broadcast_to(np.eye(3), (count, 3, 3))
+    crossed = np.cross(np.eye(3), position[:, np.newaxis]).swapaxes(1, 2)
+    turn = np.zeros((count, 3, 3)) if measured is None else measured.swapaxes(1, 2)
+    return np.dstack([along, crossed]), np.dstack([np.zeros((count, 3, 3)), turn])
+
+
+def of_body_anew(measured: Array) -> tuple[Array, Array]:
+    """Return slopes (N, 3, 6) of positions and turns by a small twist of the sensor in its axes.
+
+    `measured` (N, 3, 3) are its orientations in the tracker's frame.
+    """
+    none, along = np.zeros_like(measured), np.broadcast_to(np.eye(3), measured.shape)
+    return np.dstack([measured, none]), np.dstack([none, along])
+
+
 def gravity_in_base(gravity: Array, turn: Array) -> tuple[Array, Array]:
     """Return gravity (3,) in the axes of a turned base, ``exp(turn)' gravity``, and slopes (3, 3).
 

@@ -134,6 +134,8 @@ class StartSettings:
     dead_band : as a share of the highest recorded pressure.
     turns : turns of the base from which fits start, in rad, if its turn is unknown.
     moduli : coordinates of the moduli from which fits start, in prior deviations.
+    anew_position, anew_angle : prior deviations of a log's frame or body after it was found to be
+        defined anew, and moved back, in lengths of the arm and in rad.
     position_noise, angle_noise : expected model error in the first fit, in lengths of the arm and
         in rad.
     """
@@ -149,6 +151,8 @@ class StartSettings:
     dead_band: float = 0.05
     turns: tuple[float, ...] = (0.0, 2 * np.pi / 3, -2 * np.pi / 3, np.pi)
     moduli: tuple[float, ...] = (0.0, -1.0, 1.0)
+    anew_position: float = 0.05
+    anew_angle: float = float(np.radians(5.0))
     position_noise: float = 0.01
     angle_noise: float = float(np.radians(3.0))
 
@@ -355,12 +359,19 @@ class DetectionSettings:
     region, within : a remark reports a log with less than a share `within` of its tips in the
         region of this probability.
     outside : with less than this share in it, a log is suspected to have other channels.
-    channel_rows : number of rows with which orders of channels are compared in a log that is off.
+    channel_rows, channel_step : number of rows with which orders of channels are compared in a log
+        that is off; the best of them are found by every `channel_step`-th of these.
+    paired : number of hypotheses of each kind that are tried together with another one there.
     poses, apart : smallest number of poses by which a frame is judged, since two can be moved to
         fit any others; and their distance, as a share of the range of permitted pressures.
     rest : largest pressure of a pose near rest, as a share of that range.
     in_line : spread of poses across a line, as a share of that along it, up to which they count as
         poses on a line.
+    frame_softness : factors on pressures of the arm with which logs are compared with each other.
+    frame_ridge : of the correction of its shape, relative to one of the whole length in each row.
+    frame_lever : distance from a body's origin, in lengths of the arm, of the points on its axes by
+        which poses are compared.
+    frame_angle : by how much orientations may fit worse after a motion of the frame, in rad.
     known_turn : spread of the tip, in lengths of the arm, that determines a turn.
     ridge : added to the diagonal of the normal equations of regressions.
     clock_rows : number of rows in the regression for the clocks.
@@ -404,10 +415,16 @@ class DetectionSettings:
     within: float = 0.5
     outside: float = 0.9
     channel_rows: int = 60
+    channel_step: int = 3
+    paired: int = 3
     poses: int = 4
     apart: float = 0.1
     rest: float = 0.15
     in_line: float = 0.3
+    frame_softness: tuple[float, ...] = (1.0, 0.6, 1.7)
+    frame_ridge: float = 0.01
+    frame_lever: float = 0.25
+    frame_angle: float = float(np.radians(3.0))
     known_turn: float = 0.02
     ridge: float = 0.01
     clock_rows: int = 600

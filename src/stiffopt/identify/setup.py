@@ -25,6 +25,7 @@ from stiffopt.identify.unknowns import (
     SENSOR,
     Unknown,
     Unknowns,
+    anew_unknowns,
     history_unknowns,
     placement_unknowns,
     shape_unknowns,
@@ -272,12 +273,14 @@ class Setup:
     def beginnings(
         self, description: RobotDescription, samples: Sequence[Sample]
     ) -> tuple[Beginnings, Beginnings]:
-        """Return each recording's unknown zero of positions and unknown initial sides of plays."""
+        """Return each recording's unknown zero, or motion, and unknown initial sides of plays."""
         plays = any(segment.history and segment.history.play for segment in description.segments)
         zeros, sides = [], []
         for each in samples:
             name = each.recording.name
             zero = zero_unknowns(name, self.tolerances) if self.settings.rezero else []
+            if each.recording.anew is not None:
+                zero = anew_unknowns(f"{each.recording.anew} of {name}", description.length)
             side = side_unknowns(description, name) if each.begin == "unknown" and plays else []
             zeros.append(tuple(zero))
             sides.append(tuple(side))

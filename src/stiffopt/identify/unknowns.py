@@ -10,8 +10,10 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from stiffopt.arrays import Array
-from stiffopt.identify.settings import FIT
+from stiffopt.identify.settings import FIT, START
 from stiffopt.model.description import RobotDescription, Tolerances
 from stiffopt.model.laws import law_class
 from stiffopt.model.parameters import Parameter
@@ -51,7 +53,8 @@ class Unknowns:
     parameters : numbers of the robot file: of the equilibrium, then of the histories.
     base : twist of the base in the tracker's frame, six or none.
     sensors : twists of the sensors, for each tracked point.
-    zeros : offset of each recording's positions, three each or none.
+    zeros : offset of each recording's positions, three each, or the twist of a frame or a body that
+        was defined anew in it, six each; or none.
     sides : for each recording that begins in an unknown state, each channel's initial state of
         hysteresis, see `side_unknowns`; else none.
     """
@@ -160,6 +163,15 @@ def side_unknowns(description: RobotDescription, name: str) -> list[Unknown]:
         )
         for c in range(description.n_pressures)
     ]
+
+
+def anew_unknowns(name: str, length: float) -> list[Unknown]:
+    """Return the unknown twist of a frame or body that was defined anew, and moved to its place.
+
+    `length` is that of the arm, in m.
+    """
+    position, angle = np.full(3, START.anew_position * length), np.full(3, START.anew_angle)
+    return placement_unknowns(name, position, angle, turns=True)
 
 
 def zero_unknowns(name: str, tolerances: Tolerances) -> list[Unknown]:

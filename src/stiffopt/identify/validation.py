@@ -16,7 +16,8 @@ from stiffopt.identify.detection import idle_channels
 from stiffopt.identify.discrepancy import centres
 from stiffopt.identify.error_model import held_for, in_turn, is_moving
 from stiffopt.identify.fit import fit
-from stiffopt.identify.hypotheses import Hypothesis, of_channels, replaced
+from stiffopt.identify.frames import replaced
+from stiffopt.identify.hypotheses import Hypothesis, of_channels, pairs
 from stiffopt.identify.problem import CalibrationProblem, Noise, Predicted, Sample
 from stiffopt.identify.recording import Recording
 from stiffopt.identify.results import Comparison
@@ -163,7 +164,8 @@ def _put_right(setup: Setup, found: tuple[Comparison, ...]) -> tuple[Comparison,
         if not tried:
             continue
         with_all = [tried[i].recording if i in tried else each for i, each in enumerate(recordings)]
-        again = compare(Setup.of(setup.description, with_all, (), setup.settings))
+        tested = Setup.of(setup.description, with_all, (), setup.settings)
+        again = compare(tested, with_levels=False)
         for i, correction in tried.items():
             if correction.explains(found[i], again[i]):
                 recordings[i], remarks[i] = correction.recording, correction.remark
@@ -195,7 +197,7 @@ def _with_frame_found(setup: Setup, recording: Recording, found: Comparison) -> 
     moved, words, is_shifted = replaced(recording, measured, predicted, setup.description.length)
     remark = (
         f"the frame of this log was defined anew: its poses are {words} (--keep axes leaves them); "
-        "a log of another arm or with another order of channels may look so too"
+        "a body that was defined anew, another arm or another order of channels may look so too"
     )
     spread = np.linalg.svd(predicted - predicted.mean(axis=0), compute_uv=False)
     in_line = bool(spread[1] < DETECTION.in_line * spread[0])
@@ -208,27 +210,42 @@ def _with_channels_found(
     """Return a recording whose columns are those of other channels; None if it is unclear which.
 
     The order, or the dead or shared line, is that with which the arm at rest at the pressures is
-    clearly nearest to the tip.
+    clearly nearest to the tip. If none is near, pairs are tried, as in `hypotheses`: one has to be
+    far nearer than any single one.
     """
     description = setup.description
     arm, low = Manipulator(description), np.maximum(description.pressure_min, 0.0)
     seen = np.flatnonzero(np.isfinite(found.distance))
     rows = seen[np.linspace(0, len(seen) - 1, DETECTION.channel_rows).astype(int)]
-    tip, point = found.measured[rows], np.linalg.inv(setup.points[0].sensor)[:, 3]
+    point = np.linalg.inv(setup.points[0].sensor)[:, 3]
 
-    def miss(hypothesis: Hypothesis) -> float:
+    def miss(hypothesis: Hypothesis, step: int = 1) -> float:
+        some = rows[::step]
         try:
-            poses = arm.tip_pose(hypothesis.driven(found.pressures[rows], low))
+            poses = arm.tip_pose(hypothesis.driven(found.pressures[some], low))
         except (EquilibriumError, PressureError):  # the arm does not bear these pressures
             return np.inf
-        return float(np.median(np.linalg.norm((setup.base @ poses @ point)[:, :3] - tip, axis=1)))
+        tips = (setup.base @ poses @ point)[:, :3]
+        return float(np.median(np.linalg.norm(tips - found.measured[some], axis=1)))
 
-    tried = [each for each in of_channels(description, 1) if each.kind not in setup.settings.keep]
-    ranked = sorted((miss(each), k) for k, each in enumerate(tried))
-    is_clear = len(ranked) > 1 and ranked[0][0] <= DETECTION.tie * ranked[1][0]
-    if not is_clear or np.isinf(ranked[0][0]):
+    def ranked(tried: Sequence[Hypothesis]) -> list[Hypothesis]:
+        return sorted(tried, key=lambda each: miss(each, DETECTION.channel_step))
+
+    def clearest(tried: Sequence[Hypothesis]) -> tuple[float, Hypothesis | None]:
+        misses = [miss(each) for each in tried[: DETECTION.shortlist]]
+        least, *others = sorted(misses) or [np.inf]
+        is_clear = others and np.isfinite(least) and least <= DETECTION.tie * others[0]
+        return least, tried[misses.index(least)] if is_clear else None
+
+    single = [each for each in of_channels(description, 1) if each.kind not in setup.settings.keep]
+    single = ranked(single)
+    least, best = clearest(single)
+    if least > DETECTION.frame * DETECTION.off * description.length:
+        left, two = clearest(ranked(pairs(single, DETECTION.paired)))
+        if two is not None and left <= DETECTION.overwhelming * least:
+            best = two
+    if best is None:
         return None
-    best = tried[ranked[0][1]]
     (corrected,) = best.applied([recording], low)
     told = best.told(description, [recording.name])
     remark = f"{told} (--keep {best.kind} leaves that as it was recorded)"
@@ -253,6 +270,8 @@ def compare(
     setup: Setup,
     known: Mapping[str, float] | None = None,
     on_evaluation: Callable[[], None] = lambda: None,
+    *,
+    with_levels: bool = True,
 ) -> tuple[Comparison, ...]:
     """Predict the recordings of a setup and compare.
 
@@ -261,6 +280,7 @@ def compare(
     setup : Setup
     known : scaled coordinates of zeros and initial states by name, as far as a fit has found them.
     on_evaluation : called at every evaluation.
+    with_levels : whether to find out in which regions the readings lie, which takes a while.
     """
     description, recordings = setup.description, setup.recordings
     most = setup.settings.compared_rows if any(description.gravity) else SAMPLING.rows
@@ -280,6 +300,8 @@ def compare(
             recordings, kept, samples, pairwise(problem.starts), strict=True
         )
     ]
+    if not with_levels:
+        return tuple(found)
     without_break = [found] if setup.settings.sequence else [[each] for each in found]
     return tuple(each for logs in without_break for each in _with_levels(setup, logs))
 

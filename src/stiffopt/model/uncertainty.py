@@ -10,6 +10,9 @@ may move the tip in any direction.  Together they follow a multivariate t-distri
 Hysteresis depends on how the arm came to its pressures.  Its mean square, about the equilibrium,
 which is what `tip_pose` returns, is that over ways from rest to pressures drawn from the recorded
 range, and from there; but at most that of effective minus commanded pressures as recorded.
+While pressures change, a lag is added.  It is along the ways to the pressures, in each channel as
+large as these are long, and at least such that both are as recorded.  Near rest all chambers fill
+or empty together, which moves the tip along the arm; amid the range they lag independently.
 Plays lead through two drawn pressures.  Creep goes on while pressures are held: a way stays for
 6 s at each of three drawn ones, and at its end for 1.5 to 6 s, or for as long as is known.  It
 begins at the mean of the drawn pressures and of rest, which takes a seventh of the time, as in the
@@ -66,6 +69,7 @@ _HELD = 0.9  # share of these variances that held poses show; the rest was creep
 _MISREMEMBERED = 0.1  # error of what a model with creep remembers, over how far it moves the tip
 _MISREMEMBERED_STRAIN = 0.05  # the same where the history is known and strain is remembered
 _STIFFEST = 0.25  # least softness, over that at recorded pressures: a dead band has none
+_LEAST_SPAN = 0.1  # least recorded range of a channel that scales its ways, over the largest
 _SINGULAR = 1e-9  # smallest variance of a direction, over that of all
 NORMAL_QUANTILE = 1.959963984540054  # of 97.5 %, for two-sided intervals of 95 %
 
@@ -259,7 +263,9 @@ class Uncertainty:
             if self._knows_creep:
                 _, _, acting = self._slopes.at(pressures + ways.mean(axis=1) / 2)
             transposed = np.swapaxes(acting, 1, 2)
-            hysteresis = acting @ self._hysteresis(ways, moved) @ transposed
+            squares = np.swapaxes(ways, 1, 2) @ ways / _WAYS
+            squares[moved] += self._lag(pressures[moved], squares[moved])
+            hysteresis = acting @ squares @ transposed
             ways = ways @ transposed
             discrepancy *= np.where(moved, 1.0, _HELD)
         else:
@@ -307,7 +313,7 @@ class Uncertainty:
         g, h = per_coordinate[0] / k[0], per_pressure[0] / k[0]
         size = len(g)
         ways = self._remembered(p, self._slopes.at(p)[2])
-        acting = self._hysteresis(ways, np.zeros(1, dtype=bool))[0]
+        acting = ways[0].T @ ways[0] / _WAYS
         variance = g @ self._covariance[:size, :size] @ g
         variance += h @ acting @ h + h**2 @ self._discrepancy(p)[0]
         deviation = float(np.sqrt(max(variance, 0.0)))
@@ -345,17 +351,28 @@ class Uncertainty:
         moves = squared_moves(per_pressure, self._discrepancy(pressures))
         return np.asarray(moves.mean(axis=0))
 
-    def _hysteresis(self, ways: Array, moving: Flags) -> Array:
-        """Return mean squares (N, n, n), in Pa^2, of effective minus commanded pressures.
+    def _lag(self, pressures: Array, squares: Array) -> Array:
+        """Return mean squares (N, n, n), in Pa^2, of the lag behind pressures (N, n) that change.
 
-        `ways` are these after each way (N, W, n), if pressures are held.
+        Those of effective minus commanded pressures are `squares` (N, n, n) without it. It is along
+        the ways to the pressures from others, drawn from the recorded range; their mean square
+        within that range is a sixth of its square. Where the ways of a channel are shorter, the
+        rest of what was recorded is independent of the other channels.
         """
-        found = np.swapaxes(ways, 1, 2) @ ways / ways.shape[1]
         errors = self._calibration.errors
-        if errors is not None and errors.moving:
-            more = np.square(errors.moving) - np.einsum("nii->ni", found[moving])
-            found[moving] += np.maximum(more, 0.0)[..., np.newaxis] * np.eye(ways.shape[2])
-        return np.asarray(found)
+        if errors is None or not errors.moving:
+            return np.zeros_like(squares)
+        more = np.square(errors.moving) - np.einsum("nii->ni", squares)
+        lag = np.sqrt(np.maximum(more, 0.0))
+        low, high = self._range
+        span = high - low
+        unit = np.maximum(span, _LEAST_SPAN * span.max())
+        mean = (pressures - (low + high) / 2) / unit
+        along = 6 * mean[:, :, np.newaxis] * mean[:, np.newaxis]
+        channels = np.arange(len(span))
+        spread = np.maximum((span / unit) ** 2 / 2, 1 - along[:, channels, channels])
+        along[:, channels, channels] += spread
+        return np.asarray(lag[:, :, np.newaxis] * lag[:, np.newaxis] * along)
 
     def _remembered(
         self, pressures: Array, per_pressure: Array, held: Array | None = None
@@ -455,16 +472,20 @@ class Uncertainty:
         return np.asarray(np.interp(np.random.default_rng(1).permuted(strata), (0, 1), _AGES))
 
     @cached_property
+    def _range(self) -> tuple[Array, Array]:
+        """Lowest and highest pressures (n,) in Pa between which the ways begin: those recorded."""
+        known, robot = self._calibration, self._description
+        low = known.pressure_min or robot.pressure_min
+        high = known.pressure_max or robot.pressure_max
+        return np.array(low), np.array(high)
+
+    @cached_property
     def _visited(self) -> Array:
         """Pressures (_VISITS, W, n) in Pa that the ways visit in turn."""
-        known, robot = self._calibration, self._description
-        low, high = (
-            known.pressure_min or robot.pressure_min,
-            known.pressure_max or robot.pressure_max,
-        )
-        strata = np.tile((np.arange(_WAYS) + 0.5) / _WAYS, (_VISITS, robot.n_pressures, 1))
+        low, high = self._range
+        strata = np.tile((np.arange(_WAYS) + 0.5) / _WAYS, (_VISITS, len(low), 1))
         shares = np.random.default_rng(0).permuted(strata, axis=2)  # a Latin hypercube
-        return np.asarray(low + np.swapaxes(shares, 1, 2) * np.subtract(high, low))
+        return np.asarray(low + np.swapaxes(shares, 1, 2) * (high - low))
 
 
 class ReadingSlopes:

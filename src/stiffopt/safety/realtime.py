@@ -169,11 +169,13 @@ def _favoured_threads() -> tuple[str, Undo]:
     A thread that waits for a processor while it has Python's lock delays the real-time thread.
     Threads started by them inherit this.
     """
+    before: dict[int, int] = {}
     try:
-        threads = [int(name) for name in os.listdir("/proc/self/task")]
-        before = {thread: os.getpriority(os.PRIO_PROCESS, thread) for thread in threads}
-        for thread, nice in before.items():
-            os.setpriority(os.PRIO_PROCESS, thread, min(nice, _NICE))
+        for thread in map(int, os.listdir("/proc/self/task")):
+            with suppress(ProcessLookupError):  # it has ended
+                nice = os.getpriority(os.PRIO_PROCESS, thread)
+                os.setpriority(os.PRIO_PROCESS, thread, min(nice, _NICE))
+                before[thread] = nice
     except (AttributeError, OSError) as error:
         text = f"its other threads get no priority over other programs ({_why(error)})"
         raise _NotPermittedError(text) from None

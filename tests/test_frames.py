@@ -1,0 +1,187 @@
+"""Logs whose frame or tracked body was defined anew are found by what the other logs show."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from made_logs import course, made_log
+from recordings import UCL
+from stiffopt.errors import FileError
+from stiffopt.identify.calibration import calibrate
+from stiffopt.identify.correction import put_right
+from stiffopt.identify.settings import CalibrationSettings, Finding
+from stiffopt.identify.setup import Setup, recordings_of
+from stiffopt.identify.validation import validate
+from stiffopt.logs import Body, Log, read_log
+from stiffopt.model.description import Recordings, RobotDescription, TrackedBody
+from stiffopt.model.robot_files import load_description
+
+Array = NDArray[np.float64]
+Change = Callable[[Log], Log]
+
+TURN = Rotation.from_rotvec(np.radians(37) * np.array([2.0, 1.0, -2.0]) / 3)
+SHIFT = np.array([0.01, -0.015, 0.01])  # m
+FAST = {
+    "structure": "static", "strain_law": "keep", "rows": 90, "trial_rows": 60, "start_rows": 40,
+    "holds_back": False,
+}  # fmt: skip
+ROBOTS = {"stiff-flop-1": 3, "stiff-flop-2": 6}
+
+
+@cache
+def log_of(name: str = "stiff-flop-1", seed: int = 0, turns: bool = True) -> Log:
+    time, pressures = course(ROBOTS[name], 60.0, seed, rate=5.0)
+    return made_log(load_description(name), time, pressures, seed=seed, turns=turns)
+
+
+def rotations(log: Log) -> Rotation:
+    return Rotation.from_quat(log.tip_quaternion, scalar_first=True)
+
+
+def in_frame(turn: Rotation, shift: Array = SHIFT) -> Change:
+    """The frame is another one."""
+
+    def changed(log: Log) -> Log:
+        quaternion = log.tip_quaternion
+        if quaternion is not None:
+            quaternion = (turn * rotations(log)).as_quat(scalar_first=True)
+        return replace(
+            log, tip_position=turn.apply(log.tip_position) + shift, tip_quaternion=quaternion
+        )
+
+    return changed
+
+
+def of_body(log: Log) -> Log:
+    """The tip's body has other axes and another origin."""
+    body = rotations(log)
+    return replace(
+        log,
+        tip_position=log.tip_position + body.apply(SHIFT),
+        tip_quaternion=(body * TURN).as_quat(scalar_first=True),
+    )
+
+
+def of_pressures(factor: float) -> Change:
+    """An arm that is softer or stiffer."""
+    return lambda log: replace(log, commanded=factor * log.commanded)
+
+
+def reordered(log: Log) -> Log:
+    """Each channel of the segment has the column of another one."""
+    return replace(log, commanded=log.commanded[:, [1, 2, 0]])
+
+
+def with_one(logs: list[Log], which: int, change: Change) -> list[Log]:
+    return [change(log) if k == which else log for k, log in enumerate(logs)]
+
+
+def told(robot: RobotDescription, logs: list[Log], keep: tuple[Finding, ...] = ()) -> list[str]:
+    """What is told of the set-up before a fit."""
+    settings = CalibrationSettings(keep=keep)
+    setup = Setup.of(robot, recordings_of(robot, list(logs), settings), (), settings)
+    return list(put_right(setup).found)
+
+
+@pytest.mark.parametrize("turns", [True, False])
+@pytest.mark.parametrize(("name", "which"), [("stiff-flop-1", 0), ("stiff-flop-2", 2)])
+def test_a_frame_that_was_defined_anew_is_found(name: str, which: int, turns: bool) -> None:
+    robot = load_description(name)
+    logs = [log_of(name, seed, turns) for seed in range(3)]
+    assert told(robot, logs) == []
+    wrong = with_one(logs, which, in_frame(TURN))
+    (remark,) = told(robot, wrong)
+    assert remark.startswith(f"the frame of log {which + 1} was defined anew")
+    assert "deg about (-0.6" in remark  # it is turned back
+    assert told(robot, wrong, keep=("axes",)) == []
+
+
+def test_a_body_that_was_defined_anew_is_found() -> None:
+    robot = load_description("stiff-flop-1")
+    wrong = with_one([log_of(seed=seed) for seed in range(3)], 1, of_body)
+    (remark,) = told(robot, wrong)
+    assert remark.startswith("the body 'tip' was defined anew in log 2")
+    assert "its orientation by" in remark
+
+
+def test_a_frame_that_was_defined_anew_for_a_whole_day_is_found() -> None:
+    logs = [log_of(seed=seed) for seed in range(5)]
+    wrong = with_one(with_one(logs, 3, in_frame(TURN)), 4, in_frame(TURN))
+    (remark,) = told(load_description("stiff-flop-1"), wrong)
+    assert remark.startswith("the frame of log 4, log 5 was defined anew")
+
+
+def test_of_two_logs_the_one_that_the_robot_file_does_not_expect_is_moved() -> None:
+    logs = [log_of(seed=seed) for seed in range(2)]
+    (remark,) = told(load_description("stiff-flop-1"), with_one(logs, 0, in_frame(TURN)))
+    assert remark.startswith("the frame of log 1 was defined anew")
+
+
+def test_a_turn_that_is_no_quarter_turn_is_not_told_as_one() -> None:
+    near = Rotation.from_rotvec([0, 0, np.radians(90)]) * Rotation.from_rotvec([0.3, 0, 0])
+    logs = [log_of(seed=seed, turns=False) for seed in range(3)]
+    (remark,) = told(load_description("stiff-flop-1"), with_one(logs, 1, in_frame(near)))
+    assert "was defined anew" in remark
+    quarter = in_frame(Rotation.from_rotvec([0, 0, np.radians(90)]), np.zeros(3))
+    (remark,) = told(load_description("stiff-flop-1"), with_one(logs, 1, quarter))
+    assert remark.startswith("the axes of the frame are turned")
+
+
+@pytest.mark.parametrize("turns", [True, False])
+@pytest.mark.parametrize("change", [of_pressures(0.5), of_pressures(1.8), reordered])
+def test_a_log_of_another_arm_is_not_excused_by_its_frame(change: Change, turns: bool) -> None:
+    logs = [log_of(seed=seed, turns=turns) for seed in range(3)]
+    wrong = with_one(logs, 1, change)
+    assert not any("anew" in each for each in told(load_description("stiff-flop-1"), wrong))
+
+
+@pytest.mark.parametrize("turns", [True, False])
+def test_channels_in_another_order_in_one_log_are_told_instead_of_a_turn(turns: bool) -> None:
+    robot = load_description("stiff-flop-1")
+    wrong = with_one([log_of(seed=seed, turns=turns) for seed in range(3)], 1, reordered)
+    (remark,) = told(robot, wrong)
+    assert remark.startswith("log 2 differs from the other logs, as if the channels are in another")
+    assert "segment 1 channel 1 has the column of segment 1 channel 3" in remark
+    assert "This is not corrected" in remark
+    assert not any("differs" in each for each in told(robot, wrong, keep=("channels",)))
+
+
+def test_a_body_that_is_lost_in_a_log_is_told() -> None:
+    robot = load_description("stiff-flop-1")
+    bodies = Recordings(bodies={"mid": TrackedBody(at=robot.length / 2)})
+    logs = [
+        replace(each, bodies={"mid": Body(0.5 * each.tip_position)})
+        for each in (log_of(seed=seed, turns=False) for seed in range(2))
+    ]
+    nowhere = Body(np.full_like(logs[1].tip_position, np.nan))
+    logs[1] = replace(logs[1], bodies={"mid": nowhere})
+    with pytest.raises(FileError, match=r"log 2: no row has readings of all .*tip, mid"):
+        told(robot.model_copy(update={"recordings": bodies}), logs)
+
+
+def test_the_fit_finds_the_rest_of_the_motion() -> None:
+    # the arm that finds a motion is less exact than the model that is then fitted
+    robot = load_description("stiff-flop-1")
+    wrong = with_one([log_of(seed=seed) for seed in range(3)], 1, in_frame(TURN))
+    result = calibrate(robot, wrong, settings=CalibrationSettings(**FAST))
+    assert "was defined anew" in result.remarks[0]
+    named = {each.name for each in result.estimates}
+    assert "frame of log 2, about x" in named
+    (found,) = validate(result.robot, [log_of(seed=7)])
+    assert found.errors.mean < 1e-3
+
+
+@pytest.mark.skipif(not UCL, reason="the recordings are not there")
+def test_a_frame_of_a_real_arm_that_was_defined_anew_is_found() -> None:
+    robot = load_description("ucl-stiff-flop")
+    logs = [read_log(path) for path in UCL]
+    assert told(robot, logs) == []
+    (remark,) = told(robot, with_one(logs, 1, in_frame(TURN)))
+    assert "was defined anew" in remark
