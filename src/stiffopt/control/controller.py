@@ -120,7 +120,7 @@ class TipController:
         unbounded = {} if slow_first_motion else {"slew_share": math.inf, "correction": math.inf}
         self._first_motion = FirstMotion(replace(tuning.first_motion, **unbounded))
         self._way_to_target = WayToTarget(setup, self._arm)
-        self._correction = CorrectionBound(tuning.correction, period, vibrates=vibrates)
+        self._correction = CorrectionBound(tuning.correction, period, vibrates=self._vibrates)
         self._requests = Requests(setup)
         Planner = ProcessPlanner if plan_in_process else InlinePlanner
         self.replanner = Replanner(Planner(robot, scene), tuning.replanning, period, dead_time)
@@ -152,7 +152,7 @@ class TipController:
         self._moved_at = -math.inf  # last time at which the reference moved
         self._computed_at = now
         self._adapted_at = -math.inf  # last adaptation of the model since the last request
-        self._adopted_at = -math.inf  # last change of the model
+        self._model_changed_at = -math.inf  # last change of the model
         self._untold: list[Notice] = []  # events since the last call of `notices`
         self._went_back_at = -math.inf  # last return to an earlier model
         self._watched_at = -math.inf  # last check whether the tip rests
@@ -378,7 +378,7 @@ class TipController:
         if self._vibrates:
             is_bounded = self.replanner.stiffens
         else:  # feedback makes up at once for a model that has just been adapted
-            is_bounded = moves and now - self._adopted_at > self._tuning.adaptation.calm_time
+            is_bounded = moves and now - self._model_changed_at > self._tuning.adaptation.calm_time
         self._correction.take(tip.pose[:3, 3], applies=course is None and is_bounded)
         if self._arm.channels.pace == 0 and self._ways and moves:
             return self._feedforward(self._without_feedback, last)
@@ -641,7 +641,7 @@ class TipController:
     def _adopt(self, adapted: Adapted, change: Array) -> None:
         """Go on with a model, whose offset of the tip differs by a change (6,)."""
         self._shift(change)
-        self._adapted_at = self._adopted_at = self._now
+        self._adapted_at = self._model_changed_at = self._now
         self.replanner.go_on_with(adapted, change)
 
     def _has_arrived(self) -> bool:

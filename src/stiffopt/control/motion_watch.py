@@ -453,9 +453,8 @@ class MotionWatch:
         far = np.flatnonzero((moved**2).sum(axis=1) > distance**2)
         most = self._tuning.slip_of_large
         return any(
-            self._missed_turn(turn @ moved[k], ways[k, _TURNED])
-            < most * float(np.linalg.norm(turn @ moved[k]))
-            for k in far
+            self._missed_turn(bent, turned) < most * float(np.linalg.norm(bent))
+            for bent, turned in zip(moved[far] @ turn.T, ways[far, _TURNED], strict=True)
         )
 
     def _lasts(self, missing: deque[float]) -> bool:

@@ -1,4 +1,4 @@
-"""What the planner is asked, and what it answers."""
+"""A request for a plan, and the plan that answers it."""
 
 from __future__ import annotations
 

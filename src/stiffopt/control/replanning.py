@@ -237,7 +237,7 @@ class Replanner:
 
     @property
     def stiffens(self) -> bool:
-        """Whether the arm, with its tip at the target, is on its way to the stiffest pressures."""
+        """Whether the tip has gone to its target first, and the arm is still becoming stiff."""
         return self.plan is not None and bool(self.plan.tip_first) and not self._blocked
 
     def go_on_with(self, adapted: Adapted, change: Array) -> None:

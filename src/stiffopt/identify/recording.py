@@ -37,7 +37,7 @@ Rows = NDArray[np.bool_]
 
 _PRESSURE_UNITS = {"MPa": 1e6, "bar": 1e5, "psi": 6894.757, "kPa": 1e3, "mbar": 1e2}
 FRAME = "frame"
-"""What was defined anew in a log, if not a body; see `Recording`."""
+"""Value of `Recording.anew` if the frame was defined anew, and not a body."""
 _TIP = "tip"
 _UNUSED = "these are not used"
 
