@@ -32,6 +32,8 @@ class _ChangeUnderWay:
     stays: bool = True  # whether the target is that of the last plan
     left: float = math.inf  # least rest of the way so far, as the tip's motion by one channel, in m
     stalled: int = 0  # successive plans that came no nearer
+    # whether the arm goes straight to the end; then that is over when its reference is there
+    is_direct: bool = False
     straight: bool = False  # whether plans lead straight to the end, as no other way was found
 
 
@@ -56,7 +58,7 @@ class PostureChanges:
 
     def begin(self, end: Array, tip_first: tuple[float, ...] = ()) -> None:
         """Begin a change to pressures (n,), in Pa; `tip_first` is that of its plans."""
-        self._change = _ChangeUnderWay(end, tip_first)
+        self._change = _ChangeUnderWay(end, tip_first, is_direct=tip_first == tuple(end.tolist()))
 
     def end(self) -> None:
         """End the change, wherever it is."""
@@ -154,6 +156,8 @@ class PostureChanges:
             over=change.over or left <= step,
         )
         is_over = left <= step and float(np.linalg.norm(change.drift[:3])) < tuning.at_rest / 10
+        if change.is_direct and is_over:
+            is_over = self._motion(request.here, end - request.here) <= tuning.change_step
         self._change = None if is_over else change
         if left <= step:
             return end
