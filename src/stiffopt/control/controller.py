@@ -576,6 +576,9 @@ class TipController:
         R, plan = tip.pose[:3, :3], self.replanner.current
         short = np.zeros(3) if plan is None else np.array(plan.short)
         elapsed = min(now - self._computed_at, _HELD * self._period)
+        if self.replanner.stiffens:
+            rates = np.abs(self._reference.motion[1, : self.robot.n_pressures])
+            course.change_posture(elapsed * float(np.linalg.norm(tip.jacobian[:3], axis=0) @ rates))
         arrived = self._rests(now) and not self.replanner.stiffens
         course.advance(
             elapsed, arrived, self._is_known(now), self._arm.tip.estimate.position,
