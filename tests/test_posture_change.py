@@ -17,7 +17,7 @@ from stiffopt.control.tuning import ForecastTuning
 from stiffopt.model.scene import Scene
 from stiffopt.optimise.goal import StiffnessGoal, StiffnessMeasure
 from stiffopt.optimise.press import Press
-from stiffopt.optimise.target import Target
+from stiffopt.optimise.target import Target, Tolerance
 from stiffopt.optimise.task import Task
 from test_planner import BAR, PRESSURES, ROBOT, request, tip
 
@@ -110,6 +110,28 @@ def changing(robot, plans=10):
     assert plan.tip_first
     assert np.abs(stiffest.pressures - plan.pressures).max() > 2e4
     return planning, asked, plan, stiffest
+
+
+def test_a_change_that_cannot_stay_at_the_target_goes_on_straight_and_says_so(robot, monkeypatch):
+    planning, asked, plan, stiffest = changing(robot)
+    exact = asked.target.model_copy(update={"tolerance": Tolerance(position=1e-5)})
+    asked = replace(asked, task=asked.task.model_copy(update={"target": exact}))
+
+    def off_target(target, limits, start):
+        """A search that is caught away from the target, and moves with the offset alone."""
+        return planning._last.pressures + 0.2 * (start - planning._last.pressures), 3e-3, 0.0
+
+    monkeypatch.setattr(planning._search, "find", off_target)
+    wanted, said = np.array(asked.target.position[:2]), []
+    for _ in range(300):
+        plan = planning.plan(replace(asked, search=False))
+        off = np.linalg.norm(tip(robot, plan.pressures)[1][:2] - wanted)
+        if planning._changes.leaves_target:
+            assert plan.far == bool(plan.message) == (off > 1e-5)
+            said.append(plan.far)
+    assert sum(said) > 20
+    assert not plan.far
+    np.testing.assert_allclose(plan.pressures, stiffest.pressures, atol=100.0)
 
 
 def test_the_tip_is_not_led_to_its_target_by_soft_pressures(robot):

@@ -564,16 +564,22 @@ class MotionWatch:
         """Return whether a growing push explains the change: it turns the tip too.
 
         A tracker's frame that turns about the base does so as well, by somewhat less, so the turn
-        by a large push must be about that which is expected.
+        by a large push must be about that which is expected. While an arm swings as slowly as it
+        would drift, the estimate takes a push for a part of the swing, so what is measured counts
+        too.
         """
-        moved, tuning = change[_OFFSET], self._tuning
         if turning is None:
             return False
-        bent = turn_of_a_push(turning) @ moved
-        size, missing = float(np.linalg.norm(bent)), self._missed_turn(bent, change[_TURN])
-        is_large = float(np.linalg.norm(moved)) > tuning.largest_push
-        share = tuning.slip_of_large if is_large else tuning.slip
-        return size > tuning.least_turn and missing < share * size
+        tuning, turn = self._tuning, turn_of_a_push(turning)
+        measured = change[_SEEN] - change[_PREDICTED]
+        for moved, turned in ((change[_OFFSET], change[_TURN]), (measured, change[_TURNED])):
+            bent = turn @ moved
+            size, missing = float(np.linalg.norm(bent)), self._missed_turn(bent, turned)
+            is_large = float(np.linalg.norm(moved)) > tuning.largest_push
+            share = tuning.slip_of_large if is_large else tuning.slip
+            if size > tuning.least_turn and missing < share * size:
+                return True
+        return False
 
     def _swing(self) -> Doubt | None:
         for swings in self._swings:

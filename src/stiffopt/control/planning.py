@@ -188,10 +188,12 @@ class Planning:
                     self._changes.begin(pressures)
                 if self._changes.to is not None:
                     pressures = self._changes.next(request, last, pressures, target, self._limits)
+            message = ""
+            if self._changes.leaves_target:
+                message = self._away(task.target.tolerance, target, pressures)
             self._last = Plan(
-                request.serial, pressures, request.offset, asked, True, stiffness, "",
-                adapted=request.adapted,
-                tip_first=self._changes.tip_first,
+                request.serial, pressures, request.offset, asked, True, stiffness, message,
+                far=bool(message), adapted=request.adapted, tip_first=self._changes.tip_first,
             )  # fmt: skip
         else:
             self._changes.end()
@@ -390,6 +392,13 @@ class Planning:
             "" if request.stay and not far else nearest_words(distance, angle, tolerance), far=far,
             short=tuple(short.tolist()), adapted=request.adapted,
         )  # fmt: skip
+
+    def _away(self, tolerance: Tolerance, target: Target, pressures: Array) -> str:
+        """Return how far the tip at pressures (n,) is from its target; empty if it is there."""
+        distance, angle = self._search.distance(target, pressures)
+        if distance <= tolerance.position and angle <= tolerance.angle:
+            return ""
+        return nearest_words(distance, angle, tolerance, "the tip")
 
     def _displacement(self, last: Plan, target: Target) -> Array:
         """Return by how much (3,) the model's target has moved since the last plan, in m."""

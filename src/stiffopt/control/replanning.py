@@ -306,6 +306,9 @@ class Replanner:
                 text = "no optimum is found for the target, only pressures that lead near it"
             text = f"{text}: {message}"
             notices = (*notices, Notice("unreachable", text, standing=True))
+        if plan is not None and is_final and plan.reached and plan.far:
+            text = f"the arm goes to other pressures for its target; until then {plan.message}"
+            notices = (*notices, Notice("changes-posture", text, standing=True))
         limited = self.adapted is not None and self.adapted.limits is not None
         if limited and (self.known is None or self.known.is_limited):
             notices = (*notices, Notice("too-soft", _TOO_SOFT, standing=True))
