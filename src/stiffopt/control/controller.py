@@ -385,7 +385,7 @@ class TipController:
             is_bounded = self.replanner.stiffens
         else:  # feedback makes up at once for a model that has just been adapted
             is_bounded = moves and now - self._model_changed_at > self._tuning.adaptation.calm_time
-        self._correction.take(tip.pose[:3, 3], applies=self._goes_to_target and is_bounded)
+        self._correction.take(tip.pose[:3, 3], applies=course is None and is_bounded)
         if self._arm.channels.pace == 0 and self._ways and moves:
             return self._feedforward(self._without_feedback, last)
         bent = self._bend(None if isinstance(course, PostureCourse) else self.replanner.bent)

@@ -3,7 +3,7 @@
 The target is moved back by the tip's offset; the model has to reach the result. The optimiser then
 finds the pressures that are stiffest on the real arm, except for errors of the modelled stiffness.
 An arm that vibrates first goes to a new target by the least motion of each channel, and from there
-slowly to the stiffest pressures. A plan is the local optimum next to the last plan. When the offset
+slowly to the stiffest pressures; where a task demands a stiffness, as far at first as it needs. A plan is the local optimum next to the last plan. When the offset
 has changed much and the arm is at rest, all configurations are searched again; the arm changes to
 another one only if that is clearly better. For a target that is out of reach, the plan is the
 nearest configuration.
@@ -281,9 +281,11 @@ class Planning:
         way and as fast; so would the fault of one. The arm goes on from there as to another
         configuration, or from the first place on that way that has a share of the stiffness `best`.
 
-        What a task demands is met there as well, and on the rest of the way; if there is no such
-        place, the arm goes straight, but not faster. On a rig with a scene it goes straight if it
-        would come too near to the scene otherwise.
+        What a task demands is met there as well, and on the rest of the way. If there is no such
+        place, the arm goes straight, with channels as slow as on the tip's way.
+
+        On a rig with a scene the arm goes straight, and as fast as it can, if it would come too
+        near to the scene otherwise.
         """
         if not request.here.size:
             return stiffest
