@@ -22,9 +22,9 @@ With `--in-use`, motions are fast from the beginning, as of an arm that has move
 armed. The table then has a line for each arm and a column for each row: what the loop causes, in
 mm, and when it was told, as what; and last the time to the second target without a fault, until the
 tip stays within 1 mm. With `--post`, the controller keeps clear of a post beside the arm, which
-leaves room for every motion. ``--robot`` and ``--steps`` draw other arms and steps. With `--commission`, `stiffopt commission --quick` looks for the
-faults of the set-up instead: its first finding, whether it permits arming, and how far the tip
-moved from rest.
+leaves room for every motion. `--robot` and `--steps` draw other arms and steps. With
+`--commission`, `stiffopt commission --quick` looks for the faults of the set-up instead: its first
+finding, whether it permits arming, and how far the tip moved from rest.
 """
 
 from __future__ import annotations
