@@ -3,10 +3,10 @@
 The target is moved back by the tip's offset; the model has to reach the result. The optimiser then
 finds the pressures that are stiffest on the real arm, except for errors of the modelled stiffness.
 An arm that vibrates first goes to a new target by the least motion of each channel, and from there
-slowly to the stiffest pressures; where a task demands a stiffness, as far at first as it needs. A plan is the local optimum next to the last plan. When the offset
-has changed much and the arm is at rest, all configurations are searched again; the arm changes to
-another one only if that is clearly better. For a target that is out of reach, the plan is the
-nearest configuration.
+slowly to the stiffest pressures; where a task demands a stiffness, it first goes as far as that
+needs. A plan is the local optimum next to the last plan. When the offset has changed much and the
+arm is at rest, all configurations are searched again; the arm changes to another one only if that
+is clearly better. For a target that is out of reach, the plan is the nearest configuration.
 
 While the tip presses on something, plans follow the target by the least change of pressures
 instead: the error of the model, from which a force must be told, is another one elsewhere, and an
