@@ -22,9 +22,10 @@ With `--in-use`, motions are fast from the beginning, as of an arm that has move
 armed. The table then has a line for each arm and a column for each row: what the loop causes, in
 mm, and when it was told, as what; and last the time to the second target without a fault, until the
 tip stays within 1 mm. With `--post`, the controller keeps clear of a post beside the arm, which
-leaves room for every motion. `--robot` and `--steps` draw other arms and steps. With
-`--commission`, `stiffopt commission --quick` looks for the faults of the set-up instead: its first
-finding, whether it permits arming, and how far the tip moved from rest.
+leaves room for every motion. `--robot` and `--steps` draw other arms and steps, and with `--demand`
+tasks demand a share of the best stiffness. With `--commission`, `stiffopt commission --quick` looks
+for the faults of the set-up instead: its first finding, whether it permits arming, and how far the
+tip moved from rest.
 """
 
 from __future__ import annotations
@@ -43,7 +44,17 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from control_baselines import PERIOD
-from control_cases import DYNAMICS, STEPS, Case, at_tip_speed, beside, draw_case, settling_time
+from control_cases import (
+    DEMANDS,
+    DYNAMICS,
+    STEPS,
+    Case,
+    at_tip_speed,
+    beside,
+    demanding,
+    draw_case,
+    settling_time,
+)
 from control_runs import STAYS, LoopRun
 from report import table
 from stiffopt import Scene, lie, load_robot
@@ -640,6 +651,8 @@ def main() -> None:
         "--steps", type=float, nargs=2, default=STEPS, help="between two targets, least and most, m"
     )
     parser.add_argument("--post", action="store_true", help="with a scene: a post beside the arm")
+    parser.add_argument("--demand", choices=DEMANDS, help="of the tasks, instead of the stiffest")
+    parser.add_argument("--share", type=float, default=0.8, help="of the best, that is demanded")
     arguments = parser.parse_args()
     seeds = [first + case for first in arguments.seed for case in range(arguments.cases)]
     drawn = [
@@ -647,6 +660,7 @@ def main() -> None:
         for seed in seeds
     ]
     cases = [at_tip_speed(case, arguments.tip_speed) for case in drawn]
+    cases = [demanding(case, arguments.demand, arguments.share) for case in cases]
     if arguments.post:
         cases = [beside(case, POST) for case in cases]
     words = arguments.rows or [""]

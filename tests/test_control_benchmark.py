@@ -28,6 +28,7 @@ from control_cases import DIRECTIONS, STEPS, draw_case, draw_path, settling_time
 from stiffopt.identify.results import Comparison
 from stiffopt.model.description import Recordings
 from stiffopt.model.manipulator import load_robot
+from stiffopt.optimise.solver import PressureSolver
 from stiffopt.plant.plant import Plant
 from stiffopt.plant.settings import Discretisation
 from stiffopt.registration import Placement, Registration
@@ -96,6 +97,20 @@ def test_arms_and_steps_may_be_other_ones():
     assert case.description.plant.mismatch.modulus == (0.85, 0.85)
     step = case.aims[0].position - case.arm().settled(np.zeros(6))
     assert 0.05 <= np.linalg.norm(step) <= 0.11
+
+
+@pytest.mark.parametrize("what", control_cases.DEMANDS)
+def test_tasks_may_demand_a_share_of_the_best_stiffness(what):
+    case = drawn()
+    place, kind = case.aims[0].position, case.aims[0].kind
+    robot = load_robot(case.believed)
+    best = PressureSolver(robot, case.task(place, kind)).solve().stiffness
+    goal = control_cases.demanding(case, what, 0.9).task(place, kind).stiffness
+    (demanded,) = goal.at_least or (goal.match,)
+    assert demanded.value == pytest.approx(0.9 * best)
+    assert demanded.direction == DIRECTIONS[kind]
+    assert bool(goal.maximise) is (what == "both")
+    assert control_cases.demanding(case, None, 0.9) is case
 
 
 def test_feedback_beats_the_model_alone_and_the_table_says_so(short_steps):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,10 +11,12 @@ import pytest
 
 from stiffopt.control.correction_bound import CorrectionBound
 from stiffopt.control.planning import Planning
+from stiffopt.control.pressing import Phase
 from stiffopt.control.replanning import Pursuit, Replanner
 from stiffopt.control.tuning import ControlTuning, CorrectionTuning, ReplanningTuning
 from stiffopt.control.way_to_target import WayToTarget
 from stiffopt.optimise.goal import StiffnessGoal, StiffnessMeasure
+from stiffopt.optimise.press import Press
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import Task
 from stiffopt.plant.settings import PlantLoad
@@ -140,6 +143,28 @@ def test_a_push_is_met_slowly_only_while_the_arm_becomes_stiff(changes):
     bench.run(0.6)
     way = np.linalg.norm(arm.at_waypoint(bench.command).pose[:3, 3] - before)
     assert way < 5.5e-3 if changes else way > 7e-3
+
+
+def test_a_press_begins_when_the_arm_is_as_stiff_as_planned():
+    """Its force is told by the stiffness that the arm has; its way takes as long as any other."""
+    bench = Bench(HANGING, "full")
+    position = bench.settled(duration=4.0)
+    controller, axial = bench.controller, StiffnessMeasure(direction=(0.0, 0.0, 1.0))
+    press = Press(force=0.03, direction=(1.0, 0.0, 0.0))
+    task, goal = bench.task(position=position), StiffnessGoal(maximise=axial)
+    controller.set_task(task.model_copy(update={"stiffness": goal, "press": press}))
+    course, ticks = controller.replanner.pursuit.course, 0
+    course._tuning = replace(course._tuning, longest_rest=0.5)  # nothing else is waited for
+    while course.phase is Phase.GOING:
+        bench.run(0.1)
+        ticks += 1
+        assert ticks < 150
+    assert ticks > 20
+    assert controller._way_to_target._tip_first  # its way took its time
+    assert not controller.replanner.plan.tip_first
+    standing = controller.status(bench.rig.clock.now())
+    assert standing.stiffness == pytest.approx(standing.best_stiffness, rel=0.03)
+    assert not [n for n in controller.notices() if n.kind == "press-failed"]
 
 
 def test_an_arm_without_inertia_makes_up_for_a_late_tracker_only_by_some_millimetres():

@@ -34,6 +34,7 @@ class _ChangeUnderWay:
     stays: bool = True  # whether the target is that of the last plan
     left: float = math.inf  # least rest of the way so far, as the tip's motion by one channel, in m
     stalled: int = 0  # successive plans that came no nearer
+    is_direct: bool = False  # whether it has no way but that of the reference to its end
     straight: bool = False  # whether plans lead straight to the end, as no other way was found
 
 
@@ -58,7 +59,7 @@ class PostureChanges:
 
     def begin(self, end: Array, tip_first: tuple[float, ...] = ()) -> None:
         """Begin a change to pressures (n,), in Pa; `tip_first` is that of its plans."""
-        self._change = _ChangeUnderWay(end, tip_first)
+        self._change = _ChangeUnderWay(end, tip_first, is_direct=tip_first == tuple(end.tolist()))
 
     def end(self) -> None:
         """End the change, wherever it is."""
@@ -155,7 +156,7 @@ class PostureChanges:
         goes_on = is_there and left < change.left - tuning.change_progress * step
         if last.target != request.target or left > change.left + step:  # another way
             goes_on, change = True, replace(change, straight=False)
-        stalled = 0 if goes_on else change.stalled + (drift <= tuning.at_rest)
+        stalled = 0 if goes_on or left <= step else change.stalled + (drift <= tuning.at_rest)
         change = replace(
             change,
             end=end,
@@ -166,5 +167,7 @@ class PostureChanges:
             over=change.over or left <= step,
         )
         is_over = left <= step and float(np.linalg.norm(change.drift[:3])) < tuning.at_rest / 10
+        if is_over and change.is_direct:
+            is_over = self._motion(request.here, end - request.here) <= tuning.change_step
         self._change = None if is_over else change
         return end if left <= step else found

@@ -329,6 +329,8 @@ class PlanningTuning:
     change_jump: float = 3.0
     # least stiffness when the tip is at its target first, as a share of the best
     soft: float = 0.5
+    # share of a stiffness by which it has to be more than is demanded before the last plan
+    demand_margin: float = 0.01
     # plans by which feedback is late on such a way, share of the newest in the mean change of the
     # offset, and longest lead for it, in m
     lead: float = 8.0
