@@ -147,9 +147,11 @@ def test_a_line_that_is_kinked_at_the_moment_of_a_push_does_not_hide_behind_it()
     plant.follow = lambda trace: follow(np.minimum(trace, highest))
     bench.controller.set_task(bench.task(position=tuple(map(float, place))))
     bench.run(0.8)
-    assert watch.pace == 0 and watch.doubt is None
+    assert watch.pace == 0
+    assert watch.doubt is None
     bench.run(1.2)
-    assert watch.doubt is not None and watch.doubt.kind == "no-response"
+    assert watch.doubt is not None
+    assert watch.doubt.kind == "no-response"
 
 
 @pytest.mark.parametrize("again", [False, True])
