@@ -87,7 +87,7 @@ class MotionWatch:
     ----------
     doubt : the present doubt; it stays until `forgive` or `go_on`.
     pace : share of its speed that the reference may keep; less than 1 before a missing response is
-        certain.
+        certain, and 0 while the arm swings after a push.
     """
 
     def __init__(
@@ -296,9 +296,12 @@ class MotionWatch:
 
         Motion is compared in space, and then without its part along the tip's axis (3,), so that a
         long elongation does not hide a wrong direction across it. After a push in motion it is
-        compared again without what the push explains, as the turn shows it.
+        compared again without what the push explains, as the turn shows it. A line that is kinked
+        may turn the tip as a push does. So the reference waits until the push is over, and what is
+        wrong with the pressures shows in the rest of the motion.
         """
         rows, missed = self._since(self._tuning.response_window), None
+        now = float(rows[-1, _TIME])
         self._notice_push(jacobian, turning)
         ways = rows[-1, _PREDICTED] - rows[:-1, _PREDICTED]
         if ((ways**2).sum(axis=1) > self._min_motion**2).any():  # projections are no longer
@@ -306,14 +309,16 @@ class MotionWatch:
             steps = self._by_segments(np.diff(rows, axis=0), jacobian)
             found = [self._missed(rows, steps, P) for P in (np.eye(3), across)]
             missed = max(found, key=_share_of)
-            self._learn(float(rows[-1, _TIME]), found[0].error, steps[-1])
-            if turning is not None and self._pushes.acts(float(rows[-1, _TIME])):
+            self._learn(now, found[0].error, steps[-1])
+            if turning is not None and self._pushes.acts(now):
                 rest = self._without_push(rows, turning)
                 left = [self._missed(rest, steps, P) for P in (np.eye(3), across)]
                 missed = min(missed, max(left, key=_share_of), key=_share_of)
         share = 0.0 if missed is None else missed.share
         usual = self._tuning.usual_share
         self.pace = min(max((1 - share) / (1 - usual), 0.0), 1.0)
+        if self._pushes.acts(now):
+            self.pace = 0.0  # a fault that shows in motion could hide behind the push
         self._misses = self._misses + 1 if share > 1 else 0
         if missed is None or self._misses < self._tuning.misses:
             return None
