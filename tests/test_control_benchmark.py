@@ -26,6 +26,7 @@ from conftest import is_long
 from control_baselines import CONTROLLERS, Gains, IntegralFeedback
 from control_cases import DIRECTIONS, STEPS, draw_case, draw_path, settling_time, with_true_file
 from stiffopt.identify.results import Comparison
+from stiffopt.model.calibration import Calibration
 from stiffopt.model.description import Recordings
 from stiffopt.model.manipulator import load_robot
 from stiffopt.plant.plant import Plant
@@ -291,6 +292,30 @@ def test_the_55_mm_arm_is_calibrated_by_its_training_run_and_by_its_circle(monke
     told = regions.markdown("ucl-55", [found["ucl-55"]], is_one=True)
     (row,) = (line for line in told.splitlines() if line.startswith("| with history |"))
     assert row.startswith("| with history | 2400 | 50 (30 to 68) | 100 (100 to 100) |")
+
+
+def test_arms_of_an_undriven_channel_differ_by_its_tolerances_alone():
+    robot, arm = regions.made("sim", 32000)
+    priors = {"gain": 0.05, "azimuth": 0.05}
+    parameters = [
+        {"key": f"segments[0].corrections.{name}[{channel}]", "deviation": 0.01, "prior": prior}
+        for name, prior in priors.items()
+        for channel in range(3)
+    ]
+    known = {"parameters": parameters, "correlation": np.eye(6).tolist()}
+    fit = robot.model_copy(update={"calibration": Calibration.model_validate(known)})
+    first, found = arm.plant.mismatch, list(regions.with_other_channels("sim", 32000, fit))
+    drawn = []
+    for each in found:
+        own = each.plant.mismatch
+        assert own.model_copy(update={"gain": first.gain, "angle": first.angle}) == first
+        assert (own.gain[:-1], own.angle[:-1]) == (first.gain[:-1], first.angle[:-1])
+        drawn += [np.log(own.gain[-1]) / priors["gain"], own.angle[-1] / priors["azimuth"]]
+    assert len(np.unique(drawn)) == 2 * regions.UNDRIVEN
+    assert 0.5 < np.std(drawn) < 1.5
+    commands = np.array([[0, 0, 0], [5e4, 5e4, 0]])
+    one, other = (each.recorded(np.array([0, 1.0]), commands) for each in (arm, found[0]))
+    np.testing.assert_allclose(one.tip_position, other.tip_position, atol=1e-5)
 
 
 @pytest.mark.parametrize("name", ["none", "dead line", "axes of one log"])
