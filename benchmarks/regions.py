@@ -18,9 +18,10 @@ known by the robot file's tolerances alone. All rows of an arm share that one er
 tested on five arms, whose last channels differ by gains and azimuths drawn from these tolerances.
 
 With `--recordings` the arms are the real ones of `stiffopt bench recordings`, calibrated with their
-strain law by default settings. The 55 mm arm is also fitted to its circle, and the test runs of
-both fits are pooled. The intervals are those of `stiffopt validate`, by a bootstrap over blocks of
-two minutes.
+strain law by default settings to each of their runs in turn (logs in sequence to the training logs
+alone), and tested with the others. The intervals are by a bootstrap over these tests: a run goes
+the same way again and again, so its blocks of two minutes, which `stiffopt validate` draws, have
+nearly the same coverage.
 """
 
 from __future__ import annotations
@@ -63,7 +64,6 @@ ROUNDS, ROUND, DESIGNED = 15, 6, 2  # rounds, poses in each, rounds as in the ex
 NOISE, ANGLE_NOISE = 1e-4, 3e-3  # m, rad
 DRAWS = 2000  # of the bootstrap over arms
 UNDRIVEN = 5  # arms for each fit without the last channel
-CIRCLE = "ucl_stiff_flop_55mm/run_2022-10-20_16-07-29.csv"
 QUICK = CalibrationSettings(
     sequence=True, structure="hysteresis", strain_law="keep", rows=800, trial_rows=400,
     start_evaluations=10,
@@ -185,7 +185,10 @@ def logs(robot: RobotDescription, arm: Arm, undriven: bool = False) -> Iterator[
 
 
 def intervals(arms: list[list[Comparison]], kind: str) -> Array:
-    """95 % intervals (2, levels) of the coverage of a kind of prediction, by drawing arms again."""
+    """95 % intervals (2, levels) of the coverage of a kind of prediction, by drawing arms again.
+
+    Or by drawing whatever else is independent of each other.
+    """
     found = [coverage(arm).get(kind) for arm in arms]
     rows = np.array([0 if each is None else each.n for each in found])
     within = np.array([np.zeros(len(LEVELS)) if each is None else each.n * np.array(each.shares)
@@ -197,13 +200,13 @@ def intervals(arms: list[list[Comparison]], kind: str) -> Array:
 
 
 def of_recordings(folder: Path) -> Iterator[tuple[str, list[Comparison]]]:
-    """Yield each real arm's name and its test runs, compared with fits to others of its runs."""
+    """Yield each real arm's name and its runs, compared with fits to others of its runs."""
     bench, base = load_bench()
     for arm in bench.arms:
-        splits = [(arm.train, arm.test)] if arm.test else []
-        if CIRCLE in arm.test:
-            others = (*arm.train, *(name for name in arm.test if name != CIRCLE))
-            splits.append(((CIRCLE,), others))
+        runs = (*arm.train, *arm.test)
+        splits = [((run,), tuple(each for each in runs if each != run)) for run in runs]
+        if arm.sequence or not arm.test:
+            splits = [(arm.train, arm.test)] if arm.test else []
         settings = CalibrationSettings(sequence=arm.sequence, strain_law="keep")
         found: list[Comparison] = []
         for train, test in splits:
@@ -217,11 +220,11 @@ def of_recordings(folder: Path) -> Iterator[tuple[str, list[Comparison]]]:
             yield arm.name, found
 
 
-def markdown(title: str, arms: list[list[Comparison]], *, is_one: bool = False) -> str:
-    """Table of the coverage of all arms together, or of one arm (`is_one`) by itself."""
+def markdown(title: str, arms: list[list[Comparison]]) -> str:
+    """Table of the coverage of all arms together, or of one in all its tests."""
     found, rows = [each for arm in arms for each in arm], []
     for name, each in coverage(found).items():
-        ends = 100 * (np.array(each.intervals) if is_one else intervals(arms, name).T)
+        ends = 100 * intervals(arms, name).T
         cells = [f"{100 * share:.0f} ({low:.0f} to {high:.0f})"
                  for share, (low, high) in zip(each.shares, ends, strict=True)]  # fmt: skip
         rows.append((name, str(each.n), *cells))
@@ -244,7 +247,7 @@ def main() -> int:
     given = parser.parse_args()
     if given.recordings is not None:
         for name, runs in of_recordings(given.recordings):
-            print(markdown(name, [runs], is_one=True), end="\n\n", flush=True)
+            print(markdown(name, [[run] for run in runs]), end="\n\n", flush=True)
         return 0
     settings = CalibrationSettings(sequence=True) if given.auto else QUICK
     found: dict[str, list[list[Comparison]]] = {"sweeps and two rounds": [], "sweeps alone": []}
