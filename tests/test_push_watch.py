@@ -147,11 +147,24 @@ def test_a_line_that_is_kinked_at_the_moment_of_a_push_does_not_hide_behind_it()
     plant.follow = lambda trace: follow(np.minimum(trace, highest))
     bench.controller.set_task(bench.task(position=tuple(map(float, place))))
     bench.run(0.8)
-    assert watch.pace == 0
+    assert watch.waits
     assert watch.doubt is None
     bench.run(1.2)
     assert watch.doubt is not None
     assert watch.doubt.kind == "no-response"
+
+
+def test_an_arm_that_is_pushed_again_and_again_goes_on(monkeypatch) -> None:
+    watch = MotionWatch(load_robot("stiff-flop-2-hanging").description, MotionTuning())
+    monkeypatch.setattr(watch._pushes, "acts", lambda now: now >= 1.0)
+    place, waits = TIP.pose[:3, 3], []
+    for time in np.arange(0.0, 10.0, 0.025):
+        watch.intend(time, place)
+        watch.take(time, place, place, np.zeros(6), np.full(6, 4e4), TIP, turned=np.zeros(3))
+        waits.append(watch.waits)
+    assert not any(waits[:39])
+    assert all(waits[41:99])
+    assert 0.4 < np.mean(waits[40:]) < 0.55
 
 
 @pytest.mark.parametrize("again", [False, True])

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from stiffopt.control.correction_bound import CorrectionBound
+from stiffopt.control.plan import Plan
 from stiffopt.control.planning import Planning
 from stiffopt.control.pressing import Phase
 from stiffopt.control.replanning import Pursuit, Replanner
@@ -125,6 +126,24 @@ def test_plans_follow_no_more_of_an_offset_than_is_permitted():
     share = -math.expm1(-tuning.interval / tuning.offset_time)
     assert moved[0] == pytest.approx(share * offset / 4)
     assert moved[1] == pytest.approx(share * (offset - moved[0]))
+
+
+@pytest.mark.parametrize("stiffens", [True, False])
+def test_while_the_reference_waits_the_arm_becomes_no_stiffer(stiffens):
+    asked = []
+    planner = SimpleNamespace(request=asked.append, latest=lambda: None)
+    replanner = Replanner(planner, ReplanningTuning(), 0.01, 0.0)
+    targets = Target(position=(0.0, 0.0, 0.1)), Target(position=(0.02, 0.0, 0.1))
+    limits = np.zeros(6), np.full(6, BAR)
+    for begin, target in enumerate(targets):
+        replanner.pursue(Pursuit(task=Task(robot=HANGING, target=target), target=target))
+        for tick in range(50):
+            now = begin + 0.01 * tick
+            replanner.update(now, np.zeros(6), np.zeros(6), 10.0, 0.1, limits, waits=True)
+            tip_first = (0.5,) if stiffens else ()
+            plan = Plan(asked[-1].serial, limits[0], np.zeros(6), target, True, 1.0, "")
+            replanner.plan = replace(plan, tip_first=tip_first)
+    assert len(asked) == (2 if stiffens else 20)  # the new target is planned at once
 
 
 @pytest.mark.parametrize("changes", [True, False])

@@ -255,6 +255,11 @@ class TipController:
         course = self.replanner.pursuit.course
         return course is None or (isinstance(course, Pressing) and course.phase is Phase.GOING)
 
+    @property
+    def _waits(self) -> bool:
+        """Whether a push makes the reference wait; one that presses has to be able to go back."""
+        return self._arm.watch.waits and self._goes_to_target
+
     def _is_held(self, now: float) -> bool:
         """Whether the pressures are held, so that they are not the reference's."""
         return self._at_rest or now - self._computed_at > _HELD * self._period
@@ -463,10 +468,8 @@ class TipController:
 
         The reference waits for them where it is, and a trajectory of pressures too.
         """
-        pace, course = (
-            min(self._arm.channels.pace, self._arm.watch.pace),
-            self.replanner.pursuit.course,
-        )
+        course = self.replanner.pursuit.course
+        pace = 0.0 if self._waits else min(self._arm.channels.pace, self._arm.watch.pace)
         if pace == 1 or isinstance(course, Bracing):
             return plan
         if isinstance(course, PostureCourse):
@@ -502,6 +505,7 @@ class TipController:
             reference.delay, self._arm.channels.available(), way, self._windows.windows,
             reference.path[: self.robot.n_pressures] if self._vibrates else None,
             self._correction.largest,
+            waits=self._waits,
         )  # fmt: skip
         if isinstance(course, Bracing):
             return self._brace_planned(course, found, now)

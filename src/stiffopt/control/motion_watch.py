@@ -87,7 +87,9 @@ class MotionWatch:
     ----------
     doubt : the present doubt; it stays until `forgive` or `go_on`.
     pace : share of its speed that the reference may keep; less than 1 before a missing response is
-        certain, and 0 while the arm swings after a push.
+        certain.
+    waits : whether a push displaces the tip, so that the reference is to wait on its way to a
+        target.
     """
 
     def __init__(
@@ -111,13 +113,14 @@ class MotionWatch:
         self._slips: deque[float] = deque(maxlen=self._tuning.slips)
         self._jumps: deque[float] = deque(maxlen=self._tuning.slips)
         self._bends_until = -math.inf  # end of the pause after a push, in s
+        self._waits_until = -math.inf  # end of the latest wait of the reference, in s
         self._known_from = math.inf  # time from which the estimator knows the tip's offset, in s
         self._path = 0.0  # length of the way of r, in m
         self._intended: deque[tuple[float, Array]] = deque(maxlen=self._kept)
         self._swings = [_Swings(self._tuning) for _ in range(3)]
         self._pushes.begin()
         self.doubt: Doubt | None = None
-        self.pace = 1.0
+        self.pace, self.waits = 1.0, False
         # motion of the tip by each segment so far, in m; largest error of the model in it, as a
         # share of it; and times, errors and motions (segments,) that do not count yet
         self._unproven: deque[tuple[float, float, Array]] = deque()
@@ -131,7 +134,7 @@ class MotionWatch:
         self._misses = 0
         self._slips.clear()
         self._jumps.clear()
-        self.pace = 1.0
+        self.pace, self.waits = 1.0, False
         self._swings = [_Swings(self._tuning) for _ in range(3)]
         self.forgive()
 
@@ -317,8 +320,7 @@ class MotionWatch:
         share = 0.0 if missed is None else missed.share
         usual = self._tuning.usual_share
         self.pace = min(max((1 - share) / (1 - usual), 0.0), 1.0)
-        if self._pushes.acts(now):
-            self.pace = 0.0  # a fault that shows in motion could hide behind the push
+        self.waits = self._is_to_wait(now)
         self._misses = self._misses + 1 if share > 1 else 0
         if missed is None or self._misses < self._tuning.misses:
             return None
@@ -337,6 +339,18 @@ class MotionWatch:
             "the tracker's frame is turned, the sensor has slipped, or something pushes the arm; "
             "run 'stiffopt commission'",
         )
+
+    def _is_to_wait(self, now: float) -> bool:
+        """Return whether the reference is to wait, so that no fault hides behind a push.
+
+        An arm that is pushed again and again goes on for half of the time at least.
+        """
+        if not self._pushes.acts(now):
+            return False
+        longest = self._tuning.longest_wait
+        if now >= self._waits_until + longest:
+            self._waits_until = now + longest
+        return now < self._waits_until
 
     def _notice_push(self, jacobian: Array, turning: TipAt | None) -> None:
         """Look for a push that begins or ends while the pressures change."""

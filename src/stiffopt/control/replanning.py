@@ -187,6 +187,8 @@ class Replanner:
         windows: tuple[Window, ...] = (),
         here: Array | None = None,
         most: float = math.inf,
+        *,
+        waits: bool = False,
     ) -> Array | None:
         """Request a plan when it is time; return the newest.
 
@@ -203,10 +205,14 @@ class Replanner:
         way : see `PlanRequest`; None without a scene.
         windows, here : see `PlanRequest`; `here` is None for an arm that does not vibrate.
         most : largest change of the tip's position, in m, that plans begin to follow at once.
+        waits : whether the reference waits; then plans that make the arm stiff do not go on.
         """
         task, target = self.pursuit.task, self.pursuit.target
         interval = self._tuning.interval
-        if task is not None and target is not None and now - self._requested_at >= interval - 1e-6:
+        is_due = now - self._requested_at >= interval - 1e-6
+        if waits and self.stiffens and not self._search:
+            is_due = False
+        if task is not None and target is not None and is_due:
             self._note_available(available)
             detour, course = self._detour, self.pursuit.course
             search = self._search and course is None and detour is None
