@@ -202,6 +202,20 @@ def test_where_only_the_end_has_what_is_demanded_the_arm_goes_straight_as_slowly
     assert plan.tip_first == ()
 
 
+def test_where_a_demand_cannot_be_met_the_tip_goes_to_its_target_from_where_it_is(robot):
+    first, here = request(robot), np.array([1.0, 0.3, 0.3]) * BAR
+    asked = demanding(replace(first, here=here), Planning(robot).plan(first), "at_least", 1.5)
+    plan = Planning(robot).plan(asked)
+    assert not plan.reached
+    assert not plan.far
+    assert plan.tip_first == pytest.approx(plan.pressures)  # it takes its time
+    off = tip(robot, plan.pressures)[1][:2] - first.target.position[:2]
+    assert np.linalg.norm(off) < 1e-4
+    straight = Planning(robot).plan(replace(asked, here=np.zeros(0)))
+    farthest = motions(robot, here, straight.pressures).max()
+    assert motions(robot, here, plan.pressures).max() < 0.9 * farthest
+
+
 def test_the_stiffness_is_known_while_a_change_of_configuration_is_refused(robot, monkeypatch):
     first = request(robot)
     planning = Planning(robot)

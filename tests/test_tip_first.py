@@ -66,7 +66,7 @@ def test_the_tip_stays_while_the_arm_becomes_stiff_in_another_direction():
 def test_no_channel_moves_the_tip_faster_than_is_noticed():
     """On the way to a target: three seconds for 0.24 m by one channel, half a period for less."""
     slew, times = np.full(2, 1e6), []
-    for metres_per_pascal in (2.4e-6, 1e-8):
+    for metres_per_pascal, demands in ((2.4e-6, False), (2.4e-6, True), (1e-8, False)):
         jacobian = np.zeros((6, 2))
         jacobian[0] = metres_per_pascal, metres_per_pascal / 2
         arm = SimpleNamespace(
@@ -76,10 +76,10 @@ def test_no_channel_moves_the_tip_faster_than_is_noticed():
         way = WayToTarget(SimpleNamespace(tuning=ControlTuning(), slew=slew), arm)
         plan = SimpleNamespace(tip_first=(1e5, 5e4), pressures=np.array([1e5, 5e4]))
         reference = SimpleNamespace(path=np.zeros(8), goal=np.zeros(8))
-        times.append(0.1 / way.slew_share(plan, reference))
+        times.append(0.1 / way.slew_share(plan, reference, demands=demands))
         reference.path = np.full(8, 2e5)
-        assert way.slew_share(plan, reference) == math.inf
-    assert times == pytest.approx([3.0, 0.5])
+        assert way.slew_share(plan, reference, demands=demands) == math.inf
+    assert times == pytest.approx([3.0, 4.8, 0.5])
 
 
 def test_corrections_are_bounded_by_the_latest_motion_and_released_slowly():

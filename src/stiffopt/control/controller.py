@@ -506,7 +506,8 @@ class TipController:
         if isinstance(course, Bracing):
             return self._brace_planned(course, found, now)
         if self._goes_to_target:
-            share = self._way_to_target.slew_share(replanner.plan, reference)
+            demands = replanner.pursuit.demands
+            share = self._way_to_target.slew_share(replanner.plan, reference, demands=demands)
             reference.slew_share = np.fmin(reference.slew_share, share)
         return found
 

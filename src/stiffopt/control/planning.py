@@ -197,7 +197,10 @@ class Planning:
             )  # fmt: skip
         else:
             self._changes.end()
-            self._last = self._nearest(request, task, target, distant=self._refused > refused)
+            plan = self._nearest(request, task, target, distant=self._refused > refused)
+            if (last is None or request.search) and self._demands and request.here.size:
+                plan = replace(plan, tip_first=tuple(plan.pressures.tolist()))
+            self._last = plan
         return self._last
 
     def _braced(self, request: PlanRequest, task: Task, asked: Target) -> Plan | None:
@@ -379,6 +382,8 @@ class Planning:
         start = 0.5 * (self._limits[0] + self._limits[1])
         if self._last is not None:
             start = np.clip(self._last.pressures, *self._limits)
+        elif self._demands and request.here.size:  # mostly only the stiffness is out of reach
+            start = np.clip(request.here, *self._limits)
         pressures, distance, angle = self._search.find(target, self._limits, start)
         tolerance = task.target.tolerance
         far = distance > tolerance.position or angle > tolerance.angle

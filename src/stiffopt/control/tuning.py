@@ -129,6 +129,7 @@ class ReferenceTuning:
     # vibration, and the greatest mean speed of the tip by any channel, in m/s
     periods_to_target: float = 0.5
     channel_speed: float = 0.08
+    demanded_channel_speed: float = 0.05  # the same of a task that demands a stiffness
     # motion over which the model on the reference is not linearised again; see `LinearisedTip`
     model_range: float = 0.07
     # time by which a doubted motion of an arm that vibrates is taken back, in s
