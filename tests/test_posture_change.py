@@ -202,6 +202,29 @@ def test_where_only_the_end_has_what_is_demanded_the_arm_goes_straight_as_slowly
     assert plan.tip_first == ()
 
 
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_target_that_moves_is_followed_with_what_is_demanded(seed):
+    arm, rng = so.load_robot("stiff-flop-2-hanging"), np.random.default_rng(seed)
+    there, here = (rng.uniform(0.2, 0.9, 6) * BAR for _ in range(2))
+    place, way = tip(arm, there)[1], rng.normal(size=3) * [1, 1, 0]
+    axial, targets = {"direction": (0.0, 0.0, 1.0)}, []
+    for tick in range(20):  # at 10 mm/s
+        moved = place + 5e-4 * tick * way / np.linalg.norm(way)
+        targets.append(Target(position=tuple(moved.tolist())))
+    task = Task(robot="stiff-flop-2-hanging", target=targets[0], stiffness={"maximise": axial})
+    asked = PlanRequest(1, task, targets[0], np.zeros(6), np.zeros(6), here=here)
+    least = 0.7 * Planning(arm).plan(replace(asked, here=np.zeros(0))).stiffness
+    goal = {"maximise": axial, "at_least": axial | {"value": least}}
+    goal = StiffnessGoal.model_validate(goal)
+    asked = replace(asked, task=task.model_copy(update={"stiffness": goal}))
+    planning = Planning(arm)
+    for target in targets:
+        plan = planning.plan(replace(asked, target=target))
+        asked = replace(asked, here=plan.pressures)
+        assert plan.reached
+        assert arm.stiffness(plan.pressures, direction=(0, 0, 1)) > 0.98 * least
+
+
 def test_where_a_demand_cannot_be_met_the_tip_goes_to_its_target_from_where_it_is(robot):
     first, here = request(robot), np.array([1.0, 0.3, 0.3]) * BAR
     asked = demanding(replace(first, here=here), Planning(robot).plan(first), "at_least", 1.5)

@@ -187,7 +187,7 @@ class Planning:
                 if self._changes.to is None and self._is_distant(last, pressures, target):
                     self._changes.begin(pressures)
                 if self._changes.to is not None:
-                    pressures = self._changes.next(request, last, pressures, target, self._limits)
+                    pressures = self._on_the_way(request, last, pressures, target)
             message = ""
             if self._changes.leaves_target:
                 message = self._away(task.target.tolerance, target, pressures)
@@ -302,6 +302,22 @@ class Planning:
             return stiffest
         self._changes.begin(stiffest, tuple(way[0].tolist()))
         return way[0]
+
+    def _on_the_way(
+        self, request: PlanRequest, last: Plan, stiffest: Array, target: Target
+    ) -> Array:
+        """Return the next pressures (n,) of the change to the stiffest ones (n,).
+
+        Where the target has moved, the way may no longer have what the task demands. Then the arm
+        goes straight.
+        """
+        pressures = self._changes.next(request, last, stiffest, target, self._limits)
+        if not self._demands or not self._demands.are_missed(self._tip.at(pressures)):
+            return pressures
+        self._changes.end()
+        if request.here.size:
+            self._changes.begin(stiffest, tuple(stiffest.tolist()))
+        return stiffest
 
     def _as_demanded(self, way: list[Array]) -> list[Array]:
         """Return the last part of a way (k, n) on which the tip has what the task demands.

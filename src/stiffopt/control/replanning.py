@@ -313,6 +313,7 @@ class Replanner:
             text = "the target cannot be reached"
             if not plan.far and self.pursuit.demands:
                 text += " with the stiffness that is asked for"
+                message = message if away else "the tip goes there without it"
             elif not plan.far:
                 text = "no optimum is found for the target, only pressures that lead near it"
             text = f"{text}: {message}"
