@@ -111,7 +111,10 @@ def changing(robot, plans=10):
     return planning, asked, plan, stiffest
 
 
-def test_a_change_that_cannot_stay_at_the_target_goes_on_straight_and_says_so(robot, monkeypatch):
+@pytest.mark.parametrize("moves", [False, True])
+def test_a_change_that_cannot_stay_at_the_target_goes_on_straight_and_says_so(
+    robot, monkeypatch, moves
+):
     planning, asked, plan, stiffest = changing(robot)
     exact = asked.target.model_copy(update={"tolerance": Tolerance(position=1e-5)})
     asked = replace(asked, task=asked.task.model_copy(update={"target": exact}))
@@ -121,9 +124,12 @@ def test_a_change_that_cannot_stay_at_the_target_goes_on_straight_and_says_so(ro
         return planning._last.pressures + 0.2 * (start - planning._last.pressures), 3e-3, 0.0
 
     monkeypatch.setattr(planning._search, "find", off_target)
-    wanted, said = np.array(asked.target.position[:2]), []
-    for _ in range(300):
-        plan = planning.plan(replace(asked, search=False))
+    wanted, said, target = np.array(asked.target.position[:2]), [], asked.target
+    for number in range(300):
+        if moves and number % 10 == 0 and number < 200:  # a little
+            wanted = wanted + 2e-5 * (-1) ** (number // 10)
+            target = target.model_copy(update={"position": (*wanted.tolist(), None)})
+        plan = planning.plan(replace(asked, search=False, target=target))
         off = np.linalg.norm(tip(robot, plan.pressures)[1][:2] - wanted)
         if planning._changes.leaves_target:
             assert plan.far == bool(plan.message) == (off > 1e-5)

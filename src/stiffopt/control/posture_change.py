@@ -148,13 +148,13 @@ class PostureChanges:
         drift = float(np.linalg.norm((request.offset - last.offset)[:3]))
         step = tuning.change_step * min(1.0, (change.plans + 1) / tuning.change_growth)
         step *= min(1.0, tuning.at_rest / max(drift, 1e-9))
-        ahead = last.pressures + min(1.0, step / max(left, 1e-9)) * way
-        found, is_there = np.asarray(np.clip(ahead, *limits)), True
-        if not change.straight and left > step:
-            found, distance, angle = self._search.find(target, limits, ahead)
+        straight_on = last.pressures + min(1.0, step / max(left, 1e-9)) * way
+        is_moved, at_target, is_there = last.target != request.target, straight_on, True
+        if left > step and (is_moved or not change.straight):
+            at_target, distance, angle = self._search.find(target, limits, straight_on)
             is_there = distance <= _REACHED.position and angle <= _REACHED.angle
         goes_on = is_there and left < change.left - tuning.change_progress * step
-        if last.target != request.target or left > change.left + step:  # another way
+        if is_there and (is_moved or left > change.left + step):  # another way
             goes_on, change = True, replace(change, straight=False)
         stalled = 0 if goes_on or left <= step else change.stalled + (drift <= tuning.at_rest)
         change = replace(
@@ -170,4 +170,7 @@ class PostureChanges:
         if is_over and change.is_direct:
             is_over = self._motion(request.here, end - request.here) <= tuning.change_step
         self._change = None if is_over else change
-        return end if left <= step else found
+        if left <= step:
+            return end
+        is_straight = self._change is not None and self._change.straight
+        return np.asarray(np.clip(straight_on, *limits)) if is_straight else at_target
