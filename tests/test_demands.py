@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import ClassVar
+
+import casadi as ca
 import numpy as np
 import pytest
 
 import stiffopt as so
 from stiffopt.control.demands import Demands
 from stiffopt.optimise.goal import StiffnessGoal
+from stiffopt.optimise.measure import Measure, Role
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import Task
 from stiffopt.optimise.tip import TipModel
@@ -65,3 +70,29 @@ def test_what_is_only_maximised_is_no_demand():
     assert not demands(maximise=PUSH)
     assert not Demands(None, MARGIN)
     assert demands(maximise=PUSH, at_least=TURN | {"value": 0.1})
+
+
+class _Reach(Measure):
+    """A measure of somebody else's, which depends on where the tip is."""
+
+    key: ClassVar[str] = "reach"
+    role: ClassVar[Role] = "at_least"
+    unit: ClassVar[str] = "N/m"
+    structure: ClassVar[tuple[str, ...]] = ("reach",)
+    parameters: ClassVar[tuple[float, ...]] = ()
+    value: float
+
+    def formula(self, tip, parameters):
+        return ca.log(ca.norm_2(tip.position) / ca.trace(tip.compliance[:3, :3]))
+
+    def holds(self, value):
+        return value >= self.value
+
+
+@pytest.mark.parametrize("share", [0.97, 1.03])
+def test_any_measure_may_be_demanded(share):
+    value = np.linalg.norm(TIP.pose[:3, 3]) / np.trace(TIP.compliance[:3, :3])
+    goal = SimpleNamespace(at_least=(_Reach(value=share * value),), match=None)
+    asked = Demands(SimpleNamespace(stiffness=goal), MARGIN)
+    assert asked.are_clearly_met(TIP) is (share < 1)
+    assert asked.are_missed(TIP) is (share > 1)

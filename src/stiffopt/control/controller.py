@@ -466,7 +466,8 @@ class TipController:
     def _awaited(self, plan: Array, now: float) -> Array:
         """Return the reference's goal (n + 6,): the plan, unless channels or tip do not follow.
 
-        The reference waits for them where it is, and a trajectory of pressures too.
+        The reference waits for them where it is, and a trajectory of pressures too; on the way to a
+        target also for the end of a push.
         """
         course = self.replanner.pursuit.course
         pace = 0.0 if self._waits else min(self._arm.channels.pace, self._arm.watch.pace)

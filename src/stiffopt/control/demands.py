@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import casadi as ca
 
 from stiffopt.control.formula import Formula
-from stiffopt.optimise.goal import AtLeast, MatchMatrix, MatchValue
 from stiffopt.optimise.measure import Measure
 from stiffopt.optimise.task import Task
 from stiffopt.optimise.tip import TipAt
@@ -19,7 +18,7 @@ class Demands:
     Parameters
     ----------
     task : the task; None, or one that only maximises, demands nothing.
-    margin : of a stiffness, as a share.
+    margin : of a stiffness, as a share, or of a relative distance from one.
     """
 
     def __init__(self, task: Task | None, margin: float) -> None:
@@ -27,8 +26,7 @@ class Demands:
         self._measures: tuple[Measure, ...] = ()
         if goal is not None:
             self._measures = (*goal.at_least, *((goal.match,) if goal.match else ()))
-        self._strict = [_with_margin(measure, margin) for measure in self._measures]
-        self._lax = [_with_margin(measure, -margin) for measure in self._measures]
+        self._margin = margin
         self._values: Formula | None = None
 
     def __bool__(self) -> bool:
@@ -38,28 +36,36 @@ class Demands:
     def are_clearly_met(self, tip: TipAt) -> bool:
         """Return whether a tip has what is demanded, with the margin.
 
-        The tolerance of a match is less by the margin, but at least half of it.
+        That of a match is at most half of its tolerance.
         """
-        return self._are_met(self._strict, tip)
+        return all(
+            measure.holds(_changed(measure, value, sign * self._strict(measure)))
+            for measure, value in self._at(tip)
+            for sign in (-1, 1)
+        )
 
     def are_missed(self, tip: TipAt) -> bool:
         """Return whether a tip is short of what is demanded by more than the margin."""
-        return not self._are_met(self._lax, tip)
+        return not all(
+            any(measure.holds(_changed(measure, value, sign * self._margin)) for sign in (-1, 0, 1))
+            for measure, value in self._at(tip)
+        )
 
-    def _are_met(self, measures: list[Measure], tip: TipAt) -> bool:
+    def _strict(self, measure: Measure) -> float:
+        tolerance = getattr(measure, "tolerance", None)  # of each match
+        return self._margin if tolerance is None else min(self._margin, tolerance / 2)
+
+    def _at(self, tip: TipAt) -> list[tuple[Measure, float]]:
+        """Return the measures with their values at a tip."""
         if self._values is None:
             self._values = _values(self._measures)
-        values = [float(value[0]) for value in self._values(tip.compliance, tip.pose[:3, :3])]
-        return all(m.holds(v) for m, v in zip(measures, values, strict=True))
+        values = self._values(tip.compliance, tip.pose[:3, :3], tip.pose[:3, 3])
+        return [(m, float(value[0])) for m, value in zip(self._measures, values, strict=True)]
 
 
-def _with_margin(measure: Measure, margin: float) -> Measure:
-    """Return a stricter measure; a laxer one for a negative margin."""
-    if isinstance(measure, AtLeast):
-        return measure.model_copy(update={"value": (1 + margin) * measure.value})
-    assert isinstance(measure, MatchValue | MatchMatrix)  # there are no others
-    tolerance = max(measure.tolerance - margin, measure.tolerance / 2)
-    return measure.model_copy(update={"tolerance": tolerance})
+def _changed(measure: Measure, value: float, share: float) -> float:
+    """Return a stiffness that is changed by a share, or a distance to which it is added."""
+    return value * (1 + share) if measure.is_stiffness else value + share
 
 
 @dataclass(frozen=True)
@@ -68,16 +74,17 @@ class _Tip:
 
     compliance: ca.SX  # (6, 6)
     rotation: ca.SX  # (3, 3)
+    position: ca.SX  # (3,)
 
     def flexibility(self, wrench: ca.SX) -> ca.SX:
         return wrench.T @ self.compliance @ wrench
 
 
 def _values(measures: tuple[Measure, ...]) -> Formula:
-    """Return stiffnesses, or distances from a matrix, of a compliance and a rotation."""
-    C, R = ca.SX.sym("C", 6, 6), ca.SX.sym("R", 3, 3)
-    tip, values = _Tip(C, R), []
+    """Return stiffnesses, or distances from a matrix, of a compliance, rotation and position."""
+    C, R, x = ca.SX.sym("C", 6, 6), ca.SX.sym("R", 3, 3), ca.SX.sym("x", 3)
+    tip, values = _Tip(C, R, x), []
     for measure in measures:
         value = measure.formula(tip, ca.DM(measure.parameters))
         values.append(ca.exp(value) if measure.is_stiffness else ca.sqrt(value))
-    return Formula([C, R], values)
+    return Formula([C, R, x], values)
