@@ -371,7 +371,8 @@ class DetectionSettings:
     frame_ridge : of the correction of its shape, relative to one of the whole length in each row.
     frame_lever : distance from a body's origin, in lengths of the arm, of the points on its axes by
         which poses are compared.
-    frame_angle : by how much orientations may fit worse after a motion of the frame, in rad.
+    frame_angle : angle of orientations, in rad, beyond which a motion may leave a share
+        `overwhelming` of their misfit.
     known_turn : spread of the tip, in lengths of the arm, that determines a turn.
     ridge : added to the diagonal of the normal equations of regressions.
     clock_rows : number of rows in the regression for the clocks.
