@@ -411,7 +411,7 @@ class FrameComparer:
         as_is = next(each for each in self._unmoved(logs) if each.softness == softness)
         tips = as_is.mean(tip_distances, as_is.recorded)
         best: OtherChannels | None = None
-        for hypothesis in self._light._ranked(logs, softness):
+        for hypothesis in self._possible(logs, softness):
             tried = self._driven(hypothesis, logs, softness)
             left = np.inf if tried is None else tried.mean(self._off, tried.recorded)
             if tried is not None and (best is None or left < best.left):
@@ -431,22 +431,29 @@ class FrameComparer:
         expected = self._expected(poses, self._rest(logs))
         return self._tried(softness, poses, logs, NOWHERE, expected)
 
-    def _ranked(self, logs: Logs, softness: float) -> list[Hypothesis]:
-        """Return hypotheses of other channels in some logs, the best first."""
-        keep, scores = self._setup.settings.keep, []
-        tried = [each for each in of_channels(self._setup.description, 1) if each.kind not in keep]
-        for each in tried:
-            found = self._driven(each, logs, softness)
-            scores.append(np.inf if found is None else found.score(logs))
-        return [tried[i] for i in np.argsort(scores, kind="stable")]
+    def _possible(self, logs: Logs, softness: float) -> list[Hypothesis]:
+        """Return hypotheses of other channels in some logs.
 
-    @cached_property
-    def _light(self) -> FrameComparer:
-        """Compares with the arm without its weight, which takes far less time."""
+        Of a heavy arm these are the ones that are best without its weight, which takes far less
+        time.
+        """
         setup = self._setup
+        found = [
+            each
+            for each in of_channels(setup.description, 1)
+            if each.kind not in setup.settings.keep
+        ]
         if not any(setup.description.gravity):
-            return self
-        return FrameComparer(replace(setup, description=weightless(setup.description)))
+            return found
+        light = FrameComparer(replace(setup, description=weightless(setup.description)))
+        if softness not in light._predicted:
+            return found
+
+        def score(hypothesis: Hypothesis) -> float:
+            tried = light._driven(hypothesis, logs, softness)
+            return np.inf if tried is None else tried.score(logs)
+
+        return sorted(found, key=score)[: DETECTION.shortlist]
 
     def _channels_alone(self) -> OtherChannels | None:
         """Return the channels of the log without which the others agree best.

@@ -244,6 +244,14 @@ def _body_motion(logs: tuple[int, ...], k: int, recorded: Track, expected: Track
     return Motion(logs, k, turn, shift)
 
 
+def moved_by_both(recorded: Tracks, expected: Tracks, length: float) -> Tracks:
+    """Return poses after motions of the frame and of the tip's body, each in turn the best one."""
+    for _ in range(DETECTION.frame_rounds):
+        recorded = frame_motion((), recorded, expected, length).of(recorded)
+        recorded = _body_motion((), 0, recorded[0], expected[0]).of(recorded)
+    return recorded
+
+
 def _distortions(logs: tuple[int, ...], recorded: Tracks, expected: Tracks) -> list[Motion]:
     """Return the best mirror and scale of positions about the frame's origin."""
     own = np.concatenate([each.position for each in recorded])

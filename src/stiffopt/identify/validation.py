@@ -19,10 +19,12 @@ from stiffopt.identify.hypotheses import Hypothesis, of_channels, pairs
 from stiffopt.identify.motions import (
     SHOWN,
     Motion,
+    Tracks,
     apart,
     best_motions,
     different_poses,
     in_line,
+    moved_by_both,
     of_rows,
     turned_like,
 )
@@ -148,8 +150,10 @@ class _Correction:
         if after.errors.mean > DETECTION.frame * before.errors.mean:
             return False
         then, now = before.errors.angle, after.errors.angle
-        if then is not None and now is not None and now > then:
-            return False  # rather a sensor that sits elsewhere on the tip
+        if then is not None and now is not None:
+            most = DETECTION.overwhelming * then + DETECTION.frame_angle
+            if now > min(then, most):
+                return False  # rather a sensor that sits elsewhere on the tip, or frame and body
         least = np.min if self.moves_all else np.mean
         limit = DETECTION.frame * least(before.distance[self.poses])
         return bool(after.distance[self.poses].mean() <= limit)
@@ -213,8 +217,11 @@ def _with_frame_found(setup: Setup, recording: Recording, found: Comparison) -> 
     if recorded[0].rotation is None:
         expected = (replace(expected[0], rotation=None),)
 
+    def left(poses: Tracks) -> float:
+        return float(apart(turned_like(poses, expected), expected, length).mean())
+
     def miss(motion: Motion) -> float:
-        return float(apart(turned_like(motion.of(recorded), expected), expected, length).mean())
+        return left(motion.of(recorded))
 
     quarters = [Motion((0,), "frame", each, np.zeros(3)) for each in CUBE_ROTATIONS]
     quarter = min(quarters, key=miss)
@@ -224,6 +231,10 @@ def _with_frame_found(setup: Setup, recording: Recording, found: Comparison) -> 
     best, *others = sorted(motions, key=miss)
     if miss(best) > DETECTION.tie * miss(others[0]):
         return None
+    if recorded[0].rotation is not None:
+        both = left(moved_by_both(recorded, expected, length))
+        if both < DETECTION.overwhelming * miss(best):
+            return None  # frame and body, of which each alone would be wrong
     remark = f"{best.told([recording])} (--keep axes leaves that as it was recorded)"
     if recorded[0].rotation is None:
         remark += "; another arm or another order of channels may look so too"
