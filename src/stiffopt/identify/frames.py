@@ -30,6 +30,7 @@ from stiffopt.identify.motions import (
     different_poses,
     in_line,
     joined,
+    moved_by_both,
     nearest_cube,
     nearest_rotation,
     of_rows,
@@ -331,6 +332,7 @@ class FrameComparer:
         others = [each for each in self._moved(best.logs) if each.motion.kind != best.motion.kind]
         left = best.score(best.logs)
         is_clear = all(left <= DETECTION.tie * each.score(best.logs) for each in others)
+        is_clear = is_clear and not self._has_both(best)
         if not (is_clear and self._is_judged(best, best.misses) and self._explains(best)):
             return self._channels_alone()
         channels = self.other_channels(best.logs, best.softness)
@@ -368,11 +370,24 @@ class FrameComparer:
         Those that do not agree may have a fault of their own.
         """
         rest = self._rest(tried.logs)
-        agreeing = [i for i in rest if tried.misses[i] <= DETECTION.off * self._length]
+        tips = [tip_distances(tried.recorded[i], tried.expected[i]).mean() for i in rest]
+        agreeing = [
+            i for i, tip in zip(rest, tips, strict=True) if tip <= DETECTION.off * self._length
+        ]
         if 2 * len(agreeing) <= len(rest):
             return False
         judged = (*tried.logs, *agreeing)
         return _rms(misses[list(judged)]) <= DETECTION.tie * self.score(judged)
+
+    def _has_both(self, tried: _Tried) -> bool:
+        """Return True if frame and body were moved, so that each alone would be told wrongly."""
+        expected = joined([tried.expected[i] for i in tried.logs])
+        if expected[0].rotation is None:
+            return False
+        recorded = joined([self._recorded[i] for i in tried.logs])
+        both = moved_by_both(recorded, expected, self._length)
+        left = self._off(turned_like(both, expected), expected).mean()
+        return bool(left < DETECTION.overwhelming * tried.mean(self._off, tried.after))
 
     def _explains(self, tried: _Tried) -> bool:
         """Return True if a motion is the reason why its logs are far off, at different poses."""
