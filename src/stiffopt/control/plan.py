@@ -51,7 +51,7 @@ class Plan:
     target: Target | None
     reached: bool  # whether the model reaches the target, here or in a distant configuration
     stiffness: float  # along the task's first direction; NaN if it has none
-    message: str  # how far the model stays from a target that is not reached
+    message: str  # how far the model's tip is from a target that it does not have, or has left
     blocked: str = ""  # why the way to the plan is not clear of the scene
     doubt: str = ""  # a warning if the model extrapolates there
     far: bool = False  # whether it is the pose that is not reached, not only the stiffness

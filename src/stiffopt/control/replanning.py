@@ -65,6 +65,12 @@ class Pursuit:
         """Return the target at a time, in s."""
         return self.target if self.course is None else self.course.at(now)
 
+    @property
+    def demands(self) -> bool:
+        """Whether the task demands a stiffness."""
+        goal = None if self.task is None else self.task.stiffness
+        return goal is not None and bool(goal.at_least or goal.match)
+
     def is_new_after(self, before: Pursuit) -> bool:
         """Whether planning starts from scratch, not from the last plan."""
         if self.task is not before.task or before.target is None:
@@ -299,13 +305,15 @@ class Replanner:
             if away is not None and task is not None:
                 message = nearest_words(*away, task.target.tolerance, "the tip")
             text = "the target cannot be reached"
-            goal = None if task is None else task.stiffness
-            if not plan.far and goal is not None and (goal.at_least or goal.match):
+            if not plan.far and self.pursuit.demands:
                 text += " with the stiffness that is asked for"
             elif not plan.far:
                 text = "no optimum is found for the target, only pressures that lead near it"
             text = f"{text}: {message}"
             notices = (*notices, Notice("unreachable", text, standing=True))
+        if plan is not None and is_final and plan.reached and plan.far:
+            text = f"the arm goes to other pressures for its target; until then {plan.message}"
+            notices = (*notices, Notice("changes-posture", text, standing=True))
         limited = self.adapted is not None and self.adapted.limits is not None
         if limited and (self.known is None or self.known.is_limited):
             notices = (*notices, Notice("too-soft", _TOO_SOFT, standing=True))
