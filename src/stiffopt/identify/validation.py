@@ -266,7 +266,7 @@ def _with_channels_found(
         except (EquilibriumError, PressureError):  # the arm does not bear these pressures
             return np.inf
         tips = (setup.base @ poses @ point)[:, :3]
-        return float(np.median(np.linalg.norm(tips - found.measured[some], axis=1)))
+        return float(np.linalg.norm(tips - found.measured[some], axis=1).mean())
 
     def ranked(tried: Sequence[Hypothesis]) -> list[Hypothesis]:
         return sorted(tried, key=lambda each: miss(each, DETECTION.channel_step))
