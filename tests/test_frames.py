@@ -153,6 +153,14 @@ def test_a_frame_and_a_body_that_differ_in_one_log_are_not_told_as_one() -> None
     assert told(load_description("stiff-flop-1"), with_one(logs, 1, both)) == []
 
 
+def test_a_frame_that_leaves_little_is_told_although_the_body_sits_a_little_elsewhere() -> None:
+    log = log_of()
+    along = rotations(log).apply([0.0, 0.0, 2e-3])
+    aside = replace(log, tip_position=log.tip_position + along)
+    (found,) = validate(calibrated(load_description("stiff-flop-1")), [in_frame(TURN)(aside)])
+    assert found.remarks[-1].startswith("the frame of log 1 was defined anew")
+
+
 @pytest.mark.parametrize(
     ("factors", "words"),
     [

@@ -26,11 +26,11 @@ from stiffopt.identify.motions import (
     MotionKind,
     Tracks,
     apart,
+    are_both_moved,
     best_motions,
     different_poses,
     in_line,
     joined,
-    moved_by_both,
     nearest_cube,
     nearest_rotation,
     of_rows,
@@ -382,12 +382,9 @@ class FrameComparer:
     def _has_both(self, tried: _Tried) -> bool:
         """Return True if frame and body were moved, so that each alone would be told wrongly."""
         expected = joined([tried.expected[i] for i in tried.logs])
-        if expected[0].rotation is None:
-            return False
         recorded = joined([self._recorded[i] for i in tried.logs])
-        both = moved_by_both(recorded, expected, self._length)
-        left = self._off(turned_like(both, expected), expected).mean()
-        return bool(left < DETECTION.overwhelming * tried.mean(self._off, tried.after))
+        left = tried.mean(self._off, tried.after)
+        return are_both_moved(left, recorded, expected, self._length)
 
     def _explains(self, tried: _Tried) -> bool:
         """Return True if a motion is the reason why its logs are far off, at different poses."""

@@ -244,12 +244,24 @@ def _body_motion(logs: tuple[int, ...], k: int, recorded: Track, expected: Track
     return Motion(logs, k, turn, shift)
 
 
-def moved_by_both(recorded: Tracks, expected: Tracks, length: float) -> Tracks:
+def _moved_by_both(recorded: Tracks, expected: Tracks, length: float) -> Tracks:
     """Return poses after motions of the frame and of the tip's body, each in turn the best one."""
     for _ in range(DETECTION.frame_rounds):
         recorded = frame_motion((), recorded, expected, length).of(recorded)
         recorded = _body_motion((), 0, recorded[0], expected[0]).of(recorded)
     return recorded
+
+
+def are_both_moved(left: float, recorded: Tracks, expected: Tracks, length: float) -> bool:
+    """Return True if frame and tip's body were moved, so that each alone would be told wrongly.
+
+    `left` is the mean distance after the best motion alone, in m. Where it is small, one motion is
+    enough: a second one would only replace what the model has wrong.
+    """
+    if recorded[0].rotation is None or left <= DETECTION.frame * DETECTION.off * length:
+        return False
+    both = turned_like(_moved_by_both(recorded, expected, length), expected)
+    return bool(apart(both, expected, length).mean() < DETECTION.overwhelming * left)
 
 
 def _distortions(logs: tuple[int, ...], recorded: Tracks, expected: Tracks) -> list[Motion]:

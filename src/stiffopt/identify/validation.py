@@ -19,12 +19,11 @@ from stiffopt.identify.hypotheses import Hypothesis, of_channels, pairs
 from stiffopt.identify.motions import (
     SHOWN,
     Motion,
-    Tracks,
     apart,
+    are_both_moved,
     best_motions,
     different_poses,
     in_line,
-    moved_by_both,
     of_rows,
     turned_like,
 )
@@ -217,11 +216,9 @@ def _with_frame_found(setup: Setup, recording: Recording, found: Comparison) -> 
     if recorded[0].rotation is None:
         expected = (replace(expected[0], rotation=None),)
 
-    def left(poses: Tracks) -> float:
-        return float(apart(turned_like(poses, expected), expected, length).mean())
-
     def miss(motion: Motion) -> float:
-        return left(motion.of(recorded))
+        poses = turned_like(motion.of(recorded), expected)
+        return float(apart(poses, expected, length).mean())
 
     quarters = [Motion((0,), "frame", each, np.zeros(3)) for each in CUBE_ROTATIONS]
     quarter = min(quarters, key=miss)
@@ -231,10 +228,8 @@ def _with_frame_found(setup: Setup, recording: Recording, found: Comparison) -> 
     best, *others = sorted(motions, key=miss)
     if miss(best) > DETECTION.tie * miss(others[0]):
         return None
-    if recorded[0].rotation is not None:
-        both = left(moved_by_both(recorded, expected, length))
-        if both < DETECTION.overwhelming * miss(best):
-            return None  # frame and body, of which each alone would be wrong
+    if are_both_moved(miss(best), recorded, expected, length):
+        return None
     remark = f"{best.told([recording])} (--keep axes leaves that as it was recorded)"
     if recorded[0].rotation is None:
         remark += "; another arm or another order of channels may look so too"
