@@ -39,10 +39,12 @@ import numpy as np
 
 from control_baselines import CONTROLLERS
 from control_cases import (
+    DEMANDS,
     DYNAMICS,
     STEPS,
     Case,
     at_tip_speed,
+    demanding,
     draw_case,
     draw_path,
     with_calibrated_file,
@@ -68,12 +70,13 @@ def one_case(
     paths: bool,
     in_loop: bool,
     tip_speed: float | None,
+    demand: tuple[str | None, float],
     drawn: dict[str, Any],
 ) -> list[Step | Follow]:
     """All that one arm has to show."""
     case = draw_case(seed, 1 if paths else targets, payload, **drawn)
     case = with_file(case, robot_file, keep)
-    case = at_tip_speed(case, tip_speed)
+    case = demanding(at_tip_speed(case, tip_speed), *demand)
     found: list[Step | Follow] = []
     path = draw_path(case) if paths else None
     for kind in dynamics:
@@ -213,6 +216,8 @@ def main() -> int:
     parser.add_argument("--paths", action="store_true", help="figures-of-eight, not targets")
     parser.add_argument("--loop", action="store_true", help="in the whole control loop")
     parser.add_argument("--tip-speed", type=float, help="`control.tip_speed` of the rig, in m/s")
+    parser.add_argument("--demand", choices=DEMANDS, help="of the tasks, instead of the stiffest")
+    parser.add_argument("--share", type=float, default=0.8, help="of the best, that is demanded")
     parser.add_argument("--robot", help="nominal robot file, if not that of the rig")
     parser.add_argument("--modulus", type=float, help="of the arms, over that of the file")
     parser.add_argument(
@@ -226,7 +231,7 @@ def main() -> int:
     work = partial(
         one_case, dynamics=given.dynamics, targets=given.targets, controllers=given.controller,
         payload=given.payload, robot_file=given.robot_file, keep=given.keep, paths=given.paths,
-        in_loop=given.loop, tip_speed=given.tip_speed,
+        in_loop=given.loop, tip_speed=given.tip_speed, demand=(given.demand, given.share),
         drawn={"robot_file": given.robot, "modulus": given.modulus, "steps": given.steps},
     )  # fmt: skip
     found: list[Any] = []

@@ -33,6 +33,7 @@ from stiffopt import (
 )
 from stiffopt.model.robot_files import load_description
 from stiffopt.model.scene import Scene
+from stiffopt.optimise.solver import PressureSolver
 from stiffopt.optimise.tip import TipModel
 from stiffopt.plant.devices import SimulatedRig
 from stiffopt.plant.plant import Plant
@@ -45,6 +46,7 @@ Array = NDArray[np.float64]
 
 RIG = Path(__file__).resolve().parent.parent / "rig" / "sim-two-segment.yaml"
 DYNAMICS = ("quasi-static", "full")
+DEMANDS = ("at_least", "match", "both")  # both: maximised as well as at least
 DIRECTIONS = {"axial": (0.0, 0.0, 1.0), "lateral": (1.0, 0.0, 0.0)}
 MODULUS, CHANNELS, SHIFT, TILT = 0.20, 0.05, 2e-3, np.deg2rad(2.0)
 UP_TO = 0.8  # of the highest pressures
@@ -97,6 +99,7 @@ class Case:
     truth : what the model says with the arm's true values.
     aims : targets, in order.
     believed : the robot file that the controller gets; it never knows of a payload.
+    demand : what its tasks demand, of `DEMANDS`, with a share; None: they maximise.
     """
 
     seed: int
@@ -105,6 +108,7 @@ class Case:
     truth: TrueModel
     aims: tuple[Aim, ...]
     believed: RobotDescription
+    demand: tuple[str, float] | None = None
 
     @property
     def registration(self) -> Registration:
@@ -133,9 +137,20 @@ class Case:
     def task(self, position: Array, kind: str) -> Task:
         """To go there and be stiff in a direction of the nominal base frame."""
         turn = self.registration.tracker_in_base.transform()[:3, :3]
-        axis = turn @ DIRECTIONS[kind]
-        goal = StiffnessGoal(maximise=StiffnessMeasure(direction=tuple(axis.tolist())))
-        return Task(robot=self.robot.name, target=self.target(position), stiffness=goal)
+        axis = tuple((turn @ DIRECTIONS[kind]).tolist())
+        goal = StiffnessGoal(maximise=StiffnessMeasure(direction=axis))
+        task = Task(robot=self.robot.name, target=self.target(position), stiffness=goal)
+        if self.demand is None:
+            return task
+        what, share = self.demand
+        best = PressureSolver(load_robot(self.believed), task).solve().stiffness
+        value = {"direction": axis, "value": share * float(best or 0.0)}
+        demanded = StiffnessGoal.model_validate({
+            "maximise": {"direction": axis} if what == "both" else (),
+            "at_least": () if what == "match" else value,
+            "match": value if what == "match" else None,
+        })  # fmt: skip
+        return task.model_copy(update={"stiffness": demanded})
 
     def rig(self, dynamics: str) -> SimulatedRig:
         """The rig, not opened; its tracker is corrected as the controller's robot file says."""
@@ -157,6 +172,11 @@ def at_tip_speed(case: Case, speed: float | None) -> Case:
         return case
     control = case.description.control.model_copy(update={"tip_speed": speed})
     return replace(case, description=case.description.model_copy(update={"control": control}))
+
+
+def demanding(case: Case, demand: str | None, share: float) -> Case:
+    """The case whose tasks demand a share of the best stiffness that its robot file has there."""
+    return case if demand is None else replace(case, demand=(demand, share))
 
 
 def beside(case: Case, scene: Scene) -> Case:

@@ -22,9 +22,10 @@ With `--in-use`, motions are fast from the beginning, as of an arm that has move
 armed. The table then has a line for each arm and a column for each row: what the loop causes, in
 mm, and when it was told, as what; and last the time to the second target without a fault, until the
 tip stays within 1 mm. With `--post`, the controller keeps clear of a post beside the arm, which
-leaves room for every motion. With `--commission`, `stiffopt commission --quick` looks for the
-faults of the set-up instead: its first finding, whether it permits arming, and how far the tip
-moved from rest.
+leaves room for every motion. `--robot` and `--steps` draw other arms and steps, and with `--demand`
+tasks demand a share of the best stiffness. With `--commission`, `stiffopt commission --quick` looks
+for the faults of the set-up instead: its first finding, whether it permits arming, and how far the
+tip moved from rest.
 """
 
 from __future__ import annotations
@@ -43,7 +44,17 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from control_baselines import PERIOD
-from control_cases import DYNAMICS, Case, at_tip_speed, beside, draw_case, settling_time
+from control_cases import (
+    DEMANDS,
+    DYNAMICS,
+    STEPS,
+    Case,
+    at_tip_speed,
+    beside,
+    demanding,
+    draw_case,
+    settling_time,
+)
 from control_runs import STAYS, LoopRun
 from report import table
 from stiffopt import Scene, lie, load_robot
@@ -102,6 +113,7 @@ class Row:
     usual : the part of it that is no fault, with which the tip takes the way to compare with.
     shows_above : command of channel 2 above which it can be noticed, in Pa: an empty channel does
         not leak.
+    channels : that an arm needs for it.
     """
 
     name: str
@@ -113,6 +125,7 @@ class Row:
     then: Callable[[Any], object] = lambda rig: None
     usual: Callable[[Any], object] | None = None
     shows_above: float = 0.0
+    channels: int = 2
 
 
 def _tracker(fault: str) -> Callable[[Any], object]:
@@ -351,7 +364,7 @@ def _both(*begins: Callable[[Any], object]) -> Callable[[Any], object]:
 
 ROWS = (
     Row("channels 1 and 2 swapped", _swapped(1, 0), at_once=True),
-    Row("channels 1 and 4 swapped", _swapped(3, 1, 2, 0), at_once=True),
+    Row("channels 1 and 4 swapped", _swapped(3, 1, 2, 0), at_once=True, channels=4),
     Row("tracker's frame turned by 10 deg about z", _turned(2, 10.0), at_once=True),
     Row("tracker's frame turned by 5 deg about x", _turned(0, 5.0), at_once=True),
     Row("sensor 10 mm further along", _slipped(0.0, 0.0, 0.01), at_once=True),
@@ -633,15 +646,26 @@ def main() -> None:
     parser.add_argument("--commission", action="store_true", help="look for faults of the set-up")
     parser.add_argument("--in-use", action="store_true", help="fast from the start; a line an arm")
     parser.add_argument("--tip-speed", type=float, help="`control.tip_speed` of the rig, in m/s")
+    parser.add_argument("--robot", help="nominal robot file, if not that of the rig")
+    parser.add_argument(
+        "--steps", type=float, nargs=2, default=STEPS, help="between two targets, least and most, m"
+    )
     parser.add_argument("--post", action="store_true", help="with a scene: a post beside the arm")
+    parser.add_argument("--demand", choices=DEMANDS, help="of the tasks, instead of the stiffest")
+    parser.add_argument("--share", type=float, default=0.8, help="of the best, that is demanded")
     arguments = parser.parse_args()
     seeds = [first + case for first in arguments.seed for case in range(arguments.cases)]
-    drawn = [draw_case(seed, 2, ranked=False) for seed in seeds]
+    drawn = [
+        draw_case(seed, 2, ranked=False, robot_file=arguments.robot, steps=tuple(arguments.steps))
+        for seed in seeds
+    ]
     cases = [at_tip_speed(case, arguments.tip_speed) for case in drawn]
+    cases = [demanding(case, arguments.demand, arguments.share) for case in cases]
     if arguments.post:
         cases = [beside(case, POST) for case in cases]
     words = arguments.rows or [""]
-    rows = [row for row in ROWS if any(word in row.name for word in words)]
+    n = min(case.robot.n_pressures for case in cases)
+    rows = [row for row in ROWS if row.channels <= n and any(word in row.name for word in words)]
     if arguments.commission:
         lines = _commissioned(cases, [row for row in rows if row.at_once])
         print("\n".join(table(["what", "refused", "way, mm", "first finding"], lines)))

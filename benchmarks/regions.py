@@ -9,15 +9,19 @@ and with simple regulators, at a second of processor time. Its logs are one swee
 and 15 rounds of six held poses, one after another: two as in `experiment kinematics`, then 13 of
 poses that each arm draws. All readings of one pose say little more than one of them does, and a
 round is simulated sooner than another arm is fitted. Robot files are fitted to the sweeps and two
-rounds, and to the sweeps alone, so that all rounds are extrapolated. With `--undriven` the last
-channel has no pressure in these logs, so that what it does is extrapolated. Prints the share of
-readings of the other rounds within the regions of 50, 68, 90, 95 and 99 %, all arms together, with
-95 % intervals by a bootstrap over arms.
+rounds, and to the sweeps alone, so that all rounds are extrapolated. Prints the share of readings
+of the other rounds within the regions of 50, 68, 90, 95 and 99 %, all arms together, with 95 %
+intervals by a bootstrap over arms.
+
+With `--undriven` the last channel has no pressure in the logs of a fit, so that what it does is
+known by the robot file's tolerances alone. All rows of an arm share that one error, so each fit is
+tested on five arms, whose last channels differ by gains and azimuths drawn from these tolerances.
 
 With `--recordings` the arms are the real ones of `stiffopt bench recordings`, calibrated with their
-strain law by default settings. The 55 mm arm is also fitted to its circle, and the test runs of
-both fits are pooled. The intervals are those of `stiffopt validate`, by a bootstrap over blocks of
-two minutes.
+strain law by default settings to each of their runs in turn (logs in sequence to the training logs
+alone), and tested with the others. The intervals are by a bootstrap over these tests: a run goes
+the same way again and again, so its blocks of two minutes, which `stiffopt validate` draws, have
+nearly the same coverage.
 """
 
 from __future__ import annotations
@@ -59,7 +63,7 @@ HALF_TOOTH = 2.2  # s
 ROUNDS, ROUND, DESIGNED = 15, 6, 2  # rounds, poses in each, rounds as in the experiment
 NOISE, ANGLE_NOISE = 1e-4, 3e-3  # m, rad
 DRAWS = 2000  # of the bootstrap over arms
-CIRCLE = "ucl_stiff_flop_55mm/run_2022-10-20_16-07-29.csv"
+UNDRIVEN = 5  # arms for each fit without the last channel
 QUICK = CalibrationSettings(
     sequence=True, structure="hysteresis", strain_law="keep", rows=800, trial_rows=400,
     start_evaluations=10,
@@ -133,6 +137,28 @@ def made(rig: str, seed: int) -> tuple[RobotDescription, Arm]:
     return robot, Arm(Plant(robot, settings), rng, rng.uniform(0.1, 0.3), rng.uniform(0.02, 0.08))
 
 
+def with_other_channels(rig: str, seed: int, fitted: RobotDescription) -> Iterator[Arm]:
+    """Arms that differ from that of the seed by the tolerances of the last channel alone.
+
+    Without pressure in that channel they move alike.
+    """
+    assert fitted.calibration is not None  # it was fitted
+    priors = {each.key: each.prior for each in fitted.calibration.parameters}
+    where = f"segments[{fitted.n_segments - 1}].corrections"
+    last = fitted.segments[-1].n_channels - 1
+    rng = np.random.default_rng([seed, 5])
+    for _ in range(UNDRIVEN):
+        robot, arm = made(rig, seed)
+        gain, angle = (
+            rng.normal(0, priors[f"{where}.{name}[{last}]"]) for name in ("gain", "azimuth")
+        )
+        own = arm.plant.mismatch
+        other = {"gain": (*own.gain[:-1], np.exp(gain)), "angle": (*own.angle[:-1], angle)}
+        settings = {"mismatch": own.model_copy(update=other), "spread": None}
+        arm.plant = Plant(robot, arm.plant.settings.model_copy(update=settings))
+        yield arm
+
+
 def logs(robot: RobotDescription, arm: Arm, undriven: bool = False) -> Iterator[tuple[str, Log]]:
     """The sweeps of all channels, then the rounds of held poses.
 
@@ -159,7 +185,10 @@ def logs(robot: RobotDescription, arm: Arm, undriven: bool = False) -> Iterator[
 
 
 def intervals(arms: list[list[Comparison]], kind: str) -> Array:
-    """95 % intervals (2, levels) of the coverage of a kind of prediction, by drawing arms again."""
+    """95 % intervals (2, levels) of the coverage of a kind of prediction, by drawing arms again.
+
+    Or by drawing whatever else is independent of each other.
+    """
     found = [coverage(arm).get(kind) for arm in arms]
     rows = np.array([0 if each is None else each.n for each in found])
     within = np.array([np.zeros(len(LEVELS)) if each is None else each.n * np.array(each.shares)
@@ -171,13 +200,13 @@ def intervals(arms: list[list[Comparison]], kind: str) -> Array:
 
 
 def of_recordings(folder: Path) -> Iterator[tuple[str, list[Comparison]]]:
-    """Yield each real arm's name and its test runs, compared with fits to others of its runs."""
+    """Yield each real arm's name and its runs, compared with fits to others of its runs."""
     bench, base = load_bench()
     for arm in bench.arms:
-        splits = [(arm.train, arm.test)] if arm.test else []
-        if CIRCLE in arm.test:
-            others = (*arm.train, *(name for name in arm.test if name != CIRCLE))
-            splits.append(((CIRCLE,), others))
+        runs = (*arm.train, *arm.test)
+        splits = [((run,), tuple(each for each in runs if each != run)) for run in runs]
+        if arm.sequence or not arm.test:
+            splits = [(arm.train, arm.test)] if arm.test else []
         settings = CalibrationSettings(sequence=arm.sequence, strain_law="keep")
         found: list[Comparison] = []
         for train, test in splits:
@@ -191,11 +220,11 @@ def of_recordings(folder: Path) -> Iterator[tuple[str, list[Comparison]]]:
             yield arm.name, found
 
 
-def markdown(title: str, arms: list[list[Comparison]], *, is_one: bool = False) -> str:
-    """Table of the coverage of all arms together, or of one arm (`is_one`) by itself."""
+def markdown(title: str, arms: list[list[Comparison]]) -> str:
+    """Table of the coverage of all arms together, or of one in all its tests."""
     found, rows = [each for arm in arms for each in arm], []
     for name, each in coverage(found).items():
-        ends = 100 * (np.array(each.intervals) if is_one else intervals(arms, name).T)
+        ends = 100 * intervals(arms, name).T
         cells = [f"{100 * share:.0f} ({low:.0f} to {high:.0f})"
                  for share, (low, high) in zip(each.shares, ends, strict=True)]  # fmt: skip
         rows.append((name, str(each.n), *cells))
@@ -218,7 +247,7 @@ def main() -> int:
     given = parser.parse_args()
     if given.recordings is not None:
         for name, runs in of_recordings(given.recordings):
-            print(markdown(name, [runs], is_one=True), end="\n\n", flush=True)
+            print(markdown(name, [[run] for run in runs]), end="\n\n", flush=True)
         return 0
     settings = CalibrationSettings(sequence=True) if given.auto else QUICK
     found: dict[str, list[list[Comparison]]] = {"sweeps and two rounds": [], "sweeps alone": []}
@@ -226,8 +255,13 @@ def main() -> int:
         robot, arm = made(given.rig, seed)
         recorded = list(logs(robot, arm, given.undriven))
         for (_, arms), fitted in zip(found.items(), (3, 1), strict=True):
-            result = calibrate(robot, recorded[:fitted], settings=settings)
-            arms.append(list(validate(result.robot, recorded, settings)[fitted:]))
+            fit = calibrate(robot, recorded[:fitted], settings=settings).robot
+            tested = [recorded]
+            if given.undriven:
+                others = with_other_channels(given.rig, seed, fit)
+                tested = [list(logs(robot, other, undriven=True)) for other in others]
+            runs = (validate(fit, each, settings)[fitted:] for each in tested)
+            arms.append([each for run in runs for each in run])
         print(f"arm {seed}: done", file=sys.stderr, flush=True)
     for title, arms in found.items():
         print(markdown(title, arms), end="\n\n")

@@ -63,12 +63,14 @@ class Fault:
     edited : turns right logs into faulty ones.
     told : what the remarks should contain, one part each, in one of the wordings between bars.
     hints : what a remark or an error may contain that says what is wrong, but corrects nothing.
+    rounds : how many rounds are calibrated with.
     """
 
     sources: tuple[int, ...] | None = None
     edited: Callable[[Logs], Logs] = list
     told: tuple[str, ...] = ()
     hints: tuple[str, ...] = ()
+    rounds: int = DESIGNED
 
 
 # -- faults ----------------------------------------------------------------------------------------
@@ -175,33 +177,92 @@ def turned(robot: RobotDescription, turns: tuple[int, ...]) -> str:
     return Hypothesis("axes", "", sources, turns).told(robot, names)
 
 
-def frame_of_one_log(robot: RobotDescription, rng: np.random.Generator) -> Fault:
-    """The frame was defined anew in one log, turned by 20 to 60 degrees and moved by 20 mm."""
+def another_pose(rng: np.random.Generator) -> tuple[Rotation, Array]:
+    """A turn by 20 to 60 degrees and a shift of 20 mm, in any directions."""
     axis, far = rng.normal(size=(2, 3))
     angle = np.radians(rng.uniform(20, 60))
-    turn = Rotation.from_rotvec(angle * axis / np.linalg.norm(axis)).as_matrix()
-    shift = 0.02 * far / np.linalg.norm(far)
-    return Fault(edited=in_one(int(rng.integers(FITTED)), turn, shift), told=("defined anew",))
+    turn = Rotation.from_rotvec(angle * axis / np.linalg.norm(axis))
+    return turn, 0.02 * far / np.linalg.norm(far)
+
+
+def frame_of_one_log(robot: RobotDescription, rng: np.random.Generator) -> Fault:
+    """The frame was defined anew in one log."""
+    turn, shift = another_pose(rng)
+    changed = in_one(int(rng.integers(FITTED)), turn.as_matrix(), shift)
+    return Fault(edited=changed, told=("the frame of",))
 
 
 def body_of_one_log(robot: RobotDescription, rng: np.random.Generator) -> Fault:
-    """The tip's body was defined anew in one log, turned by 20 to 60 degrees and moved by 20 mm."""
-    axis, far = rng.normal(size=(2, 3))
-    angle, which = np.radians(rng.uniform(20, 60)), int(rng.integers(FITTED))
-    turn = Rotation.from_rotvec(angle * axis / np.linalg.norm(axis))
-    shift = 0.02 * far / np.linalg.norm(far)
+    """The tip's body was defined anew in one log."""
+    turn, shift = another_pose(rng)
+    which = int(rng.integers(FITTED))
+    return Fault(
+        edited=lambda right: one_changed(right, which, lambda log: anew(log, turn, shift)),
+        told=("the body 'tip' was defined anew",),
+    )
 
-    def anew(log: Log) -> Log:
-        assert log.tip_quaternion is not None
-        body = Rotation.from_quat(log.tip_quaternion, scalar_first=True)
-        return replace(
-            log,
-            tip_position=log.tip_position + body.apply(shift),
-            tip_quaternion=(body * turn).as_quat(scalar_first=True),
+
+def frame_and_body(robot: RobotDescription, rng: np.random.Generator) -> Fault:
+    """The frame was defined anew in one of five logs, the tip's body in another one."""
+    (turn, shift), (own_turn, own_shift) = another_pose(rng), another_pose(rng)
+    one, other = rng.permutation(5)[:2].tolist()
+
+    def edited(right: Logs) -> Logs:
+        moved = in_one(one, turn.as_matrix(), shift)(right)
+        return one_changed(moved, other, lambda log: anew(log, own_turn, own_shift))
+
+    told = ("the frame of", "the body 'tip' was defined anew")
+    return Fault(edited=edited, told=told, rounds=4)
+
+
+def frame_and_body_of_one_log(robot: RobotDescription, rng: np.random.Generator) -> Fault:
+    """Both were defined anew in one log; that is not found, and should not be told wrongly."""
+    (turn, shift), (own_turn, own_shift) = another_pose(rng), another_pose(rng)
+
+    def both(log: Log) -> Log:
+        return anew(moved(log, turn.as_matrix(), shift), own_turn, own_shift)
+
+    which = int(rng.integers(FITTED))
+    told = ("the frame of", "the body 'tip' was defined anew")
+    return Fault(
+        edited=lambda right: one_changed(right, which, both), told=told, hints=("look at whether",)
+    )
+
+
+def mirrored(robot: RobotDescription, rng: np.random.Generator) -> Fault:
+    """In one log without orientations z has the other sign."""
+    mirror, which = np.array([1.0, 1.0, -1.0]), int(rng.integers(FITTED))
+    return Fault(edited=positions_times(mirror, which), told=("are mirrored",))
+
+
+def scaled(robot: RobotDescription, rng: np.random.Generator) -> Fault:
+    """The positions of one log have another scale; no orientations are recorded."""
+    scale = float(rng.choice([0.6, 1.3]))
+    changed = positions_times(scale * np.ones(3), int(rng.integers(FITTED)))
+    return Fault(edited=changed, told=("have another scale",))
+
+
+def positions_times(factors: Array, which: int) -> Callable[[Logs], Logs]:
+    """Leave out all orientations, and multiply the positions of one log by factors (3,)."""
+
+    def edited(right: Logs) -> Logs:
+        without = [(name, replace(log, tip_quaternion=None)) for name, log in right]
+        return one_changed(
+            without, which, lambda log: replace(log, tip_position=log.tip_position * factors)
         )
 
-    told = "the body 'tip' was defined anew"
-    return Fault(edited=lambda right: one_changed(right, which, anew), told=(told,))
+    return edited
+
+
+def anew(log: Log, turn: Rotation, shift: Array) -> Log:
+    """The log with the tip's body turned and shifted (3,) in its own axes."""
+    assert log.tip_quaternion is not None
+    body = Rotation.from_quat(log.tip_quaternion, scalar_first=True)
+    return replace(
+        log,
+        tip_position=log.tip_position + body.apply(shift),
+        tip_quaternion=(body * turn).as_quat(scalar_first=True),
+    )
 
 
 def order_of_one_log(robot: RobotDescription, rng: np.random.Generator) -> Fault:
@@ -279,8 +340,12 @@ FAULTS: dict[str, Callable[[RobotDescription, np.random.Generator], Fault]] = {
     "clocks": clocks,
     "body of one log": body_of_one_log,
     "order of one log": order_of_one_log,
+    "frame, body of another log": frame_and_body,
+    "frame and body of one log": frame_and_body_of_one_log,
+    "mirrored log": mirrored,
+    "scaled log": scaled,
 }
-ONLY_CALIBRATED = ("axes",)  # `validate` sees one log: the same as `axes of one log`
+ONLY_CALIBRATED = ("axes", "frame, body of another log")  # `validate` sees one log
 
 
 # -- runs ------------------------------------------------------------------------------------------
@@ -312,7 +377,7 @@ def recorded(rig: str, seed: int, fault: Fault, rounds: slice) -> tuple[RobotDes
 
 def told_in_calibration(rig: str, seed: int, fault: Fault) -> list[str]:
     """What `calibrate` tells of the set-up, without its fit."""
-    robot, faulty = recorded(rig, seed, fault, slice(0, FITTED))
+    robot, faulty = recorded(rig, seed, fault, slice(0, 1 + fault.rounds))
     try:
         read = [without_drift(each) for each in recordings_of(robot, faulty, QUICK)]
     except InputError as error:

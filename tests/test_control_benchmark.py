@@ -26,8 +26,10 @@ from conftest import is_long
 from control_baselines import CONTROLLERS, Gains, IntegralFeedback
 from control_cases import DIRECTIONS, STEPS, draw_case, draw_path, settling_time, with_true_file
 from stiffopt.identify.results import Comparison
+from stiffopt.model.calibration import Calibration
 from stiffopt.model.description import Recordings
 from stiffopt.model.manipulator import load_robot
+from stiffopt.optimise.solver import PressureSolver
 from stiffopt.plant.plant import Plant
 from stiffopt.plant.settings import Discretisation
 from stiffopt.registration import Placement, Registration
@@ -96,6 +98,20 @@ def test_arms_and_steps_may_be_other_ones():
     assert case.description.plant.mismatch.modulus == (0.85, 0.85)
     step = case.aims[0].position - case.arm().settled(np.zeros(6))
     assert 0.05 <= np.linalg.norm(step) <= 0.11
+
+
+@pytest.mark.parametrize("what", control_cases.DEMANDS)
+def test_tasks_may_demand_a_share_of_the_best_stiffness(what):
+    case = drawn()
+    place, kind = case.aims[0].position, case.aims[0].kind
+    robot = load_robot(case.believed)
+    best = PressureSolver(robot, case.task(place, kind)).solve().stiffness
+    goal = control_cases.demanding(case, what, 0.9).task(place, kind).stiffness
+    (demanded,) = goal.at_least or (goal.match,)
+    assert demanded.value == pytest.approx(0.9 * best)
+    assert demanded.direction == DIRECTIONS[kind]
+    assert bool(goal.maximise) is (what == "both")
+    assert control_cases.demanding(case, None, 0.9) is case
 
 
 def test_feedback_beats_the_model_alone_and_the_table_says_so(short_steps):
@@ -261,7 +277,7 @@ def test_a_file_with_the_true_values_hangs_as_the_arm_does_from_its_tilted_base(
     assert np.min(errors["not tilted"]) > 1
 
 
-def test_the_55_mm_arm_is_calibrated_by_its_training_run_and_by_its_circle(monkeypatch):
+def test_real_arms_are_calibrated_by_each_of_their_runs(monkeypatch):
     """Each fit is tested with the other runs, and all of these are pooled."""
     fits, tests, compared = [], [], Comparison(
         "", np.arange(600.0), *[np.zeros((600, 3))] * 5, None, *np.ones((2, 600), dtype=bool),
@@ -284,13 +300,51 @@ def test_the_55_mm_arm_is_calibrated_by_its_training_run_and_by_its_circle(monke
     monkeypatch.setattr(regions, "validate", tested)
     found = dict(regions.of_recordings(Path("somewhere")))
     assert list(found) == ["ucl-58", "ucl-55", "asu"]  # two modules have no test run
-    assert fits[1:3] == [(["ol-p2p"], False), (["-07-29"], False)]
-    assert tests[1:3] == [["cl-p2p", "-07-29"], ["ol-p2p", "cl-p2p"]]
-    assert len(found["ucl-55"]) == 4
-    assert fits[3] == ([f"apr4_{number}" for number in range(1, 6)], True)  # one after another
-    told = regions.markdown("ucl-55", [found["ucl-55"]], is_one=True)
+    runs = ["ol-p2p", "cl-p2p", "-07-29"]
+    assert fits[3:6] == [([run], False) for run in runs]
+    assert tests[3:6] == [[each for each in runs if each != run] for run in runs]
+    assert len(found["ucl-55"]) == 6
+    assert fits[6] == ([f"apr4_{number}" for number in range(1, 6)], True)  # one after another
+    assert tests[6] == ["apr4_6", "apr4_7"]
+
+
+def test_intervals_of_a_real_arm_are_by_its_runs():
+    """Blocks of a run that repeats its way are no evidence of their own."""
+    every = np.ones(600, dtype=bool)
+    runs = [
+        Comparison(
+            "", np.arange(600.0), *[np.zeros((600, 3))] * 5, None, every, every,
+            *[np.full(600, level)] * 2, (),
+        )
+        for level in (0.4, 0.6, 0.6)
+    ]  # fmt: skip
+    told = regions.markdown("", [[run] for run in runs])
     (row,) = (line for line in told.splitlines() if line.startswith("| with history |"))
-    assert row.startswith("| with history | 2400 | 50 (30 to 68) | 100 (100 to 100) |")
+    assert row.startswith("| with history | 1800 | 33 (0 to 100) | 100 (100 to 100) |")
+
+
+def test_arms_of_an_undriven_channel_differ_by_its_tolerances_alone():
+    robot, arm = regions.made("sim", 32000)
+    priors = {"gain": 0.05, "azimuth": 0.05}
+    parameters = [
+        {"key": f"segments[0].corrections.{name}[{channel}]", "deviation": 0.01, "prior": prior}
+        for name, prior in priors.items()
+        for channel in range(3)
+    ]
+    known = {"parameters": parameters, "correlation": np.eye(6).tolist()}
+    fit = robot.model_copy(update={"calibration": Calibration.model_validate(known)})
+    first, found = arm.plant.mismatch, list(regions.with_other_channels("sim", 32000, fit))
+    drawn = []
+    for each in found:
+        own = each.plant.mismatch
+        assert own.model_copy(update={"gain": first.gain, "angle": first.angle}) == first
+        assert (own.gain[:-1], own.angle[:-1]) == (first.gain[:-1], first.angle[:-1])
+        drawn += [np.log(own.gain[-1]) / priors["gain"], own.angle[-1] / priors["azimuth"]]
+    assert len(np.unique(drawn)) == 2 * regions.UNDRIVEN
+    assert 0.5 < np.std(drawn) < 1.5
+    commands = np.array([[0, 0, 0], [5e4, 5e4, 0]])
+    one, other = (each.recorded(np.array([0, 1.0]), commands) for each in (arm, found[0]))
+    np.testing.assert_allclose(one.tip_position, other.tip_position, atol=1e-5)
 
 
 @pytest.mark.parametrize("name", ["none", "dead line", "axes of one log"])

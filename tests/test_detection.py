@@ -465,6 +465,17 @@ def test_two_wrong_lines_or_orders_are_found_when_a_model_is_validated(
     assert found.errors.mean < 1e-3
 
 
+def test_an_order_that_shows_in_less_than_half_of_a_log_is_found_with_another_one() -> None:
+    time, pressures = course(6, 60.0, 6, rate=5.0, hold=6.0)
+    pressures[:, 3:] *= (time > 0.6 * time[-1])[:, np.newaxis]  # the second segment moves late
+    log = driven(pressures, time, "stiff-flop-2")
+    wrong = replace(log, commanded=log.commanded[:, np.argsort([1, 2, 0, 3, 5, 4])])
+    (found,) = validate(calibrated(arm("stiff-flop-2")), [wrong])
+    assert "segment 1 channel 1 has the column of segment 1 channel 2" in found.remarks[-1]
+    assert "segment 2 channel 2 has the column of segment 2 channel 3" in found.remarks[-1]
+    assert found.errors.mean < 1e-3
+
+
 # -- units -----------------------------------------------------------------------------------------
 
 

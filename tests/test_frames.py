@@ -20,6 +20,7 @@ from stiffopt.identify.settings import CalibrationSettings, Finding
 from stiffopt.identify.setup import Setup, recordings_of
 from stiffopt.identify.validation import validate
 from stiffopt.logs import Body, Log, read_log
+from stiffopt.model.calibration import Calibration
 from stiffopt.model.description import Recordings, RobotDescription, TrackedBody
 from stiffopt.model.robot_files import load_description
 
@@ -75,8 +76,13 @@ def of_pressures(factor: float) -> Change:
 
 
 def reordered(log: Log) -> Log:
-    """Each channel of the segment has the column of another one."""
-    return replace(log, commanded=log.commanded[:, [1, 2, 0]])
+    """Each channel of the first segment has the column of another one."""
+    others = range(3, log.commanded.shape[1])
+    return replace(log, commanded=log.commanded[:, [1, 2, 0, *others]])
+
+
+def calibrated(robot: RobotDescription) -> RobotDescription:
+    return robot.model_copy(update={"calibration": Calibration(logs=("before.csv",))})
 
 
 def with_one(logs: list[Log], which: int, change: Change) -> list[Log]:
@@ -118,6 +124,78 @@ def test_a_frame_that_was_defined_anew_for_a_whole_day_is_found() -> None:
     assert remark.startswith("the frame of log 4, log 5 was defined anew")
 
 
+def test_a_frame_and_a_body_that_differ_in_other_logs_are_both_found() -> None:
+    robot = load_description("stiff-flop-1")
+    logs = [log_of(seed=seed) for seed in range(5)]
+    wrong = with_one(with_one(logs, 1, in_frame(TURN)), 4, of_body)
+    frame, body = told(robot, wrong)
+    assert frame.startswith("the frame of log 2 was defined anew")
+    assert "the body 'tip' was defined anew in log 5" in body
+    frames = with_one(with_one(logs, 1, in_frame(TURN)), 3, in_frame(TURN.inv(), -SHIFT))
+    both = " ".join(told(robot, frames))
+    assert "the frame of log 2 was" in both
+    assert "the frame of log 4 was" in both
+
+
+def test_of_different_frames_none_is_told_where_no_logs_agree() -> None:
+    logs = [log_of(seed=seed) for seed in range(3)]
+    wrong = with_one(with_one(logs, 1, in_frame(TURN)), 2, in_frame(TURN.inv(), -SHIFT))
+    assert told(load_description("stiff-flop-1"), wrong) == []
+
+
+def test_a_frame_and_a_body_that_differ_in_one_log_are_not_told_as_one() -> None:
+    logs = [log_of(seed=seed) for seed in range(3)]
+    turn = Rotation.from_rotvec([0.0, 0.9, 0.0])
+
+    def both(log: Log) -> Log:
+        return of_body(in_frame(turn)(log))
+
+    assert told(load_description("stiff-flop-1"), with_one(logs, 1, both)) == []
+
+
+def test_a_frame_that_leaves_little_is_told_although_the_body_sits_a_little_elsewhere() -> None:
+    log = log_of()
+    along = rotations(log).apply([0.0, 0.0, 2e-3])
+    aside = replace(log, tip_position=log.tip_position + along)
+    (found,) = validate(calibrated(load_description("stiff-flop-1")), [in_frame(TURN)(aside)])
+    assert found.remarks[-1].startswith("the frame of log 1 was defined anew")
+
+
+@pytest.mark.parametrize(
+    ("factors", "words"),
+    [
+        (np.array([1.0, 1.0, -1.0]), "are mirrored: z has the other sign"),
+        (np.array([0.6, 0.6, 0.6]), "have another scale: they are times 1.6"),
+    ],
+)
+def test_positions_with_another_sign_or_scale_are_no_other_frame(
+    factors: Array, words: str
+) -> None:
+    robot = load_description("stiff-flop-1")
+    wrong = with_one(
+        [log_of(seed=seed, turns=False) for seed in range(3)],
+        1,
+        lambda log: replace(log, tip_position=log.tip_position * factors),
+    )
+    (remark,) = told(robot, wrong)
+    assert remark.startswith(f"the positions of log 2 {words}")
+    (found,) = validate(calibrated(robot), wrong[1:2])
+    assert found.remarks[-1].startswith(f"the positions of log 1 {words}")
+    assert found.errors.mean < 3e-3
+
+
+def test_a_body_that_was_defined_anew_is_found_when_a_model_is_validated() -> None:
+    robot = calibrated(load_description("stiff-flop-1"))
+    (found,) = validate(robot, [of_body(log_of())])
+    assert found.remarks[-1].startswith("the body 'tip' was defined anew in log 1")
+    assert found.errors.mean < 3e-3
+    (found,) = validate(robot, [in_frame(TURN)(log_of())])
+    assert found.remarks[-1].startswith("the frame of log 1 was defined anew")
+    assert "another arm" not in found.remarks[-1]  # which orientations rule out
+    (found,) = validate(robot, [of_body(in_frame(TURN)(log_of()))])
+    assert "look at whether" in found.remarks[-1]
+
+
 def test_of_two_logs_the_one_that_the_robot_file_does_not_expect_is_moved() -> None:
     logs = [log_of(seed=seed) for seed in range(2)]
     (remark,) = told(load_description("stiff-flop-1"), with_one(logs, 0, in_frame(TURN)))
@@ -143,9 +221,10 @@ def test_a_log_of_another_arm_is_not_excused_by_its_frame(change: Change, turns:
 
 
 @pytest.mark.parametrize("turns", [True, False])
-def test_channels_in_another_order_in_one_log_are_told_instead_of_a_turn(turns: bool) -> None:
-    robot = load_description("stiff-flop-1")
-    wrong = with_one([log_of(seed=seed, turns=turns) for seed in range(3)], 1, reordered)
+@pytest.mark.parametrize("name", ROBOTS)
+def test_channels_in_another_order_in_one_log_are_told(name: str, turns: bool) -> None:
+    robot = load_description(name)
+    wrong = with_one([log_of(name, seed, turns) for seed in range(3)], 1, reordered)
     (remark,) = told(robot, wrong)
     assert remark.startswith("log 2 differs from the other logs, as if the channels are in another")
     assert "segment 1 channel 1 has the column of segment 1 channel 3" in remark

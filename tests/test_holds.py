@@ -52,6 +52,15 @@ def test_a_hold_of_a_client_lasts() -> None:
     assert "hold-timeout" in arm.kinds
 
 
+def test_a_hold_without_words_outlasts_one_of_the_tracker() -> None:
+    arm = lab()
+    arm.world.inject("tracker", "off")
+    arm.until(State.HOLDING)
+    arm.loop.hold("")
+    arm.world.inject("tracker", "ok")
+    assert arm.ticks(150).state is State.HOLDING
+
+
 def test_a_stream_of_targets_does_not_keep_a_hold_alive() -> None:
     arm = lab()
     arm.controller.valid = False
@@ -162,7 +171,7 @@ def test_a_hold_never_commands_more_than_was_commanded_whatever_a_gauge_reads() 
     arm.ticks(15)  # falling: the chambers have more than is commanded
     before = arm.loop.snapshot().commanded
     assert before.max() > 1e4
-    most = np.max(arm.loop._supervisor._recent, axis=0)  # of the last 0.3 s
+    _, most = arm.loop._supervisor._recent.range()  # of the last 0.3 s
     arm.world.inject("supply", "wrong", channel=2)  # reads 0.2 bar of an empty chamber
     arm.controller.said = DOUBT
     for _ in range(30):

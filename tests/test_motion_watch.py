@@ -299,10 +299,12 @@ def displaced(
     force: float = 1.0,
     grown: Callable[[float], float] | None = None,
     turns: Callable[[float], float] | None = None,
+    estimated: float = 1.0,
 ) -> Doubt | None:
     """Doubt of a tip that is displaced by 10 mm and turned by a share of what a push turns it.
 
-    It begins with 0.6 of that turn the other way if the turn follows a time course of its own.
+    It begins with 0.6 of that turn the other way if the turn follows a time course of its own. An
+    `estimated` share of what has grown is known, the rest counts as a swing.
     """
     push = TIP.pose[:3, :3] @ np.array([0.01, 0.004, 0.0]) * force
     pushed = ROBOT.loaded_tip_pose(P, [*push, 0.0, 0.0, 0.0])
@@ -316,7 +318,8 @@ def displaced(
             offset[3:] = turned and (turns(time) - 0.6) * turn
         watch.intend(time, np.zeros(3))
         if grown:  # the loop has not made up for it
-            take(watch, time, offset[:3], np.zeros(3), offset)
+            known, still = estimated * offset, np.zeros(3)
+            watch.take(time, offset[:3], still, known, np.zeros(6), TIP, turned=offset[3:])
         else:
             take(watch, time, np.zeros(3), -offset[:3], offset)
     assert np.linalg.norm(moved) > 6e-3 * force
@@ -445,9 +448,14 @@ def test_a_drift_that_turns_nothing_is_doubted_though_the_posture_follows_it() -
     assert time < 2.0
 
 
+@pytest.mark.parametrize("estimated", [1.0, 0.05])
 @pytest.mark.parametrize("force", [0.7, 2.0])
-def test_a_push_that_grows_slowly_is_no_drift(force: float) -> None:
-    assert displaced(1.0, force, slowly) is None
+def test_a_push_that_grows_slowly_is_no_drift(force: float, estimated: float) -> None:
+    assert displaced(1.0, force, slowly, estimated=estimated) is None
+
+
+def test_a_drift_in_a_slow_swing_is_doubted() -> None:
+    assert displaced(0.0, 0.7, slowly, estimated=0.05) is not None
 
 
 def begun(turned: Callable[[float], float]) -> tuple[float, Doubt | None]:

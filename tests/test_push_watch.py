@@ -128,8 +128,43 @@ def test_a_push_that_begins_or_ends_with_a_new_target_is_not_doubted(ends: bool)
     place = bench.pose_at(np.array([0.2, 0.9, 0.6, 0.5, 0.3, 0.2]) * BAR)[:3, 3]
     plant.set_load(PlantLoad() if ends else load)
     bench.controller.set_task(bench.task(position=tuple(map(float, place))))
-    bench.run(1.5)
+    bench.run(3.0)
     assert bench.controller._arm.watch.doubt is None
+    assert np.linalg.norm(bench.tip[:3, 3] - place) < 2e-3  # the reference has waited, and gone on
+
+
+@pytest.mark.usefixtures("compiled")
+def test_a_line_that_is_kinked_at_the_moment_of_a_push_does_not_hide_behind_it() -> None:
+    """The reference waits for the end of the push; in the rest of the motion the line shows."""
+    bench = Bench(HANGING, "full")
+    bench.settled(duration=5.0)
+    watch, plant = bench.controller._arm.watch, bench.rig.world.plant
+    watch.forgive()
+    place = bench.pose_at(np.array([0.85, 0.48, 0.88, 0.13, 0.6, 0.39]) * BAR)[:3, 3]
+    plant.set_load(PlantLoad(force=(-0.023, -0.026, 0.0)))
+    highest, follow = np.full(bench.n, np.inf), plant.follow
+    highest[2] = bench.rig.world.pressures[2]
+    plant.follow = lambda trace: follow(np.minimum(trace, highest))
+    bench.controller.set_task(bench.task(position=tuple(map(float, place))))
+    bench.run(0.8)
+    assert watch.waits
+    assert watch.doubt is None
+    bench.run(1.2)
+    assert watch.doubt is not None
+    assert watch.doubt.kind == "no-response"
+
+
+def test_an_arm_that_is_pushed_again_and_again_goes_on(monkeypatch) -> None:
+    watch = MotionWatch(load_robot("stiff-flop-2-hanging").description, MotionTuning())
+    monkeypatch.setattr(watch._pushes, "acts", lambda now: now >= 1.0)
+    place, waits = TIP.pose[:3, 3], []
+    for time in np.arange(0.0, 10.0, 0.025):
+        watch.intend(time, place)
+        watch.take(time, place, place, np.zeros(6), np.full(6, 4e4), TIP, turned=np.zeros(3))
+        waits.append(watch.waits)
+    assert not any(waits[:39])
+    assert all(waits[41:99])
+    assert 0.4 < np.mean(waits[40:]) < 0.55
 
 
 @pytest.mark.parametrize("again", [False, True])

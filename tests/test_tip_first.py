@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from stiffopt.control.correction_bound import CorrectionBound
+from stiffopt.control.plan import Plan
 from stiffopt.control.planning import Planning
+from stiffopt.control.pressing import Phase
 from stiffopt.control.replanning import Pursuit, Replanner
 from stiffopt.control.tuning import ControlTuning, CorrectionTuning, ReplanningTuning
 from stiffopt.control.way_to_target import WayToTarget
 from stiffopt.optimise.goal import StiffnessGoal, StiffnessMeasure
+from stiffopt.optimise.press import Press
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import Task
 from stiffopt.plant.settings import PlantLoad
@@ -63,7 +67,7 @@ def test_the_tip_stays_while_the_arm_becomes_stiff_in_another_direction():
 def test_no_channel_moves_the_tip_faster_than_is_noticed():
     """On the way to a target: three seconds for 0.24 m by one channel, half a period for less."""
     slew, times = np.full(2, 1e6), []
-    for metres_per_pascal in (2.4e-6, 1e-8):
+    for metres_per_pascal, demands in ((2.4e-6, False), (2.4e-6, True), (1e-8, False)):
         jacobian = np.zeros((6, 2))
         jacobian[0] = metres_per_pascal, metres_per_pascal / 2
         arm = SimpleNamespace(
@@ -73,10 +77,10 @@ def test_no_channel_moves_the_tip_faster_than_is_noticed():
         way = WayToTarget(SimpleNamespace(tuning=ControlTuning(), slew=slew), arm)
         plan = SimpleNamespace(tip_first=(1e5, 5e4), pressures=np.array([1e5, 5e4]))
         reference = SimpleNamespace(path=np.zeros(8), goal=np.zeros(8))
-        times.append(0.1 / way.slew_share(plan, reference))
+        times.append(0.1 / way.slew_share(plan, reference, demands=demands))
         reference.path = np.full(8, 2e5)
-        assert way.slew_share(plan, reference) == math.inf
-    assert times == pytest.approx([3.0, 0.5])
+        assert way.slew_share(plan, reference, demands=demands) == math.inf
+    assert times == pytest.approx([3.0, 4.8, 0.5])
 
 
 def test_corrections_are_bounded_by_the_latest_motion_and_released_slowly():
@@ -124,6 +128,24 @@ def test_plans_follow_no_more_of_an_offset_than_is_permitted():
     assert moved[1] == pytest.approx(share * (offset - moved[0]))
 
 
+@pytest.mark.parametrize("stiffens", [True, False])
+def test_while_the_reference_waits_the_arm_becomes_no_stiffer(stiffens):
+    asked = []
+    planner = SimpleNamespace(request=asked.append, latest=lambda: None)
+    replanner = Replanner(planner, ReplanningTuning(), 0.01, 0.0)
+    targets = Target(position=(0.0, 0.0, 0.1)), Target(position=(0.02, 0.0, 0.1))
+    limits = np.zeros(6), np.full(6, BAR)
+    for begin, target in enumerate(targets):
+        replanner.pursue(Pursuit(task=Task(robot=HANGING, target=target), target=target))
+        for tick in range(50):
+            now = begin + 0.01 * tick
+            replanner.update(now, np.zeros(6), np.zeros(6), 10.0, 0.1, limits, waits=True)
+            tip_first = (0.5,) if stiffens else ()
+            plan = Plan(asked[-1].serial, limits[0], np.zeros(6), target, True, 1.0, "")
+            replanner.plan = replace(plan, tip_first=tip_first)
+    assert len(asked) == (2 if stiffens else 20)  # the new target is planned at once
+
+
 @pytest.mark.parametrize("changes", [True, False])
 def test_a_push_is_met_slowly_only_while_the_arm_becomes_stiff(changes):
     bench = Bench(HANGING, "full")
@@ -140,6 +162,28 @@ def test_a_push_is_met_slowly_only_while_the_arm_becomes_stiff(changes):
     bench.run(0.6)
     way = np.linalg.norm(arm.at_waypoint(bench.command).pose[:3, 3] - before)
     assert way < 5.5e-3 if changes else way > 7e-3
+
+
+def test_a_press_begins_when_the_arm_is_as_stiff_as_planned():
+    """Its force is told by the stiffness that the arm has; its way takes as long as any other."""
+    bench = Bench(HANGING, "full")
+    position = bench.settled(duration=4.0)
+    controller, axial = bench.controller, StiffnessMeasure(direction=(0.0, 0.0, 1.0))
+    press = Press(force=0.03, direction=(1.0, 0.0, 0.0))
+    task, goal = bench.task(position=position), StiffnessGoal(maximise=axial)
+    controller.set_task(task.model_copy(update={"stiffness": goal, "press": press}))
+    course, ticks = controller.replanner.pursuit.course, 0
+    course._tuning = replace(course._tuning, longest_rest=0.5)  # nothing else is waited for
+    while course.phase is Phase.GOING:
+        bench.run(0.1)
+        ticks += 1
+        assert ticks < 150
+    assert ticks > 20
+    assert controller._way_to_target._tip_first  # its way took its time
+    assert not controller.replanner.plan.tip_first
+    standing = controller.status(bench.rig.clock.now())
+    assert standing.stiffness == pytest.approx(standing.best_stiffness, rel=0.03)
+    assert not [n for n in controller.notices() if n.kind == "press-failed"]
 
 
 def test_an_arm_without_inertia_makes_up_for_a_late_tracker_only_by_some_millimetres():

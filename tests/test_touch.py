@@ -406,6 +406,19 @@ def test_an_error_of_the_model_that_feedback_removes_holds_nothing_back() -> Non
     assert np.linalg.norm(tip - target) < 1e-6
 
 
+@pytest.mark.parametrize(("left", "holds"), [(3e-4, False), (2e-3, True)])
+def test_an_offset_that_changes_with_the_posture_holds_nothing_back(
+    left: float, holds: bool
+) -> None:
+    """Feedback keeps the tip near its target then; an object keeps it off."""
+    watch, target = ObstructionWatch(ObstructionTuning()), np.array([0.02, 0.01, 0.1])
+    tip, found = target - np.array([left, 0.0, 0.0]), False
+    for offset in np.linspace(0.0, -8e-3, 1000):
+        watch.change_posture(1e-4)
+        found = found or watch.take(tip, np.array([offset, 0.0, 0.0, 0.0, 0.0, 0.0]), target)
+    assert found is holds
+
+
 def test_the_offset_is_kept_along_the_direction_only() -> None:
     arm = Spring(0.003, 200.0)
     arm.run(6.0)

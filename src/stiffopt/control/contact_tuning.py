@@ -94,6 +94,8 @@ class ObstructionTuning:
     # cause, as a share of the way to the target
     least: float = 1.5e-3
     creep: float = 0.1
+    # part that a change of posture at the target may cause, as a share of the channels' motions
+    posture: float = 0.1
 
 
 @dataclass(frozen=True)

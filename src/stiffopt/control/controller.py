@@ -249,6 +249,17 @@ class TipController:
         course, offset = self.replanner.pursuit.course, self._arm.tip.offset
         return course.corrected(offset) if isinstance(course, Pressing) else offset
 
+    @property
+    def _goes_to_target(self) -> bool:
+        """Whether the tip goes to a target, or is there, without a course of its own."""
+        course = self.replanner.pursuit.course
+        return course is None or (isinstance(course, Pressing) and course.phase is Phase.GOING)
+
+    @property
+    def _waits(self) -> bool:
+        """Whether a push makes the reference wait; one that presses has to be able to go back."""
+        return self._arm.watch.waits and self._goes_to_target
+
     def _is_held(self, now: float) -> bool:
         """Whether the pressures are held, so that they are not the reference's."""
         return self._at_rest or now - self._computed_at > _HELD * self._period
@@ -455,12 +466,11 @@ class TipController:
     def _awaited(self, plan: Array, now: float) -> Array:
         """Return the reference's goal (n + 6,): the plan, unless channels or tip do not follow.
 
-        The reference waits for them where it is, and a trajectory of pressures too.
+        The reference waits for them where it is, and a trajectory of pressures too; on the way to a
+        target also for the end of a push.
         """
-        pace, course = (
-            min(self._arm.channels.pace, self._arm.watch.pace),
-            self.replanner.pursuit.course,
-        )
+        course = self.replanner.pursuit.course
+        pace = 0.0 if self._waits else min(self._arm.channels.pace, self._arm.watch.pace)
         if pace == 1 or isinstance(course, Bracing):
             return plan
         if isinstance(course, PostureCourse):
@@ -496,11 +506,13 @@ class TipController:
             reference.delay, self._arm.channels.available(), way, self._windows.windows,
             reference.path[: self.robot.n_pressures] if self._vibrates else None,
             self._correction.largest,
+            waits=self._waits,
         )  # fmt: skip
         if isinstance(course, Bracing):
             return self._brace_planned(course, found, now)
-        if course is None:
-            share = self._way_to_target.slew_share(replanner.plan, reference)
+        if self._goes_to_target:
+            demands = replanner.pursuit.demands
+            share = self._way_to_target.slew_share(replanner.plan, reference, demands=demands)
             reference.slew_share = np.fmin(reference.slew_share, share)
         return found
 
@@ -570,8 +582,12 @@ class TipController:
         R, plan = tip.pose[:3, :3], self.replanner.current
         short = np.zeros(3) if plan is None else np.array(plan.short)
         elapsed = min(now - self._computed_at, _HELD * self._period)
+        if self.replanner.stiffens:
+            rates = np.abs(self._reference.motion[1, : self.robot.n_pressures])
+            course.change_posture(elapsed * float(np.linalg.norm(tip.jacobian[:3], axis=0) @ rates))
+        arrived = self._rests(now) and not self.replanner.stiffens
         course.advance(
-            elapsed, self._rests(now), self._is_known(now), self._arm.tip.estimate.position,
+            elapsed, arrived, self._is_known(now), self._arm.tip.estimate.position,
             self._arm.tip.offset, self._arm.touch.felt, self._arm.touch.creep,
             R, R @ tip.compliance[:3, :3] @ R.T, short,
         )  # fmt: skip
@@ -606,9 +622,7 @@ class TipController:
         sample = estimator.sample
         if sample is None or now - sample.time > t.seen or self._is_held(now):
             return False
-        course = self.replanner.pursuit.course
-        goes = course is None or (isinstance(course, Pressing) and course.phase is Phase.GOING)
-        if not goes or not self._has_arrived():
+        if not self._goes_to_target or not self._has_arrived():
             return False
         return are_within(t.vibration, estimator.vibration[0])
 

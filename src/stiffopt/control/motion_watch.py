@@ -88,6 +88,8 @@ class MotionWatch:
     doubt : the present doubt; it stays until `forgive` or `go_on`.
     pace : share of its speed that the reference may keep; less than 1 before a missing response is
         certain.
+    waits : whether a push displaces the tip, so that the reference is to wait on its way to a
+        target.
     """
 
     def __init__(
@@ -111,13 +113,14 @@ class MotionWatch:
         self._slips: deque[float] = deque(maxlen=self._tuning.slips)
         self._jumps: deque[float] = deque(maxlen=self._tuning.slips)
         self._bends_until = -math.inf  # end of the pause after a push, in s
+        self._waits_until = -math.inf  # end of the latest wait of the reference, in s
         self._known_from = math.inf  # time from which the estimator knows the tip's offset, in s
         self._path = 0.0  # length of the way of r, in m
         self._intended: deque[tuple[float, Array]] = deque(maxlen=self._kept)
         self._swings = [_Swings(self._tuning) for _ in range(3)]
         self._pushes.begin()
         self.doubt: Doubt | None = None
-        self.pace = 1.0
+        self.pace, self.waits = 1.0, False
         # motion of the tip by each segment so far, in m; largest error of the model in it, as a
         # share of it; and times, errors and motions (segments,) that do not count yet
         self._unproven: deque[tuple[float, float, Array]] = deque()
@@ -131,7 +134,7 @@ class MotionWatch:
         self._misses = 0
         self._slips.clear()
         self._jumps.clear()
-        self.pace = 1.0
+        self.pace, self.waits = 1.0, False
         self._swings = [_Swings(self._tuning) for _ in range(3)]
         self.forgive()
 
@@ -296,9 +299,12 @@ class MotionWatch:
 
         Motion is compared in space, and then without its part along the tip's axis (3,), so that a
         long elongation does not hide a wrong direction across it. After a push in motion it is
-        compared again without what the push explains, as the turn shows it.
+        compared again without what the push explains, as the turn shows it. A line that is kinked
+        may turn the tip as a push does. So the reference waits until the push is over, and what is
+        wrong with the pressures shows in the rest of the motion.
         """
         rows, missed = self._since(self._tuning.response_window), None
+        now = float(rows[-1, _TIME])
         self._notice_push(jacobian, turning)
         ways = rows[-1, _PREDICTED] - rows[:-1, _PREDICTED]
         if ((ways**2).sum(axis=1) > self._min_motion**2).any():  # projections are no longer
@@ -306,14 +312,15 @@ class MotionWatch:
             steps = self._by_segments(np.diff(rows, axis=0), jacobian)
             found = [self._missed(rows, steps, P) for P in (np.eye(3), across)]
             missed = max(found, key=_share_of)
-            self._learn(float(rows[-1, _TIME]), found[0].error, steps[-1])
-            if turning is not None and self._pushes.acts(float(rows[-1, _TIME])):
+            self._learn(now, found[0].error, steps[-1])
+            if turning is not None and self._pushes.acts(now):
                 rest = self._without_push(rows, turning)
                 left = [self._missed(rest, steps, P) for P in (np.eye(3), across)]
                 missed = min(missed, max(left, key=_share_of), key=_share_of)
         share = 0.0 if missed is None else missed.share
         usual = self._tuning.usual_share
         self.pace = min(max((1 - share) / (1 - usual), 0.0), 1.0)
+        self.waits = self._is_to_wait(now)
         self._misses = self._misses + 1 if share > 1 else 0
         if missed is None or self._misses < self._tuning.misses:
             return None
@@ -332,6 +339,18 @@ class MotionWatch:
             "the tracker's frame is turned, the sensor has slipped, or something pushes the arm; "
             "run 'stiffopt commission'",
         )
+
+    def _is_to_wait(self, now: float) -> bool:
+        """Return whether the reference is to wait, so that no fault hides behind a push.
+
+        An arm that is pushed again and again goes on for half of the time at least.
+        """
+        if not self._pushes.acts(now):
+            return False
+        longest = self._tuning.longest_wait
+        if now >= self._waits_until + longest:
+            self._waits_until = now + longest
+        return now < self._waits_until
 
     def _notice_push(self, jacobian: Array, turning: TipAt | None) -> None:
         """Look for a push that begins or ends while the pressures change."""
@@ -564,16 +583,22 @@ class MotionWatch:
         """Return whether a growing push explains the change: it turns the tip too.
 
         A tracker's frame that turns about the base does so as well, by somewhat less, so the turn
-        by a large push must be about that which is expected.
+        by a large push must be about that which is expected. While an arm swings as slowly as it
+        would drift, the estimate takes a push for a part of the swing, so what is measured counts
+        too.
         """
-        moved, tuning = change[_OFFSET], self._tuning
         if turning is None:
             return False
-        bent = turn_of_a_push(turning) @ moved
-        size, missing = float(np.linalg.norm(bent)), self._missed_turn(bent, change[_TURN])
-        is_large = float(np.linalg.norm(moved)) > tuning.largest_push
-        share = tuning.slip_of_large if is_large else tuning.slip
-        return size > tuning.least_turn and missing < share * size
+        tuning, turn = self._tuning, turn_of_a_push(turning)
+        measured = change[_SEEN] - change[_PREDICTED]
+        for moved, turned in ((change[_OFFSET], change[_TURN]), (measured, change[_TURNED])):
+            bent = turn @ moved
+            size, missing = float(np.linalg.norm(bent)), self._missed_turn(bent, turned)
+            is_large = float(np.linalg.norm(moved)) > tuning.largest_push
+            share = tuning.slip_of_large if is_large else tuning.slip
+            if size > tuning.least_turn and missing < share * size:
+                return True
+        return False
 
     def _swing(self) -> Doubt | None:
         for swings in self._swings:

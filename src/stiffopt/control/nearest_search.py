@@ -77,6 +77,11 @@ class NearestSearch:
         result: Array = x * _BAR
         return result, distance, angle
 
+    def distance(self, target: Target, pressures: Array) -> tuple[float, float]:
+        """Return the position and angle errors at pressures (n,), in m and rad."""
+        found = self._error(target, pressures / _BAR)
+        return (math.nan, math.nan) if found is None else found[2:]
+
     def _error(self, target: Target, x: Array) -> tuple[Array, Array, float, float] | None:
         """Return the error at x (n,), in bar, as `TipErrors.weighted`; None: no equilibrium."""
         try:

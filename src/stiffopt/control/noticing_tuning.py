@@ -67,6 +67,7 @@ class PushTuning:
 class MotionTuning:
     """Thresholds for doubting the tip's motion (`MotionWatch`)."""
 
+    longest_wait: float = 1.5  # of the reference while a push acts, and until it may wait again
     spacing: float = 0.02  # minimum time between two samples that are compared, in s
     longest_pause: float = 0.1  # without control, after which samples are not compared, in s
     # error of the model, as a share of the motion that each segment causes: at first, and the least

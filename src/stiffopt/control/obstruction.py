@@ -5,7 +5,8 @@ If the model is wrong, the tip follows the pressures by about as much as the mod
 error vanishes. If an object is in the way, the tip stays, the error remains, and the pressures
 press ever harder. So the change of the offset since the tip stopped tells the one from the other. A
 wrong model may change it by twice the error at that time, since it takes several corrections, and
-creep by a share of the way before.
+creep by a share of the way before. While the arm becomes stiff at the target, the errors of its
+channels change it as well; then feedback keeps the error of the tip small.
 """
 
 from __future__ import annotations
@@ -34,6 +35,11 @@ class ObstructionWatch:
         self._offset: Array = np.zeros(3)  # its offset (3,) at that time
         self.withheld: Array = np.zeros(3)
         self.allowed = 0.0
+        self._channels_moved = 0.0  # since that time, see `change_posture`
+
+    def change_posture(self, moved: float) -> None:
+        """Take in by how much the channels have moved the tip, each alone, in m, added up."""
+        self._channels_moved += moved
 
     def change_model(self, change: Array) -> None:
         """Adjust to another model, for which the tip's offset changes by (6,)."""
@@ -54,6 +60,8 @@ class ObstructionWatch:
         if not np.linalg.norm(tip - self._stopped) < t.still:
             self._stopped, self._offset = tip.copy(), offset[:3].copy()
             way = float(np.linalg.norm(modelled - self._begun))
-            self.allowed = t.least + 2 * left + t.creep * way
+            self.allowed, self._channels_moved = t.least + 2 * left + t.creep * way, 0.0
         self.withheld = self._offset - offset[:3]
-        return float(np.linalg.norm(self.withheld)) * min(1.0, left / t.error) > self.allowed
+        by_posture = t.posture * self._channels_moved * min(1.0, t.error / max(left, 1e-9))
+        allowed = self.allowed + by_posture
+        return float(np.linalg.norm(self.withheld)) * min(1.0, left / t.error) > allowed

@@ -51,10 +51,12 @@ class Plan:
     target: Target | None
     reached: bool  # whether the model reaches the target, here or in a distant configuration
     stiffness: float  # along the task's first direction; NaN if it has none
-    message: str  # how far the model stays from a target that is not reached
+    message: str  # how far the model's tip is from a target that it does not have, or has left
     blocked: str = ""  # why the way to the plan is not clear of the scene
     doubt: str = ""  # a warning if the model extrapolates there
-    far: bool = False  # whether it is the pose that is not reached, not only the stiffness
+    # whether it is the pose that is not reached, not only the stiffness, or that has been left for
+    # other pressures that reach it
+    far: bool = False
     # from its tip to the target, in m, of a plan that follows a target by the least change
     short: tuple[float, ...] = (0.0, 0.0, 0.0)
     adapted: Adapted | None = None  # the model that it was made with, as in the request

@@ -3,10 +3,10 @@
 The target is moved back by the tip's offset; the model has to reach the result. The optimiser then
 finds the pressures that are stiffest on the real arm, except for errors of the modelled stiffness.
 An arm that vibrates first goes to a new target by the least motion of each channel, and from there
-slowly to the stiffest pressures. A plan is the local optimum next to the last plan. When the offset
-has changed much and the arm is at rest, all configurations are searched again; the arm changes to
-another one only if that is clearly better. For a target that is out of reach, the plan is the
-nearest configuration.
+slowly to the stiffest pressures; where a task demands a stiffness, it first goes as far as that
+needs. A plan is the local optimum next to the last plan. When the offset has changed much and the
+arm is at rest, all configurations are searched again; the arm changes to another one only if that
+is clearly better. For a target that is out of reach, the plan is the nearest configuration.
 
 While the tip presses on something, plans follow the target by the least change of pressures
 instead: the error of the model, from which a force must be told, is another one elsewhere, and an
@@ -25,6 +25,7 @@ import numpy as np
 
 from stiffopt.arrays import Array
 from stiffopt.control.adaptation import Adapted, Learning
+from stiffopt.control.demands import Demands
 from stiffopt.control.nearest_search import NearestSearch
 from stiffopt.control.plan import Plan, PlanRequest
 from stiffopt.control.posture_change import PostureChanges
@@ -41,7 +42,7 @@ from stiffopt.optimise.solution import PressureSolution
 from stiffopt.optimise.solver import PressureSolver
 from stiffopt.optimise.target import Target, Tolerance
 from stiffopt.optimise.task import PressureRange, Task
-from stiffopt.optimise.tip import TipModel
+from stiffopt.optimise.tip import TipAt, TipModel
 from stiffopt.paths.configurations import Unsolved
 from stiffopt.paths.leaning import approach_to
 
@@ -74,6 +75,7 @@ class Planning:
         self._ways = None if self._scene is None else Ways(robot, self._scene)
         self._search = NearestSearch(self._tip, FeedbackTuning().lever, NearestTuning())
         self._solver: PressureSolver | None = None
+        self._demands = Demands(None, self._tuning.demand_margin)
         self._stiffness: Callable[[Array, Array], float] | None = None  # in the task's direction
 
     def _go_on_with(self, request: PlanRequest) -> None:
@@ -152,6 +154,7 @@ class Planning:
             self._solver = PressureSolver(self._robot, task.model_copy(update={"target": exact}))
             self._is_compiled = self._solver.compile()
             self._stiffness = stiffness_function(task)
+            self._demands = Demands(task, self._tuning.demand_margin)
         self._limits = self._effective_limits(request)
         last, refused = request.last or self._last, self._refused
         self._last = last
@@ -179,20 +182,25 @@ class Planning:
             pressures = np.array(solution.pressures, dtype=float)
             stiffness = math.nan if solution.stiffness is None else float(solution.stiffness)
             if last is None or request.search:
-                pressures = self._tip_first(request, task, target, pressures, stiffness)
+                pressures = self._tip_first(request, target, pressures, stiffness)
             else:
                 if self._changes.to is None and self._is_distant(last, pressures, target):
                     self._changes.begin(pressures)
                 if self._changes.to is not None:
-                    pressures = self._changes.next(request, last, pressures, target, self._limits)
+                    pressures = self._on_the_way(request, last, pressures, target)
+            message = ""
+            if self._changes.leaves_target:
+                message = self._away(task.target.tolerance, target, pressures)
             self._last = Plan(
-                request.serial, pressures, request.offset, asked, True, stiffness, "",
-                adapted=request.adapted,
-                tip_first=self._changes.tip_first,
+                request.serial, pressures, request.offset, asked, True, stiffness, message,
+                far=bool(message), adapted=request.adapted, tip_first=self._changes.tip_first,
             )  # fmt: skip
         else:
             self._changes.end()
-            self._last = self._nearest(request, task, target, distant=self._refused > refused)
+            plan = self._nearest(request, task, target, distant=self._refused > refused)
+            if (last is None or request.search) and self._demands and request.here.size:
+                plan = replace(plan, tip_first=tuple(plan.pressures.tolist()))
+            self._last = plan
         return self._last
 
     def _braced(self, request: PlanRequest, task: Task, asked: Target) -> Plan | None:
@@ -251,9 +259,13 @@ class Planning:
         It may go all the same if it is not at the target now.
         """
         here, there = last.pressures, np.asarray(solution.pressures)
-        _, distance, angle = self._search.find(target, self._limits, here)
-        is_off = distance > _REACHED.position or angle > _REACHED.angle
-        return is_off or bool(self._changes.way_on(target, self._limits, here, there))
+        at_target = self._at_target(target, here)
+        return at_target is None or bool(self._changes.way_on(target, self._limits, here, there))
+
+    def _at_target(self, target: Target, here: Array, **options: bool) -> Array | None:
+        """Return pressures (n,) near others that have the tip at its target; None without any."""
+        found, distance, angle = self._search.find(target, self._limits, here, **options)
+        return None if distance > _REACHED.position or angle > _REACHED.angle else found
 
     def _is_distant(self, last: Plan, pressures: Array, target: Target) -> bool:
         """Return True if pressures (n,) are too far from the last plan for one configuration."""
@@ -263,7 +275,7 @@ class Planning:
         return float(np.max(np.abs(pressures - last.pressures))) > reach
 
     def _tip_first(
-        self, request: PlanRequest, task: Task, target: Target, stiffest: Array, best: float
+        self, request: PlanRequest, target: Target, stiffest: Array, best: float
     ) -> Array:
         """Return the pressures (n,) to which the arm goes before the stiffest ones (n,).
 
@@ -272,32 +284,64 @@ class Planning:
         way and as fast; so would the fault of one. The arm goes on from there as to another
         configuration, or from the first place on that way that has a share of the stiffness `best`.
 
-        A task that demands a stiffness, or a press, needs the stiffest pressures at once. On a rig
-        with a scene the arm goes there straight if it would come too near to the scene otherwise.
+        What a task demands is met there as well, and on the rest of the way. If there is no such
+        place, the arm goes straight, with channels as slow as on the tip's way.
+
+        On a rig with a scene the arm goes straight, and as fast as it can, if it would come too
+        near to the scene otherwise.
         """
-        goal, tuning = task.stiffness, self._tuning
-        demands = task.press is not None or (goal is not None and (goal.at_least or goal.match))
-        if not request.here.size or demands:
+        if not request.here.size:
             return stiffest
-        found, distance, angle = self._search.find(
-            target, self._limits, request.here, least_motion=True
-        )
-        if distance > _REACHED.position or angle > _REACHED.angle:
-            return stiffest
-        way = self._changes.way_on(target, self._limits, found, stiffest)
-        while way and self._is_soft(way[0], tuning.soft * best):
+        found = self._at_target(target, request.here, least_motion=True)
+        way = [] if found is None else self._changes.way_on(target, self._limits, found, stiffest)
+        while way and self._is_soft(way[0], self._tuning.soft * best):
             way = way[1:]
+        if self._demands:
+            way = [*self._as_demanded(way), stiffest]
         if not way or self._blocked(request, *way, stiffest):
             return stiffest
         self._changes.begin(stiffest, tuple(way[0].tolist()))
         return way[0]
 
+    def _on_the_way(
+        self, request: PlanRequest, last: Plan, stiffest: Array, target: Target
+    ) -> Array:
+        """Return the next pressures (n,) of the change to the stiffest ones (n,).
+
+        Where the target has moved, the way may no longer have what the task demands. Then the arm
+        goes straight.
+        """
+        pressures = self._changes.next(request, last, stiffest, target, self._limits)
+        if not self._demands or not self._demands.are_missed(self._tip.at(pressures)):
+            return pressures
+        self._changes.end()
+        if request.here.size:
+            self._changes.begin(stiffest, tuple(stiffest.tolist()))
+        return stiffest
+
+    def _as_demanded(self, way: list[Array]) -> list[Array]:
+        """Return the last part of a way (k, n) on which the tip has what the task demands.
+
+        Where it begins, there is a margin.
+        """
+        begin = len(way)
+        for index, place in reversed(list(enumerate(way))):
+            tip = self._tip.at(place)
+            if self._demands.are_missed(tip):
+                break
+            if self._demands.are_clearly_met(tip):
+                begin = index
+        return way[begin:]
+
     def _is_soft(self, pressures: Array, least: float) -> bool:
         """Return whether the task's stiffness at pressures (n,) is less than `least`."""
+        return self._stiffness is not None and self._stiffness_at(self._tip.at(pressures)) < least
+
+    def _stiffness_at(self, tip: TipAt) -> float:
+        """Return the stiffness in the task's first direction; NaN if it has none."""
         if self._stiffness is None:
-            return False
-        tip = self._tip.at(pressures)
-        return self._stiffness(tip.compliance, tip.pose[:3, :3]) < least
+            return math.nan
+        return self._stiffness(tip.compliance, tip.pose[:3, :3])
 
     def _blocked(self, request: PlanRequest, *pressures: Array) -> str:
         """Return why the request's way and on to pressures (n,) is not clear of the scene."""
@@ -354,22 +398,30 @@ class Planning:
         start = 0.5 * (self._limits[0] + self._limits[1])
         if self._last is not None:
             start = np.clip(self._last.pressures, *self._limits)
+        elif self._demands and request.here.size:  # mostly only the stiffness is out of reach
+            start = np.clip(request.here, *self._limits)
         pressures, distance, angle = self._search.find(target, self._limits, start)
         tolerance = task.target.tolerance
         far = distance > tolerance.position or angle > tolerance.angle
-        stays, stiffness, short = request.stay and not far, math.nan, np.zeros(3)
-        if request.stay:
+        reached, stiffness, short = (request.stay and not far) or distant, math.nan, np.zeros(3)
+        if request.stay or distant:
             tip = self._tip.at(pressures)
-            if stays and self._stiffness is not None:
-                stiffness = self._stiffness(tip.compliance, tip.pose[:3, :3])
-            if target.position is not None:
+            stiffness = self._stiffness_at(tip) if reached else math.nan
+            if request.stay and target.position is not None:
                 away = np.array(target.position, dtype=float) - tip.pose[:3, 3]
                 short = np.nan_to_num(away)
         return Plan(
-            request.serial, pressures, request.offset, request.target, stays or distant, stiffness,
-            "" if stays else nearest_words(distance, angle, tolerance), far=far,
+            request.serial, pressures, request.offset, request.target, reached, stiffness,
+            "" if request.stay and not far else nearest_words(distance, angle, tolerance), far=far,
             short=tuple(short.tolist()), adapted=request.adapted,
         )  # fmt: skip
+
+    def _away(self, tolerance: Tolerance, target: Target, pressures: Array) -> str:
+        """Return how far the tip at pressures (n,) is from its target; empty if it is there."""
+        distance, angle = self._search.distance(target, pressures)
+        if distance <= tolerance.position and angle <= tolerance.angle:
+            return ""
+        return nearest_words(distance, angle, tolerance, "the tip")
 
     def _displacement(self, last: Plan, target: Target) -> Array:
         """Return by how much (3,) the model's target has moved since the last plan, in m."""

@@ -16,8 +16,10 @@ from stiffopt.arrays import Array
 from stiffopt.control.nearest_search import NearestSearch
 from stiffopt.control.plan import Plan, PlanRequest
 from stiffopt.control.tuning import FeedbackTuning, PlanningTuning
-from stiffopt.optimise.target import Target
+from stiffopt.optimise.target import Target, Tolerance
 from stiffopt.optimise.tip import TipModel
+
+_REACHED = Tolerance()  # of a tip that is at its target
 
 
 @dataclass(frozen=True)
@@ -32,6 +34,7 @@ class _ChangeUnderWay:
     stays: bool = True  # whether the target is that of the last plan
     left: float = math.inf  # least rest of the way so far, as the tip's motion by one channel, in m
     stalled: int = 0  # successive plans that came no nearer
+    is_direct: bool = False  # whether it has no way but that of the reference to its end
     straight: bool = False  # whether plans lead straight to the end, as no other way was found
 
 
@@ -56,7 +59,7 @@ class PostureChanges:
 
     def begin(self, end: Array, tip_first: tuple[float, ...] = ()) -> None:
         """Begin a change to pressures (n,), in Pa; `tip_first` is that of its plans."""
-        self._change = _ChangeUnderWay(end, tip_first)
+        self._change = _ChangeUnderWay(end, tip_first, is_direct=tip_first == tuple(end.tolist()))
 
     def end(self) -> None:
         """End the change, wherever it is."""
@@ -66,6 +69,11 @@ class PostureChanges:
     def to(self) -> Array | None:
         """Pressures (n,), in Pa, to which the change leads; None without a change."""
         return None if self._change is None else self._change.end
+
+    @property
+    def leaves_target(self) -> bool:
+        """Whether the change goes straight to its end, so that the tip leaves its target."""
+        return self._change is not None and self._change.straight
 
     @property
     def tip_first(self) -> tuple[float, ...]:
@@ -131,8 +139,8 @@ class PostureChanges:
     ) -> Array:
         """Return the next pressures (n,) on the way to others (n,), in Pa.
 
-        The change is slower while the offset changes. If the way comes no nearer to its end, the
-        arm goes there straight, as slowly.
+        The change is slower while the offset changes. If the way comes no nearer to its end, or
+        the tip is not at its target there, the arm soon goes straight to the end, as slowly.
         """
         change, tuning, way = self._change, self._tuning, end - last.pressures
         assert change is not None  # there is a change under way
@@ -140,10 +148,15 @@ class PostureChanges:
         drift = float(np.linalg.norm((request.offset - last.offset)[:3]))
         step = tuning.change_step * min(1.0, (change.plans + 1) / tuning.change_growth)
         step *= min(1.0, tuning.at_rest / max(drift, 1e-9))
-        goes_on = left < change.left - tuning.change_progress * step
-        if last.target != request.target or left > change.left + step:  # another way
+        straight_on = last.pressures + min(1.0, step / max(left, 1e-9)) * way
+        is_moved, at_target, is_there = last.target != request.target, straight_on, True
+        if left > step and (is_moved or not change.straight):
+            at_target, distance, angle = self._search.find(target, limits, straight_on)
+            is_there = distance <= _REACHED.position and angle <= _REACHED.angle
+        goes_on = is_there and left < change.left - tuning.change_progress * step
+        if is_there and (is_moved or left > change.left + step):  # another way
             goes_on, change = True, replace(change, straight=False)
-        stalled = 0 if goes_on else change.stalled + (drift <= tuning.at_rest)
+        stalled = 0 if goes_on or left <= step else change.stalled + (drift <= tuning.at_rest)
         change = replace(
             change,
             end=end,
@@ -154,10 +167,10 @@ class PostureChanges:
             over=change.over or left <= step,
         )
         is_over = left <= step and float(np.linalg.norm(change.drift[:3])) < tuning.at_rest / 10
+        if is_over and change.is_direct:
+            is_over = self._motion(request.here, end - request.here) <= tuning.change_step
         self._change = None if is_over else change
         if left <= step:
             return end
-        ahead = last.pressures + step / left * way
-        if change.straight:
-            return np.asarray(np.clip(ahead, *limits))
-        return self._search.find(target, limits, ahead)[0]
+        is_straight = self._change is not None and self._change.straight
+        return np.asarray(np.clip(straight_on, *limits)) if is_straight else at_target

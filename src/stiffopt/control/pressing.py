@@ -143,6 +143,10 @@ class Pressing:
         self._offset = self._offset + change
         self._watch.change_model(change)
 
+    def change_posture(self, moved: float) -> None:
+        """Take in by how much a change of posture has moved the tip by its channels, in m."""
+        self._watch.change_posture(moved)
+
     def advance(
         self,
         elapsed: float,
@@ -161,7 +165,7 @@ class Pressing:
         Parameters
         ----------
         elapsed : time since the last tick, in s.
-        arrived : whether the arm rests at its target.
+        arrived : whether the arm rests at its target, as stiff as planned.
         known : whether no better estimate of its stiffness is due soon.
         tip, offset : position (3,) of the tip, in m, and its offset (6,) from the model.
         felt : estimated force on the tip.

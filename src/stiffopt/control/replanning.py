@@ -65,6 +65,12 @@ class Pursuit:
         """Return the target at a time, in s."""
         return self.target if self.course is None else self.course.at(now)
 
+    @property
+    def demands(self) -> bool:
+        """Whether the task demands a stiffness."""
+        goal = None if self.task is None else self.task.stiffness
+        return goal is not None and bool(goal.at_least or goal.match)
+
     def is_new_after(self, before: Pursuit) -> bool:
         """Whether planning starts from scratch, not from the last plan."""
         if self.task is not before.task or before.target is None:
@@ -181,6 +187,8 @@ class Replanner:
         windows: tuple[Window, ...] = (),
         here: Array | None = None,
         most: float = math.inf,
+        *,
+        waits: bool = False,
     ) -> Array | None:
         """Request a plan when it is time; return the newest.
 
@@ -197,10 +205,14 @@ class Replanner:
         way : see `PlanRequest`; None without a scene.
         windows, here : see `PlanRequest`; `here` is None for an arm that does not vibrate.
         most : largest change of the tip's position, in m, that plans begin to follow at once.
+        waits : whether the reference waits; then plans that make the arm stiff do not go on.
         """
         task, target = self.pursuit.task, self.pursuit.target
         interval = self._tuning.interval
-        if task is not None and target is not None and now - self._requested_at >= interval - 1e-6:
+        is_due = now - self._requested_at >= interval - 1e-6
+        if waits and self.stiffens and not self._search:
+            is_due = False
+        if task is not None and target is not None and is_due:
             self._note_available(available)
             detour, course = self._detour, self.pursuit.course
             search = self._search and course is None and detour is None
@@ -299,13 +311,16 @@ class Replanner:
             if away is not None and task is not None:
                 message = nearest_words(*away, task.target.tolerance, "the tip")
             text = "the target cannot be reached"
-            goal = None if task is None else task.stiffness
-            if not plan.far and goal is not None and (goal.at_least or goal.match):
+            if not plan.far and self.pursuit.demands:
                 text += " with the stiffness that is asked for"
+                message = message if away else "the tip goes there without it"
             elif not plan.far:
                 text = "no optimum is found for the target, only pressures that lead near it"
             text = f"{text}: {message}"
             notices = (*notices, Notice("unreachable", text, standing=True))
+        if plan is not None and is_final and plan.reached and plan.far:
+            text = f"the arm goes to other pressures for its target; until then {plan.message}"
+            notices = (*notices, Notice("changes-posture", text, standing=True))
         limited = self.adapted is not None and self.adapted.limits is not None
         if limited and (self.known is None or self.known.is_limited):
             notices = (*notices, Notice("too-soft", _TOO_SOFT, standing=True))

@@ -5,9 +5,7 @@ It has no threads and no clock of its own: `ControlLoop` makes its calls one at 
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -21,6 +19,7 @@ from stiffopt.control.arming import (
 )
 from stiffopt.control.checks import highest_pressures, refusing
 from stiffopt.control.gauge_watch import GaugeWatch
+from stiffopt.control.holding import HoldReason, Holds, Ramp, RecentCommands
 from stiffopt.control.interface import Controller, ControlOutput
 from stiffopt.control.lifecycle import Alarms, EventBuffer, Lifecycle
 from stiffopt.control.noticing_tuning import SupervisionTuning
@@ -37,47 +36,6 @@ from stiffopt.safety.expected_pressure import Regulation
 from stiffopt.safety.gate import Outlet, let_down
 from stiffopt.safety.monitors import PressureMonitor, Trouble
 from stiffopt.safety.realtime import load_of_processors
-
-
-@dataclass(frozen=True)
-class _Hold:
-    """The reason for holding the pressures; only a request ends a `lasting` hold.
-
-    `undo` is the share of the latest motion to undo.
-    """
-
-    reason: str
-    lasting: bool = False
-    undo: float = 0.0
-
-
-@dataclass(frozen=True)
-class _Ramp:
-    """Lets pressures (n,) down from the time `begin` on, within a duration in s.
-
-    `stages` (k, n) are the shares of the pressures left at equal intervals, from 1 to 0.
-    """
-
-    begin: float
-    duration: float
-    pressures: Array
-    reason: str
-    stages: Array
-
-    def progress(self, now: float) -> float:
-        """Return the progress of the ramp at a time, from 0 to 1.
-
-        It is 0 before `begin`: a request during a tick begins a ramp later than that tick's `now`.
-        """
-        return min(max((now - self.begin) / self.duration, 0.0), 1.0)
-
-    def share(self, now: float) -> Array:
-        """Return the shares (n,) of the pressures that are left at a time."""
-        last = len(self.stages) - 1
-        place = self.progress(now) * last
-        before = min(int(place), last - 1)
-        after = place - before
-        return (1 - after) * self.stages[before] + after * self.stages[before + 1]
 
 
 class Supervisor:
@@ -117,9 +75,7 @@ class Supervisor:
         self._zero: Array = np.zeros(n)
         self.commanded: Array = self._zero  # set-points (n,) of the supply, in Pa
         self._requested: Array = self._zero  # the same before the outlet limited them
-        # the latest set-points, over the time by which the chambers may lag behind them
-        lag = int(np.ceil(tuning.chamber_lag / period))
-        self._recent: deque[Array] = deque([self._zero], maxlen=max(2, lag))
+        self._recent = RecentCommands(n, period, tuning)
         self._held: Array | None = None
         self._stops = False  # whether the controller has begun to stop a doubted motion
         # the latest reading; NaN before the first one, and for implausible values
@@ -128,17 +84,14 @@ class Supervisor:
         self.rejected = 0  # number of these samples that were rejected
         self.saturated = self._no_channels  # (n,) at a limit that keeps them from their goal
         self._returned_reading: PressureReading | None = None  # of the last command
-        self._holds: dict[str, _Hold] = {}  # by kind
-        # begin and end of the last series of holds that no client asked for, in s
-        self._held_since = self._held_until = -np.inf
-        self._ramp: _Ramp | None = None
+        self._holds = Holds(tuning)
+        self._ramp: Ramp | None = None
         self.vented = True  # the supply's last accepted command was to vent
         self._trouble: Trouble | None = None
         self._failures = 0  # of the controller, in succession
         self._leans = False  # whether the arm may touch objects of the scene
         self._force_limited_at = -np.inf
         self._alarm_kinds: frozenset[str] = frozenset()
-        self._doubted_at = -np.inf
         self._ticked_at = self._clock.now()
 
     # -- a tick ---------------------------------------------------------------------------------
@@ -202,7 +155,7 @@ class Supervisor:
 
     def _note_commanded(self, now: float, pressures: Array) -> None:
         self.commanded = pressures
-        self._recent.append(pressures)
+        self._recent.add(pressures)
         self._monitor.tell(now, pressures)
 
     def _measure(self, now: float) -> None:
@@ -278,7 +231,7 @@ class Supervisor:
             return
         sight = self._tracker.sight(now)
         if sight is Sight.SEEN:
-            if self._holds.pop("tracker", None) is not None:
+            if self._holds.remove("tracker"):
                 self._resume(now)
         elif sight is Sight.MISSING:
             self._hold(now, "tracker", "the tracker does not see the tip")
@@ -327,7 +280,9 @@ class Supervisor:
                 self._command(now, stopping)
                 return
             if self._held is None:  # only once: a late reading must not change them
-                self._held = self.commanded if self._stops else self._present_pressures()
+                undo = 0.0 if self._holds.doubt is None else self._holds.doubt.undo
+                stopping = self._recent.stopping(self.reading.pressures, self._requested, undo)
+                self._held = self.commanded if self._stops else stopping
             self._command(now, self._held)
             return
         if not ramp.progress(now) < 1 - 1e-9:
@@ -337,7 +292,7 @@ class Supervisor:
 
     def _stopping_pressures(self, now: float) -> Array | None:
         """Return pressures (n,) that bring a doubted motion to rest; None where it rests."""
-        if "doubt" not in self._holds or now - self._doubted_at > self._tuning.longest_stop:
+        if not self._holds.may_stop(now):
             return None
         pressures = self.controller.stop(now)
         if pressures is None or not self._makes_sense(pressures):
@@ -345,31 +300,11 @@ class Supervisor:
         self._stops = True
         return pressures
 
-    def _present_pressures(self) -> Array:
-        """Return pressures (n,) that stop the arm, in Pa.
-
-        Chambers lag behind commands, so these are the measured pressures. Whatever the gauges read,
-        none is above or below all recent commands. A motion that is doubted is undone, wholly or by
-        a share: the arm goes back towards the first of the recent commands.
-        """
-        last, lowest = np.minimum(self._requested, self.commanded), np.min(self._recent, axis=0)
-        measured = np.clip(self.reading.pressures, lowest, np.max(self._recent, axis=0))
-        falls = measured - last > self._tuning.falls  # False for NaN: not measured
-        held: Array = np.where(falls, measured, np.fmin(measured, last))
-        if (doubt := self._holds.get("doubt")) is not None:
-            held = held + doubt.undo * (self._recent[0] - held)
-        return held
-
     def _end_a_long_hold(self, now: float) -> None:
         """Let down after `Safety.hold_timeout`, unless a client asked for the hold."""
         limit = self._safety.hold_timeout
-        own = [hold for hold in self._holds.values() if not hold.lasting]
-        if self._ramp is not None or not own:
-            return
-        self._held_until = now
-        if limit is not None and now - self._held_since >= limit:
-            text = f"held for {limit:g} s, and still: {own[0].reason}"
-            self._let_down(now, "hold-timeout", text)
+        if self._ramp is None and (reason := self._holds.exceeded(now, limit)) is not None:
+            self._let_down(now, "hold-timeout", f"held for {limit:g} s, and still: {reason}")
 
     def _command(self, now: float, pressures: Array, *, controlled: bool = False) -> bool:
         """Hand pressures (n,) to the outlet; return whether it accepted them."""
@@ -414,11 +349,10 @@ class Supervisor:
                 self.alarms.set(now, notice.kind, notice.text, severity)
             else:
                 self.events.add(now, notice.kind, notice.text, notice.severity)
-            if notice.hold and self.lifecycle.armed and "doubt" not in self._holds:
+            if notice.hold and self.lifecycle.armed and self._holds.doubt is None:
                 self._hold(now, "doubt", notice.text, undo=notice.undo)
-                if now - self._doubted_at < self._tuning.doubt_memory:
+                if self._holds.doubted(now):
                     self._let_down(now, "doubt-again", f"again: {notice.text}")
-                self._doubted_at = now
         for kind in self._alarm_kinds - standing:
             self.alarms.clear(now, kind)
         self._alarm_kinds = standing
@@ -428,11 +362,8 @@ class Supervisor:
     def _hold(
         self, now: float, kind: str, reason: str, *, lasting: bool = False, undo: float = 0.0
     ) -> None:
-        if kind not in self._holds:
+        if self._holds.add(now, kind, HoldReason(reason, lasting, undo)):
             self.events.add(now, f"hold-{kind}", f"pressures are held: {reason}", Severity.WARNING)
-        if not lasting and now - self._held_until > self._tuning.hold_memory:
-            self._held_since = now
-        self._holds[kind] = _Hold(reason, lasting, undo)
         if self.lifecycle.state is State.ACTIVE:
             self._held, self._stops = None, False
             self.lifecycle.change(State.HOLDING, reason)
@@ -441,8 +372,8 @@ class Supervisor:
         """Control again if no reason to hold remains."""
         if self._ramp is not None or self.lifecycle.state is not State.HOLDING:
             return
-        if self._holds:
-            self.lifecycle.reason = next(iter(self._holds.values())).reason
+        if (reason := self._holds.reason) is not None:
+            self.lifecycle.reason = reason
             return
         self.controller.resume(now)
         self._failures = 0
@@ -456,7 +387,7 @@ class Supervisor:
         stages, warning = np.array([self._zero + 1, self._zero]), ""
         if self._clearance is not None and not self._leans:  # a braced arm scales all together
             stages, warning = self._clearance.way_down(self.commanded)
-        self._ramp = _Ramp(now, self._safety.ramp_time, self.commanded, reason, stages)
+        self._ramp = Ramp(now, self._safety.ramp_time, self.commanded, reason, stages)
         if self.lifecycle.state is State.ACTIVE:
             self.lifecycle.change(State.HOLDING, f"letting down: {reason}")
         else:
@@ -564,9 +495,8 @@ class Supervisor:
         self._monitor.clear()
         self._gauges.forget()
         self._tracker.begin(now)
-        self._doubted_at = self._held_since = self._held_until = -np.inf
         self._returned_reading, self._failures, self._ticked_at = None, 0, now
-        self._holds.clear()
+        self._holds.forget()
         self._leans = False
         self.lifecycle.change(State.ACTIVE)
         self.events.add(now, "armed", "armed: pressures may change from now on")
@@ -586,7 +516,7 @@ class Supervisor:
         self._permit_motion("set a task")
         highest = highest_pressures(task, self.outlet.limits)
         self.controller.set_task(task)
-        self._recent = deque([self.commanded], maxlen=self._recent.maxlen)
+        self._recent.forget()
         try:
             self.outlet.restrict(highest)
         except DeviceError as error:  # the controller has the task, but the gate does not
@@ -614,10 +544,9 @@ class Supervisor:
     def _go_on(self, now: float, event: str, text: str) -> None:
         if text:
             self.events.add(now, event, text)
-        for kind in ("asked", "solver", "clearance"):
-            self._holds.pop(kind, None)
+        self._holds.remove("asked", "solver", "clearance")
         if event != "target":  # a stream of targets must not end a doubt
-            self._holds.pop("doubt", None)
+            self._holds.remove("doubt")
         try:
             self._resume(now)
         except Exception as error:  # too late to refuse: the request is already pursued

@@ -129,6 +129,7 @@ class ReferenceTuning:
     # vibration, and the greatest mean speed of the tip by any channel, in m/s
     periods_to_target: float = 0.5
     channel_speed: float = 0.08
+    demanded_channel_speed: float = 0.05  # the same of a task that demands a stiffness
     # motion over which the model on the reference is not linearised again; see `LinearisedTip`
     model_range: float = 0.07
     # time by which a doubted motion of an arm that vibrates is taken back, in s
@@ -329,6 +330,8 @@ class PlanningTuning:
     change_jump: float = 3.0
     # least stiffness when the tip is at its target first, as a share of the best
     soft: float = 0.5
+    # share of a stiffness by which it has to be more than is demanded before the last plan
+    demand_margin: float = 0.01
     # plans by which feedback is late on such a way, share of the newest in the mean change of the
     # offset, and longest lead for it, in m
     lead: float = 8.0

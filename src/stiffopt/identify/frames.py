@@ -1,17 +1,14 @@
 """Find logs whose frame, or a body of whose tracker, was defined anew between logs.
 
-Tracking software defines a body by its markers, with an origin and axes as somebody chose them. If
-the body that is the frame is defined anew, all poses of later logs are moved alike, ``T X``. If the
-tip's body, or another tracked one, is, its poses are moved in its own axes, ``X G``.
-
-The arm of the robot file, with its shape corrected a little, is fitted to the other logs. One rigid
-motion has to bring the log, or several in a row, to where this arm is at their pressures. Where the
-evidence is not overwhelming, nothing is moved.
+The arm of the robot file, with its shape corrected a little, is fitted to the other logs. One
+motion (see `motions`) has to bring the log, or several in a row, to where this arm is at their
+pressures. Other channels in this log alone may explain it as well; these are told and not
+corrected. Where the evidence is not overwhelming, nothing is told.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -21,120 +18,34 @@ from numpy.typing import NDArray
 
 from stiffopt.arrays import Array
 from stiffopt.errors import EquilibriumError, PressureError
-from stiffopt.identify.detection import lagged_pressures
-from stiffopt.identify.discrepancy import centres
-from stiffopt.identify.hypotheses import Hypothesis, moved, of_channels, rows_with_all, turn_text
-from stiffopt.identify.recording import FRAME, Recording, Track
+from stiffopt.identify.detection import lagged_pressures, weightless
+from stiffopt.identify.hypotheses import Hypothesis, moved, of_channels, rows_with_all
+from stiffopt.identify.motions import (
+    NOWHERE,
+    Motion,
+    MotionKind,
+    Tracks,
+    apart,
+    are_both_moved,
+    best_motions,
+    different_poses,
+    in_line,
+    joined,
+    nearest_cube,
+    nearest_rotation,
+    of_rows,
+    tip_angles,
+    tip_distances,
+    turned_like,
+)
+from stiffopt.identify.recording import Recording, Track
 from stiffopt.identify.settings import DETECTION
 from stiffopt.identify.setup import Setup
 from stiffopt.identify.tracker_faults import CUBE_ROTATIONS, mean_rotation, whole
 from stiffopt.model.description import RobotDescription
 from stiffopt.model.manipulator import Manipulator
 
-SHOWN = 5e-4
-"""Shortest translation of a frame that is told, in m."""
-Tracks = tuple[Track, ...]
-"""Poses in the rows of a log, the tip's first, in the frame of the recordings."""
-
-
-@dataclass(frozen=True, eq=False)
-class Motion:
-    """A rigid motion that undoes a new definition of the frame or of a body in some logs.
-
-    Attributes
-    ----------
-    logs : indices of the logs.
-    track : index of the track whose body was defined anew; None for the frame of all tracks.
-    rotation : (3, 3), and
-    shift : (3,), in m. A pose ``X, x`` of the frame becomes ``R X, R x + s``, that of a body
-        ``X R, x + X s``.
-    """
-
-    logs: tuple[int, ...]
-    track: int | None
-    rotation: Array
-    shift: Array
-
-    def applied(self, recordings: Sequence[Recording]) -> list[Recording]:
-        """Return the recordings, with those of the logs moved."""
-        anew = FRAME if self.track is None else recordings[0].tracks[self.track].name
-        return [
-            replace(each, tracks=self.of(each.tracks), anew=anew) if i in self.logs else each
-            for i, each in enumerate(recordings)
-        ]
-
-    def of(self, tracks: Tracks) -> Tracks:
-        """Return the poses of a log after the motion."""
-        if self.track is None:
-            return moved(tracks, self.rotation, self.shift)
-        own = tracks[self.track]
-        assert own.rotation is not None
-        turned = Track(
-            own.name, own.position + own.rotation @ self.shift, own.rotation @ self.rotation
-        )
-        return (*tracks[: self.track], turned, *tracks[self.track + 1 :])
-
-    def told(self, recordings: Sequence[Recording]) -> str:
-        """Describe the motion, as the beginning of a sentence."""
-        names = ", ".join(recordings[i].name for i in self.logs)
-        words = motion_text(self.rotation, self.shift)
-        if self.track is None:
-            return f"the frame of {names} was defined anew: its poses are {words}"
-        body = recordings[0].tracks[self.track].name
-        return f"the body '{body}' was defined anew in {names}: it is {words} in its own axes"
-
-
-def motion_text(rotation: Array, shift: Array) -> str:
-    """Describe a rigid motion, as the end of a sentence."""
-    words = f"turned {turn_text(rotation)}"
-    if np.linalg.norm(shift) > SHOWN:
-        words += f" and moved by {np.linalg.norm(shift) * 1e3:.0f} mm"
-    return words
-
-
-NOWHERE = Motion((), None, np.eye(3), np.zeros(3))
-"""Moves no log."""
-
-
-def _points(tracks: Sequence[Track], lever: float) -> Array:
-    """Return the origins of the bodies, and points on their axes at a distance: (N, m, 3)."""
-    found = []
-    for each in tracks:
-        origin = each.position[:, np.newaxis]
-        found.append(origin)
-        if each.rotation is not None:
-            found.append(origin + lever * each.rotation.swapaxes(1, 2))
-    return np.concatenate(found, axis=1)
-
-
-def _turned_like(tracks: Tracks, expected: Tracks) -> Tracks:
-    """Return poses with that rotation of the cube in each body's axes that is nearest."""
-    return tuple(
-        own
-        if own.rotation is None or other.rotation is None
-        else replace(own, rotation=own.rotation @ _nearest_cube(own.rotation, other.rotation))
-        for own, other in zip(tracks, expected, strict=True)
-    )
-
-
-def _nearest_cube(own: Array, expected: Array) -> Array:
-    """Return the rotation of the cube that brings rotations (N, 3, 3) nearest to others."""
-    between = np.einsum("nji,njk->ik", expected, own)
-    return CUBE_ROTATIONS[np.argmax(np.einsum("ij,gji->g", between, CUBE_ROTATIONS))]
-
-
-def _tip_distances(one: Tracks, other: Tracks) -> Array:
-    """Return the distances (N,) of the tips of two poses, in m."""
-    return np.asarray(np.linalg.norm(one[0].position - other[0].position, axis=1))
-
-
-def _angles(one: Tracks, other: Tracks) -> Array:
-    """Return the angles (N,) between the tips of two poses, in rad; zero if they are not known."""
-    own, expected = one[0].rotation, other[0].rotation
-    if own is None or expected is None:
-        return np.zeros(len(one[0].position))
-    cosine = (np.einsum("nij,nij->n", own, expected) - 1) / 2
-    return np.asarray(np.arccos(np.clip(cosine, -1, 1)))
+Logs = tuple[int, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,21 +54,31 @@ class _Tried:
 
     Attributes
     ----------
-    motion : `NOWHERE` if the logs are left as they are.
     logs : which were not fitted.
+    motion : `NOWHERE` if they are left as they are.
     softness : factor on pressures.
     expected, recorded, after : poses in each log: by the arm, as recorded, and after the motion.
-    score : RMS distance of points on the bodies, as a mean over all logs, in m.
+    misses : (logs,), RMS distance of points on the bodies after the motion, in m.
     far : mean distance by which the fit moves the tip of the robot file's arm, in m.
     """
 
+    logs: Logs
     motion: Motion
     softness: float
     expected: list[Tracks]
     recorded: list[Tracks]
     after: list[Tracks]
-    score: float
+    misses: Array
     far: float
+
+    def score(self, logs: Logs | None = None) -> float:
+        """Return the RMS miss of some logs, or of all, in m."""
+        return _rms(self.misses if logs is None else self.misses[list(logs)])
+
+    def mean(self, measure: Callable[[Tracks, Tracks], Array], poses: Sequence[Tracks]) -> float:
+        """Return the mean of a measure between poses and the expected ones, over the logs."""
+        found = [measure(poses[i], self.expected[i]) for i in self.logs]
+        return float(np.concatenate(found).mean())
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,7 +86,7 @@ class MovedFrame:
     """An accepted motion.
 
     `as_is`, `then`: mean misses of the tip without it and with it, in m; `turned_as_is`,
-    `turned_then`: of its orientation, in rad; `score`: see `FrameComparer`.
+    `turned_then`: of its orientation, in rad; `score`: see `FrameComparer.score`.
     """
 
     motion: Motion
@@ -191,11 +112,11 @@ class MovedFrame:
 class OtherChannels:
     """Logs that have other channels than the others do, or other lines, rather than a moved frame.
 
-    `as_is`, `then`: mean misses of the tip without and with these; `left`: of its pose; `score`: as
-    of `FrameComparer`; in m.
+    `as_is`, `then`: mean misses of the tip without and with these; `left`: of its pose; `score`:
+    see `FrameComparer.score`; in m.
     """
 
-    logs: tuple[int, ...]
+    logs: Logs
     hypothesis: Hypothesis
     as_is: float
     then: float
@@ -224,7 +145,6 @@ class FrameComparer:
     def __init__(self, setup: Setup) -> None:
         description = setup.description
         self._setup, self._length = setup, description.length
-        self._lever = DETECTION.frame_lever * description.length
         self._arm = Manipulator(description.model_copy(update={"calibration": None}))
         stations = [description.length if each.at is None else each.at for each in setup.points]
         ends = np.cumsum([segment.length for segment in description.segments])
@@ -249,14 +169,7 @@ class FrameComparer:
             self._pressures.append(
                 lagged_pressures(each.time, each.pressures, DETECTION.clock_lag)[rows]
             )
-            self._recorded.append(tuple(
-                replace(
-                    t,
-                    position=t.position[rows],
-                    rotation=None if t.rotation is None else t.rotation[rows],
-                )
-                for t in tracks
-            ))  # fmt: skip
+            self._recorded.append(of_rows(tuple(tracks), rows))
 
     @cached_property
     def _predicted(self) -> dict[float, list[Array]]:
@@ -275,11 +188,9 @@ class FrameComparer:
         except (EquilibriumError, PressureError):
             return None
 
-    def score(self) -> float:
-        """Return the RMS miss of all logs by the arm fitted to them, in m."""
-        everything = range(len(self._pressures))
-        scores = [self._tried(each, everything, NOWHERE).score for each in self._predicted.values()]
-        return min(scores, default=np.inf)
+    def score(self, logs: Logs | None = None) -> float:
+        """Return the RMS miss of some logs, or of all, by the arm fitted to all of them, in m."""
+        return min((each.score(logs) for each in self._unmoved(())), default=np.inf)
 
     def turned(self, turns: Sequence[int]) -> FrameComparer:
         """Return the comparer of the logs whose axes are turned; see `Hypothesis.turns`."""
@@ -291,12 +202,10 @@ class FrameComparer:
         ]
         return other
 
-    def left(self, logs: tuple[int, ...]) -> float:
+    def left(self, logs: Logs) -> float:
         """Return the mean miss of some logs by the arm fitted to the others, in m."""
-        rest = [i for i in range(len(self._pressures)) if i not in logs]
-        tried = [self._tried(each, rest, NOWHERE) for each in self._predicted.values()]
-        best = min(tried, key=lambda each: each.score)
-        return self._mean(best, best.recorded, self._off, logs)
+        best = min(self._unmoved(logs), key=_Tried.score)
+        return best.mean(self._off, best.recorded)
 
     # the shape of the arm ----------------------------------------------------------------------
 
@@ -326,7 +235,7 @@ class FrameComparer:
                 distance = np.linalg.norm(off - features @ coefficients, axis=1)
                 median = max(float(np.median(distance)), 1e-9)
                 weight = 1 / np.sqrt(1 + (distance / median) ** 2)
-            start = _nearest_rotation(
+            start = nearest_rotation(
                 own, own + features @ coefficients, DETECTION.known_turn * self._length
             )
             rotations = self._expected_rotations(poses, fitted, k, start)
@@ -352,7 +261,7 @@ class FrameComparer:
         arm = np.concatenate([own[i] for i in fitted])
         for _ in range(DETECTION.clock_rounds):
             known = np.concatenate([
-                each @ _nearest_cube(each, base @ own[i] @ sensor)
+                each @ nearest_cube(each, base @ own[i] @ sensor)
                 for i, each in zip(fitted, measured, strict=True)
             ])  # fmt: skip
             sensor = mean_rotation(arm.swapaxes(1, 2) @ base.T @ known)
@@ -361,194 +270,228 @@ class FrameComparer:
 
     # motions -----------------------------------------------------------------------------------
 
-    def _tried(
-        self,
-        poses: list[Array],
-        fitted: Sequence[int],
-        motion: Motion,
-        expected: list[Tracks] | None = None,
-    ) -> _Tried:
-        """Return what a motion leaves."""
-        expected = self._expected(poses, fitted) if expected is None else expected
-        recorded = [_turned_like(*each) for each in zip(self._recorded, expected, strict=True)]
-        after = list(recorded)
-        for i in motion.logs:
-            after[i] = _turned_like(motion.of(self._recorded[i]), expected[i])
-        squares = [np.mean(self._off(a, e) ** 2) for a, e in zip(after, expected, strict=True)]
-        tips = [
-            np.linalg.norm(expected[i][0].position - poses[i][:, 0, :3, 3], axis=1).mean()
-            for i in fitted
-        ]
-        score, far = float(np.sqrt(np.mean(squares))), float(np.mean(tips))
-        return _Tried(motion, 1.0, expected, recorded, after, score, far)
+    def _rest(self, logs: Logs) -> Logs:
+        return tuple(i for i in range(len(self._pressures)) if i not in logs)
 
     def _off(self, one: Tracks, other: Tracks) -> Array:
-        """Return the RMS distances (N,) of points on the bodies between two poses, in m."""
-        apart = _points(one, self._lever) - _points(other, self._lever)
-        return np.asarray(np.sqrt((apart**2).sum(axis=2).mean(axis=1)))
+        return apart(one, other, self._length)
 
-    def _of_frame(self, logs: tuple[int, ...], expected: list[Tracks]) -> Motion:
-        """Return the motion of all tracks that brings logs nearest to the expected poses.
+    def _unmoved(self, logs: Logs) -> list[_Tried]:
+        """Return what the arm fitted to the other logs leaves, for each softness."""
+        return [
+            self._tried(softness, poses, logs, NOWHERE, self._expected(poses, self._rest(logs)))
+            for softness, poses in self._predicted.items()
+        ]
 
-        Flips of the bodies may leave all orientations of a log turned by one rotation of the cube.
-        """
-        known = DETECTION.known_turn * self._length
-        target = np.concatenate([_points(expected[i], self._lever).reshape(-1, 3) for i in logs])
-        best, least = (np.eye(3), np.zeros(3)), np.inf
-        for cube in CUBE_ROTATIONS if any(self._turns) else CUBE_ROTATIONS[:1]:
-            turned = [
-                [t if t.rotation is None else replace(t, rotation=t.rotation @ cube) for t in own]
-                for own in (self._recorded[i] for i in logs)
-            ]
-            source = np.concatenate([_points(own, self._lever).reshape(-1, 3) for own in turned])
-            rotation = _nearest_rotation(source, target, known)
-            shift = target.mean(axis=0) - rotation @ source.mean(axis=0)
-            left = float(np.mean((source @ rotation.T + shift - target) ** 2))
-            if left < least:
-                best, least = (rotation, shift), left
-        return Motion(logs, None, *best)
+    def _moved(self, logs: Logs) -> list[_Tried]:
+        """Return the best motion of each kind of some logs, by the arm fitted to the others."""
+        found: dict[MotionKind, _Tried] = {}
+        own = joined([self._recorded[i] for i in logs])
+        for softness, poses in self._predicted.items():
+            expected = self._expected(poses, self._rest(logs))
+            wanted = joined([expected[i] for i in logs])
+            for motion in best_motions(logs, own, wanted, self._length):
+                tried = self._tried(softness, poses, logs, motion, expected)
+                if motion.kind not in found or tried.score() < found[motion.kind].score():
+                    found[motion.kind] = tried
+        return list(found.values())
 
-    def _of_body(self, logs: tuple[int, ...], k: int, expected: list[Tracks]) -> Motion:
-        """Return the motion of a track in its own axes that brings it nearest to the expected."""
-        own, wanted, off = [], [], []
-        for i in logs:
-            recorded, other = self._recorded[i][k], expected[i][k]
-            assert recorded.rotation is not None
-            assert other.rotation is not None
-            own.append(recorded.rotation)
-            wanted.append(other.rotation)
-            off.append(other.position - recorded.position)
-        rotation = np.concatenate(own)
-        turn = mean_rotation(rotation.swapaxes(1, 2) @ np.concatenate(wanted))
-        shift = np.einsum("nji,nj->i", rotation, np.concatenate(off)) / len(rotation)
-        return Motion(logs, k, turn, shift)
-
-    def _all_tried(self) -> Iterator[_Tried]:
-        """Yield the best motion of each kind, of each log and of at most half of them in a row."""
-        count = len(self._pressures)
-        for begin in range(count):
-            for end in range(begin + 1, min(count, begin + count // 2) + 1):
-                logs = tuple(range(begin, end))
-                rest = [i for i in range(count) if i not in logs]
-                tried: dict[int | None, _Tried] = {}
-                for softness, poses in self._predicted.items():
-                    expected = self._expected(poses, rest)
-                    motions = [self._of_frame(logs, expected)]
-                    motions += [
-                        self._of_body(logs, k, expected)
-                        for k, turns in enumerate(self._turns)
-                        if turns
-                    ]
-                    for motion in motions:
-                        found = self._tried(poses, rest, motion, expected)
-                        if motion.track not in tried or found.score < tried[motion.track].score:
-                            tried[motion.track] = replace(found, softness=softness)
-                yield from tried.values()
+    def _tried(
+        self,
+        softness: float,
+        poses: list[Array],
+        logs: Logs,
+        motion: Motion,
+        expected: list[Tracks],
+    ) -> _Tried:
+        """Return what a motion leaves."""
+        recorded = [turned_like(*each) for each in zip(self._recorded, expected, strict=True)]
+        after = list(recorded)
+        for i in motion.logs:
+            after[i] = turned_like(motion.of(self._recorded[i]), expected[i])
+        misses = [
+            np.sqrt(np.mean(self._off(*each) ** 2)) for each in zip(after, expected, strict=True)
+        ]
+        far = [
+            np.linalg.norm(expected[i][0].position - poses[i][:, 0, :3, 3], axis=1).mean()
+            for i in self._rest(logs)
+        ]
+        return _Tried(
+            logs, motion, softness, expected, recorded, after, np.array(misses), float(np.mean(far))
+        )
 
     def found(self) -> MovedFrame | OtherChannels | None:
         """Return the motion that the evidence proves; None if there is none or it is unclear.
 
         Channels that explain the same logs as well are returned instead.
         """
-        ranked = sorted(self._all_tried(), key=lambda each: each.score)
-        if not ranked or self.score() * DETECTION.tie < ranked[0].score:
+        alone = [each for i in range(len(self._pressures)) for each in self._moved((i,))]
+        if not alone:
             return None
-        best = ranked[0]
-        everything = set(range(len(self._pressures)))
-        for each in ranked[1:]:
-            same = each.motion.track == best.motion.track
-            if same and set(each.motion.logs) == everything - set(best.motion.logs):
-                best = min(best, each, key=lambda either: either.far)  # the file's frame stays
-            elif each.motion.logs == best.motion.logs:
-                left, other = (self._mean(one, one.after, self._off) for one in (best, each))
-                if left > DETECTION.tie * other:
-                    return None
-            elif best.score > DETECTION.tie * each.score:
-                return None
-        if not self._explains(best):
-            return None
-        channels = self.other_channels(best.motion.logs, best.softness)
-        if channels is not None and best.score > DETECTION.tie * channels.score:
+        best = self._widened(min(alone, key=_Tried.score))
+        others = [each for each in self._moved(best.logs) if each.motion.kind != best.motion.kind]
+        left = best.score(best.logs)
+        is_clear = all(left <= DETECTION.tie * each.score(best.logs) for each in others)
+        is_clear = is_clear and not self._has_both(best)
+        if not (is_clear and self._is_judged(best, best.misses) and self._explains(best)):
+            return self._channels_alone()
+        channels = self.other_channels(best.logs, best.softness)
+        if channels is not None and best.score() > DETECTION.tie * channels.score:
             return channels
-        tips = [self._mean(best, poses, _tip_distances) for poses in (best.recorded, best.after)]
-        turned = [self._mean(best, poses, _angles) for poses in (best.recorded, best.after)]
-        return MovedFrame(best.motion, tips[0], tips[1], turned[0], turned[1], best.score)
+        tips = [best.mean(tip_distances, poses) for poses in (best.recorded, best.after)]
+        turned = [best.mean(tip_angles, poses) for poses in (best.recorded, best.after)]
+        return MovedFrame(best.motion, tips[0], tips[1], turned[0], turned[1], best.score())
 
-    @staticmethod
-    def _mean(
-        tried: _Tried,
-        poses: Sequence[Tracks],
-        measure: Callable[[Tracks, Tracks], Array],
-        logs: Sequence[int] = (),
-    ) -> float:
-        """Return the mean of a measure between poses and the expected ones, over the moved logs."""
-        logs = logs or tried.motion.logs
-        return float(np.concatenate([measure(poses[i], tried.expected[i]) for i in logs]).mean())
+    def _widened(self, best: _Tried) -> _Tried:
+        """Return the same kind of motion, of more logs in a row as long as this fits better.
+
+        Of two halves that differ the one is moved that agrees less with the robot file.
+        """
+        count = len(self._pressures)
+
+        def alike(logs: Logs) -> list[_Tried]:
+            return [each for each in self._moved(logs) if each.motion.kind == best.motion.kind]
+
+        while len(best.logs) < count // 2:
+            begin, end = best.logs[0], best.logs[-1] + 1
+            wider = [(begin - 1, *best.logs)] if begin else []
+            wider += [(*best.logs, end)] if end < count else []
+            found = min((each for logs in wider for each in alike(logs)), key=_Tried.score)
+            if found.score() >= best.score():
+                break
+            best = found
+        if 2 * len(best.logs) == count:
+            best = min([best, *alike(self._rest(best.logs))], key=lambda each: each.far)
+        return best
+
+    def _is_judged(self, tried: _Tried, misses: Array) -> bool:
+        """Return True if most of the other logs agree, and an arm fitted to all logs does not.
+
+        Those that do not agree may have a fault of their own.
+        """
+        rest = self._rest(tried.logs)
+        tips = [tip_distances(tried.recorded[i], tried.expected[i]).mean() for i in rest]
+        agreeing = [
+            i for i, tip in zip(rest, tips, strict=True) if tip <= DETECTION.off * self._length
+        ]
+        if 2 * len(agreeing) <= len(rest):
+            return False
+        judged = (*tried.logs, *agreeing)
+        return _rms(misses[list(judged)]) <= DETECTION.tie * self.score(judged)
+
+    def _has_both(self, tried: _Tried) -> bool:
+        """Return True if frame and body were moved, so that each alone would be told wrongly."""
+        expected = joined([tried.expected[i] for i in tried.logs])
+        recorded = joined([self._recorded[i] for i in tried.logs])
+        left = tried.mean(self._off, tried.after)
+        return are_both_moved(left, recorded, expected, self._length)
 
     def _explains(self, tried: _Tried) -> bool:
-        """Return True if a motion is the reason why its logs are far off, at different poses.
-
-        As in `validation`: at least four, one of them near rest, where the pose of every arm is
-        known; poses on a line could be turned to fit any other arm, so all have to be moved.
-        """
-        limits = np.subtract(
-            self._setup.description.pressure_max, self._setup.description.pressure_min
+        """Return True if a motion is the reason why its logs are far off, at different poses."""
+        logs = tried.logs
+        rows = different_poses(
+            np.concatenate([self._pressures[i] for i in logs]), self._setup.description
         )
-        span, logs = float(limits.max()), tried.motion.logs
-        pressures = np.concatenate([self._pressures[i] for i in logs])
-        if np.abs(pressures).max(axis=1).min() > DETECTION.rest * span:
-            return False
-        rows = centres(pressures, DETECTION.apart * span, DETECTION.rows)
-        if len(rows) < DETECTION.poses:
+        if not len(rows):
             return False
         before, after = (
             np.concatenate([self._off(poses[i], tried.expected[i]) for i in logs])
             for poses in (tried.recorded, tried.after)
         )
-        turned, then = (
-            self._mean(tried, poses, _angles) for poses in (tried.recorded, tried.after)
-        )
+        turned, then = (tried.mean(tip_angles, poses) for poses in (tried.recorded, tried.after))
         tips = np.concatenate([tried.expected[i][0].position for i in logs])[rows]
-        spread = np.linalg.svd(tips - tips.mean(axis=0), compute_uv=False)
-        in_line = spread[1] < DETECTION.in_line * spread[0]
         off = DETECTION.off * self._length
-        least = float((np.min if in_line else np.mean)(before[rows]))
+        least = float((np.min if in_line(tips) else np.mean)(before[rows]))
         return bool(
             before.mean() > off
             and after.mean() < off
             and after.mean() <= DETECTION.frame * before.mean()
             and after[rows].mean() <= DETECTION.frame * least
-            and then <= turned + DETECTION.frame_angle
+            and then <= DETECTION.overwhelming * turned + DETECTION.frame_angle
         )
 
-    def other_channels(self, logs: tuple[int, ...], softness: float = 1.0) -> OtherChannels | None:
+    # channels ----------------------------------------------------------------------------------
+
+    def other_channels(self, logs: Logs, softness: float = 1.0) -> OtherChannels | None:
         """Return the other channels, or line, that some logs alone are most likely to have.
 
         `softness` is the factor on pressures. None if the arm does not bear them, or if these
         channels explain little.
         """
-        description, keep = self._setup.description, self._setup.settings.keep
         if softness not in self._predicted:
             return None
-        low = np.maximum(description.pressure_min, 0.0)
-        rest = [i for i in range(len(self._pressures)) if i not in logs]
-        as_is = self._tried(self._predicted[softness], rest, NOWHERE)
-        tips = self._mean(as_is, as_is.recorded, _tip_distances, logs)
+        as_is = next(each for each in self._unmoved(logs) if each.softness == softness)
+        tips = as_is.mean(tip_distances, as_is.recorded)
         best: OtherChannels | None = None
-        for hypothesis in of_channels(description, 1):
-            driven = [hypothesis.driven(self._pressures[i], low) for i in logs]
-            found = None if hypothesis.kind in keep else self._poses(softness, driven)
-            if found is None:
-                continue
-            poses = list(self._predicted[softness])
-            for i, each in zip(logs, found, strict=True):
-                poses[i] = each
-            tried = self._tried(poses, rest, NOWHERE)
-            left = self._mean(tried, tried.recorded, self._off, logs)
-            if best is None or left < best.left:
-                then = self._mean(tried, tried.recorded, _tip_distances, logs)
-                best = OtherChannels(logs, hypothesis, tips, then, left, tried.score)
+        for hypothesis in self._possible(logs, softness):
+            tried = self._driven(hypothesis, logs, softness)
+            left = np.inf if tried is None else tried.mean(self._off, tried.recorded)
+            if tried is not None and (best is None or left < best.left):
+                then = tried.mean(tip_distances, tried.recorded)
+                best = OtherChannels(logs, hypothesis, tips, then, left, tried.score())
         return best if best and best.then < DETECTION.overwhelming * best.as_is else None
+
+    def _driven(self, hypothesis: Hypothesis, logs: Logs, softness: float) -> _Tried | None:
+        """Return what is left if some logs have other channels; None if the arm breaks by them."""
+        low = np.maximum(self._setup.description.pressure_min, 0.0)
+        found = self._poses(softness, [hypothesis.driven(self._pressures[i], low) for i in logs])
+        if found is None:
+            return None
+        poses = list(self._predicted[softness])
+        for i, each in zip(logs, found, strict=True):
+            poses[i] = each
+        expected = self._expected(poses, self._rest(logs))
+        return self._tried(softness, poses, logs, NOWHERE, expected)
+
+    def _possible(self, logs: Logs, softness: float) -> list[Hypothesis]:
+        """Return hypotheses of other channels in some logs.
+
+        Of a heavy arm these are the ones that are best without its weight, which takes far less
+        time.
+        """
+        setup = self._setup
+        found = [
+            each
+            for each in of_channels(setup.description, 1)
+            if each.kind not in setup.settings.keep
+        ]
+        if not any(setup.description.gravity):
+            return found
+        light = FrameComparer(replace(setup, description=weightless(setup.description)))
+        if softness not in light._predicted:
+            return found
+
+        def score(hypothesis: Hypothesis) -> float:
+            tried = light._driven(hypothesis, logs, softness)
+            return np.inf if tried is None else tried.score(logs)
+
+        return sorted(found, key=score)[: DETECTION.shortlist]
+
+    def _channels_alone(self) -> OtherChannels | None:
+        """Return the channels of the log without which the others agree best.
+
+        Of two logs it is the one that agrees less with the robot file.
+        """
+        tried = [each for i in range(len(self._pressures)) for each in self._unmoved((i,))]
+        by_file = len(self._pressures) == 2
+        best = min(
+            tried, key=lambda each: each.far if by_file else each.score(self._rest(each.logs))
+        )
+        if best.score(best.logs) <= DETECTION.off * self._length:
+            return None
+        channels = self.other_channels(best.logs, best.softness)
+        if channels is None:
+            return None
+        misses = best.misses.copy()
+        misses[list(best.logs)] = channels.left
+        moved = min(each.score(best.logs) for each in self._moved(best.logs))
+        if channels.left > DETECTION.tie * moved or not self._is_judged(best, misses):
+            return None
+        return channels
+
+
+def _rms(misses: Array) -> float:
+    return float(np.sqrt(np.mean(misses**2)))
 
 
 def _turning(track: Track) -> NDArray[np.bool_]:
@@ -562,50 +505,3 @@ def _is_turning(track: Track) -> bool:
     """Return True if the orientation is known in most of the rows in which the position is."""
     seen = whole(track.position)
     return bool(np.sum(_turning(track)[seen]) > 0.8 * np.sum(seen))
-
-
-def _nearest_rotation(source: Array, target: Array, known: float) -> Array:
-    """Return the rotation (3, 3) that turns points (N, 3) to others about their means.
-
-    Turns that spreads of less than `known`, in m, would determine stay small.
-    """
-    spread = (target - target.mean(axis=0)).T @ (source - source.mean(axis=0))
-    u, _, vt = np.linalg.svd(spread + len(source) * known**2 * np.eye(3))
-    return np.asarray(u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt)
-
-
-# -- a tested log ----------------------------------------------------------------------------------
-
-
-def replaced(
-    recording: Recording, measured: Array, predicted: Array, length: float
-) -> tuple[Recording, str, bool]:
-    """Move a recording rigidly to where a calibrated model predicts its tip.
-
-    Prefers a rotation of the cube without translation if it fits about as well.
-
-    Parameters
-    ----------
-    recording : Recording
-    measured, predicted : (N, 3), in m.
-    length : of the arm, in m.
-
-    Returns
-    -------
-    recording, words, is_shifted
-        The words describe the motion, as the end of a sentence.
-    """
-    seen = whole(measured)
-    x, y = measured[seen], predicted[seen]
-
-    def miss(rotation: Array, shift: Array) -> float:
-        return float(np.linalg.norm(x @ rotation.T + shift - y, axis=1).mean())
-
-    quarter = min(CUBE_ROTATIONS, key=lambda rotation: miss(rotation, np.zeros(3)))
-    rotation = _nearest_rotation(x @ quarter.T, y, DETECTION.known_turn * length) @ quarter
-    shift = y.mean(axis=0) - rotation @ x.mean(axis=0)
-    if DETECTION.overwhelming * miss(quarter, np.zeros(3)) < miss(rotation, shift):
-        rotation, shift = quarter, np.zeros(3)
-    is_shifted = bool(np.linalg.norm(shift) > SHOWN)
-    tracks = moved(recording.tracks, rotation, shift)
-    return replace(recording, tracks=tracks), motion_text(rotation, shift), is_shifted

@@ -371,7 +371,9 @@ class DetectionSettings:
     frame_ridge : of the correction of its shape, relative to one of the whole length in each row.
     frame_lever : distance from a body's origin, in lengths of the arm, of the points on its axes by
         which poses are compared.
-    frame_angle : by how much orientations may fit worse after a motion of the frame, in rad.
+    frame_angle : angle of orientations, in rad, beyond which a motion may leave a share
+        `overwhelming` of their misfit.
+    frame_rounds : how often the motions of frame and body are found in turn.
     known_turn : spread of the tip, in lengths of the arm, that determines a turn.
     ridge : added to the diagonal of the normal equations of regressions.
     clock_rows : number of rows in the regression for the clocks.
@@ -425,6 +427,7 @@ class DetectionSettings:
     frame_ridge: float = 0.01
     frame_lever: float = 0.25
     frame_angle: float = float(np.radians(3.0))
+    frame_rounds: int = 20
     known_turn: float = 0.02
     ridge: float = 0.01
     clock_rows: int = 600

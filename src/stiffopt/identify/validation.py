@@ -13,13 +13,22 @@ from numpy.typing import NDArray
 from stiffopt.arrays import Array
 from stiffopt.errors import EquilibriumError, PressureError, StiffoptError
 from stiffopt.identify.detection import idle_channels
-from stiffopt.identify.discrepancy import centres
 from stiffopt.identify.error_model import held_for, in_turn, is_moving
 from stiffopt.identify.fit import fit
-from stiffopt.identify.frames import replaced
 from stiffopt.identify.hypotheses import Hypothesis, of_channels, pairs
+from stiffopt.identify.motions import (
+    SHOWN,
+    Motion,
+    apart,
+    are_both_moved,
+    best_motions,
+    different_poses,
+    in_line,
+    of_rows,
+    turned_like,
+)
 from stiffopt.identify.problem import CalibrationProblem, Noise, Predicted, Sample
-from stiffopt.identify.recording import Recording
+from stiffopt.identify.recording import Recording, Track
 from stiffopt.identify.results import Comparison
 from stiffopt.identify.settings import DETECTION, ERRORS, SAMPLING, CalibrationSettings
 from stiffopt.identify.setup import (
@@ -33,6 +42,7 @@ from stiffopt.identify.setup import (
     recordings_of,
     sampled,
 )
+from stiffopt.identify.tracker_faults import CUBE_ROTATIONS
 from stiffopt.identify.unknowns import Unknowns
 from stiffopt.logs import StiffnessTable
 from stiffopt.model.compliance import Boundary
@@ -139,8 +149,10 @@ class _Correction:
         if after.errors.mean > DETECTION.frame * before.errors.mean:
             return False
         then, now = before.errors.angle, after.errors.angle
-        if then is not None and now is not None and now > then:
-            return False  # rather a sensor that sits elsewhere on the tip
+        if then is not None and now is not None:
+            most = DETECTION.overwhelming * then + DETECTION.frame_angle
+            if now > min(then, most):
+                return False  # rather a sensor that sits elsewhere on the tip, or frame and body
         least = np.min if self.moves_all else np.mean
         limit = DETECTION.frame * least(before.distance[self.poses])
         return bool(after.distance[self.poses].mean() <= limit)
@@ -185,23 +197,46 @@ def _put_right(setup: Setup, found: tuple[Comparison, ...]) -> tuple[Comparison,
 def _with_frame_found(setup: Setup, recording: Recording, found: Comparison) -> _Correction | None:
     """Return a recording moved to where the robot predicts its tip; None if it is not suspected.
 
-    It is judged by different poses: where a log holds one pose for long, a motion of the frame
-    could replace whatever the model has wrong there. Poses on a line, as in one rise from rest,
-    could be turned about the pose at rest to fit any model. There a frame that was moved, and not
-    only turned, has to move all of them: none is predicted well without the motion.
+    The frame, or the tip's body if its orientation is known, may have been defined anew; a quarter
+    turn of the frame is taken if it is about as good as any. Each pose counts once: where a log
+    holds one for long, a motion could replace whatever the model has wrong there. A frame that was
+    moved, and not only turned, has to move all poses that lie on a line.
     """
-    poses = _different(setup.description, found)
-    if "axes" in setup.settings.keep or len(poses) < DETECTION.poses:
+    description, length = setup.description, setup.description.length
+    seen = np.flatnonzero(np.isfinite(found.distance))
+    if found.angle is not None:
+        seen = seen[np.isfinite(found.angle[seen])]
+    poses = seen[different_poses(found.effective[seen], description)]
+    if "axes" in setup.settings.keep or not len(poses):
         return None
-    measured, predicted = found.measured[poses], found.predicted[poses]
-    moved, words, is_shifted = replaced(recording, measured, predicted, setup.description.length)
-    remark = (
-        f"the frame of this log was defined anew: its poses are {words} (--keep axes leaves them); "
-        "a body that was defined anew, another arm or another order of channels may look so too"
-    )
-    spread = np.linalg.svd(predicted - predicted.mean(axis=0), compute_uv=False)
-    in_line = bool(spread[1] < DETECTION.in_line * spread[0])
-    return _Correction(moved, remark, poses, moves_all=in_line and is_shifted)
+    recorded = of_rows(recording.tracks[:1], np.searchsorted(recording.time, found.time[poses]))
+    reached = setup.base @ Manipulator(description).tip_pose(found.effective[poses])
+    reached = reached @ setup.points[0].sensor
+    expected = (Track("tip", reached[:, :3, 3], reached[:, :3, :3]),)
+    if recorded[0].rotation is None:
+        expected = (replace(expected[0], rotation=None),)
+
+    def miss(motion: Motion) -> float:
+        poses = turned_like(motion.of(recorded), expected)
+        return float(apart(poses, expected, length).mean())
+
+    quarters = [Motion((0,), "frame", each, np.zeros(3)) for each in CUBE_ROTATIONS]
+    quarter = min(quarters, key=miss)
+    motions = best_motions((0,), recorded, expected, length)
+    if DETECTION.overwhelming * miss(quarter) < miss(motions[0]):
+        motions[0] = quarter
+    best, *others = sorted(motions, key=miss)
+    if miss(best) > DETECTION.tie * miss(others[0]):
+        return None
+    if are_both_moved(miss(best), recorded, expected, length):
+        return None
+    remark = f"{best.told([recording])} (--keep axes leaves that as it was recorded)"
+    if recorded[0].rotation is None:
+        remark += "; another arm or another order of channels may look so too"
+    is_shifted = bool(np.linalg.norm(best.shift) > SHOWN)
+    moved = replace(recording, tracks=best.of(recording.tracks))
+    moves_all = in_line(expected[0].position) and is_shifted
+    return _Correction(moved, remark, poses, moves_all)
 
 
 def _with_channels_found(
@@ -226,7 +261,7 @@ def _with_channels_found(
         except (EquilibriumError, PressureError):  # the arm does not bear these pressures
             return np.inf
         tips = (setup.base @ poses @ point)[:, :3]
-        return float(np.median(np.linalg.norm(tips - found.measured[some], axis=1)))
+        return float(np.linalg.norm(tips - found.measured[some], axis=1).mean())
 
     def ranked(tried: Sequence[Hypothesis]) -> list[Hypothesis]:
         return sorted(tried, key=lambda each: miss(each, DETECTION.channel_step))
@@ -250,20 +285,6 @@ def _with_channels_found(
     told = best.told(description, [recording.name])
     remark = f"{told} (--keep {best.kind} leaves that as it was recorded)"
     return _Correction(corrected, remark, seen)
-
-
-def _different(description: RobotDescription, found: Comparison) -> NDArray[np.intp]:
-    """Return rows of a comparison whose tip was measured, at different effective pressures.
-
-    None if none of them is near rest, where the pose of every arm is known: elsewhere a frame could
-    replace a wrong modulus.
-    """
-    seen = np.flatnonzero(np.isfinite(found.distance))
-    span = float(np.max(np.subtract(description.pressure_max, description.pressure_min)))
-    pressures = found.effective[seen]
-    if not len(seen) or np.abs(pressures).max(axis=1).min() > DETECTION.rest * span:
-        return seen[:0]
-    return np.asarray(seen[centres(pressures, DETECTION.apart * span, DETECTION.rows)])
 
 
 def compare(
