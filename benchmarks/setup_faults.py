@@ -236,10 +236,10 @@ def mirrored(robot: RobotDescription, rng: np.random.Generator) -> Fault:
 
 
 def scaled(robot: RobotDescription, rng: np.random.Generator) -> Fault:
-    """The positions of one log have another scale; no orientations are recorded."""
+    """The positions of one log have another scale, as another arm would have: it is left."""
     scale = float(rng.choice([0.6, 1.3]))
     changed = positions_times(scale * np.ones(3), int(rng.integers(FITTED)))
-    return Fault(edited=changed, told=("have another scale",))
+    return Fault(edited=changed, hints=("look at whether",))
 
 
 def positions_times(factors: Array, which: int) -> Callable[[Logs], Logs]:

@@ -152,10 +152,10 @@ def test_the_loop_leans_holds_tells_a_lift_off_and_lets_go(solution, approach, m
     assert loop.force == 0
     loop.controller.set_task(TASK.unbraced.model_copy(update={"scene": None}))
     loop.wait(2.0)
-    assert loop.controller._ways
+    assert loop.controller._way_back
     loop.controller.set_task(TASK)  # again, and then to a target elsewhere: it lets go first
     loop.until(lambda s: s.brace == "held", 40.0)
-    assert not loop.controller._ways  # a free posture is no way back
+    assert not loop.controller._way_back  # a free posture is no way back
     waypoint = Waypoint(time=1.0, target=TASK.target)
     with pytest.raises(InputError, match="give it a task without 'brace' first"):
         loop.controller.follow(Trajectory(waypoints=[waypoint]), loop.rig.clock.now())

@@ -161,26 +161,42 @@ def test_a_frame_that_leaves_little_is_told_although_the_body_sits_a_little_else
     assert found.remarks[-1].startswith("the frame of log 1 was defined anew")
 
 
-@pytest.mark.parametrize(
-    ("factors", "words"),
-    [
-        (np.array([1.0, 1.0, -1.0]), "are mirrored: z has the other sign"),
-        (np.array([0.6, 0.6, 0.6]), "have another scale: they are times 1.6"),
-    ],
-)
-def test_positions_with_another_sign_or_scale_are_no_other_frame(
-    factors: Array, words: str
-) -> None:
+def with_factors(factors: Array) -> list[Log]:
+    """Three logs without orientations; the positions of the second one are times factors (3,)."""
+    logs = [log_of(seed=seed, turns=False) for seed in range(3)]
+    return with_one(logs, 1, lambda log: replace(log, tip_position=log.tip_position * factors))
+
+
+def test_mirrored_positions_are_no_other_frame() -> None:
     robot = load_description("stiff-flop-1")
-    wrong = with_one(
-        [log_of(seed=seed, turns=False) for seed in range(3)],
-        1,
-        lambda log: replace(log, tip_position=log.tip_position * factors),
-    )
+    wrong = with_factors(np.array([1.0, 1.0, -1.0]))
+    words = "are mirrored: z has the other sign"
     (remark,) = told(robot, wrong)
     assert remark.startswith(f"the positions of log 2 {words}")
     (found,) = validate(calibrated(robot), wrong[1:2])
     assert found.remarks[-1].startswith(f"the positions of log 1 {words}")
+    assert found.errors.mean < 3e-3
+
+
+@pytest.mark.parametrize("scale", [0.6, 1.3])
+def test_another_scale_of_positions_is_left_as_another_arm_would_look_the_same(
+    scale: float,
+) -> None:
+    robot = load_description("stiff-flop-1")
+    wrong = with_factors(np.full(3, scale))
+    assert told(robot, wrong) == []
+    (found,) = validate(calibrated(robot), wrong[1:2])
+    assert "look at whether" in found.remarks[-1]
+
+
+@pytest.mark.parametrize("rows", [0.0, 0.1])
+def test_a_frame_is_found_where_most_orientations_are_missing(rows: float) -> None:
+    log = in_frame(TURN)(log_of())
+    quaternion = np.array(log.tip_quaternion)
+    quaternion[round(rows * len(quaternion)) :] = np.nan
+    robot = calibrated(load_description("stiff-flop-1"))
+    (found,) = validate(robot, [replace(log, tip_quaternion=quaternion)])
+    assert found.remarks[-1].startswith("the frame of log 1 was defined anew")
     assert found.errors.mean < 3e-3
 
 

@@ -42,8 +42,8 @@ def test_what_feedback_added_is_taken_back_without_a_swing(is_of_arm):
     bench.settled(duration=4.0)
     controller = bench.controller
     more = np.array([0.3, 0.0, 0.0, 0.2, 0.0, 0.0]) * BAR
-    path, added = controller._ways[0]
-    controller._ways[0] = path, added + more
+    path, added = controller._way_back._places[0]
+    controller._way_back._places[0] = path, added + more
     offset = controller._arm.pressures.command_offset
     now_added = bench.command - (controller._reference.command - offset)
     back = path[: bench.n] - offset + (now_added if is_of_arm else added + more)

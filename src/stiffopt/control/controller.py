@@ -9,7 +9,6 @@ damps the arm's vibration. A small quadratic program (`Allocation`) combines bot
 from __future__ import annotations
 
 import math
-from collections import deque
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -41,6 +40,7 @@ from stiffopt.control.tip_errors import target_arrays
 from stiffopt.control.tip_feedback import TipFeedback
 from stiffopt.control.tuning import ControlTuning
 from stiffopt.control.vibration import BendingMode, BentMode
+from stiffopt.control.way_back import WayBack
 from stiffopt.control.way_to_target import WayToTarget
 from stiffopt.control.windows import WindowWatch
 from stiffopt.errors import InputError
@@ -113,10 +113,7 @@ class TipController:
         self._mode, self._vibrates = mode, mode is not None
         self._bent: BentMode | None = None  # modes that the estimator has
         self._feedback = TipFeedback(setup, self._arm)
-        # the latest places of the reference, with what feedback added to its commands
-        self._ways: deque[tuple[Array, Array]] = deque(
-            maxlen=max(1, round(tuning.reference.taken_back / period))
-        )
+        self._way_back = WayBack(round(tuning.reference.taken_back / period))
         unbounded = {} if slow_first_motion else {"slew_share": math.inf, "correction": math.inf}
         self._first_motion = FirstMotion(replace(tuning.first_motion, **unbounded))
         self._way_to_target = WayToTarget(setup, self._arm)
@@ -159,8 +156,7 @@ class TipController:
         self._lost = self._arm.channels.lost
         self._windows.begin()
         self._led_to: Target | None = None  # present target of a trajectory of pressures
-        self._ways.clear()
-        self._back_to: Array | None = None  # goal of the reference that stops a doubted motion
+        self._way_back.forget()
         self._way_to_target.begin()
         self._correction.begin()
 
@@ -292,8 +288,7 @@ class TipController:
         here = pressures.chamber if self._arm.channels.lost.any() else pressures.command
         self._reference.begin(np.concatenate([here + pressures.history_offset, offset]))
         self._feedback.resume()
-        self._ways.clear()
-        self._back_to = None
+        self._way_back.forget()
         self._way_to_target.begin()
         self._correction.begin()
         self._at_rest = False
@@ -380,7 +375,7 @@ class TipController:
         if moves:
             self._moved_at = now
         if self._arm.leaning is not None:
-            self._ways.clear()  # a free posture is no way back for an arm that leans, or leant
+            self._way_back.forget()  # a free posture is none for an arm that leans, or leant
             return self._feedforward(reference.command - pressures.command_offset, last)
         tip = self._arm.on_path(reference.path[:n])
         if now - self._went_back_at > self._tuning.adaptation.blind_time:
@@ -391,8 +386,9 @@ class TipController:
         else:  # feedback makes up at once for a model that has just been adapted
             is_bounded = moves and now - self._model_changed_at > self._tuning.adaptation.calm_time
         self._correction.take(tip.pose[:3, 3], applies=course is None and is_bounded)
-        if self._arm.channels.pace == 0 and self._ways and moves:
-            return self._feedforward(self._without_feedback, last)
+        if self._arm.channels.pace == 0 and self._way_back and moves:  # feedback waits as well
+            without = reference.command - pressures.command_offset + self._way_back.added
+            return self._feedforward(without, last)
         bent = self._bend(None if isinstance(course, PostureCourse) else self.replanner.bent)
         self._led_to = None
         if isinstance(course, PostureCourse):
@@ -411,7 +407,7 @@ class TipController:
         )
         if command is None:
             return self._output(last.copy(), self._feedback.saturated, valid=False)
-        self._ways.append((reference.path.copy(), command - goal))
+        self._way_back.add(reference.path.copy(), command - goal)
         return self._output(command, self._feedback.saturated)
 
     def _motion_share(self, path: Array) -> Array:
@@ -440,28 +436,20 @@ class TipController:
         reference, offset = self._reference, self._arm.pressures.command_offset
         doubt = self._arm.watch.doubt
         is_doubted = doubt is not None or channels.opposed.any()
-        if not self._vibrates or not is_doubted or not self._ways:
+        if not self._vibrates or not is_doubted or not self._way_back:
             return None
-        if self._back_to is None:
+        goal = self._way_back.goal
+        if goal is None:
             added = last - (reference.command - offset)
             reference.shift(np.concatenate([added, np.zeros(6)]))
-            path, added_then = self._ways[0]
             stays = doubt is not None and doubt.is_of_arm
-            back = added if stays else added_then
-            self._back_to = path + np.concatenate([back, np.zeros(6)])
-        if self._is_near(self._back_to[: len(last)]):
+            goal = self._way_back.set_out(added if stays else self._way_back.added)
+        if self._is_near(goal[: len(last)]):
             return None
-        reference.advance(self._back_to)
+        reference.advance(goal)
         command = reference.command - offset
         command = np.where(channels.opposed, channels.last_followed, command)
         return self._feedforward(command, last).pressures
-
-    @property
-    def _without_feedback(self) -> Array:
-        """Commands (n,) of the reference, with what feedback added to them a while before."""
-        command = self._reference.command - self._arm.pressures.command_offset
-        added: Array = self._ways[0][1]
-        return command + added
 
     def _awaited(self, plan: Array, now: float) -> Array:
         """Return the reference's goal (n + 6,): the plan, unless channels or tip do not follow.
@@ -477,7 +465,8 @@ class TipController:
             course.wait((1 - pace) * min(now - self._computed_at, _HELD * self._period))
             return plan
         # an arm that vibrates goes on for a while before its smooth path turns
-        path = self._ways[0][0] if self._vibrates and self._ways else self._reference.path
+        back = self._way_back
+        path = back.earliest if self._vibrates and back else self._reference.path
         return path + pace * (plan - path)
 
     def _feedforward(self, pressures: Array, last: Array) -> ControlOutput:

@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stiffopt.arrays import Array
 from stiffopt.errors import EquilibriumError, PressureError
@@ -30,6 +29,7 @@ from stiffopt.identify.motions import (
     best_motions,
     different_poses,
     in_line,
+    is_turning,
     joined,
     nearest_cube,
     nearest_rotation,
@@ -37,6 +37,7 @@ from stiffopt.identify.motions import (
     tip_angles,
     tip_distances,
     turned_like,
+    turning,
 )
 from stiffopt.identify.recording import Recording, Track
 from stiffopt.identify.settings import DETECTION
@@ -150,9 +151,11 @@ class FrameComparer:
         ends = np.cumsum([segment.length for segment in description.segments])
         self._stations, self._tracks = np.array([*stations, *ends]), len(stations)
         self._turns = [
-            point.turns and all(_is_turning(each.tracks[k]) for each in setup.recordings)
+            point.turns and all(is_turning(each.tracks[k]) for each in setup.recordings)
             for k, point in enumerate(setup.points)
         ]
+        tracks = [track for each in setup.recordings for track in each.tracks]
+        self._has_orientations = any(track.rotation is not None for track in tracks)
         self._pressures: list[Array] = []
         self._recorded: list[Tracks] = []
         count = max(DETECTION.rows // len(setup.recordings), 8)
@@ -162,7 +165,7 @@ class FrameComparer:
                 for t, turns in zip(each.tracks, self._turns, strict=True)
             ]
             seen = [
-                whole(t.position) & (_turning(t) if turns else True)
+                whole(t.position) & (turning(t) if turns else True)
                 for t, turns in zip(tracks, self._turns, strict=True)
             ]
             rows = rows_with_all(each, seen, count)
@@ -290,7 +293,9 @@ class FrameComparer:
         for softness, poses in self._predicted.items():
             expected = self._expected(poses, self._rest(logs))
             wanted = joined([expected[i] for i in logs])
-            for motion in best_motions(logs, own, wanted, self._length):
+            for motion in best_motions(
+                logs, own, wanted, self._length, has_orientations=self._has_orientations
+            ):
                 tried = self._tried(softness, poses, logs, motion, expected)
                 if motion.kind not in found or tried.score() < found[motion.kind].score():
                     found[motion.kind] = tried
@@ -332,7 +337,7 @@ class FrameComparer:
         others = [each for each in self._moved(best.logs) if each.motion.kind != best.motion.kind]
         left = best.score(best.logs)
         is_clear = all(left <= DETECTION.tie * each.score(best.logs) for each in others)
-        is_clear = is_clear and not self._has_both(best)
+        is_clear = is_clear and best.motion.kind != "scale" and not self._has_both(best)
         if not (is_clear and self._is_judged(best, best.misses) and self._explains(best)):
             return self._channels_alone()
         channels = self.other_channels(best.logs, best.softness)
@@ -492,16 +497,3 @@ class FrameComparer:
 
 def _rms(misses: Array) -> float:
     return float(np.sqrt(np.mean(misses**2)))
-
-
-def _turning(track: Track) -> NDArray[np.bool_]:
-    """Return in which rows (N,) a track's orientation is known."""
-    if track.rotation is None:
-        return np.zeros(len(track.position), dtype=bool)
-    return np.asarray(np.isfinite(track.rotation).all(axis=(1, 2)))
-
-
-def _is_turning(track: Track) -> bool:
-    """Return True if the orientation is known in most of the rows in which the position is."""
-    seen = whole(track.position)
-    return bool(np.sum(_turning(track)[seen]) > 0.8 * np.sum(seen))

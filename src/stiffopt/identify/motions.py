@@ -2,8 +2,9 @@
 
 Tracking software defines a body by its markers, with an origin and axes as somebody chose them. If
 the body that is the frame is defined anew, all poses of later logs are moved alike, ``T X``. If the
-tip's body, or another tracked one, is, its poses are moved in its own axes, ``X G``. Positions
-without orientations may also be mirrored, or have another scale.
+tip's body, or another tracked one, is, its poses are moved in its own axes, ``X G``. If no
+orientations were recorded, positions may also be mirrored. Another scale is no explanation, since
+an arm of another length or modulus looks the same; it only keeps a frame from being told.
 
 Poses are compared by points on the bodies: their origins and, where orientations were recorded,
 points on their axes.
@@ -23,7 +24,7 @@ from stiffopt.identify.discrepancy import centres
 from stiffopt.identify.hypotheses import moved, turn_text
 from stiffopt.identify.recording import FRAME, Recording, Track
 from stiffopt.identify.settings import DETECTION
-from stiffopt.identify.tracker_faults import CUBE_ROTATIONS, mean_rotation
+from stiffopt.identify.tracker_faults import CUBE_ROTATIONS, mean_rotation, whole
 from stiffopt.model.description import RobotDescription
 
 SHOWN = 5e-4
@@ -41,7 +42,7 @@ class Motion:
     ----------
     logs : indices of the logs.
     kind : "frame", or the index of the track whose body was defined anew; "mirror" or "scale" of
-        positions without orientations.
+        recordings without orientations.
     turn : (3, 3), a rotation; with a factor of -1 or of the scale, a mirror or a scale, and
     shift : (3,), in m. A pose ``X, x`` of the frame becomes ``R X, R x + s``, that of a body
         ``X R, x + X s``.
@@ -75,19 +76,13 @@ class Motion:
         if self.kind == "mirror":
             axis = "xyz"[int(np.argmin(np.diag(self.turn)))]
             return f"the positions of {names} are mirrored: {axis} has the other sign"
-        if self.kind == "scale":
-            return f"the positions of {names} have another scale: they are times {self._scale:.3g}"
         words = f"turned {turn_text(self.turn)}"
         if np.linalg.norm(self.shift) > SHOWN:
             words += f" and moved by {np.linalg.norm(self.shift) * 1e3:.0f} mm"
-        if self.kind == "frame":
+        if not isinstance(self.kind, int):
             return f"the frame of {names} was defined anew: its poses are {words}"
         body = recordings[0].tracks[self.kind].name
         return f"the body '{body}' was defined anew in {names}: it is {words} in its own axes"
-
-    @property
-    def _scale(self) -> float:
-        return float(self.turn[0, 0])
 
 
 NOWHERE = Motion((), "frame", np.eye(3), np.zeros(3))
@@ -181,6 +176,19 @@ def different_poses(pressures: Array, description: RobotDescription) -> NDArray[
     return rows if len(rows) >= DETECTION.poses else nothing
 
 
+def turning(track: Track) -> NDArray[np.bool_]:
+    """Return in which rows (N,) a track's orientation is known."""
+    if track.rotation is None:
+        return np.zeros(len(track.position), dtype=bool)
+    return np.asarray(np.isfinite(track.rotation).all(axis=(1, 2)))
+
+
+def is_turning(track: Track) -> bool:
+    """Return True if the orientation is known in most of the rows in which the position is."""
+    seen = whole(track.position)
+    return bool(np.sum(turning(track)[seen]) > 0.8 * np.sum(seen))
+
+
 def in_line(positions: Array) -> bool:
     """Return True if positions (N, 3) lie about on a line.
 
@@ -194,7 +202,12 @@ def in_line(positions: Array) -> bool:
 
 
 def best_motions(
-    logs: tuple[int, ...], recorded: Tracks, expected: Tracks, length: float
+    logs: tuple[int, ...],
+    recorded: Tracks,
+    expected: Tracks,
+    length: float,
+    *,
+    has_orientations: bool,
 ) -> list[Motion]:
     """Return the motion of each kind that brings the poses of logs nearest to the expected ones.
 
@@ -203,11 +216,12 @@ def best_motions(
     logs : their indices.
     recorded, expected : poses in all of their rows.
     length : of the arm, in m.
+    has_orientations : whether some were recorded, be it in too few rows to be compared.
     """
     found = [frame_motion(logs, recorded, expected, length)]
     turning = [k for k, each in enumerate(recorded) if each.rotation is not None]
     found += [_body_motion(logs, k, recorded[k], expected[k]) for k in turning]
-    return found if turning else found + _distortions(logs, recorded, expected)
+    return found if has_orientations else found + _distortions(logs, recorded, expected)
 
 
 def frame_motion(

@@ -24,6 +24,7 @@ from stiffopt.identify.motions import (
     best_motions,
     different_poses,
     in_line,
+    is_turning,
     of_rows,
     turned_like,
 )
@@ -203,8 +204,8 @@ def _with_frame_found(setup: Setup, recording: Recording, found: Comparison) -> 
     moved, and not only turned, has to move all poses that lie on a line.
     """
     description, length = setup.description, setup.description.length
-    seen = np.flatnonzero(np.isfinite(found.distance))
-    if found.angle is not None:
+    seen, turns = np.flatnonzero(np.isfinite(found.distance)), is_turning(recording.tracks[0])
+    if turns and found.angle is not None:
         seen = seen[np.isfinite(found.angle[seen])]
     poses = seen[different_poses(found.effective[seen], description)]
     if "axes" in setup.settings.keep or not len(poses):
@@ -213,8 +214,8 @@ def _with_frame_found(setup: Setup, recording: Recording, found: Comparison) -> 
     reached = setup.base @ Manipulator(description).tip_pose(found.effective[poses])
     reached = reached @ setup.points[0].sensor
     expected = (Track("tip", reached[:, :3, 3], reached[:, :3, :3]),)
-    if recorded[0].rotation is None:
-        expected = (replace(expected[0], rotation=None),)
+    if not turns:
+        recorded, expected = ((replace(each[0], rotation=None),) for each in (recorded, expected))
 
     def miss(motion: Motion) -> float:
         poses = turned_like(motion.of(recorded), expected)
@@ -222,11 +223,12 @@ def _with_frame_found(setup: Setup, recording: Recording, found: Comparison) -> 
 
     quarters = [Motion((0,), "frame", each, np.zeros(3)) for each in CUBE_ROTATIONS]
     quarter = min(quarters, key=miss)
-    motions = best_motions((0,), recorded, expected, length)
+    has_orientations = any(each.rotation is not None for each in recording.tracks)
+    motions = best_motions((0,), recorded, expected, length, has_orientations=has_orientations)
     if DETECTION.overwhelming * miss(quarter) < miss(motions[0]):
         motions[0] = quarter
     best, *others = sorted(motions, key=miss)
-    if miss(best) > DETECTION.tie * miss(others[0]):
+    if best.kind == "scale" or (others and miss(best) > DETECTION.tie * miss(others[0])):
         return None
     if are_both_moved(miss(best), recorded, expected, length):
         return None
