@@ -247,13 +247,13 @@ class TipController:
 
     @property
     def _goes_to_target(self) -> bool:
-        """Whether the tip goes to a target, or is there, without a course of its own."""
+        """Whether the tip goes to one target, or rests there: no trajectory, press or brace."""
         course = self.replanner.pursuit.course
         return course is None or (isinstance(course, Pressing) and course.phase is Phase.GOING)
 
     @property
     def _waits(self) -> bool:
-        """Whether a push makes the reference wait; one that presses has to be able to go back."""
+        """Whether the reference waits because of a push; in a press it must be free to go back."""
         return self._arm.watch.waits and self._goes_to_target
 
     def _is_held(self, now: float) -> bool:

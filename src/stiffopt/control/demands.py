@@ -13,7 +13,7 @@ from stiffopt.optimise.tip import TipAt
 
 
 class Demands:
-    """What a task demands by `at_least` and `match`.
+    """The stiffnesses that a task demands with its keys `at_least` and `match`.
 
     Parameters
     ----------
@@ -30,7 +30,7 @@ class Demands:
         self._values: Formula | None = None
 
     def __bool__(self) -> bool:
-        """Whether there are any."""
+        """Whether the task demands a stiffness."""
         return bool(self._measures)
 
     def are_clearly_met(self, tip: TipAt) -> bool:
@@ -70,7 +70,7 @@ def _changed(measure: Measure, value: float, share: float) -> float:
 
 @dataclass(frozen=True)
 class _Tip:
-    """What the formulas of measures need of a tip."""
+    """The symbols of a tip from which measures compute their values."""
 
     compliance: ca.SX  # (6, 6)
     rotation: ca.SX  # (3, 3)

@@ -11,10 +11,11 @@ from stiffopt.arrays import Array
 from stiffopt.control.tip_errors import TipErrors
 from stiffopt.control.tuning import NearestTuning
 from stiffopt.errors import StiffoptError
-from stiffopt.optimise.target import Target
+from stiffopt.optimise.target import Target, Tolerance
 from stiffopt.optimise.tip import TipModel
 
 _BAR = 1e5
+_REACHED = Tolerance()  # of a tip that is at its target
 
 
 class NearestSearch:
@@ -76,6 +77,13 @@ class NearestSearch:
                 break
         result: Array = x * _BAR
         return result, distance, angle
+
+    def reaches(
+        self, target: Target, bounds: tuple[Array, Array], start: Array, **options: bool
+    ) -> tuple[Array, bool]:
+        """Return pressures (n,) as `find` does, and whether the tip is at its target there."""
+        found, distance, angle = self.find(target, bounds, start, **options)
+        return found, distance <= _REACHED.position and angle <= _REACHED.angle
 
     def distance(self, target: Target, pressures: Array) -> tuple[float, float]:
         """Return the position and angle errors at pressures (n,), in m and rad."""

@@ -47,7 +47,6 @@ from stiffopt.paths.configurations import Unsolved
 from stiffopt.paths.leaning import approach_to
 
 _SLACK = 100.0  # Pa, by which an answer may exceed its limits
-_REACHED = Tolerance()  # of the tip that is at its target before the arm is stiff
 _EXACT = Tolerance(position=PlanningTuning.position_tolerance, angle=PlanningTuning.angle_tolerance)
 
 
@@ -264,8 +263,8 @@ class Planning:
 
     def _at_target(self, target: Target, here: Array, **options: bool) -> Array | None:
         """Return pressures (n,) near others that have the tip at its target; None without any."""
-        found, distance, angle = self._search.find(target, self._limits, here, **options)
-        return None if distance > _REACHED.position or angle > _REACHED.angle else found
+        found, is_there = self._search.reaches(target, self._limits, here, **options)
+        return found if is_there else None
 
     def _is_distant(self, last: Plan, pressures: Array, target: Target) -> bool:
         """Return True if pressures (n,) are too far from the last plan for one configuration."""

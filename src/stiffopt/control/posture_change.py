@@ -16,10 +16,8 @@ from stiffopt.arrays import Array
 from stiffopt.control.nearest_search import NearestSearch
 from stiffopt.control.plan import Plan, PlanRequest
 from stiffopt.control.tuning import FeedbackTuning, PlanningTuning
-from stiffopt.optimise.target import Target, Tolerance
+from stiffopt.optimise.target import Target
 from stiffopt.optimise.tip import TipModel
-
-_REACHED = Tolerance()  # of a tip that is at its target
 
 
 @dataclass(frozen=True)
@@ -72,7 +70,7 @@ class PostureChanges:
 
     @property
     def leaves_target(self) -> bool:
-        """Whether the change goes straight to its end, so that the tip leaves its target."""
+        """Whether the tip leaves its target, since the change goes straight to its end."""
         return self._change is not None and self._change.straight
 
     @property
@@ -151,8 +149,7 @@ class PostureChanges:
         straight_on = last.pressures + min(1.0, step / max(left, 1e-9)) * way
         is_moved, at_target, is_there = last.target != request.target, straight_on, True
         if left > step and (is_moved or not change.straight):
-            at_target, distance, angle = self._search.find(target, limits, straight_on)
-            is_there = distance <= _REACHED.position and angle <= _REACHED.angle
+            at_target, is_there = self._search.reaches(target, limits, straight_on)
         goes_on = is_there and left < change.left - tuning.change_progress * step
         if is_there and (is_moved or left > change.left + step):  # another way
             goes_on, change = True, replace(change, straight=False)
@@ -172,5 +169,4 @@ class PostureChanges:
         self._change = None if is_over else change
         if left <= step:
             return end
-        is_straight = self._change is not None and self._change.straight
-        return np.asarray(np.clip(straight_on, *limits)) if is_straight else at_target
+        return np.asarray(np.clip(straight_on, *limits)) if self.leaves_target else at_target

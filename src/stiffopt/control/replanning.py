@@ -67,7 +67,7 @@ class Pursuit:
 
     @property
     def demands(self) -> bool:
-        """Whether the task demands a stiffness."""
+        """Whether the task has the key `at_least` or `match`."""
         goal = None if self.task is None else self.task.stiffness
         return goal is not None and bool(goal.at_least or goal.match)
 
@@ -249,7 +249,7 @@ class Replanner:
 
     @property
     def stiffens(self) -> bool:
-        """Whether the tip has gone to its target first, and the arm is still becoming stiff."""
+        """Whether plans still make the arm stiffer; the tip has gone to its target before."""
         return self.plan is not None and bool(self.plan.tip_first) and not self._blocked
 
     def go_on_with(self, adapted: Adapted, change: Array) -> None:
