@@ -23,9 +23,10 @@ from stiffopt.identify.setup import Setup, recordings_of
 from stiffopt.identify.tracker_faults import CUBE_ROTATIONS
 from stiffopt.identify.validation import validate
 from stiffopt.logs import Body, Log, read_log
-from stiffopt.model.description import Corrections, RobotDescription
+from stiffopt.model.description import RobotDescription
 from stiffopt.model.history import History
 from stiffopt.model.robot_files import load_description
+from stiffopt.model.segment import Corrections
 
 Array = NDArray[np.float64]
 
