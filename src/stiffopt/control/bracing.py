@@ -32,6 +32,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from enum import StrEnum
+from typing import NamedTuple
 
 import numpy as np
 
@@ -59,6 +60,15 @@ class BracePhase(StrEnum):
     HELD = "held"
     RELEASING = "releasing"
     RELEASED = "released"
+
+
+class _Parts(NamedTuple):
+    """What is known of a brace once its approach is planned."""
+
+    approach: BraceApproach
+    friction: Friction
+    pushes: BracePushEstimator
+    correction: BraceCorrection
 
 
 class Bracing:
@@ -94,10 +104,7 @@ class Bracing:
         self._settled: Array = np.zeros(3)  # y - s when the arm had settled
         self._residual: Array = np.zeros(3)  # y - s, smoothed over vibrations
         self._held = self._pushed = 0.0  # durations, in s
-        self.approach: BraceApproach | None = None
-        self._friction: Friction | None = None
-        self._pushes: BracePushEstimator | None = None
-        self._correction: BraceCorrection | None = None
+        self._parts: _Parts | None = None  # once the approach is planned
         self._slides: SlideEstimator | None = None
         self._slid = 0  # successive samples at which a contact has slid
         self._start: Array = np.zeros(0)  # pressures (n,) from which the arm goes to rest
@@ -115,6 +122,17 @@ class Bracing:
     def at(self, now: float) -> Target:
         """Return the target, which is constant."""
         return self.task.target
+
+    @property
+    def approach(self) -> BraceApproach | None:
+        """The way into contact; None until it is planned."""
+        return None if self._parts is None else self._parts.approach
+
+    @property
+    def _planned(self) -> _Parts:
+        """What comes with the approach; only called once it is planned."""
+        assert self._parts is not None
+        return self._parts
 
     @property
     def leans(self) -> bool:
@@ -146,21 +164,20 @@ class Bracing:
     @property
     def pressures(self) -> Array:
         """Effective pressures (n,) now, in Pa."""
-        approach, correction = self.approach, self._correction
-        if approach is None or correction is None or self.phase is BracePhase.TO_REST:
+        if self._parts is None or self.phase is BracePhase.TO_REST:
             return self._left * self._start
-        rows = approach.pressures
+        approach, rows = self._parts.approach, self._parts.approach.pressures
         on_way = np.array([np.interp(self._time, approach.times, row) for row in rows.T])
         share = min(self._time / approach.reached, 1.0)
-        return on_way + share * correction.change
+        return on_way + share * self._parts.correction.change
 
     def begin(self, approach: BraceApproach, pressures: Array) -> None:
         """Go from pressures (n,) to rest, then along the approach."""
-        self.approach, self._start = approach, pressures
-        self._friction = Friction(approach.hold, approach.pressures[-1])
-        stuck = self._friction if self._sticks else None
-        self._pushes = BracePushEstimator(self.task, approach, stuck, self._tuning)
-        self._correction = BraceCorrection(approach.hold, stuck, len(pressures), self._tuning)
+        friction = Friction(approach.hold, approach.pressures[-1])
+        stuck = friction if self._sticks else None
+        pushes = BracePushEstimator(self.task, approach, stuck, self._tuning)
+        correction = BraceCorrection(approach.hold, stuck, len(pressures), self._tuning)
+        self._parts, self._start = _Parts(approach, friction, pushes, correction), pressures
         self._left = float(bool(np.abs(pressures).max() > self._tuning.at_rest))
         self._estimated = np.full((len(approach.contacts), 2), np.nan)
         self.phase = BracePhase.TO_REST
@@ -280,13 +297,12 @@ class Bracing:
 
         See `look` for the other arguments; the first sample of a held brace stands as it is.
         """
-        assert self._friction is not None
-        t = self._tuning
+        t, friction = self._tuning, self._planned.friction
         if self.phase is BracePhase.HELD:  # the plan has followed friction to there
             creep = t.creep * elapsed / (t.creep_time + self._held)
-            self._friction.follow(pressures, min(elapsed / t.even_time, 1.0), creep)
+            friction.follow(pressures, min(elapsed / t.even_time, 1.0), creep)
             if self._sticks:
-                residual = residual - self._friction.tip[:3] @ self._friction.forces
+                residual = residual - friction.tip[:3] @ friction.forces
         if self._error is None:
             return residual
         return self._residual + min(elapsed / t.swing_time, 1.0) * (residual - self._residual)
@@ -314,28 +330,26 @@ class Bracing:
 
         See `look` for the arguments.
         """
-        assert self._friction is not None
-        assert self._pushes is not None
-        assert self._correction is not None
-        t, friction, residual = self._tuning, self._friction, self._residual
+        t, residual = self._tuning, self._residual
+        _, friction, pushes, correction = self._planned
         if self._error is None:
             self._error = residual
         raw, settles = residual - self._error, self._held < self._settling
-        off = raw + self._correction.withheld(raw)
-        self._correction.forget(elapsed)
+        off = raw + correction.withheld(raw)
+        correction.forget(elapsed)
         self._held += elapsed
         before = friction.normals(pressures) if self._sticks else friction.sliding(pressures)
         if not settles and self._has_slid(elapsed, seen, quaternion, pressures):
             return
-        push, covariance = self._pushes.likely(tip, off)
-        feels = not settles and self._pushes.feels(off, push, before)
+        push, covariance = pushes.likely(tip, off)
+        feels = not settles and pushes.feels(off, push, before)
         if settles:
             self._settled = residual
         # a push that lasts becomes part of b, and one that is not felt may be taken for a
         # correction that friction withholds; so all that the tip has moved since it settled, but
         # for what is felt, may be a push
         change = residual - self._settled - float(feels) * off
-        drift = self._pushes.lost(tip, change, self._creep(tip, pressures))
+        drift = pushes.lost(tip, change, self._creep(tip, pressures))
         if not feels or (self._pushed > t.longest_push and not self._concerns.doubt):
             time = t.settling_time if settles else t.error_time
             self._error = self._error + min(elapsed / time, 1.0) * raw
@@ -365,8 +379,7 @@ class Bracing:
 
         Where it is not at a free arm's place either, the arm still touches something.
         """
-        assert self.approach is not None
-        t, contacts, free = self._tuning, self.approach.contacts, self._free_tip()
+        t, contacts, free = self._tuning, self._planned.approach.contacts, self._free_tip()
         off, from_free, apart = (
             float(np.linalg.norm(each)) for each in (seen - planned, seen - free, free - planned)
         )
@@ -380,7 +393,7 @@ class Bracing:
             f"the tip is {1e3 * off:.0f} mm from where the plan put it, and {1e3 * from_free:.0f} "
             "mm from where an arm without contact has it"
         )
-        rough = {contacts[j].object for j in self.approach.hold.sticking.own}
+        rough = {contacts[j].object for j in self._planned.approach.hold.sticking.own}
         names = " and ".join(f"'{each}'" for each in sorted(rough or {c.object for c in contacts}))
         if rough:
             why += f"; friction on {names} probably holds the body: give it a larger friction"
@@ -395,15 +408,12 @@ class Bracing:
 
         Only contacts that are to stick count. See `look` for the arguments.
         """
-        assert self.approach is not None
-        assert self._friction is not None
-        assert self._pushes is not None
-        t, approach = self._tuning.sliding, self.approach
+        t, approach = self._tuning.sliding, self._planned.approach
         if not (self._sticks and approach.hold.sticking.own):
             return False
         if self._slides is None:
-            usual = self._pushes.usual(approach.tips[-1].pose[:3, :3])
-            self._slides = SlideEstimator(approach, self._friction, usual, t)
+            usual = self._planned.pushes.usual(approach.tips[-1].pose[:3, :3])
+            self._slides = SlideEstimator(approach, self._planned.friction, usual, t)
         self._slides.take(elapsed, self._held, seen, quaternion, pressures)
         sizes = np.linalg.norm(self._slides.slides, axis=1)
         slid = (sizes > t.told) & (self._slides.deviations() > t.surely)
@@ -428,8 +438,8 @@ class Bracing:
 
     def _free_tip(self) -> Array:
         """Return the position (3,) of the tip of a free arm at the present place of the way."""
-        assert self.approach is not None
-        times, rows = self.approach.times, self.approach.free_tips
+        approach = self._planned.approach
+        times, rows = approach.times, approach.free_tips
         return np.array([np.interp(self._time, times, row) for row in rows.T])
 
     def _rest_deviations(self, before: Array) -> Array:
@@ -437,8 +447,7 @@ class Bracing:
 
         `before`: these forces (k,). A robot that is not calibrated has none of its own.
         """
-        assert self.approach is not None
-        least, own = self._tuning.least_deviation * before, self.approach.hold.deviations
+        least, own = self._tuning.least_deviation * before, self._planned.approach.hold.deviations
         return np.maximum(own, least)
 
     def _deviations(self, before: Array, change: Array) -> Array:
@@ -448,8 +457,7 @@ class Bracing:
         stiff, and from the response of the model. `before`: forces (k,) without the push; `change`:
         by it (k,).
         """
-        assert self._pushes is not None
-        G, response = self._pushes.per_push, self._tuning.response * change
+        G, response = self._planned.pushes.per_push, self._tuning.response * change
         pushed = np.einsum("ki,ij,kj->k", G, self.covariance, G)
         return np.sqrt(self._rest_deviations(before) ** 2 + pushed + response**2)
 
@@ -470,17 +478,14 @@ class Bracing:
 
         `before`: normal forces (k,) without it; `drift`: what they may have lost (k,).
         """
-        assert self.approach is not None
-        assert self._friction is not None
-        assert self._pushes is not None
         t, size = self._tuning, float(np.linalg.norm(self.push))
-        change = self._pushes.per_push @ self.push
+        change = self._planned.pushes.per_push @ self.push
         forces, own = before + change, self._deviations(before, change)
         most, least = forces + t.certain * own, self._estimate(forces, np.hypot(own, drift))
         falls = change < 0
         left = size * float(np.min(before[falls] / -change[falls], initial=math.inf))
         if self._sticks:
-            left = min(left, self._friction.left(self.push / size, before))
+            left = min(left, self._planned.friction.left(self.push / size, before))
         self.margin = max(left - size, 0.0)
         words = f"under a push of {1e3 * size:.0f} mN"
         if (most < 0).any():
@@ -488,10 +493,10 @@ class Bracing:
             lost = np.flatnonzero(most < 0).tolist()
             self.release(why=f"{lifted} lifts off {words}", lost=lost)
             return
-        slid, found = self._friction.slid(self.push, before), {}
+        slid, found = self._planned.friction.slid(self.push, before), {}
         kind, how = (UNCERTAIN, "may slide") if self._sticks else (SLIPS, "slips")
         for i in np.flatnonzero(slid > t.slid):
-            each = self.approach.hold.sticking.own[int(i)]
+            each = self._planned.approach.hold.sticking.own[int(i)]
             found[Concern(kind, each, "slide")] = f"{self._named(each)} {how} {words}"
         for each in map(int, np.flatnonzero(least < 0)):
             text, whole = self._lifted(each, float(most[each])), 1e3 * before[each]
@@ -521,8 +526,7 @@ class Bracing:
         return f"{self._named(contact)} may have lifted off: it has 0 to {1e3 * most:.0f} mN"
 
     def _named(self, contact: int) -> str:
-        assert self.approach is not None
-        return f"the contact on '{self.approach.contacts[contact].object}'"
+        return f"the contact on '{self._planned.approach.contacts[contact].object}'"
 
     def _notify(self, kind: str, text: str, severity: Severity = Severity.INFO) -> None:
         self._notices.append(Notice(kind, text, severity))
@@ -541,10 +545,10 @@ class Bracing:
         jacobian : of the position of a tip whose contacts slide, base axes (3, n), in m/Pa.
         limits : smallest and largest pressures (n,), in Pa.
         """
-        if self._correction is None or self.displacement.any():
+        if self._parts is None or self.displacement.any():
             return
         low, high = (each - self.pressures for each in limits)
-        words = self._correction.correct(elapsed, self._held, error, jacobian, low, high)
+        words = self._parts.correction.correct(elapsed, self._held, error, jacobian, low, high)
         if words:
             self._notify("brace-off-target", words, Severity.WARNING)
 
