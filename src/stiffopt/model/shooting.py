@@ -33,8 +33,9 @@ from stiffopt import lie
 from stiffopt.arrays import Array
 from stiffopt.model.actuation import SectionGeometry
 from stiffopt.model.compliance import inverse_3x3
-from stiffopt.model.description import RobotDescription, Segment
+from stiffopt.model.description import RobotDescription
 from stiffopt.model.kinematics import Actuation
+from stiffopt.model.segment import Segment
 from stiffopt.model.shape import PointOfArm
 
 _ROOT = sqrt(21)
