@@ -90,6 +90,7 @@ DOUBTS = (
     "regulator-stuck",
     "pressure-reading",
     "tracker-jumps",
+    "tracker-times",
     "tracker-lost",
     "unreachable",
 )
