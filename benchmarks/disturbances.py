@@ -89,6 +89,7 @@ DOUBTS = (
     "regulator-stuck",
     "pressure-reading",
     "tracker-jumps",
+    "tracker-times",
     "tracker-lost",
     "unreachable",
 )

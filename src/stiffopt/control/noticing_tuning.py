@@ -28,6 +28,19 @@ class SupervisionTuning:
 
 
 @dataclass(frozen=True)
+class ScatterTuning:
+    """When the times of the tracker's samples scatter (`TimeScatter`)."""
+
+    most: float = 0.02  # standard deviation of the times above which there is an alarm, in s
+    least: float = 0.01  # that the noise of positions may seem to be, in s
+    least_speed: float = 0.01  # of the tip, in m/s
+    window: float = 0.35  # of motion, in s
+    count: int = 7  # least number of samples in it
+    outlier: float = 3.0  # multiple of the median error that counts of an error
+    longest_interval: float = 0.2  # between samples of one motion, in s
+
+
+@dataclass(frozen=True)
 class DriftScale:
     """A drift: faster than `least_speed`, in m/s, in each of `count` intervals, in s."""
 

@@ -19,6 +19,7 @@ from stiffopt.control.pressing import Pressing
 from stiffopt.control.regulators import PressureEstimator
 from stiffopt.control.replanning import AnyCourse
 from stiffopt.control.setup import ControlSetup
+from stiffopt.control.time_scatter import TimeScatter
 from stiffopt.control.tip_errors import turn_of_a_push
 from stiffopt.control.touch import TouchEstimator
 from stiffopt.errors import StiffoptError
@@ -79,6 +80,7 @@ class ArmObserver:
             ),
         )
         self.watch = MotionWatch(robot.description, tuning.motion, vibrates=mode is not None)
+        self.times = TimeScatter(control.tracker_noise)
         self.model: ArmModel | None = None
         self._now, self._modelled_at = 0.0, np.zeros(n)
 
@@ -111,6 +113,7 @@ class ArmObserver:
         self.tip.begin()
         self.touch.begin()
         self.watch.begin()
+        self.times.begin()
         self.modelled: TipAt | None = None
         self.leaning: LeaningTip | None = None
         self._looked_at = now  # capture time of the last sample, in s
@@ -183,6 +186,7 @@ class ArmObserver:
         self, sample: PoseSample, effective: Array, tip: TipAt, course: AnyCourse | None
     ) -> None:
         """Estimate the force on the tip from a sample, and check the sample against the model."""
+        self.times.take(sample.time, sample.position)
         predicted, pushed = self.tip.predicted, np.zeros(3)
         presses = isinstance(course, Pressing) and course.touches_on_purpose
         if isinstance(course, Pressing) and presses:

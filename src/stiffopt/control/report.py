@@ -156,6 +156,13 @@ class Report:
                 "swings after its motions; run 'stiffopt commission', and check the robot file"
             )
             notices = (*notices, Notice("frequency", text, standing=True))
+        if arm.times.is_large:
+            text = (
+                f"the times of the tracker's samples scatter by {1e3 * arm.times.scatter:.0f} ms, "
+                "so that the tip leaves its way as it moves; stamp samples where they are "
+                "captured, and look for a busy computer or network"
+            )
+            notices = (*notices, Notice("tracker-times", text, standing=True))
         if doubt := arm.watch.doubt:
             held = Notice(doubt.kind, doubt.text, Severity.ERROR, True, True, doubt.undo)
             notices = (*notices, held)
