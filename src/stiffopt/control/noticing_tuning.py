@@ -152,4 +152,6 @@ class TrackerTuning:
     enough: int = 8  # minimum number of samples for that
     # ticks with new samples, none overdue, after which a missing tip is seen again
     back: int = 8
+    # repetitions of one pose in a row after which a tracker is stuck that never repeats one at rest
+    repeats: int = 8
     jitter: float = 0.25  # share of an interval by which a sample may be late
