@@ -67,13 +67,13 @@ class PushTuning:
 class StillTuning:
     """When a sensor lies still while the pressures turn the tip (`StillWatch`)."""
 
-    windows: tuple[float, ...] = (0.5, 1.0)  # times over which it is looked for, in s
-    interval: float = 0.05  # by which the first sample may be later than a window, in s
-    samples: int = 2  # least number of samples in a third of a window
+    window: float = 1.0  # in which it is looked for, in s
+    interval: float = 0.1  # by which the first sample may be later than its beginning, in s
+    samples: int = 2  # least number of samples in a third of it
     # largest change of the mean pose between thirds: over the scatter of a sample, and in rad
     scatters: float = 3.0
     turn: float = 3e-3
-    # least turn of the model that is not seen, in rad: of pushed and loaded arms it was below 0.011
+    # least turn of the model that is not seen, in rad: of healthy arms it was 0.013 at most
     least: float = 0.025
     further: float = 2.0  # see `MotionTuning.further`
     misses: int = 2  # successive samples

@@ -64,21 +64,21 @@ class StillWatch:
         tip :
             The model's tip now.
         """
-        poses, windows = self._poses, self._tuning.windows
+        poses = self._poses
         poses.append(_Pose(time, position, rotation, predicted, modelled))
-        while time - poses[0].time > max(windows) + 1e-6:
+        while time - poses[0].time > self._tuning.window + 1e-6:
             poses.popleft()
-        missing = max(self._missing(window, tip) for window in windows)
+        missing = self._missing(tip)
         self._count = self._count + 1 if missing > 0 else 0
         return missing if self._count >= self._tuning.misses else 0.0
 
-    def _missing(self, window: float, tip: TipAt) -> float:
-        """Return the turn that is not seen in the last so many seconds, in rad; 0 if all may be."""
-        tuning, last = self._tuning, self._poses[-1]
-        if last.time - self._poses[0].time < window - tuning.interval:
+    def _missing(self, tip: TipAt) -> float:
+        """Return the turn that is not seen in the last samples, in rad; 0 if all may be."""
+        tuning, poses = self._tuning, list(self._poses)
+        first, last = poses[0], poses[-1]
+        if last.time - first.time < tuning.window - tuning.interval:
             return 0.0
-        poses = [pose for pose in self._poses if pose.time > last.time - window - 1e-6]
-        if not math.hypot(*_turn(poses[0].modelled, last.modelled).tolist()) > tuning.least:
+        if not math.hypot(*_turn(first.modelled, last.modelled).tolist()) > tuning.least:
             return 0.0
         if len(poses) < 3 * tuning.samples:
             return 0.0
