@@ -670,7 +670,8 @@ class TipController:
     def notices(self) -> tuple[Notice, ...]:
         """Return alarms and events."""
         untold, self._untold = self._untold, []
-        return (*untold, *self._report.notices(self._rests_short()))
+        waits = self._waits and not self._is_held(self._now) and not self._has_arrived()
+        return (*untold, *self._report.notices(self._rests_short(), waits=waits))
 
     def _rests_short(self) -> bool:
         """Return whether the tip is at rest although its target, out of reach, is elsewhere.

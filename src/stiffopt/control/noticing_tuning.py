@@ -77,6 +77,22 @@ class PushTuning:
 
 
 @dataclass(frozen=True)
+class StillTuning:
+    """When a sensor lies still while the pressures turn the tip (`StillWatch`)."""
+
+    window: float = 1.0  # in which it is looked for, in s
+    interval: float = 0.1  # by which the first sample may be later than its beginning, in s
+    samples: int = 2  # least number of samples in a third of it
+    # largest change of the mean pose between thirds: over the scatter of a sample, and in rad
+    scatters: float = 3.0
+    turn: float = 3e-3
+    # least turn of the model that is not seen, in rad: of healthy arms it was 0.013 at most
+    least: float = 0.025
+    further: float = 2.0  # see `MotionTuning.further`
+    misses: int = 2  # successive samples
+
+
+@dataclass(frozen=True)
 class MotionTuning:
     """Thresholds for doubting the tip's motion (`MotionWatch`)."""
 
@@ -94,6 +110,7 @@ class MotionTuning:
     push: float = 8e-4
     push_time: float = 0.25
     pushes: PushTuning = field(default_factory=PushTuning)  # of pushes in motion
+    still_watch: StillTuning = field(default_factory=StillTuning)  # of a sensor that lies still
     noise: float = 1e-3  # of a measured motion, in m
     scatter: float = 5e-5  # standard deviation of a tracked position in each axis, in m
     # shortest way for a test of the response: in m, and as a share of the arm's length
@@ -148,4 +165,6 @@ class TrackerTuning:
     enough: int = 8  # minimum number of samples for that
     # ticks with new samples, none overdue, after which a missing tip is seen again
     back: int = 8
+    # repetitions of one pose in a row after which a tracker is stuck that never repeats one at rest
+    repeats: int = 8
     jitter: float = 0.25  # share of an interval by which a sample may be late

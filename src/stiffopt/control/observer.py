@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from stiffopt import lie
 from stiffopt.arrays import Array
 from stiffopt.control.bracing import Bracing
 from stiffopt.control.channels import Channels
@@ -187,7 +188,7 @@ class ArmObserver:
     ) -> None:
         """Estimate the force on the tip from a sample, and check the sample against the model."""
         self.times.take(sample.time, sample.position)
-        predicted, pushed = self.tip.predicted, np.zeros(3)
+        predicted, pushed, rotations = self.tip.predicted, np.zeros(3), None
         presses = isinstance(course, Pressing) and course.touches_on_purpose
         if isinstance(course, Pressing) and presses:
             self.touch.expect(course.direction, course.press.speed, presses=course.presses)
@@ -204,10 +205,12 @@ class ArmObserver:
             pushed = self.touch.felt.displacement
             if turned is not None:
                 turned = turned - turn_of_a_push(tip, along_stiff_axis=True) @ pushed
+        elif sample.quaternion is not None:
+            rotations = lie.rotation_from_quaternion(sample.quaternion), self.tip.modelled
         self.watch.take(
             sample.time, sample.position - pushed, predicted, self.tip.offset, captured,
             tip, turned=turned, swings=self.tip.swings, deviation=self.tip.deviation,
-            omega=self.tip.omega,
+            omega=self.tip.omega, rotations=rotations,
         )  # fmt: skip
 
     def lean_on(self, leaning: LeaningTip | None) -> Array:

@@ -126,10 +126,11 @@ class Report:
             AdaptedNumber(f"regulator_lag[{channel}]", *each) for channel, each in enumerate(found)
         )
 
-    def notices(self, rests_short: bool) -> tuple[Notice, ...]:
+    def notices(self, rests_short: bool, *, waits: bool) -> tuple[Notice, ...]:
         """Return alarms and events.
 
         `rests_short`: whether the tip rests short of its target, so that its distance can be told.
+        `waits`: whether the reference waits for the end of a push.
         """
         arm, pursuit, away = self._arm, self._replanner.pursuit, None
         if rests_short:
@@ -138,6 +139,11 @@ class Report:
         notices = (*self._replanner.notices(away), *arm.channels.notices())
         if isinstance(pursuit.course, Pressing | Bracing):
             notices = (*notices, *pursuit.course.notices())
+        if waits:
+            text = (
+                "something pushes the arm: it waits on its way to the target, for a second or two"
+            )
+            notices = (*notices, Notice("motion-waits", text, Severity.INFO, standing=True))
         if self.model_is_wrong:
             distance = 1e3 * float(np.linalg.norm(arm.tip.offset[:3]))
             text = (
