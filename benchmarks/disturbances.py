@@ -86,6 +86,7 @@ DOUBTS = (
     "lost-channel",
     "channel-opposed",
     "shortfall",
+    "missing-motion",
     "slow-channel",
     "regulator-stuck",
     "pressure-reading",

@@ -64,6 +64,21 @@ class PushTuning:
 
 
 @dataclass(frozen=True)
+class MissingMotionTuning:
+    """When the tip lacks the motion of a channel (`MissingMotion`)."""
+
+    interval: float = 0.2  # between samples that are compared, in s
+    longest_pause: float = 0.5  # between two samples, after which they are not compared, in s
+    # share of a channel's motion that errors of the model explain; share that counts of a change of
+    # the offset across it
+    usual: float = 0.5
+    across: float = 0.5
+    most: float = 3e-3  # missing motion beyond that, of a fault, in m
+    # at which the channel goes back then, as the motion of the model's tip by it, in m/s
+    back_speed: float = 5e-3
+
+
+@dataclass(frozen=True)
 class MotionTuning:
     """Thresholds for doubting the tip's motion (`MotionWatch`)."""
 
