@@ -47,6 +47,9 @@ class PushTuning:
     slow: float = 12.0  # above which it is less, as the inverse square, in rad/s
     steady: float = 0.3  # time at the beginning in which the speed of a steady change is seen, in s
     steady_share: float = 0.7  # of such a change that counts; times `share` it is more than all
+    # motion of the tip by each channel below which such a change is slow, in m/s: the arm then
+    # becomes stiff with 5 mm/s at most, and feedback adds to that
+    slow_change: float = 6e-3
     least: float = 2e-3  # least displacement, in m
     moves: float = 0.3  # least share of it by which the tip moves
     # displacement over all that the pressures can have moved the tip, and length added to that, in
@@ -59,7 +62,7 @@ class PushTuning:
     turn: float = 0.3
     further: float = 2.0
     lasts: float = 1.0  # time after that in which the arm swings, in s
-    # multiple of its largest displacement, when recognised, that it explains later
+    # multiple of its largest displacement, soon after it was recognised, that it explains later
     grows: float = 1.2
 
 
