@@ -63,6 +63,13 @@ def test_what_happens_in_a_pause_does_not_count():
     assert watch.channel is None
 
 
+def test_a_fast_motion_is_not_judged():
+    watch = MissingMotion(MissingMotionTuning())
+    for time, offset in zip(TIMES / 5, lacking([0.0, 1.0, 0.0]), strict=True):
+        watch.take(time, offset, 5 * time * RATES, J)
+    assert watch.channel is None
+
+
 @pytest.mark.parametrize("rises", [True, False])
 def test_that_channel_goes_back_until_there_is_another_target(rises):
     asked, seen = [], []

@@ -117,18 +117,6 @@ def test_a_push_explains_no_more_than_it_was_seen_to_do() -> None:
     assert np.linalg.norm(found[0]) == pytest.approx(1.2 * 8e-3, rel=1e-3)
 
 
-def test_a_push_counts_as_it_grows_although_channels_move_meanwhile() -> None:
-    """A wall that is met later does not."""
-    watch, grown = PushWatch(PushTuning(), vibrates=True), samples(8e-3, 8e-3)
-    assert watch.take(*samples(4e-3, 0.0), J, TIP)
-    for later, largest in ((0.1, 8e-3), (0.5, 8e-3)):
-        assert not watch.take(grown.times + later, *grown[1:], J, TIP)
-        caught = samples(40e-3, 0.0)
-        found = watch.displacements(caught.away, caught.turned, TIP)
-        assert np.linalg.norm(found[0]) == pytest.approx(1.2 * largest, rel=1e-3)
-        grown = samples(16e-3, 16e-3)
-
-
 @pytest.mark.usefixtures("compiled")
 @pytest.mark.parametrize("ends", [False, True])
 def test_a_push_that_begins_or_ends_with_a_new_target_is_not_doubted(ends: bool) -> None:

@@ -9,6 +9,7 @@ rise on and on; at the next target the chamber would not follow it down, and the
 the channel goes back to where it was last seen to move the tip, as slowly as it has come, and the
 others make up for it.
 
+In a fast motion, on the way to a target, the offset shows too late for that; other tests judge it.
 For each channel, the part of its motion that the tip lacks is added up, beyond half of it and half
 of what the offset changes across it. Motion that the tip follows counts back.
 """
@@ -74,6 +75,9 @@ class MissingMotion:
         change = offset - offset_before
         by_channels = jacobian * (pressures - pressures_before)  # (3, n)
         motions = np.sqrt((by_channels**2).sum(axis=0))
+        if motions.max() > tuning.fastest * (time - before):
+            self._missing = np.zeros(len(motions))  # the arm goes to its target
+            return
         directions = by_channels / np.maximum(motions, 1e-12)
         along = -change @ directions
         across = np.sqrt(np.maximum(change @ change - along**2, 0.0))

@@ -62,7 +62,7 @@ class PushTuning:
     turn: float = 0.3
     further: float = 2.0
     lasts: float = 1.0  # time after that in which the arm swings, in s
-    # multiple of its largest displacement, soon after it was recognised, that it explains later
+    # multiple of its largest displacement, when recognised, that it explains later
     grows: float = 1.2
 
 
@@ -76,6 +76,9 @@ class MissingMotionTuning:
     # the offset across it
     usual: float = 0.5
     across: float = 0.5
+    # motion of the tip by a channel above which the arm goes to a target, in m/s: as it becomes
+    # stiff that is 5 mm/s, and up to 15 mm/s where feedback makes up for what the tip lacks
+    fastest: float = 2e-2
     most: float = 3e-3  # missing motion beyond that, of a fault, in m
     # at which the channel goes back then, as the motion of the model's tip by it, in m/s
     back_speed: float = 5e-3

@@ -40,8 +40,7 @@ class PushWatch:
 
     def begin(self) -> None:
         """Restart without a push."""
-        self._since = self._until = -math.inf  # when it was recognised, and until when it acts
-        self._size = 0.0  # its largest displacement, in m
+        self._until, self._size = -math.inf, 0.0
 
     def acts(self, now: float) -> bool:
         """Return whether a push has begun or ended lately, at a time in s."""
@@ -92,17 +91,13 @@ class PushWatch:
         expected = float(np.linalg.norm(bent))
         if expected < tuning.least_turn or missing > tuning.turn * expected:
             return False
-        if now < self._since + tuning.time:  # it displaces the tip further
-            self._size = max(self._size, size)
         late = self._late * min(1.0, (tuning.slow / max(self.omega, 1e-9)) ** 2)
         acting = slice(max(2, int(times.searchsorted(now - late, "right"))))
         by_channels = self._caused(times[acting], pressures[acting], jacobian)
         by_swing = 2 * float(swings[first])  # from one side to the other
         if size < tuning.share * max(by_channels + tuning.noise, by_swing):
             return False
-        if not self.acts(now):
-            self._since, self._size = now, 0.0
-        self._size = max(size, self._size)
+        self._size = max(size, self._size if self.acts(now) else 0.0)
         self._until = now + tuning.lasts
         return True
 
