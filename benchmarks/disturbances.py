@@ -85,6 +85,7 @@ DOUBTS = (
     "lost-channel",
     "channel-opposed",
     "shortfall",
+    "missing-motion",
     "slow-channel",
     "regulator-stuck",
     "pressure-reading",

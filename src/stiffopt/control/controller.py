@@ -313,6 +313,9 @@ class TipController:
         if counts.used and sample and tip and not self._first_motion.is_over:
             parts = tip.pose[:3, :3] @ tip.jacobian[:3] * self._arm.tip.captured
             self._first_motion.take(self._arm.tip.predicted, sample.position, parts)
+        if counts.used and sample and tip:
+            estimator = self._arm.tip
+            self.replanner.look(sample.time, estimator.offset, estimator.captured, tip)
         if self.forecast is not None:
             self.forecast.present = self._present(now)
         return counts
@@ -394,13 +397,14 @@ class TipController:
         if isinstance(course, PostureCourse):
             self._led_to = course.target(tip.pose, reference.path[n:])
         goal = reference.command - pressures.command_offset
+        limits = self._arm.channels.commands(reference.path[:n], *self._permitted, goal)
         command = self._feedback.command(
             tip,
             reference,
             self.replanner.pursuit.prescribed,
             self._offset,
             goal,
-            self._arm.channels.commands(reference.path[:n], *self._permitted, goal),
+            self.replanner.limited(limits, pressures.command_offset),
             None if isinstance(course, PostureCourse | Pressing) else course is not None,
             min(self._first_motion.largest_correction(tip.pose[:3, 3]), self._correction.largest),
             bent,

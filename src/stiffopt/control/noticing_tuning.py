@@ -60,6 +60,9 @@ class PushTuning:
     slow: float = 12.0  # above which it is less, as the inverse square, in rad/s
     steady: float = 0.3  # time at the beginning in which the speed of a steady change is seen, in s
     steady_share: float = 0.7  # of such a change that counts; times `share` it is more than all
+    # motion of the tip by each channel below which such a change is slow, in m/s: the arm then
+    # becomes stiff with 5 mm/s at most, and feedback adds to that
+    slow_change: float = 6e-3
     least: float = 2e-3  # least displacement, in m
     moves: float = 0.3  # least share of it by which the tip moves
     # displacement over all that the pressures can have moved the tip, and length added to that, in
@@ -90,6 +93,24 @@ class StillTuning:
     least: float = 0.025
     further: float = 2.0  # see `MotionTuning.further`
     misses: int = 2  # successive samples
+
+
+@dataclass(frozen=True)
+class MissingMotionTuning:
+    """When the tip lacks the motion of a channel (`MissingMotion`)."""
+
+    interval: float = 0.2  # between samples that are compared, in s
+    longest_pause: float = 0.5  # between two samples, after which they are not compared, in s
+    # share of a channel's motion that errors of the model explain; share that counts of a change of
+    # the offset across it
+    usual: float = 0.5
+    across: float = 0.5
+    # motion of the tip by a channel above which the arm goes to a target, in m/s: as it becomes
+    # stiff that is 5 mm/s, and up to 15 mm/s where feedback makes up for what the tip lacks
+    fastest: float = 2e-2
+    most: float = 3e-3  # missing motion beyond that, of a fault, in m
+    # at which the channel goes back then, as the motion of the model's tip by it, in m/s
+    back_speed: float = 5e-3
 
 
 @dataclass(frozen=True)
