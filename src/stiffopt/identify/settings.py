@@ -107,6 +107,7 @@ class SamplingSettings:
     loaded_fit_rows, loaded_rows : largest numbers of rows in a fit and in a comparison of an arm
         under gravity, each of whose poses needs a search for equilibrium.
     rows : largest number of rows of a log in a comparison.
+    turn_rows : number of rows of a log by which a body's axes are told from turned ones.
     dead_time_step : longest time between rows, in s, that distinguishes a dead time from a lag.
     """
 
@@ -117,6 +118,7 @@ class SamplingSettings:
     loaded_fit_rows: int = 300
     loaded_rows: int = 400
     rows: int = 50_000
+    turn_rows: int = 20
     dead_time_step: float = 0.5
 
 
