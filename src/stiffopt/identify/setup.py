@@ -299,6 +299,8 @@ class Setup:
         )
         turning = [point.name for point in self.points if point.turns]
         few = [_of_few_rows(each, turning) for each in samples]
+        if not any(len(each.rows) for each in few):
+            return list(samples)
         problem = CalibrationProblem(description, unknowns, few, self.points, self.base, NOISE)
         predicted = problem.predict(np.zeros(0))
         found = []

@@ -230,7 +230,7 @@ def _with_frame_found(setup: Setup, recording: Recording, found: Comparison) -> 
     best, *others = sorted(motions, key=miss)
     if best.kind == "scale" or (others and miss(best) > DETECTION.tie * miss(others[0])):
         return None
-    if are_both_moved(miss(best), recorded, expected, length):
+    if are_both_moved(best, recorded, expected, length):
         return None
     remark = f"{best.told([recording])} (--keep axes leaves that as it was recorded)"
     if recorded[0].rotation is None:
