@@ -531,16 +531,16 @@ class FrameComparer:
 
         None of two logs, as either may be the odd one.
         """
-        off, odd = DETECTION.off * self._length, self._odd_one()
         if len(self._pressures) < 3:
             return None
-        of_all = min(self._unmoved(()), key=_Tried.score)
+        odd, of_all = self._odd_one(), min(self._unmoved(()), key=_Tried.score)
 
-        def misses(tried: _Tried, logs: Logs) -> list[bool]:
-            far = (distances(tried.recorded[i], tried.expected[i]).mean() for i in logs)
-            return [each > off for each in far]
+        def most(tried: _Tried, logs: Logs) -> float:
+            far = [distances(tried.recorded[i], tried.expected[i]).mean() for i in logs]
+            return float(max(far))
 
-        is_odd = all(misses(of_all, odd.logs)) and not any(misses(odd, self._rest(odd.logs)))
+        left, others = most(of_all, odd.logs), most(odd, self._rest(odd.logs))
+        is_odd = left > DETECTION.off * self._length and others < DETECTION.frame * left
         return self.misfit(odd.logs) if is_odd else None
 
     def channels_alone(self) -> OtherChannels | None:
