@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -110,6 +111,25 @@ def test_that_channel_goes_back_until_there_is_another_target(rises):
     assert at == pytest.approx(0.5 * BAR)  # where the tip has last followed
     low, high = replanner.limited(limits, np.full(3, 0.1 * BAR))
     assert (high[1] if rises else low[1]) == pytest.approx(at - 0.1 * BAR)
+
+
+def test_a_stream_of_targets_that_leads_away_and_a_trajectory_give_the_channel_free():
+    planner = SimpleNamespace(request=lambda _: None, latest=lambda: None, notices=tuple)
+    task = Task(robot=HANGING, target=Target(position=(0.0, 0.0, 0.1)))
+    for way in ("stream", "trajectory"):
+        replanner = Replanner(planner, ReplanningTuning(), 0.01, 0.0)
+        replanner.pursue(Pursuit(task=task, target=task.target))
+        replanner._missing.channel, replanner._search = 1, False
+        if way == "trajectory":
+            replanner.pursue(Pursuit(task=task, target=task.target, course=cast(Any, object())))
+            assert replanner._missing.channel is None
+            continue
+        for x in np.arange(1, 5) * 1e-3:
+            replanner.pursue(Pursuit(task=task, target=Target(position=(x, 0.0, 0.1))))
+            assert replanner._missing.channel == 1
+        for x in np.arange(5, 8) * 1e-3:
+            replanner.pursue(Pursuit(task=task, target=Target(position=(x, 0.0, 0.1))))
+        assert replanner._missing.channel is None
 
 
 @pytest.mark.usefixtures("compiled")

@@ -57,6 +57,12 @@ def test_vibration_and_noise_are_no_scatter(frequency: float, noise: float) -> N
     assert not watched(times, times, noise=noise, frequency=frequency).is_large
 
 
+@pytest.mark.parametrize("rate", [15.0, 20.0, 22.0])
+def test_fast_swings_that_are_sampled_seldom_are_not_judged(rate: float) -> None:
+    times = np.arange(120) / rate
+    assert math.isnan(watched(times, times, frequency=5.0).scatter)
+
+
 def test_single_wrong_samples_and_pauses_are_no_scatter() -> None:
     found, times = TimeScatter(1e-4), np.arange(120) / RATE
     for k, (time, position) in enumerate(zip(times, way(times, 1.7), strict=True)):

@@ -87,34 +87,6 @@ def test_1_2_3_missing_after_three_frames_and_lost_after_the_timeout(changes: An
     assert watched.until(Sight.SEEN) is not None
 
 
-@pytest.mark.parametrize(("noise", "sight"), [(5e-5, Sight.LOST), (0.0, Sight.SEEN)])
-@pytest.mark.parametrize("turns", [False, True])
-def test_3_a_pose_that_is_repeated_under_new_numbers_is_not_seen(
-    noise: float, sight: Sight, turns: bool
-) -> None:
-    """A tracker without noise repeats the pose of an arm at rest."""
-    rng, watched = np.random.default_rng(4), Watched()
-
-    def measured() -> dict[str, Any]:
-        moved = noise * rng.standard_normal(3)
-        return {"position": moved, "quaternion": np.array([1.0, *moved]) if turns else None}
-
-    while watched.watch.samples < 20:
-        watched.tick(**measured())
-    watched.armed = True
-    for _ in range(100):
-        assert watched.tick(**measured()) is Sight.SEEN
-    stuck = measured()
-    for _ in range(20):  # 8 samples, but for the first
-        assert watched.tick(**stuck) is Sight.SEEN
-    seen = [watched.tick(**stuck) for _ in range(80)]
-    assert seen[-1] is sight
-    assert Sight.MISSING not in seen[:5]
-    for _ in range(40):
-        watched.tick(**measured())
-    assert watched.watch.sight(watched.t) is Sight.SEEN
-
-
 @pytest.mark.parametrize("missing", [1, 2])
 def test_1_fewer_missing_frames_do_not_matter(missing: int) -> None:
     watched = Watched().ready()

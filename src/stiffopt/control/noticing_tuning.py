@@ -36,8 +36,8 @@ class ScatterTuning:
     least_speed: float = 0.01  # of the tip, in m/s
     window: float = 0.35  # of motion, in s
     count: int = 7  # least number of samples in it
+    longest_span: float = 0.135  # of four samples: over a longer one a swing is rough itself, in s
     outlier: float = 3.0  # multiple of the median error that counts of an error
-    longest_interval: float = 0.2  # between samples of one motion, in s
 
 
 @dataclass(frozen=True)
@@ -186,6 +186,4 @@ class TrackerTuning:
     enough: int = 8  # minimum number of samples for that
     # ticks with new samples, none overdue, after which a missing tip is seen again
     back: int = 8
-    # repetitions of one pose in a row after which a tracker is stuck that never repeats one at rest
-    repeats: int = 8
     jitter: float = 0.25  # share of an interval by which a sample may be late

@@ -124,7 +124,7 @@ class Replanner:
         self._detour: Course | None = None  # the tip's way to its target after a loss of channels
         self._detour_from: Plan | None = None  # where it begins, until that is planned from
         self._offset = np.zeros(6)
-        self._missing.begin()
+        self._forget_missing()
         self.deviation = math.nan  # of the plan's stiffness, relative
         self._available: tuple[Array, Array] | None = None  # see `update`
         self.bent: BentMode | None = None  # modes of the arm where the reference was last
@@ -143,8 +143,14 @@ class Replanner:
             self.plan = None  # it belongs to another posture than the trajectory's
         self._search = self._search or far
         self._requested_at = -math.inf
-        if self._search:
-            self._missing.begin()
+        left = is_far(self._lacking_at, pursuit.target, far_position, far_angle)
+        if self._search or left or pursuit.course is not None:
+            self._forget_missing()
+
+    def _forget_missing(self) -> None:
+        """Let all channels go as far as others permit."""
+        self._missing.begin()
+        self._lacking_at = self.pursuit.target  # where motion of a channel may be missing
 
     def look(self, time: float, offset: Array, pressures: Array, tip: TipAt) -> None:
         """Look whether the tip lacks the motion of a channel as the arm becomes stiff.

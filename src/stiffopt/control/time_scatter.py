@@ -22,7 +22,8 @@ class TimeScatter:
     and keeps errors that differ from sample to sample. Over a window of motion, the root of the sum
     of the squares of e along v, by that of v, is the standard deviation of the times. Of an error
     far above the median only a part counts, so that single wrong samples hardly matter. Noise of
-    the positions counts as scatter as well, the less the faster the tip.
+    the positions counts as scatter as well, the less the faster the tip; so does a fast swing of it
+    that is sampled seldom. Hence samples further apart than 45 ms are not judged.
 
     `noise` is the standard deviation of a position along an axis, in m.
 
@@ -47,10 +48,10 @@ class TimeScatter:
 
     def take(self, time: float, position: Array) -> None:
         """Take in a sample: its time, in s, and position (3,), in m."""
-        if self._rows and not 0 < time - self._rows[-1][0] < self._tuning.longest_interval:
+        if self._rows and not time > self._rows[-1][0]:
             self._rows.clear()
         self._rows.append((time, position))
-        if len(self._rows) < 4:
+        if len(self._rows) < 4 or time - self._rows[0][0] > self._tuning.longest_span:
             return
         times = np.array([row[0] for row in self._rows]) - time
         positions = np.array([row[1] for row in self._rows])

@@ -45,9 +45,6 @@ class TrackerWatch:
         self.jumps = 0  # successive samples that were rejected
         self._back = tuning.back  # ticks with new samples since the tip was missing
         self._frame: int | None = None
-        self._newest: PoseSample | None = None
-        self._same = 0  # successive samples with the pose of the one before
-        self._is_noisy = False  # whether samples of the vented arm never repeat a pose
         self._reported = self._latest = -np.inf
         # interval between samples, and their age on arrival, in s; a guess until learned
         self.usual = safety.tracker_timeout / safety.tracker_frames, 0.0
@@ -69,26 +66,15 @@ class TrackerWatch:
         self._latest = max(self._latest, now - self.usual[1])
 
     def new(self, samples: Sequence[PoseSample]) -> Sequence[PoseSample]:
-        """Return the samples without repetitions of a frame.
-
-        A tracker whose noise changes every pose at rest does not see the tip either when it gives
-        one pose `TrackerTuning.repeats` times in a row, even under new numbers.
-        """
+        """Return the samples without repetitions of a frame."""
         if not samples:
             return samples
         fresh = []
         for sample in samples:
             if sample.frame != self._frame:
                 self._frame = sample.frame
-                if not self._is_stuck(sample):
-                    fresh.append(sample)
+                fresh.append(sample)
         return fresh
-
-    def _is_stuck(self, sample: PoseSample) -> bool:
-        """Return whether the tracker repeats a pose again and again."""
-        before, self._newest = self._newest, sample
-        self._same = self._same + 1 if before and _is_same(sample, before) else 0
-        return self._is_noisy and self._same >= self.tuning.repeats
 
     def learn(self, now: float, samples: Sequence[PoseSample]) -> None:
         """Learn interval, age and position from samples of a vented arm."""
@@ -102,8 +88,6 @@ class TrackerWatch:
             self._ages.append(now - sample.time)
             if len(self._positions) >= self.tuning.enough:
                 self.usual = _median(self._intervals), _median(self._ages)
-                steps = np.diff(np.array(self._positions), axis=0)
-                self._is_noisy = bool(steps.any(axis=1).all())
 
     @property
     def samples(self) -> int:
@@ -163,14 +147,6 @@ class TrackerWatch:
     def jumping(self) -> bool:
         """Whether so many successive samples were rejected that it is a fault."""
         return self.jumps >= self._safety.max_jumps
-
-
-def _is_same(sample: PoseSample, before: PoseSample) -> bool:
-    """Return whether two samples have exactly the same pose."""
-    if not np.array_equal(sample.position, before.position):
-        return False
-    here, there = sample.quaternion, before.quaternion
-    return here is there or (here is not None and there is not None and np.array_equal(here, there))
 
 
 def _median(values: deque[float]) -> float:
