@@ -324,8 +324,9 @@ class TipController:
         estimate, replanner = self._arm.tip.estimate, self.replanner
         return Present(
             replanner.pursuit, replanner.plan, self._way(now), self._arm.tip.offset,
-            self._arm.pressures.command_offset, self._arm.channels.available(), replanner.adapted,
-            estimate.position, estimate.rotation, self._vibrates,
+            self._arm.pressures.command_offset,
+            replanner.limited(self._arm.channels.available(), np.zeros(self.robot.n_pressures)),
+            replanner.adapted, estimate.position, estimate.rotation, self._vibrates,
         )  # fmt: skip
 
     def _way(self, now: float) -> Array:

@@ -6,8 +6,8 @@ channel, and against that motion. Errors of the model are a smaller share of it.
 direction and a speed of its own, but one that grows for long with those of a channel looks the
 same. If the loop went on to make up for what the tip lacks with that channel, its command would
 rise on and on; at the next target the chamber would not follow it down, and the tip goes aside. So
-the channel goes back to where it was last seen to move the tip, as slowly as it has come, and the
-others make up for it.
+such a channel goes back to where it was last seen to move the tip, as slowly as it has come, and
+the others make up for it. A pressure that falls in vain is only told: nothing here raises one.
 
 In a fast motion, on the way to a target, the offset shows too late for that; other tests judge it.
 For each channel, the part of its motion that the tip lacks is added up, beyond half of it and half
@@ -16,10 +16,21 @@ of what the offset changes across it. Motion that the tip follows counts back.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from stiffopt.arrays import Array
 from stiffopt.control.noticing_tuning import MissingMotionTuning
+
+
+@dataclass
+class _WayBack:
+    """The way back of a channel whose pressure has risen in vain."""
+
+    highest: float  # pressure now, in Pa
+    goal: float  # at the end of the way
+    rate: float  # in Pa/s
 
 
 class MissingMotion:
@@ -28,11 +39,6 @@ class MissingMotion:
     Parameters
     ----------
     tuning : how much of it is a fault.
-
-    Attributes
-    ----------
-    channel : the channel, counted from 0, whose motion was found to be missing; None: none. It
-        stays until `begin`.
     """
 
     def __init__(self, tuning: MissingMotionTuning) -> None:
@@ -41,14 +47,16 @@ class MissingMotion:
 
     def begin(self) -> None:
         """Restart, as for another target."""
-        self.channel: int | None = None
-        # of that channel: the pressure that it must not exceed, or must not fall below; where that
-        # goes, in Pa; and how fast, in Pa/s
-        self._bound = self._goal = self._rate = 0.0
-        self._was_rising = True
+        # of each channel whose motion was found to be missing; None if its pressure was falling
+        self._found: dict[int, _WayBack | None] = {}
         self._missing: Array = np.zeros(1)  # of each channel (n,), or of all, in m
         self._followed: Array = np.zeros(1)  # pressures (n,) with nothing missing yet, in Pa
         self.pause()
+
+    @property
+    def channels(self) -> tuple[int, ...]:
+        """The channels whose motion was found to be missing, counted from 0; until `begin`."""
+        return tuple(sorted(self._found))
 
     def pause(self) -> None:
         """Continue with the next sample: changes until then do not count."""
@@ -85,27 +93,26 @@ class MissingMotion:
         grown = np.maximum(lacking, -motions) - tuning.usual * motions
         self._followed = np.where(self._missing > 0, self._followed, pressures_before)
         self._missing = np.maximum(self._missing + grown, 0.0)
-        most = int(np.argmax(self._missing))
-        if self.channel is None and self._missing[most] > tuning.most:
-            self.channel, self._bound = most, float(pressures[most])
-            self._goal = float(self._followed[most])
-            self._was_rising = self._bound > self._goal
-            self._rate = tuning.back_speed / float(np.linalg.norm(jacobian[:, most]))
+        for channel in map(int, np.flatnonzero(self._missing > tuning.most)):
+            if channel not in self._found:
+                highest, goal = float(pressures[channel]), float(self._followed[channel])
+                rate = tuning.back_speed / float(np.linalg.norm(jacobian[:, channel]))
+                way = _WayBack(highest, goal, rate) if highest > goal else None
+                self._found[channel] = way
 
     def go_back(self, elapsed: float) -> None:
-        """Let the channel that was found go back for a time, in s."""
-        step = self._rate * elapsed
-        self._bound += min(max(self._goal - self._bound, -step), step)
+        """Let the channels that were found go back for a time, in s."""
+        for way in self._found.values():
+            if way is not None:
+                way.highest = max(way.highest - way.rate * elapsed, way.goal)
 
     def limited(self, low: Array, high: Array) -> tuple[Array, Array]:
-        """Return the lowest and highest pressures (n,) that plans may use, within others.
+        """Return the lowest and highest pressures (n,) that may be used, within others.
 
-        The channel that was found goes no further than its bound.
+        A channel that was found while its pressure rose has at most that of its way back.
         """
-        if self.channel is None:
-            return low, high
-        bound = np.clip(self._bound, low, high)
-        is_it = np.arange(len(low)) == self.channel
-        if self._was_rising:
-            return low, np.where(is_it, bound, high)
-        return np.where(is_it, bound, low), high
+        high = high.copy()
+        for channel, way in self._found.items():
+            if way is not None:
+                high[channel] = max(min(high[channel], way.highest), low[channel])
+        return low, high

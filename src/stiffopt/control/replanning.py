@@ -125,6 +125,7 @@ class Replanner:
         self._detour_from: Plan | None = None  # where it begins, until that is planned from
         self._offset = np.zeros(6)
         self._forget_missing()
+        self._updated_at = -math.inf  # time of the last update, in s
         self.deviation = math.nan  # of the plan's stiffness, relative
         self._available: tuple[Array, Array] | None = None  # see `update`
         self.bent: BentMode | None = None  # modes of the arm where the reference was last
@@ -174,7 +175,7 @@ class Replanner:
         They are those of plans, see `MissingMotion.limited`. `offset`: effective pressures relative
         to commands (n,), in Pa.
         """
-        if self._missing.channel is None:
+        if not self._missing.channels:
             return limits
         low, high = self._missing.limited(limits[0] + offset, limits[1] + offset)
         return low - offset, high - offset
@@ -248,6 +249,8 @@ class Replanner:
         """
         task, target = self.pursuit.task, self.pursuit.target
         interval = self._tuning.interval
+        self._missing.go_back(min(now - self._updated_at, interval))
+        self._updated_at = now
         is_due = now - self._requested_at >= interval - 1e-6
         if waits and self.stiffens and not self._search:
             is_due = False
@@ -269,7 +272,6 @@ class Replanner:
             ahead = offset - self._offset
             bound = min(1.0, most / max(float(np.linalg.norm(ahead[:3])), 1e-9))
             self._offset = self._offset + share * bound * ahead
-            self._missing.go_back(interval)
             stay = isinstance(course, Pressing) and course.phase is not Phase.GOING
             request = PlanRequest(
                 self._serial, task, target, self._offset.copy(), pressure_offset, search,
@@ -362,12 +364,13 @@ class Replanner:
         if plan is not None and is_final and plan.reached and plan.far:
             text = f"the arm goes to other pressures for its target; until then {plan.message}"
             notices = (*notices, Notice("changes-posture", text, standing=True))
-        if self._missing.channel is not None:
+        if self._missing.channels:
+            each = ", ".join(str(channel + 1) for channel in self._missing.channels)
             text = (
-                f"the tip does not move as the pressure of channel {self._missing.channel + 1} "
-                "should move it: its chamber does not get the pressure that the gauge reads, or "
-                "something pushes the arm; look at its tube. Until there is another target, the "
-                "other channels make up for it"
+                f"the tip does not move as the pressure of channel {each} should move it: its "
+                "chamber does not get the pressure that the gauge reads, or something pushes the "
+                "arm; look at its tube. Until there is another target, the other channels make up "
+                "for it"
             )
             notices = (*notices, Notice("missing-motion", text, standing=True))
         limited = self.adapted is not None and self.adapted.limits is not None
