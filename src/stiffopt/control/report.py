@@ -141,7 +141,7 @@ class Report:
             notices = (*notices, *pursuit.course.notices())
         if waits:
             text = (
-                "something pushes the arm: it waits on its way to the target, for a second or two"
+                "the arm seems to be pushed: it waits on its way to the target, for a second or two"
             )
             notices = (*notices, Notice("motion-waits", text, Severity.INFO, standing=True))
         if self.model_is_wrong:

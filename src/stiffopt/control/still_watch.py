@@ -83,8 +83,10 @@ class StillWatch:
         if len(poses) < 3 * tuning.samples:
             return 0.0
         places = _thirds([pose.position for pose in poses])
+        if _spread(places) > tuning.scatters * self._scatter:
+            return 0.0
         turns = _thirds([_turn(last.rotation, pose.rotation) for pose in poses])
-        if _spread(places) > tuning.scatters * self._scatter or _spread(turns) > tuning.turn:
+        if _spread(turns) > tuning.turn:
             return 0.0
         predicted = _thirds([pose.predicted for pose in poses])
         modelled = _thirds([_turn(last.modelled, pose.modelled) for pose in poses])

@@ -65,7 +65,8 @@ def _moved_frame(setup: Setup, found: Found | None) -> MovedFrame | OtherChannel
 
     None if there is none, or if a correction that was found otherwise explains the logs about as
     well. Quarter turns of some logs explain them if neither a motion nor other channels in these
-    logs fit far better, nor a mirror as well, and if they leave little.
+    logs fit far better, nor a mirror as well, and if they leave little: a wrong correction is worse
+    than none.
     """
     turns = () if found is None else found.hypothesis.turns
     logs = tuple(i for i, turn in enumerate(turns) if turn)
@@ -90,8 +91,9 @@ def _moved_frame(setup: Setup, found: Found | None) -> MovedFrame | OtherChannel
     is_mirrored = left > DETECTION.tie * comparer.left_of_mirror(logs)
     if is_mirrored and isinstance(frame, MovedFrame) and frame.motion.kind == "mirror":
         return frame
-    is_left = turned.misfit(logs).left > DETECTION.off * setup.description.length
-    return comparer.misfit(logs) if is_mirrored or is_left else None
+    then = turned.misfit(logs).left
+    is_left = then > DETECTION.off * setup.description.length
+    return replace(comparer.misfit(logs), turned=then) if is_mirrored or is_left else None
 
 
 def _comparer(setup: Setup) -> Comparer:

@@ -81,6 +81,16 @@ class _Tried:
         found = [measure(poses[i], self.expected[i]) for i in self.logs]
         return float(np.concatenate(found).mean())
 
+    def miss(self, i: int) -> float:
+        """Return the mean miss of the tip in a log as it was recorded, in m."""
+        return float(distances(self.recorded[i], self.expected[i]).mean())
+
+    def share(self, i: int) -> float:
+        """Return the same over the tip's mean distance from its middle in that log."""
+        tips = self.recorded[i][0].position
+        motion = float(np.linalg.norm(tips - tips.mean(axis=0), axis=1).mean())
+        return self.miss(i) / max(motion, 1e-9)
+
     @property
     def measures(self) -> tuple[Callable[[Tracks, Tracks], Array], ...]:
         """Distances and angles of the body that was moved, or of the tip."""
@@ -150,20 +160,32 @@ class OtherChannels:
 class Misfit:
     """Logs that do not fit the others, for no reason that was found.
 
-    `left`: mean miss of the tip by the arm fitted to the others, in m.
+    `left`: mean miss of the tip by the arm fitted to the others, in m. `turned`: what a quarter
+    turn of the axes would leave, which is too uncertain to be corrected; infinite without one.
     """
 
     logs: Logs
     left: float
+    turned: float = np.inf
 
     def told(self, recordings: Sequence[Recording]) -> str:
         """Describe it, as a sentence."""
         names = ", ".join(recordings[i].name for i in self.logs)
-        return (
-            f"{names} does not fit the other logs: the arm fitted to them misses its tip by "
-            f"{self.left * 1e3:.1f} mm, and neither another frame or body nor other channels "
-            "explain that; look at whether it is of the same arm with the same channels, and "
-            "whether both its frame and a body were defined anew, or leave it out"
+        one = len(self.logs) == 1
+        words = (
+            f"{names} {'does' if one else 'do'} not fit the other logs: the arm fitted to them "
+            f"misses {'its' if one else 'their'} tip by {self.left * 1e3:.1f} mm"
+        )
+        if np.isfinite(self.turned):
+            return words + (
+                f"; axes turned by quarter turns leave {self.turned * 1e3:.1f} mm, or a mirror "
+                "explains it as well, so that nothing was corrected; look at how the tracker's "
+                "frame was defined"
+            )
+        return words + (
+            ", and no single reason was found; look at whether it is of the same arm with the same "
+            "channels, has pressures far beyond those of the others, or whether both its frame and "
+            "a body were defined anew, or leave it out"
         )
 
 
@@ -419,7 +441,7 @@ class FrameComparer:
         Those that do not agree may have a fault of their own.
         """
         rest = self._rest(tried.logs)
-        tips = [distances(tried.recorded[i], tried.expected[i]).mean() for i in rest]
+        tips = [tried.miss(i) for i in rest]
         agreeing = [
             i for i, tip in zip(rest, tips, strict=True) if tip <= DETECTION.off * self._length
         ]
@@ -529,19 +551,18 @@ class FrameComparer:
     def _unexplained(self) -> Misfit | None:
         """Return a log that does not fit the others, which agree, even by the arm fitted to all.
 
-        None of two logs, as either may be the odd one.
+        None of two logs, as either may be the odd one. Others that hold a smaller part of the
+        workspace are missed by less, so misses are compared as shares of a log's motion.
         """
         if len(self._pressures) < 3:
             return None
         odd, of_all = self._odd_one(), min(self._unmoved(()), key=_Tried.score)
 
-        def most(tried: _Tried, logs: Logs) -> float:
-            far = [distances(tried.recorded[i], tried.expected[i]).mean() for i in logs]
-            return float(max(far))
-
-        left, others = most(of_all, odd.logs), most(odd, self._rest(odd.logs))
-        is_odd = left > DETECTION.off * self._length and others < DETECTION.frame * left
-        return self.misfit(odd.logs) if is_odd else None
+        (i,) = odd.logs
+        others = max(odd.share(k) for k in self._rest(odd.logs))
+        is_far = of_all.miss(i) > DETECTION.off * self._length
+        is_odd = others < DETECTION.frame * of_all.share(i)
+        return self.misfit(odd.logs) if is_far and is_odd else None
 
     def channels_alone(self) -> OtherChannels | None:
         """Return other channels of the log without which the others agree best; None if unclear."""
