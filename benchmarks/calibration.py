@@ -50,8 +50,9 @@ from stiffopt.experiments.kinematics import KinematicsSettings, recording_name, 
 from stiffopt.experiments.probing import Probing, Series
 from stiffopt.experiments.slope import fit_lines
 from stiffopt.experiments.stiffness import HARD_STOP, StiffnessSettings
-from stiffopt.model.description import Corrections, Recordings
+from stiffopt.model.description import Recordings
 from stiffopt.model.robot_files import load_description
+from stiffopt.model.segment import Corrections
 from stiffopt.plant.plant import Plant
 from stiffopt.plant.settings import Mismatch, PlantSettings, Silicone
 from stiffopt.registration import Placement, Registration

@@ -21,6 +21,7 @@ from stiffopt.paths.leaning import BraceApproach, approach_to
 
 ROBOT = stiffopt.load_robot("stiff-flop-2")
 TASK = stiffopt.load_task("problems/braced/post.yaml")
+TUNING = BracingTuning(settling=0.1, relief=0.0)
 PERIOD = 0.01
 LIMITS = (np.zeros(6), np.full(6, 1.5e5))
 
@@ -65,10 +66,10 @@ def approach_fixture() -> BraceApproach:
     return brace_approach()
 
 
-def held(approach: BraceApproach, **brace: Any) -> Bracing:
+def held(approach: BraceApproach, tuning: BracingTuning = TUNING, **brace: Any) -> Bracing:
     """A course that has arrived in contact, of the task with other keys of its `brace`."""
     task = TASK.model_copy(update={"brace": TASK.brace.model_copy(update=brace)})
-    course = Bracing(task, BracingTuning(settling=0.1, relief=0.0))
+    course = Bracing(task, tuning)
     course.begin(approach, np.zeros(6))
     for _ in range(10_000):
         course.advance(PERIOD, True)

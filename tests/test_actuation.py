@@ -11,7 +11,8 @@ import pytest
 from independent.arms import FLOP, Arm, eq_9
 from stiffopt.errors import InputError
 from stiffopt.model.actuation import SectionGeometry, onset
-from stiffopt.model.description import Corrections, RobotDescription, Segment
+from stiffopt.model.description import RobotDescription
+from stiffopt.model.segment import Corrections, Segment
 from tested_laws import LAWS, TUBES, evaluated, segment_of, some_pressures, strain_and_compliance
 
 

@@ -92,7 +92,7 @@ def test_friction_that_is_known_at_the_end_of_the_way_loses_no_contact_on_it(app
         course.advance(0.025, True)
         p = course.pressures
         tip = model.at(p)
-        assert course._friction.forces == pytest.approx(forces)
+        assert course._planned.friction.forces == pytest.approx(forces)
         course.look(0.025, tip.pose[:3, 3], tip, p)
     assert course.phase is BracePhase.HELD
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from leaning_arm import (
+    TUNING,
     approach_fixture,  # noqa: F401
     held,
     lift_off,
@@ -103,8 +104,9 @@ def test_slides_are_known_apart_from_creep_and_pushes(approach, way, has_turn, s
 
 @pytest.mark.parametrize("slide", [0.0, 8e-4])
 def test_a_slide_that_the_tip_shows_is_told_without_a_push_that_is_felt(approach, slide):
-    course, tip, p = held(approach, contacts="sticking"), approach.tips[-1], approach.pressures[-1]
-    course._tuning = replace(course._tuning, felt=math.inf, least_felt=math.inf)
+    numb = replace(TUNING, felt=math.inf, least_felt=math.inf)
+    course = held(approach, numb, contacts="sticking")
+    tip, p = approach.tips[-1], approach.pressures[-1]
     for k in range(800):
         slides = np.array([0.0, slide * np.clip(k / 40 - 15, 0, 1)])
         seen, quaternion = moved_tip(approach, np.zeros(3), slides, np.zeros(6))

@@ -13,9 +13,10 @@ from independent.arms import FLOP, Tube, neo_hookean
 from independent.motions import derivative
 from independent.sections import section
 from stiffopt.model.actuation import SectionGeometry
-from stiffopt.model.description import Compensation, RobotDescription, Segment
+from stiffopt.model.description import RobotDescription
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.robot_files import load_description
+from stiffopt.model.segment import Compensation, Segment
 from tested_laws import LAWS, TUBES, evaluated, resultant, scaled, segment_of, some_pressures
 
 Vector = NDArray[np.float64]

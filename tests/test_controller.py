@@ -400,6 +400,23 @@ def test_touch_and_creep_get_tip_and_pressures_of_the_same_time():
     assert max(errors) < 2e-4
 
 
+@pytest.mark.parametrize("loose", [True, False])
+def test_a_sensor_that_lies_still_while_the_tip_turns_at_its_target_is_doubted(loose: bool):
+    bench = Bench(FREE, spread=0.5)
+    position = bench.settled(duration=2.5)
+    turned = so.lie.exp(0.2 * np.array([0, 0, 0, *bench.tip[:3, 0]])) @ bench.tip
+    if loose:
+        bench.rig.world.inject("tracker", "loose")
+    pointing = tuple(map(float, turned[:3, 2]))
+    bench.controller.set_task(bench.task(position=position, pointing=pointing))
+    bench.run(0.6)
+    doubt = bench.controller._arm.watch.doubt
+    assert (doubt is not None) is loose
+    if doubt is not None:
+        assert doubt.kind == "no-response"
+        assert "lie still" in doubt.text
+
+
 def test_the_first_motion_gets_tip_and_pressures_of_the_same_time():
     bench = moving(rested=2.0, moved=0.1, dynamics="quasi-static")
     arm, ways, errors = bench.controller._arm, [], []

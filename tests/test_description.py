@@ -14,15 +14,9 @@ from hypothesis import strategies as st
 
 from stiffopt.errors import FileError, InputError
 from stiffopt.files import save_file
-from stiffopt.model.description import (
-    Chambers,
-    Compensation,
-    Material,
-    RegulatorLimits,
-    RobotDescription,
-    Segment,
-)
+from stiffopt.model.description import RegulatorLimits, RobotDescription
 from stiffopt.model.robot_files import builtin_robots, load_description
+from stiffopt.model.segment import Chambers, Compensation, Material, Segment
 
 ROBOT = """\
 format: stiffopt-robot/1

@@ -1,8 +1,7 @@
-"""What is wrong with how an arm was recorded: found where it is clear, else left alone."""
+"""Which channels, lines and axes of recordings are wrong: found if it is clear, else left alone."""
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
 from functools import cache
 
@@ -10,60 +9,32 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from lagging_arm import AS_RECORDED, arm, calibrated, driven, log_of, turned
 from made_logs import course, made_log
 from recordings import ASU, UCL, recordings
-from stiffopt.errors import FileError
 from stiffopt.identify import correction
 from stiffopt.identify.calibration import calibrate
 from stiffopt.identify.correction import put_right
 from stiffopt.identify.detection import idle_channels, on_one_clock, without_drift
 from stiffopt.identify.hypotheses import Comparer, Found, found_wrong, of_channels
 from stiffopt.identify.recording import Recording
-from stiffopt.identify.settings import CalibrationSettings, Finding
+from stiffopt.identify.settings import CalibrationSettings
 from stiffopt.identify.setup import Setup, recordings_of
 from stiffopt.identify.tracker_faults import CUBE_ROTATIONS
 from stiffopt.identify.validation import validate
 from stiffopt.logs import Body, Log, read_log
-from stiffopt.model.calibration import Calibration, ErrorModel
-from stiffopt.model.description import Corrections, RobotDescription
-from stiffopt.model.history import Creep, History, Play
+from stiffopt.model.description import RobotDescription
+from stiffopt.model.history import History
 from stiffopt.model.robot_files import load_description
+from stiffopt.model.segment import Corrections
 
 Array = NDArray[np.float64]
 
-AS_RECORDED = CalibrationSettings()
-AWAY = np.array([0.3, -0.1, 0.2])
 FAST = {
     "structure": "static", "strain_law": "keep", "rows": 60, "trial_rows": 60, "start_rows": 40,
     "holds_back": False,
 }  # fmt: skip
 MODULES = recordings("ucl_stiff_flop_*55mm/*.csv")
-
-
-def arm(name: str = "stiff-flop-1") -> RobotDescription:
-    """An arm that lags a little."""
-    robot = load_description(name)
-    segments = [each.model_copy(update={"history": History(lag=0.2)}) for each in robot.segments]
-    return robot.model_copy(update={"segments": tuple(segments)})
-
-
-def calibrated(robot: RobotDescription) -> RobotDescription:
-    return robot.model_copy(update={"calibration": Calibration(logs=("before.csv",))})
-
-
-def driven(pressures: Array, time: Array, name: str = "stiff-flop-1") -> Log:
-    return made_log(arm(name), time, pressures)
-
-
-@cache
-def log_of(name: str = "stiff-flop-1", n: int = 3, duration: float = 60.0, seed: int = 0) -> Log:
-    time, pressures = course(n, duration, seed, rate=5.0)
-    return driven(pressures, time, name)
-
-
-def turned(log: Log, rotation: Array) -> Log:
-    """The log of a tracker whose axes are turned."""
-    return replace(log, tip_position=log.tip_position @ rotation)
 
 
 def found_in(robot: RobotDescription, logs: list[Log]) -> Found | None:
@@ -290,352 +261,6 @@ def test_axes_that_all_logs_share_go_into_the_registration() -> None:
     other = turned(log_of(seed=2), rotation)
     (found,) = validate(result.robot, [other], CalibrationSettings(keep=("axes",)))
     assert found.errors.mean < 3e-3
-
-
-# -- frames that were defined anew -----------------------------------------------------------------
-
-
-def test_a_frame_that_was_defined_anew_is_found_when_a_model_is_validated() -> None:
-    robot, log = calibrated(arm()), log_of()
-    rotation = CUBE_ROTATIONS[9]
-    (found,) = validate(robot, [turned(log, rotation)])
-    assert found.errors.mean < 1e-3
-    assert "defined anew" in found.remarks[-1]
-    assert "turned by" in found.remarks[-1]
-    (kept,) = validate(robot, [turned(log, rotation)], CalibrationSettings(keep=("axes",)))
-    assert kept.errors.mean > 0.05
-    anywhere = replace(log, tip_position=turned(log, rotation).tip_position + AWAY)
-    (found,) = validate(robot, [anywhere])
-    assert found.errors.mean < 1e-3
-    assert "moved by" in found.remarks[-1]
-
-
-def held(rest: int, rise: int = 1, rows: int = 300) -> Log:
-    """The log of an arm that is at rest for some rows, rises, then holds one pose."""
-    share = np.clip((np.arange(rows) - rest + 1) / rise, 0, 1)
-    pressures = share[:, np.newaxis] * [1e5, 0.5e5, 0.0]
-    return driven(pressures, np.linspace(0.0, 0.2 * rows, rows))
-
-
-@pytest.mark.parametrize("log", [log_of(), held(rest=1), held(rest=30), held(rest=1, rise=200)])
-def test_a_model_that_is_wrong_is_not_excused_by_its_frame(log: Log) -> None:
-    stiff = calibrated(arm())
-    material = stiff.segments[0].material.model_copy(update={"youngs_modulus": 400e3})
-    segment = stiff.segments[0].model_copy(update={"material": material})
-    (found,) = validate(stiff.model_copy(update={"segments": (segment,)}), [log])
-    assert found.errors.mean > 9e-3
-    assert "whether the log is of the arm of this calibration" in found.remarks[-1]
-    assert not any("defined anew" in remark for remark in found.remarks)
-
-
-def test_exchanged_channels_in_one_rise_are_not_a_frame_that_was_moved() -> None:
-    log = held(rest=1, rise=200)
-    wrong = replace(log, commanded=np.roll(log.commanded, 1, axis=1))
-    (found,) = validate(calibrated(arm()), [wrong])
-    assert found.errors.mean < 1e-3
-    assert "--keep channels" in found.remarks[-1]
-    assert not any("defined anew" in remark for remark in found.remarks)
-
-
-def test_other_channels_whose_pressures_the_arm_does_not_bear_are_not_suspected() -> None:
-    """Two channels at 4 bar, as on a shared line, would soften this arm to nothing."""
-    share = np.minimum(np.arange(300) / 200, 1)[:, np.newaxis]
-    log = driven(share * [4e5, 0.0, 0.0], np.linspace(0.0, 60.0, 300))
-    stiff = calibrated(arm())
-    wrong = replace(log, tip_position=log.tip_position * [-1.0, -1.0, 1.0])
-    (found,) = validate(stiff, [wrong])
-    assert found.errors.mean > 0.1 * stiff.length
-    assert "look at whether" in found.remarks[-1]
-
-
-def judged(robot: RobotDescription) -> RobotDescription:
-    """A calibrated robot that knows how far it is off: by half a millimetre."""
-    errors = ErrorModel(
-        residual=5e-4,
-        discrepancy=300.0,
-        reach=2e4,
-        gain=0.0,
-        degrees_of_freedom=6.0,
-        moving=(2e3,) * 3,
-        settled=(2e3,) * 3,
-        recorded=tuple(map(tuple, log_of().commanded[::10].tolist())),
-        spacing=1e4,
-    )
-    return robot.model_copy(update={"calibration": Calibration(errors=errors)})
-
-
-def turn_about_z(angle: float) -> Array:
-    cos, sin = np.cos(angle), np.sin(angle)
-    return np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
-
-
-def test_a_frame_turned_about_the_tip_at_rest_is_found_by_poses_in_many_directions() -> None:
-    log = log_of()
-    noise = np.random.default_rng(0).normal(scale=6e-4, size=log.tip_position.shape)
-    moved = turned(log, turn_about_z(np.radians(25))).tip_position + noise
-    moved[:, 0] += 2e-3
-    (found,) = validate(judged(arm()), [replace(log, tip_position=moved)])
-    assert "defined anew: its poses are turned by 25 deg about" in found.remarks[-1]
-    assert "moved by" in found.remarks[-1]
-
-
-def test_a_log_outside_its_regions_has_a_remark() -> None:
-    robot, log = judged(arm()), log_of()
-    (found,) = validate(robot, [turned(log, turn_about_z(np.radians(8)))])
-    assert 3e-3 < found.errors.mean < 0.1 * robot.length
-    assert "of the tips lie within the regions of 99 %; look at" in found.remarks[-1]
-    (right,) = validate(robot, [log])
-    assert not right.remarks
-
-
-def test_a_dead_line_that_moves_the_tip_a_little_is_found_outside_the_regions() -> None:
-    robot, pressures = judged(arm()), log_of().commanded * [1.0, 1.0, 0.12]
-    log = driven(pressures, log_of().time)
-    real = driven(pressures * [1.0, 1.0, 0.0], log.time)
-    (found,) = validate(robot, [replace(log, tip_position=real.tip_position)])
-    assert "the line of segment 1 channel 3 is dead" in found.remarks[-1]
-    assert found.errors.mean < 1e-3
-    before = np.linalg.norm(log.tip_position - real.tip_position, axis=1).mean()
-    assert 1e-3 < before < 0.1 * robot.length
-    (right,) = validate(robot, [log])
-    assert not right.remarks
-
-
-def test_one_pose_that_moves_a_little_shows_no_moved_frame() -> None:
-    stiff = calibrated(arm())
-    material = stiff.segments[0].material.model_copy(update={"youngs_modulus": 400e3})
-    segment = stiff.segments[0].model_copy(update={"material": material})
-    pressures = log_of().commanded * 0.1 + [9e4, 3e4, 1e4]
-    log = driven(pressures, log_of().time)
-    (found,) = validate(stiff.model_copy(update={"segments": (segment,)}), [log])
-    assert found.errors.mean > 0.1 * stiff.length
-    assert not any("defined anew" in remark for remark in found.remarks)
-
-
-def test_a_sensor_that_sits_elsewhere_is_no_moved_frame() -> None:
-    sensor = np.eye(4)
-    sensor[0, 3] = 0.02
-    log = log_of()
-    aside = made_log(arm(), log.time, log.commanded, sensor=sensor, turns=True)
-    (found,) = validate(calibrated(arm()), [aside])
-    assert found.errors.mean > 0.01
-    assert not any("defined anew" in remark for remark in found.remarks)
-
-
-@pytest.mark.parametrize(
-    ("sources", "words", "kind"),
-    [
-        ([1, 0, 2], "channel 1 has the column of segment 1 channel 2", "channels"),
-        ([0, 1, 0], "channel 3 has the pressure of segment 1 channel 1, as if", "lines"),
-    ],
-)
-def test_wrong_channels_are_found_when_a_model_is_validated(
-    sources: list[int], words: str, kind: Finding
-) -> None:
-    robot, log = calibrated(arm()), log_of()
-    driven_by = np.argsort(sources) if kind == "channels" else sources
-    moved = driven(log.commanded[:, driven_by], log.time)
-    wrong = replace(log, tip_position=moved.tip_position)
-    (found,) = validate(robot, [wrong])
-    assert words in found.remarks[-1]
-    assert found.errors.mean < 1e-3
-    (kept,) = validate(robot, [wrong], CalibrationSettings(keep=(kind,)))
-    assert words not in " ".join(kept.remarks)
-
-
-@pytest.mark.parametrize(
-    ("sources", "words"),
-    [
-        ([0, -1, 2, 3, 4, 3], ["segment 1 channel 2 is dead", "segment 2 channel 3 has the press"]),
-        ([1, 2, 0, 3, 5, 4], ["channel 1 has the column of segment 1 channel 2", "segment 2 chan"]),
-    ],
-)
-def test_two_wrong_lines_or_orders_are_found_when_a_model_is_validated(
-    sources: list[int], words: list[str]
-) -> None:
-    robot, log = calibrated(arm("stiff-flop-2")), log_of("stiff-flop-2", 6)
-    every = np.column_stack([log.commanded, np.zeros(len(log.time))])
-    if -1 in sources:
-        tip = driven(every[:, sources], log.time, "stiff-flop-2").tip_position
-        wrong = replace(log, tip_position=tip)
-    else:
-        wrong = replace(log, commanded=log.commanded[:, np.argsort(sources)])
-    (found,) = validate(robot, [wrong])
-    assert all(each in found.remarks[-1] for each in words)
-    assert found.errors.mean < 1e-3
-
-
-def test_an_order_that_shows_in_less_than_half_of_a_log_is_found_with_another_one() -> None:
-    time, pressures = course(6, 60.0, 6, rate=5.0, hold=6.0)
-    pressures[:, 3:] *= (time > 0.6 * time[-1])[:, np.newaxis]  # the second segment moves late
-    log = driven(pressures, time, "stiff-flop-2")
-    wrong = replace(log, commanded=log.commanded[:, np.argsort([1, 2, 0, 3, 5, 4])])
-    (found,) = validate(calibrated(arm("stiff-flop-2")), [wrong])
-    assert "segment 1 channel 1 has the column of segment 1 channel 2" in found.remarks[-1]
-    assert "segment 2 channel 2 has the column of segment 2 channel 3" in found.remarks[-1]
-    assert found.errors.mean < 1e-3
-
-
-# -- units -----------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("unit", "factor"), [("kPa", 1e3), ("psi", 6894.757), ("bar", 1e5), ("MPa", 1e6)]
-)
-def test_pressures_in_other_units_are_found(unit: str, factor: float) -> None:
-    log, robot = log_of(), load_description("stiff-flop-1")
-    wrong = replace(log, commanded=log.commanded / factor)
-    (read,) = recordings_of(robot, [wrong], AS_RECORDED)
-    np.testing.assert_allclose(read.pressures, log.commanded, atol=1e-6)
-    assert f"the pressures are in {unit}, not Pa" in read.remarks[0]
-    with pytest.raises(FileError, match="expected Pa"):
-        recordings_of(robot, [wrong], CalibrationSettings(keep=("units",)))
-
-
-def test_other_units_are_found_of_an_arm_that_its_weight_straightens() -> None:
-    time, pressures = course(6, 60.0, highest=6e4, rate=1.0)
-    log = driven(pressures, time, "stiff-flop-2-hanging")
-    robot = load_description("stiff-flop-2-hanging")
-    (read,) = recordings_of(robot, [replace(log, commanded=pressures / 1e3)], AS_RECORDED)
-    np.testing.assert_allclose(read.pressures, pressures, atol=1e-6)
-
-
-def test_a_unit_that_is_not_clear_is_refused() -> None:
-    log = log_of()
-    wrong = replace(log, commanded=log.commanded / 2.5e3)  # between kPa and psi
-    with pytest.raises(FileError, match="expected Pa"):
-        recordings_of(load_description("stiff-flop-1"), [wrong], AS_RECORDED)
-
-
-# -- clocks ----------------------------------------------------------------------------------------
-
-
-def shifted(log: Log, by: float) -> Log:
-    """The log of a tracker whose clock is late."""
-    columns = [np.interp(log.time - by, log.time, column) for column in log.tip_position.T]
-    return replace(log, tip_position=np.column_stack(columns))
-
-
-@pytest.mark.parametrize("by", [-6.0, -1.5, 5.0])
-def test_two_clocks_are_made_one(by: float) -> None:
-    robot, log = load_description("stiff-flop-1"), log_of(duration=80.0)
-    (read,) = recordings_of(robot, [shifted(log, by)], AS_RECORDED)
-    assert "as if they had two clocks" in read.remarks[-1]
-    late = np.column_stack([np.interp(log.time - by, log.time, c) for c in log.commanded.T])
-    assert np.abs(read.pressures - late).mean() < 0.05 * log.commanded.max()
-    (kept,) = recordings_of(robot, [shifted(log, by)], CalibrationSettings(keep=("clock",)))
-    np.testing.assert_array_equal(kept.pressures, log.commanded)
-
-
-@pytest.mark.parametrize(
-    ("begins", "late"),
-    [
-        ([0, 20, 40, 60], []),
-        ([0, 60, 20, 40], [2]),  # as a shell sorts 1, 10, 2, 3
-        ([60, 0, 20, 40], [1]),
-        ([0, 20, 0, 20], []),  # two days
-        ([0, 0, 0, 0], []),
-    ],
-)
-def test_logs_of_a_sequence_that_are_given_out_of_order_are_told(
-    begins: list[float], late: list[int]
-) -> None:
-    log, robot = log_of(duration=15.0), arm()
-    logs = [(str(begin), replace(log, time=log.time + begin)) for begin in begins]
-    for settings, expected in ((CalibrationSettings(sequence=True), late), (AS_RECORDED, [])):
-        found = recordings_of(robot, logs, settings)
-        told = [
-            i
-            for i, each in enumerate(found)
-            if "in the order of their times" in " ".join(each.remarks)
-        ]
-        assert told == expected
-        assert all(f"before {found[i - 1].name} begins" in found[i].remarks[-1] for i in told)
-
-
-@pytest.mark.skipif(not (UCL and MODULES), reason="the recordings are not there")
-@pytest.mark.parametrize("by", [-12.0, -5.0])
-def test_two_clocks_of_real_arms_are_made_one(by: float) -> None:
-    one = load_description("ucl-stiff-flop")
-    for log in map(read_log, [*UCL, *MODULES]):
-        if log.n != 3:
-            continue
-        late = [np.interp(log.time + by, log.time, each) for each in log.commanded.T]
-        (read,) = recordings_of(one, [replace(log, commanded=np.column_stack(late))], AS_RECORDED)
-        said = re.search(r"the tip moves (.*) s (after|before) its pressures", read.remarks[-1])
-        assert said
-        assert float(said[1]) == pytest.approx(abs(by), abs=1.0)
-        assert said[2] == "before"
-
-
-def test_an_arm_that_lags_has_one_clock() -> None:
-    robot, log = load_description("stiff-flop-1"), log_of(duration=80.0)
-    for by in (0.0, 0.5, 1.0):
-        (read,) = recordings_of(robot, [shifted(log, by)], AS_RECORDED)
-        np.testing.assert_array_equal(read.pressures, log.commanded)
-
-
-# -- the beginning ---------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("step", [(9e4, 3e4, 0.0), (1.2e4, 0.0, 0.0)])
-def test_a_log_that_begins_with_a_step_begins_at_rest(step: tuple[float, float, float]) -> None:
-    robot, log = load_description("stiff-flop-1"), log_of()
-    stepped = replace(log, commanded=np.vstack([[step], log.commanded[1:]]))
-    (read,) = recordings_of(robot, [stepped], AS_RECORDED)
-    np.testing.assert_array_equal(read.before, 0.0)
-    (read,) = recordings_of(robot, [replace(stepped, measured=stepped.commanded)], AS_RECORDED)
-    np.testing.assert_array_equal(read.before, stepped.commanded[0])
-
-
-def test_a_log_of_an_arm_under_pressure_begins_there() -> None:
-    log = log_of(duration=80.0)
-    begin = int(np.argmax(log.commanded.min(axis=1)))
-    late = Log(log.time[begin:], log.commanded[begin:], log.tip_position[begin:])
-    (read,) = recordings_of(load_description("stiff-flop-1"), [late], AS_RECORDED)
-    np.testing.assert_array_equal(read.before, late.commanded[0])
-
-
-# -- a drift ---------------------------------------------------------------------------------------
-
-
-@cache
-def laps() -> Log:
-    """A log of an arm with hysteresis and creep that repeats its course eleven times."""
-    pressures = course(3, 20.0, 1, rate=5.0)[1]
-    robot = arm()
-    history = History(
-        lag=0.2, play=(Play(width=2e4, share=0.3),), creep=(Creep(time=20.0, share=0.1),)
-    )
-    segments = [each.model_copy(update={"history": history}) for each in robot.segments]
-    robot = robot.model_copy(update={"segments": tuple(segments)})
-    repeated = np.tile(pressures, (11, 1))
-    return made_log(robot, np.arange(len(repeated)) / 5.0, repeated)
-
-
-def test_a_drift_is_removed() -> None:
-    log = laps()
-    drift = np.outer((log.time / log.time[-1]) ** 3, [4e-3, -5e-3, 1e-3])
-    off = replace(log, tip_position=log.tip_position + drift)
-    (read,) = recordings_of(load_description("stiff-flop-1"), [off], AS_RECORDED)
-    found = without_drift(read)
-    assert "the tip's positions drift by up to 5.2 mm" in found.remarks[-1]
-    left = (found.tracks[0].position - log.tip_position)[: len(log.time) * 15 // 16]
-    np.testing.assert_allclose(left - left.mean(axis=0), 0.0, atol=6e-4)
-
-
-def test_hysteresis_and_creep_are_no_drift() -> None:
-    robot = load_description("stiff-flop-1")
-    (read,) = recordings_of(robot, [laps()], AS_RECORDED)
-    assert without_drift(read) is read
-
-
-def test_only_a_log_that_returns_to_its_pressures_tells_a_drift() -> None:
-    log = log_of(duration=160.0)
-    drift = np.outer((log.time / log.time[-1]) ** 3, [4e-3, -5e-3, 1e-3])
-    off = replace(log, tip_position=log.tip_position + drift)
-    (read,) = recordings_of(load_description("stiff-flop-1"), [off], AS_RECORDED)
-    assert without_drift(read) is read
 
 
 # -- real arms -------------------------------------------------------------------------------------

@@ -25,14 +25,9 @@ from stiffopt.identify.bench import load_bench
 from stiffopt.logs import read_log
 from stiffopt.model.calibration import Calibration, ErrorModel, FittedParameter
 from stiffopt.model.description import (
-    Chambers,
-    Compensation,
-    Corrections,
-    Material,
     Recordings,
     RegulatorLimits,
     RobotDescription,
-    Segment,
     Tolerances,
     TrackedBody,
 )
@@ -40,6 +35,7 @@ from stiffopt.model.history import Creep, History, Play
 from stiffopt.model.obstacles import OBSTACLES
 from stiffopt.model.robot_files import load_description
 from stiffopt.model.scene import AllowedContact, Scene, SceneObject
+from stiffopt.model.segment import Chambers, Compensation, Corrections, Material, Segment
 from stiffopt.optimise.brace import Brace
 from stiffopt.optimise.goal import MatchMatrix, MatchValue, StiffnessGoal
 from stiffopt.optimise.measures.directional import AtLeast

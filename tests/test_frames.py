@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
@@ -117,6 +118,30 @@ def test_a_body_that_was_defined_anew_is_found() -> None:
     assert "its orientation by" in remark
 
 
+def test_a_further_body_that_was_defined_anew_is_told_with_its_own_errors() -> None:
+    robot = load_description("stiff-flop-1")
+    middle = robot.length / 2
+    robot = robot.model_copy(
+        update={"recordings": Recordings(bodies={"mid": TrackedBody(at=middle)})}
+    )
+    logs = []
+    for seed in range(3):
+        time, pressures = course(3, 60.0, seed, rate=5.0)
+        made = made_log(robot, time, pressures, seed=seed, turns=True, bodies=(("mid", middle),))
+        if seed == 1:
+            body = made.bodies["mid"]
+            alone = of_body(Log(time, pressures, body.position, body.quaternion))
+            anew = Body(alone.tip_position, alone.tip_quaternion)
+            made = replace(made, bodies={"mid": anew})
+        logs.append(made)
+    (remark,) = told(robot, logs)
+    assert remark.startswith("the body 'mid' was defined anew in log 2")
+    far = re.search(r"misses 'mid' by ([\d.]+) mm instead of ([\d.]+) mm, its", remark)
+    assert far
+    assert float(far[1]) < 3
+    assert 15 < float(far[2]) < 25
+
+
 def test_a_frame_that_was_defined_anew_for_a_whole_day_is_found() -> None:
     logs = [log_of(seed=seed) for seed in range(5)]
     wrong = with_one(with_one(logs, 3, in_frame(TURN)), 4, in_frame(TURN))
@@ -143,14 +168,19 @@ def test_of_different_frames_none_is_told_where_no_logs_agree() -> None:
     assert told(load_description("stiff-flop-1"), wrong) == []
 
 
-def test_a_frame_and_a_body_that_differ_in_one_log_are_not_told_as_one() -> None:
+@pytest.mark.parametrize("degrees", [20.0, 52.0, 90.0])
+def test_a_frame_and_a_body_that_differ_in_one_log_are_not_told_as_one(degrees: float) -> None:
+    """Not even as a quarter turn; only that the log does not fit."""
     logs = [log_of(seed=seed) for seed in range(3)]
-    turn = Rotation.from_rotvec([0.0, 0.9, 0.0])
+    turn = Rotation.from_rotvec([0.0, np.radians(degrees), 0.0])
 
     def both(log: Log) -> Log:
         return of_body(in_frame(turn)(log))
 
-    assert told(load_description("stiff-flop-1"), with_one(logs, 1, both)) == []
+    (remark,) = told(load_description("stiff-flop-1"), with_one(logs, 1, both))
+    assert remark.startswith("log 2 does not fit the other logs")
+    of_two = told(load_description("stiff-flop-1"), [logs[0], both(logs[1])])
+    assert all("does not fit the other logs" in each for each in of_two)
 
 
 def test_a_frame_that_leaves_little_is_told_although_the_body_sits_a_little_elsewhere() -> None:
@@ -178,13 +208,36 @@ def test_mirrored_positions_are_no_other_frame() -> None:
     assert found.errors.mean < 3e-3
 
 
+@pytest.mark.parametrize("turns", [True, False])
+def test_positions_of_a_left_handed_frame_are_no_other_frame(turns: bool) -> None:
+    """With orientations, ``M R M'``, nothing explains them; without, the mirror does."""
+    robot = load_description("stiff-flop-1")
+    mirror = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
+
+    def left_handed(log: Log) -> Log:
+        found = replace(log, tip_position=log.tip_position @ mirror)
+        if not turns:
+            return found
+        turned = Rotation.from_matrix(mirror @ rotations(log).as_matrix() @ mirror)
+        return replace(found, tip_quaternion=turned.as_quat(scalar_first=True))
+
+    wrong = with_one([log_of(seed=seed, turns=turns) for seed in range(3)], 1, left_handed)
+    (remark,) = told(robot, wrong)
+    if turns:
+        assert remark.startswith("log 2 does not fit the other logs")
+    else:
+        assert remark.startswith(
+            "the positions of log 2 are mirrored: (x, y, z) should be (z, y, x)"
+        )
+
+
 @pytest.mark.parametrize("scale", [0.6, 1.3])
 def test_another_scale_of_positions_is_left_as_another_arm_would_look_the_same(
     scale: float,
 ) -> None:
     robot = load_description("stiff-flop-1")
     wrong = with_factors(np.full(3, scale))
-    assert told(robot, wrong) == []
+    assert all("does not fit the other logs" in remark for remark in told(robot, wrong))
     (found,) = validate(calibrated(robot), wrong[1:2])
     assert "look at whether" in found.remarks[-1]
 
@@ -233,7 +286,8 @@ def test_a_turn_that_is_no_quarter_turn_is_not_told_as_one() -> None:
 def test_a_log_of_another_arm_is_not_excused_by_its_frame(change: Change, turns: bool) -> None:
     logs = [log_of(seed=seed, turns=turns) for seed in range(3)]
     wrong = with_one(logs, 1, change)
-    assert not any("anew" in each for each in told(load_description("stiff-flop-1"), wrong))
+    found = told(load_description("stiff-flop-1"), wrong)
+    assert not any("was defined anew" in each for each in found)
 
 
 @pytest.mark.parametrize("turns", [True, False])
@@ -245,6 +299,7 @@ def test_channels_in_another_order_in_one_log_are_told(name: str, turns: bool) -
     assert remark.startswith("log 2 differs from the other logs, as if the channels are in another")
     assert "segment 1 channel 1 has the column of segment 1 channel 3" in remark
     assert "This is not corrected" in remark
+    assert told(robot, wrong, keep=("axes",)) == [remark]
     assert not any("differs" in each for each in told(robot, wrong, keep=("channels",)))
 
 

@@ -18,8 +18,8 @@ from scipy.integrate import solve_ivp
 from conftest import is_long
 from independent.arms import FLOP
 from stiffopt.errors import InputError
-from stiffopt.model.description import Segment
 from stiffopt.model.history import NO_HISTORY, Creep, History, Memory, Part, Play, part_of
+from stiffopt.model.segment import Segment
 
 Vector = NDArray[np.float64]
 

@@ -14,10 +14,10 @@ import pytest
 import stiffopt as so
 from running import wait_for
 from stiffopt.model import compiler
-from stiffopt.model.description import Compensation, Corrections
 from stiffopt.model.kinematics import Actuation
 from stiffopt.model.laws import strain_laws
 from stiffopt.model.layout import layout_of, numbers_of, symbolic_arm
+from stiffopt.model.segment import Compensation, Corrections
 from stiffopt.model.shape import FreeShape
 
 RNG = np.random.default_rng(15)

@@ -10,11 +10,12 @@ from numpy.typing import NDArray
 
 from independent.motions import body_twists, derivative
 from stiffopt.model.arguments import DirectionalMeasure, checked_measure
-from stiffopt.model.description import Corrections, RobotDescription
+from stiffopt.model.description import RobotDescription
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.parameters import Parameter, with_values
 from stiffopt.model.parametric import ParametricArm
 from stiffopt.model.robot_files import load_description
+from stiffopt.model.segment import Corrections
 
 Vector = NDArray[np.float64]
 

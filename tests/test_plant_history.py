@@ -16,9 +16,10 @@ from stiffopt.control.channels import Channels
 from stiffopt.control.regulators import PressureEstimator
 from stiffopt.control.tuning import RegulatorTuning
 from stiffopt.lie import log
-from stiffopt.model.description import Corrections, RobotDescription
+from stiffopt.model.description import RobotDescription
 from stiffopt.model.history import Creep, History, Play
 from stiffopt.model.manipulator import Manipulator
+from stiffopt.model.segment import Corrections
 from stiffopt.plant.plant import Plant, SimulationError
 from stiffopt.plant.settings import Discretisation, Mismatch, PlantSettings, Silicone
 from stiffopt.rig.interface import PressureLimits

@@ -24,8 +24,8 @@ from stiffopt.control.state import State
 from stiffopt.control.ways import ClearanceWatch, Ways
 from stiffopt.daemon.daemon import Daemon
 from stiffopt.errors import InputError
-from stiffopt.model.description import Corrections
 from stiffopt.model.scene import Scene
+from stiffopt.model.segment import Corrections
 from stiffopt.optimise.target import Target
 from stiffopt.paths.solution import PathSolution
 from stiffopt.paths.trajectory import MAX_WAYPOINTS, Trajectory, Waypoint, without_straight

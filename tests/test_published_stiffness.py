@@ -21,9 +21,10 @@ from stiffopt.cli import main as entry
 from stiffopt.identify.calibration import calibrate
 from stiffopt.logs import read_stiffness_table
 from stiffopt.model.calibration import Calibration
-from stiffopt.model.description import Corrections, RobotDescription, Tolerances
+from stiffopt.model.description import RobotDescription, Tolerances
 from stiffopt.model.parameters import Parameter, explicit, with_values
 from stiffopt.model.robot_files import load_description
+from stiffopt.model.segment import Corrections
 
 Array = NDArray[np.float64]
 

@@ -253,7 +253,7 @@ def test_a_release_does_not_go_past_the_end_again(legs):
     last = len(states(True, 0.2)) - 1
     leg = approach.times[[last, last + easing.STATES, -1]]
     brace.phase, brace._time = BracePhase.APPROACHING, float(np.interp(legs, [0, 1, 2], leg))
-    brace._change = np.full(6, 2e3)
+    brace._planned.correction.change = np.full(6, 2e3)
     before = brace.pressures
     turn = approach.pressures[last + easing.STATES]
     assert np.abs(turn - approach.pressures[-1]).max() > 1e4

@@ -15,8 +15,8 @@ from independent.arms import FLOP, LOPSIDED, Tube, neo_hookean
 from independent.motions import derivative, shift, wrench_map
 from independent.sections import RodSection, paper_section, rod_section, section, silicone
 from stiffopt.model.actuation import NORM_SMOOTHING, SectionGeometry, smooth_norm
-from stiffopt.model.description import Segment
 from stiffopt.model.laws.neo_hookean import neo_hookean_stretch
+from stiffopt.model.segment import Segment
 from tested_laws import (
     LAWS,
     TUBES,

@@ -453,6 +453,29 @@ def test_it_does_not_begin_while_something_touches_the_tip() -> None:
     assert [notice.kind for notice in pressing.notices()] == ["press-waits"]
 
 
+@pytest.mark.parametrize(("pause", "is_told"), [(0.6, True), (5.5, False)])
+def test_a_press_tells_that_it_waits_for_pushes_that_come_and_go(
+    pause: float, is_told: bool
+) -> None:
+    """For an arm that swings after each, so that it does not rest between them."""
+    pressing, still = (
+        Pressing(PRESS, TARGET, PressingTuning()),
+        CreepEstimator(3, False, CreepTuning()),
+    )
+    pushed, free = (
+        TipForce(touches, force * N, 1e-6 * np.eye(3), 5e-3 * N)
+        for touches, force in ((True, 0.05), (False, 0.0))
+    )
+    for time in np.arange(0.0, 40.0, 0.01):
+        force = pushed if time % (1.0 + pause) < 1.0 else free
+        pressing.advance(
+            0.01, False, True, np.zeros(3), np.zeros(6), force, still, np.eye(3), COMPLIANCE,
+            np.zeros(3),
+        )  # fmt: skip
+    assert pressing.phase is Phase.GOING
+    assert [notice.kind for notice in pressing.notices()] == ["press-waits"] * is_told
+
+
 @pytest.mark.parametrize(
     ("tip", "kinds"),
     [

@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 
 from stiffopt.errors import InputError, PressureError
 from stiffopt.model.calibration import Calibration, ErrorModel, FittedParameter
-from stiffopt.model.description import Corrections, RobotDescription
+from stiffopt.model.description import RobotDescription
 from stiffopt.model.history import Creep, History, Memory, Part, Play
 from stiffopt.model.manipulator import Manipulator, load_robot
 from stiffopt.model.parameters import Parameter, with_values
 from stiffopt.model.robot_files import load_description
+from stiffopt.model.segment import Corrections
 from stiffopt.model.uncertainty import TipUncertainty, Uncertainty
 
 Array = NDArray[np.float64]

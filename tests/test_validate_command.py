@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -129,3 +130,28 @@ def test_markdown_leaves_names_as_they_are(folder: Path, tmp_path: Path, capsys:
     )  # fmt: skip
     assert code == 0
     assert r"| a\_log\_b.csv |" in (tmp_path / "page" / "report.md").read_text(encoding="utf-8")
+
+
+def test_a_shift_that_rest_does_not_show_is_found_from_a_longer_beginning(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = read_log(folder / "tuesday.csv")
+    shifted = log.tip_position + np.where(log.time < 3, 0, [[2e-3], [-1e-3], [1e-3]]).T
+    write_log(tmp_path / "wednesday.csv", replace(log, tip_position=shifted))
+
+    def mean_error(*options: str) -> float:
+        code, out, _ = run(
+            capsys, "validate", "--robot", folder / "fitted.yaml", tmp_path / "wednesday.csv",
+            *options, "--json",
+        )  # fmt: skip
+        assert code == 0
+        return float(json.loads(out)["position_error_mm"]["mean"])
+
+    least = mean_error("--rezero")
+    assert mean_error("--rezero", "--beginning", "20 s") < 0.5 * least
+    code, _, err = run(
+        capsys, "validate", "--robot", folder / "fitted.yaml", folder / "tuesday.csv",
+        "--beginning", "0 s",
+    )  # fmt: skip
+    assert code == 2
+    assert "--beginning: expected more than 0 s" in err

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from independent.arms import CROSS, FLOP, LOPSIDED, PAIR, SIX, Tube, neo_hookean
-from stiffopt.model.description import Segment
 from stiffopt.model.laws import strain_law
+from stiffopt.model.segment import Segment
 
 Vector = NDArray[np.float64]
 TUBES = {"flop": FLOP, "cross": CROSS, "pair": PAIR, "lopsided": LOPSIDED, "six": SIX}

@@ -54,6 +54,14 @@ Rezero = Annotated[
         "--rezero", help="The origin of positions differs from log to log: fit a shift for each."
     ),
 ]
+Beginning = Annotated[
+    str | None,
+    option(
+        "TIME",
+        "How much of the beginning of a log that is only predicted tells its initial state and, "
+        "with --rezero, its shift; by default 2 s.",
+    ),
+]
 Pressures = Annotated[
     str, option("WHICH", "commanded or measured: the pressures that drive the model.")
 ]
@@ -136,6 +144,7 @@ def calibrate(
     timeout: TimeoutOption = None,
     sequence: Sequence = False,
     rezero: Rezero = False,
+    beginning: Beginning = None,
     pressures: Pressures = "commanded",
     channels: Channels = None,
     frame: Frame = None,
@@ -172,7 +181,7 @@ def calibrate(
     from stiffopt.cli import calibrate_run  # here, so that --help waits for no numerics
 
     recordings = calibrate_run.RecordingOptions(
-        robot, tuple(logs or ()), sequence, rezero, pressures, channels, frame,
+        robot, tuple(logs or ()), sequence, rezero, beginning, pressures, channels, frame,
         tuple(keep or ()),
     )  # fmt: skip
     return calibrate_run.run_calibrate(
@@ -188,6 +197,7 @@ def validate(
     logs: Annotated[list[str], typer.Argument(metavar="LOG...", show_default=False)],
     sequence: Sequence = False,
     rezero: Rezero = False,
+    beginning: Beginning = None,
     pressures: Pressures = "commanded",
     channels: Channels = None,
     frame: Frame = None,
@@ -205,7 +215,7 @@ def validate(
     from stiffopt.cli import calibrate_run
 
     recordings = calibrate_run.RecordingOptions(
-        robot, tuple(logs), sequence, rezero, pressures, channels, frame,
+        robot, tuple(logs), sequence, rezero, beginning, pressures, channels, frame,
         tuple(keep or ()),
     )  # fmt: skip
     calibrate_run.run_validate(recordings, report, as_json=as_json, quiet=quiet)

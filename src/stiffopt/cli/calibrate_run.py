@@ -233,6 +233,7 @@ class RecordingOptions:
     logs: tuple[str, ...]
     sequence: bool
     rezero: bool
+    beginning: str | None
     pressures: str
     channels: str | None
     frame: str | None
@@ -245,6 +246,11 @@ class RecordingOptions:
             quantities.choice("--keep", each, get_args(Finding))
         given = {"sequence": self.sequence, "rezero": self.rezero, "pressures": self.pressures,
                  "keep": self.keep}  # fmt: skip
+        if self.beginning is not None:
+            settle = quantities.quantity("--beginning", self.beginning, "s", "time")
+            if settle <= 0:
+                raise InputError(f"--beginning: expected more than 0 s, got {settle:g} s")
+            others["settle"] = settle
         return CalibrationSettings(**given, **others)
 
     def description(self) -> RobotDescription:

@@ -37,6 +37,9 @@ from typing import NamedTuple
 import numpy as np
 
 from stiffopt.arrays import Array
+from stiffopt.control.brace_concerns import SLIPS, UNCERTAIN, Concern, Concerns
+from stiffopt.control.brace_correction import BraceCorrection
+from stiffopt.control.brace_push import BracePushEstimator
 from stiffopt.control.contact_tuning import BracingTuning
 from stiffopt.control.friction import Friction
 from stiffopt.control.interface import Notice
@@ -45,10 +48,7 @@ from stiffopt.control.state import HeldContact, Severity
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import Task
 from stiffopt.optimise.tip import TipAt
-from stiffopt.paths.configurations import maximised
 from stiffopt.paths.leaning import BraceApproach
-
-_UNCERTAIN, _SLIPS = "brace-uncertain", "brace-slips"
 
 
 class BracePhase(StrEnum):
@@ -62,12 +62,13 @@ class BracePhase(StrEnum):
     RELEASED = "released"
 
 
-class Concern(NamedTuple):
-    """A reason to report a contact."""
+class _Parts(NamedTuple):
+    """What is known of a brace once its approach is planned."""
 
-    kind: str  # `brace-uncertain` or `brace-slips`
-    contact: int  # its index
-    cause: str  # `slide` or `lift` under a push, or `drift` of b
+    approach: BraceApproach
+    friction: Friction
+    pushes: BracePushEstimator
+    correction: BraceCorrection
 
 
 class Bracing:
@@ -101,11 +102,9 @@ class Bracing:
         self.covariance: Array = tuning.usual_push**2 * np.eye(3)
         self._error: Array | None = None  # b (3,)
         self._settled: Array = np.zeros(3)  # y - s when the arm had settled
-        self._corrected: Array = np.zeros(3)  # of late, by the model; friction may withhold it
         self._residual: Array = np.zeros(3)  # y - s, smoothed over vibrations
         self._held = self._pushed = 0.0  # durations, in s
-        self.approach: BraceApproach | None = None
-        self._friction: Friction | None = None
+        self._parts: _Parts | None = None  # once the approach is planned
         self._slides: SlideEstimator | None = None
         self._slid = 0  # successive samples at which a contact has slid
         self._start: Array = np.zeros(0)  # pressures (n,) from which the arm goes to rest
@@ -113,13 +112,8 @@ class Bracing:
         self._time = 0.0  # along the approach, in s
         self._pace = 0.0  # of that time, from 0 to 1
         self._waited = 0.0  # at its end, in s
-        self._change: Array = np.zeros(0)  # of the planned pressures (n,), to correct the tip
         self._free = 0  # successive samples at which the tip is nearer to a free arm's
-        self._is_off = False  # the tip is known to stay off its target
-        self._nearest = (math.inf, 0.0)  # distance of the tip from it, in m, and when it fell to it
-        self._concerns: dict[Concern, str] = {}  # what is reported, with its text
-        self._calm: dict[Concern, float] = {}  # how long it has not been seen, in s
-        self._doubted = 0.0  # for how long contacts have been uncertain, in s
+        self._concerns = Concerns(tuning)
         self._estimated: Array = np.zeros((0, 2))  # forces of contacts and their deviations (k, 2)
         self._lost: frozenset[int] = frozenset()  # contacts
         self._why = ""
@@ -130,6 +124,17 @@ class Bracing:
         return self.task.target
 
     @property
+    def approach(self) -> BraceApproach | None:
+        """The way into contact; None until it is planned."""
+        return None if self._parts is None else self._parts.approach
+
+    @property
+    def _planned(self) -> _Parts:
+        """What comes with the approach; only called once it is planned."""
+        assert self._parts is not None
+        return self._parts
+
+    @property
     def leans(self) -> bool:
         """Whether the arm is in contact, approaches it, or lets go."""
         return self.phase in (BracePhase.APPROACHING, BracePhase.HELD, BracePhase.RELEASING)
@@ -138,7 +143,7 @@ class Bracing:
     def contacts(self) -> str:
         """State of the contacts: `held`, `uncertain` or `lost`; empty if the arm does not lean."""
         if self.phase is BracePhase.HELD and not self.is_let_down:
-            return "uncertain" if self._doubt else "held"
+            return "uncertain" if self._concerns.doubt else "held"
         return "lost" if self._why else ""
 
     @property
@@ -146,8 +151,7 @@ class Bracing:
         """The contacts while the brace is held; after a loss, those that were lost."""
         if self.approach is None or not self.contacts:
             return ()
-        doubted = {each.contact for each in self._concerns if each.kind == _UNCERTAIN}
-        found = []
+        doubted, found = self._concerns.uncertain, []
         for number, each in enumerate(self.approach.contacts):
             if self.phase is BracePhase.HELD:
                 state = "uncertain" if number in doubted else "held"
@@ -158,28 +162,23 @@ class Bracing:
         return tuple(found)
 
     @property
-    def _doubt(self) -> str:
-        """Why contacts are uncertain; empty if they are not."""
-        texts = [text for each, text in self._concerns.items() if each.kind == _UNCERTAIN]
-        return "; also ".join(texts)
-
-    @property
     def pressures(self) -> Array:
         """Effective pressures (n,) now, in Pa."""
-        approach = self.approach
-        if approach is None or self.phase is BracePhase.TO_REST:
+        if self._parts is None or self.phase is BracePhase.TO_REST:
             return self._left * self._start
-        rows = approach.pressures
+        approach, rows = self._parts.approach, self._parts.approach.pressures
         on_way = np.array([np.interp(self._time, approach.times, row) for row in rows.T])
         share = min(self._time / approach.reached, 1.0)
-        return on_way + share * self._change
+        return on_way + share * self._parts.correction.change
 
     def begin(self, approach: BraceApproach, pressures: Array) -> None:
         """Go from pressures (n,) to rest, then along the approach."""
-        self.approach, self._start = approach, pressures
-        self._friction = Friction(approach.hold, approach.pressures[-1])
+        friction = Friction(approach.hold, approach.pressures[-1])
+        stuck = friction if self._sticks else None
+        pushes = BracePushEstimator(self.task, approach, stuck, self._tuning)
+        correction = BraceCorrection(approach.hold, stuck, len(pressures), self._tuning)
+        self._parts, self._start = _Parts(approach, friction, pushes, correction), pressures
         self._left = float(bool(np.abs(pressures).max() > self._tuning.at_rest))
-        self._change = np.zeros_like(pressures)
         self._estimated = np.full((len(approach.contacts), 2), np.nan)
         self.phase = BracePhase.TO_REST
 
@@ -277,60 +276,81 @@ class Bracing:
         pressures : effective pressures (n,), in Pa.
         quaternion : measured orientation (4,) of the tip, w first; None if it is not measured.
         """
-        t, held, friction = self._tuning, self.phase is BracePhase.HELD, self._friction
-        if self.approach is None or friction is None:
-            return
-        if not np.isfinite(seen).all():
+        if not np.isfinite(seen).all() or not self._is_on_way(pressures):
             return
         if quaternion is not None and not np.isfinite(quaternion).all():
             quaternion = None
-        if not (held or self.phase is BracePhase.APPROACHING):
-            return
-        if self.is_let_down or float(np.abs(pressures - self.pressures).max()) > t.off_plan:
-            return
-        sticks = self._sticks
-        residual = seen - tip.pose[:3, 3]
-        if held:  # the plan has followed friction to there
+        self._residual = self._smoothed(elapsed, seen - tip.pose[:3, 3], pressures)
+        if self._is_free(tip.pose[:3, 3]):
+            self._let_go_astray(seen, tip.pose[:3, 3])
+        elif self.phase is BracePhase.HELD:
+            self._judge_held(elapsed, seen, tip, pressures, quaternion)
+
+    def _is_on_way(self, pressures: Array) -> bool:
+        """Return whether the arm leans, or comes to lean, with pressures (n,) near the way's."""
+        if self.phase not in (BracePhase.APPROACHING, BracePhase.HELD) or self.is_let_down:
+            return False
+        return not float(np.abs(pressures - self.pressures).max()) > self._tuning.off_plan
+
+    def _smoothed(self, elapsed: float, residual: Array, pressures: Array) -> Array:
+        """Return y - s (3,) without what friction explains, smoothed over vibrations.
+
+        See `look` for the other arguments; the first sample of a held brace stands as it is.
+        """
+        t, friction = self._tuning, self._planned.friction
+        if self.phase is BracePhase.HELD:  # the plan has followed friction to there
             creep = t.creep * elapsed / (t.creep_time + self._held)
             friction.follow(pressures, min(elapsed / t.even_time, 1.0), creep)
-            if sticks:
+            if self._sticks:
                 residual = residual - friction.tip[:3] @ friction.forces
         if self._error is None:
-            self._residual = residual
-        self._residual = self._residual + min(elapsed / t.swing_time, 1.0) * (
-            residual - self._residual
-        )
-        residual = self._residual
-        to_free = self._free_tip() - tip.pose[:3, 3]
+            return residual
+        return self._residual + min(elapsed / t.swing_time, 1.0) * (residual - self._residual)
+
+    def _is_free(self, planned: Array) -> bool:
+        """Return whether the tip has been nearer to a free arm's than to the planned one (3,)."""
+        t = self._tuning
+        to_free = self._free_tip() - planned
         distance = float(np.linalg.norm(to_free))
-        share = float(residual @ to_free) / max(distance, 1e-9) ** 2
-        enough = t.min_distance if held else t.min_on_way
+        share = float(self._residual @ to_free) / max(distance, 1e-9) ** 2
+        enough = t.min_distance if self.phase is BracePhase.HELD else t.min_on_way
         is_free = distance > enough and share > t.free_share
         self._free = self._free + 1 if is_free else 0
-        if self._free >= t.samples:
-            self._let_go_astray(seen, tip.pose[:3, 3])
-            return
-        if not held:
-            return
+        return self._free >= t.samples
+
+    def _judge_held(
+        self,
+        elapsed: float,
+        seen: Array,
+        tip: TipAt,
+        pressures: Array,
+        quaternion: Array | None,
+    ) -> None:
+        """Take in what a sample tells of the model's error and of a push; judge the contacts.
+
+        See `look` for the arguments.
+        """
+        t, residual = self._tuning, self._residual
+        _, friction, pushes, correction = self._planned
         if self._error is None:
             self._error = residual
         raw, settles = residual - self._error, self._held < self._settling
-        off = raw + self._withheld(raw)
-        self._corrected *= 1 - min(elapsed / t.withheld_time, 1.0)
+        off = raw + correction.withheld(raw)
+        correction.forget(elapsed)
         self._held += elapsed
-        R, before = tip.pose[:3, :3], friction.sliding(pressures)
-        C = R @ tip.compliance[:3, :3] @ R.T
-        if sticks:
-            before = friction.normals(pressures)
-            C = C + friction.tip[:3] @ self.approach.hold.sticking.per_push
-            if not settles and self._has_slid(elapsed, seen, quaternion, pressures):
-                return
-        push, covariance = self._push(C, R, off)
-        feels = not settles and self._feels(off, push, before)
+        before = friction.normals(pressures) if self._sticks else friction.sliding(pressures)
+        if not settles and self._has_slid(elapsed, seen, quaternion, pressures):
+            return
+        push, covariance = pushes.likely(tip, off)
+        feels = not settles and pushes.feels(off, push, before)
         if settles:
             self._settled = residual
-        drift = self._drift(C, R, residual - self._settled - float(feels) * off, tip, pressures)
-        if not feels or (self._pushed > t.longest_push and not self._doubt):
+        # a push that lasts becomes part of b, and one that is not felt may be taken for a
+        # correction that friction withholds; so all that the tip has moved since it settled, but
+        # for what is felt, may be a push
+        change = residual - self._settled - float(feels) * off
+        drift = pushes.lost(tip, change, self._creep(tip, pressures))
+        if not feels or (self._pushed > t.longest_push and not self._concerns.doubt):
             time = t.settling_time if settles else t.error_time
             self._error = self._error + min(elapsed / time, 1.0) * raw
             self._pushed = self._pushed * float(feels)
@@ -338,19 +358,28 @@ class Bracing:
             self._rest(before, drift, elapsed)
             return
         self._pushed += elapsed
-        if sticks and not self._doubt:  # what stays is creep in the end
+        if self._sticks and not self._concerns.doubt:  # what stays is creep in the end
             self._error = self._error + min(elapsed / t.push_creeps, 1.0) * raw
         self.push, self.displacement = push, off
         self.covariance[:] = covariance
         self._judge(before, drift, elapsed)
+
+    def _creep(self, tip: TipAt, pressures: Array) -> float:
+        """Return the deviation of the creep since the arm settled, in m.
+
+        It is what the tip would move if the pressures (n,) grew. Where friction holds the body,
+        creep may move the tip in any direction.
+        """
+        t, began = self._tuning, self._tuning.creep_time + self._settling
+        folds = math.log(max((t.creep_time + self._held) / began, 1.0))
+        return t.unknown_creep * folds * float(np.linalg.norm(tip.jacobian[:3] @ pressures))
 
     def _let_go_astray(self, seen: Array, planned: Array) -> None:
         """Release contacts with a tip (3,) that is not where the plan has it (3,).
 
         Where it is not at a free arm's place either, the arm still touches something.
         """
-        assert self.approach is not None
-        t, contacts, free = self._tuning, self.approach.contacts, self._free_tip()
+        t, contacts, free = self._tuning, self._planned.approach.contacts, self._free_tip()
         off, from_free, apart = (
             float(np.linalg.norm(each)) for each in (seen - planned, seen - free, free - planned)
         )
@@ -364,7 +393,7 @@ class Bracing:
             f"the tip is {1e3 * off:.0f} mm from where the plan put it, and {1e3 * from_free:.0f} "
             "mm from where an arm without contact has it"
         )
-        rough = {contacts[j].object for j in self.approach.hold.sticking.own}
+        rough = {contacts[j].object for j in self._planned.approach.hold.sticking.own}
         names = " and ".join(f"'{each}'" for each in sorted(rough or {c.object for c in contacts}))
         if rough:
             why += f"; friction on {names} probably holds the body: give it a larger friction"
@@ -372,49 +401,19 @@ class Bracing:
             why += f": check the place of {names}, and give it its friction if it has any"
         self.release(why=f"{why}, and solve again")
 
-    def _push(
-        self, C: Array, rotation: Array, off: Array, creep: float = 0.0
-    ) -> tuple[Array, Array]:
-        """Return the most likely push (3,) that moves the tip by `off` (3,), and its covariance.
-
-        `C`: compliance (3, 3) of the tip, base axes; `creep`: deviation of what else moves the tip,
-        in m.
-        """
-        usual, noise = self._usual(rotation), self._noise(off) + creep**2 * np.eye(3)
-        gain = np.linalg.solve(C @ usual @ C.T + noise, C @ usual).T
-        return gain @ off, usual - gain @ C @ usual
-
-    def _drift(
-        self, C: Array, rotation: Array, change: Array, tip: TipAt, pressures: Array
-    ) -> Array:
-        """Return the forces (k,) that contacts may have lost since settling, unknown to anybody.
-
-        A push that lasts becomes part of b, and one that is not felt may be taken for a correction
-        that friction withholds. Creep moves the tip too, in any direction where friction holds the
-        body; its deviation is what the tip would move if the pressures grew. `change`: of y - s,
-        without what is felt (3,); see `_push` for `C`.
-        """
-        t, began = self._tuning, self._tuning.creep_time + self._settling
-        folds = math.log(max((t.creep_time + self._held) / began, 1.0))
-        creep = t.unknown_creep * folds * float(np.linalg.norm(tip.jacobian[:3] @ pressures))
-        push = self._push(C, rotation, change, creep)[0]
-        return np.maximum(-(self._per_push @ push), 0.0)
-
     def _has_slid(
         self, elapsed: float, seen: Array, quaternion: Array | None, pressures: Array
     ) -> bool:
         """Return whether place and turn of the tip tell that a contact has slid; then let go.
 
-        See `look` for the arguments.
+        Only contacts that are to stick count. See `look` for the arguments.
         """
-        assert self.approach is not None
-        assert self._friction is not None
-        t, approach = self._tuning.sliding, self.approach
-        if not approach.hold.sticking.own:
+        t, approach = self._tuning.sliding, self._planned.approach
+        if not (self._sticks and approach.hold.sticking.own):
             return False
         if self._slides is None:
-            usual = self._usual(approach.tips[-1].pose[:3, :3])
-            self._slides = SlideEstimator(approach, self._friction, usual, t)
+            usual = self._planned.pushes.usual(approach.tips[-1].pose[:3, :3])
+            self._slides = SlideEstimator(approach, self._planned.friction, usual, t)
         self._slides.take(elapsed, self._held, seen, quaternion, pressures)
         sizes = np.linalg.norm(self._slides.slides, axis=1)
         slid = (sizes > t.told) & (self._slides.deviations() > t.surely)
@@ -425,50 +424,6 @@ class Bracing:
         why = f"{self._named(own[most])} has slid by {1e3 * sizes[most]:.1f} mm"
         self.release(why=why, lost=[own[int(i)] for i in np.flatnonzero(slid)])
         return True
-
-    def _feels(self, off: Array, push: Array, before: Array) -> bool:
-        """Return whether a displacement (3,) of the tip is more than the model's error.
-
-        It is if it is large, or if its push uses up a share of what a contact holds: an arm that is
-        stiff loses its contact before the tip has moved far. `before`: normal forces (k,).
-        """
-        assert self._friction is not None
-        t, size = self._tuning, float(np.linalg.norm(off))
-        uses = float((-(self._per_push @ push) / np.maximum(before, 1e-6)).max())
-        if self._sticks and push.any():
-            force = float(np.linalg.norm(push))
-            uses = max(uses, force / max(self._friction.left(push / force, before), 1e-6))
-        return size > t.felt or (size > t.least_felt and uses > t.felt_share)
-
-    def _noise(self, off: Array) -> Array:
-        """Return the covariance (3, 3) of a displacement (3,) of the tip that no push explains.
-
-        A tip that is moved by y goes along an arc, so that its place is off the linear response by
-        y^2 / (2 length).
-        """
-        assert self.approach is not None
-        length = float(np.linalg.norm(self.approach.free_tips[0]))
-        bent = float(off @ off) / (2 * length)
-        return (self._tuning.deviation**2 + bent**2) * np.eye(3)
-
-    def _usual(self, rotation: Array) -> Array:
-        """Return the covariance (3, 3) of pushes before the tip is seen, in N^2; base axes.
-
-        An arm whose contacts are to stick hardly moves along its axis. There, pushes are expected
-        rather along the directions in which the task wants it to be stiff.
-        """
-        t, share = self._tuning, self._tuning.aside if self._sticks else 1.0
-        turns = {"base": np.eye(3), "tip": rotation}
-        ways = np.array([turns[m.frame] @ m.direction for m in maximised(self.task)]).T
-        along = ways @ np.linalg.pinv(ways)
-        return t.usual_push**2 * (share**2 * np.eye(3) + (1 - share**2) * along)
-
-    @property
-    def _per_push(self) -> Array:
-        """Derivatives (k, 3) of the contacts' normal forces by a push."""
-        assert self.approach is not None
-        assert self._friction is not None
-        return self._friction.per_push if self._sticks else self.approach.hold.per_push
 
     @property
     def _settling(self) -> float:
@@ -483,27 +438,16 @@ class Bracing:
 
     def _free_tip(self) -> Array:
         """Return the position (3,) of the tip of a free arm at the present place of the way."""
-        assert self.approach is not None
-        times, rows = self.approach.times, self.approach.free_tips
+        approach = self._planned.approach
+        times, rows = approach.times, approach.free_tips
         return np.array([np.interp(self._time, times, row) for row in rows.T])
-
-    def _withheld(self, off: Array) -> Array:
-        """Return the part of the recent correction (3,), in m, that explains a residual (3,) best.
-
-        A contact with friction sticks at first and slips later, so the tip may lag behind the
-        correction, or catch up, by up to all of it.
-        """
-        square = float(self._corrected @ self._corrected)
-        share = -float(off @ self._corrected) / max(square, 1e-12)
-        return float(np.clip(share, -1.0, 1.0)) * self._corrected
 
     def _rest_deviations(self, before: Array) -> Array:
         """Return the standard deviations (k,) of normal forces without a push, in N.
 
         `before`: these forces (k,). A robot that is not calibrated has none of its own.
         """
-        assert self.approach is not None
-        least, own = self._tuning.least_deviation * before, self.approach.hold.deviations
+        least, own = self._tuning.least_deviation * before, self._planned.approach.hold.deviations
         return np.maximum(own, least)
 
     def _deviations(self, before: Array, change: Array) -> Array:
@@ -513,8 +457,7 @@ class Bracing:
         stiff, and from the response of the model. `before`: forces (k,) without the push; `change`:
         by it (k,).
         """
-        assert self.approach is not None
-        G, response = self._per_push, self._tuning.response * change
+        G, response = self._planned.pushes.per_push, self._tuning.response * change
         pushed = np.einsum("ki,ij,kj->k", G, self.covariance, G)
         return np.sqrt(self._rest_deviations(before) ** 2 + pushed + response**2)
 
@@ -527,7 +470,7 @@ class Bracing:
         for each in map(int, np.flatnonzero((left < 0) & (drift > t.felt_share * before))):
             text = self._lifted(each, float(before[each] + t.certain * own[each]))
             why = "since the tip has moved away as by a slow push"
-            found[Concern(_UNCERTAIN, each, "drift")] = f"{text}, {why}"
+            found[Concern(UNCERTAIN, each, "drift")] = f"{text}, {why}"
         self._weigh(found, elapsed)
 
     def _judge(self, before: Array, drift: Array, elapsed: float) -> None:
@@ -535,16 +478,14 @@ class Bracing:
 
         `before`: normal forces (k,) without it; `drift`: what they may have lost (k,).
         """
-        assert self.approach is not None
-        assert self._friction is not None
         t, size = self._tuning, float(np.linalg.norm(self.push))
-        change = self._per_push @ self.push
+        change = self._planned.pushes.per_push @ self.push
         forces, own = before + change, self._deviations(before, change)
         most, least = forces + t.certain * own, self._estimate(forces, np.hypot(own, drift))
         falls = change < 0
         left = size * float(np.min(before[falls] / -change[falls], initial=math.inf))
         if self._sticks:
-            left = min(left, self._friction.left(self.push / size, before))
+            left = min(left, self._planned.friction.left(self.push / size, before))
         self.margin = max(left - size, 0.0)
         words = f"under a push of {1e3 * size:.0f} mN"
         if (most < 0).any():
@@ -552,15 +493,15 @@ class Bracing:
             lost = np.flatnonzero(most < 0).tolist()
             self.release(why=f"{lifted} lifts off {words}", lost=lost)
             return
-        slid, found = self._friction.slid(self.push, before), {}
-        kind, how = (_UNCERTAIN, "may slide") if self._sticks else (_SLIPS, "slips")
+        slid, found = self._planned.friction.slid(self.push, before), {}
+        kind, how = (UNCERTAIN, "may slide") if self._sticks else (SLIPS, "slips")
         for i in np.flatnonzero(slid > t.slid):
-            each = self.approach.hold.sticking.own[int(i)]
+            each = self._planned.approach.hold.sticking.own[int(i)]
             found[Concern(kind, each, "slide")] = f"{self._named(each)} {how} {words}"
         for each in map(int, np.flatnonzero(least < 0)):
             text, whole = self._lifted(each, float(most[each])), 1e3 * before[each]
             text = f"{text} {words}; without it, {whole:.0f} mN"
-            found[Concern(_UNCERTAIN, each, "lift")] = text
+            found[Concern(UNCERTAIN, each, "lift")] = text
         self._weigh(found, elapsed)
 
     def _estimate(self, forces: Array, deviations: Array) -> Array:
@@ -573,33 +514,19 @@ class Bracing:
     def _weigh(self, found: dict[Concern, str], elapsed: float) -> None:
         """Take in what is of concern at a sample.
 
-        It is reported when it comes, and until it has not been seen for `again`. The arm lets go
-        only at a sample that is itself doubtful.
+        The arm lets go only at a sample that is itself doubtful.
         """
-        t = self._tuning
-        for each, text in found.items():
-            if each not in self._concerns:
-                self._notify(each.kind, text, Severity.WARNING)
-                self._concerns[each] = text
-        for each in list(self._concerns):
-            self._calm[each] = 0.0 if each in found else self._calm[each] + elapsed
-            if self._calm[each] >= t.again:
-                del self._concerns[each]
-        if not self._doubt:
-            self._doubted = 0.0
-        if any(each.kind == _UNCERTAIN for each in found):
-            self._doubted += elapsed
-            if self._doubted > t.longest_push:
-                time = f"{t.longest_push:.0f} s"
-                lost = [each.contact for each in self._concerns if each.kind == _UNCERTAIN]
-                self.release(why=f"for {time} it was uncertain: {self._doubt}", lost=lost)
+        longest, concerns = self._tuning.longest_push, self._concerns
+        self._notices += concerns.take(found, elapsed)
+        if concerns.doubted > longest and any(each.kind == UNCERTAIN for each in found):
+            why = f"for {longest:.0f} s it was uncertain: {concerns.doubt}"
+            self.release(why=why, lost=concerns.uncertain)
 
     def _lifted(self, contact: int, most: float) -> str:
         return f"{self._named(contact)} may have lifted off: it has 0 to {1e3 * most:.0f} mN"
 
     def _named(self, contact: int) -> str:
-        assert self.approach is not None
-        return f"the contact on '{self.approach.contacts[contact].object}'"
+        return f"the contact on '{self._planned.approach.contacts[contact].object}'"
 
     def _notify(self, kind: str, text: str, severity: Severity = Severity.INFO) -> None:
         self._notices.append(Notice(kind, text, severity))
@@ -609,8 +536,7 @@ class Bracing:
     ) -> None:
         """Move the braced tip slowly to its target, with constant contact forces.
 
-        Then also relieve contacts that are to stick of the friction that the way into contact left:
-        the pressures change the tangential forces while the tip stays.
+        See `BraceCorrection`. A push is not compensated.
 
         Parameters
         ----------
@@ -619,59 +545,12 @@ class Bracing:
         jacobian : of the position of a tip whose contacts slide, base axes (3, n), in m/Pa.
         limits : smallest and largest pressures (n,), in Pa.
         """
-        if self.displacement.any() or self.approach is None or self._friction is None:
-            return  # a push is not compensated
-        t = self._tuning
-        off, (least, since) = float(np.linalg.norm(error)), self._nearest
-        if off < (1 - t.progress) * least:
-            self._nearest = off, self._held
-        elif not self._is_off and least > t.off_target and self._held > since + t.patience:
-            self._is_off = True
-            text = f"the tip stays {1e3 * off:.1f} mm from its target while the arm leans"
-            if self.approach.hold.sticking.own:
-                text += "; friction may hold the body"
-            self._notify("brace-off-target", text, Severity.WARNING)
-        hold, friction = self.approach.hold, self._friction
-        rows, wanted = [jacobian, t.force_weight * hold.per_pressure], [error]
-        if self._sticks and self._held >= t.settling:  # the tip has come to its target
-            rates = hold.sticking.per_pressure
-            jacobian = jacobian + friction.tip[:3] @ rates
-            rows = [jacobian, t.force_weight * friction.per_pressure, t.force_weight * rates]
-            wanted = [error, np.zeros(len(hold.forces)), -t.force_weight * friction.forces]
-        step = elapsed * self._step(np.vstack(rows), np.concatenate(wanted), limits)
-        time, speed = t.first_time, t.first_speed
-        if self._held >= t.settling:  # so slow that a push which is not felt yet is quicker
-            time, speed = t.time, t.correction_speed
-        step /= time
-        step *= min(1.0, speed * elapsed / max(float(np.linalg.norm(jacobian @ step)), 1e-12))
-        before = self._change
-        self._change = np.clip(before + step, -t.most_change, t.most_change)
-        self._corrected = self._corrected + jacobian @ (self._change - before)
-
-    def _step(self, rows: Array, wanted: Array, limits: tuple[Array, Array]) -> Array:
-        """Return the change (n,) of pressures that fits rows (m, n) @ it best.
-
-        To relieve friction takes all channels, so those at their limits are known to stay there.
-        `wanted` may lack zeros at its end. A channel that comes to its limit stays there for this
-        step, even if the others could then do better without that: the next steps make it up.
-        """
-        t, n = self._tuning, len(self._change)
-        A = np.vstack([rows, t.pressure_weight * np.eye(n)])
-        b = np.concatenate([wanted, np.zeros(len(A) - len(wanted))])
-        low, high = np.full(n, -np.inf), np.full(n, np.inf)
-        if self._sticks:
-            now, most = self.pressures, t.most_change
-            low = np.clip(limits[0] - now, -most - self._change, 0.0)
-            high = np.clip(limits[1] - now, 0.0, most - self._change)
-        step, free = np.zeros(n), np.ones(n, dtype=bool)
-        while free.any():
-            B = A[:, free]
-            step[free] = np.linalg.solve(B.T @ B, B.T @ (b - A[:, ~free] @ step[~free]))
-            beyond = (step < low) | (step > high)
-            if not beyond.any():
-                break
-            step, free = np.clip(step, low, high), free & ~beyond
-        return step
+        if self._parts is None or self.displacement.any():
+            return
+        low, high = (each - self.pressures for each in limits)
+        words = self._parts.correction.correct(elapsed, self._held, error, jacobian, low, high)
+        if words:
+            self._notify("brace-off-target", words, Severity.WARNING)
 
     def notices(self) -> tuple[Notice, ...]:
         """Return events since the last call, and alarms."""
@@ -679,5 +558,5 @@ class Bracing:
         if self._why and self.phase in (BracePhase.RELEASING, BracePhase.RELEASED):
             found = (*found, Notice("brace-lost", self._why, Severity.ERROR, standing=True))
         elif self.contacts == "uncertain":
-            found = (*found, Notice(_UNCERTAIN, self._doubt, standing=True))
+            found = (*found, Notice(UNCERTAIN, self._concerns.doubt, standing=True))
         return found

@@ -313,6 +313,9 @@ class TipController:
         if counts.used and sample and tip and not self._first_motion.is_over:
             parts = tip.pose[:3, :3] @ tip.jacobian[:3] * self._arm.tip.captured
             self._first_motion.take(self._arm.tip.predicted, sample.position, parts)
+        if counts.used and sample and tip:
+            estimator = self._arm.tip
+            self.replanner.look(sample.time, estimator.offset, estimator.captured, tip)
         if self.forecast is not None:
             self.forecast.present = self._present(now)
         return counts
@@ -321,8 +324,9 @@ class TipController:
         estimate, replanner = self._arm.tip.estimate, self.replanner
         return Present(
             replanner.pursuit, replanner.plan, self._way(now), self._arm.tip.offset,
-            self._arm.pressures.command_offset, self._arm.channels.available(), replanner.adapted,
-            estimate.position, estimate.rotation, self._vibrates,
+            self._arm.pressures.command_offset,
+            replanner.limited(self._arm.channels.available(), np.zeros(self.robot.n_pressures)),
+            replanner.adapted, estimate.position, estimate.rotation, self._vibrates,
         )  # fmt: skip
 
     def _way(self, now: float) -> Array:
@@ -394,13 +398,14 @@ class TipController:
         if isinstance(course, PostureCourse):
             self._led_to = course.target(tip.pose, reference.path[n:])
         goal = reference.command - pressures.command_offset
+        limits = self._arm.channels.commands(reference.path[:n], *self._permitted, goal)
         command = self._feedback.command(
             tip,
             reference,
             self.replanner.pursuit.prescribed,
             self._offset,
             goal,
-            self._arm.channels.commands(reference.path[:n], *self._permitted, goal),
+            self.replanner.limited(limits, pressures.command_offset),
             None if isinstance(course, PostureCourse | Pressing) else course is not None,
             min(self._first_motion.largest_correction(tip.pose[:3, 3]), self._correction.largest),
             bent,
@@ -670,7 +675,8 @@ class TipController:
     def notices(self) -> tuple[Notice, ...]:
         """Return alarms and events."""
         untold, self._untold = self._untold, []
-        return (*untold, *self._report.notices(self._rests_short()))
+        waits = self._waits and not self._is_held(self._now) and not self._has_arrived()
+        return (*untold, *self._report.notices(self._rests_short(), waits=waits))
 
     def _rests_short(self) -> bool:
         """Return whether the tip is at rest although its target, out of reach, is elsewhere.

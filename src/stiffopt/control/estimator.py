@@ -139,6 +139,7 @@ class TipEstimator:
         self.sample: PoseSample | None = None  # the latest that was used
         self.predicted: Array = np.zeros(3)  # position at its capture without the offset
         self.turned: Array = np.zeros(3)  # rotation vector from the orientation predicted likewise
+        self.modelled: Array = np.eye(3)  # the model's rotation at that time
         self.captured: Array = np.zeros(0)  # pressures (n,) at that time, in Pa
         # amplitudes of the driven and the free vibration at that time, in m
         self.swings = (0.0, 0.0)
@@ -365,7 +366,8 @@ class TipEstimator:
         )  # fmt: skip
         self._displacements = np.zeros(2)
         self._used_until = sample.time
-        self.sample, self.captured, self._rejected = sample, past.pressures, 0
+        self.sample, self._rejected = sample, 0
+        self.captured, self.modelled = past.pressures, past.rotation
         self.swings = float(swings[0]), float(swings[1])
 
 

@@ -1,6 +1,6 @@
 """Checks that the tip moves as the pressures imply; if not, the loop doubts tracker or arm.
 
-The tracker measures the tip at y, the model predicts s, and the reference intends r. Four tests
+The tracker measures the tip at y, the model predicts s, and the reference intends r. Five tests
 look for what no push, payload or model error explains:
 
 * response: r has moved, but y has not moved along with s, or has moved elsewhere;
@@ -10,7 +10,8 @@ look for what no push, payload or model error explains:
   with such a turn is a push. It may excite higher modes, in which the tip turns otherwise, so the
   test pauses. A tip at rest is judged sooner, by y - s and its own turn, vibration included;
 * drift: y - s keeps moving, faster than the model's error can change while s moves;
-* swing: y - r oscillates, and does not decay.
+* swing: y - r oscillates, and does not decay;
+* still: the orientation of s turns, but y rests, and its orientation too (`StillWatch`).
 
 A push or a payload moves y - s too, but then it rests. Drift is tested at three time scales, to
 distinguish it from creep. The model may be wrong by a share of the motion that each segment causes,
@@ -31,7 +32,8 @@ import numpy as np
 from stiffopt.arrays import Array
 from stiffopt.control.noticing_tuning import DriftScale, MotionTuning
 from stiffopt.control.push_watch import PushWatch
-from stiffopt.control.tip_errors import turn_of_a_push
+from stiffopt.control.still_watch import StillWatch
+from stiffopt.control.tip_errors import missed_turn, turn_of_a_push
 from stiffopt.model.description import RobotDescription
 from stiffopt.optimise.tip import TipAt
 
@@ -104,6 +106,7 @@ class MotionWatch:
         width = _PRESSURES.start + ends[-1]  # of a row; see `_TIME` and the others
         self._rows: Array = np.empty((2 * self._kept, width))
         self._pushes = PushWatch(tuning.pushes, vibrates=vibrates)
+        self._still = StillWatch(tuning.still_watch, tuning.scatter)
         self.begin()
 
     def begin(self) -> None:
@@ -119,6 +122,7 @@ class MotionWatch:
         self._intended: deque[tuple[float, Array]] = deque(maxlen=self._kept)
         self._swings = [_Swings(self._tuning) for _ in range(3)]
         self._pushes.begin()
+        self._still.begin()
         self.doubt: Doubt | None = None
         self.pace, self.waits = 1.0, False
         # motion of the tip by each segment so far, in m; largest error of the model in it, as a
@@ -131,6 +135,7 @@ class MotionWatch:
         self._intended.clear()
         self._unproven.clear()
         self._pushes.begin()
+        self._still.begin()
         self._misses = 0
         self._slips.clear()
         self._jumps.clear()
@@ -150,6 +155,7 @@ class MotionWatch:
         rows[:, _OFFSET] += change[:3]
         rows[:, _TURN] += change[3:]
         rows[:, _TURNED] += change[3:]
+        self._still.begin()
 
     def intend(self, now: float, position: Array) -> None:
         """Note the tip position (3,) that the reference intends; in each tick of control."""
@@ -168,6 +174,7 @@ class MotionWatch:
         swings: tuple[float, float] = (0.0, 0.0),
         deviation: float = 0.0,
         omega: float = 0.0,
+        rotations: tuple[Array, Array] | None = None,
     ) -> None:
         """Take in a sample of the tracker.
 
@@ -192,6 +199,9 @@ class MotionWatch:
             Standard deviation of the offset's position along an axis, in m.
         omega :
             Of the vibration, in rad/s.
+        rotations :
+            Axes (3, 3) of the tip in the sample, and as the model has them; None: not to be
+            compared, as they are not measured, or something holds the tip.
         """
         intended = self._intended_at(time)
         if intended is None or self._is_early(time) or self.doubt is not None:
@@ -225,6 +235,7 @@ class MotionWatch:
         if turning is not None:
             self.doubt = self.doubt or self._jump(jacobian, turning)
         self.doubt = self.doubt or self._drift(jacobian, turning) or self._swing()
+        self.doubt = self.doubt or self._lies_still(time, seen, predicted, tip, rotations)
 
     def _is_pushed(self) -> bool:
         """Return whether something has just displaced the tip while the reference rested."""
@@ -521,14 +532,7 @@ class MotionWatch:
         )
 
     def _missed_turn(self, bent: Array, turned: Array) -> float:
-        """Return by how much a turn (3,) differs from that of a push, in rad.
-
-        A force at the tip would cause the turn `bent` (3,). A moment, another posture than the
-        model's or a higher mode may turn the tip further the same way.
-        """
-        share = float(bent @ turned) / max(float(bent @ bent), 1e-12)
-        share = min(max(share, 1.0), self._tuning.further)
-        return float(np.linalg.norm(turned - share * bent))
+        return missed_turn(bent, turned, self._tuning.further)
 
     def _share(self, moved: Array, way: Array) -> float:
         """Return the change of the offset (3,) as a share of the model's way (3,).
@@ -540,6 +544,29 @@ class MotionWatch:
         aside = float(np.linalg.norm(moved - share * way))
         is_along = aside < tuning.aside * float(np.linalg.norm(moved))
         return share if is_along and abs(share) < tuning.largest_error else 0.0
+
+    def _lies_still(
+        self,
+        time: float,
+        seen: Array,
+        predicted: Array,
+        tip: TipAt,
+        rotations: tuple[Array, Array] | None,
+    ) -> Doubt | None:
+        """Test whether the pressures turn the tip, but neither motion nor turn is seen."""
+        if rotations is None:
+            self._still.begin()
+            return None
+        turn = self._still.take(time, seen, rotations[0], predicted, rotations[1], tip)
+        if not turn:
+            return None
+        return Doubt(
+            "no-response",
+            f"the tip should have turned by {math.degrees(turn):.1f} degrees or more and is seen "
+            "to lie still: its sensor has come off, the tracker repeats an old pose, or something "
+            "holds the tip; look at the sensor",
+            undo=0.0,  # it has probably moved as intended
+        )
 
     def _drift(self, jacobian: Array, turning: TipAt | None) -> Doubt | None:
         """Test whether the tip keeps moving without a cause in the pressures.

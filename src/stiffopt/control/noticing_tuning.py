@@ -28,6 +28,19 @@ class SupervisionTuning:
 
 
 @dataclass(frozen=True)
+class ScatterTuning:
+    """When the times of the tracker's samples scatter (`TimeScatter`)."""
+
+    most: float = 0.02  # standard deviation of the times above which there is an alarm, in s
+    least: float = 0.01  # that the noise of positions may seem to be, in s
+    least_speed: float = 0.01  # of the tip, in m/s
+    window: float = 0.35  # of motion, in s
+    count: int = 7  # least number of samples in it
+    longest_span: float = 0.135  # of four samples: over a longer one a swing is rough itself, in s
+    outlier: float = 3.0  # multiple of the median error that counts of an error
+
+
+@dataclass(frozen=True)
 class DriftScale:
     """A drift: faster than `least_speed`, in m/s, in each of `count` intervals, in s."""
 
@@ -47,6 +60,9 @@ class PushTuning:
     slow: float = 12.0  # above which it is less, as the inverse square, in rad/s
     steady: float = 0.3  # time at the beginning in which the speed of a steady change is seen, in s
     steady_share: float = 0.7  # of such a change that counts; times `share` it is more than all
+    # motion of the tip by each channel below which such a change is slow, in m/s: the arm then
+    # becomes stiff with 5 mm/s at most, and feedback adds to that
+    slow_change: float = 6e-3
     least: float = 2e-3  # least displacement, in m
     moves: float = 0.3  # least share of it by which the tip moves
     # displacement over all that the pressures can have moved the tip, and length added to that, in
@@ -61,6 +77,40 @@ class PushTuning:
     lasts: float = 1.0  # time after that in which the arm swings, in s
     # multiple of its largest displacement, when recognised, that it explains later
     grows: float = 1.2
+
+
+@dataclass(frozen=True)
+class StillTuning:
+    """When a sensor lies still while the pressures turn the tip (`StillWatch`)."""
+
+    window: float = 1.0  # in which it is looked for, in s
+    interval: float = 0.1  # by which the first sample may be later than its beginning, in s
+    samples: int = 2  # least number of samples in a third of it
+    # largest change of the mean pose between thirds: over the scatter of a sample, and in rad
+    scatters: float = 3.0
+    turn: float = 3e-3
+    # least turn of the model that is not seen, in rad: of healthy arms it was 0.013 at most
+    least: float = 0.025
+    further: float = 2.0  # see `MotionTuning.further`
+    misses: int = 2  # successive samples
+
+
+@dataclass(frozen=True)
+class MissingMotionTuning:
+    """When the tip lacks the motion of a channel (`MissingMotion`)."""
+
+    interval: float = 0.2  # between samples that are compared, in s
+    longest_pause: float = 0.5  # between two samples, after which they are not compared, in s
+    # share of a channel's motion that errors of the model explain; share that counts of a change of
+    # the offset across it
+    usual: float = 0.5
+    across: float = 0.5
+    # motion of the tip by a channel above which the arm goes to a target, in m/s: as it becomes
+    # stiff that is 5 mm/s, and up to 15 mm/s where feedback makes up for what the tip lacks
+    fastest: float = 2e-2
+    most: float = 3e-3  # missing motion beyond that, of a fault, in m
+    # at which the channel goes back then, as the motion of the model's tip by it, in m/s
+    back_speed: float = 5e-3
 
 
 @dataclass(frozen=True)
@@ -81,6 +131,7 @@ class MotionTuning:
     push: float = 8e-4
     push_time: float = 0.25
     pushes: PushTuning = field(default_factory=PushTuning)  # of pushes in motion
+    still_watch: StillTuning = field(default_factory=StillTuning)  # of a sensor that lies still
     noise: float = 1e-3  # of a measured motion, in m
     scatter: float = 5e-5  # standard deviation of a tracked position in each axis, in m
     # shortest way for a test of the response: in m, and as a share of the arm's length

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from stiffopt import lie
 from stiffopt.arrays import Array
 from stiffopt.control.bracing import Bracing
 from stiffopt.control.channels import Channels
@@ -19,6 +20,7 @@ from stiffopt.control.pressing import Pressing
 from stiffopt.control.regulators import PressureEstimator
 from stiffopt.control.replanning import AnyCourse
 from stiffopt.control.setup import ControlSetup
+from stiffopt.control.time_scatter import TimeScatter
 from stiffopt.control.tip_errors import turn_of_a_push
 from stiffopt.control.touch import TouchEstimator
 from stiffopt.errors import StiffoptError
@@ -79,6 +81,7 @@ class ArmObserver:
             ),
         )
         self.watch = MotionWatch(robot.description, tuning.motion, vibrates=mode is not None)
+        self.times = TimeScatter(control.tracker_noise)
         self.model: ArmModel | None = None
         self._now, self._modelled_at = 0.0, np.zeros(n)
 
@@ -111,6 +114,7 @@ class ArmObserver:
         self.tip.begin()
         self.touch.begin()
         self.watch.begin()
+        self.times.begin()
         self.modelled: TipAt | None = None
         self.leaning: LeaningTip | None = None
         self._looked_at = now  # capture time of the last sample, in s
@@ -183,7 +187,8 @@ class ArmObserver:
         self, sample: PoseSample, effective: Array, tip: TipAt, course: AnyCourse | None
     ) -> None:
         """Estimate the force on the tip from a sample, and check the sample against the model."""
-        predicted, pushed = self.tip.predicted, np.zeros(3)
+        self.times.take(sample.time, sample.position)
+        predicted, pushed, rotations = self.tip.predicted, np.zeros(3), None
         presses = isinstance(course, Pressing) and course.touches_on_purpose
         if isinstance(course, Pressing) and presses:
             self.touch.expect(course.direction, course.press.speed, presses=course.presses)
@@ -200,10 +205,12 @@ class ArmObserver:
             pushed = self.touch.felt.displacement
             if turned is not None:
                 turned = turned - turn_of_a_push(tip, along_stiff_axis=True) @ pushed
+        elif sample.quaternion is not None:
+            rotations = lie.rotation_from_quaternion(sample.quaternion), self.tip.modelled
         self.watch.take(
             sample.time, sample.position - pushed, predicted, self.tip.offset, captured,
             tip, turned=turned, swings=self.tip.swings, deviation=self.tip.deviation,
-            omega=self.tip.omega,
+            omega=self.tip.omega, rotations=rotations,
         )  # fmt: skip
 
     def lean_on(self, leaning: LeaningTip | None) -> Array:

@@ -67,7 +67,8 @@ class Pressing:
         self._creep: Array = np.zeros(3)
         # durations, in s: at rest, without a force, within and outside the tolerance
         self._waited = self._felt_nothing = self._within = self._off = 0.0
-        self._pushed = 0.0  # how long something has pushed the tip before the approach, in s
+        # how long something has pushed the tip before the approach, with pauses, and has not, in s
+        self._pushed = self._calm = 0.0
         self._touched, self._why = False, ""
         self._told = False  # whether the tip comes from beyond the target
         self._watch = ObstructionWatch(tuning.obstruction)
@@ -184,7 +185,7 @@ class Pressing:
             return
         if self.phase is Phase.GOING:
             self._waited = self._waited + elapsed if arrived else 0.0
-            self._pushed = self._pushed + elapsed if felt.touches else 0.0
+            self._note_pushes(elapsed, felt.touches)
             n = self.press.direction_in_base(rotation)
             self._tell_from_where(float(n @ np.nan_to_num(tip - aim)))
             deviation = creep.deviation(n, t.foresight) / float(n @ compliance @ n)
@@ -220,6 +221,14 @@ class Pressing:
                 self._go_clear(gone, way, tip)
             elif self._shift <= 0.0:
                 self._end()
+
+    def _note_pushes(self, elapsed: float, touches: bool) -> None:
+        """Note how long something pushes the tip, also if it does so again and again."""
+        self._calm = 0.0 if touches else self._calm + elapsed
+        if touches:
+            self._pushed += elapsed
+        elif self._calm > self._tuning.patience:
+            self._pushed = 0.0
 
     def _tell_from_where(self, beyond: float) -> None:
         """Tell at the beginning if the tip is beyond the target, in m, where the object may be."""
@@ -332,7 +341,7 @@ class Pressing:
             text = f"{self._why}; the tip goes back {where}, and stays there until a new task"
             return (*found, Notice("press-failed", text, standing=True))
         if self.phase is Phase.GOING and self._pushed > self._tuning.patience:
-            text = "something touches the tip already; it presses once nothing does"
+            text = "something keeps touching the tip; it presses once nothing does"
             return (*found, Notice("press-waits", text, standing=True))
         if self.phase is Phase.PRESSING and self._off > self._tuning.patience:
             text = (

@@ -86,34 +86,39 @@ class PushWatch:
             return False
         if math.dist(seen[-1], seen[first + farthest]) < tuning.moves * size:
             return False  # a tip that lies still has not been pushed
-        late = self._late * min(1.0, (tuning.slow / max(self.omega, 1e-9)) ** 2)
-        acting = slice(max(2, int(times.searchsorted(now - late, "right"))))
-        moved = self._moved(times[acting], pressures[acting])
-        by_channels = np.sqrt((jacobian**2).sum(axis=0)) * moved
-        by_swing = 2 * float(swings[first])  # from one side to the other
-        if size < tuning.share * max(float(by_channels.sum()) + tuning.noise, by_swing):
-            return False
         bent = turn_of_a_push(tip) @ ways[farthest]
         missing = float(np.linalg.norm(turned[-1] - turned[first + farthest] - bent))
         expected = float(np.linalg.norm(bent))
         if expected < tuning.least_turn or missing > tuning.turn * expected:
             return False
+        late = self._late * min(1.0, (tuning.slow / max(self.omega, 1e-9)) ** 2)
+        acting = slice(max(2, int(times.searchsorted(now - late, "right"))))
+        by_channels = self._caused(times[acting], pressures[acting], jacobian)
+        by_swing = 2 * float(swings[first])  # from one side to the other
+        if size < tuning.share * max(by_channels + tuning.noise, by_swing):
+            return False
         self._size = max(size, self._size if self.acts(now) else 0.0)
         self._until = now + tuning.lasts
         return True
 
-    def _moved(self, times: Array, pressures: Array) -> Array:
-        """Return how far each pressure (n,) has moved to displace the tip lately, in Pa.
+    def _caused(self, times: Array, pressures: Array, jacobian: Array) -> float:
+        """Return how far all channels can have displaced the tip lately, in m.
 
-        A slow change that has gone on at one speed counts with the time of a push alone, and less,
-        as the arm does not swing with it.
+        A change that has gone on at one speed counts with the time of a push alone, and less, as
+        the arm does not swing with it. A slow one has been seen to go right until then; so only one
+        channel counts, which may just have failed.
         """
         tuning = self._tuning
         begun = max(1, int(times.searchsorted(times[0] + tuning.steady, "right")) - 1)
         rates = (pressures[begun] - pressures[0]) / (times[begun] - times[0])
+        gains = np.sqrt((jacobian**2).sum(axis=0))
         away = pressures - rates * (times - times[0])[:, None]
-        moved: Array = np.ptp(away, axis=0) + tuning.steady_share * np.abs(rates) * tuning.time
-        return np.minimum(moved, np.ptp(pressures, axis=0))
+        moved, steady = gains * np.ptp(away, axis=0), gains * np.abs(rates)
+        largest, most = float(steady.max()), gains * np.ptp(pressures, axis=0)
+        if largest < tuning.slow_change:
+            return float(np.minimum(moved, most).sum()) + tuning.time * largest
+        moved += tuning.steady_share * tuning.time * steady
+        return float(np.minimum(moved, most).sum())
 
     def displacements(self, away: Array, turned: Array, tip: TipAt) -> Array:
         """Return the displacements (k, 3) that pushes explain of those from the last sample, in m.

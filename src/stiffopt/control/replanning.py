@@ -14,6 +14,7 @@ from stiffopt.control.bracing import Bracing
 from stiffopt.control.course import Course
 from stiffopt.control.feedback import prescribed_components
 from stiffopt.control.interface import Notice
+from stiffopt.control.missing_motion import MissingMotion
 from stiffopt.control.plan import Plan, PlanRequest
 from stiffopt.control.planner import InlinePlanner, ProcessPlanner
 from stiffopt.control.planning import nearest_words
@@ -25,6 +26,7 @@ from stiffopt.control.vibration import BentMode
 from stiffopt.errors import InputError
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import Task
+from stiffopt.optimise.tip import TipAt
 from stiffopt.paths.trajectory import Trajectory, Waypoint
 
 AnyCourse = Course | PostureCourse | Pressing | Bracing
@@ -105,6 +107,7 @@ class Replanner:
         dead_time: float,
     ) -> None:
         self._planner, self._tuning = planner, tuning
+        self._missing = MissingMotion(tuning.missing)
         self.known: Estimate | None = None  # of the model's numbers
         self.adapted: Adapted | None = None  # the model that plans use; None: the robot file's
         self._newest: Plan | None = None  # the last that `latest` took
@@ -121,6 +124,8 @@ class Replanner:
         self._detour: Course | None = None  # the tip's way to its target after a loss of channels
         self._detour_from: Plan | None = None  # where it begins, until that is planned from
         self._offset = np.zeros(6)
+        self._forget_missing()
+        self._updated_at = -math.inf  # time of the last update, in s
         self.deviation = math.nan  # of the plan's stiffness, relative
         self._available: tuple[Array, Array] | None = None  # see `update`
         self.bent: BentMode | None = None  # modes of the arm where the reference was last
@@ -139,6 +144,41 @@ class Replanner:
             self.plan = None  # it belongs to another posture than the trajectory's
         self._search = self._search or far
         self._requested_at = -math.inf
+        left = is_far(self._lacking_at, pursuit.target, far_position, far_angle)
+        if self._search or left or pursuit.course is not None:
+            self._forget_missing()
+
+    def _forget_missing(self) -> None:
+        """Let all channels go as far as others permit."""
+        self._missing.begin()
+        self._lacking_at = self.pursuit.target  # where motion of a channel may be missing
+
+    def look(self, time: float, offset: Array, pressures: Array, tip: TipAt) -> None:
+        """Look whether the tip lacks the motion of a channel as the arm becomes stiff.
+
+        Parameters
+        ----------
+        time : of capture of a sample, in s.
+        offset : of the tip (6,) from the model's.
+        pressures : effective ones (n,) at that time, in Pa.
+        tip : the model's tip now.
+        """
+        if self.stiffens and self.pursuit.course is None:
+            jacobian = tip.pose[:3, :3] @ tip.jacobian[:3]
+            self._missing.take(time, offset[:3], pressures, jacobian)
+        else:
+            self._missing.pause()
+
+    def limited(self, limits: tuple[Array, Array], offset: Array) -> tuple[Array, Array]:
+        """Return the lowest and highest commands (n,), within others, that may be used.
+
+        They are those of plans, see `MissingMotion.limited`. `offset`: effective pressures relative
+        to commands (n,), in Pa.
+        """
+        if not self._missing.channels:
+            return limits
+        low, high = self._missing.limited(limits[0] + offset, limits[1] + offset)
+        return low - offset, high - offset
 
     def go_straight(
         self, now: float, position: Array, rotation: Array, pressures: Array, offset: Array
@@ -209,6 +249,8 @@ class Replanner:
         """
         task, target = self.pursuit.task, self.pursuit.target
         interval = self._tuning.interval
+        self._missing.go_back(min(now - self._updated_at, interval))
+        self._updated_at = now
         is_due = now - self._requested_at >= interval - 1e-6
         if waits and self.stiffens and not self._search:
             is_due = False
@@ -233,8 +275,8 @@ class Replanner:
             stay = isinstance(course, Pressing) and course.phase is not Phase.GOING
             request = PlanRequest(
                 self._serial, task, target, self._offset.copy(), pressure_offset, search,
-                *available, windows=windows, adapted=self.adapted, stay=stay,
-                last=self._detour_from,
+                *self._missing.limited(*available), windows=windows, adapted=self.adapted,
+                stay=stay, last=self._detour_from,
                 step=math.inf if detour is None else self._tuning.detour_step,
                 here=np.zeros(0) if here is None else here,
             )  # fmt: skip
@@ -255,6 +297,7 @@ class Replanner:
     def go_on_with(self, adapted: Adapted, change: Array) -> None:
         """Plan with an adapted model, whose offset differs by a change (6,)."""
         self.adapted = adapted
+        self._missing.pause()
         if self.known is not None:
             limited = adapted.limits is not None
             self.known = replace(self.known, proposal=None, is_limited=limited)
@@ -321,6 +364,15 @@ class Replanner:
         if plan is not None and is_final and plan.reached and plan.far:
             text = f"the arm goes to other pressures for its target; until then {plan.message}"
             notices = (*notices, Notice("changes-posture", text, standing=True))
+        if self._missing.channels:
+            each = ", ".join(str(channel + 1) for channel in self._missing.channels)
+            text = (
+                f"the tip does not move as the pressure of channel {each} should move it: its "
+                "chamber does not get the pressure that the gauge reads, or something pushes the "
+                "arm; look at its tube. Until there is another target, the other channels make up "
+                "for it"
+            )
+            notices = (*notices, Notice("missing-motion", text, standing=True))
         limited = self.adapted is not None and self.adapted.limits is not None
         if limited and (self.known is None or self.known.is_limited):
             notices = (*notices, Notice("too-soft", _TOO_SOFT, standing=True))

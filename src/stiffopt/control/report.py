@@ -126,10 +126,11 @@ class Report:
             AdaptedNumber(f"regulator_lag[{channel}]", *each) for channel, each in enumerate(found)
         )
 
-    def notices(self, rests_short: bool) -> tuple[Notice, ...]:
+    def notices(self, rests_short: bool, *, waits: bool) -> tuple[Notice, ...]:
         """Return alarms and events.
 
         `rests_short`: whether the tip rests short of its target, so that its distance can be told.
+        `waits`: whether the reference waits for the end of a push.
         """
         arm, pursuit, away = self._arm, self._replanner.pursuit, None
         if rests_short:
@@ -138,6 +139,11 @@ class Report:
         notices = (*self._replanner.notices(away), *arm.channels.notices())
         if isinstance(pursuit.course, Pressing | Bracing):
             notices = (*notices, *pursuit.course.notices())
+        if waits:
+            text = (
+                "the arm seems to be pushed: it waits on its way to the target, for a second or two"
+            )
+            notices = (*notices, Notice("motion-waits", text, Severity.INFO, standing=True))
         if self.model_is_wrong:
             distance = 1e3 * float(np.linalg.norm(arm.tip.offset[:3]))
             text = (
@@ -156,6 +162,13 @@ class Report:
                 "swings after its motions; run 'stiffopt commission', and check the robot file"
             )
             notices = (*notices, Notice("frequency", text, standing=True))
+        if arm.times.is_large:
+            text = (
+                f"the times of the tracker's samples scatter by {1e3 * arm.times.scatter:.0f} ms, "
+                "so that the tip leaves its way as it moves; stamp samples where they are "
+                "captured, and look for a busy computer or network"
+            )
+            notices = (*notices, Notice("tracker-times", text, standing=True))
         if doubt := arm.watch.doubt:
             held = Notice(doubt.kind, doubt.text, Severity.ERROR, True, True, doubt.undo)
             notices = (*notices, held)

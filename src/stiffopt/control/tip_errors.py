@@ -152,6 +152,17 @@ def turn_of_a_push(tip: TipAt, *, along_stiff_axis: bool = False) -> Array:
     return rotation @ turn @ rotation.T
 
 
+def missed_turn(bent: Array, turned: Array, further: float) -> float:
+    """Return by how much a turn (3,) differs from that of a push, in rad.
+
+    A force at the tip would cause the turn `bent` (3,). A moment, another posture than the model's
+    or a higher mode may turn the tip further the same way, up to a multiple of it.
+    """
+    share = float(bent @ turned) / max(float(bent @ bent), 1e-12)
+    share = min(max(share, 1.0), further)
+    return float(np.linalg.norm(turned - share * bent))
+
+
 def target_arrays(target: Target | None) -> tuple[Array | None, Array | None, Array | None]:
     """Return position (3,), NaN for free axes, pointing (3,) and quaternion (4,) of a target."""
     if target is None:

@@ -11,7 +11,7 @@ import math
 from dataclasses import dataclass, field, replace
 
 from stiffopt.control.contact_tuning import BracingTuning, CreepTuning, PressingTuning, TouchTuning
-from stiffopt.control.noticing_tuning import MotionTuning
+from stiffopt.control.noticing_tuning import MissingMotionTuning, MotionTuning
 from stiffopt.rig.settings import ControlSettings, Safety
 
 
@@ -221,6 +221,7 @@ class ReplanningTuning:
     detour_rest: float = 1e3
     # change of an available pressure, in Pa, after which all configurations are searched
     other_pressure: float = 1e4
+    missing: MissingMotionTuning = field(default_factory=MissingMotionTuning)
 
 
 @dataclass(frozen=True)

@@ -19,8 +19,8 @@ from stiffopt import lie
 from stiffopt.arrays import Array
 from stiffopt.errors import InputError
 from stiffopt.model.actuation import SectionGeometry
-from stiffopt.model.description import Segment
 from stiffopt.model.manipulator import Manipulator
+from stiffopt.model.segment import Segment
 from stiffopt.model.shooting import mass_per_length
 
 PIECES = 12

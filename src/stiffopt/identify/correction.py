@@ -10,7 +10,7 @@ import numpy as np
 from stiffopt import lie
 from stiffopt.arrays import Array
 from stiffopt.identify.detection import idle_channels
-from stiffopt.identify.frames import FrameComparer, MovedFrame, OtherChannels
+from stiffopt.identify.frames import FrameComparer, Misfit, MovedFrame, OtherChannels
 from stiffopt.identify.hypotheses import Comparer, Found, Hypothesis, best_lines, found_wrong
 from stiffopt.identify.settings import DETECTION
 from stiffopt.identify.setup import Setup
@@ -31,9 +31,8 @@ def put_right(setup: Setup) -> Setup:
         found = found_wrong(comparer, setup.description, setup.settings.keep)
         corrected = setup if found is None else _under(setup, found.hypothesis, comparer.low)
         frame = _moved_frame(setup, found)
-        if isinstance(frame, OtherChannels):
-            told = frame.told(setup.description, setup.recordings)
-            setup = replace(setup, found=(*setup.found, again + told))
+        if isinstance(frame, OtherChannels | Misfit):  # which is not corrected
+            setup = replace(setup, found=(*setup.found, again + _told(frame, setup)))
             break
         if frame is not None:
             recordings = frame.motion.applied(setup.recordings)
@@ -55,32 +54,46 @@ def put_right(setup: Setup) -> Setup:
     return _with_idle_channels(setup, comparer, lines)
 
 
-def _moved_frame(setup: Setup, found: Found | None) -> MovedFrame | OtherChannels | None:
+def _told(found: OtherChannels | Misfit, setup: Setup) -> str:
+    if isinstance(found, Misfit):
+        return found.told(setup.recordings)
+    return found.told(setup.description, setup.recordings)
+
+
+def _moved_frame(setup: Setup, found: Found | None) -> MovedFrame | OtherChannels | Misfit | None:
     """Return the motion of some logs that undoes a new definition of their frame or of a body.
 
     None if there is none, or if a correction that was found otherwise explains the logs about as
     well. Quarter turns of some logs explain them if neither a motion nor other channels in these
-    logs fit far better.
+    logs fit far better, nor a mirror as well, and if they leave little: a wrong correction is worse
+    than none.
     """
     turns = () if found is None else found.hypothesis.turns
-    of_all = found is not None and len(set(turns)) == 1
-    if "axes" in setup.settings.keep or len(setup.recordings) < 2 or of_all:
+    logs = tuple(i for i, turn in enumerate(turns) if turn)
+    if len(setup.recordings) < 2 or (found is not None and len(set(turns)) == 1):
         return None
     comparer = FrameComparer(setup)
+    if "axes" in setup.settings.keep:
+        return comparer.channels_alone()
     frame = comparer.found()
-    if found is None:
-        return frame
+    if found is None or len(logs) == len(turns):
+        return frame if found is None else None
     turned = comparer.turned(turns)
     if isinstance(frame, MovedFrame) and frame.score < DETECTION.overwhelming * turned.score():
         return frame
-    logs = tuple(i for i, turn in enumerate(turns) if turn)
     if isinstance(frame, OtherChannels) and frame.logs == logs:
         channels: OtherChannels | None = frame
     else:
         channels = comparer.other_channels(logs)
-    if channels is not None and channels.left < DETECTION.tie * turned.left(logs):
+    left = turned.left(logs)
+    if channels is not None and channels.left < DETECTION.tie * left:
         return channels
-    return None
+    is_mirrored = left > DETECTION.tie * comparer.left_of_mirror(logs)
+    if is_mirrored and isinstance(frame, MovedFrame) and frame.motion.kind == "mirror":
+        return frame
+    then = turned.misfit(logs).left
+    is_left = then > DETECTION.off * setup.description.length
+    return replace(comparer.misfit(logs), turned=then) if is_mirrored or is_left else None
 
 
 def _comparer(setup: Setup) -> Comparer:

@@ -46,13 +46,11 @@ from stiffopt.model.calibration import (
     ErrorModel,
     RelativeErrors,
     distances_from,
-    even_variance,
-    fading_mean,
     growth,
     recorded_range,
     squared_moves,
 )
-from stiffopt.model.uncertainty import memory_shares
+from stiffopt.model.remembered_errors import RememberedErrors
 
 Rows = NDArray[np.bool_]
 
@@ -246,8 +244,8 @@ def _even_variance(moves: Array, fit: Fit) -> Array:
     ]
     time = in_turn([each.recording.time[each.rows] for each in samples])
     runs = zip(np.split(time, breaks[1:]), np.split(moves, breaks[1:]), strict=True)
-    before = np.concatenate([fading_mean(*run) for run in runs])
-    return even_variance(moves, before, *memory_shares(fit.robot, span))
+    memory = RememberedErrors.of(fit.robot, span)
+    return memory.even_variance(moves, np.concatenate([memory.before(*run) for run in runs]))
 
 
 def in_turn(times: Sequence[Array]) -> Array:

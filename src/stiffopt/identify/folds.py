@@ -59,7 +59,8 @@ def held_back(found: Fit, settle: float, on_evaluation: Callable[[], None]) -> d
             parts[name] = HeldBack(rows, others, errors)
     if not parts:
         raise InputError(
-            "there is nothing left to compare models with; expected longer logs, or name a model"
+            "there is nothing left to compare models with; expected longer logs, a shorter "
+            "`--beginning`, or name a model"
         )
     return parts
 

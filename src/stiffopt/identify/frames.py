@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -24,18 +24,18 @@ from stiffopt.identify.motions import (
     Motion,
     MotionKind,
     Tracks,
+    angles,
     apart,
     are_both_moved,
     best_motions,
     different_poses,
+    distances,
     in_line,
     is_turning,
     joined,
     nearest_cube,
     nearest_rotation,
     of_rows,
-    tip_angles,
-    tip_distances,
     turned_like,
     turning,
 )
@@ -81,13 +81,30 @@ class _Tried:
         found = [measure(poses[i], self.expected[i]) for i in self.logs]
         return float(np.concatenate(found).mean())
 
+    def miss(self, i: int) -> float:
+        """Return the mean miss of the tip in a log as it was recorded, in m."""
+        return float(distances(self.recorded[i], self.expected[i]).mean())
+
+    def share(self, i: int) -> float:
+        """Return the same over the tip's mean distance from its middle in that log."""
+        tips = self.recorded[i][0].position
+        motion = float(np.linalg.norm(tips - tips.mean(axis=0), axis=1).mean())
+        return self.miss(i) / max(motion, 1e-9)
+
+    @property
+    def measures(self) -> tuple[Callable[[Tracks, Tracks], Array], ...]:
+        """Distances and angles of the body that was moved, or of the tip."""
+        k = self.motion.kind if isinstance(self.motion.kind, int) else 0
+        return partial(distances, k=k), partial(angles, k=k)
+
 
 @dataclass(frozen=True, eq=False)
 class MovedFrame:
     """An accepted motion.
 
-    `as_is`, `then`: mean misses of the tip without it and with it, in m; `turned_as_is`,
-    `turned_then`: of its orientation, in rad; `score`: see `FrameComparer.score`.
+    `as_is`, `then`: mean misses of the tip, or of the body that was defined anew, without it and
+    with it, in m; `turned_as_is`, `turned_then`: of its orientation, in rad; `score`: see
+    `FrameComparer.score`.
     """
 
     motion: Motion
@@ -99,9 +116,13 @@ class MovedFrame:
 
     def told(self, recordings: Sequence[Recording]) -> str:
         """Describe the motion and the evidence, as the beginning of a sentence."""
+        kind = self.motion.kind
+        body = "the tip"
+        if isinstance(kind, int) and kind:
+            body = f"'{recordings[0].tracks[kind].name}'"
         words = (
-            f"{self.motion.told(recordings)}; the arm fitted to the other logs then misses the tip "
-            f"by {self.then * 1e3:.1f} mm instead of {self.as_is * 1e3:.1f} mm"
+            f"{self.motion.told(recordings)}; the arm fitted to the other logs then misses "
+            f"{body} by {self.then * 1e3:.1f} mm instead of {self.as_is * 1e3:.1f} mm"
         )
         if self.turned_as_is:
             then, as_is = np.degrees([self.turned_then, self.turned_as_is])
@@ -132,6 +153,39 @@ class OtherChannels:
             f"the arm fitted to the others then misses the tip by {self.then * 1e3:.1f} mm instead "
             f"of {self.as_is * 1e3:.1f} mm. This is not corrected: look at the columns of this "
             "log, and at its frame, or leave it out"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Misfit:
+    """Logs that do not fit the others, for no reason that was found.
+
+    `left`: mean miss of the tip by the arm fitted to the others, in m. `turned`: what a quarter
+    turn of the axes would leave, which is too uncertain to be corrected; infinite without one.
+    """
+
+    logs: Logs
+    left: float
+    turned: float = np.inf
+
+    def told(self, recordings: Sequence[Recording]) -> str:
+        """Describe it, as a sentence."""
+        names = ", ".join(recordings[i].name for i in self.logs)
+        one = len(self.logs) == 1
+        words = (
+            f"{names} {'does' if one else 'do'} not fit the other logs: the arm fitted to them "
+            f"misses {'its' if one else 'their'} tip by {self.left * 1e3:.1f} mm"
+        )
+        if np.isfinite(self.turned):
+            return words + (
+                f"; axes turned by quarter turns leave {self.turned * 1e3:.1f} mm, or a mirror "
+                "explains it as well, so that nothing was corrected; look at how the tracker's "
+                "frame was defined"
+            )
+        return words + (
+            ", and no single reason was found; look at whether it is of the same arm with the same "
+            "channels, has pressures far beyond those of the others, or whether both its frame and "
+            "a body were defined anew, or leave it out"
         )
 
 
@@ -209,6 +263,16 @@ class FrameComparer:
         """Return the mean miss of some logs by the arm fitted to the others, in m."""
         best = min(self._unmoved(logs), key=_Tried.score)
         return best.mean(self._off, best.recorded)
+
+    def left_of_mirror(self, logs: Logs) -> float:
+        """Return the same after the best mirror of some logs; infinite if there is none."""
+        tried = (each for each in self._moved(logs) if each.motion.kind == "mirror")
+        return min((each.mean(self._off, each.after) for each in tried), default=np.inf)
+
+    def misfit(self, logs: Logs) -> Misfit:
+        """Return by how much some logs do not fit the others."""
+        best = min(self._unmoved(logs), key=_Tried.score)
+        return Misfit(logs, best.mean(distances, best.recorded))
 
     # the shape of the arm ----------------------------------------------------------------------
 
@@ -325,10 +389,11 @@ class FrameComparer:
             logs, motion, softness, expected, recorded, after, np.array(misses), float(np.mean(far))
         )
 
-    def found(self) -> MovedFrame | OtherChannels | None:
-        """Return the motion that the evidence proves; None if there is none or it is unclear.
+    def found(self) -> MovedFrame | OtherChannels | Misfit | None:
+        """Return the motion that the evidence proves; None if there is none.
 
-        Channels that explain the same logs as well are returned instead.
+        Channels that explain the same logs as well are returned instead, and a misfit if no reason
+        is clear.
         """
         alone = [each for i in range(len(self._pressures)) for each in self._moved((i,))]
         if not alone:
@@ -339,13 +404,14 @@ class FrameComparer:
         is_clear = all(left <= DETECTION.tie * each.score(best.logs) for each in others)
         is_clear = is_clear and best.motion.kind != "scale" and not self._has_both(best)
         if not (is_clear and self._is_judged(best, best.misses) and self._explains(best)):
-            return self._channels_alone()
+            return self.channels_alone() or self._unexplained()
         channels = self.other_channels(best.logs, best.softness)
         if channels is not None and best.score() > DETECTION.tie * channels.score:
             return channels
-        tips = [best.mean(tip_distances, poses) for poses in (best.recorded, best.after)]
-        turned = [best.mean(tip_angles, poses) for poses in (best.recorded, best.after)]
-        return MovedFrame(best.motion, tips[0], tips[1], turned[0], turned[1], best.score())
+        miss, turn = best.measures
+        as_is, then = (best.mean(miss, poses) for poses in (best.recorded, best.after))
+        turned, left = (best.mean(turn, poses) for poses in (best.recorded, best.after))
+        return MovedFrame(best.motion, as_is, then, turned, left, best.score())
 
     def _widened(self, best: _Tried) -> _Tried:
         """Return the same kind of motion, of more logs in a row as long as this fits better.
@@ -375,7 +441,7 @@ class FrameComparer:
         Those that do not agree may have a fault of their own.
         """
         rest = self._rest(tried.logs)
-        tips = [tip_distances(tried.recorded[i], tried.expected[i]).mean() for i in rest]
+        tips = [tried.miss(i) for i in rest]
         agreeing = [
             i for i, tip in zip(rest, tips, strict=True) if tip <= DETECTION.off * self._length
         ]
@@ -388,8 +454,7 @@ class FrameComparer:
         """Return True if frame and body were moved, so that each alone would be told wrongly."""
         expected = joined([tried.expected[i] for i in tried.logs])
         recorded = joined([self._recorded[i] for i in tried.logs])
-        left = tried.mean(self._off, tried.after)
-        return are_both_moved(left, recorded, expected, self._length)
+        return are_both_moved(tried.motion, recorded, expected, self._length)
 
     def _explains(self, tried: _Tried) -> bool:
         """Return True if a motion is the reason why its logs are far off, at different poses."""
@@ -403,7 +468,8 @@ class FrameComparer:
             np.concatenate([self._off(poses[i], tried.expected[i]) for i in logs])
             for poses in (tried.recorded, tried.after)
         )
-        turned, then = (tried.mean(tip_angles, poses) for poses in (tried.recorded, tried.after))
+        _, measure = tried.measures
+        turned, then = (tried.mean(measure, poses) for poses in (tried.recorded, tried.after))
         tips = np.concatenate([tried.expected[i][0].position for i in logs])[rows]
         off = DETECTION.off * self._length
         least = float((np.min if in_line(tips) else np.mean)(before[rows]))
@@ -426,13 +492,13 @@ class FrameComparer:
         if softness not in self._predicted:
             return None
         as_is = next(each for each in self._unmoved(logs) if each.softness == softness)
-        tips = as_is.mean(tip_distances, as_is.recorded)
+        tips = as_is.mean(distances, as_is.recorded)
         best: OtherChannels | None = None
         for hypothesis in self._possible(logs, softness):
             tried = self._driven(hypothesis, logs, softness)
             left = np.inf if tried is None else tried.mean(self._off, tried.recorded)
             if tried is not None and (best is None or left < best.left):
-                then = tried.mean(tip_distances, tried.recorded)
+                then = tried.mean(distances, tried.recorded)
                 best = OtherChannels(logs, hypothesis, tips, then, left, tried.score())
         return best if best and best.then < DETECTION.overwhelming * best.as_is else None
 
@@ -472,16 +538,35 @@ class FrameComparer:
 
         return sorted(found, key=score)[: DETECTION.shortlist]
 
-    def _channels_alone(self) -> OtherChannels | None:
-        """Return the channels of the log without which the others agree best.
+    def _odd_one(self) -> _Tried:
+        """Return the log without which the others agree best.
 
         Of two logs it is the one that agrees less with the robot file.
         """
         tried = [each for i in range(len(self._pressures)) for each in self._unmoved((i,))]
-        by_file = len(self._pressures) == 2
-        best = min(
-            tried, key=lambda each: each.far if by_file else each.score(self._rest(each.logs))
-        )
+        if len(self._pressures) == 2:
+            return min(tried, key=lambda each: each.far)
+        return min(tried, key=lambda each: each.score(self._rest(each.logs)))
+
+    def _unexplained(self) -> Misfit | None:
+        """Return a log that does not fit the others, which agree, even by the arm fitted to all.
+
+        None of two logs, as either may be the odd one. Others that hold a smaller part of the
+        workspace are missed by less, so misses are compared as shares of a log's motion.
+        """
+        if len(self._pressures) < 3:
+            return None
+        odd, of_all = self._odd_one(), min(self._unmoved(()), key=_Tried.score)
+
+        (i,) = odd.logs
+        others = max(odd.share(k) for k in self._rest(odd.logs))
+        is_far = of_all.miss(i) > DETECTION.off * self._length
+        is_odd = others < DETECTION.frame * of_all.share(i)
+        return self.misfit(odd.logs) if is_far and is_odd else None
+
+    def channels_alone(self) -> OtherChannels | None:
+        """Return other channels of the log without which the others agree best; None if unclear."""
+        best = self._odd_one()
         if best.score(best.logs) <= DETECTION.off * self._length:
             return None
         channels = self.other_channels(best.logs, best.softness)

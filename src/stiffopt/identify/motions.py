@@ -3,8 +3,9 @@
 Tracking software defines a body by its markers, with an origin and axes as somebody chose them. If
 the body that is the frame is defined anew, all poses of later logs are moved alike, ``T X``. If the
 tip's body, or another tracked one, is, its poses are moved in its own axes, ``X G``. If no
-orientations were recorded, positions may also be mirrored. Another scale is no explanation, since
-an arm of another length or modulus looks the same; it only keeps a frame from being told.
+orientations were recorded, positions may also be those of a left-handed frame. Another scale is no
+explanation, since an arm of another length or modulus looks the same; it only keeps a frame from
+being told.
 
 Poses are compared by points on the bodies: their origins and, where orientations were recorded,
 points on their axes.
@@ -43,7 +44,7 @@ class Motion:
     logs : indices of the logs.
     kind : "frame", or the index of the track whose body was defined anew; "mirror" or "scale" of
         recordings without orientations.
-    turn : (3, 3), a rotation; with a factor of -1 or of the scale, a mirror or a scale, and
+    turn : (3, 3), a rotation; a mirror is one times -1, a scale one times its factor, and
     shift : (3,), in m. A pose ``X, x`` of the frame becomes ``R X, R x + s``, that of a body
         ``X R, x + X s``.
     """
@@ -74,8 +75,7 @@ class Motion:
         """Describe the motion, as the beginning of a sentence."""
         names = ", ".join(recordings[i].name for i in self.logs)
         if self.kind == "mirror":
-            axis = "xyz"[int(np.argmin(np.diag(self.turn)))]
-            return f"the positions of {names} are mirrored: {axis} has the other sign"
+            return f"the positions of {names} are mirrored: {_mirror_text(self.turn)}"
         words = f"turned {turn_text(self.turn)}"
         if np.linalg.norm(self.shift) > SHOWN:
             words += f" and moved by {np.linalg.norm(self.shift) * 1e3:.0f} mm"
@@ -83,6 +83,15 @@ class Motion:
             return f"the frame of {names} was defined anew: its poses are {words}"
         body = recordings[0].tracks[self.kind].name
         return f"the body '{body}' was defined anew in {names}: it is {words} in its own axes"
+
+
+def _mirror_text(turn: Array) -> str:
+    """Describe which axes a mirror (3, 3) changes, as the end of a sentence."""
+    if np.sum(np.diag(turn) > 0.5) == 2:
+        return f"{'xyz'[int(np.argmin(np.diag(turn)))]} has the other sign"
+    signs = ("-" if row.sum() < 0 else "" for row in turn)
+    axes = (f"{sign}{'xyz'[k]}" for sign, k in zip(signs, np.abs(turn).argmax(axis=1), strict=True))
+    return f"(x, y, z) should be ({', '.join(axes)})"
 
 
 NOWHERE = Motion((), "frame", np.eye(3), np.zeros(3))
@@ -132,16 +141,16 @@ def _points(tracks: Tracks, length: float) -> Array:
     return np.concatenate(found, axis=1)
 
 
-def tip_distances(one: Tracks, other: Tracks) -> Array:
-    """Return the distances (N,) of the tips of two poses, in m."""
-    return np.asarray(np.linalg.norm(one[0].position - other[0].position, axis=1))
+def distances(one: Tracks, other: Tracks, k: int = 0) -> Array:
+    """Return the distances (N,) of a track, by default of the tip, in two poses, in m."""
+    return np.asarray(np.linalg.norm(one[k].position - other[k].position, axis=1))
 
 
-def tip_angles(one: Tracks, other: Tracks) -> Array:
-    """Return the angles (N,) between the tips of two poses, in rad; zero if they are not known."""
-    own, expected = one[0].rotation, other[0].rotation
+def angles(one: Tracks, other: Tracks, k: int = 0) -> Array:
+    """Return the angles (N,) of a track in two poses, in rad; zero if they are not known."""
+    own, expected = one[k].rotation, other[k].rotation
     if own is None or expected is None:
-        return np.zeros(len(one[0].position))
+        return np.zeros(len(one[k].position))
     cosine = (np.einsum("nij,nij->n", own, expected) - 1) / 2
     return np.asarray(np.arccos(np.clip(cosine, -1, 1)))
 
@@ -266,27 +275,34 @@ def _moved_by_both(recorded: Tracks, expected: Tracks, length: float) -> Tracks:
     return recorded
 
 
-def are_both_moved(left: float, recorded: Tracks, expected: Tracks, length: float) -> bool:
+def are_both_moved(motion: Motion, recorded: Tracks, expected: Tracks, length: float) -> bool:
     """Return True if frame and tip's body were moved, so that each alone would be told wrongly.
 
-    `left` is the mean distance after the best motion alone, in m. Where it is small, one motion is
-    enough: a second one would only replace what the model has wrong.
+    `motion` is the best motion alone. Where it leaves little, it is enough: a second one would only
+    replace what the model has wrong. If it leaves the orientation far off, less has to be gained by
+    a second one.
     """
-    if recorded[0].rotation is None or left <= DETECTION.frame * DETECTION.off * length:
+    if recorded[0].rotation is None:
+        return False
+    after = turned_like(motion.of(recorded), expected)
+    left = float(apart(after, expected, length).mean())
+    if left <= DETECTION.frame * DETECTION.off * length:
         return False
     both = turned_like(_moved_by_both(recorded, expected, length), expected)
-    return bool(apart(both, expected, length).mean() < DETECTION.overwhelming * left)
+    is_turned = angles(after, expected).mean() > DETECTION.both_angle
+    share = DETECTION.tie if is_turned else DETECTION.overwhelming
+    return bool(apart(both, expected, length).mean() < share * left)
 
 
 def _distortions(logs: tuple[int, ...], recorded: Tracks, expected: Tracks) -> list[Motion]:
-    """Return the best mirror and scale of positions about the frame's origin."""
+    """Return the best mirror of positions, which may be shifted, and scale about the origin."""
     own = np.concatenate([each.position for each in recorded])
     wanted = np.concatenate([each.position for each in expected])
-    per_axis = (own * wanted).sum(axis=0)
-    mirror = np.where(np.arange(3) == np.argmin(per_axis), -1.0, 1.0)
-    scale = float(per_axis.sum() / (own**2).sum())
+    spread = (wanted - wanted.mean(axis=0)).T @ (own - own.mean(axis=0))
+    mirror = -CUBE_ROTATIONS[np.argmin(np.einsum("gij,ij->g", CUBE_ROTATIONS, spread))]
+    scale = float((own * wanted).sum() / (own**2).sum())
     return [
-        Motion(logs, "mirror", np.diag(mirror), np.zeros(3)),
+        Motion(logs, "mirror", mirror, wanted.mean(axis=0) - mirror @ own.mean(axis=0)),
         Motion(logs, "scale", scale * np.eye(3), np.zeros(3)),
     ]
 

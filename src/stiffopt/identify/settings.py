@@ -107,6 +107,7 @@ class SamplingSettings:
     loaded_fit_rows, loaded_rows : largest numbers of rows in a fit and in a comparison of an arm
         under gravity, each of whose poses needs a search for equilibrium.
     rows : largest number of rows of a log in a comparison.
+    turn_rows : number of rows of a log by which a body's axes are told from turned ones.
     dead_time_step : longest time between rows, in s, that distinguishes a dead time from a lag.
     """
 
@@ -117,6 +118,7 @@ class SamplingSettings:
     loaded_fit_rows: int = 300
     loaded_rows: int = 400
     rows: int = 50_000
+    turn_rows: int = 20
     dead_time_step: float = 0.5
 
 
@@ -374,6 +376,8 @@ class DetectionSettings:
     frame_angle : angle of orientations, in rad, beyond which a motion may leave a share
         `overwhelming` of their misfit.
     frame_rounds : how often the motions of frame and body are found in turn.
+    both_angle : angle of orientations, in rad, left by one motion, beyond which a share `tie` that
+        two motions leave of its misfit is evidence for both; else it is `overwhelming`.
     known_turn : spread of the tip, in lengths of the arm, that determines a turn.
     ridge : added to the diagonal of the normal equations of regressions.
     clock_rows : number of rows in the regression for the clocks.
@@ -428,6 +432,7 @@ class DetectionSettings:
     frame_lever: float = 0.25
     frame_angle: float = float(np.radians(3.0))
     frame_rounds: int = 20
+    both_angle: float = float(np.radians(15.0))
     known_turn: float = 0.02
     ridge: float = 0.01
     clock_rows: int = 600

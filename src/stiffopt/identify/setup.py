@@ -297,17 +297,21 @@ class Setup:
         unknowns = Unknowns(
             (), (), nothing * len(self.points), nothing * len(samples), nothing * len(samples)
         )
-        problem = CalibrationProblem(description, unknowns, samples, self.points, self.base, NOISE)
+        turning = [point.name for point in self.points if point.turns]
+        few = [_of_few_rows(each, turning) for each in samples]
+        if not any(len(each.rows) for each in few):
+            return list(samples)
+        problem = CalibrationProblem(description, unknowns, few, self.points, self.base, NOISE)
         predicted = problem.predict(np.zeros(0))
         found = []
-        for each, (begin, end) in zip(samples, pairwise(problem.starts), strict=True):
+        for each, some, (begin, end) in zip(samples, few, pairwise(problem.starts), strict=True):
             tracks: list[Track] = []
             for track in each.recording.tracks:
                 k = [point.name for point in self.points].index(track.name)
                 if self.points[k].turns and track.rotation is not None:
                     expected = self.base[:3, :3] @ predicted.poses[k][begin:end, :3, :3]
                     expected = expected @ self.points[k].sensor[:3, :3]
-                    track = replace(track, rotation=_turned(track.rotation, each.rows, expected))
+                    track = replace(track, rotation=_turned(track.rotation, some.rows, expected))
                 tracks.append(track)
             recording = replace(each.recording, tracks=tuple(tracks))
             found.append(replace(each, recording=recording))
@@ -390,6 +394,18 @@ def thinned(recording: Recording, wanted: Rows, span: Array) -> tuple[Recording,
         tracks=tracks,
     )
     return smaller, position[wanted]
+
+
+def _of_few_rows(sample: Sample, turning: Sequence[str]) -> Sample:
+    """Return a sample of few rows that tell how the bodies `turning` are turned in its log."""
+    found: set[int] = set()
+    for track in sample.recording.tracks:
+        if track.name in turning and track.rotation is not None:
+            known = sample.rows[np.isfinite(track.rotation[sample.rows]).all(axis=(1, 2))]
+            count = min(len(known), SAMPLING.turn_rows)
+            found.update(known[np.linspace(0, len(known) - 1, count).round().astype(np.intp)])
+    rows = np.array(sorted(found), dtype=np.intp)
+    return replace(sample, rows=rows, weight=np.ones(len(rows)), spread=1.0)
 
 
 def sampled(recording: Recording, rows: Rows, span: Array, begin: Begin) -> Sample:

@@ -19,9 +19,10 @@ from stiffopt.identify.recording import Recording
 from stiffopt.identify.results import Errors
 from stiffopt.identify.settings import CHOICE, START
 from stiffopt.model.actuation import StrainLaw
-from stiffopt.model.description import Compensation, Corrections, RobotDescription, Segment
+from stiffopt.model.description import RobotDescription
 from stiffopt.model.history import Creep, History, Play
 from stiffopt.model.laws import law_class, strain_laws
+from stiffopt.model.segment import Compensation, Corrections, Segment
 
 
 @dataclass(frozen=True)

@@ -230,7 +230,7 @@ def _with_frame_found(setup: Setup, recording: Recording, found: Comparison) -> 
     best, *others = sorted(motions, key=miss)
     if best.kind == "scale" or (others and miss(best) > DETECTION.tie * miss(others[0])):
         return None
-    if are_both_moved(miss(best), recorded, expected, length):
+    if are_both_moved(best, recorded, expected, length):
         return None
     remark = f"{best.told([recording])} (--keep axes leaves that as it was recorded)"
     if recorded[0].rotation is None:
@@ -325,8 +325,12 @@ def compare(
     ]
     if not with_levels:
         return tuple(found)
+    calibration = description.calibration
+    if calibration is None or calibration.errors is None:
+        return tuple(found)
+    source = Uncertainty(description)
     without_break = [found] if setup.settings.sequence else [[each] for each in found]
-    return tuple(each for logs in without_break for each in _with_levels(setup, logs))
+    return tuple(each for logs in without_break for each in _with_levels(setup, logs, source))
 
 
 def _beginnings(
@@ -420,11 +424,8 @@ def _comparison(
     )
 
 
-def _with_levels(setup: Setup, logs: Sequence[Comparison]) -> list[Comparison]:
+def _with_levels(setup: Setup, logs: Sequence[Comparison], source: Uncertainty) -> list[Comparison]:
     """Return comparisons of logs without a break with the levels of their regions."""
-    calibration = setup.description.calibration
-    if calibration is None or calibration.errors is None:
-        return list(logs)
     ends = np.cumsum([0, *(len(each.time) for each in logs)])
     rows = np.concatenate([
         np.linspace(begin, end - 1, min(end - begin, ERRORS.compared)).astype(np.intp)
@@ -435,7 +436,6 @@ def _with_levels(setup: Setup, logs: Sequence[Comparison]) -> list[Comparison]:
     moving = np.concatenate([each.moving for each in logs])[rows]
     time = in_turn([each.time for each in logs])[rows]
     held = np.concatenate([held_for(each.time, each.moving) for each in logs])[rows]
-    source = Uncertainty(setup.description)
     known = source.errors(p, effective=u, rates=rates, time=time)
     unknown = source.errors(p, moving=moving, held=held)
     off = np.concatenate([each.measured - each.predicted for each in logs])[rows]

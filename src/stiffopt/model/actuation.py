@@ -18,7 +18,7 @@ import numpy as np
 from stiffopt import lie
 from stiffopt.arrays import Array
 from stiffopt.model.calibration import FittedNumber
-from stiffopt.model.description import Compensation, Segment
+from stiffopt.model.segment import Compensation, Segment
 from stiffopt.schema import BadKeyError, Schema
 
 NORM_SMOOTHING = 0.01

@@ -14,14 +14,11 @@ from pydantic import Field, model_validator
 
 from stiffopt.arrays import Array, Flags
 from stiffopt.errors import shown
-from stiffopt.model.history import lagged
 from stiffopt.schema import BadKeyError, Items, Schema
 from stiffopt.units import Angle, Duration, Length, Number, Pressure, Ratio
 
 _POSITIVE = Field(ge=0)
 _ROUNDING = 1e-3  # of correlations, which are written with few digits
-_MORE_MEMORY = 0.07  # of the pressure acts through hysteresis that no model has
-_FADING = 30.0  # s in which an arm forgets former pressures, by creep
 _NEAR = 0.1  # distance within which a pressure counts as recorded, over the recorded range
 _KNOWN = 0.07  # error of what a recorded pressure tells of relative errors, in recorded ranges
 _SLACK = 0.02  # allowed excess over recorded pressures, as a share of the highest
@@ -77,8 +74,8 @@ class ErrorModel(Schema):
     """Model of the tip's prediction errors, near recorded pressures and far from them.
 
     The arm behaves as if its effective pressures were off by a discrepancy, a Gaussian process in
-    the pressures of each segment, which moves the tip equally in all directions (`even_variance`).
-    It has two independent parts.
+    the pressures of each segment, which moves the tip equally in all directions
+    (`RememberedErrors`).  It has two independent parts.
 
     A rough part has the standard deviation `discrepancy` far from recorded pressures, and at a
     distance d from the nearest the variance ``discrepancy^2 (1 - exp(-2 d / reach))``.  A smooth
@@ -197,32 +194,6 @@ def squared_moves(per_pressure: Array, variances: Array) -> Array:
     channels' discrepancies (..., N, n), in Pa^2.
     """
     return np.asarray(variances * (per_pressure**2).sum(axis=1))
-
-
-def even_variance(moves: Array, before: Array, memory: Array, kept: Array) -> Array:
-    """Return the variance (..., N) of each axis of the tip, in m^2, the same for all directions.
-
-    An arm with hysteresis answers to former pressures too, and to what the model has wrong there.
-    How much it does is uncertain: a fit may take creep for play. So the present pressures count as
-    if plays followed them, and the former ones as if they did not.
-
-    Parameters
-    ----------
-    moves : by the discrepancy at the pressures of now, as `squared_moves` (..., N, n).
-    before : their mean where the arm was before, as `fading_mean` (..., N, n).
-    memory, kept : shares (n,) of each channel's pressure that act through the model's hysteresis,
-        and that are still former ones (`History.remembered_shares`).
-    """
-    most, least = (share + (1 - share) * _MORE_MEMORY for share in (memory, kept))
-    return np.asarray(((1 - least) ** 2 * moves + most**2 * before).sum(axis=-1) / 3)
-
-
-def fading_mean(time: Array, moves: Array) -> Array:
-    """Return mean squares (N, ...), weighted by exp(-age / 30 s), of moves (N, ...) at times (N,).
-
-    Before the first time, the arm was where it was then.
-    """
-    return lagged(time, moves, _FADING, moves[0])
 
 
 def distances_from(channels: Sequence[int], pressures: Array, recorded: Array) -> Array:

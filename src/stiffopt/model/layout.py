@@ -24,10 +24,11 @@ import numpy as np
 from stiffopt.arrays import Array
 from stiffopt.model.actuation import SectionGeometry, StrainLaw
 from stiffopt.model.codegen import dense
-from stiffopt.model.description import Compensation, Corrections, RobotDescription, Segment
+from stiffopt.model.description import RobotDescription
 from stiffopt.model.kinematics import Actuation
 from stiffopt.model.laws import strain_law
 from stiffopt.model.parameters import explicit
+from stiffopt.model.segment import Compensation, Corrections, Segment
 from stiffopt.model.shape import FreeShape
 from stiffopt.schema import Schema
 

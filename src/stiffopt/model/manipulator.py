@@ -27,12 +27,13 @@ from stiffopt.model.contact.equilibrium import (
     ContactEquilibrium,
     contact_equilibrium,
 )
-from stiffopt.model.description import Compensation, RobotDescription
+from stiffopt.model.description import RobotDescription
 from stiffopt.model.equilibrium import dead_and_follower
 from stiffopt.model.history import NO_HISTORY
 from stiffopt.model.robot_files import load_description
 from stiffopt.model.scene import Scene
 from stiffopt.model.screws import Twist, Wrench, checked_wrench
+from stiffopt.model.segment import Compensation
 from stiffopt.model.shape import stiffness_along
 from stiffopt.model.uncertainty import TipUncertainty, Uncertainty
 from stiffopt.notebook import ShownInNotebook

@@ -19,15 +19,11 @@ import casadi as ca
 from stiffopt.errors import InputError, shown
 from stiffopt.model.actuation import Section
 from stiffopt.model.calibration import FittedNumber
-from stiffopt.model.description import (
-    Compensation,
-    Corrections,
-    RobotDescription,
-    Segment,
-)
+from stiffopt.model.description import RobotDescription
 from stiffopt.model.history import History
 from stiffopt.model.kinematics import Actuation
 from stiffopt.model.laws import law_class, strain_laws
+from stiffopt.model.segment import Compensation, Corrections, Segment
 from stiffopt.schema import Schema
 
 _SchemaT = TypeVar("_SchemaT", bound=Schema)

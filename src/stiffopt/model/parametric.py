@@ -125,6 +125,8 @@ class ParametricArm:
             if isinstance(shape, FreeShape):
                 found = ca.cse(found)
             function = ca.Function("parametric", list(shape.inputs), found)
+            if isinstance(shape, Chain):
+                function = function.expand()  # evaluated in half the time
             self._functions[key, at] = InterpretedFunction(dense(function))
         evaluate = self._functions[key, at]
         repeated = np.broadcast_to(coordinates, (len(pressures), len(coordinates)))
@@ -141,13 +143,19 @@ class ParametricArm:
         return FreeShape.of(self.description, self._actuation, at)
 
     def _states(self, equilibrium: Equilibrium, variables: Array) -> list[EquilibriumState]:
-        """Return equilibria (N,), each found from the last one of the same row."""
+        """Return equilibria (N,), each found from a known one whose pressures are near.
+
+        That is the last one of the same row, or that of the row before.
+        """
+        n = self.description.n_pressures
         near = self._near.get(len(variables), [])
         states: list[EquilibriumState] = []
         for row, own in enumerate(variables):
-            start = near[row] if near else (states[-1] if states else None)
+            known = [*near[row : row + 1], *states[-1:]]
             state = None
-            if start is not None:
+            if known:
+                far = [np.abs(each.pressures[:n] - own[:n]).sum() for each in known]
+                start = known[int(np.argmin(far))]
                 end = start._replace(pressures=own, loads=self._loads)
                 path = equilibrium.follow(start, end, shortest=0.1, stable=False)
                 state = path.state if path.share == 1.0 else None

@@ -33,8 +33,9 @@ from stiffopt import lie
 from stiffopt.arrays import Array
 from stiffopt.model.actuation import SectionGeometry
 from stiffopt.model.compliance import inverse_3x3
-from stiffopt.model.description import RobotDescription, Segment
+from stiffopt.model.description import RobotDescription
 from stiffopt.model.kinematics import Actuation
+from stiffopt.model.segment import Segment
 from stiffopt.model.shape import PointOfArm
 
 _ROOT = sqrt(21)
@@ -285,9 +286,12 @@ class Chain:
     @property
     def per_gravity(self) -> ca.MX:
         """Body twist (6, 3) of the station per m/s^2 of gravity, along the equilibrium."""
-        change = self.gravity_jacobian(ca.vertcat(self.quaternion, self.position))
-        turn = _turn_between(self.quaternion, change[:4, :])
-        return ca.vertcat(self.rotation.T @ change[4:, :], turn)
+        residual, twist = self._per_x
+        values = ca.vertcat(self.residual, self.quaternion, self.position)
+        change = ca.jacobian(values, self.inputs[2])  # with a free tip
+        tip = -inverse_3x3(residual[:, :3]) @ change[:3, :]
+        turn = _turn_between(self.quaternion, change[3:7, :])
+        return ca.vertcat(self.rotation.T @ change[7:, :], turn) + twist[:, :3] @ tip
 
     def per_rest(self, change: ca.MX) -> ca.MX:
         """Reduce a change (k, 3 + n + 6) to equilibrium: (k, n + 6) per pressure and wrench."""

@@ -49,12 +49,13 @@ from numpy.typing import ArrayLike
 from stiffopt.arrays import Array, Flags
 from stiffopt.errors import InputError
 from stiffopt.model.arguments import checked_measure
-from stiffopt.model.calibration import Calibration, even_variance, fading_mean, squared_moves
+from stiffopt.model.calibration import Calibration, squared_moves
 from stiffopt.model.compliance import Boundary, Frame, Kind
 from stiffopt.model.description import RobotDescription
 from stiffopt.model.history import NO_HISTORY, part_of
 from stiffopt.model.parameters import Parameter
 from stiffopt.model.parametric import ParametricArm
+from stiffopt.model.remembered_errors import RememberedErrors
 
 Part = Literal["parameters", "hysteresis", "discrepancy", "residual"]
 
@@ -252,10 +253,10 @@ class Uncertainty:
         u = pressures if effective is None else effective
         position, per_number, per_pressure = self._slopes.at(u)
         moves = squared_moves(per_pressure, self._discrepancy(u))
-        before = self._typical_moves if time is None else fading_mean(time, moves)
+        before = self._memory.before(time, moves) if time is not None else self._before_unknown
         errors = self._calibration.errors
         residual = self._calibration.position_residual if errors is None else errors.residual
-        discrepancy = even_variance(moves, before, *self._memory)
+        discrepancy = self._memory.even_variance(moves, before)
         if effective is None:
             moved = moving if moving is not None else np.zeros(len(pressures), dtype=bool)
             ways = self._remembered(pressures, per_pressure, held)
@@ -329,10 +330,10 @@ class Uncertainty:
         return errors.variances(self._channels, pressures)
 
     @cached_property
-    def _memory(self) -> Array:
-        """Shares (2, n) of the channels' pressures, as `even_variance` takes them."""
+    def _memory(self) -> RememberedErrors:
+        """How far the arm answers to the discrepancy at former pressures."""
         errors = self._calibration.errors
-        return memory_shares(self._description, 0.0 if errors is None else errors.range)
+        return RememberedErrors.of(self._description, 0.0 if errors is None else errors.range)
 
     @cached_property
     def _delays(self) -> Array:
@@ -341,15 +342,18 @@ class Uncertainty:
         return np.repeat([each.dead_time + each.lag for each in histories], self._channels)
 
     @cached_property
-    def _typical_moves(self) -> Array:
-        """Mean squares (n,) by which the discrepancy moves the tip within the limits, in m^2."""
+    def _before_unknown(self) -> Array:
+        """Mean squares (n,), in m^2, by which the discrepancy at former pressures moves the tip.
+
+        These are anywhere within the limits.
+        """
         low, high = np.array([self._description.pressure_min, self._description.pressure_max])
         shares = np.array(list(product((0.25, 0.75), repeat=max(self._channels))))
         places = np.concatenate([np.arange(channels) for channels in self._channels])
         pressures = low + shares[:, places] * (high - low)
         _, _, per_pressure = self._slopes.at(pressures)
         moves = squared_moves(per_pressure, self._discrepancy(pressures))
-        return np.asarray(moves.mean(axis=0))
+        return self._memory.before_unknown(moves.mean(axis=0))
 
     def _lag(self, pressures: Array, squares: Array) -> Array:
         """Return mean squares (N, n, n), in Pa^2, of the lag behind pressures (N, n) that change.
@@ -564,20 +568,6 @@ def _shape(moves: Array, covariance: Array) -> tuple[Array, Array]:
     variance = squares.var(axis=1) + np.einsum("nij,nji->n", 4 * bounded + 2 * rest, rest)
     trace, square = np.einsum("nii->n", rest), np.einsum("nij,nji->n", rest, rest)
     return np.asarray(18 / variance), np.asarray((trace**2 + 2 * square) / 15)
-
-
-def memory_shares(robot: RobotDescription, span: float) -> Array:
-    """Return shares (2, n) of the channels' pressures, as `even_variance` takes them.
-
-    `span`, in Pa, is the range within which pressures move; see `History.remembered_shares`.
-    """
-    return np.array([
-        np.concatenate([
-            (segment.history or NO_HISTORY).remembered_shares(segment.n_channels, within)
-            for segment in robot.segments
-        ])
-        for within in (0.0, span)
-    ])  # fmt: skip
 
 
 def squared_radius(level: float, degrees_of_freedom: float, shape: float = 3.0) -> float:

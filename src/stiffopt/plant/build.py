@@ -11,8 +11,9 @@ from numpy.polynomial import legendre
 from stiffopt import lie
 from stiffopt.arrays import Array
 from stiffopt.errors import InputError
-from stiffopt.model.description import Compensation, Corrections, RobotDescription, Segment
+from stiffopt.model.description import RobotDescription
 from stiffopt.model.history import NO_HISTORY, Memory
+from stiffopt.model.segment import Compensation, Corrections, Segment
 from stiffopt.plant.material import LINEAR, YEOH, SectionMaterial
 from stiffopt.plant.rod import DiscreteRod
 from stiffopt.plant.settings import Mismatch, PlantSettings
@@ -27,7 +28,7 @@ class ChannelEffects(NamedTuple):
     """The effect of the channels: corrections of the robot file, plus the mismatch.
 
     `dead_band`, `gain`, `offset`: (n,); ``gain onset(p) + offset`` acts if the shape is that of the
-    pressure p, Pa; see `stiffopt.model.description.Corrections`. `angle`: rotation of the channel's
+    pressure p, Pa; see `stiffopt.model.segment.Corrections`. `angle`: rotation of the channel's
     chambers about the axis (n,), rad.
     """
 

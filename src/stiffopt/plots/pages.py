@@ -132,12 +132,9 @@ def _task_rows(task: Task) -> Iterable[Row]:
     yield "robot", task.robot or "the one that the solver is given"
     for term in task.target.terms:
         yield term.key, term.condition()
-    if task.stiffness is not None:
-        yield "stiffness", repr(task.stiffness).partition("(")[2].removesuffix(")")
-    if task.press is not None:
-        yield "press", repr(task.press).partition("(")[2].removesuffix(")")
-    if task.brace is not None:
-        yield "brace", repr(task.brace).partition("(")[2].removesuffix(")")
+    for name, part in (("stiffness", task.stiffness), ("press", task.press), ("brace", task.brace)):
+        if part is not None:
+            yield name, repr(part).partition("(")[2].removesuffix(")")
     yield from _condition_rows(task)
 
 

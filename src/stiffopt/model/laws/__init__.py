@@ -12,7 +12,7 @@ from functools import cache
 
 from stiffopt.errors import InputError, shown
 from stiffopt.model.actuation import SectionGeometry, StrainLaw
-from stiffopt.model.description import Segment
+from stiffopt.model.segment import Segment
 
 
 def strain_laws() -> dict[str, type[StrainLaw]]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import casadi as ca
 
 from stiffopt.model.actuation import Section, StrainLaw, bending_matrix
-from stiffopt.model.description import Segment
+from stiffopt.model.segment import Segment
 from stiffopt.schema import BadKeyError
 
 

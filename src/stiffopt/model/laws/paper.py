@@ -20,7 +20,7 @@ class LinearLaw(StrainLaw):
     The modulus against loads is ``stiffness (E + softening slope |p|)``, the paper's own where both
     factors are 1.  With a least bending radius R, the curvature is
     ``kappa / sqrt(1 + R^2 |kappa|^2)`` instead, and its derivative by the moment is the flexibility
-    under loads.  See `stiffopt.model.description.Compensation`.
+    under loads.  See `stiffopt.model.segment.Compensation`.
     """
 
     limit = "the pressure drives the compensated modulus of this segment to zero"
