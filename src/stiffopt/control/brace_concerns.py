@@ -20,11 +20,13 @@ class Concern(NamedTuple):
 
 
 class Concerns:
-    """What is of concern, from when it comes until it has not been seen for a while.
+    """The present concerns about the contacts of a brace.
+
+    A concern begins when it is first seen. It ends when it has not been seen for the time `again`.
 
     Parameters
     ----------
-    tuning : with the time `again` for which a concern is not to be seen until it ends.
+    tuning : has the time `again`, in s.
 
     Attributes
     ----------

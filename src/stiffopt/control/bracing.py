@@ -63,7 +63,7 @@ class BracePhase(StrEnum):
 
 
 class _Parts(NamedTuple):
-    """What is known of a brace once its approach is planned."""
+    """The planned approach of a brace, and the parts that are made from it."""
 
     approach: BraceApproach
     friction: Friction
@@ -130,7 +130,7 @@ class Bracing:
 
     @property
     def _planned(self) -> _Parts:
-        """What comes with the approach; only called once it is planned."""
+        """The approach and its parts; there must be a planned approach."""
         assert self._parts is not None
         return self._parts
 

@@ -247,13 +247,16 @@ class TipController:
 
     @property
     def _goes_to_target(self) -> bool:
-        """Whether the tip goes to one target, or rests there: no trajectory, press or brace."""
+        """Whether the task has a single target, without a trajectory, a brace or a begun press."""
         course = self.replanner.pursuit.course
         return course is None or (isinstance(course, Pressing) and course.phase is Phase.GOING)
 
     @property
     def _waits(self) -> bool:
-        """Whether the reference waits because of a push; in a press it must be free to go back."""
+        """Whether the reference waits because something pushes the arm.
+
+        It does not in a press, which must be able to go back at any time.
+        """
         return self._arm.watch.waits and self._goes_to_target
 
     def _is_held(self, now: float) -> bool:
@@ -310,11 +313,11 @@ class TipController:
         self._arm.tip.learns = steers and swings
         counts = self._arm.observe(now, commanded, reading, samples, course)
         tip, sample = self._arm.modelled, self._arm.tip.sample
-        if counts.used and sample and tip and not self._first_motion.is_over:
-            parts = tip.pose[:3, :3] @ tip.jacobian[:3] * self._arm.tip.captured
-            self._first_motion.take(self._arm.tip.predicted, sample.position, parts)
         if counts.used and sample and tip:
             estimator = self._arm.tip
+            if not self._first_motion.is_over:
+                parts = tip.pose[:3, :3] @ tip.jacobian[:3] * estimator.captured
+                self._first_motion.take(estimator.predicted, sample.position, parts)
             self.replanner.look(sample.time, estimator.offset, estimator.captured, tip)
         if self.forecast is not None:
             self.forecast.present = self._present(now)

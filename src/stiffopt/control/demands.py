@@ -30,7 +30,7 @@ class Demands:
         self._values: Formula | None = None
 
     def __bool__(self) -> bool:
-        """Whether the task demands a stiffness."""
+        """Return True if the task demands a stiffness."""
         return bool(self._measures)
 
     def are_clearly_met(self, tip: TipAt) -> bool:

@@ -70,7 +70,7 @@ class PostureChanges:
 
     @property
     def leaves_target(self) -> bool:
-        """Whether the tip leaves its target, since the change goes straight to its end."""
+        """Whether the change goes straight to its end, so that the tip may leave its target."""
         return self._change is not None and self._change.straight
 
     @property

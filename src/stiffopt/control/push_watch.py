@@ -105,8 +105,8 @@ class PushWatch:
         """Return how far all channels can have displaced the tip lately, in m.
 
         A change that has gone on at one speed counts with the time of a push alone, and less, as
-        the arm does not swing with it. A slow one has been seen to go right until then; so only one
-        channel counts, which may just have failed.
+        the arm does not swing with it. If it is slow, only its fastest channel counts: the tip has
+        followed all of them until then, and one may just have failed.
         """
         tuning = self._tuning
         begun = max(1, int(times.searchsorted(times[0] + tuning.steady, "right")) - 1)

@@ -69,7 +69,7 @@ class Pursuit:
 
     @property
     def demands(self) -> bool:
-        """Whether the task has the key `at_least` or `match`."""
+        """Whether the task demands a stiffness, by its key `at_least` or `match`."""
         goal = None if self.task is None else self.task.stiffness
         return goal is not None and bool(goal.at_least or goal.match)
 

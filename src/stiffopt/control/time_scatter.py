@@ -30,21 +30,23 @@ class TimeScatter:
     Attributes
     ----------
     scatter : standard deviation of the times, in s; NaN until the tip has moved for long enough.
+    is_large : whether there is to be an alarm.
     """
 
     def __init__(self, noise: float, tuning: ScatterTuning | None = None) -> None:
         self._tuning = tuning = tuning or ScatterTuning()
         self._least_speed = max(tuning.least_speed, noise / tuning.least)
         self._rows: deque[tuple[float, Array]] = deque(maxlen=4)
+        # interval, error along the motion, and speed of each sample in the window
         self._errors: deque[tuple[float, float, float]] = deque()
-        self._moved = 0.0  # time for which the tip moved in the window, in s
-        self.scatter, self.is_large = math.nan, False
+        self.begin()
 
     def begin(self) -> None:
         """Restart."""
         self._rows.clear()
         self._errors.clear()
-        self._moved, self.scatter, self.is_large = 0.0, math.nan, False
+        self._moved = 0.0  # time for which the tip moved in the window, in s
+        self.scatter, self.is_large = math.nan, False
 
     def take(self, time: float, position: Array) -> None:
         """Take in a sample: its time, in s, and position (3,), in m."""

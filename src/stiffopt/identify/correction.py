@@ -76,8 +76,10 @@ def _moved_frame(setup: Setup, found: Found | None) -> MovedFrame | OtherChannel
     if "axes" in setup.settings.keep:
         return comparer.channels_alone()
     frame = comparer.found()
-    if found is None or len(logs) == len(turns):
-        return frame if found is None else None
+    if found is None:
+        return frame
+    if len(logs) == len(turns):  # each log is turned, by itself
+        return None
     turned = comparer.turned(turns)
     if isinstance(frame, MovedFrame) and frame.score < DETECTION.overwhelming * turned.score():
         return frame

@@ -557,7 +557,6 @@ class FrameComparer:
         if len(self._pressures) < 3:
             return None
         odd, of_all = self._odd_one(), min(self._unmoved(()), key=_Tried.score)
-
         (i,) = odd.logs
         others = max(odd.share(k) for k in self._rest(odd.logs))
         is_far = of_all.miss(i) > DETECTION.off * self._length
